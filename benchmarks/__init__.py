@@ -1,0 +1,1 @@
+"""Timings side by side with the peers, as ratios measured in one run."""

@@ -1,0 +1,74 @@
+"""Time two ways of doing one thing in turn, so that a drifting clock speed cancels."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Row:
+    """One comparison: `ours` and `peer` in seconds for the same work.
+
+    `target` is the bound on the ratio ours/peer (at most), or on peer/ours where `faster`.
+    """
+
+    work: str
+    ours: float
+    peer: float
+    peer_name: str
+    target: float
+    faster: bool = False
+
+    @property
+    def ratio(self) -> float:
+        """ours/peer, or peer/ours where `faster`."""
+        return self.peer / self.ours if self.faster else self.ours / self.peer
+
+    @property
+    def reached(self) -> bool:
+        """Whether the target holds."""
+        return self.ratio >= self.target if self.faster else self.ratio <= self.target
+
+
+def best_of_pairs(
+    ours: Callable[[], object], peer: Callable[[], object], repeats: int = 7
+) -> tuple[float, float]:
+    """Return the median seconds of each, run in turn `repeats` times after one warm-up."""
+    ours()
+    peer()
+    mine, theirs = [], []
+    for _ in range(repeats):
+        mine.append(seconds(ours))
+        theirs.append(seconds(peer))
+    return statistics.median(mine), statistics.median(theirs)
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """Return the seconds that one call takes."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def print_table(title: str, rows: list[Row]) -> None:
+    """Print the comparisons as a Markdown table."""
+    print(f"\n## {title}\n")
+    print("| work | ours | peer | peer is | ratio | to reach | reached |")
+    print("|---|---|---|---|---|---|---|")
+    for row in rows:
+        sign, unit = (">=", "x faster") if row.faster else ("<=", "x the time")
+        print(
+            f"| {row.work} | {_pretty(row.ours)} | {_pretty(row.peer)} | {row.peer_name} "
+            f"| {row.ratio:.3g} {unit} | {sign} {row.target:g} "
+            f"| {'yes' if row.reached else 'NO'} |"
+        )
+
+
+def _pretty(value: float) -> str:
+    for factor, unit in ((1.0, "s"), (1e3, "ms"), (1e6, "us")):
+        if value * factor >= 1.0:
+            return f"{value * factor:.3g} {unit}"
+    return f"{value * 1e9:.3g} ns"

@@ -1,0 +1,34 @@
+"""Identify Dahl friction from sine-sweep measurements.
+
+``import dahl_ident as di`` gives every public name; each is loaded when first used, so that
+the import itself stays light.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dahl_ident.elements import Dahl, Damper, Mass, Model, Spring
+
+__version__ = "0.1.0"
+
+_ROOMS = {
+    "dahl_ident.elements": ("Dahl", "Damper", "Mass", "Model", "Spring"),
+}
+_HOME = {name: room for room, names in _ROOMS.items() for name in names}
+
+__all__ = ["Dahl", "Damper", "Mass", "Model", "Spring"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

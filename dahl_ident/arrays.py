@@ -1,0 +1,108 @@
+"""Array types, and the checks that every public function makes on what it is given."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dahl_ident.errors import ValidationError
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+def real_array(value: ArrayLike, name: str) -> FloatArray:
+    """Return `value` as a float array, or say what else it is.
+
+    Parameters
+    ----------
+    value : array_like
+        Numbers of any shape.
+    name : str
+        The argument's name, for the message.
+
+    Returns
+    -------
+    ndarray of float
+        A new array, or `value` itself where it already was one.
+
+    Raises
+    ------
+    ValidationError
+        If the values are complex, text, dates or ragged.
+    """
+    try:
+        array = np.asarray(value)
+    except ValueError as exc:
+        raise ValidationError(f"{name}: expected an array of real numbers, got {exc}") from exc
+    if array.dtype.kind == "c":
+        raise ValidationError(
+            f"{name}: expected real numbers, got complex ones (dtype {array.dtype}); "
+            "pass an amplitude or a waveform, not a phasor"
+        )
+    if array.dtype.kind not in "fiub":
+        raise ValidationError(f"{name}: expected real numbers, got dtype {array.dtype}")
+    return array.astype(np.float64, copy=False)
+
+
+def finite_array(value: ArrayLike, name: str) -> FloatArray:
+    """Return `value` as a float array without NaN or infinity, or name the first bad index."""
+    array = real_array(value, name)
+    good = np.isfinite(array)
+    if not good.all():
+        _refuse(array, good, name, "finite numbers")
+    return array
+
+
+def non_negative_array(value: ArrayLike, name: str) -> FloatArray:
+    """Return `value` as a finite float array without negative numbers."""
+    array = finite_array(value, name)
+    good = array >= 0.0
+    if not good.all():
+        _refuse(array, good, name, "numbers >= 0")
+    return array
+
+
+def positive_array(value: ArrayLike, name: str) -> FloatArray:
+    """Return `value` as a finite float array of numbers above zero."""
+    array = finite_array(value, name)
+    good = array > 0.0
+    if not good.all():
+        _refuse(array, good, name, "numbers > 0")
+    return array
+
+
+def positive_number(value: Any, name: str) -> float:
+    """Return `value` as one finite float above zero."""
+    array = positive_array(value, name)
+    if array.ndim:
+        raise ValidationError(f"{name}: expected one number, got an array of shape {array.shape}")
+    return float(array)
+
+
+def finite_number(value: Any, name: str) -> float:
+    """Return `value` as one finite float."""
+    array = finite_array(value, name)
+    if array.ndim:
+        raise ValidationError(f"{name}: expected one number, got an array of shape {array.shape}")
+    return float(array)
+
+
+def broadcast_shape(**named: NDArray[Any]) -> tuple[int, ...]:
+    """Return the common shape of the named arrays, or say which shapes do not go together."""
+    try:
+        return np.broadcast_shapes(*(a.shape for a in named.values()))
+    except ValueError:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in named.items())
+        raise ValidationError(f"shapes do not go together: {shapes}") from None
+
+
+def _refuse(array: FloatArray, good: NDArray[np.bool_], name: str, expected: str) -> None:
+    bad = np.argwhere(~good)
+    first = tuple(int(i) for i in bad[0])
+    value = float(array[first])
+    where = f"[{', '.join(map(str, first))}]" if first else ""
+    more = f" ({len(bad)} such values)" if len(bad) > 1 else ""
+    raise ValidationError(f"{name}{where} is {value!r}{more}; expected {expected}")

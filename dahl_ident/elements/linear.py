@@ -1,0 +1,184 @@
+"""Linear elements: mass, viscous damper, spring, and any python-control system."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dahl_ident.arrays import ComplexArray, FloatArray, finite_array
+from dahl_ident.elements.element import Element, StiffnessGradient, motion, prefixed
+from dahl_ident.elements.parameter import Parameter
+
+
+class _Lumped(Element):
+    """One parameter p that enters as Z = p (j omega)^n; a fundamental answers no harmonic."""
+
+    _label: str
+    _unit: str
+    _description: str
+    _order: int
+
+    def _set_up(self, value: float | None, name: str | None) -> None:
+        self._name = name
+        self._parameters = (
+            Parameter(prefixed(name, self._label), self._unit, self._description, value),
+        )
+
+    def _unit_stiffness(self, omega: FloatArray, harmonic: int) -> ComplexArray:
+        if harmonic != 1:
+            # a pure sine of displacement moves a linear element at its own frequency alone
+            return np.zeros(np.shape(omega), dtype=np.complex128)
+        return np.asarray((1j * omega) ** self._order)
+
+    def stiffness(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> ComplexArray:
+        """Return p (j omega)^n, unchecked; the amplitude does not matter."""
+        return np.asarray(values[0] * self._unit_stiffness(omega, harmonic) + 0.0 * amplitude)
+
+    def stiffness_gradient(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> StiffnessGradient:
+        """Return p (j omega)^n with its derivatives, unchecked."""
+        value = self.stiffness(values, amplitude, omega, harmonic)
+        unit = np.broadcast_to(self._unit_stiffness(omega, harmonic), value.shape)
+        return StiffnessGradient(value, np.zeros_like(value), (unit,))
+
+
+class Mass(_Lumped):
+    """Inertia: Z = -m omega^2 (Eqn. 53).
+
+    Parameters
+    ----------
+    mass : float, optional
+        m, kg (kg m^2 in rotation). Given: fixed; left out: free.
+    name : str, optional
+        Prefix of the parameter's name, where a model has several masses.
+
+    Raises
+    ------
+    ValidationError
+        If `mass` is not a finite number.
+
+    Examples
+    --------
+    >>> Mass(0.3).dynamic_stiffness(1e-3, 10.0)
+    (-30+0j)
+    """
+
+    _label, _unit, _description, _order = "mass", "kg", "mass", 2
+
+    def __init__(self, mass: float | None = None, *, name: str | None = None) -> None:
+        self._set_up(mass, name)
+
+    def force(
+        self,
+        displacement: ArrayLike,
+        *,
+        velocity: ArrayLike | None = None,
+        acceleration: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Return m times `acceleration` (m/s^2), N.
+
+        Examples
+        --------
+        >>> Mass(2.0).force([0.0], acceleration=[3.0])
+        array([6.])
+        """
+        return np.asarray(self.known_values()[0] * motion(acceleration, "acceleration", self))
+
+
+class Damper(_Lumped):
+    """Viscous damping: Z = j omega c (Eqn. 53, where c is called b).
+
+    Parameters
+    ----------
+    damping : float, optional
+        c, N s/m (N m s/rad in rotation). Given: fixed; left out: free.
+    name : str, optional
+        Prefix of the parameter's name, where a model has several dampers.
+
+    Raises
+    ------
+    ValidationError
+        If `damping` is not a finite number.
+
+    Examples
+    --------
+    >>> Damper(0.24).dynamic_stiffness(1e-3, 10.0)
+    2.4j
+    """
+
+    _label, _unit, _description, _order = "damping", "N s/m", "viscous damping", 1
+
+    def __init__(self, damping: float | None = None, *, name: str | None = None) -> None:
+        self._set_up(damping, name)
+
+    def force(
+        self,
+        displacement: ArrayLike,
+        *,
+        velocity: ArrayLike | None = None,
+        acceleration: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Return c times `velocity` (m/s), N.
+
+        Examples
+        --------
+        >>> Damper(2.0).force([0.0], velocity=[3.0])
+        array([6.])
+        """
+        return np.asarray(self.known_values()[0] * motion(velocity, "velocity", self))
+
+
+class Spring(_Lumped):
+    """Linear spring: Z = k (Eqn. 53).
+
+    Parameters
+    ----------
+    stiffness : float, optional
+        k, N/m (N m/rad in rotation). Given: fixed; left out: free.
+    name : str, optional
+        Prefix of the parameter's name, where a model has several springs.
+
+    Raises
+    ------
+    ValidationError
+        If `stiffness` is not a finite number.
+
+    Examples
+    --------
+    >>> Spring(0.3).dynamic_stiffness(1e-3, 10.0)
+    (0.3+0j)
+    """
+
+    _label, _unit, _description, _order = "stiffness", "N/m", "spring stiffness", 0
+
+    def __init__(self, stiffness: float | None = None, *, name: str | None = None) -> None:
+        self._set_up(stiffness, name)
+
+    def force(
+        self,
+        displacement: ArrayLike,
+        *,
+        velocity: ArrayLike | None = None,
+        acceleration: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Return k times `displacement` (m), N.
+
+        Examples
+        --------
+        >>> Spring(2.0).force([3.0])
+        array([6.])
+        """
+        return np.asarray(self.known_values()[0] * finite_array(displacement, "displacement"))

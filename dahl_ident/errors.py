@@ -1,0 +1,55 @@
+"""Every failure that a user can meet, by name.
+
+All derive from :class:`DahlIdentError`, so one ``except`` catches the toolkit's own errors
+and nothing else. A message says what was found, what was expected and what to do.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "DahlIdentError",
+    "DataError",
+    "ExtractionError",
+    "FitError",
+    "MissingDependencyError",
+    "ModelError",
+    "SamplingError",
+    "UnitError",
+    "ValidationError",
+]
+
+
+class DahlIdentError(Exception):
+    """Base of every error that this package raises on purpose."""
+
+
+class ValidationError(DahlIdentError, ValueError):
+    """An argument has a value, type or shape that gives no meaningful number."""
+
+
+class ModelError(DahlIdentError, ValueError):
+    """A model cannot be built or evaluated: clashing names, or a parameter without a value."""
+
+
+class UnitError(DahlIdentError, ValueError):
+    """A unit is missing, unknown, or of the wrong dimension."""
+
+
+class DataError(DahlIdentError, ValueError):
+    """A file or table cannot be used; the message names file, row and column."""
+
+
+class ExtractionError(DahlIdentError, ValueError):
+    """A record holds no usable sine response; the message says what it holds instead."""
+
+
+class FitError(DahlIdentError, RuntimeError):
+    """An estimate cannot be made, or cannot be trusted and ``throw=True``."""
+
+
+class SamplingError(DahlIdentError, RuntimeError):
+    """A Markov chain cannot be run, resumed or used."""
+
+
+class MissingDependencyError(DahlIdentError, ImportError):
+    """An optional package is needed; the message gives the command that installs it."""
