@@ -1,0 +1,58 @@
+# Two commands do everything on a machine that has python3 (3.11 or later), pip, make and git:
+#   make demo    install, run the whole chain on shipped data, print the report's path
+#   make test    install, then every check that a change must pass
+
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+JOBS   ?= 2
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test lint types rooms unit test-lowest bench lock clean
+
+help:  ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
+
+# The stamp is newer than what it was made from, so a second call installs nothing.
+$(VENV)/.installed: pyproject.toml requirements/dev.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements/dev.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	touch $@
+
+install: $(VENV)/.installed  ## the pinned environment in .venv
+
+demo: install  ## the whole chain on shipped data
+	$(BIN)/dahl-ident demo
+
+test: lint types rooms unit  ## every check that a change must pass
+
+lint: install  ## ruff, check and format
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: install  ## mypy, strict
+	$(BIN)/mypy
+
+rooms: install  ## the order of the rooms
+	$(BIN)/lint-imports
+
+unit: install  ## tests and doctests, warnings as errors
+	$(BIN)/pytest -n $(JOBS) --dist worksteal
+
+test-lowest: install  ## the same tests on the lowest declared versions
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python .venv-lowest
+	$(BIN)/uv pip install --quiet --python .venv-lowest/bin/python --resolution lowest-direct \
+		--editable ".[dev]"
+	.venv-lowest/bin/pytest -n $(JOBS) --dist worksteal
+
+bench: install  ## timings side by side with the peers
+	$(BIN)/python -m benchmarks
+
+lock: install  ## renew the pinned environment from pyproject.toml
+	$(BIN)/uv pip compile --quiet --no-emit-index-url --no-emit-find-links --upgrade \
+		--python-version 3.11 --universal --extra dev --output-file requirements/dev.txt \
+		--custom-compile-command "make lock" pyproject.toml
+
+clean:  ## remove what the commands above made
+	rm -rf $(VENV) .venv-lowest build dist out .pytest_cache .mypy_cache .ruff_cache

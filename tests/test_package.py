@@ -1,0 +1,74 @@
+"""The package as its users meet it: its names, its weight, its wheel."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import dahl_ident as di
+
+ROOT = Path(__file__).parents[1]
+
+PUBLIC_NAMES = [
+    "Dahl",
+    "Damper",
+    "Mass",
+    "Model",
+    "Spring",
+]
+
+
+def test_public_names_are_frozen() -> None:
+    assert sorted(di.__all__) == PUBLIC_NAMES
+
+
+@pytest.mark.parametrize("name", PUBLIC_NAMES)
+def test_every_public_name_loads_and_is_documented(name: str) -> None:
+    value = getattr(di, name)
+    assert name in dir(di)
+    assert value.__doc__
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="module 'dahl_ident' has no attribute 'dahl'"):
+        di.dahl  # noqa: B018 - the access is the test
+
+
+def test_import_loads_no_heavy_library() -> None:
+    code = "import sys, dahl_ident; print(' '.join(sys.modules))"
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True
+    ).stdout.split()
+    heavy = {"scipy", "matplotlib", "casadi", "emcee", "control", "pandas", "pint", "typer", "h5py"}
+    assert not heavy & set(loaded)
+
+
+def test_wheel_installs_and_runs_elsewhere(tmp_path: Path) -> None:
+    uv = [sys.executable, "-m", "uv"]
+    build = [*uv, "build", "--quiet", "--wheel", "--out-dir", str(tmp_path), str(ROOT)]
+    subprocess.run(build, check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+    assert "dahl_ident/py.typed" in names
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+    assert not [name for name in names if name.startswith(("tests/", "benchmarks/", "stubs/"))]
+
+    env = tmp_path / "env"
+    subprocess.run([*uv, "venv", "--quiet", "--python", sys.executable, str(env)], check=True)
+    python = env / ("Scripts" if sys.platform == "win32" else "bin") / "python"
+    subprocess.run(
+        [*uv, "pip", "install", "--quiet", "--python", str(python), str(wheel)], check=True
+    )
+    code = (
+        "import dahl_ident as di; print(di.__file__); "
+        "print(abs(di.Dahl(f_max=1.0, sigma=1.0).describing_function(1.0)).round(5))"
+    )
+    out = subprocess.run(
+        [str(python), "-c", code], cwd=tmp_path, check=True, capture_output=True, text=True
+    ).stdout.split()
+    assert Path(out[0]).is_relative_to(env)
+    assert out[1] == "0.79291"
