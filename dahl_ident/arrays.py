@@ -90,6 +90,13 @@ def finite_number(value: Any, name: str) -> float:
     return float(array)
 
 
+def whole_number(value: Any, name: str, minimum: int) -> int:
+    """Return `value` as an int of at least `minimum`; a float or a bool is refused."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
+        raise ValidationError(f"{name} is {value!r}; expected a whole number >= {minimum}")
+    return int(value)
+
+
 def broadcast_shape(**named: NDArray[Any]) -> tuple[int, ...]:
     """Return the common shape of the named arrays, or say which shapes do not go together."""
     try:

@@ -1,1 +1,6 @@
-"""placeholder"""
+"""Measured data: frequency responses, records, and the files they come from."""
+
+from dahl_ident.data.frequency_response import FrequencyResponse
+from dahl_ident.data.record import Record
+
+__all__ = ["FrequencyResponse", "Record"]

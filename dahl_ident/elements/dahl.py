@@ -25,9 +25,10 @@ from dahl_ident.arrays import (
     non_negative_array,
     positive_array,
     positive_number,
+    whole_number,
 )
 from dahl_ident.elements import general_dahl, hysteresis, linear_dahl
-from dahl_ident.elements.element import Element, StiffnessGradient, check_harmonic, prefixed
+from dahl_ident.elements.element import Element, StiffnessGradient, prefixed
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ValidationError
 
@@ -189,13 +190,13 @@ class Dahl(Element):
         0.7325 -0.3035
         """
         A = non_negative_array(amplitude, "amplitude")
-        check_harmonic(harmonic)
+        k = whole_number(harmonic, "harmonic", 1)
         f_max, sigma, alpha = self.known_values()
         beta = sigma * A / f_max
         if _is_linear(alpha):
-            c = f_max * linear_dahl.harmonic(beta, harmonic)
+            c = f_max * linear_dahl.harmonic(beta, k)
         else:
-            c = f_max * general_dahl.harmonic(beta, alpha, harmonic)
+            c = f_max * general_dahl.harmonic(beta, alpha, k)
         return c.real[()], -c.imag[()]
 
     def gain(self, amplitude: ArrayLike) -> FloatArray:
@@ -308,10 +309,9 @@ class Dahl(Element):
         [0.7616, -0.3519, -0.7616, 0.3519, 0.7616]
         """
         A = positive_number(amplitude, "amplitude")
-        if isinstance(points, bool) or not isinstance(points, int | np.integer) or points < 3:
-            raise ValidationError(f"points is {points!r}; expected a whole number >= 3")
+        samples = whole_number(points, "points", 3)
         f_max, sigma, alpha = (float(v) for v in self.known_values())
-        return hysteresis.steady_loop(A, f_max, sigma, alpha, int(points))
+        return hysteresis.steady_loop(A, f_max, sigma, alpha, samples)
 
     def force(
         self,
@@ -434,7 +434,9 @@ class Dahl(Element):
         shape = np.broadcast_shapes(h.shape, np.shape(alpha))
         by_ln_amplitude = -sigma * by_f_max
         by_amplitude = np.divide(
-            by_ln_amplitude, amplitude, out=_slope_at_rest(values, harmonic, shape),
+            by_ln_amplitude,
+            amplitude,
+            out=_slope_at_rest(values, harmonic, shape),
             where=np.broadcast_to(amplitude > 0.0, shape),
         )
         return StiffnessGradient(

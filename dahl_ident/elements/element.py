@@ -15,6 +15,7 @@ from dahl_ident.arrays import (
     broadcast_shape,
     finite_array,
     non_negative_array,
+    whole_number,
 )
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError, ValidationError
@@ -116,8 +117,8 @@ class Element(ABC):
         A = non_negative_array(amplitude, "amplitude")
         w = non_negative_array(omega, "omega")
         shape = broadcast_shape(amplitude=A, omega=w)
-        check_harmonic(harmonic)
-        Z = self.stiffness(self.known_values(), A, w, harmonic)
+        k = whole_number(harmonic, "harmonic", 1)
+        Z = self.stiffness(self.known_values(), A, w, k)
         return np.broadcast_to(Z, shape).copy()[()]
 
     @abstractmethod
@@ -170,12 +171,6 @@ def prefixed(name: str | None, label: str) -> str:
             f"name is {name!r}; expected letters, digits and underscores, such as 'pivot'"
         )
     return f"{name}_{label}"
-
-
-def check_harmonic(harmonic: int) -> None:
-    """Refuse a harmonic that is not a whole number of at least 1."""
-    if isinstance(harmonic, bool) or not isinstance(harmonic, int | np.integer) or harmonic < 1:
-        raise ValidationError(f"harmonic is {harmonic!r}; expected a whole number >= 1")
 
 
 def motion(value: ArrayLike | None, name: str, needed_by: Element) -> FloatArray:
