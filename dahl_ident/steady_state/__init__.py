@@ -1,0 +1,26 @@
+"""The steady response of a plant to a sine force: displacement amplitude from drive.
+
+A plant with friction answers a force u_0 cos(omega t) with a displacement amplitude A that is
+not proportional to u_0, because its dynamic stiffness depends on A (Eqn. 53):
+
+    A |Z(A, omega)| = u_0,    Z = L(omega) + N(A),    L = k - m omega^2 + j omega c + ...
+
+N is the sum of the describing functions of the friction elements, L all the rest.
+
+- :func:`response` is for users: one plant with known parameters, checked arguments, every
+  amplitude on request.
+- :func:`solve` and :func:`receptance_gradient` are for estimation: many parameter vectors at
+  once, and the derivatives of X/u_0 by implicit differentiation.
+
+Where L is passive (Im L >= 0) A |Z| rises with A, whatever the exponents, so the amplitude is
+unique. Only an active linear part (negative damping) can bring several, or self-sustained
+oscillation. An undamped resonance (L = 0) driven with 4 f_max/pi or more has no steady
+amplitude at all.
+"""
+
+from __future__ import annotations
+
+# from dahl_ident.steady_state.forced import SteadyResponse, response
+from dahl_ident.steady_state.implicit import ReceptanceGradient, receptance_gradient, solve
+
+__all__ = ["ReceptanceGradient", "SteadyResponse", "receptance_gradient", "response", "solve"]

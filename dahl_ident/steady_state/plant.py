@@ -1,0 +1,152 @@
+"""A plant at many points: linear part, friction and drive in flat arrays, one row a point."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements.dahl import Dahl
+from dahl_ident.elements.element import Element
+from dahl_ident.elements.model import as_model
+
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+EPS = float(np.finfo(np.float64).eps)
+_ROUNDING = 8.0 * EPS  # of k - m omega^2 and its like, relative to the terms' sizes
+_LARGEST = 1e300  # stands for an amplitude without bound
+
+
+@dataclass(frozen=True)
+class Friction:
+    """The elements that depend on the amplitude, with one or many vectors of their parameters."""
+
+    elements: tuple[Dahl, ...]
+    values: tuple[tuple[FloatArray, ...], ...]  # all of shape (), or all of shape (vectors,)
+
+    def force(self, amplitude: FloatArray, vector: IntArray) -> ComplexArray:
+        """Return A N, the force's fundamental; `vector` says whose parameters each row has."""
+        force = np.zeros(amplitude.shape, dtype=np.complex128)
+        for element, values in zip(self.elements, self.values, strict=True):
+            force += element.stiffness(_rows(values, vector), amplitude, np.zeros(()))
+        force *= amplitude
+        return force
+
+    def force_and_slope(
+        self, amplitude: FloatArray, vector: IntArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Return A N and its derivative by ln A."""
+        force = np.zeros(amplitude.shape, dtype=np.complex128)
+        slope = np.zeros(amplitude.shape, dtype=np.complex128)
+        for element, values in zip(self.elements, self.values, strict=True):
+            Z = element.stiffness_gradient(_rows(values, vector), amplitude, np.zeros(()))
+            force += amplitude * Z.value
+            slope += amplitude * (Z.value + amplitude * Z.by_amplitude)
+        return force, slope
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Return what |N| and A |N| never exceed, for each vector.
+
+        The loop is nowhere steeper than 2^alpha sigma and nowhere higher than f_max; the
+        fundamental of a wave of slope or height 1 is at most 4/pi, that of the square wave.
+        """
+        steepest, largest = np.zeros(()), np.zeros(())
+        for f_max, sigma, alpha in self.values:
+            steepest = steepest + 4.0 / np.pi * 2.0**alpha * sigma
+            largest = largest + 4.0 / np.pi * f_max
+        return steepest, largest
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A |L + N(A)| = drive at every point; all arrays have one entry a point."""
+
+    linear: ComplexArray
+    rounding: FloatArray  # what rounding the terms of L leaves of it
+    drive: FloatArray
+    vector: IntArray
+    friction: Friction
+
+    def at(self, points: IntArray) -> Plant:
+        """Return the plant at some of its points."""
+        return Plant(
+            self.linear[points],
+            self.rounding[points],
+            self.drive[points],
+            self.vector[points],
+            self.friction,
+        )
+
+    def largest_friction(self) -> FloatArray:
+        """Return the friction force's fundamental in gross slip."""
+        return _rows((self.friction.bounds()[1],), self.vector)[0] + np.zeros(self.drive.shape)
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Return amplitudes below and above every solution."""
+        steepest, largest = _rows(self.friction.bounds(), self.vector)
+        stiffness = np.abs(self.linear)
+        low = 0.999 * self.drive / (stiffness + steepest)
+        with np.errstate(divide="ignore", over="ignore"):
+            high = np.minimum(1.001 * (self.drive + largest) / stiffness, _LARGEST)
+        return low, high
+
+    def misfit(
+        self, amplitude: FloatArray, force: ComplexArray, slope: ComplexArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return ln(A |Z| / u_0) and its derivative by ln A."""
+        rest = amplitude * self.linear
+        total = rest + force
+        size = np.abs(total)
+        with np.errstate(divide="ignore", invalid="ignore"):  # Z = 0 at a limit cycle
+            rise = ((rest + slope) * total.conj()).real / size**2
+            return np.log(size / self.drive), rise
+
+    def conditioning(self, amplitude: FloatArray, force: ComplexArray) -> FloatArray:
+        """Return (|L| + |N|) A/u_0, by which rounding grows near a sharp resonance."""
+        return (np.abs(self.linear) * amplitude + np.abs(force)) / self.drive
+
+
+def flatten(
+    model: Element, values: Sequence[FloatArray], omega: FloatArray, drive: FloatArray
+) -> tuple[Plant, tuple[int, ...]]:
+    """Return the plant at every point of the broadcast arguments, and their shape."""
+    shape = np.broadcast_shapes(np.shape(omega), np.shape(drive), *(np.shape(v) for v in values))
+    linear, size = np.zeros((), dtype=np.complex128), np.zeros(())
+    friction: list[tuple[Dahl, Sequence[FloatArray]]] = []
+    first = 0
+    for element in as_model(model).elements:
+        own = values[first : first + len(element.parameters)]
+        first += len(element.parameters)
+        if isinstance(element, Dahl):
+            friction.append((element, own))
+        else:
+            part = element.stiffness(own, np.zeros(()), omega)
+            linear, size = linear + part, size + np.abs(part)
+    batch = np.broadcast_shapes(*(np.shape(v) for _, own in friction for v in own))
+    vectors = np.arange(np.prod(batch, dtype=np.intp)).reshape(batch)
+    flat_values = tuple(
+        tuple(np.reshape(v, ()) if vectors.size == 1 else _flat(v, batch) for v in own)
+        for _, own in friction
+    )
+    plant = Plant(
+        _flat(linear, shape),
+        _flat(_ROUNDING * size, shape),
+        _flat(drive, shape),
+        _flat(vectors, shape),
+        Friction(tuple(element for element, _ in friction), flat_values),
+    )
+    return plant, shape
+
+
+def _flat(array: NDArray[_Scalar], shape: tuple[int, ...]) -> NDArray[_Scalar]:
+    return np.broadcast_to(array, shape).ravel()
+
+
+def _rows(values: Sequence[FloatArray], vector: IntArray) -> list[FloatArray]:
+    return [v[vector] if v.ndim else v for v in values]

@@ -1,0 +1,249 @@
+"""All amplitudes at which A |L + N(A)| equals the drive.
+
+**Passive points** (Im L >= 0) have one. It is bracketed by bisection over the nodes of a table
+of the friction force A N against ln A, started by inverse cubic interpolation, and polished by
+Newton's method in ln A that never leaves its bracket. With the dense table used for many
+points, one step from the interpolated start is enough almost everywhere.
+
+**Active points** (Im L < 0) may have several. All lie between the bounds that |N| and A |N|
+set. A grid over this range finds where A |Z| turns, each turning point is located, and each
+rising or falling piece that crosses the drive holds one amplitude. Turning points nearer to
+each other than the grid's nodes, 1.8 % in amplitude, may be missed.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.steady_state.plant import EPS, BoolArray, Friction, IntArray, Plant
+
+_COARSE_PER_DECADE = 16
+_DENSE_PER_DECADE = 96
+_MANY = 4096  # points from which the dense table pays
+_SCAN_PER_DECADE = 128
+_SCAN_CELLS = 2**18  # points times nodes of the scan in work at once
+_CHUNK = 8192  # points solved together: their scratch arrays stay in the processor's cache
+
+
+def all_roots(plant: Plant) -> FloatArray:
+    """Return every amplitude of every point, rising, shape (points, most), NaN where fewer."""
+    resonant = np.abs(plant.linear) <= plant.rounding
+    if not plant.friction.elements:
+        with np.errstate(divide="ignore", over="ignore"):
+            amplitude = plant.drive / np.abs(plant.linear)
+        return np.where(resonant, np.nan, amplitude)[:, None]
+    unbounded = resonant & (plant.drive >= plant.largest_friction())
+    passive = plant.linear.imag >= -plant.rounding
+    roots = np.full((plant.drive.size, 1), np.nan)
+    single = np.flatnonzero(passive & ~unbounded)
+    if single.size:
+        table = _tabulate(plant.friction, dense=single.size >= _MANY)
+        for first in range(0, single.size, _CHUNK):
+            points = single[first : first + _CHUNK]
+            roots[points, 0] = _single_roots(plant.at(points), table)
+    active = np.flatnonzero(~passive)
+    return _insert(roots, *_scan(plant, active)) if active.size else roots
+
+
+class _Table(NamedTuple):
+    """Friction force over amplitude, the nodes of one parameter vector after the other."""
+
+    nodes: int  # per vector; 2^k - 1, so that bisection takes k steps
+    amplitude: FloatArray
+    force: ComplexArray
+    slope: ComplexArray  # by ln A
+
+
+def _tabulate(friction: Friction, *, dense: bool) -> _Table:
+    """Return the friction force from deep microslip to deep slip of every element."""
+    knees = [np.atleast_1d(f_max / sigma) for f_max, sigma, _ in friction.values]
+    low = np.log10(np.min(knees, axis=0)) - 4.0
+    high = np.log10(np.max(knees, axis=0)) + 4.0
+    least = np.max(high - low) * (_DENSE_PER_DECADE if dense else _COARSE_PER_DECADE)
+    nodes = 2 ** int(np.ceil(np.log2(least))) - 1
+    amplitude = 10.0 ** np.linspace(low, high, nodes, axis=-1).ravel()
+    vector = np.repeat(np.arange(low.size), nodes)
+    return _Table(nodes, amplitude, *friction.force_and_slope(amplitude, vector))
+
+
+def _single_roots(plant: Plant, table: _Table) -> FloatArray:
+    """Return the one amplitude of each passive point."""
+    below = _search(plant, table)
+    first = plant.vector * table.nodes
+    left = first + np.maximum(below - 1, 0)
+    right = first + np.minimum(below, table.nodes - 1)
+    start, per_misfit = _inverse_cubic(plant, table, left, right)
+    with np.errstate(all="ignore"):  # beyond the table's ends the result is not used
+        force = plant.friction.force(start, plant.vector)
+        size = np.abs(start * plant.linear + force)
+        step = -np.log(size / plant.drive) * per_misfit
+        amplitude = start * np.exp(step)
+        settled = np.abs(step) * plant.conditioning(start, force) < 1e-9
+    settled &= (below > 0) & (below < table.nodes)
+    if not settled.all():
+        rest = np.flatnonzero(~settled)
+        part = plant.at(rest)
+        low, high, guess = _bracket(part, table, below[rest], left[rest], right[rest])
+        rising = np.ones(rest.shape, dtype=bool)
+        amplitude[rest] = _polish(part, low, high, guess, rising)
+    return amplitude
+
+
+def _search(plant: Plant, table: _Table) -> IntArray:
+    """Return at how many nodes A |Z| lies below the drive, by bisection without branches."""
+    unit = np.max(np.abs(table.force))  # keeps the squares in range
+    linear, force = plant.linear / unit, table.force / unit
+    limit = (plant.drive / unit) ** 2
+    offset = plant.vector * table.nodes - 1
+    below = np.zeros(limit.shape, dtype=np.intp)
+    width = (table.nodes + 1) // 2
+    while width:
+        node = offset + (below + width)
+        total = table.amplitude.take(node, mode="clip") * linear
+        total += force.take(node, mode="clip")
+        size = total.real**2
+        size += total.imag**2
+        below += width * (size < limit)
+        width //= 2
+    return below
+
+
+def _inverse_cubic(
+    plant: Plant, table: _Table, left: IntArray, right: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return A and dlnA/dg at g = ln(A |Z|/u_0) = 0, from Hermite's cubic of ln A over g."""
+    A0, A1 = table.amplitude[left], table.amplitude[right]
+    g0, s0 = plant.misfit(A0, table.force[left], table.slope[left])
+    g1, s1 = plant.misfit(A1, table.force[right], table.slope[right])
+    with np.errstate(all="ignore"):  # left and right are one node beyond the table's ends
+        width, log_ratio = g1 - g0, np.log(A1 / A0)
+        t = -g0 / width
+        m0, m1 = width / s0, width / s1
+        y = t * ((1 - t) ** 2 * m0 + t * ((3 - 2 * t) * log_ratio + (t - 1) * m1))
+        slope = 6 * t * (1 - t) * log_ratio + (1 - t) * (1 - 3 * t) * m0 + t * (3 * t - 2) * m1
+        return A0 * np.exp(y), slope / width
+
+
+def _bracket(
+    plant: Plant, table: _Table, below: IntArray, left: IntArray, right: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return an amplitude below the solution, one above it, and a start between them."""
+    stuck, slipping = below == 0, below == table.nodes
+    A0, A1 = table.amplitude[left], table.amplitude[right]
+    least, most = plant.bounds()
+    low = np.where(stuck, np.minimum(least, A1), A0)
+    high = np.where(slipping, np.maximum(most, A0), A1)
+    largest = plant.largest_friction()
+    with np.errstate(divide="ignore"):
+        linear = plant.drive / np.abs(plant.linear + table.force[left] / A0)
+        excess = np.sqrt(np.abs(plant.drive - largest)) * np.sqrt(plant.drive + largest)
+        start = np.where(stuck, linear, excess / np.abs(plant.linear))
+    return low, high, np.where(stuck | slipping, start, np.sqrt(low) * np.sqrt(high))
+
+
+def _polish(
+    plant: Plant, low: FloatArray, high: FloatArray, start: FloatArray, rising: BoolArray
+) -> FloatArray:
+    """Return the amplitude in each bracket, by Newton steps in ln A or else bisection.
+
+    A |Z| - u_0 changes sign once between `low` and `high`, upwards where `rising`.
+    """
+    low, high = low.copy(), high.copy()
+    amplitude = np.where((start > low) & (start < high), start, np.sqrt(low) * np.sqrt(high))
+    active = np.arange(amplitude.size)
+    for _ in range(200):
+        A, part = amplitude[active], plant.at(active)
+        force, slope = plant.friction.force_and_slope(A, part.vector)
+        g, s = part.misfit(A, force, slope)
+        beyond = (g > 0.0) == rising[active]
+        high[active[beyond]] = A[beyond]
+        low[active[~beyond]] = A[~beyond]
+        left, right = low[active], high[active]
+        kappa = part.conditioning(A, force)
+        with np.errstate(all="ignore"):  # a step from a turning point is no number: bisect
+            step = -g / s
+            newton = A * np.exp(step)
+        inside = (newton >= left) & (newton <= right)
+        settled = (np.abs(g) <= 64.0 * EPS * kappa) | (right <= left * (1.0 + 4.0 * EPS))
+        amplitude[active] = np.where(
+            inside, newton, np.where(settled, A, np.sqrt(left) * np.sqrt(right))
+        )
+        settled |= inside & (np.abs(step) * kappa < 1e-8)
+        active = active[~settled]
+        if not active.size:
+            break
+    return amplitude
+
+
+def _scan(plant: Plant, points: IntArray) -> tuple[IntArray, FloatArray]:
+    """Return every amplitude of the chosen points, as pairs (point, amplitude)."""
+    low, high = plant.at(points).bounds()
+    least, most = np.min(low), np.max(high)
+    nodes = 2 + int(np.ceil(_SCAN_PER_DECADE * (np.log10(most) - np.log10(least))))
+    grid = np.geomspace(least, most, nodes)
+    at, amplitudes = [], []
+    together = max(1, _SCAN_CELLS // nodes)
+    for first in range(0, points.size, together):
+        chunk = points[first : first + together]
+        which, amplitude = _scan_grid(plant.at(chunk), grid)
+        at.append(chunk[which])
+        amplitudes.append(amplitude)
+    return np.concatenate(at), np.concatenate(amplitudes)
+
+
+def _scan_grid(plant: Plant, grid: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return the amplitudes of every point within `grid`, pairs in one cell included."""
+    vectors, which = np.unique(plant.vector, return_inverse=True)
+    tables = plant.friction.force_and_slope(
+        np.tile(grid, vectors.size), np.repeat(vectors, grid.size)
+    )
+    force, slope = (table.reshape(vectors.size, -1)[which] for table in tables)
+    wide = Plant(
+        plant.linear[:, None],
+        plant.rounding[:, None],
+        plant.drive[:, None],
+        plant.vector[:, None],
+        plant.friction,
+    )
+    g, s = wide.misfit(grid, force, slope)
+    above, falling = g > 0.0, s < 0.0
+    turns = falling[:, 1:] != falling[:, :-1]
+    at, cell = np.nonzero(turns)
+    turn, over = _turning_point(plant.at(at), grid[cell], grid[cell + 1], falling[at, cell])
+    plain, whole = np.nonzero((above[:, 1:] != above[:, :-1]) & ~turns)
+    point = np.concatenate((plain, at, at))
+    low = np.concatenate((grid[whole], grid[cell], turn))
+    high = np.concatenate((grid[whole + 1], turn, grid[cell + 1]))
+    before = np.concatenate((above[plain, whole], above[at, cell], over))
+    after = np.concatenate((above[plain, whole + 1], over, above[at, cell + 1]))
+    crossed = np.flatnonzero(before != after)
+    point, low, high = point[crossed], low[crossed], high[crossed]
+    middle = np.sqrt(low) * np.sqrt(high)
+    return point, _polish(plant.at(point), low, high, middle, after[crossed])
+
+
+def _turning_point(
+    plant: Plant, low: FloatArray, high: FloatArray, falling: BoolArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return where A |Z| turns in each cell, by bisection, and whether it exceeds u_0 there."""
+    for _ in range(54):
+        middle = np.sqrt(low) * np.sqrt(high)
+        g, s = plant.misfit(middle, *plant.friction.force_and_slope(middle, plant.vector))
+        before = (s < 0.0) == falling
+        low, high = np.where(before, middle, low), np.where(before, high, middle)
+    return middle, g > 0.0
+
+
+def _insert(roots: FloatArray, point: IntArray, amplitude: FloatArray) -> FloatArray:
+    """Return `roots` with the pairs (point, amplitude) put into their rows in rising order."""
+    order = np.lexsort((amplitude, point))
+    point, amplitude = point[order], amplitude[order]
+    counts = np.bincount(point, minlength=len(roots))
+    place = np.arange(point.size) - np.repeat(np.cumsum(counts) - counts, counts)
+    wide = np.full((len(roots), max(1, counts.max())), np.nan)
+    wide[:, :1] = roots
+    wide[point, place] = amplitude
+    return wide
