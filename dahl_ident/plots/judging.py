@@ -1,0 +1,208 @@
+"""Pictures that judge a fit: residuals, profiles, correlation, where the information is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import ArrayLike
+
+from dahl_ident.plots import style
+
+
+def plot_residuals(
+    x: ArrayLike,
+    first: ArrayLike,
+    second: ArrayLike,
+    *,
+    names: tuple[str, str] = ("real part", "imaginary part"),
+    x_label: str = "displacement amplitude [m]",
+    suspicious: ArrayLike = (),
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the two residuals of every point, in standard deviations, joined so that runs show.
+
+    Parameters
+    ----------
+    x : array_like, shape (n,)
+        Amplitude or frequency.
+    first, second : array_like, shape (n,)
+        Residuals in units of the noise.
+    names : tuple of str
+        What the two residuals are.
+    x_label : str
+        Axis label with unit.
+    suspicious : array_like of int
+        Indices to ring.
+    ax : Axes, optional
+        New where left out.
+
+    Returns
+    -------
+    Axes
+        Residuals over `x`.
+
+    Examples
+    --------
+    >>> plot_residuals([1.0, 2.0], [0.1, -0.2], [1.0, 0.3]).get_ylabel()
+    'residual [standard deviations]'
+    """
+    axis = style.axes(ax)
+    order = np.argsort(x)
+    where = np.asarray(x)[order]
+    axis.axhspan(-2.0, 2.0, color=style.GREY, alpha=0.12, lw=0)
+    axis.axhline(0.0, color=style.GREY, lw=0.8)
+    for y, name, colour, marker in zip(
+        (first, second), names, style.SERIES, style.MARKERS, strict=False
+    ):
+        axis.plot(where, np.asarray(y)[order], marker, ls="-", lw=0.6, color=colour, label=name)
+    for index in np.asarray(suspicious, dtype=int):
+        for y in (first, second):
+            axis.plot(
+                np.asarray(x)[index], np.asarray(y)[index], "o", mfc="none", mec=style.VERMILION,
+                markersize=10,
+            )  # fmt: skip
+    if where.min() > 0.0 and where.max() > 5.0 * where.min():
+        axis.set_xscale("log")
+    axis.set(xlabel=x_label, ylabel="residual [standard deviations]")
+    axis.legend(ncols=2)
+    return axis
+
+
+def plot_profile(
+    value: ArrayLike,
+    deviance: ArrayLike,
+    *,
+    best: float,
+    limits: Mapping[str, float],
+    label: str,
+    log: bool = False,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the profile of the deviance over one parameter, with the levels of its intervals.
+
+    Parameters
+    ----------
+    value, deviance : array_like, shape (n,)
+        Fixed values of the parameter, and the rise of -2 ln likelihood (or of F) there.
+    best : float
+        The estimate.
+    limits : mapping of str to float
+        Height of each confidence level, by its label.
+    label : str
+        The parameter with its unit.
+    log : bool, default False
+        Logarithmic axis, for a positive parameter.
+    ax : Axes, optional
+        New where left out.
+
+    Returns
+    -------
+    Axes
+        Deviance over the parameter.
+
+    Examples
+    --------
+    >>> axis = plot_profile([1, 2, 3], [4, 0, 4], best=2, limits={"95 %": 3.84}, label="k [N/m]")
+    >>> axis.get_xlabel()
+    'k [N/m]'
+    """
+    axis = style.axes(ax)
+    axis.plot(value, deviance, color=style.BLUE, marker=".", lw=1.2)
+    axis.axvline(best, color=style.FIT, lw=0.8)
+    for name, height in limits.items():
+        axis.axhline(height, color=style.GREY, lw=0.8, ls="--")
+        axis.annotate(
+            name, (0.99, height), xycoords=("axes fraction", "data"), ha="right", va="bottom",
+            fontsize=7, color=style.GREY,
+        )  # fmt: skip
+    top = 1.6 * max(limits.values())
+    axis.set(xlabel=label, ylabel="rise of deviance", ylim=(-0.02 * top, top))
+    if log:
+        axis.set_xscale("log")
+    return axis
+
+
+def plot_correlation(
+    names: Sequence[str], correlation: ArrayLike, *, ax: Axes | None = None
+) -> Axes:
+    """Draw a correlation matrix, with its numbers.
+
+    Parameters
+    ----------
+    names : sequence of str
+        The parameters.
+    correlation : array_like, shape (p, p)
+        Between -1 and 1.
+    ax : Axes, optional
+        New where left out.
+
+    Returns
+    -------
+    Axes
+        The matrix.
+
+    Examples
+    --------
+    >>> axis = plot_correlation(["f_max", "sigma"], [[1.0, -0.3], [-0.3, 1.0]])
+    >>> len(axis.texts)
+    4
+    """
+    axis = style.axes(ax, size=(3.6, 3.2))
+    matrix = np.asarray(correlation)
+    axis.imshow(matrix, cmap="PuOr", vmin=-1.0, vmax=1.0)
+    for (i, j), value in np.ndenumerate(matrix):
+        axis.text(
+            j, i, f"{value:.2f}", ha="center", va="center", fontsize=8,
+            color="white" if abs(value) > 0.6 else "black",
+        )  # fmt: skip
+    axis.set_xticks(range(len(names)), names, rotation=30, ha="right")
+    axis.set_yticks(range(len(names)), names)
+    axis.grid(visible=False)
+    return axis
+
+
+def plot_information(
+    x: ArrayLike,
+    shares: Mapping[str, ArrayLike],
+    *,
+    x_label: str = "displacement amplitude [m]",
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw how much each point says about each parameter (the identifiability map).
+
+    Parameters
+    ----------
+    x : array_like, shape (n,)
+        Amplitude of each point.
+    shares : mapping of str to array_like, shape (n,)
+        For each parameter, each point's share of the information, summing to 1.
+    x_label : str
+        Axis label with unit.
+    ax : Axes, optional
+        New where left out.
+
+    Returns
+    -------
+    Axes
+        Share over amplitude.
+
+    Examples
+    --------
+    >>> plot_information([1.0, 2.0], {"f_max": [0.2, 0.8]}).get_ylabel()
+    'share of information [%]'
+    """
+    axis = style.axes(ax)
+    order = np.argsort(x)
+    for (name, share), colour, marker in zip(
+        shares.items(), style.SERIES, style.MARKERS, strict=False
+    ):
+        axis.plot(
+            np.asarray(x)[order], 100.0 * np.asarray(share)[order], marker=marker, color=colour,
+            label=name, lw=1.2,
+        )  # fmt: skip
+    axis.set(xlabel=x_label, ylabel="share of information [%]", xscale="log")
+    axis.set_ylim(bottom=0.0)
+    axis.legend()
+    return axis

@@ -1,0 +1,162 @@
+"""Pictures of a posterior: corner and trace."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import ArrayLike, NDArray
+
+from dahl_ident.errors import ValidationError
+from dahl_ident.plots import style
+
+_QUANTILES = (0.025, 0.16, 0.5, 0.84, 0.975)
+
+
+def plot_corner(
+    names: Sequence[str],
+    draws: ArrayLike,
+    *,
+    log: Sequence[bool] = (),
+    truth: Mapping[str, float] | None = None,
+    ax: NDArray[Any] | None = None,
+) -> NDArray[Any]:
+    """Draw every parameter's marginal and every pair's joint density.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Labels with units.
+    draws : array_like, shape (n, p)
+        Independent or thinned draws.
+    log : sequence of bool, shape (p,), optional
+        Which axes are logarithmic.
+    truth : mapping of str to float, optional
+        Values to mark, by label.
+    ax : ndarray of Axes, shape (p, p), optional
+        New where left out.
+
+    Returns
+    -------
+    ndarray of Axes, shape (p, p)
+        The upper triangle is empty.
+
+    Examples
+    --------
+    >>> draws = np.random.default_rng(1).normal(size=(500, 2))
+    >>> plot_corner(["a", "b"], draws).shape
+    (2, 2)
+    """
+    values = np.asarray(draws, dtype=float)
+    p = values.shape[1]
+    logs = list(log) or [False] * p
+    if ax is None:
+        with mpl.rc_context(style.RC):
+            side = 1.2 + 1.5 * p
+            _, grid = plt.subplots(p, p, figsize=(side, side), squeeze=False, layout="constrained")
+    else:
+        grid = np.asarray(ax, dtype=object)
+        if grid.shape != (p, p):
+            raise ValidationError(f"ax has shape {grid.shape}; expected {(p, p)}")
+    edges = [_edges(values[:, i], logs[i]) for i in range(p)]
+    for i in range(p):
+        for j in range(p):
+            axis = grid[i, j]
+            if j > i:
+                axis.set_axis_off()
+                continue
+            if i == j:
+                axis.hist(values[:, i], edges[i], color=style.SKY, histtype="stepfilled")
+                for q in np.quantile(values[:, i], _QUANTILES[1:4]):
+                    axis.axvline(q, color=style.BLUE, lw=0.8, ls="--")
+                axis.set_yticks([])
+            else:
+                axis.hist2d(
+                    values[:, j], values[:, i], [edges[j], edges[i]], cmap="Blues", rasterized=True
+                )
+                axis.set_yscale("log" if logs[i] else "linear")
+            axis.set_xscale("log" if logs[j] else "linear")
+            axis.grid(visible=False)
+            _mark(axis, names, i, j, truth or {})
+            axis.tick_params(labelbottom=i == p - 1, labelleft=j == 0 and i > 0, which="both")
+            axis.tick_params(axis="x", labelrotation=30, which="both")
+            if i == p - 1:
+                axis.set_xlabel(names[j])
+            if j == 0 and i > 0:
+                axis.set_ylabel(names[i])
+    return grid
+
+
+def plot_trace(
+    names: Sequence[str],
+    chain: ArrayLike,
+    *,
+    discard: int = 0,
+    log: Sequence[bool] = (),
+    ax: Sequence[Axes] | None = None,
+) -> NDArray[Any]:
+    """Draw the walkers' paths, and where the warm-up ends.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Labels with units.
+    chain : array_like, shape (steps, walkers, p)
+        All steps.
+    discard : int, default 0
+        Steps of warm-up, shaded.
+    log : sequence of bool, shape (p,), optional
+        Which axes are logarithmic.
+    ax : sequence of Axes, shape (p,), optional
+        New where left out.
+
+    Returns
+    -------
+    ndarray of Axes, shape (p,)
+        One for each parameter.
+
+    Examples
+    --------
+    >>> chain = np.random.default_rng(1).normal(size=(50, 8, 2))
+    >>> len(plot_trace(["a", "b"], chain, discard=10))
+    2
+    """
+    values = np.asarray(chain, dtype=float)
+    p = values.shape[2]
+    logs = list(log) or [False] * p
+    if ax is None:
+        with mpl.rc_context(style.RC):
+            _, rows = plt.subplots(
+                p, 1, figsize=(5.4, 1.0 + 1.3 * p), sharex=True, squeeze=False,
+                layout="constrained",
+            )  # fmt: skip
+        rows = rows[:, 0]
+    else:
+        rows = np.ravel(np.asarray(ax, dtype=object))
+    shown = values[:, :: max(1, values.shape[1] // 32)]
+    for i, axis in enumerate(rows):
+        axis.plot(shown[:, :, i], color=style.BLUE, alpha=0.25, lw=0.5, rasterized=True)
+        if discard:
+            axis.axvspan(0, discard, color=style.GREY, alpha=0.25, lw=0)
+        axis.set_yscale("log" if logs[i] else "linear")
+        axis.set_ylabel(names[i])
+    rows[-1].set_xlabel("step")
+    return rows
+
+
+def _edges(values: Any, log: bool) -> Any:
+    low, high = np.quantile(values, [0.001, 0.999])
+    if not high > low:
+        low, high = low - 0.5 * abs(low) - 1e-300, high + 0.5 * abs(high) + 1e-300
+    return np.geomspace(low, high, 31) if log else np.linspace(low, high, 31)
+
+
+def _mark(axis: Axes, names: Sequence[str], i: int, j: int, truth: Mapping[str, float]) -> None:
+    if names[j] in truth:
+        axis.axvline(truth[names[j]], color=style.VERMILION, lw=1)
+    if i != j and names[i] in truth:
+        axis.axhline(truth[names[i]], color=style.VERMILION, lw=1)

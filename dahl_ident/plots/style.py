@@ -1,0 +1,93 @@
+"""One look for every plot: safe for colour-blind readers, in print, and at 400 px.
+
+Colours are those of Okabe and Ito; series differ in marker as well, so that a grey print still
+tells them apart. Levels, which have an order, take a sequential map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.errors import ValidationError
+
+BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE, YELLOW, BLACK = (
+    "#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7", "#F0E442", "#000000",
+)  # fmt: skip
+SERIES = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
+MARKERS = ("o", "s", "^", "D", "v", "P")
+FIT = BLACK
+GREY = "#767676"
+
+RC: dict[Any, Any] = {
+    "axes.grid": True,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10,
+    "axes.labelsize": 9,
+    "font.size": 9,
+    "grid.alpha": 0.25,
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "lines.linewidth": 1.5,
+    "lines.markersize": 4,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+}
+
+
+def axes(ax: Axes | None, *, size: tuple[float, float] = (4.6, 3.4)) -> Axes:
+    """Return `ax`, or the one axes of a new figure in the house style."""
+    if ax is not None:
+        return ax
+    with mpl.rc_context(RC):
+        _, new = plt.subplots(figsize=size, layout="constrained")
+    return new
+
+
+def axes_pair(
+    ax: Sequence[Axes] | None, *, size: tuple[float, float] = (4.6, 5.0)
+) -> tuple[Axes, Axes]:
+    """Return the two given axes, or two new ones, one above the other, that share x."""
+    if ax is None:
+        with mpl.rc_context(RC):
+            _, new = plt.subplots(2, 1, figsize=size, sharex=True, layout="constrained")
+        return new[0], new[1]
+    pair = np.ravel(np.asarray(ax, dtype=object))
+    if pair.size != 2:
+        raise ValidationError(f"ax holds {pair.size} axes; expected two, for gain and phase")
+    return pair[0], pair[1]
+
+
+def level_colours(count: int) -> list[Any]:
+    """Return `count` colours from dark to light, in the order of the levels."""
+    return list(mpl.colormaps["viridis"](np.linspace(0.0, 0.88, count)))
+
+
+def engineering(value: float, unit: str) -> str:
+    """Return a number with an SI prefix, such as ``3.33 mm``.
+
+    Units that are not one symbol, such as N/m, take a power of ten instead of a prefix.
+    """
+    if value == 0.0 or not np.isfinite(value):
+        return f"{value:g} {unit}".strip()
+    prefixes = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+    exponent = int(3 * np.floor(np.log10(abs(value)) / 3.0))
+    if unit not in ("N", "m", "s", "Hz", "J", "rad") or exponent not in prefixes:
+        return f"{value:.3g} {unit}".strip()
+    return f"{value / 10.0**exponent:.3g} {prefixes[exponent]}{unit}"
+
+
+def pad_log(values: FloatArray) -> tuple[float, float]:
+    """Return limits a little wider than positive `values`, on a logarithmic axis."""
+    low, high = float(np.min(values)), float(np.max(values))
+    margin = max((high / low) ** 0.04, 1.05)
+    return low / margin, high * margin
