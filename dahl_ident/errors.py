@@ -13,6 +13,7 @@ __all__ = [
     "FitError",
     "MissingDependencyError",
     "ModelError",
+    "MultipleSolutionsWarning",
     "SamplingError",
     "UnitError",
     "ValidationError",
@@ -53,3 +54,7 @@ class SamplingError(DahlIdentError, RuntimeError):
 
 class MissingDependencyError(DahlIdentError, ImportError):
     """An optional package is needed; the message gives the command that installs it."""
+
+
+class MultipleSolutionsWarning(UserWarning):
+    """A plant with negative damping has several steady amplitudes, and one was chosen."""

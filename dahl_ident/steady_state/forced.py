@@ -1,0 +1,181 @@
+"""The public door: the steady response of a known plant, checked and with its verdicts."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dahl_ident.arrays import (
+    ComplexArray,
+    FloatArray,
+    broadcast_shape,
+    non_negative_array,
+    positive_array,
+)
+from dahl_ident.elements.element import Element
+from dahl_ident.errors import MultipleSolutionsWarning
+from dahl_ident.steady_state.plant import BoolArray, IntArray, flatten
+from dahl_ident.steady_state.roots import all_roots as find_all
+
+
+@dataclass(frozen=True)
+class SteadyResponse:
+    """Displacement X for a drive u_0 cos(omega t): x(t) = A cos(omega t + phase).
+
+    All arrays have the broadcast shape of frequency and drive, with one more axis, the
+    amplitudes in rising order, where all were asked for. Scalars for scalar arguments.
+
+    Attributes
+    ----------
+    frequency_hz : ndarray
+        Hz.
+    drive : ndarray
+        Zero-to-peak force u_0, N (N m in rotation).
+    amplitude : ndarray
+        Zero-to-peak displacement A, m (rad); NaN where there is none.
+    displacement : ndarray of complex
+        Phasor X = A exp(j phase), the drive's phase being zero.
+    found : ndarray of bool
+        Whether the entry holds an amplitude.
+    number_of_solutions : ndarray of int
+        How many amplitudes the point has; shape of frequency and drive.
+    message : str
+        Empty where every point has exactly one amplitude; else which have none or several,
+        and why.
+    """
+
+    frequency_hz: FloatArray
+    drive: FloatArray
+    amplitude: FloatArray
+    displacement: ComplexArray
+    found: BoolArray
+    number_of_solutions: IntArray
+    message: str
+
+    @property
+    def phase(self) -> FloatArray:
+        """Phase of the displacement against the drive, rad; negative where it lags."""
+        return np.angle(self.displacement)[()]
+
+    @property
+    def receptance(self) -> ComplexArray:
+        """X/u_0, m/N."""
+        return (self.displacement / self.drive)[()]
+
+    @property
+    def dynamic_stiffness(self) -> ComplexArray:
+        """u_0/X, N/m."""
+        return (self.drive / self.displacement)[()]
+
+
+def response(
+    plant: Element, frequency_hz: ArrayLike, drive: ArrayLike, *, all_roots: bool = False
+) -> SteadyResponse:
+    """Return the steady displacement for a sine force: A |Z(A, omega)| = u_0  (Eqn. 53).
+
+    Parameters
+    ----------
+    plant : Element
+        Element or sum with every parameter known, such as
+        ``Dahl(0.1, 30) + Mass(0.3) + Damper(0.24) + Spring(0.3)``.
+    frequency_hz : array_like
+        Hz, >= 0; broadcast with `drive`.
+    drive : array_like
+        Zero-to-peak force u_0, N, > 0; for levels against frequencies give it the shape
+        (levels, 1).
+    all_roots : bool, default False
+        Return every amplitude of each point along a last axis, rising, filled up with NaN.
+        Otherwise the smallest alone. Only plants with negative damping have several.
+
+    Returns
+    -------
+    SteadyResponse
+        Amplitude, phase, phasor, receptance, dynamic stiffness, and what was found. Where no
+        amplitude is steady it holds NaN, and its `message` says why.
+
+    Warns
+    -----
+    MultipleSolutionsWarning
+        If a point has several amplitudes and `all_roots` is off.
+
+    Raises
+    ------
+    ModelError
+        If a parameter has no value.
+    ValidationError
+        If a frequency is negative or a drive not positive, either is NaN, infinite or complex,
+        or their shapes do not go together.
+
+    Notes
+    -----
+    ``A |Z| = u_0`` holds within 1e-12 max(1, kappa/4), kappa = (abs(L) + abs(N))/abs(Z): near a
+    sharp resonance L and N nearly cancel. Of several amplitudes that differ by less than 1.8 %
+    some may be missed.
+
+    Examples
+    --------
+    The static gain of Fig. 7 jumps where the drive overcomes friction:
+
+    >>> from dahl_ident import Dahl, Damper, Mass, Spring
+    >>> plant = Dahl(f_max=0.1, sigma=30) + Mass(0.3) + Damper(0.24) + Spring(0.3)
+    >>> abs(response(plant, 0.0, [0.1, 0.2]).receptance).round(4).tolist()
+    [0.0515, 2.36]
+    """
+    f = non_negative_array(frequency_hz, "frequency_hz")
+    u0 = positive_array(drive, "drive")
+    shape = broadcast_shape(frequency_hz=f, drive=u0)
+    values, omega = plant.known_values(), 2.0 * np.pi * f
+    points, _ = flatten(plant, values, omega, u0)
+    roots = find_all(points)
+    count = np.isfinite(roots).sum(axis=1).reshape(shape)
+    message = _message(count, np.broadcast_to(f, shape), np.broadcast_to(u0, shape))
+    if all_roots:
+        amplitude = roots.reshape(*shape, roots.shape[1])
+        f, u0, omega = f[..., None], u0[..., None], omega[..., None]
+    else:
+        amplitude = roots[:, 0].reshape(shape)
+        if np.any(count > 1):
+            text = f"{message}; the smallest is returned, all of them with all_roots=True"
+            warnings.warn(text, MultipleSolutionsWarning, stacklevel=2)
+    found = np.isfinite(amplitude)
+    Z = plant.stiffness(values, np.where(found, amplitude, 0.0), omega)
+    displacement = amplitude * np.exp(-1j * np.angle(Z))
+    for array in (amplitude, displacement, found, count):
+        array.flags.writeable = False
+    return SteadyResponse(
+        frequency_hz=np.broadcast_to(f, amplitude.shape)[()],
+        drive=np.broadcast_to(u0, amplitude.shape)[()],
+        amplitude=amplitude[()],
+        displacement=displacement[()],
+        found=found[()],
+        number_of_solutions=count[()],
+        message=message,
+    )
+
+
+def _message(count: IntArray, frequency_hz: FloatArray, drive: FloatArray) -> str:
+    """Return which points have no amplitude or several, and why; empty where all have one."""
+    verdicts = (
+        (
+            count == 0,
+            "no steady amplitude (an undamped resonance, driven with at least 4/pi times the "
+            "friction limit; add damping or lower the drive)",
+        ),
+        (
+            count > 1,
+            "several steady amplitudes (the linear part has negative damping there)",
+        ),
+    )
+    parts = []
+    for where, verdict in verdicts:
+        if not where.any():
+            continue
+        first = tuple(np.argwhere(where)[0])
+        parts.append(
+            f"{where.sum()} of {where.size} points: {verdict}; the first at "
+            f"{frequency_hz[first]:g} Hz, drive {drive[first]:g}"
+        )
+    return "; ".join(parts)
