@@ -1,0 +1,223 @@
+"""The exact force for a displacement history, against integration and its own invariants."""
+
+from __future__ import annotations
+
+import tracemalloc
+from itertools import pairwise
+
+import mpmath as mp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements.hysteresis import force_history, memory_decay, steady_loop
+
+F_MAX, SIGMA = 0.1, 30.0
+X_C = F_MAX / SIGMA
+ALPHAS = [0.25, 0.5, 1.0 - 1e-9, 1.0, 1.0 + 1e-9, 1.5, 2.0, 4.0]
+
+histories = st.lists(
+    st.floats(-20.0, 20.0).map(lambda v: round(v, 6) * X_C), min_size=2, max_size=30
+).map(np.array)
+alphas = st.one_of(st.just(1.0), st.floats(0.05, 8.0))
+starts = st.floats(-1.0, 1.0).map(lambda v: v * F_MAX)
+
+
+def generator(seed: int) -> np.random.Generator:
+    return np.random.Generator(np.random.PCG64(seed))
+
+
+def integrated(x: FloatArray, alpha: float, initial_force: float) -> FloatArray:
+    """Eqn. 2 in displacement, one DOP853 run for each straight stretch."""
+    force = [initial_force]
+    for a, b in pairwise(x):
+        s = np.sign(b - a)
+
+        def slope(_: float, F: FloatArray, s: float = s) -> FloatArray:
+            margin = 1.0 - s * F / F_MAX
+            return np.asarray(SIGMA * np.abs(margin) ** alpha * np.sign(margin))
+
+        if a == b:
+            force.append(force[-1])
+            continue
+        run = solve_ivp(slope, (a, b), [force[-1]], method="DOP853", rtol=1e-12, atol=1e-14 * F_MAX)
+        assert run.success
+        force.append(float(run.y[0, -1]))
+    return np.array(force)
+
+
+def by_mpmath(x: FloatArray, alpha: float, initial_force: float) -> FloatArray:
+    """The stretch-by-stretch solution with 40 digits."""
+    with mp.workdps(40):
+        F = mp.mpf(initial_force) / F_MAX
+        p = 1 - mp.mpf(alpha)
+        out = [F]
+        for a, b in pairwise(x):
+            s = mp.sign(mp.mpf(b) - mp.mpf(a))
+            z = 1 - s * F
+            d = abs(mp.mpf(b) - mp.mpf(a)) * SIGMA / F_MAX
+            if s != 0:
+                rest = z**p - p * d if z > 0 and p != 0 else None
+                z = z * mp.exp(-d) if p == 0 else (rest ** (1 / p) if rest and rest > 0 else 0 * z)
+                F = s * (1 - z)
+            out.append(F)
+        return np.array([float(F * F_MAX) for F in out])
+
+
+@pytest.mark.parametrize("alpha", [0.25, 0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("initial_force", [0.0, -0.6 * F_MAX])
+def test_force_agrees_with_an_ode_solver(alpha: float, initial_force: float) -> None:
+    # short of full slip, at which a general solver chatters for alpha < 1
+    x = generator(3).uniform(-0.4, 0.4, 40) * X_C
+    x[0] = 0.0
+    x[11:13] = x[10]
+    force = force_history(x, F_MAX, SIGMA, alpha, initial_force)
+    assert np.max(np.abs(force - integrated(x, alpha, initial_force))) < 1e-9 * F_MAX
+
+
+@pytest.mark.parametrize("alpha", ALPHAS)
+def test_force_agrees_with_multiple_precision_over_any_step(alpha: float) -> None:
+    rng = generator(4)
+    x = 10.0 ** rng.uniform(-15, 9, 400) * rng.choice([-1.0, 1.0], 400) * X_C
+    x[50:250] = np.cumsum(10.0 ** rng.uniform(-15, 1, 200) * rng.choice([-1.0, 1.0], 200)) * X_C
+    force = force_history(x, F_MAX, SIGMA, alpha, 0.3 * F_MAX)
+    assert np.max(np.abs(force - by_mpmath(x, alpha, 0.3 * F_MAX))) < 1e-12 * F_MAX
+
+
+@given(x=histories, alpha=alphas, initial_force=starts, between=st.integers(2, 40))
+def test_force_does_not_depend_on_the_sampling(
+    x: FloatArray, alpha: float, initial_force: float, between: int
+) -> None:
+    coarse = force_history(x, F_MAX, SIGMA, alpha, initial_force)
+    dense = np.concatenate(
+        [np.linspace(a, b, between, endpoint=False) for a, b in pairwise(x)] + [x[-1:]]
+    )
+    fine = force_history(dense, F_MAX, SIGMA, alpha, initial_force)
+    assert np.max(np.abs(fine[::between] - coarse)) < 1e-11 * F_MAX
+
+
+@pytest.mark.parametrize("alpha", ALPHAS)
+def test_ten_or_ten_thousand_samples_of_one_stretch_end_at_one_force(alpha: float) -> None:
+    ends = [
+        force_history(np.linspace(-1.0, 2.0, n) * X_C, F_MAX, SIGMA, alpha, -0.2 * F_MAX)[-1]
+        for n in (10, 10_000)
+    ]
+    assert ends[0] == pytest.approx(ends[1], rel=1e-15)
+
+
+@given(x=histories, alpha=alphas, initial_force=starts)
+def test_force_is_bounded_odd_and_dissipates(
+    x: FloatArray, alpha: float, initial_force: float
+) -> None:
+    force = force_history(x, F_MAX, SIGMA, alpha, initial_force)
+    assert np.max(np.abs(force)) <= F_MAX * (1.0 + 1e-15)
+    assert np.array_equal(force_history(-x, F_MAX, SIGMA, alpha, -initial_force), -force)
+    # the force never falls while the displacement rises
+    assert np.all(np.diff(force) * np.sign(np.diff(x)) >= -1e-15 * F_MAX)
+
+
+@given(x=histories, initial_force=starts, scale=st.floats(1e-3, 1e3))
+def test_units_scale_through(x: FloatArray, initial_force: float, scale: float) -> None:
+    base = force_history(x, F_MAX, SIGMA, 2.0, initial_force)
+    longer = force_history(scale * x, F_MAX, SIGMA / scale, 2.0, initial_force)
+    stronger = force_history(x, scale * F_MAX, scale * SIGMA, 2.0, scale * initial_force)
+    assert longer == pytest.approx(base, rel=1e-10, abs=1e-11 * F_MAX)
+    assert stronger == pytest.approx(scale * base, rel=1e-10, abs=1e-11 * F_MAX * scale)
+
+
+@pytest.mark.parametrize("alpha", ALPHAS)
+@pytest.mark.parametrize("pauses", [[0], [5], [0, 1, 5, 5, 9], [9]])
+def test_standing_still_holds_the_force(alpha: float, pauses: list[int]) -> None:
+    x = generator(5).uniform(-2.0, 2.0, 10) * X_C
+    moving = force_history(x, F_MAX, SIGMA, alpha, 0.0)
+    index = np.sort(np.concatenate([np.arange(10), pauses]))
+    assert force_history(x[index], F_MAX, SIGMA, alpha, 0.0) == pytest.approx(
+        moving[index], rel=1e-14
+    )
+
+
+def test_no_motion_keeps_the_initial_force() -> None:
+    for n in (0, 1, 2, 7):
+        force = force_history(np.full(n, 3.0), F_MAX, SIGMA, 1.0, -0.05)
+        assert np.array_equal(force, np.full(n, -0.05))
+
+
+@pytest.mark.parametrize("alpha", ALPHAS)
+@pytest.mark.parametrize("direction", [-1.0, 1.0])
+def test_full_slip_is_left_and_kept_as_the_direction_says(alpha: float, direction: float) -> None:
+    x = direction * np.array([0.0, 1e-9, 1.0, 1e3]) * X_C
+    onward = force_history(x, F_MAX, SIGMA, alpha, direction * F_MAX)
+    assert np.array_equal(onward, np.full(4, direction * F_MAX))
+    back = force_history(-x, F_MAX, SIGMA, alpha, direction * F_MAX)
+    assert back == pytest.approx(by_mpmath(-x, alpha, direction * F_MAX), rel=1e-13)
+
+
+def test_slip_is_reached_at_a_finite_path_below_alpha_one() -> None:
+    # from rest, z^(1/2) = 1 - d/2 is zero at d = 2
+    force = force_history(np.array([0.0, 1.0, 2.0, 3.0]) * X_C, F_MAX, SIGMA, 0.5, 0.0)
+    assert force == pytest.approx(np.array([0.0, 0.75, 1.0, 1.0]) * F_MAX, rel=1e-14)
+
+
+@pytest.mark.parametrize("alpha", ALPHAS)
+@pytest.mark.parametrize("scale", [1e-300, 1e-30, 1e30, 1e300])
+def test_extreme_displacements_give_finite_forces_quietly(alpha: float, scale: float) -> None:
+    x = scale * np.array([0.0, 1.0, -1.0, 0.5, 0.5, -0.25])
+    for f_max, sigma in ((1e-30, 1e30), (1e30, 1e-30), (1.0, 1.0)):
+        force = force_history(x, f_max, sigma, alpha, 0.5 * f_max)
+        assert np.all(np.isfinite(force))
+        assert np.max(np.abs(force)) <= f_max
+
+
+@pytest.mark.parametrize("alpha", [1.0, 2.0])
+def test_memory_stays_small(alpha: float) -> None:
+    x = generator(6).standard_normal(100_000) * X_C
+    tracemalloc.start()
+    force = force_history(x, F_MAX, SIGMA, alpha, 0.0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20 * (x.nbytes + force.nbytes)
+
+
+@pytest.mark.parametrize("alpha", [0.25, 0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("beta", [0.3, 1.0, 30.0])
+@pytest.mark.parametrize("points", [4, 401])
+def test_steady_loop_is_what_a_history_settles_into(alpha: float, beta: float, points: int) -> None:
+    x, force = steady_loop(beta * X_C, F_MAX, SIGMA, alpha, points)
+    theta = np.linspace(0.0, 2.0 * np.pi, 1201)[:-1]
+    assert x == pytest.approx(beta * X_C * np.cos(np.linspace(0.0, 2.0 * np.pi, points)))
+    cycles = 120
+    history = beta * X_C * np.tile(np.cos(theta), cycles)
+    settled = force_history(history, F_MAX, SIGMA, alpha, 0.0)[-1200:]
+    step = 1200 // (points - 1)
+    assert force[:-1] == pytest.approx(settled[::step], abs=1e-12 * F_MAX)
+    assert force[-1] == pytest.approx(force[0], rel=1e-12)
+
+
+def test_steady_loop_is_eqns_10_and_11() -> None:
+    beta = 1.7
+    x, force = steady_loop(beta * X_C, F_MAX, SIGMA, 1.0, 101)
+    u, half = x / X_C, np.arange(101) <= 50
+    eqn_11 = -1.0 + (1.0 + np.tanh(beta)) * np.exp(u - beta)
+    eqn_10 = 1.0 - (1.0 + np.tanh(beta)) * np.exp(-(u + beta))
+    assert force == pytest.approx(F_MAX * np.where(half, eqn_11, eqn_10), abs=1e-15)
+
+
+@pytest.mark.parametrize("alpha", [0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("beta", [0.02, 0.2, 0.6])
+def test_memory_decay_is_the_ratio_of_deviations_a_cycle_apart(alpha: float, beta: float) -> None:
+    x, force = steady_loop(beta * X_C, F_MAX, SIGMA, alpha, 3)
+    deviation = 1e-6 * F_MAX
+    disturbed = force_history(x, F_MAX, SIGMA, alpha, force[0] + deviation)
+    factor = memory_decay(np.array([beta]), alpha)[0]
+    assert (disturbed[-1] - force[-1]) / deviation == pytest.approx(factor, rel=1e-5)
+
+
+def test_memory_decay_limits() -> None:
+    beta = np.array([1e-4, 1e3])
+    for alpha in (0.5, 1.0, 2.0):
+        slow, fast = memory_decay(beta, alpha)
+        assert slow == pytest.approx(np.exp(-4.0 * alpha * 1e-4), rel=1e-9)
+        assert 0.0 <= fast < 1e-5
