@@ -1,0 +1,348 @@
+r"""Noise models: what turns measured minus predicted response into residuals of unit variance.
+
+Each row of data is one complex number R, so it gives two residuals, kept together here as the
+real and imaginary part of one complex residual y. Three models:
+
+``measured``
+    The data's covariance C of (Re R, Im R), row by row: ``y = L^-1 (R - R_model)``, C = L L'.
+    The scale is known. Where C was estimated with finite `dof` nu, the residuals are not
+    Gaussian but follow Student's t in two dimensions; a row then counts as
+    ``(nu + 1) ln(1 + |y|^2/nu)`` in place of ``|y|^2``, which is -2 ln of its density.
+``relative``
+    Constant unknown variance of (ln gain, phase): ``y = ln(R / R_model)``. Weights do not
+    depend on the parameters, so least squares is maximum likelihood; dividing R - R_model by
+    |R| or |R_model| would not be. A harmonic's error scales with the fundamental of the same
+    point: ``y = (R_k - R_k,model) / |R_1|`` with the measured fundamental.
+``absolute``
+    Constant unknown variance of (Re R, Im R), in the data's own quantity: ``y = R - R_model``.
+
+**Noise in the measured amplitude** (``measured`` only). The true ln A of a row is unknown; its
+measured value has a known error, correlated with that of R because R is a quotient with the
+displacement. Given the parameters, the best true amplitude minimises the joint chi-square of
+both, and what is left of it is
+
+    |y|^2 = r' V^-1 r,    r = R - R_model - e d,    V = C - c d' - d c' + s^2 d d',
+
+with d = dR_model/dln A at the best amplitude, s and c the standard deviation of ln A and its
+covariance with R, and e = (c - s^2 d)' V^-1 r the error found. This is the likelihood with the
+true amplitudes profiled out, or, the same, integrated under their Jeffreys prior. V depends on
+the parameters and yet no ln det V belongs into the sum: with it, or with weights held fixed and
+the model taken at the measured amplitudes, estimates would be biased towards a flatter curve
+however many rows there are (the attenuation of errors-in-variables regression).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.rows import Rows
+from dahl_ident.errors import DataError, ValidationError
+
+NOISE_MODELS = ("measured", "relative", "absolute")
+
+_GAUSSIAN = 1e15  # degrees of freedom at which Student's t is the Gaussian to rounding
+_AMPLITUDE_STEPS = 40
+_AMPLITUDE_TOLERANCE = 1e-10  # of the amplitude's standard deviation
+
+
+class Noise(ABC):
+    """How residuals follow from the predicted response; one object holds one table's rows."""
+
+    scale_known: bool
+    log_area: FloatArray
+    """Sum over rows of ln |dy/dR|, the log of the whitening's determinant, plus constants."""
+
+    @abstractmethod
+    def residual(self, predicted: ComplexArray) -> ComplexArray:
+        """Return the complex residual of every row."""
+
+    @abstractmethod
+    def change(self, predicted: ComplexArray, by: ComplexArray) -> ComplexArray:
+        """Return the residual's derivative where the prediction has the derivative `by`."""
+
+
+@dataclass(frozen=True)
+class Relative(Noise):
+    """Constant unknown variance of (ln gain, phase)."""
+
+    response: ComplexArray
+    fundamental: FloatArray | None
+    """|R_1| in rows of harmonics, 0 in rows of the fundamental; None without harmonics."""
+    log_area: FloatArray
+    scale_known: bool = False
+
+    def residual(self, predicted: ComplexArray) -> ComplexArray:
+        """Return ln(R/R_model), or the scaled difference in rows of harmonics."""
+        if self.fundamental is None:
+            return np.log(self.response / predicted)
+        harmonic = self.fundamental > 0.0
+        ratio = np.where(harmonic, 1.0, self.response / np.where(harmonic, 1.0, predicted))
+        size = np.where(harmonic, self.fundamental, 1.0)
+        return np.where(harmonic, (self.response - predicted) / size, np.log(ratio))
+
+    def change(self, predicted: ComplexArray, by: ComplexArray) -> ComplexArray:
+        """Return the derivative of the residual."""
+        if self.fundamental is None:
+            return -by / predicted
+        harmonic = self.fundamental > 0.0
+        return -by / np.where(harmonic, self.fundamental, predicted)
+
+
+@dataclass(frozen=True)
+class Absolute(Noise):
+    """Constant unknown variance of (Re R, Im R)."""
+
+    response: ComplexArray
+    log_area: FloatArray
+    scale_known: bool = False
+
+    def residual(self, predicted: ComplexArray) -> ComplexArray:
+        """Return R - R_model."""
+        return self.response - predicted
+
+    def change(self, predicted: ComplexArray, by: ComplexArray) -> ComplexArray:
+        """Return the derivative of the residual."""
+        return -by
+
+
+@dataclass(frozen=True)
+class Measured(Noise):
+    """Known covariance of (Re R, Im R), and of ln A where `amplitude` is given."""
+
+    response: ComplexArray
+    covariance: Covariance
+    whitening: Whitening
+    log_area: FloatArray
+    dof: FloatArray | None
+    amplitude: AmplitudeError | None
+    scale_known: bool = True
+
+    def residual(self, predicted: ComplexArray) -> ComplexArray:
+        """Return L^-1 (R - R_model)."""
+        return self.whitening(self.response - predicted)
+
+    def change(self, predicted: ComplexArray, by: ComplexArray) -> ComplexArray:
+        """Return the derivative of the residual."""
+        return -self.whitening(by)
+
+
+class Covariance(NamedTuple):
+    """Rows' symmetric matrices [[rr, ri], [ri, ii]]."""
+
+    rr: FloatArray
+    ri: FloatArray
+    ii: FloatArray
+
+
+class Whitening(NamedTuple):
+    """Inverse Cholesky factors [[a, 0], [b, c]], which act on a complex number's two parts."""
+
+    a: FloatArray
+    b: FloatArray
+    c: FloatArray
+
+    @classmethod
+    def of(cls, covariance: Covariance) -> Whitening:
+        """Return the whitening of `covariance`; NaN or infinite where it is singular."""
+        rr, ri, ii = covariance
+        first = np.sqrt(rr)
+        lower = ri / first
+        second = np.sqrt(ii - lower**2)
+        return cls(1.0 / first, -lower / first / second, 1.0 / second)
+
+    def __call__(self, value: ComplexArray) -> ComplexArray:
+        """Return the whitened real and imaginary parts."""
+        x, y = value.real, value.imag
+        return np.asarray(self.a * x + 1j * (self.b * x + self.c * y))
+
+    def solve(self, value: ComplexArray) -> ComplexArray:
+        """Return V^-1 value, that is L'^-1 L^-1 value."""
+        w = self(value)
+        return np.asarray(self.a * w.real + self.b * w.imag + 1j * (self.c * w.imag))
+
+
+class AmplitudeError(NamedTuple):
+    """Error of ln A: its variance, and its covariance with Re R (real part) and Im R."""
+
+    variance: FloatArray
+    cross: ComplexArray
+
+    def whitening(self, covariance: Covariance, by_ln_amplitude: ComplexArray) -> Whitening:
+        """Return the whitening of V = C - c d' - d c' + s^2 d d'."""
+        d, c, s2 = by_ln_amplitude, self.cross, self.variance
+        return Whitening.of(
+            Covariance(
+                covariance.rr + (s2 * d.real - 2.0 * c.real) * d.real,
+                covariance.ri + s2 * d.real * d.imag - c.real * d.imag - c.imag * d.real,
+                covariance.ii + (s2 * d.imag - 2.0 * c.imag) * d.imag,
+            )
+        )
+
+
+class Corrected(NamedTuple):
+    """Residuals at the best true amplitudes, and what the prediction was there."""
+
+    residual: ComplexArray
+    whitening: Whitening
+    error: FloatArray
+
+
+def correct_amplitude(
+    noise: Measured,
+    error: AmplitudeError,
+    predict: Callable[[FloatArray], tuple[ComplexArray, ComplexArray]],
+) -> Corrected:
+    """Return residuals with every true amplitude at its best value.
+
+    `predict` takes the error e of ln A, and returns the response and its derivative by ln A at
+    the amplitude measured over exp(e).
+    """
+    spread = np.sqrt(error.variance)
+    better = np.zeros(noise.response.shape)
+    for _ in range(_AMPLITUDE_STEPS):
+        found = better
+        predicted, slope = predict(found)
+        r = noise.response - predicted - slope * found
+        whitening = error.whitening(noise.covariance, slope)
+        lever = whitening.solve(r)
+        shift = error.cross - error.variance * slope
+        better = shift.real * lever.real + shift.imag * lever.imag
+        if not np.any(np.abs(better - found) > _AMPLITUDE_TOLERANCE * spread):
+            break
+    return Corrected(whitening(r), whitening, found)
+
+
+def student(z: FloatArray, dof: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return rho(z) = (dof + 1) ln(1 + z/dof), the loss of an estimated covariance, and rho'."""
+    return (dof + 1.0) * np.log1p(z / dof), (dof + 1.0) / (dof + z)
+
+
+def bend(
+    y: ComplexArray,
+    changes: list[ComplexArray],
+    rho: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+) -> tuple[ComplexArray, list[ComplexArray]]:
+    """Return residuals of the same directions whose squares are rho(|y|^2), with derivatives."""
+    z = y.real**2 + y.imag**2
+    loss, slope = rho(z)
+    flat = z <= 1e-12  # here rho(z) = rho'(0) z to rounding
+    safe = np.where(flat, 1.0, z)
+    factor = np.sqrt(np.where(flat, slope, loss / safe))
+    # d factor / dz, times 2
+    turn = np.where(flat, 0.0, (slope - loss / safe) / (safe * factor))
+    bent = [factor * d + y * turn * (y.real * d.real + y.imag * d.imag) for d in changes]
+    return factor * y, bent
+
+
+def noise_for(rows: Rows, kind: str | None) -> Noise:
+    """Return the noise model `kind` for `rows`.
+
+    None stands for ``measured`` where the data have a covariance, else ``relative``.
+    """
+    if kind is None:
+        kind = "relative" if rows.covariance is None else "measured"
+    if kind not in NOISE_MODELS:
+        raise ValidationError(f"noise is {kind!r}; expected one of {', '.join(NOISE_MODELS)}")
+    if kind == "relative":
+        return _relative(rows)
+    if kind == "absolute":
+        return Absolute(rows.response, np.zeros(rows.response.shape[:-1]))
+    return _measured(rows)
+
+
+def _relative(rows: Rows) -> Relative:
+    size = np.abs(rows.response)
+    fundamental = None
+    if (rows.harmonic > 1).any():
+        fundamental = _fundamental(rows, size)
+        size = np.where(rows.harmonic > 1, fundamental, size)
+    if not size.all():
+        raise DataError(
+            f"response{_first(size == 0.0)} is 0, which has no logarithm; relative noise needs a "
+            "response other than 0 in every row: take noise='absolute', or leave the row out"
+        )
+    return Relative(rows.response, fundamental, -2.0 * np.log(size).sum(axis=-1))
+
+
+def _fundamental(rows: Rows, size: FloatArray) -> FloatArray:
+    """Return |R_1| of the same point in rows of harmonics, 0 elsewhere."""
+    omega = np.broadcast_to(rows.omega, size.shape)
+    amplitude = np.broadcast_to(0.0 if rows.amplitude is None else rows.amplitude, size.shape)
+    same = (omega[..., :, None] == omega[..., None, :]) & (
+        amplitude[..., :, None] == amplitude[..., None, :]
+    )
+    same &= rows.harmonic == 1
+    harmonic = rows.harmonic > 1
+    lost = harmonic & ~same.any(axis=-1)
+    if lost.any():
+        raise DataError(
+            f"row {_first(lost)} holds a harmonic, but no row holds the fundamental of the same "
+            "frequency and amplitude, to which relative noise refers; add it, or take "
+            "noise='absolute'"
+        )
+    partner = np.take_along_axis(size, same.argmax(axis=-1), axis=-1)
+    return np.where(harmonic, partner, 0.0)
+
+
+def _measured(rows: Rows) -> Measured:
+    if rows.covariance is None:
+        raise DataError(
+            "noise='measured' needs a covariance, and the data have none; "
+            "give it, or take noise='relative'"
+        )
+    C = rows.covariance
+    covariance = Covariance(C[..., 0, 0], C[..., 0, 1], C[..., 1, 1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        whitening = Whitening.of(covariance)
+        log_area = np.log(whitening.a) + np.log(whitening.c)
+    singular = ~np.isfinite(log_area)
+    if singular.any():
+        raise DataError(
+            f"covariance{_first(singular)} is singular, {C[singular][0].tolist()}: some "
+            "combination of real and imaginary part would be free of error; give every row a "
+            "regular covariance, or take noise='relative'"
+        )
+    dof = rows.dof if rows.dof is not None and np.isfinite(rows.dof).any() else None
+    if dof is not None:
+        dof = np.minimum(dof, _GAUSSIAN)
+        log_area = log_area + np.log(_student_density(dof))
+    return Measured(
+        rows.response, covariance, whitening, log_area.sum(axis=-1), dof, _amplitude_error(rows)
+    )
+
+
+def _student_density(dof: FloatArray) -> FloatArray:
+    """Return the density at 0 of a two-dimensional t, relative to the Gaussian's."""
+    if not (dof > 1.0).all():
+        raise DataError(
+            f"dof{_first(dof <= 1.0)} is {dof[dof <= 1.0][0]:g}; a covariance of two parts needs "
+            "more than 1 degree of freedom to weigh a row: measure more cycles, or take "
+            "noise='relative'"
+        )
+    return np.asarray(1.0 - 1.0 / dof)
+
+
+def _amplitude_error(rows: Rows) -> AmplitudeError | None:
+    """Return the error of ln A in rows whose model takes the measured amplitude, if any."""
+    if rows.amplitude_std is None or rows.amplitude is None:
+        return None
+    relative = np.where(rows.forced, 0.0, 1.0 / rows.amplitude)
+    variance = (rows.amplitude_std * relative) ** 2
+    if not variance.any():
+        return None
+    cross = np.zeros(rows.n, dtype=np.complex128)
+    if rows.amplitude_covariance is not None:
+        cross = rows.amplitude_covariance @ np.array([1.0, 1.0j]) * relative
+    return AmplitudeError(variance, cross)
+
+
+def _first(bad: NDArray[np.bool_]) -> str:
+    """Return the index of the first bad row, of the first bad table where several are stacked."""
+    return str([int(i) for i in np.argwhere(bad)[0]])

@@ -1,0 +1,143 @@
+r"""What the sensors do between the mechanism and the table.
+
+A measured response is not the mechanism's own where a channel has a gain error, or where one
+channel lags the other. With F and X the true phasors,
+
+    measured F = force_gain F
+    measured X = displacement_gain X exp(-j omega delay)
+
+so the measured dynamic stiffness of harmonic k is
+``(force_gain / displacement_gain) exp(+j k omega delay) Z_k``, because the phase of F_k is
+referred to k times the displacement's phase. All six quantities follow from it. A gain acts on
+the amplitudes of a table as well: the mechanism moved by the measured amplitude over
+`displacement_gain`, and was driven by the measured drive over `force_gain`. An unknown force
+gain therefore leaves only x_c of friction alone, and an unknown displacement gain only f_max.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from dahl_ident.arrays import ComplexArray, FloatArray, finite_number
+from dahl_ident.elements.parameter import Parameter
+from dahl_ident.errors import ValidationError
+
+
+@runtime_checkable
+class Prior(Protocol):
+    """A frozen distribution of scipy.stats, or anything with these methods."""
+
+    def logpdf(self, x: Any) -> Any:
+        """Return the logarithm of the density at x."""
+
+    def mean(self) -> Any:
+        """Return the mean."""
+
+    def std(self) -> Any:
+        """Return the standard deviation."""
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Gains of the two channels and the delay between them.
+
+    Parameters
+    ----------
+    force_gain : float, None or scipy.stats distribution, default 1
+        Measured over true force, > 0. A number fixes it, None frees it, a frozen distribution
+        such as ``scipy.stats.norm(1.0, 0.005)`` frees it with that prior.
+    displacement_gain : float, None or scipy.stats distribution, default 1
+        Measured over true displacement, > 0.
+    delay : float, None or scipy.stats distribution, default 0
+        Time by which the displacement channel lags the force channel, s.
+
+    Raises
+    ------
+    ValidationError
+        If a gain is not above zero, or a number is not finite.
+
+    Examples
+    --------
+    >>> [p.name for p in Sensors(force_gain=None).parameters if p.free]
+    ['force_gain']
+    """
+
+    force_gain: float | Prior | None = 1.0
+    displacement_gain: float | Prior | None = 1.0
+    delay: float | Prior | None = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("force_gain", "displacement_gain", "delay"):
+            given = getattr(self, name)
+            if given is not None and not isinstance(given, Prior):
+                object.__setattr__(self, name, finite_number(given, name))
+        _ = self.parameters  # checks the bounds
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The three parameters, in the order of the constructor."""
+        return (
+            _parameter("force_gain", "", "measured over true force", self.force_gain, 1.0),
+            _parameter(
+                "displacement_gain",
+                "",
+                "measured over true displacement",
+                self.displacement_gain,
+                1.0,
+            ),
+            _parameter("delay", "s", "lag of the displacement channel", self.delay, 0.0),
+        )
+
+    @property
+    def priors(self) -> dict[str, Prior]:
+        """The prior of each parameter that has one, by name."""
+        given = {p.name: getattr(self, p.name) for p in self.parameters}
+        return {name: value for name, value in given.items() if isinstance(value, Prior)}
+
+    def with_free(self, names: Sequence[str]) -> Sensors:
+        """Return these sensors with the named parameters free and without a prior."""
+        return self._with(dict.fromkeys(names))
+
+    def with_fixed(self, values: Mapping[str, float]) -> Sensors:
+        """Return these sensors with the named parameters held at the given values."""
+        return self._with(values)
+
+    def _with(self, changes: Mapping[str, float | Prior | None]) -> Sensors:
+        current = {p.name: getattr(self, p.name) for p in self.parameters}
+        return Sensors(**{**current, **changes})
+
+
+def measured_stiffness_factor(
+    values: Sequence[FloatArray], omega: FloatArray, harmonic: int
+) -> ComplexArray:
+    """Return measured over true F_k/X_1 for sensor `values` in the order of the parameters."""
+    force_gain, displacement_gain, delay = values
+    return np.asarray(
+        force_gain / displacement_gain * np.exp(1j * harmonic * omega * delay),
+        dtype=np.complex128,
+    )
+
+
+def _parameter(
+    name: str, unit: str, description: str, given: float | Prior | None, neutral: float
+) -> Parameter:
+    positive = neutral > 0.0
+    free = given is None or isinstance(given, Prior)
+    value = float(given.mean()) if isinstance(given, Prior) else given
+    if value is not None and positive and value <= 0.0:
+        raise ValidationError(
+            f"{name} is {value!r}; expected a number > 0 (turn a channel's sign when reading it)"
+        )
+    return Parameter(
+        name,
+        unit,
+        description,
+        neutral if value is None else value,
+        free=free,
+        lower=0.0 if positive else -np.inf,
+        transform="log" if positive else "linear",
+    )
