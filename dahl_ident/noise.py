@@ -55,6 +55,7 @@ _AMPLITUDE_TOLERANCE = 1e-10  # of the amplitude's standard deviation
 class Noise(ABC):
     """How residuals follow from the predicted response; one object holds one table's rows."""
 
+    name: str
     scale_known: bool
     log_area: FloatArray
     """Sum over rows of ln |dy/dR|, the log of the whitening's determinant, plus constants."""
@@ -76,6 +77,7 @@ class Relative(Noise):
     fundamental: FloatArray | None
     """|R_1| in rows of harmonics, 0 in rows of the fundamental; None without harmonics."""
     log_area: FloatArray
+    name: str = "relative"
     scale_known: bool = False
 
     def residual(self, predicted: ComplexArray) -> ComplexArray:
@@ -101,6 +103,7 @@ class Absolute(Noise):
 
     response: ComplexArray
     log_area: FloatArray
+    name: str = "absolute"
     scale_known: bool = False
 
     def residual(self, predicted: ComplexArray) -> ComplexArray:
@@ -122,6 +125,7 @@ class Measured(Noise):
     log_area: FloatArray
     dof: FloatArray | None
     amplitude: AmplitudeError | None
+    name: str = "measured"
     scale_known: bool = True
 
     def residual(self, predicted: ComplexArray) -> ComplexArray:

@@ -18,7 +18,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -27,7 +28,6 @@ from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ValidationError
 
 
-@runtime_checkable
 class Prior(Protocol):
     """A frozen distribution of scipy.stats, or anything with these methods."""
 
@@ -73,11 +73,11 @@ class Sensors:
     def __post_init__(self) -> None:
         for name in ("force_gain", "displacement_gain", "delay"):
             given = getattr(self, name)
-            if given is not None and not isinstance(given, Prior):
+            if given is not None and not hasattr(given, "logpdf"):
                 object.__setattr__(self, name, finite_number(given, name))
         _ = self.parameters  # checks the bounds
 
-    @property
+    @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         """The three parameters, in the order of the constructor."""
         return (
@@ -92,11 +92,16 @@ class Sensors:
             _parameter("delay", "s", "lag of the displacement channel", self.delay, 0.0),
         )
 
-    @property
+    @cached_property
     def priors(self) -> dict[str, Prior]:
         """The prior of each parameter that has one, by name."""
         given = {p.name: getattr(self, p.name) for p in self.parameters}
-        return {name: value for name, value in given.items() if isinstance(value, Prior)}
+        return {n: v for n, v in given.items() if not (v is None or isinstance(v, float))}
+
+    @cached_property
+    def are_exact(self) -> bool:
+        """Whether the channels are taken as they are: both gains 1, no delay."""
+        return (self.force_gain, self.displacement_gain, self.delay) == (1.0, 1.0, 0.0)
 
     def with_free(self, names: Sequence[str]) -> Sensors:
         """Return these sensors with the named parameters free and without a prior."""
@@ -126,8 +131,7 @@ def _parameter(
     name: str, unit: str, description: str, given: float | Prior | None, neutral: float
 ) -> Parameter:
     positive = neutral > 0.0
-    free = given is None or isinstance(given, Prior)
-    value = float(given.mean()) if isinstance(given, Prior) else given
+    value = given if given is None or isinstance(given, float) else float(given.mean())
     if value is not None and positive and value <= 0.0:
         raise ValidationError(
             f"{name} is {value!r}; expected a number > 0 (turn a channel's sign when reading it)"
@@ -137,7 +141,10 @@ def _parameter(
         unit,
         description,
         neutral if value is None else value,
-        free=free,
+        free=not isinstance(given, float),
         lower=0.0 if positive else -np.inf,
         transform="log" if positive else "linear",
     )
+
+
+EXACT = Sensors()

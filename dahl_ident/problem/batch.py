@@ -1,0 +1,89 @@
+"""Many tables of one shape as one problem: fits and bootstrap replicates by the thousand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.data.rows import Rows
+from dahl_ident.elements import Element
+from dahl_ident.elements.model import as_model
+from dahl_ident.errors import DataError
+from dahl_ident.problem.problem import Problem
+from dahl_ident.sensors import EXACT, Sensors
+
+
+class ProblemBatch(Problem):
+    """The same estimate for S tables: theta has shape (S, P), one row for each table.
+
+    Every method of :class:`Problem` takes theta of shape (S, P) and applies row s to table s.
+
+    Parameters
+    ----------
+    data : sequence of FrequencyResponse
+        Tables with the same number of rows, quantity, harmonics and controlled variable.
+    model, noise, sensors, free, fixed
+        As for :class:`Problem`.
+
+    Raises
+    ------
+    DataError
+        If the tables do not agree in shape, or there is none.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dahl_ident import Dahl
+    >>> A = np.array([1e-4, 1e-3, 1e-2])
+    >>> tables = [
+    ...     FrequencyResponse(np.ones(3), Dahl(f, 30.0).describing_function(A), A)
+    ...     for f in (0.1, 0.2)
+    ... ]
+    >>> batch = ProblemBatch(tables, Dahl())
+    >>> theta = batch.to_search([[0.1, 30.0], [0.2, 30.0]])
+    >>> bool(np.all(np.abs(batch.residuals(theta)) < 1e-14))
+    True
+    """
+
+    def __init__(
+        self,
+        data: Sequence[FrequencyResponse],
+        model: Element,
+        *,
+        noise: str | None = None,
+        sensors: Sensors | None = None,
+        free: Iterable[str] = (),
+        fixed: Mapping[str, float] | None = None,
+    ) -> None:
+        if not data:
+            raise DataError("there is no table to estimate from; give at least one")
+        self._set_model(as_model(model), sensors or EXACT, tuple(free), dict(fixed or {}))
+        self._set_rows(Rows.stack(data), noise)
+
+    @classmethod
+    def replicates(cls, problem: Problem, responses: ComplexArray) -> ProblemBatch:
+        """Return `problem` with each of S sets of responses, shape (S, n), in place of its own.
+
+        Everything else, covariance included, stays as it is.
+        """
+        n = problem.n_residuals // 2
+        if responses.ndim != 2 or responses.shape[1] != n:
+            raise DataError(
+                f"responses have shape {responses.shape}; expected (replicates, {n}), one number "
+                "for each row of the data"
+            )
+        batch = object.__new__(cls)
+        batch.__dict__.update(problem.__dict__)
+        batch._set_rows(problem._rows.with_responses(responses), problem.noise)
+        return batch
+
+    @property
+    def n_tables(self) -> int:
+        """The number S of tables."""
+        return len(self._rows.response)
+
+    def _shape(self, theta: FloatArray) -> tuple[int, ...]:
+        return np.broadcast_shapes((*theta.shape[:-1], 1), self._rows.response.shape)

@@ -1,0 +1,84 @@
+"""Search coordinates: the logarithm of positive parameters, the number itself for the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dahl_ident.arrays import FloatArray, positive_array, real_array
+from dahl_ident.elements import Dahl, Model, Parameter
+from dahl_ident.errors import ValidationError
+
+
+class Coordinates:
+    """The free parameters of a problem and their search coordinates theta, (P,) or (S, P)."""
+
+    def __init__(self, parameters: Sequence[Parameter]) -> None:
+        self.parameters = tuple(parameters)
+        self.names = tuple(p.name for p in self.parameters)
+        self.positive = np.array([p.transform == "log" for p in self.parameters])
+        self._all_positive = bool(self.positive.all())
+
+    def checked(self, theta: ArrayLike, name: str = "theta") -> FloatArray:
+        """Return `theta` as an array of shape (P,) or (S, P), or say what it is instead."""
+        array = real_array(theta, name)
+        P = len(self.parameters)
+        if array.ndim not in (1, 2) or array.shape[-1] != P:
+            raise ValidationError(
+                f"{name} has shape {array.shape}; expected ({P},) or (S, {P}) for "
+                f"{', '.join(self.names)}"
+            )
+        return array
+
+    def to_search(self, values: ArrayLike) -> FloatArray:
+        """Return the search coordinates of parameter values."""
+        array = self.checked(values, "values")
+        for index in np.flatnonzero(self.positive):
+            positive_array(array[..., index], self.names[index])
+        return np.where(self.positive, np.log(np.where(self.positive, array, 1.0)), array)
+
+    def to_values(self, theta: FloatArray) -> FloatArray:
+        """Return the parameter values, unchecked."""
+        with np.errstate(over="ignore", under="ignore"):
+            if self._all_positive:
+                return np.exp(theta)
+            return np.where(self.positive, np.exp(np.where(self.positive, theta, 0.0)), theta)
+
+    def slopes(self, values: FloatArray) -> FloatArray:
+        """Return d value / d theta: the value itself for positive parameters, 1 for others."""
+        return np.where(self.positive, values, 1.0)
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Return the parameters' lower and upper bounds in search coordinates."""
+        lower = np.array([p.lower for p in self.parameters])
+        upper = np.array([p.upper for p in self.parameters])
+        with np.errstate(divide="ignore"):
+            low = np.log(np.maximum(lower, 0.0), out=lower.copy(), where=self.positive)
+            high = np.log(upper, out=upper.copy(), where=self.positive)
+        return low, high
+
+
+def in_order(theta: FloatArray, interchangeable: Sequence[NDArray[np.intp]]) -> FloatArray:
+    """Return `theta` with the columns of like Dahl elements exchanged until x_c rises."""
+    array = theta.copy()
+    for columns in interchangeable:
+        ln_x_c = array[..., columns[:, 0]] - array[..., columns[:, 1]]
+        order = np.argsort(ln_x_c, axis=-1)
+        for kind in columns.T:
+            array[..., kind] = np.take_along_axis(array[..., kind], order, axis=-1)
+    return array
+
+
+def interchangeable_elements(model: Model, names: tuple[str, ...]) -> list[NDArray[np.intp]]:
+    """Return, for each set of like Dahl elements, their columns in theta: f_max, sigma, alpha."""
+    alike: dict[tuple[object, ...], list[list[int]]] = {}
+    for element in model.elements:
+        if not isinstance(element, Dahl) or not all(p.free for p in element.parameters[:2]):
+            continue
+        alpha = element.parameters[2]
+        bounds = tuple((p.lower, p.upper) for p in element.parameters)
+        columns = [names.index(p.name) for p in element.parameters if p.free]
+        alike.setdefault((None if alpha.free else alpha.value, bounds), []).append(columns)
+    return [np.array(columns) for columns in alike.values() if len(columns) > 1]

@@ -1,0 +1,241 @@
+"""From parameters to the response that a table holds, with exact derivatives.
+
+The model gives the dynamic stiffness Z_k(A, omega) = F_k/X_1. From it follow, with the sensors'
+factor g (see :mod:`dahl_ident.sensors`), all six quantities:
+
+    R = (j omega)^p (g Z)^q,    q = 1 or -1,  p from -2 to 2.
+
+Rows whose displacement was controlled take the measured amplitude as A: an explicit model. Rows
+whose force was controlled take the measured drive u_0, and A solves A |Z(A, omega)| = u_0; its
+derivatives come from the implicit function theorem,
+
+    d ln A = (d ln u_0 - Re(dZ/Z)) / (1 + Re(A Z_A/Z)).
+
+The measured amplitude of such a row serves only to choose among several solutions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident import steady_state
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.rows import Rows
+from dahl_ident.elements import Model, Parameter
+from dahl_ident.errors import DataError
+from dahl_ident.problem.coordinates import Coordinates
+from dahl_ident.sensors import Sensors, measured_stiffness_factor
+
+_POWERS = {
+    "receptance": (0, -1),
+    "mobility": (1, -1),
+    "accelerance": (2, -1),
+    "dynamic_stiffness": (0, 1),
+    "mechanical_impedance": (-1, 1),
+    "apparent_mass": (-2, 1),
+}
+_NONE: ComplexArray = np.zeros((), dtype=np.complex128)
+
+
+class Prediction(NamedTuple):
+    """The response R with its derivatives by search coordinate and by ln A (explicit rows)."""
+
+    value: ComplexArray
+    changes: list[ComplexArray]
+    by_ln_amplitude: ComplexArray
+
+
+class _Group(NamedTuple):
+    """Rows that are computed together."""
+
+    rows: slice | NDArray[np.intp]
+    harmonic: int
+    forced: bool
+
+
+class Predictor:
+    """What a model and its sensors make of the amplitudes, drives and frequencies of `rows`."""
+
+    def __init__(
+        self, model: Model, sensors: Sensors, coordinates: Coordinates, rows: Rows
+    ) -> None:
+        self._model, self._coordinates = model, coordinates
+        self._neutral = sensors.are_exact
+        names = coordinates.names
+        self._slots = [_slot(p, names) for p in (*model.parameters, *sensors.parameters)]
+        self._set_rows(rows)
+
+    def _set_rows(self, rows: Rows) -> None:
+        self._rows = rows
+        self._groups = _groups(rows)
+        power, self._exponent = _POWERS[rows.quantity]
+        self._operator = np.asarray((1j * rows.omega) ** power, dtype=np.complex128)
+        self._guess = _measured_amplitude(rows, self._operator, self._exponent)
+
+    def measured_stiffness(self) -> ComplexArray:
+        """Return the data as dynamic stiffness, whatever their quantity."""
+        ratio = self._rows.response / self._operator
+        return ratio if self._exponent == 1 else 1.0 / ratio
+
+    def measured_amplitude(self) -> FloatArray:
+        """Return the measured amplitude, from the drive where it was not recorded."""
+        return self._guess
+
+    def __call__(
+        self,
+        theta: FloatArray,
+        *,
+        derivatives: bool = True,
+        amplitude_error: FloatArray | None = None,
+    ) -> Prediction:
+        """Return the response and its derivatives at search coordinates, (P,) or (S, P).
+
+        `amplitude_error` is the error of ln A of explicit rows: A is the measured amplitude over
+        its exponential.
+        """
+        columns = self._coordinates.to_values(theta)[..., None]
+        values = [
+            constant if index is None else columns[..., index, :] for index, constant in self._slots
+        ]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
+            parts = [
+                self._predict(group, values, derivatives, amplitude_error) for group in self._groups
+            ]
+        return parts[0] if len(parts) == 1 else self._merge(parts, theta)
+
+    def _merge(self, parts: list[Prediction], theta: FloatArray) -> Prediction:
+        shape = np.broadcast_shapes((*theta.shape[:-1], 1), self._rows.response.shape)
+        whole = [np.empty(shape, dtype=np.complex128) for _ in range(2 + len(parts[0].changes))]
+        for group, part in zip(self._groups, parts, strict=True):
+            pieces = (part.value, part.by_ln_amplitude, *part.changes)
+            for target, piece in zip(whole, pieces, strict=True):
+                target[..., group.rows] = piece
+        return Prediction(whole[0], whole[2:], whole[1])
+
+    def _predict(
+        self,
+        group: _Group,
+        values: list[FloatArray],
+        derivatives: bool,
+        amplitude_error: FloatArray | None,
+    ) -> Prediction:
+        own, sensed = values[:-3], values[-3:]
+        omega = self._rows.omega[..., group.rows]
+        amplitude, found = self._amplitude(group, own, sensed, amplitude_error)
+        factor = self._operator[..., group.rows]
+        if not self._neutral:
+            sensor = measured_stiffness_factor(sensed, omega, group.harmonic)
+            factor = factor * sensor**self._exponent
+        if not derivatives:
+            Z = self._model.stiffness(own, amplitude, omega, group.harmonic)
+            return Prediction(factor * _where(found, Z) ** self._exponent, [], _NONE)
+        Z, by_amplitude, by_parameter = self._model.stiffness_gradient(
+            own, amplitude, omega, group.harmonic
+        )
+        Z = _where(found, Z)
+        by_ln_amplitude = amplitude * by_amplitude
+        response = factor * Z if self._exponent == 1 else factor / Z
+        slope = factor if self._exponent == 1 else -response / Z
+        stretch = 1.0 / (1.0 + (by_ln_amplitude / Z).real) if group.forced else None
+        changes = []
+        for (index, _), value, d in zip(self._slots, own, by_parameter, strict=False):
+            if index is None:
+                continue
+            change = d * value if self._coordinates.positive[index] else d
+            if stretch is not None:
+                change = change - by_ln_amplitude * ((change / Z).real * stretch)
+            changes.append(slope * change)
+        by_ln_amplitude = slope * by_ln_amplitude
+        if not self._neutral:
+            direct = by_ln_amplitude if stretch is None else by_ln_amplitude * stretch
+            changes += self._sensor_changes(group, response, direct, omega)
+        return Prediction(response, changes, by_ln_amplitude)
+
+    def _sensor_changes(
+        self, group: _Group, response: ComplexArray, direct: ComplexArray, omega: FloatArray
+    ) -> list[ComplexArray]:
+        """Return dR by the free sensor parameters; `direct` is dR/dln A or dR/dln u_0."""
+        own = self._exponent * response
+        by_sensor = (
+            own - direct if group.forced else own,
+            -own if group.forced else -own - direct,
+            1j * group.harmonic * omega * own,
+        )
+        slots = self._slots[-3:]
+        return [d for d, (index, _) in zip(by_sensor, slots, strict=True) if index is not None]
+
+    def _amplitude(
+        self,
+        group: _Group,
+        own: Sequence[FloatArray],
+        sensed: Sequence[FloatArray],
+        error: FloatArray | None,
+    ) -> tuple[FloatArray, NDArray[np.bool_] | None]:
+        """Return the true amplitude of each row, and where there is one unless everywhere."""
+        rows = group.rows
+        amplitude = self._guess[..., rows]
+        if not self._neutral:
+            amplitude = amplitude / sensed[1]
+        if not group.forced:
+            return amplitude if error is None else amplitude * np.exp(-error[..., rows]), None
+        assert self._rows.drive is not None
+        drive = self._rows.drive[..., rows] / sensed[0]
+        omega = self._rows.omega[..., rows]
+        amplitude = steady_state.solve(self._model, own, omega, drive, amplitude)
+        found = np.isfinite(amplitude)
+        return (amplitude, None) if found.all() else (np.where(found, amplitude, 1.0), found)
+
+
+def _where(found: NDArray[np.bool_] | None, Z: ComplexArray) -> ComplexArray:
+    return Z if found is None else np.where(found, Z, np.nan)
+
+
+def _slot(parameter: Parameter, names: tuple[str, ...]) -> tuple[int | None, FloatArray]:
+    """Return where a parameter's value comes from: an index into theta, or a constant."""
+    if parameter.free:
+        return names.index(parameter.name), np.empty(0)
+    return None, np.asarray(parameter.value)
+
+
+def _groups(rows: Rows) -> list[_Group]:
+    """Split rows by harmonic and by what was controlled, and check that each can be predicted."""
+    if rows.amplitude is None:
+        _require(~rows.forced, "displacement", "amplitude")
+    if rows.drive is None:
+        _require(rows.forced, "force", "drive")
+    bad = rows.forced & (rows.harmonic > 1)
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise DataError(
+            f"row {row} is force-controlled and holds harmonic {rows.harmonic[row]}; the steady "
+            "state of a driven plant is solved for its fundamental only: leave such rows out, or "
+            "say controlled='displacement' if the measured amplitude is to be used"
+        )
+    kinds = sorted({*zip(rows.harmonic.tolist(), rows.forced.tolist(), strict=True)})
+    if len(kinds) == 1:
+        return [_Group(slice(None), *kinds[0])]
+    return [
+        _Group(np.flatnonzero((rows.harmonic == k) & (rows.forced == forced)), k, forced)
+        for k, forced in kinds
+    ]
+
+
+def _require(rows: NDArray[np.bool_], controlled: str, name: str) -> None:
+    if rows.any():
+        other = {"displacement": "force", "force": "displacement"}[controlled]
+        raise DataError(
+            f"row {int(np.argmax(rows))} is {controlled}-controlled, but the data have no {name}; "
+            f"give it, or say controlled={other!r} if the laboratory held the {other}"
+        )
+
+
+def _measured_amplitude(rows: Rows, operator: ComplexArray, exponent: int) -> FloatArray:
+    if rows.amplitude is not None:
+        return rows.amplitude
+    assert rows.drive is not None
+    with np.errstate(divide="ignore"):
+        return np.asarray(rows.drive / np.abs(rows.response / operator) ** exponent)

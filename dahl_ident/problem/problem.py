@@ -1,0 +1,380 @@
+"""One estimate's data, model, noise and sensors, as every solver and sampler sees them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.data.rows import Rows
+from dahl_ident.elements import Element, Model, Parameter
+from dahl_ident.elements.model import as_model
+from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.noise import Measured, bend, correct_amplitude, noise_for, student
+from dahl_ident.problem.coordinates import Coordinates, in_order, interchangeable_elements
+from dahl_ident.problem.prediction import Predictor
+from dahl_ident.sensors import EXACT, Prior, Sensors
+
+
+class Problem:
+    """Data, model, noise and sensors: residuals, Jacobian and likelihood of one estimate.
+
+    Parameters
+    ----------
+    data : FrequencyResponse
+        Displacement-controlled rows need an amplitude, force-controlled rows a drive.
+    model : Element
+        One element or a sum, such as ``Dahl() + Mass(0.3)``.
+    noise : {"measured", "relative", "absolute"}, optional
+        Default: "measured" where the data have a covariance, else "relative".
+    sensors : Sensors, optional
+        Gains and delay; left out, the channels are taken as exact.
+    free : iterable of str, optional
+        Names of given parameters to estimate all the same, from their values.
+    fixed : mapping of str to float, optional
+        Parameters to hold at a value.
+
+    Attributes
+    ----------
+    data, model, sensors
+        As given, `free` and `fixed` put in.
+    noise : str
+        The name of the noise model.
+    parameters : tuple of Parameter
+        The free ones, the model's first, then the sensors'. P is their number.
+    names : tuple of str
+        Their names.
+    priors : dict of str to Prior
+        The priors of sensor parameters that are free.
+    scale_known : bool
+        Whether the residuals have unit variance as they are.
+    n_residuals : int
+        Residuals of the data, two a row; those of priors come on top.
+
+    Raises
+    ------
+    ModelError
+        If nothing is free, or a name is unknown.
+    DataError
+        If the rows lack what their model or noise needs.
+    ValidationError
+        If `noise` is unknown.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dahl_ident import Dahl
+    >>> from dahl_ident.data import FrequencyResponse
+    >>> A = np.array([1e-4, 1e-3, 1e-2])
+    >>> N = Dahl(f_max=0.1, sigma=30.0).describing_function(A)
+    >>> problem = Problem(FrequencyResponse(np.ones(3), N, A), Dahl())
+    >>> problem.names
+    ('f_max', 'sigma')
+    >>> theta = problem.to_search([0.1, 30.0])
+    >>> bool(np.all(np.abs(problem.residuals(theta)) < 1e-14))
+    True
+    """
+
+    def __init__(
+        self,
+        data: FrequencyResponse,
+        model: Element,
+        *,
+        noise: str | None = None,
+        sensors: Sensors | None = None,
+        free: Iterable[str] = (),
+        fixed: Mapping[str, float] | None = None,
+    ) -> None:
+        self.data = data
+        self._set_model(as_model(model), sensors or EXACT, tuple(free), dict(fixed or {}))
+        self._set_rows(Rows.of(data), noise)
+
+    def _set_model(
+        self, model: Model, sensors: Sensors, free: tuple[str, ...], fixed: dict[str, float]
+    ) -> None:
+        if free or fixed:
+            model, sensors = _with_changes(model, sensors, free, fixed)
+        self.model, self.sensors = model, sensors
+        parameters = [p for p in (*model.parameters, *sensors.parameters) if p.free]
+        if not parameters:
+            raise ModelError(f"{model!r} has no free parameter; leave one out, or name it in free=")
+        self._coordinates = Coordinates(parameters)
+        self._alike = interchangeable_elements(model, self.names)
+        self.priors: dict[str, Prior] = sensors.priors
+
+    def _set_rows(self, rows: Rows, noise: str | None) -> None:
+        self._rows = rows
+        self._predictor = Predictor(self.model, self.sensors, self._coordinates, rows)
+        self._noise = noise_for(rows, noise)
+        self.noise = self._noise.name
+        self.scale_known = self._noise.scale_known
+        self.n_residuals = 2 * rows.n
+
+    def __repr__(self) -> str:
+        return (
+            f"<{type(self).__name__}: {self._rows.n} rows of {self._rows.quantity}, "
+            f"{self.noise} noise, free {', '.join(self.names)}>"
+        )
+
+    # Coordinates
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The free parameters, the model's first, then the sensors'."""
+        return self._coordinates.parameters
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the free parameters."""
+        return self._coordinates.names
+
+    def to_search(self, values: ArrayLike) -> FloatArray:
+        """Return the search coordinates of parameter values, in the order of `names`.
+
+        Parameters
+        ----------
+        values : array_like, shape (P,) or (S, P)
+            In SI units.
+
+        Returns
+        -------
+        ndarray of the same shape
+            Logarithms of positive parameters, the values of the others.
+
+        Raises
+        ------
+        ValidationError
+            If the shape is wrong or a positive parameter is not above zero.
+        """
+        return self._coordinates.to_search(values)
+
+    def to_values(self, theta: ArrayLike) -> FloatArray:
+        """Return the parameter values at search coordinates, shape (P,) or (S, P)."""
+        return self._coordinates.to_values(self._coordinates.checked(theta))
+
+    def value_slopes(self, theta: ArrayLike) -> FloatArray:
+        """Return d value / d theta: the value itself for positive parameters, 1 for others."""
+        return self._coordinates.slopes(self.to_values(theta))
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Return the parameters' lower and upper bounds in search coordinates."""
+        return self._coordinates.bounds()
+
+    def in_order(self, theta: ArrayLike) -> FloatArray:
+        """Return theta with interchangeable Dahl elements ordered by rising x_c.
+
+        Elements are interchangeable where both f_max and sigma of each are free and their
+        exponents are alike; without an order their labels could switch.
+        """
+        return in_order(self._coordinates.checked(theta), self._alike)
+
+    # Predictions
+
+    def predict(self, theta: ArrayLike) -> ComplexArray:
+        """Return the response that the model predicts, in the data's quantity.
+
+        Parameters
+        ----------
+        theta : array_like, shape (P,) or (S, P)
+            Search coordinates.
+
+        Returns
+        -------
+        ndarray of complex, shape (n,) or (S, n)
+            Sensors included; NaN where a driven plant has no steady amplitude.
+        """
+        theta = self._coordinates.checked(theta)
+        value = self._predictor(theta, derivatives=False).value
+        return np.broadcast_to(value, self._shape(theta)).copy()
+
+    def prediction_jacobian(self, theta: ArrayLike) -> ComplexArray:
+        """Return dR/dtheta, shape (n, P) or (S, n, P)."""
+        theta = self._coordinates.checked(theta)
+        changes = self._predictor(theta).changes
+        return np.stack([np.broadcast_to(d, self._shape(theta)) for d in changes], axis=-1)
+
+    # Residuals
+
+    def residuals(self, theta: ArrayLike, scale: ArrayLike = 1.0) -> FloatArray:
+        """Return the whitened residuals, measured minus predicted.
+
+        Parameters
+        ----------
+        theta : array_like, shape (P,) or (S, P)
+            Search coordinates.
+        scale : array_like, shape () or (S,), default 1
+            Noise scale by which the data's residuals are divided; leave at 1 where it is known.
+
+        Returns
+        -------
+        ndarray, shape (m,) or (S, m)
+            Two numbers a row of data, in its order, then one for each prior:
+            (value - mean)/std.
+        """
+        theta = self._coordinates.checked(theta)
+        y, _ = self.whitened(theta, derivatives=False)
+        return self._with_priors(theta, y, [], scale)[0]
+
+    def jacobian(self, theta: ArrayLike, scale: ArrayLike = 1.0) -> FloatArray:
+        """Return the residuals' derivative by theta, shape (m, P) or (S, m, P)."""
+        return self.residuals_and_jacobian(theta, scale)[1]
+
+    def residuals_and_jacobian(
+        self, theta: ArrayLike, scale: ArrayLike = 1.0
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return residuals and Jacobian, for the price of the Jacobian.
+
+        With noise in the amplitude the residuals are defined up to a rotation of each pair. The
+        Jacobian leaves that out, so that J' r is the exact gradient of half the sum of squares.
+        """
+        theta = self._coordinates.checked(theta)
+        y, changes = self.whitened(theta)
+        residuals, jacobian = self._with_priors(theta, y, changes, scale)
+        return residuals, jacobian.swapaxes(-1, -2)
+
+    def whitened(
+        self, theta: FloatArray, *, derivatives: bool = True, tails: bool = True
+    ) -> tuple[ComplexArray, list[ComplexArray]]:
+        """Return the complex residual of each row of data, and its derivatives, unchecked.
+
+        Without `tails` a covariance of few degrees of freedom counts as if it were known.
+        """
+        noise = self._noise
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
+            if isinstance(noise, Measured):
+                y, changes = self._whitened_by_covariance(noise, theta, derivatives)
+                if tails and noise.dof is not None:
+                    dof = noise.dof
+                    y, changes = bend(y, changes, lambda z: student(z, dof))
+                return y, changes
+            predicted, by, _ = self._predictor(theta, derivatives=derivatives)
+            return noise.residual(predicted), [noise.change(predicted, d) for d in by]
+
+    def _whitened_by_covariance(
+        self, noise: Measured, theta: FloatArray, derivatives: bool
+    ) -> tuple[ComplexArray, list[ComplexArray]]:
+        if noise.amplitude is None:
+            predicted, by, _ = self._predictor(theta, derivatives=derivatives)
+            return noise.residual(predicted), [noise.change(predicted, d) for d in by]
+
+        def value_and_slope(error: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+            value, _, slope = self._predictor(theta, amplitude_error=error)
+            return value, slope
+
+        y, whiten, error = correct_amplitude(noise, noise.amplitude, value_and_slope)
+        by = self._predictor(theta, amplitude_error=error).changes if derivatives else []
+        return y, [-whiten(d) for d in by]
+
+    def _with_priors(
+        self, theta: FloatArray, y: ComplexArray, changes: list[ComplexArray], scale: ArrayLike
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return real residuals and the transposed Jacobian, those of priors last."""
+        lead, m = self._shape(theta)[:-1], self.n_residuals
+        residuals = np.empty((*lead, m + len(self.priors)))
+        jacobian = np.zeros((*lead, len(changes), m + len(self.priors)))
+        size = np.asarray(scale)[..., None]
+        residuals[..., :m] = _parts(y) / size
+        for index, change in enumerate(changes):
+            jacobian[..., index, :m] = _parts(change) / size
+        if self.priors:
+            values = self._coordinates.to_values(theta)
+            slopes = self._coordinates.slopes(values)
+            for row, (name, prior) in enumerate(self.priors.items(), start=m):
+                index = self.names.index(name)
+                mean, std = _normal(name, prior)
+                residuals[..., row] = (values[..., index] - mean) / std
+                if changes:
+                    jacobian[..., index, row] = slopes[..., index] / std
+        return residuals, jacobian
+
+    # Likelihood
+
+    def log_likelihood(self, theta: ArrayLike, scale: ArrayLike | None = None) -> FloatArray:
+        """Return ln of the density of the data, per unit of Re R and Im R of every row.
+
+        Parameters
+        ----------
+        theta : array_like, shape (P,) or (S, P)
+            Search coordinates.
+        scale : array_like, shape () or (S,), optional
+            The noise's scale, where it is unknown: standard deviation of ln gain and of phase
+            (rad) for "relative", of Re R and Im R for "absolute". Left out, the scale of the
+            highest likelihood, (sum of squares / 2n)^(1/2), at each theta.
+
+        Returns
+        -------
+        ndarray, shape () or (S,)
+            Priors not included; -inf where the model has no prediction. All noise models give
+            densities of the same numbers, so their likelihoods compare.
+
+        Raises
+        ------
+        ValidationError
+            If `scale` is given where it is known.
+        """
+        theta = self._coordinates.checked(theta)
+        if self.scale_known and scale is not None:
+            raise ValidationError(
+                f"scale is given, but {self.noise} noise has a known scale; leave it out"
+            )
+        y, _ = self.whitened(theta, derivatives=False)
+        squares = np.sum(y.real**2 + y.imag**2, axis=-1)
+        n = self._rows.n
+        s2 = np.asarray(1.0 if scale is None else scale) ** 2
+        if scale is None and not self.scale_known:
+            s2 = squares / (2.0 * n)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            result = self._noise.log_area - n * np.log(2.0 * np.pi * s2) - 0.5 * squares / s2
+        return np.where(np.isnan(result), -np.inf, result)[()]
+
+    def information(self, theta: ArrayLike, scale: ArrayLike = 1.0) -> FloatArray:
+        """Return the Fisher information of theta, shape (P, P) or (S, P, P), priors included.
+
+        J' J of the whitened residuals; a row whose covariance was estimated with nu degrees of
+        freedom counts (nu + 1)(nu - 1)/(nu (nu + 3)), the expectation for Student's t.
+        """
+        theta = self._coordinates.checked(theta)
+        y, changes = self.whitened(theta, tails=False)
+        dof = self._noise.dof if isinstance(self._noise, Measured) else None
+        if dof is not None:
+            weight = np.sqrt((dof + 1.0) * (dof - 1.0) / (dof * (dof + 3.0)))
+            changes = [weight * d for d in changes]
+        _, jacobian = self._with_priors(theta, y, changes, scale)
+        return jacobian @ jacobian.swapaxes(-1, -2)
+
+    def _shape(self, theta: FloatArray) -> tuple[int, ...]:
+        """Return the shape of the rows' numbers for `theta`."""
+        return (*theta.shape[:-1], self._rows.n)
+
+
+def _with_changes(
+    model: Model, sensors: Sensors, free: tuple[str, ...], fixed: dict[str, float]
+) -> tuple[Model, Sensors]:
+    """Free and fix parameters by name, wherever they live."""
+    both = set(free) & set(fixed)
+    if both:
+        raise ModelError(f"{', '.join(sorted(both))} is both in free= and in fixed=; choose one")
+    sensed = {p.name for p in sensors.parameters}
+    model = model.with_free([n for n in free if n not in sensed])
+    model = model.with_fixed({n: v for n, v in fixed.items() if n not in sensed})
+    sensors = sensors.with_free([n for n in free if n in sensed])
+    return model, sensors.with_fixed({n: v for n, v in fixed.items() if n in sensed})
+
+
+def _normal(name: str, prior: Prior) -> tuple[float, float]:
+    """Return mean and standard deviation of a normal prior, the only kind least squares takes."""
+    kind = getattr(getattr(prior, "dist", None), "name", type(prior).__name__)
+    if kind != "norm":
+        raise ValidationError(
+            f"the prior of {name} is {kind}; least squares takes normal priors "
+            "(scipy.stats.norm), any other needs sampling"
+        )
+    return float(prior.mean()), float(prior.std())
+
+
+def _parts(values: ComplexArray) -> FloatArray:
+    """Return real and imaginary parts side by side in the last axis."""
+    return np.ascontiguousarray(values).view(np.float64)
