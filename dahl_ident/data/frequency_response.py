@@ -9,9 +9,9 @@ dissipating element has a positive imaginary part of its dynamic stiffness.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,30 +22,40 @@ from dahl_ident.arrays import (
     finite_array,
     non_negative_array,
     positive_array,
-    real_array,
 )
-from dahl_ident.data.fields import column, frozen_copy, frozen_mapping, one_of, thawed
+from dahl_ident.data.fields import (
+    check_covariance,
+    column,
+    complex_values,
+    controlled_words,
+    degrees_of_freedom,
+    frozen_copy,
+    frozen_mapping,
+    harmonic_numbers,
+    labels,
+    one_of,
+    plain_values,
+    spread,
+    thawed,
+)
+from dahl_ident.data.quantities import converted, jacobian
+from dahl_ident.data.summary import as_html, as_text, distinct, extent, listed, noted
 from dahl_ident.errors import ValidationError
+from dahl_ident.units import MOTIONS, QUANTITIES, Motion, Quantity, si_unit
 
-Quantity = Literal[
-    "receptance",
-    "mobility",
-    "accelerance",
-    "dynamic_stiffness",
-    "mechanical_impedance",
-    "apparent_mass",
-]
-Motion = Literal["translation", "rotation"]
-QUANTITIES = (
-    "receptance",
-    "mobility",
-    "accelerance",
-    "dynamic_stiffness",
-    "mechanical_impedance",
-    "apparent_mass",
+_ROW_FIELDS = (
+    "frequency_hz",
+    "response",
+    "amplitude",
+    "drive",
+    "covariance",
+    "dof",
+    "amplitude_std",
+    "amplitude_covariance",
+    "level",
+    "controlled",
+    "harmonic",
 )
-MOTIONS = ("translation", "rotation")
-CONTROLLED = ("displacement", "force")
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -143,22 +153,25 @@ class FrequencyResponse:
         n = frequency.size
         values = {
             "frequency_hz": frozen_copy(frequency),
-            "response": _complex_column(response, n),
+            "response": column(response, "response", n, complex_values),
             "amplitude": column(amplitude, "amplitude", n, positive_array),
             "drive": column(drive, "drive", n, positive_array),
             "covariance": column(covariance, "covariance", n, finite_array, shape=(2, 2)),
-            "dof": _dof(dof, n),
+            "dof": spread(dof, "dof", n, degrees_of_freedom),
             "amplitude_std": column(amplitude_std, "amplitude_std", n, non_negative_array),
             "amplitude_covariance": column(
                 amplitude_covariance, "amplitude_covariance", n, finite_array, shape=(2,)
             ),
-            "level": _level(level, n),
-            "controlled": _controlled(controlled, n),
-            "harmonic": _harmonic(harmonic, n),
+            "level": spread(level, "level", n, labels),
+            "controlled": spread(controlled, "controlled", n, controlled_words),
+            "harmonic": spread(harmonic, "harmonic", n, harmonic_numbers),
             "quantity": one_of(quantity, "quantity", QUANTITIES),
             "motion": one_of(motion, "motion", MOTIONS),
             "quality": frozen_mapping(
-                {k: _quality_column(v, k, n) for k, v in (quality or {}).items()}
+                {
+                    name: column(verdict, f"quality {name!r}", n, plain_values)
+                    for name, verdict in (quality or {}).items()
+                }
             ),
             "provenance": frozen_mapping(provenance),
         }
@@ -190,10 +203,44 @@ class FrequencyResponse:
                 "only dynamic stiffness has rows for harmonics"
             )
         if self.covariance is not None:
-            _check_covariance(self.covariance, self.amplitude_std, self.amplitude_covariance)
+            check_covariance(self.covariance, self.amplitude_std, self.amplitude_covariance)
 
     def __len__(self) -> int:
         return self.frequency_hz.size
+
+    def __repr__(self) -> str:
+        return as_text(*self._summary())
+
+    def _repr_html_(self) -> str:
+        return as_html(*self._summary())
+
+    def _summary(self) -> tuple[str, list[tuple[str, str]]]:
+        """Title, and levels, ranges and units."""
+        name = self.quantity.replace("_", " ")
+        lines = [("frequency", extent(self.frequency_hz, "Hz"))]
+        if self.levels:
+            lines.append((f"{len(self.levels)} levels", listed(self.levels)))
+        for field, kind in (("amplitude", "displacement"), ("drive", "force")):
+            values = getattr(self, field)
+            if values is not None:
+                unit = si_unit(kind, self.motion)
+                lines.append((field, f"{extent(values, unit)}, zero to peak"))
+        lines += [
+            ("gain", extent(self.gain, self.unit)),
+            ("phase", extent(np.degrees(self.phase), "deg")),
+            ("controlled", listed(distinct(self.controlled))),
+        ]
+        if (self.harmonic > 1).any():
+            lines.append(("harmonics", listed(distinct(self.harmonic))))
+        if self.covariance is None:
+            lines.append(("covariance", "unknown"))
+        else:
+            dof = "" if self.dof is None else f", {extent(self.dof, 'degrees of freedom')}"
+            lines.append(("covariance", f"known{dof}"))
+        if self.quality:
+            lines.append(("quality", listed(self.quality)))
+        lines += noted(self.provenance)
+        return f"FrequencyResponse: {self.n} points of {name}, {self.motion}", lines
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuild, (thawed((f.name, getattr(self, f.name)) for f in fields(self)),)
@@ -218,98 +265,185 @@ class FrequencyResponse:
         """Phase of the response, rad, in (-pi, pi]."""
         return np.angle(self.response)
 
+    @property
+    def levels(self) -> list[Any]:
+        """Distinct level labels in order of appearance; empty where there are none."""
+        return [] if self.level is None else distinct(self.level)
+
+    @property
+    def unit(self) -> str:
+        """SI unit of the response."""
+        return si_unit(self.quantity, self.motion)
+
+    def to(self, quantity: Quantity) -> FrequencyResponse:
+        """Return the same points as another standard quantity, their covariance with them.
+
+        The covariance transforms by the Jacobian of the conversion, first order in the error.
+        The reference of amplitude and drive stays: displacement and force.
+
+        Parameters
+        ----------
+        quantity : str
+            One of the six standard quantities.
+
+        Returns
+        -------
+        FrequencyResponse
+
+        Raises
+        ------
+        ValidationError
+            If a response of zero would have to be inverted, or rows hold harmonics, which are
+            dynamic stiffness only.
+
+        Examples
+        --------
+        >>> data = FrequencyResponse([1.0], [4.0 + 3.0j], amplitude=[1e-3])
+        >>> data.to("receptance").response
+        array([0.16-0.12j])
+        """
+        one_of(quantity, "quantity", QUANTITIES)
+        if quantity == self.quantity:
+            return self
+        if (self.harmonic > 1).any():
+            raise ValidationError(
+                f"rows with harmonics {listed(np.unique(self.harmonic))} cannot become "
+                f"{quantity}; only dynamic stiffness has harmonics. Use select(harmonic=1) first"
+            )
+        response, derivative = converted(self.response, self.omega, self.quantity, quantity)
+        J = jacobian(derivative)
+        covariance, cross = self.covariance, self.amplitude_covariance
+        return replace(
+            self,
+            response=response,
+            quantity=quantity,
+            covariance=None if covariance is None else J @ covariance @ J.swapaxes(1, 2),
+            amplitude_covariance=None if cross is None else np.einsum("nij,nj->ni", J, cross),
+        )
+
+    def select(
+        self,
+        *,
+        level: Any = None,
+        frequency_hz: tuple[float, float] | None = None,
+        harmonic: int | None = None,
+        rows: ArrayLike | None = None,
+    ) -> FrequencyResponse:
+        """Return the points that meet every condition given.
+
+        Parameters
+        ----------
+        level : label or list of labels, optional
+            Keep these levels.
+        frequency_hz : (low, high), optional
+            Keep this range, both ends included, Hz.
+        harmonic : int, optional
+            Keep this harmonic.
+        rows : (n,) array_like of bool, optional
+            Keep these rows.
+
+        Returns
+        -------
+        FrequencyResponse
+
+        Raises
+        ------
+        ValidationError
+            If no point is left, or a level is not there.
+
+        Examples
+        --------
+        >>> data = FrequencyResponse([1.0, 2.0], [1.0, 1.0j], drive=[1.0, 1.0], level=["a", "b"])
+        >>> data.select(level="b").frequency_hz
+        array([2.])
+        """
+        keep = np.ones(self.n, dtype=bool)
+        if level is not None:
+            wanted = [level] if np.ndim(level) == 0 else list(level)
+            absent = [w for w in wanted if w not in self.levels]
+            if self.level is None or absent:
+                raise ValidationError(f"no level {absent}; there are {listed(self.levels)}")
+            keep &= np.isin(self.level, wanted)
+        if frequency_hz is not None:
+            low, high = frequency_hz
+            keep &= (self.frequency_hz >= low) & (self.frequency_hz <= high)
+        if harmonic is not None:
+            keep &= self.harmonic == harmonic
+        if rows is not None:
+            mask = np.asarray(rows)
+            if mask.dtype != np.bool_ or mask.shape != keep.shape:
+                raise ValidationError(
+                    f"rows: expected {self.n} of True or False, got dtype {mask.dtype} of shape "
+                    f"{mask.shape}"
+                )
+            keep &= mask
+        if not keep.any():
+            raise ValidationError(f"none of the {self.n} points meets the conditions")
+        return replace(self, **_combined([self], lambda arrays: arrays[0][keep]))
+
+    @staticmethod
+    def concatenate(parts: Sequence[FrequencyResponse]) -> FrequencyResponse:
+        """Return all points of several tables in one.
+
+        Parameters
+        ----------
+        parts : sequence of FrequencyResponse
+            Of one quantity and motion, each with the same columns.
+
+        Returns
+        -------
+        FrequencyResponse
+            Its provenance lists those of the parts.
+
+        Raises
+        ------
+        ValidationError
+            If quantity, motion or columns differ.
+
+        Examples
+        --------
+        >>> part = FrequencyResponse([1.0], [1.0j], amplitude=[1e-3])
+        >>> FrequencyResponse.concatenate([part, part]).n
+        2
+        """
+        if not parts:
+            raise ValidationError("concatenate needs at least one table, got none")
+        first = parts[0]
+        for i, part in enumerate(parts):
+            ours, theirs = _kind(first), _kind(part)
+            if ours != theirs:
+                raise ValidationError(
+                    f"parts[{i}] ({listed(sorted(theirs - ours)) or 'less'}) does not go with "
+                    f"parts[0] ({listed(sorted(ours - theirs)) or 'less'}); bring them to one "
+                    "quantity with .to() and to the same columns"
+                )
+        sources = [dict(p.provenance) for p in parts if p.provenance is not None]
+        provenance = {"parts": sources} if sources else None
+        return replace(first, **_combined(parts, np.concatenate), provenance=provenance)
+
+
+def _combined(
+    parts: Sequence[FrequencyResponse], combine: Callable[[list[NDArray[Any]]], NDArray[Any]]
+) -> dict[str, Any]:
+    """Apply `combine` to each column of all parts; returns constructor arguments."""
+    columns: dict[str, Any] = {
+        name: combine([getattr(part, name) for part in parts])
+        for name in _ROW_FIELDS
+        if getattr(parts[0], name) is not None
+    }
+    columns["quality"] = {
+        name: combine([part.quality[name] for part in parts]) for name in parts[0].quality
+    }
+    return columns
+
+
+def _kind(data: FrequencyResponse) -> set[str]:
+    """Return what two tables must share to become one."""
+    columns = {name for name in _ROW_FIELDS if getattr(data, name) is not None}
+    if data.level is not None:
+        columns.add("text levels" if data.level.dtype.kind == "U" else "numeric levels")
+    return columns | set(data.quality) | {data.quantity, data.motion}
+
 
 def _rebuild(arguments: dict[str, Any]) -> FrequencyResponse:
     return FrequencyResponse(**arguments)
-
-
-def _complex_column(value: ArrayLike, n: int) -> ComplexArray:
-    array = np.asarray(value)
-    if array.dtype.kind not in "cfiu":
-        raise ValidationError(f"response: expected complex numbers, got dtype {array.dtype}")
-    if array.shape != (n,):
-        raise ValidationError(f"response: expected shape {(n,)}, got {array.shape}")
-    array = array.astype(np.complex128)
-    finite_array(array.real, "response.real")
-    finite_array(array.imag, "response.imag")
-    return frozen_copy(array)
-
-
-def _dof(value: ArrayLike | None, n: int) -> FloatArray | None:
-    if value is None:
-        return None
-    array = real_array(value, "dof")
-    if array.ndim == 0:
-        array = np.full(n, float(array))
-    good = array > 0.0
-    if not good.all():
-        row = int(np.argmin(good))
-        raise ValidationError(f"dof[{row}] is {array[row]!r}; expected a number > 0 or infinity")
-    return column(array, "dof", n, real_array)
-
-
-def _level(value: ArrayLike | None, n: int) -> NDArray[Any] | None:
-    if value is None:
-        return None
-    array = np.asarray(value)
-    if array.dtype.kind == "O":
-        array = array.astype(str)
-    array = array if array.dtype.kind == "U" else finite_array(array, "level")
-    if array.ndim == 0:
-        array = np.full(n, array)
-    if array.shape != (n,):
-        raise ValidationError(f"level: expected one label or shape {(n,)}, got {array.shape}")
-    return frozen_copy(array)
-
-
-def _controlled(value: ArrayLike, n: int) -> NDArray[np.str_]:
-    array = np.asarray(value, dtype=np.str_)
-    if array.ndim == 0:
-        array = np.full(n, array)
-    if array.shape != (n,):
-        raise ValidationError(f"controlled: expected one word or shape {(n,)}, got {array.shape}")
-    for word in np.unique(array):
-        one_of(str(word), "controlled", CONTROLLED)
-    return frozen_copy(array)
-
-
-def _harmonic(value: ArrayLike, n: int) -> NDArray[np.int64]:
-    array = positive_array(value, "harmonic")
-    if (array != np.round(array)).any():
-        raise ValidationError(f"harmonic: expected whole numbers, got {array[array % 1 != 0][0]!r}")
-    if array.ndim == 0:
-        array = np.full(n, array)
-    if array.shape != (n,):
-        raise ValidationError(f"harmonic: expected one number or shape {(n,)}, got {array.shape}")
-    return frozen_copy(array.astype(np.int64))
-
-
-def _quality_column(value: ArrayLike, name: str, n: int) -> NDArray[Any]:
-    array = np.asarray(value)
-    if array.shape != (n,):
-        raise ValidationError(f"quality {name!r}: expected shape {(n,)}, got {array.shape}")
-    return frozen_copy(array.astype(str) if array.dtype.kind == "O" else array)
-
-
-def _check_covariance(
-    covariance: FloatArray, amplitude_std: FloatArray | None, cross: FloatArray | None
-) -> None:
-    """Refuse what is no covariance of (amplitude, real part, imaginary part)."""
-    joint = np.zeros((len(covariance), 3, 3))
-    joint[:, 1:, 1:] = covariance
-    if amplitude_std is not None:
-        joint[:, 0, 0] = amplitude_std**2
-    if cross is not None:
-        joint[:, 0, 1:] = joint[:, 1:, 0] = cross
-    scale = np.sqrt(np.abs(np.diagonal(joint, axis1=1, axis2=2)))
-    scale[scale == 0.0] = 1.0
-    correlation = joint / (scale[:, :, None] * scale[:, None, :])
-    asymmetry = np.abs(correlation[:, 1, 2] - correlation[:, 2, 1])
-    smallest = np.linalg.eigvalsh(correlation)[:, 0]
-    bad = (asymmetry > 1e-9) | (smallest < -1e-9)
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise ValidationError(
-            f"covariance[{row}] is {covariance[row].tolist()}; expected a symmetric positive "
-            "semidefinite matrix, also together with the amplitude's variance and covariance"
-        )

@@ -16,11 +16,10 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray, finite_array, positive_number
 from dahl_ident.data.fields import column, frozen_copy, frozen_mapping, one_of, thawed
-from dahl_ident.data.frequency_response import MOTIONS, Motion
 from dahl_ident.errors import ValidationError
+from dahl_ident.units import MOTION_KINDS, MOTIONS, Motion
 
 DriveUnit = Literal["N", "N m", "V", "A"]
-MOTION_CHANNELS = ("displacement", "velocity", "acceleration")
 _GAP = 1.5  # a step of more than this many median steps misses a sample
 
 
@@ -102,10 +101,10 @@ class Record:
         values: dict[str, Any] = {
             name: column(value, name, n, finite_array) for name, value in channels.items()
         }
-        given = [name for name in MOTION_CHANNELS if values[name] is not None]
+        given = [name for name in MOTION_KINDS if values[name] is not None]
         if len(given) != 1:
             raise ValidationError(
-                f"expected exactly one of {', '.join(MOTION_CHANNELS)}, got {given or 'none'}"
+                f"expected exactly one of {', '.join(MOTION_KINDS)}, got {given or 'none'}"
             )
         if force is None and drive is None:
             raise ValidationError("neither force nor drive is given; a record needs one of them")

@@ -1,0 +1,351 @@
+"""Units at the edge: what a file or a user writes, brought to SI.
+
+Everything inside the package is SI: m or rad, N or N m, s, Hz, zero-to-peak amplitudes. Text
+such as ``"um rms"``, ``"kip"``, ``"lbf-in"`` or ``"dB (m/s^2)/N"`` meets this module first.
+A unit says more than a factor: whether a motion is a displacement, a velocity or an
+acceleration, whether it is translation or rotation, and which of the six standard quantities a
+response is. A missing or misfitting unit is an error, never a guess.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dahl_ident.arrays import FloatArray, finite_array
+from dahl_ident.errors import UnitError
+
+if TYPE_CHECKING:
+    import pint
+
+Motion = Literal["translation", "rotation"]
+Quantity = Literal[
+    "receptance",
+    "mobility",
+    "accelerance",
+    "dynamic_stiffness",
+    "mechanical_impedance",
+    "apparent_mass",
+]
+Dimension = tuple[tuple[str, float], ...]
+Marker = Literal["zero to peak", "rms", "peak to peak"]
+
+# SI unit of each kind, for translation and for rotation.
+SI_UNITS: dict[str, tuple[str, str]] = {
+    "displacement": ("m", "rad"),
+    "velocity": ("m/s", "rad/s"),
+    "acceleration": ("m/s^2", "rad/s^2"),
+    "force": ("N", "N m"),
+    "receptance": ("m/N", "rad/(N m)"),
+    "mobility": ("m/(N s)", "rad/(N m s)"),
+    "accelerance": ("m/(N s^2)", "rad/(N m s^2)"),
+    "dynamic_stiffness": ("N/m", "N m/rad"),
+    "mechanical_impedance": ("N s/m", "N m s/rad"),
+    "apparent_mass": ("kg", "kg m^2"),
+    "voltage": ("V", "V"),
+    "current": ("A", "A"),
+    "force_per_voltage": ("N/V", "N m/V"),
+    "force_per_current": ("N/A", "N m/A"),
+    "time": ("s", "s"),
+    "frequency": ("Hz", "Hz"),
+    "angular_frequency": ("rad/s", "rad/s"),
+    "angle": ("rad", "rad"),
+    "number": ("1", "1"),
+}
+MOTIONS: tuple[Motion, ...] = get_args(Motion)
+QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
+MOTION_KINDS = ("displacement", "velocity", "acceleration")
+_MECHANICAL = (*MOTION_KINDS, "force", *QUANTITIES)
+
+_TO_PEAK: dict[Marker, float] = {"zero to peak": 1.0, "rms": np.sqrt(2.0), "peak to peak": 0.5}
+_MARKERS: tuple[tuple[Marker, str], ...] = (
+    ("rms", r"r\.?m\.?s\.?|eff"),
+    ("peak to peak", r"pk-pk|pkpk|p-p|pp|peak[- ]to[- ]peak|peak[- ]peak"),
+    ("zero to peak", r"zero[- ]to[- ]peak|zero[- ]peak|0-pk?|0-peak|zp|pk|peak"),
+)
+_MARKER = re.compile(
+    "(?:^|[\\s_,]|(?<=\\w))(?:" + "|".join(f"({p})" for _, p in _MARKERS) + r")\s*$", re.I
+)
+_DECIBEL = re.compile(r"^\s*dB\b(?:\s*re\.?\s*(?:1\b)?)?\s*", re.I)
+# What laboratories write and pint does not know, or takes for something else.
+_SPELLINGS = {
+    "sec": "s",
+    "HZ": "Hz",
+    "hz": "Hz",
+    "Nm": "N*m",
+    "kNm": "kN*m",
+    "mNm": "mN*m",
+    "Nmm": "N*mm",
+    "Ns": "N*s",
+    "Nms": "N*m*s",
+}
+_TOKEN = re.compile(r"[A-Za-zµμ°%Ω_]\w*|\b1\b|(?<![\d(])\^-?\d(?!\d)|[*/() ]")
+_LONGEST = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """A unit as text, read.
+
+    Parameters
+    ----------
+    text : str
+        As it was written.
+    factor : float
+        SI value of one of it, its marker not yet counted.
+    dimension : tuple of (str, float)
+        Exponents of the SI base units, the radian among them, sorted by name.
+    marker : {"zero to peak", "rms", "peak to peak"} or None
+        How an amplitude in this unit counts; None where the text does not say.
+    decibel : bool
+        Whether numbers in it are decibels relative to it.
+    """
+
+    text: str
+    factor: float
+    dimension: Dimension
+    marker: Marker | None = None
+    decibel: bool = False
+
+    @property
+    def to_peak(self) -> float:
+        """Zero-to-peak amplitude for one of this unit's amplitudes; 1 where it does not say."""
+        return _TO_PEAK[self.marker or "zero to peak"]
+
+
+def parse_unit(text: str) -> Unit:
+    """Read a unit such as ``"um rms"`` or ``"(m/s^2)/N"``.
+
+    Parameters
+    ----------
+    text : str
+        Products by space, ``*``, a dot or a hyphen; powers as ``m/s^2``, ``m/s2`` or ``m/s²``;
+        amplitudes marked ``rms``, ``pp`` or ``pk`` at the end; decibels as ``dB`` followed by
+        the reference unit. ``g`` is the gram; the acceleration is ``g_n``, and ``g`` is read so
+        only where :func:`kind_of` needs an acceleration.
+
+    Returns
+    -------
+    Unit
+
+    Raises
+    ------
+    UnitError
+        If the text is no unit.
+
+    Examples
+    --------
+    >>> unit = parse_unit("um rms")
+    >>> f"{unit.factor:g}", unit.marker
+    ('1e-06', 'rms')
+    """
+    rest = text.strip()
+    decibel = _DECIBEL.match(rest)
+    if decibel:
+        rest = rest[decibel.end() :]
+    marker: Marker | None = None
+    found = _MARKER.search(rest)
+    if found:
+        marker = next(m for (m, _), g in zip(_MARKERS, found.groups(), strict=True) if g)
+        rest = rest[: found.start()]
+    if decibel and not rest:
+        raise UnitError(
+            f"[{text}] does not say what 0 dB is; give the reference, such as [dB re N/m]"
+        )
+    factor, dimension = _root(_normalised(rest, text), text)
+    return Unit(text.strip(), factor, dimension, marker, decibel is not None)
+
+
+def kind_of(unit: Unit, kinds: tuple[str, ...], what: str) -> tuple[str, Motion, float]:
+    """Say which of `kinds` a unit belongs to.
+
+    Parameters
+    ----------
+    unit : Unit
+        What was read.
+    kinds : tuple of str
+        The kinds that are possible here, keys of `SI_UNITS`.
+    what : str
+        What carries the unit, for the message.
+
+    Returns
+    -------
+    kind : str
+    motion : {"translation", "rotation"}
+    factor : float
+        SI value of one of the unit.
+
+    Raises
+    ------
+    UnitError
+        If its dimension is none of theirs.
+
+    Examples
+    --------
+    >>> kind_of(parse_unit("mm/N"), QUANTITIES, "gain")
+    ('receptance', 'translation', 0.001)
+    >>> kind_of(parse_unit("lbf-in"), ("force",), "force")[:2]
+    ('force', 'rotation')
+    """
+    for candidate in _readings(unit):
+        for kind in kinds:
+            for motion, si in zip(MOTIONS, SI_UNITS[kind], strict=True):
+                if _same(candidate.dimension, parse_unit(si).dimension, kind):
+                    return kind, motion, candidate.factor
+    expected = " or ".join(dict.fromkeys(u for kind in kinds for u in SI_UNITS[kind]))
+    raise UnitError(
+        f"{what} has the unit [{unit.text}]; expected a unit of the dimension of {expected}"
+        + (" (pound-force is lbf, kilogram-force kgf)" if "force" in kinds else "")
+    )
+
+
+def factor_to(unit: Unit, si: str, what: str) -> float:
+    """Return the value of one `unit` in the SI unit `si`, angles counting as pure numbers.
+
+    Raises
+    ------
+    UnitError
+        If the dimensions differ.
+
+    Examples
+    --------
+    >>> factor_to(parse_unit("(kN/m)^2"), "(N/m)^2", "variance")
+    1000000.0
+    """
+    wanted = _without_angle(parse_unit(si).dimension)
+    for candidate in _readings(unit):
+        if _without_angle(candidate.dimension) == wanted:
+            return candidate.factor
+    raise UnitError(f"{what} has the unit [{unit.text}]; expected one of the dimension of {si}")
+
+
+def si_unit(kind: str, motion: Motion = "translation") -> str:
+    """Return the SI unit of a kind, as printed beside its numbers.
+
+    Examples
+    --------
+    >>> si_unit("dynamic_stiffness", "rotation")
+    'N m/rad'
+    """
+    return SI_UNITS[kind][motion == "rotation"]
+
+
+def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float, str, Motion]:
+    """Read a number with its unit, such as ``"0.2 N"`` or ``"5 um rms"``.
+
+    Returns
+    -------
+    value : float
+        In SI; an amplitude marked rms or pp becomes zero to peak.
+    kind : str
+    motion : {"translation", "rotation"}
+
+    Raises
+    ------
+    UnitError
+        If the text is no number with a unit of one of `kinds`.
+
+    Examples
+    --------
+    >>> parse_quantity("20 um pp", ("displacement",), "amplitude")
+    (..., 'displacement', 'translation')
+    """
+    found = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)\s*", text)
+    if not found:
+        raise UnitError(f"{what} is {text!r}; expected a number and its unit, such as '0.2 N'")
+    unit = parse_unit(found[2])
+    kind, motion, factor = kind_of(unit, kinds, what)
+    return float(found[1]) * factor * unit.to_peak, kind, motion
+
+
+def from_si(values: ArrayLike, unit: str, kind: str, motion: Motion = "translation") -> FloatArray:
+    """Return SI `values` in another unit, for tables and axes.
+
+    Parameters
+    ----------
+    values : array_like
+        In SI.
+    unit : str
+        The unit to show them in.
+    kind : str
+        What they are, a key of `SI_UNITS`.
+    motion : {"translation", "rotation"}
+
+    Returns
+    -------
+    ndarray of float
+
+    Raises
+    ------
+    UnitError
+        If the unit is of another dimension.
+
+    Examples
+    --------
+    >>> from_si([2e-6], "um", "displacement").round(12)
+    array([2.])
+    """
+    target = parse_unit(unit)
+    _, found, factor = kind_of(target, (kind,), kind)
+    if kind in _MECHANICAL and found != motion:
+        raise UnitError(f"{kind} in {motion} cannot be shown in [{unit}], a unit of {found}")
+    return finite_array(values, kind) / (factor * target.to_peak)
+
+
+def _normalised(text: str, written: str) -> str:
+    """Bring what laboratories write to what pint reads, and nothing dangerous."""
+    superscripts = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+    out = re.sub(r"[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+", lambda m: "^" + m[0].translate(superscripts), text.strip())
+    out = re.sub(r"[·⋅×]", "*", out).replace("**", "^")
+    out = re.sub(r"(?<=[A-Za-z°])[-.](?=[A-Za-z])", "*", out)
+    out = re.sub(r"(?<=[A-Za-z])(-?\d)", r"^\1", out)
+    out = re.sub(r"[A-Za-z]+", lambda m: _SPELLINGS.get(m[0], m[0]), out)
+    if not out or len(out) > _LONGEST or _TOKEN.sub("", out):
+        raise UnitError(
+            f"[{written}] is not a unit; expected one such as [m], [um rms], [kN], [m/s^2] or "
+            "[N m/rad]"
+        )
+    return out
+
+
+@cache
+def _registry() -> pint.UnitRegistry[Any]:
+    import pint
+
+    registry: pint.UnitRegistry[Any] = pint.UnitRegistry()
+    registry.define("g_n = standard_gravity")
+    return registry
+
+
+@cache
+def _root(text: str, written: str) -> tuple[float, Dimension]:
+    """Factor to SI base units and their exponents."""
+    registry = _registry()
+    try:
+        base: Any = registry.Quantity(1.0, registry.parse_units(text)).to_base_units()
+    except Exception as exc:  # pint raises tokeniser, attribute and arithmetic errors alike
+        raise UnitError(f"[{written}] is not a known unit: {exc}") from exc
+    return float(base.magnitude), tuple(sorted((k, float(v)) for k, v in base.unit_items()))
+
+
+def _readings(unit: Unit) -> list[Unit]:
+    """Return the unit, and with g as the standard acceleration, which laboratories write so."""
+    if not re.search(r"\bg\b", unit.text):
+        return [unit]
+    return [unit, parse_unit(re.sub(r"\bg\b", "g_n", unit.text))]
+
+
+def _without_angle(dimension: Dimension) -> Dimension:
+    return tuple(part for part in dimension if part[0] != "radian")
+
+
+def _same(one: Dimension, other: Dimension, kind: str) -> bool:
+    if kind in QUANTITIES or kind == "force":
+        # N m and N m/rad are both written for a rotary stiffness
+        return _without_angle(one) == _without_angle(other)
+    return one == other
