@@ -40,9 +40,9 @@ With `q = 1 - tanh(beta)/beta`, `v = tanh(beta)/beta - sech(beta)^2` and the dec
 Once `q`, `v` and `p` are right, no line loses digits, except where the result itself changes
 sign (`Im h'` at beta = 1.6061, `Re(h + beta h')` at 1.8355). Those three are computed
 
-- below `beta` of 0.4 from the continued fractions of `beta coth(beta)` and of `I_2/I_1`, whose
+- below `beta` of 0.2 from the continued fractions of `beta coth(beta)` and of `I_2/I_1`, whose
   terms are all positive, and from `v = tanh(beta)^2 - q`;
-- above 100, `p` from the asymptotic series of `beta (I_0/I_1 - 1)` in `1/beta`;
+- above 300, `p` from the asymptotic series of `beta (I_0/I_1 - 1)` in `1/beta`;
 - between from the formulas as they stand, with exponentially scaled Bessel functions,
   `I_1/cosh(beta) = (1 + tanh beta) I_1 exp(-beta)`.
 
@@ -58,28 +58,30 @@ parts, which ends by itself because `U` is a polynomial.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
+from scipy import fft, special
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 
 _BLOCK = 8192
 """Amplitudes in one pass: their intermediate arrays stay in the processor's cache."""
 
-_SMALL, _LARGE = 0.4, 100.0
+_BLOCK_NODES = 65536
+"""The same for harmonics: amplitudes times nodes of the quadrature."""
+
+_SMALL, _LARGE = 0.2, 300.0
+"""Below and above these beta the formulas as they stand lose digits."""
+
 _TINY = 1e-200
 """Stands in for a vanishing beta where the limit of a quotient is meant."""
 
-_COTH_DENOMINATORS = (3.0, 5.0, 7.0, 9.0, 11.0, 13.0)
-_BESSEL_DENOMINATORS = (4.0, 6.0, 8.0, 10.0, 12.0, 14.0)
-_BESSEL_ASYMPTOTICS = (
-    1 / 2, 3 / 8, 3 / 8, 63 / 128, 27 / 32, 1899 / 1024, 81 / 16, 543483 / 32768, 32427 / 512,
-)  # fmt: skip
+_COTH_DENOMINATORS = (3.0, 5.0, 7.0, 9.0, 11.0)
+_BESSEL_DENOMINATORS = (4.0, 6.0, 8.0, 10.0, 12.0)
+_BESSEL_ASYMPTOTICS = (1 / 2, 3 / 8, 3 / 8, 63 / 128, 27 / 32, 1899 / 1024)
+_FOUR_BY_PI = 4.0 / math.pi
 
 
 def describing_function(beta: FloatArray) -> ComplexArray:
@@ -101,12 +103,12 @@ def describing_function(beta: FloatArray) -> ComplexArray:
     >>> describing_function(np.array([0.0, 1.0])).round(6)
     array([1.      +0.j      , 0.732508+0.303548j])
     """
-    h = np.empty(beta.shape, np.complex128)
-    for b, out in _blocks(beta, h):
-        tanh, inverse, real, _ = _bessel_part(b)
-        out.real = real
-        out.imag = (4 / math.pi) * _loss(b, tanh, inverse)
-    return h
+    flat, h = beta.reshape(-1), np.empty(beta.size, np.complex128)
+    for block in _blocks(beta.size, _BLOCK):
+        b = flat[block]
+        tanh, inverse, _, h.real[block] = _bessel_part(b)
+        h.imag[block] = _loss(b, _indices(b < _SMALL), inverse, tanh * inverse)
+    return h.reshape(beta.shape)
 
 
 def describing_function_gradient(
@@ -132,92 +134,100 @@ def describing_function_gradient(
     >>> print(f"{by_ln_f_max:.6g} {by_ln_sigma:.6g}")
     2.39365e-09+1.27324e-06j -7.97884e-10+1.27324e-12j
     """
-    h, by_ln_f_max, by_ln_sigma = (np.empty(beta.shape, np.complex128) for _ in range(3))
-    for b, out, out_f_max, out_sigma in _blocks(beta, h, by_ln_f_max, by_ln_sigma):
-        tanh, inverse, real, i1e = _bessel_part(b)
-        decay = _decay(b, tanh, i1e)
-        loss = _loss(b, tanh, inverse)
-        stiffness_loss = _loss_by_ln_sigma(b, tanh, inverse, loss)
-        out.real = real
-        out.imag = (4 / math.pi) * loss
-        out_f_max.real = decay * real
-        out_f_max.imag = (4 / math.pi) * (loss - stiffness_loss)
-        out_sigma.real = (1.0 - decay) * real
-        out_sigma.imag = (4 / math.pi) * stiffness_loss
+    # one allocation, because three smaller ones may cost fresh pages at every call
+    flat, result = beta.reshape(-1), np.empty((3, beta.size), np.complex128)
+    real, imag = result.real, result.imag
+    for block in _blocks(beta.size, _BLOCK):
+        b = flat[block]
+        small = _indices(b < _SMALL)
+        tanh, inverse, i1e, stiffness = _bessel_part(b)
+        softening = _decay(b, small, inverse, tanh, i1e) * stiffness
+        real[0, block], real[1, block] = stiffness, softening
+        real[2, block] = stiffness - softening
+        ratio = tanh * inverse
+        loss = _loss(b, small, inverse, ratio)
+        loss_by_ln_sigma = _loss_by_ln_sigma(small, inverse, tanh, ratio, loss)
+        imag[0, block], imag[2, block] = loss, loss_by_ln_sigma
+        imag[1, block] = loss - loss_by_ln_sigma
+    h, by_ln_f_max, by_ln_sigma = result.reshape(3, *beta.shape)
     return h, by_ln_f_max, by_ln_sigma
 
 
-def _blocks(beta: FloatArray, *outputs: ComplexArray) -> Iterator[tuple[NDArray[Any], ...]]:
-    """Yield flat views of `beta` and of each contiguous output, block by block."""
-    flat = beta.reshape(-1), *(out.reshape(-1) for out in outputs)
-    for start in range(0, beta.size, _BLOCK):
-        yield tuple(array[start : start + _BLOCK] for array in flat)
+def _blocks(size: int, length: int) -> list[slice]:
+    return [slice(start, start + length) for start in range(0, size, length)]
+
+
+def _indices(condition: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the indices where `condition` holds: quicker to work with than a mask."""
+    return condition.nonzero()[0]
 
 
 def _bessel_part(b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return tanh(beta), 1/beta, Re h and I_1 exp(-beta)."""
+    """Return tanh(beta), 1/beta, I_1 exp(-beta) and Re h."""
     positive = np.maximum(b, _TINY)
     tanh = np.tanh(b)
     inverse = 1.0 / positive
     i1e = special.i1e(positive)
-    return tanh, inverse, 2.0 * (1.0 + tanh) * (i1e * inverse), i1e
+    return tanh, inverse, i1e, 2.0 * (1.0 + tanh) * (i1e * inverse)
 
 
-def _loss(b: FloatArray, tanh: FloatArray, inverse: FloatArray) -> FloatArray:
-    """Return q/beta = (1 - tanh(beta)/beta)/beta."""
-    loss = (1.0 - tanh * inverse) * inverse
-    small = b < _SMALL
-    if small.any():
-        s = np.minimum(b, _SMALL)
+def _loss(
+    b: FloatArray, small: NDArray[np.intp], inverse: FloatArray, ratio: FloatArray
+) -> FloatArray:
+    """Return Im h = (4/pi) q/beta, given 1/beta and tanh(beta)/beta."""
+    loss = _FOUR_BY_PI * (1.0 - ratio) * inverse
+    if small.size:
+        s = b[small]
         t = s * s
         # beta coth(beta) - 1 = t/f, hence q = t/(t + f)
-        np.copyto(loss, s / (t + _continued_fraction(t, _COTH_DENOMINATORS)), where=small)
+        loss[small] = _FOUR_BY_PI * s / (t + _continued_fraction(t, _COTH_DENOMINATORS))
     return loss
 
 
 def _loss_by_ln_sigma(
-    b: FloatArray, tanh: FloatArray, inverse: FloatArray, loss: FloatArray
+    small: NDArray[np.intp],
+    inverse: FloatArray,
+    tanh: FloatArray,
+    ratio: FloatArray,
+    loss: FloatArray,
 ) -> FloatArray:
-    """Return v/beta = (tanh(beta)/beta - sech(beta)^2)/beta."""
-    ratio = tanh * inverse
-    result = (ratio - (1.0 - tanh) * (1.0 + tanh)) * inverse
-    small = b < _SMALL
-    if small.any():
-        np.copyto(result, tanh * ratio - loss, where=small)
+    """Return Im(h + beta h') = (4/pi) v/beta."""
+    result = _FOUR_BY_PI * (ratio - (1.0 - tanh) * (1.0 + tanh)) * inverse
+    if small.size:
+        result[small] = _FOUR_BY_PI * tanh[small] * ratio[small] - loss[small]
     return result
 
 
-def _decay(b: FloatArray, tanh: FloatArray, i1e: FloatArray) -> FloatArray:
+def _decay(
+    b: FloatArray, small: NDArray[np.intp], inverse: FloatArray, tanh: FloatArray, i1e: FloatArray
+) -> FloatArray:
     """Return p = -d ln(Re h) / d ln(beta)."""
-    decay = 2.0 - b * (special.i0e(np.maximum(b, _TINY)) / i1e - tanh)
-    small, large = b < _SMALL, b > _LARGE
-    if small.any():
-        s = np.minimum(b, _SMALL)
+    decay = 2.0 - b * (special.i0e(b) / i1e - tanh)
+    if small.size:
+        s = b[small]
         bessel_ratio = s / _continued_fraction(s * s, _BESSEL_DENOMINATORS)
-        np.copyto(decay, s * (tanh - bessel_ratio), where=small)
-    if large.any():
-        u = 1.0 / np.maximum(b, _LARGE)
-        np.copyto(decay, 2.0 - _polynomial(u, _BESSEL_ASYMPTOTICS), where=large)
+        decay[small] = s * (tanh[small] - bessel_ratio)
+    large = _indices(b > _LARGE)
+    if large.size:
+        decay[large] = 2.0 - _polynomial(inverse[large], _BESSEL_ASYMPTOTICS)
     return decay
 
 
 def _continued_fraction(t: FloatArray, denominators: tuple[float, ...]) -> FloatArray:
     """Return d_0 + t/(d_1 + t/(d_2 + ...))."""
-    value = t / denominators[-1]
-    for d in denominators[-2:0:-1]:
-        value += d
-        np.divide(t, value, out=value)
-    value += denominators[0]
+    *others, last = denominators
+    value = others.pop() + t / last
+    for d in reversed(others):
+        value = d + t / value
     return value
 
 
 def _polynomial(u: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:
     """Return c_0 + c_1 u + c_2 u^2 + ..."""
-    value = coefficients[-1] * u
-    for c in coefficients[-2:0:-1]:
-        value += c
-        value *= u
-    value += coefficients[0]
+    *others, last = coefficients
+    value = others.pop() + u * last
+    for c in reversed(others):
+        value = c + u * value
     return value
 
 
@@ -265,18 +275,24 @@ def harmonic_gradient(beta: FloatArray, k: int) -> tuple[ComplexArray, ComplexAr
     if k == 1:
         h, _, by_ln_sigma = describing_function_gradient(beta)
         return beta * h, beta * by_ln_sigma
-    c, slope = np.zeros(beta.shape, np.complex128), np.zeros(beta.shape, np.complex128)
+    flat, c, slope = beta.reshape(-1), *np.zeros((2, beta.size), np.complex128)
     if k % 2:
-        for b, out_c, out_slope in _blocks(beta, c, slope):
+        for block in _blocks(beta.size, 1 + _BLOCK_NODES // _node_count(k)):
+            b = flat[block]
             large = b > _harmonic_limit(k)
-            for part, compute in ((~large, _quadrature), (large, _asymptotics)):
-                if part.any():
-                    out_c[part], out_slope[part] = compute(b[part], k)
-    return c, slope
+            for part, compute in ((_indices(~large), _quadrature), (_indices(large), _asymptotics)):
+                if part.size:
+                    c[block][part], slope[block][part] = compute(b[part], k)
+    return c.reshape(beta.shape), slope.reshape(beta.shape)
 
 
 def _harmonic_limit(k: int) -> float:
     return max(75.0, k * k / 3.0)
+
+
+def _node_count(k: int) -> int:
+    """Return the nodes in a quarter period that resolve exp(beta cos) up to the limit."""
+    return int(math.sqrt(20.0 * _harmonic_limit(k))) + 8
 
 
 @lru_cache(maxsize=64)
@@ -286,12 +302,11 @@ def _chebyshev_rule(k: int) -> tuple[FloatArray, FloatArray]:
     With f as a sum of cos(m angle), even m, over equally spaced angles (Fejer), each term gives
     Int_0^pi sin(k angle) cos(m angle) = 2 k / (k^2 - m^2).
     """
-    half = int(math.sqrt(20.0 * _harmonic_limit(k))) + 8
-    angle = (np.arange(half) + 0.5) * (math.pi / (2 * half))
+    half = _node_count(k)
+    angle = (math.pi / (2 * half)) * np.arange(0.5, half)
     m = np.arange(0, 2 * half, 2)
     moments = 2.0 * k / (k * k - m * m)
-    moments[0] /= 2.0
-    return angle, (4.0 / (math.pi * half)) * (np.cos(np.outer(angle, m)) @ moments)
+    return angle, (2.0 / (math.pi * half)) * fft.dct(moments, type=3)
 
 
 def _quadrature(b: FloatArray, k: int) -> tuple[ComplexArray, ComplexArray]:
@@ -327,8 +342,9 @@ def _asymptotic_sum(
     b: FloatArray, power: float, ratios: list[float]
 ) -> tuple[FloatArray, FloatArray]:
     """Return S = beta^-power (1 + r_1/beta (1 + r_2/beta (1 + ...))) and beta dS/dbeta."""
-    term = np.power(b, -power)
-    total, slope = term.copy(), -power * term
+    term: FloatArray = np.power(b, -power)
+    total: FloatArray = term.copy()
+    slope: FloatArray = -power * term
     for m, ratio in enumerate(ratios, start=1):
         term = term * (ratio / b)
         total += term
