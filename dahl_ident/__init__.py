@@ -10,16 +10,18 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dahl_ident.elements import Dahl, Damper, Mass, Model, Spring
+    from dahl_ident.elements import Dahl, Damper, LinearSystem, Mass, Model, Spring
+    from dahl_ident.steady_state import response
 
 __version__ = "0.1.0"
 
 _ROOMS = {
-    "dahl_ident.elements": ("Dahl", "Damper", "Mass", "Model", "Spring"),
+    "dahl_ident.elements": ("Dahl", "Damper", "LinearSystem", "Mass", "Model", "Spring"),
+    "dahl_ident.steady_state": ("response",),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["Dahl", "Damper", "Mass", "Model", "Spring"]
+__all__ = ["Dahl", "Damper", "LinearSystem", "Mass", "Model", "Spring", "response"]
 
 
 def __getattr__(name: str) -> Any:

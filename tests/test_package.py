@@ -16,9 +16,11 @@ ROOT = Path(__file__).parents[1]
 PUBLIC_NAMES = [
     "Dahl",
     "Damper",
+    "LinearSystem",
     "Mass",
     "Model",
     "Spring",
+    "response",
 ]
 
 

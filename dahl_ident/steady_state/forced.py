@@ -119,7 +119,7 @@ def response(
     --------
     The static gain of Fig. 7 jumps where the drive overcomes friction:
 
-    >>> from dahl_ident import Dahl, Damper, Mass, Spring
+    >>> from dahl_ident import Dahl, Damper, Mass, Spring, response
     >>> plant = Dahl(f_max=0.1, sigma=30) + Mass(0.3) + Damper(0.24) + Spring(0.3)
     >>> abs(response(plant, 0.0, [0.1, 0.2]).receptance).round(4).tolist()
     [0.0515, 2.36]

@@ -1,0 +1,273 @@
+"""Any linear system from python-control as an element: fixed, or with named free parameters.
+
+A structure's linear part is often known as a transfer function, a state-space model or measured
+frequency response data (FRD). Its response R is one of the six standard quantities, which has to
+be said and is never guessed. FRD is interpolated by a cubic spline of Z, which is exact for one
+mode, where a spline of the receptance overshoots its peak; and only between its first and last
+frequency.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.quantities import converted
+from dahl_ident.elements.element import Element, StiffnessGradient, prefixed
+from dahl_ident.elements.parameter import Parameter
+from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.units import QUANTITIES, Quantity
+
+_FORCE_OVER_MOTION = ("dynamic_stiffness", "mechanical_impedance", "apparent_mass")
+_STEP = 1e-3
+_STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -2.0 / 3.0), (1.0, 2.0 / 3.0), (2.0, -1.0 / 12.0))
+"""Central difference of fourth order: places and weights."""
+
+
+class LinearSystem(Element):
+    """Linear system in parallel with the other elements: Z(omega) from a python-control object.
+
+    Parameters
+    ----------
+    system : control.TransferFunction, control.StateSpace, control.FRD or callable
+        One input and one output; continuous, or discrete with a known sampling time. A
+        callable takes the `parameters` by keyword and returns such a system.
+    quantity : str
+        What the system's response is: "receptance" (displacement over force), "mobility",
+        "accelerance", "dynamic_stiffness" (force over displacement), "mechanical_impedance" or
+        "apparent_mass".
+    parameters : mapping of str to float, None or Parameter, optional
+        Arguments of a callable `system`. A number fixes the argument; None leaves it free; a
+        Parameter gives unit, bounds and search coordinate as well.
+    name : str, optional
+        Prefix of the parameters' names.
+
+    Raises
+    ------
+    ValidationError
+        If `system` is none of these, has several inputs or outputs or no sampling time,
+        `quantity` is unknown, or `parameters` and a callable do not go together.
+
+    Notes
+    -----
+    Evaluating outside the frequencies of an FRD, above half a sampling rate, or where the
+    response determines no stiffness, raises ValidationError. Derivatives by the arguments
+    of a callable are central differences of fourth order with steps of 1e-3 of the argument,
+    good to about 1e-12 abs(Z/p) where Z is smooth; an argument of exactly 0 has no such step.
+
+    Examples
+    --------
+    >>> import control
+    >>> from dahl_ident import LinearSystem
+    >>> plate = LinearSystem(control.tf([1], [0.3, 0.24, 0.3]), quantity="receptance")
+    >>> complex(plate.dynamic_stiffness(1e-3, 10.0).round(10))
+    (-29.7+2.4j)
+    >>> def mode(mass, stiffness):
+    ...     return control.tf([1], [mass, 0, stiffness])
+    >>> LinearSystem(mode, quantity="receptance", parameters={"mass": 2, "stiffness": None})
+    LinearSystem(receptance of mode, mass=2, stiffness=free)
+    """
+
+    def __init__(
+        self,
+        system: Any,
+        *,
+        quantity: Quantity,
+        parameters: Mapping[str, float | Parameter | None] | None = None,
+        name: str | None = None,
+    ) -> None:
+        if quantity not in QUANTITIES:
+            known = ", ".join(repr(q) for q in QUANTITIES)
+            raise ValidationError(f"quantity is {quantity!r}; expected one of {known}")
+        given = dict(parameters or {})
+        is_function = callable(system) and not _is_system(system)
+        if is_function != bool(given):
+            raise ValidationError(
+                f"system is a {type(system).__name__} with the parameters {list(given)}; expected "
+                "a python-control system without parameters, or a function of all of them"
+            )
+        self._name = name
+        self._system = system
+        self._quantity = quantity
+        self._labels = tuple(given)
+        self._parameters = tuple(_parameter(prefixed(name, k), v) for k, v in given.items())
+        self._last: tuple[FloatArray, ComplexArray] | None = None
+        if not is_function:
+            _check(system)
+
+    def stiffness(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> ComplexArray:
+        """Return Z(omega); the amplitude does not matter, and a sine answers no harmonic."""
+        Z = self._for_each_vector(values, omega, harmonic, self._curve, rows=1)[0]
+        return np.asarray(Z + 0.0 * amplitude)
+
+    def stiffness_gradient(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> StiffnessGradient:
+        """Return Z(omega) with its derivatives by the arguments of a callable system."""
+        rows = 1 + len(self._labels)
+        table = self._for_each_vector(values, omega, harmonic, self._curve_and_slopes, rows)
+        Z, *slopes = (row + 0.0 * amplitude for row in table)
+        return StiffnessGradient(Z, np.zeros_like(Z), tuple(slopes))
+
+    def force(
+        self,
+        displacement: ArrayLike,
+        *,
+        velocity: ArrayLike | None = None,
+        acceleration: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Refuse: a response over frequency gives no force for a displacement history."""
+        raise ModelError(
+            f"{self!r} is known in the frequency domain alone and has no force over time; build "
+            "the model from Mass, Damper and Spring to simulate records"
+        )
+
+    def _for_each_vector(
+        self,
+        values: Sequence[FloatArray],
+        omega: FloatArray,
+        harmonic: int,
+        work: Callable[[tuple[float, ...], FloatArray], ComplexArray],
+        rows: int,
+    ) -> ComplexArray:
+        """Return what `work` gives for every parameter vector, shape (rows, *broadcast)."""
+        batch = np.broadcast_shapes(*(np.shape(v) for v in values))
+        shape = np.broadcast_shapes(batch, np.shape(omega))
+        result = np.zeros((rows, *shape), dtype=np.complex128)
+        if harmonic != 1:
+            return result
+        vectors = np.stack([np.broadcast_to(v, batch).ravel() for v in (*values, np.zeros(batch))])
+        which = np.broadcast_to(np.arange(vectors.shape[1]).reshape(batch), shape)
+        frequencies = np.broadcast_to(omega, shape)
+        for i, vector in enumerate(vectors[:-1].T.tolist()):
+            result[:, which == i] = work(tuple(vector), frequencies[which == i])
+        return result
+
+    def _curve(self, vector: tuple[float, ...], omega: FloatArray) -> ComplexArray:
+        """Return Z at angular frequencies, shape (n,); a fixed system remembers the last."""
+        if self._labels:
+            system = self._system(**dict(zip(self._labels, vector, strict=True)))
+            _check(system)
+            return dynamic_stiffness(system, self._quantity, omega)
+        if self._last is None or not np.array_equal(self._last[0], omega):
+            self._last = omega.copy(), dynamic_stiffness(self._system, self._quantity, omega)
+        return self._last[1]
+
+    def _curve_and_slopes(self, vector: tuple[float, ...], omega: FloatArray) -> ComplexArray:
+        rows = [self._curve(vector, omega)]
+        for i, (label, value) in enumerate(zip(self._labels, vector, strict=True)):
+            if value == 0.0:
+                raise ModelError(
+                    f"{label} is exactly 0, which gives its derivative no step; start it from a "
+                    "small number, or write the function with an offset"
+                )
+            step = _STEP * value
+            terms = [
+                weight / step * self._curve(_moved(vector, i, place * step), omega)
+                for place, weight in _STENCIL
+            ]
+            rows.append(np.sum(terms, axis=0))
+        return np.stack(rows)
+
+    def __repr__(self) -> str:
+        what = getattr(self._system, "__name__", type(self._system).__name__)
+        _, _, rest = super().__repr__().partition("(")
+        separator = "" if rest == ")" else ", "
+        return f"LinearSystem({self._quantity} of {what}{separator}{rest}"
+
+
+def dynamic_stiffness(system: Any, quantity: Quantity, omega: FloatArray) -> ComplexArray:
+    """Return Z at angular frequencies, shape (n,), from a system whose response is `quantity`."""
+    control = importlib.import_module("control")
+    if not isinstance(system, control.FRD):
+        return _to_stiffness(_evaluate(system, omega), quantity, omega)
+    from scipy.interpolate import make_interp_spline
+
+    known = np.asarray(system.omega, dtype=np.float64)
+    nodes = known[np.argsort(known)]
+    if np.any(np.diff(nodes) == 0.0):
+        raise ValidationError("the FRD has a frequency twice; average its values there")
+    outside = (omega < nodes[0] * (1.0 - 1e-12)) | (omega > nodes[-1] * (1.0 + 1e-12))
+    if outside.any():
+        raise ValidationError(
+            f"the FRD reaches from {nodes[0]:g} to {nodes[-1]:g} rad/s and was asked for "
+            f"{omega[outside][0]:g} rad/s; leave that frequency out, or give a wider FRD"
+        )
+    R = np.ravel(system(1j * known))[np.argsort(known)]
+    Z = _to_stiffness(R, quantity, nodes)
+    return np.asarray(make_interp_spline(nodes, Z, k=min(3, len(nodes) - 1))(omega))
+
+
+def _evaluate(system: Any, omega: FloatArray) -> ComplexArray:
+    """Return the response of a TransferFunction or StateSpace; not finite at a pole."""
+    place = 1j * omega
+    if system.isdtime(strict=True):
+        limit = np.pi / system.dt
+        if np.any(omega > limit):
+            raise ValidationError(
+                f"the discrete system ends at half its sampling rate, {limit:g} rad/s, and was "
+                f"asked for {np.max(omega):g} rad/s"
+            )
+        place = np.exp(place * system.dt)
+    with np.errstate(all="ignore"):
+        return np.ravel(system(place, warn_infinite=False))
+
+
+def _to_stiffness(R: ComplexArray, quantity: Quantity, omega: FloatArray) -> ComplexArray:
+    """Return Z from the system's response, 0 at a pole of X/F, or say where there is none."""
+    pole = np.isinf(R)
+    bad = np.isnan(R) & ~pole | (pole & (quantity in _FORCE_OVER_MOTION))
+    if bad.any():
+        raise ValidationError(
+            f"the {quantity} is {R[bad][0]:g} at {omega[bad][0]:g} rad/s; expected a finite "
+            "number: check the system, or leave that frequency out"
+        )
+    Z, _ = converted(np.where(pole, 1.0, R), omega, quantity, "dynamic_stiffness")
+    return np.where(pole, 0.0, Z)
+
+
+def _check(system: Any) -> None:
+    """Refuse what is no python-control system with one input, one output and a known time."""
+    if not _is_system(system):
+        raise ValidationError(
+            f"system is a {type(system).__name__}; expected a python-control TransferFunction, "
+            "StateSpace or FRD, or a function that returns one"
+        )
+    if (system.ninputs, system.noutputs) != (1, 1):
+        raise ValidationError(
+            f"system has {system.ninputs} inputs and {system.noutputs} outputs; expected one of "
+            "each, such as system[0, 0]"
+        )
+    if system.dt is True:
+        raise ValidationError("system is discrete without a sampling time; set its dt, s")
+
+
+def _is_system(system: Any) -> bool:
+    control = importlib.import_module("control")
+    return isinstance(system, (control.TransferFunction, control.StateSpace, control.FRD))
+
+
+def _parameter(name: str, given: float | Parameter | None) -> Parameter:
+    if isinstance(given, Parameter):
+        return replace(given, name=name)
+    return Parameter(name, "", "argument of a linear system", given)
+
+
+def _moved(vector: tuple[float, ...], index: int, by: float) -> tuple[float, ...]:
+    return (*vector[:index], vector[index] + by, *vector[index + 1 :])
