@@ -20,7 +20,7 @@ amplitude at all.
 
 from __future__ import annotations
 
-# from dahl_ident.steady_state.forced import SteadyResponse, response
+from dahl_ident.steady_state.forced import SteadyResponse, response
 from dahl_ident.steady_state.implicit import ReceptanceGradient, receptance_gradient, solve
 
 __all__ = ["ReceptanceGradient", "SteadyResponse", "receptance_gradient", "response", "solve"]
