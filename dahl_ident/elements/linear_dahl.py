@@ -168,7 +168,9 @@ def _bessel_part(b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, Flo
     tanh = np.tanh(b)
     inverse = 1.0 / positive
     i1e = special.i1e(positive)
-    return tanh, inverse, i1e, 2.0 * (1.0 + tanh) * (i1e * inverse)
+    stiffness = 2.0 * (1.0 + tanh) * (i1e * inverse)
+    # rounding must not lift it over its value at rest
+    return tanh, inverse, i1e, np.minimum(stiffness, 1.0)
 
 
 def _loss(
