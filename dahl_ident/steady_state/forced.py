@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import (
     ComplexArray,
@@ -19,6 +20,8 @@ from dahl_ident.elements.element import Element
 from dahl_ident.errors import MultipleSolutionsWarning
 from dahl_ident.steady_state.plant import BoolArray, IntArray, flatten
 from dahl_ident.steady_state.roots import all_roots as find_all
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -143,17 +146,20 @@ def response(
     found = np.isfinite(amplitude)
     Z = plant.stiffness(values, np.where(found, amplitude, 0.0), omega)
     displacement = amplitude * np.exp(-1j * np.angle(Z))
-    for array in (amplitude, displacement, found, count):
-        array.flags.writeable = False
     return SteadyResponse(
-        frequency_hz=np.broadcast_to(f, amplitude.shape)[()],
-        drive=np.broadcast_to(u0, amplitude.shape)[()],
-        amplitude=amplitude[()],
-        displacement=displacement[()],
-        found=found[()],
-        number_of_solutions=count[()],
+        frequency_hz=_read_only(f, amplitude.shape),
+        drive=_read_only(u0, amplitude.shape),
+        amplitude=_read_only(amplitude, amplitude.shape),
+        displacement=_read_only(displacement, amplitude.shape),
+        found=_read_only(found, amplitude.shape),
+        number_of_solutions=_read_only(count, shape),
         message=message,
     )
+
+
+def _read_only(array: NDArray[_Scalar], shape: tuple[int, ...]) -> NDArray[_Scalar]:
+    """Return a view that cannot be written, or a scalar."""
+    return np.broadcast_to(array, shape)[()]
 
 
 def _message(count: IntArray, frequency_hz: FloatArray, drive: FloatArray) -> str:
@@ -161,8 +167,8 @@ def _message(count: IntArray, frequency_hz: FloatArray, drive: FloatArray) -> st
     verdicts = (
         (
             count == 0,
-            "no steady amplitude (an undamped resonance, driven with at least 4/pi times the "
-            "friction limit; add damping or lower the drive)",
+            "no steady amplitude (an undamped resonance, or rest without a spring, driven with at "
+            "least 4/pi times the friction limit; add damping or a spring, or lower the drive)",
         ),
         (
             count > 1,

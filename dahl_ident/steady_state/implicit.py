@@ -76,10 +76,10 @@ def receptance_gradient(
     found = np.isfinite(amplitude)
     A = np.where(found, amplitude, 1.0)
     Z, by_amplitude, by_parameter = model.stiffness_gradient(values, A, omega)
-    X = np.asarray(1.0 / np.where(found, Z, np.nan), dtype=np.complex128)
-    turn = A * by_amplitude * X
+    X = np.where(found, 1.0 / Z, np.nan)
+    turn = A * by_amplitude / Z
     share = turn / (1.0 + turn.real)
-    relative = [d * X for d in by_parameter]
+    relative = [d / Z for d in by_parameter]
     return ReceptanceGradient(
         X,
         amplitude,

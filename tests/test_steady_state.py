@@ -1,0 +1,404 @@
+"""The steady response: accuracy, uniqueness, several amplitudes, none, and derivatives."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+from scipy.special import i1e
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import Dahl, Damper, Element, Mass, Model, Spring
+from dahl_ident.errors import ModelError, MultipleSolutionsWarning, ValidationError
+from dahl_ident.steady_state import SteadyResponse, receptance_gradient, response, solve
+
+FIG_7 = Dahl(f_max=0.1, sigma=30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
+WIDE = np.geomspace(1e-12, 1e12, 97)[:, None]
+
+
+def worst_residual(plant: Model, result: SteadyResponse) -> float:
+    """Return abs(A abs(Z)/u_0 - 1) over its bound max(1, kappa/4), the largest one found."""
+    A, omega = result.amplitude, 2.0 * np.pi * result.frequency_hz
+    found = np.isfinite(A)
+    friction = Model(*(e for e in plant.elements if isinstance(e, Dahl)))
+    N = friction.dynamic_stiffness(np.where(found, A, 1.0))
+    Z = plant.dynamic_stiffness(np.where(found, A, 1.0), omega)
+    kappa = (np.abs(Z - N) + np.abs(N)) / np.abs(Z)
+    residual = np.abs(A * np.abs(Z) / result.drive - 1.0) / np.maximum(1.0, kappa / 4.0)
+    return float(np.max(residual[found]))
+
+
+def some_plants(count: int, alphas: Sequence[float]) -> list[Model]:
+    rng = np.random.default_rng(7)
+    plants = []
+    for i in range(count):
+        f_max, sigma, mass, damping, stiffness = 10.0 ** rng.uniform(-3.0, 3.0, 5)
+        plants.append(
+            Dahl(f_max, sigma, alphas[i % len(alphas)])
+            + Mass(mass)
+            + Damper(damping * rng.choice([0.0, 1e-6, 1.0]))
+            + Spring(stiffness * rng.choice([0.0, 1.0]))
+        )
+    return plants
+
+
+@pytest.mark.parametrize("plant", some_plants(30, [1.0]), ids=repr)
+def test_drives_over_24_decades(plant: Model) -> None:
+    f_max = float(plant.parameters[0].value or 0.0)
+    result = response(plant, np.geomspace(1e-3, 1e3, 61), f_max * WIDE)
+    assert result.amplitude.shape == (97, 61)
+    assert result.found.all()
+    assert result.message == ""
+    assert worst_residual(plant, result) < 1e-12
+
+
+@pytest.mark.parametrize("plant", some_plants(8, [0.25, 0.7, 2.0, 4.0]), ids=repr)
+def test_drives_over_24_decades_with_other_exponents(plant: Model) -> None:
+    f_max = float(plant.parameters[0].value or 0.0)
+    result = response(plant, np.geomspace(1e-2, 1e2, 9), f_max * WIDE[::4])
+    assert result.found.all()
+    assert worst_residual(plant, result) < 1e-12
+
+
+def test_several_friction_elements_side_by_side() -> None:
+    plant = (
+        Dahl(1.0, 10.0, name="a")
+        + Dahl(0.01, 1e4, name="b")
+        + Dahl(5.0, 2.0, 2.0, name="c")
+        + Mass(0.3)
+        + Spring(0.01)
+    )
+    result = response(plant, [0.0, 0.1, 0.9, 25.0], WIDE)
+    assert result.found.all()
+    assert worst_residual(plant, result) < 1e-12
+
+
+@pytest.mark.parametrize("exponent", [(30, 30), (30, -30), (-30, 30), (-30, -30)])
+def test_extreme_units_pass_without_warning(exponent: tuple[int, int]) -> None:
+    f_max, sigma = 10.0 ** exponent[0], 10.0 ** exponent[1]
+    plant = Dahl(f_max, sigma) + Mass(sigma) + Spring(0.1 * sigma)
+    result = response(plant, [0.0, 0.1, 1.0], f_max * WIDE)
+    assert result.found.all()
+    assert worst_residual(plant, result) < 1e-12
+
+
+def closed_form(A: float, omega: float) -> float:
+    """Return A abs(Z) of Fig. 7 from scipy's Bessel function."""
+    beta = 30.0 * A / 0.1
+    tanh = np.tanh(beta)
+    real = 2.0 * i1e(beta) * (1.0 + tanh) / beta
+    N = 30.0 * complex(real, 4.0 / np.pi * (1.0 - tanh / beta) / beta)
+    return float(A * abs(0.3 - 0.3 * omega**2 + 0.24j * omega + N))
+
+
+def test_amplitude_is_that_of_brentq_on_the_closed_form() -> None:
+    frequency = np.array([0.01, 0.16, 0.5, 1.58, 3.0])
+    drive = np.array([1e-3, 0.05, 0.1, 0.13, 0.2, 5.0])
+    ours = response(FIG_7, frequency, drive[:, None]).amplitude
+    for i, u0 in enumerate(drive):
+        for j, omega in enumerate(2.0 * np.pi * frequency):
+            peer = brentq(lambda A, w=omega, u=u0: closed_form(A, w) - u, 1e-7, 1e4, rtol=1e-14)
+            assert ours[i, j] == pytest.approx(peer, rel=1e-10)
+
+
+def test_few_and_many_points_agree() -> None:
+    frequency = np.geomspace(0.01, 30.0, 400)
+    drive = np.geomspace(1e-4, 10.0, 51)[:, None]
+    many = response(FIG_7, frequency, drive).amplitude
+    few = np.stack([response(FIG_7, frequency, u0).amplitude for u0 in drive[::10]])
+    np.testing.assert_allclose(many[::10], few, rtol=1e-12)
+
+
+def test_small_and_large_drives_see_two_linear_systems() -> None:
+    omega = 2.0 * np.pi * np.array([0.0, 0.3, 1.0, 4.0])
+    base = 0.3 - 0.3 * omega**2 + 0.24j * omega
+    stuck = response(FIG_7, omega / (2.0 * np.pi), 1e-13)
+    np.testing.assert_allclose(stuck.receptance, 1.0 / (base + 30.0), rtol=1e-9)
+    np.testing.assert_allclose(stuck.phase, np.angle(1.0 / (base + 30.0)), atol=1e-9)
+    slipping = response(FIG_7, omega / (2.0 * np.pi), 1e9)
+    np.testing.assert_allclose(slipping.dynamic_stiffness, base, rtol=1e-5)
+
+
+# uniqueness
+
+
+@st.composite
+def passive_parts(draw: st.DrawFn) -> ComplexArray:
+    """Return linear parts L/sigma with Im L >= 0, from microscopic to huge."""
+    size = st.floats(-8.0, 8.0)
+    angle = st.one_of(st.floats(0.0, np.pi), st.sampled_from([0.0, np.pi / 2.0, np.pi]))
+    parts = draw(st.lists(st.tuples(size, angle), min_size=25, max_size=25))
+    return np.array([10.0**s * complex(np.cos(a), abs(np.sin(a))) for s, a in parts])
+
+
+@given(passive_parts(), st.sampled_from([0.25, 0.5, 1.0, 1.0, 1.7, 4.0]), st.booleans())
+def test_passive_plants_have_one_amplitude(
+    linear: ComplexArray, alpha: float, several: bool
+) -> None:
+    friction: Element = Dahl(1.0, 1.0, alpha, name="a")
+    if several:
+        friction = friction + Dahl(10.0, 0.3, 1.0, name="b") + Dahl(0.01, 0.7, 2.0, name="c")
+    A = np.geomspace(1e-6, 1e6, 241)
+    force = A * friction.dynamic_stiffness(A)
+    inertial = A * linear[:, None]
+    drive = np.abs(inertial + force)
+    rounding = 1e-13 * (np.abs(inertial) + np.abs(force))
+    assert np.all(np.diff(drive) > -rounding[:, 1:])
+
+
+def test_an_active_plant_breaks_that_property() -> None:
+    A = np.geomspace(1e-6, 1e6, 241)
+    force = A * Dahl(1.0, 1.0).dynamic_stiffness(A)
+    assert np.any(np.diff(np.abs(A * (-0.5 - 0.3j) + force)) < -1e-3)
+
+
+# several amplitudes
+
+
+ACTIVE = Dahl(0.1, 30.0) + Mass(0.3) + Damper(-0.24) + Spring(0.3)
+
+
+def brute_force(plant: Element, frequency_hz: float, drive: float) -> FloatArray:
+    """Return where A abs(Z) crosses the drive on a very fine grid."""
+    A = np.geomspace(1e-7, 1e4, 2_000_001)
+    above = A * np.abs(plant.dynamic_stiffness(A, 2.0 * np.pi * frequency_hz)) > drive
+    cell = np.flatnonzero(above[1:] != above[:-1])
+    return np.sqrt(A[cell] * A[cell + 1])
+
+
+@pytest.mark.parametrize("damping", [-0.01, -0.24, -2.0])
+def test_all_amplitudes_of_an_active_plant(damping: float) -> None:
+    plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(damping) + Spring(0.3)
+    frequency = np.array([0.1, 0.4, 0.8, 1.2, 1.5, 1.59, 2.0])
+    drive = np.geomspace(1e-3, 0.5, 12)[:, None]
+    result = response(plant, frequency, drive, all_roots=True)
+    assert worst_residual(plant, result) < 1e-12
+    several = np.argwhere(result.number_of_solutions > 1)
+    for i, j in [*several[:4], (0, 0), (11, 6)]:
+        roots = result.amplitude[i, j]
+        expected = brute_force(plant, frequency[j], float(drive[i, 0]))
+        np.testing.assert_allclose(roots[np.isfinite(roots)], expected, rtol=2e-5)
+        assert len(expected) == result.number_of_solutions[i, j]
+
+
+def test_the_default_warns_and_returns_the_smallest() -> None:
+    frequency, drive = np.linspace(0.05, 3.0, 60), np.geomspace(1e-3, 1.0, 20)[:, None]
+    every = response(ACTIVE, frequency, drive, all_roots=True)
+    count = int(np.sum(every.number_of_solutions > 1))
+    assert count > 3
+    assert every.amplitude.shape == (20, 60, int(every.number_of_solutions.max()))
+    text = rf"{count} of 1200 points: several steady amplitudes .* the smallest is returned"
+    with pytest.warns(MultipleSolutionsWarning, match=text):
+        one = response(ACTIVE, frequency, drive)
+    np.testing.assert_array_equal(one.amplitude, np.nanmin(every.amplitude, axis=-1))
+    assert "several" in one.message
+    assert "several" in every.message
+
+
+def limit_cycle() -> tuple[Model, float, float]:
+    """Return a plant with Z = 0 at amplitude 1 and omega 10, with both numbers."""
+    friction = Dahl(1.0, 2.0)
+    N = complex(friction.describing_function(1.0))
+    return friction + Mass(0.1) + Damper(-N.imag / 10.0) + Spring(10.0 - N.real), 1.0, 10.0
+
+
+def test_a_weakly_driven_limit_cycle_has_two_close_amplitudes_beside_the_small_one() -> None:
+    plant, amplitude, omega = limit_cycle()
+    result = response(plant, omega / (2.0 * np.pi), 1e-9, all_roots=True)
+    small, below, above = result.amplitude
+    assert small < 1e-8
+    assert 0.0 < amplitude - below < 1e-8
+    assert 0.0 < above - amplitude < 1e-8
+
+
+def test_start_chooses_among_several() -> None:
+    plant, _, omega = limit_cycle()
+    values = plant.known_values()
+    every = response(plant, omega / (2.0 * np.pi), 0.01, all_roots=True).amplitude
+    for root in every:
+        near = solve(plant, values, np.asarray(omega), np.asarray(0.01), start=1.01 * root)
+        assert near == root
+    assert solve(plant, values, np.asarray(omega), np.asarray(0.01)) == every[0]
+
+
+# no amplitude
+
+
+RESONANT = Dahl(1.0, 1.0) + Mass(1.0) + Spring(1.0)
+
+
+def test_undamped_resonance_has_no_amplitude_above_the_friction_limit() -> None:
+    drive = np.array([0.5, 1.27, 4.0 / np.pi, 2.0])
+    result = response(RESONANT, 0.5 / np.pi, drive)
+    assert result.found.tolist() == [True, True, False, False]
+    assert result.number_of_solutions.tolist() == [1, 1, 0, 0]
+    assert np.isnan(result.amplitude[2:]).all()
+    assert np.isnan(result.displacement[2:]).all()
+    assert result.message.startswith("2 of 4 points: no steady amplitude (an undamped resonance")
+    assert result.message.endswith("the first at 0.159155 Hz, drive 1.27324")
+    friction = Dahl(1.0, 1.0)
+    force = result.amplitude[:2] * friction.gain(result.amplitude[:2])
+    np.testing.assert_allclose(force, drive[:2], rtol=1e-12)
+
+
+def test_resonance_that_rounding_hides_has_no_amplitude_either() -> None:
+    plant = Dahl(1.0, 1.0) + Mass(0.3) + Spring(0.1)
+    omega = np.sqrt(0.1 / 0.3)
+    assert 0.1 - 0.3 * omega**2 != 0.0
+    assert not response(plant, omega / (2.0 * np.pi), 2.0).found
+    assert response(plant, 1.0000001 * omega / (2.0 * np.pi), 2.0).found
+
+
+def test_linear_plant_alone() -> None:
+    plant = Mass(2.0) + Spring(8.0)
+    result = response(plant, np.array([0.0, 1.0]) / np.pi, 4.0)
+    assert result.amplitude[0] == pytest.approx(0.5)
+    assert not result.found[1]
+
+
+# derivatives
+
+
+def receptance_40_digits(p: list[mpmath.mpf], omega: float, drive: mpmath.mpf) -> mpmath.mpc:
+    """Return X/u_0 of linear Dahl friction, mass, damper and spring, by bisection."""
+    f_max, sigma, mass, damping, stiffness = p
+
+    def Z(A: mpmath.mpf) -> mpmath.mpc:
+        beta = sigma * A / f_max
+        real = 2 * mpmath.besseli(1, beta) / (beta * mpmath.cosh(beta))
+        imag = 4 / mpmath.pi * (1 - mpmath.tanh(beta) / beta) / beta
+        return stiffness - mass * omega**2 + 1j * damping * omega + sigma * mpmath.mpc(real, imag)
+
+    root = mpmath.findroot(
+        lambda y: mpmath.log(mpmath.exp(y) * abs(Z(mpmath.exp(y))) / drive),
+        (mpmath.log(1e-8), mpmath.log(1e4)),
+        solver="anderson",
+        tol=1e-60,
+        maxsteps=300,
+    )
+    return 1 / Z(mpmath.exp(root))
+
+
+@pytest.mark.parametrize(("frequency", "drive"), [(0.05, 0.05), (0.3, 0.12), (1.4, 0.3)])
+def test_derivatives_of_the_receptance_against_40_digits(frequency: float, drive: float) -> None:
+    omega = 2.0 * np.pi * frequency
+    values = FIG_7.known_values()
+    ours = receptance_gradient(FIG_7, values, np.asarray(omega), np.asarray(drive))
+    with mpmath.workdps(40):
+        p = [mpmath.mpf(float(values[i])) for i in (0, 1, 3, 4, 5)]
+        truth = receptance_40_digits(p, omega, mpmath.mpf(drive))
+        assert abs(complex(ours.value) / complex(truth) - 1.0) < 1e-12
+        step = mpmath.mpf(10) ** -12
+
+        def slope(change: int) -> complex:
+            def at(factor: mpmath.mpf) -> mpmath.mpc:
+                q = [v * factor if i == change else v for i, v in enumerate(p)]
+                u0 = mpmath.mpf(drive) * (factor if change == 5 else 1)
+                return receptance_40_digits(q, omega, u0)
+
+            return complex((at(1 + step) - at(1 - step)) / (2 * step))
+
+        relative = [slope(i) for i in range(6)]
+    derivatives = [ours.by_parameter[i] for i in (0, 1, 3, 4, 5)]
+    for value, derivative, exact in zip((0, 1, 3, 4, 5), derivatives, relative, strict=False):
+        assert complex(derivative) * float(values[value]) == pytest.approx(exact, rel=1e-9)
+    assert complex(ours.by_drive) * drive == pytest.approx(relative[5], rel=1e-9)
+
+
+def test_derivatives_with_a_free_exponent_and_two_friction_elements() -> None:
+    plant = Dahl(1.0, 5.0, 1.7, name="a") + Dahl(0.2, 9.0, name="b") + Mass(0.1) + Damper(0.05)
+    model = plant.with_free(["a_alpha"])
+    values = list(model.known_values())
+    omega, drive = np.array([1.0, 6.0, 12.0]), np.array([[0.3], [1.1], [4.0]])
+    ours = receptance_gradient(model, values, omega, drive)
+    for i, parameter in enumerate(model.parameters):
+        if parameter.name == "b_alpha":  # fixed at 1: its derivative is left out
+            continue
+        step = 1e-5 * values[i]
+        sides = [
+            receptance_gradient(
+                model, [*values[:i], values[i] + s, *values[i + 1 :]], omega, drive
+            ).value
+            for s in (-step, step)
+        ]
+        numerical = (sides[1] - sides[0]) / (2.0 * step)
+        np.testing.assert_allclose(
+            ours.by_parameter[i], numerical, atol=1e-7 * np.abs(ours.value / values[i]).max()
+        )
+
+
+def test_many_parameter_vectors_at_once_are_each_alone() -> None:
+    rng = np.random.default_rng(3)
+    omega, drive = 2.0 * np.pi * np.geomspace(0.05, 3.0, 11), np.geomspace(0.01, 1.0, 11)
+    vectors = np.array([float(v) for v in FIG_7.known_values()]) * rng.uniform(0.5, 2.0, (17, 6))
+    vectors[:, 2] = 1.0
+    together = receptance_gradient(FIG_7, list(vectors.T[:, :, None]), omega, drive)
+    assert together.value.shape == (17, 11)
+    for s, vector in enumerate(vectors):
+        alone = receptance_gradient(FIG_7, [np.asarray(v) for v in vector], omega, drive)
+        np.testing.assert_allclose(together.value[s], alone.value, rtol=1e-12)
+        for a, b in zip(together.by_parameter, alone.by_parameter, strict=True):
+            np.testing.assert_allclose(a[s], b, rtol=1e-9)
+
+
+def test_missing_amplitude_has_no_derivative() -> None:
+    values = RESONANT.known_values()
+    ours = receptance_gradient(RESONANT, values, np.array([1.0, 2.0]), np.array([2.0, 2.0]))
+    assert np.isnan(ours.value).tolist() == [True, False]
+    assert np.isnan(ours.by_parameter[0]).tolist() == [True, False]
+
+
+# arguments and results
+
+
+def test_shapes_broadcast_and_scalars_stay_scalars() -> None:
+    one = response(FIG_7, 1.0, 0.1)
+    assert np.shape(one.amplitude) == ()
+    assert isinstance(one.amplitude, float)
+    assert abs(one.displacement) == pytest.approx(one.amplitude)
+    assert np.angle(one.receptance) == pytest.approx(one.phase)
+    grid = response(FIG_7, [[1.0, 2.0]], [[0.1], [0.2], [0.3]])
+    for field in (grid.frequency_hz, grid.drive, grid.amplitude, grid.phase, grid.found):
+        assert field.shape == (3, 2)
+    assert grid.amplitude[0, 0] == one.amplitude
+    assert response(FIG_7, [], 0.1).amplitude.shape == (0,)
+    assert response(FIG_7, 1.0, [0.1], all_roots=True).dynamic_stiffness.shape == (1, 1)
+
+
+def test_results_are_read_only() -> None:
+    result = response(FIG_7, [1.0, 2.0], 0.1)
+    with pytest.raises(ValueError, match="read-only"):
+        result.amplitude[0] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("frequency", "drive", "text"),
+    [
+        ([1.0, -2.0], 1.0, r"frequency_hz\[1\] is -2\.0; expected numbers >= 0"),
+        ([1.0, np.nan], 1.0, r"frequency_hz\[1\] is nan; expected finite"),
+        (1.0, [[0.1, 0.0]], r"drive\[0, 1\] is 0\.0; expected numbers > 0"),
+        (1.0, np.inf, r"drive is inf; expected finite"),
+        (1.0, 1.0 + 1.0j, r"drive: expected real numbers, got complex"),
+        ([1.0, 2.0], [0.1, 0.2, 0.3], r"frequency_hz \(2,\), drive \(3,\)"),
+    ],
+)
+def test_bad_arguments_are_named(frequency: FloatArray, drive: FloatArray, text: str) -> None:
+    with pytest.raises(ValidationError, match=text):
+        response(FIG_7, frequency, drive)
+
+
+def test_a_plant_without_a_value_says_which() -> None:
+    with pytest.raises(ModelError, match="has no value for sigma, damping"):
+        response(Dahl(0.1) + Damper(), 1.0, 0.1)
+
+
+def test_no_warning_where_one_amplitude_exists() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        response(FIG_7, [0.0, 1.0], [[1e-6], [1e6]])
