@@ -101,6 +101,16 @@ class LinearSystem(Element):
         if not is_function:
             _check(system)
 
+    @property
+    def system(self) -> Any:
+        """The python-control system, or the function that returns one."""
+        return self._system
+
+    @property
+    def quantity(self) -> Quantity:
+        """What the system's response is."""
+        return self._quantity
+
     def stiffness(
         self,
         values: Sequence[FloatArray],

@@ -1,0 +1,106 @@
+"""Numbers as people write them: a value no finer than its uncertainty."""
+
+from __future__ import annotations
+
+import math
+
+
+def rounded(value: float, uncertainty: float | None) -> tuple[str, str]:
+    """Return value and uncertainty as text, the uncertainty with two significant digits.
+
+    Parameters
+    ----------
+    value : float
+        Any number.
+    uncertainty : float or None
+        Standard deviation in the same unit; None, NaN or infinite where unknown.
+
+    Returns
+    -------
+    tuple of str
+        The value, to six digits where the uncertainty is unknown; the uncertainty or ``"?"``.
+
+    Examples
+    --------
+    >>> rounded(0.0999123, 0.00101)
+    ('0.0999', '0.0010')
+    >>> rounded(2.4e6, 31234.0)
+    ('2.400e+06', '0.031e+06')
+    >>> rounded(1.5, None)
+    ('1.5', '?')
+    """
+    if uncertainty is None or not math.isfinite(uncertainty) or not math.isfinite(value):
+        return f"{value:.6g}", "?"
+    if uncertainty == 0.0:
+        return f"{value:.6g}", "0"
+    largest = max(abs(value), uncertainty)
+    power = math.floor(math.log10(largest))
+    exponent = power if power >= 5 or power < -3 else 0
+    # rounding 0.0996 to two digits gives 0.10, so the digits follow the rounded uncertainty
+    last = math.floor(math.log10(float(f"{uncertainty:.1e}"))) - 1
+    decimals = max(0, exponent - last)
+    texts = [f"{number / 10.0**exponent:.{decimals}f}" for number in (value, uncertainty)]
+    if exponent:
+        texts = [f"{text}e{exponent:+03d}" for text in texts]
+    return texts[0], texts[1]
+
+
+def with_unit(value: float, uncertainty: float | None, unit: str) -> str:
+    """Return ``"0.0999 +- 0.0010 N"``.
+
+    Parameters
+    ----------
+    value, uncertainty : float
+        As for :func:`rounded`.
+    unit : str
+        Appended; may be empty.
+
+    Returns
+    -------
+    str
+        One line of text.
+
+    Examples
+    --------
+    >>> with_unit(0.0999123, 0.00101, "N")
+    '0.0999 +- 0.0010 N'
+    """
+    number, error = rounded(value, uncertainty)
+    return f"{number} +- {error} {unit}".rstrip()
+
+
+def interval(lower: float, upper: float, unit: str) -> str:
+    """Return ``"0.098 to 0.102 N"``; an open end is said in words.
+
+    Parameters
+    ----------
+    lower, upper : float
+        Ends; minus or plus infinity, or 0 for a positive parameter, where open.
+    unit : str
+        Appended; may be empty.
+
+    Returns
+    -------
+    str
+        One line of text.
+
+    Examples
+    --------
+    >>> interval(0.0981, 0.1019, "N")
+    '0.0981 to 0.1019 N'
+    >>> interval(0.31, math.inf, "N")
+    'at least 0.31 N'
+    """
+    low_open, high_open = not math.isfinite(lower), not math.isfinite(upper)
+    if low_open and high_open:
+        return "anything"
+    if high_open:
+        return f"at least {lower:.3g} {unit}".rstrip()
+    if low_open:
+        return f"at most {upper:.3g} {unit}".rstrip()
+    width = upper - lower
+    digits = 4
+    if width > 0.0:
+        largest = max(abs(lower), abs(upper))
+        digits = max(3, 2 + math.ceil(math.log10(largest / width)))
+    return f"{lower:.{digits}g} to {upper:.{digits}g} {unit}".rstrip()
