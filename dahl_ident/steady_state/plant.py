@@ -17,6 +17,7 @@ from dahl_ident.elements.model import as_model
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 _Scalar = TypeVar("_Scalar", bound=np.generic)
+_Parts = list[tuple[Dahl, Sequence[FloatArray]]]
 
 EPS = float(np.finfo(np.float64).eps)
 _ROUNDING = 8.0 * EPS  # of k - m omega^2 and its like, relative to the terms' sizes
@@ -65,13 +66,17 @@ class Friction:
 
 @dataclass(frozen=True)
 class Plant:
-    """A |L + N(A)| = drive at every point; all arrays have one entry a point."""
+    """A |L + N(A)| = drive at every point, all in units that suit the friction.
+
+    All arrays have one entry a point.
+    """
 
     linear: ComplexArray
     rounding: FloatArray  # what rounding the terms of L leaves of it
     drive: FloatArray
     vector: IntArray
     friction: Friction
+    unit: FloatArray  # of amplitude, m
 
     def at(self, points: IntArray) -> Plant:
         """Return the plant at some of its points."""
@@ -81,6 +86,7 @@ class Plant:
             self.drive[points],
             self.vector[points],
             self.friction,
+            self.unit[points],
         )
 
     def largest_friction(self) -> FloatArray:
@@ -118,7 +124,7 @@ def flatten(
     """Return the plant at every point of the broadcast arguments, and their shape."""
     shape = np.broadcast_shapes(np.shape(omega), np.shape(drive), *(np.shape(v) for v in values))
     linear, size = np.zeros((), dtype=np.complex128), np.zeros(())
-    friction: list[tuple[Dahl, Sequence[FloatArray]]] = []
+    friction: _Parts = []
     first = 0
     for element in as_model(model).elements:
         own = values[first : first + len(element.parameters)]
@@ -128,6 +134,7 @@ def flatten(
         else:
             part = element.stiffness(own, np.zeros(()), omega)
             linear, size = linear + part, size + np.abs(part)
+    force, stiffness, friction = _units(friction)
     batch = np.broadcast_shapes(*(np.shape(v) for _, own in friction for v in own))
     vectors = np.arange(np.prod(batch, dtype=np.intp)).reshape(batch)
     flat_values = tuple(
@@ -135,13 +142,27 @@ def flatten(
         for _, own in friction
     )
     plant = Plant(
-        _flat(linear, shape),
-        _flat(_ROUNDING * size, shape),
-        _flat(drive, shape),
+        _flat(linear / stiffness, shape),
+        _flat(_ROUNDING * size / stiffness, shape),
+        _flat(drive / force, shape),
         _flat(vectors, shape),
         Friction(tuple(element for element, _ in friction), flat_values),
+        _flat(force / stiffness, shape),
     )
     return plant, shape
+
+
+def _units(friction: _Parts) -> tuple[FloatArray, FloatArray, _Parts]:
+    """Return units of force and stiffness, and the friction in them.
+
+    In units of f_max and sigma one element of one exponent is the same for every vector.
+    """
+    one = np.ones(())
+    if len(friction) == 1:
+        [(element, (f_max, sigma, alpha))] = friction
+        if np.size(alpha) and np.all(alpha == np.ravel(alpha)[0]):
+            return f_max, sigma, [(element, (one, one, np.ravel(alpha)[0]))]
+    return one, one, friction
 
 
 def _flat(array: NDArray[_Scalar], shape: tuple[int, ...]) -> NDArray[_Scalar]:

@@ -20,9 +20,7 @@ import numpy as np
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.steady_state.plant import EPS, BoolArray, Friction, IntArray, Plant
 
-_COARSE_PER_DECADE = 16
-_DENSE_PER_DECADE = 96
-_MANY = 4096  # points from which the dense table pays
+_NODES_PER_DECADE = (4, 96)
 _SCAN_PER_DECADE = 128
 _SCAN_CELLS = 2**18  # points times nodes of the scan in work at once
 _CHUNK = 8192  # points solved together: their scratch arrays stay in the processor's cache
@@ -40,12 +38,14 @@ def all_roots(plant: Plant) -> FloatArray:
     roots = np.full((plant.drive.size, 1), np.nan)
     single = np.flatnonzero(passive & ~unbounded)
     if single.size:
-        table = _tabulate(plant.friction, dense=single.size >= _MANY)
+        table = _tabulate(plant.friction, single.size)
         for first in range(0, single.size, _CHUNK):
             points = single[first : first + _CHUNK]
             roots[points, 0] = _single_roots(plant.at(points), table)
     active = np.flatnonzero(~passive)
-    return _insert(roots, *_scan(plant, active)) if active.size else roots
+    if active.size:
+        roots = _insert(roots, *_scan(plant, active))
+    return roots * plant.unit[:, None]
 
 
 class _Table(NamedTuple):
@@ -57,12 +57,16 @@ class _Table(NamedTuple):
     slope: ComplexArray  # by ln A
 
 
-def _tabulate(friction: Friction, *, dense: bool) -> _Table:
-    """Return the friction force from deep microslip to deep slip of every element."""
+def _tabulate(friction: Friction, points: int) -> _Table:
+    """Return the friction force from deep microslip to deep slip of every element.
+
+    A vector has about as many nodes as there are points to solve for it, within limits.
+    """
     knees = [np.atleast_1d(f_max / sigma) for f_max, sigma, _ in friction.values]
     low = np.log10(np.min(knees, axis=0)) - 4.0
     high = np.log10(np.max(knees, axis=0)) + 4.0
-    least = np.max(high - low) * (_DENSE_PER_DECADE if dense else _COARSE_PER_DECADE)
+    decades = np.max(high - low)
+    least = np.clip(points / low.size, *(decades * n for n in _NODES_PER_DECADE))
     nodes = 2 ** int(np.ceil(np.log2(least))) - 1
     amplitude = 10.0 ** np.linspace(low, high, nodes, axis=-1).ravel()
     vector = np.repeat(np.arange(low.size), nodes)
@@ -207,6 +211,7 @@ def _scan_grid(plant: Plant, grid: FloatArray) -> tuple[IntArray, FloatArray]:
         plant.drive[:, None],
         plant.vector[:, None],
         plant.friction,
+        plant.unit[:, None],
     )
     g, s = wide.misfit(grid, force, slope)
     above, falling = g > 0.0, s < 0.0
