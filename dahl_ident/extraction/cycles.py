@@ -1,0 +1,184 @@
+"""Cycles of a waveform: where they begin, and the amplitude and frequency of each.
+
+A record of unknown frequency is cut at its rising crossings. A crossing counts when the motion
+goes from below ``-h`` to above ``+h``, so noise makes none; ``h`` is a part of the amplitude, and
+where the motion stays within ``+-h`` for long the search goes on there with that part's own
+amplitude. So levels that differ by any factor are found, each about its own mean. Where the
+frequency is known the record is cut into its periods instead, which works in any noise.
+
+The phase of each cycle's own sine then puts its beginning right, so amplitude and frequency of a
+cycle have the noise of a sine fit, and not that of a few samples near zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray
+
+_THRESHOLD = 0.3  # of the amplitude; sine noise may be a tenth of it
+_HIGH = 0.995  # quantile that stands for the amplitude
+_QUIET = 1.5  # times the time beyond the threshold: longer within it, and another level is there
+_FEWEST_SAMPLES = 16
+_DEEPEST = 12
+_SAMPLED = 50_000  # samples that the quantiles are taken from
+_FEWEST_A_CYCLE = 3
+_HOLE = 1.0 / 3.0  # of a cycle without samples: its amplitude is not known
+
+
+@dataclass(frozen=True)
+class Cycles:
+    """Consecutive cycles of a sine; those with a hole in the sampling are left out.
+
+    `noise` is the standard deviation of `log_amplitude`, and of the phase in rad.
+    `log_frequency` belongs to the boundaries, from the middle of one cycle to that of the next.
+    """
+
+    start: FloatArray
+    stop: FloatArray
+    log_amplitude: FloatArray
+    noise: FloatArray
+    log_frequency: FloatArray
+
+    def __len__(self) -> int:
+        return self.start.size
+
+
+def find_cycles(time: FloatArray, motion: FloatArray) -> list[Cycles]:
+    """Cut a record of unknown frequencies into runs of consecutive cycles, in order of time."""
+    runs = _crossing_runs(time, motion, 0)
+    runs.sort(key=lambda edges: float(edges[0]))
+    return [_measured(time, motion, edges) for edges in runs]
+
+
+def cut_cycles(time: FloatArray, motion: FloatArray, frequency_hz: float) -> list[Cycles]:
+    """Cut a record of known frequency into its periods, from the first sample on."""
+    interval = float(np.median(np.diff(time)))
+    count = int((time[-1] - time[0] + 1.5 * interval) * frequency_hz)
+    if count < 1:
+        return []
+    edges = time[0] - 0.5 * interval + np.arange(count + 1) / frequency_hz
+    return [_measured(time, motion, edges)]
+
+
+def _crossing_runs(time: FloatArray, motion: FloatArray, depth: int) -> list[FloatArray]:
+    """Return the rising crossings, split where the motion is quiet, and those found there."""
+    if time.size < _FEWEST_SAMPLES or depth > _DEEPEST:
+        return []
+    seen = motion[:: max(1, time.size // _SAMPLED)]
+    low, high = np.quantile(seen, [1.0 - _HIGH, _HIGH])
+    middle, threshold = 0.5 * (low + high), 0.5 * _THRESHOLD * (high - low)
+    if not threshold > 1e-12 * max(abs(low), abs(high)):
+        return []
+    moved = motion - middle
+    beyond = np.flatnonzero(np.abs(moved) > threshold)
+    above = moved[beyond] > 0.0
+    turn = np.flatnonzero(above[1:] != above[:-1])
+    bounds = np.concatenate([[0], turn + 1, [beyond.size]])
+    spent = time[beyond[bounds[1:] - 1]] - time[beyond[bounds[:-1]]]
+    pause = time[beyond[1:]] - time[beyond[:-1]]
+    usual = np.repeat(np.maximum(spent, 0.0), np.diff(bounds))
+    samples = np.diff(beyond) - 1
+    quiet = (pause > _QUIET * np.maximum(usual[1:], usual[:-1])) & (samples >= _FEWEST_SAMPLES)
+    return [
+        *_split_crossings(time, moved, beyond, above, quiet),
+        *_within(time, motion, beyond, quiet, depth),
+    ]
+
+
+def _split_crossings(
+    time: FloatArray,
+    moved: FloatArray,
+    beyond: NDArray[np.intp],
+    above: NDArray[np.bool_],
+    quiet: NDArray[np.bool_],
+) -> list[FloatArray]:
+    """Return the times of rising crossings in runs that no quiet part interrupts."""
+    rising = np.flatnonzero(~above[:-1] & above[1:] & ~quiet)
+    before, after = beyond[rising], beyond[rising + 1]
+    share = moved[before] / (moved[before] - moved[after])
+    crossing = time[before] + share * (time[after] - time[before])
+    interruptions = np.cumsum(quiet)[rising]
+    runs = np.split(crossing, np.flatnonzero(np.diff(interruptions)) + 1)
+    return [run for run in runs if run.size >= 2]
+
+
+def _within(
+    time: FloatArray,
+    motion: FloatArray,
+    beyond: NDArray[np.intp],
+    quiet: NDArray[np.bool_],
+    depth: int,
+) -> list[FloatArray]:
+    """Return what is found in the quiet parts, those at the ends of the record included."""
+    where = np.flatnonzero(quiet)
+    starts = np.concatenate([[0], beyond[where] + 1, beyond[-1:] + 1])
+    stops = np.concatenate([beyond[:1], beyond[where + 1], [time.size]])
+    found: list[FloatArray] = []
+    for start, stop in zip(starts, stops, strict=True):
+        found += _crossing_runs(time[start:stop], motion[start:stop], depth + 1)
+    return found
+
+
+def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray) -> Cycles:
+    """Return the amplitude of each cycle and the frequency from each to the next."""
+    cuts = np.searchsorted(time, edges)
+    counts = np.diff(cuts)
+    known = np.flatnonzero((counts >= _FEWEST_A_CYCLE) & ~_with_hole(time, edges))
+    start, stop, n = edges[known], edges[known + 1], counts[known]
+    inside = slice(int(cuts[0]), int(cuts[-1]))
+    turn = np.repeat(2.0 * np.pi / np.diff(edges), counts)
+    theta = (time[inside] - np.repeat(edges[:-1], counts)) * turn
+    y = motion[inside]
+    bounds = np.column_stack([cuts[known], cuts[known + 1]]).ravel() - cuts[0]
+    mean = _sums(y, bounds) / n
+    phasor = (
+        2.0
+        / n
+        * (_sums(y * np.exp(-1j * theta), bounds) - mean * _sums(np.exp(-1j * theta), bounds))
+    )
+    power = _sums(y * y, bounds) / n - mean**2
+    amplitude = np.maximum(np.abs(phasor), np.finfo(np.float64).tiny)
+    left = np.sqrt(np.maximum(power - 0.5 * amplitude**2, 0.0))
+    return Cycles(
+        start,
+        stop,
+        np.log(amplitude),
+        left / amplitude * np.sqrt(2.0 / n),
+        _log_frequency(start, stop, np.angle(phasor)),
+    )
+
+
+def _sums(values: NDArray[Any], bounds: NDArray[np.intp]) -> NDArray[Any]:
+    """Return the sums between pairs of bounds."""
+    return np.add.reduceat(np.append(values, 0.0), bounds)[::2] if bounds.size else values[:0]
+
+
+def _log_frequency(start: FloatArray, stop: FloatArray, phase: FloatArray) -> FloatArray:
+    """Return the mean frequency from the middle of each cycle to that of the next.
+
+    The phases give the fraction of a turn; the whole turns are those that the cycles make,
+    and as many as fit into what is missing between them.
+    """
+    middle, period = 0.5 * (start + stop), stop - start
+    missing = (start[1:] - stop[:-1]) / (0.5 * (period[1:] + period[:-1]))
+    fraction = np.diff(phase) / (2.0 * np.pi)
+    turns = fraction + np.round(1.0 + missing - fraction)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log(turns / np.diff(middle))
+
+
+def _with_hole(time: FloatArray, edges: FloatArray) -> NDArray[np.bool_]:
+    """Return which cycles have a part of them without samples."""
+    periods = np.diff(edges)
+    broken = np.zeros(periods.size, dtype=bool)
+    steps = np.diff(time)
+    for i in np.flatnonzero(steps > _HOLE * periods.min()):
+        first = max(int(np.searchsorted(edges, time[i], side="right")) - 1, 0)
+        last = int(np.searchsorted(edges, time[i + 1]))
+        broken[first:last] |= steps[i] > _HOLE * periods[first:last]
+    return broken

@@ -1,0 +1,318 @@
+"""From a record to a frequency response: segments, sine fits, verdicts, one table."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dahl_ident.arrays import FloatArray, positive_number, whole_number
+from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.errors import ExtractionError, ValidationError
+from dahl_ident.extraction.cycles import Cycles, cut_cycles, find_cycles
+from dahl_ident.extraction.point import FEWEST_CYCLES, Point, Settings, measure
+from dahl_ident.extraction.segments import MODES, Mode, Segment, find_segments
+from dahl_ident.extraction.sine_fit import (
+    HARMONICS,
+    Stretch,
+    columns,
+    estimate_frequency,
+    steady_stretch,
+    thinned,
+    track_phase,
+)
+
+_PLATEAU_CYCLES = 3  # fewer only where no plateau has so many
+_SWEEP_DEGREE = 3  # of the phase in a window
+_STEADY_END = 0.005  # of the amplitude, that the ends of a record may stray from the sine
+
+
+def extract(
+    record: Record,
+    *,
+    frequency: float | None = None,
+    mode: Mode = "auto",
+    num_periods: int | None = None,
+    settling_periods: int | None = None,
+    harmonics: Sequence[int] = (1, 3, 5, 7, 9),
+    controlled: str = "displacement",
+    level: ArrayLike | None = None,
+    min_share: float = 0.6,
+) -> FrequencyResponse:
+    """Turn recorded waveforms into dynamic stiffness with covariance and verdicts.
+
+    The record is split into stretches of constant amplitude and frequency; rests and ramps are
+    left out. Each stretch gives one point: the fundamental of force over that of displacement,
+    N = F_1/X_1, and a row for each further harmonic, F_k/X_1. Cycles in which friction still
+    remembers the level before are left out as far as needed. A continuous sweep gives a series
+    of points.
+
+    Parameters
+    ----------
+    record : Record
+        Waveforms of motion and force, sampled anyhow. Velocity and acceleration are integrated
+        at the fitted frequency.
+    frequency : float, optional
+        Excitation frequency, Hz, where it is known; the whole record is then read at it. Left
+        out: found, and estimated for each stretch together with the phasors.
+    mode : {"auto", "steps", "sweep"}, default "auto"
+        What the record holds: levels one after another, or a continuous sweep of amplitude or
+        frequency. "auto" takes whichever there is more of.
+    num_periods : int, optional
+        Periods of each stretch that are used, settling ones among them: the last ones. In a
+        sweep, those of a window. Default: all of a stretch.
+    settling_periods : int, optional
+        Leading periods of `num_periods` that are left out. Default: as many as the memory of
+        friction needs, judged from the decaying mean of the force.
+    harmonics : sequence of int, default (1, 3, 5, 7, 9)
+        Which harmonics become rows, 1 to 9; fewer where the sampling cannot tell them apart.
+    controlled : {"displacement", "force"}, default "displacement"
+        What the laboratory held constant. Where it is the force, memory is looked for in the
+        displacement's mean.
+    level : str or float, optional
+        Nominal label of the record.
+    min_share : float, default 0.6
+        Share of the power, offset and drift apart, that the fundamental has at least, in motion
+        and in force. Lower it for a sine buried in noise.
+
+    Returns
+    -------
+    FrequencyResponse
+        Dynamic stiffness with `covariance`, `dof`, `amplitude_std` and `amplitude_covariance`.
+        The covariance is such that ``d' C^-1 d / 2`` follows F(2, dof). Its `quality` columns:
+
+        ``settled``
+            Whether the bias left by friction's memory is within a standard error.
+        ``bias_real``, ``bias_imag``
+            That bias as estimated, in the response's unit; it is not subtracted.
+        ``more_periods``
+            Settling periods that are missing.
+        ``num_periods``, ``settling_periods``
+            Periods of the stretch, and how many leading ones were left out.
+        ``covariance_from``
+            "cycles", or "spectrum" with fewer than four: an estimate from farther beside the
+            harmonics.
+        ``start_time``, ``end_time``
+            First and last sample used, s.
+        ``displacement_share``, ``force_share``
+            The fundamental's share of the power of the motion channel and of the force.
+        ``displacement_distortion``
+            Harmonics 2 to 9 of the displacement over its fundamental.
+        ``displacement_steps``, ``force_steps``
+            Amplitude in steps of the sensor; infinite where no steps show.
+        ``displacement_clipped``, ``force_clipped``
+            Share of samples that stand still at the highest or lowest value.
+        ``verdict``
+            "good", or what speaks against the point.
+
+    Raises
+    ------
+    ExtractionError
+        If no stretch is usable: too short, motion or force not dominated by one sine, or less
+        motion than the sensor's step. Where only some are, a warning tells which and why.
+    ValidationError
+        If an argument is out of range, or the record has only a drive without a factor.
+
+    Notes
+    -----
+    The sine fit is that of IEEE Std 1057 with harmonics. The uncertainty of a record's
+    `drive_factor` is common to all points and not part of their covariance. A hum during rests
+    that is a clean sine in both channels is taken for a level; give `frequency` then.
+
+    Examples
+    --------
+    >>> from dahl_ident.elements import Dahl
+    >>> friction = Dahl(f_max=0.1, sigma=30.0)
+    >>> t = np.arange(4000) / 200.0
+    >>> x = 0.004 * np.sin(2.0 * np.pi * 1.25 * t)
+    >>> rng = np.random.default_rng(0)
+    >>> force = friction.force(x) + 1e-4 * rng.standard_normal(t.size)
+    >>> data = extract(Record(t, displacement=x, force=force), harmonics=[1])
+    >>> N, exact = data.response[0], friction.describing_function(data.amplitude[0])
+    >>> f"{N:.2f}", f"{exact:.2f}", str(data.quality["verdict"][0])
+    ('19.74+9.72j', '19.74+9.72j', 'good')
+    """
+    settings = _settings(record, num_periods, settling_periods, harmonics, controlled, min_share)
+    if mode not in MODES:
+        raise ValidationError(f"mode is {mode!r}; expected one of {', '.join(MODES)}")
+    known = None if frequency is None else positive_number(frequency, "frequency")
+    channels = np.stack([record.motion_samples, record.force_samples])
+    points, refused = [], []
+    for segment in _segments(record.time, channels[0], known, mode, num_periods):
+        try:
+            stretch = _stretch(record.time, channels, segment, known)
+            points.append(measure(stretch, settings, sweep=segment.sweep))
+        except ExtractionError as exc:
+            refused.append(str(exc))
+    if not points:
+        raise ExtractionError(_summary(refused))
+    if refused:
+        warnings.warn(f"left out: {_summary(refused)}", stacklevel=2)
+    options = {
+        "frequency": known,
+        "mode": mode,
+        "num_periods": num_periods,
+        "settling_periods": settling_periods,
+        "harmonics": list(settings.harmonics),
+        "min_share": settings.min_share,
+        "refused": refused,
+    }
+    provenance = {**(record.provenance or {}), "extraction": options}
+    return _table(points, record, settings, level, provenance)
+
+
+def _settings(
+    record: Record,
+    num_periods: int | None,
+    settling_periods: int | None,
+    harmonics: Sequence[int],
+    controlled: str,
+    min_share: float,
+) -> Settings:
+    if num_periods is not None:
+        num_periods = whole_number(num_periods, "num_periods", FEWEST_CYCLES)
+    if settling_periods is not None:
+        settling_periods = whole_number(settling_periods, "settling_periods", 0)
+    orders = tuple(whole_number(k, "harmonics", 1) for k in harmonics)
+    if not orders or max(orders) > HARMONICS or len(set(orders)) < len(orders):
+        raise ValidationError(
+            f"harmonics is {list(harmonics)!r}; expected different numbers from 1 to {HARMONICS}"
+        )
+    if controlled not in ("displacement", "force"):
+        raise ValidationError(f"controlled is {controlled!r}; expected 'displacement' or 'force'")
+    if not 0.0 <= min_share < 1.0:
+        raise ValidationError(f"min_share is {min_share!r}; expected a share from 0 to below 1")
+    return Settings(
+        orders, num_periods, settling_periods, min_share, record.motion_channel, controlled
+    )
+
+
+def _segments(
+    time: FloatArray,
+    motion: FloatArray,
+    frequency: float | None,
+    mode: Mode,
+    window: int | None,
+) -> list[Segment]:
+    """Return the segments of a record, or say that it has none."""
+    guess = frequency
+    for attempt in range(2):
+        runs = find_cycles(time, motion) if guess is None else cut_cycles(time, motion, guess)
+        for fewest in (_PLATEAU_CYCLES, FEWEST_CYCLES):
+            segments = find_segments(runs, mode, fewest, window)
+            if segments:
+                return segments
+        if guess is not None or attempt:
+            break
+        guess = _strongest_line(time, motion)
+    raise ExtractionError(_no_segments(time, motion, runs, frequency))
+
+
+def _strongest_line(time: FloatArray, motion: FloatArray) -> float:
+    """Return the frequency with most power, samples taken as evenly spaced."""
+    spectrum = np.abs(np.fft.rfft(motion - motion.mean()))
+    line = int(np.argmax(spectrum[1:])) + 1
+    return line / float((time[-1] - time[0]) * time.size / (time.size - 1))
+
+
+def _no_segments(
+    time: FloatArray, motion: FloatArray, runs: Sequence[Cycles], frequency: float | None
+) -> str:
+    cycles = sum(len(run) for run in runs)
+    read = "" if frequency is None else f" of {frequency:.6g} Hz"
+    return (
+        f"no stretch of constant amplitude and frequency in {time[-1] - time[0]:.6g} s: "
+        f"{cycles} cycles{read}, motion from {motion.min():.4g} to {motion.max():.4g}; expected "
+        f"at least {FEWEST_CYCLES} cycles alike: record longer, give frequency=, or mode='sweep'"
+    )
+
+
+def _stretch(
+    time: FloatArray, channels: FloatArray, segment: Segment, frequency: float | None
+) -> Stretch:
+    """Return the samples of a segment with their phase."""
+    first, last = np.searchsorted(time, [segment.start, segment.stop]).tolist()
+    omega = 2.0 * np.pi * segment.frequency_hz
+    stretch = steady_stretch(time[first:last], channels[:, first:last], omega)
+    if segment.sweep:
+        return track_phase(stretch, _SWEEP_DEGREE)
+    if frequency is None:
+        stretch = estimate_frequency(track_phase(stretch, 1))
+    part = _with_ends(time, channels[0], stretch, slice(first, last))
+    if part == slice(first, last):
+        return stretch
+    stretch = steady_stretch(time[part], channels[:, part], stretch.omega)
+    return stretch if frequency is not None else estimate_frequency(stretch)
+
+
+def _with_ends(time: FloatArray, motion: FloatArray, stretch: Stretch, part: slice) -> slice:
+    """Return the slice with the partial cycles at the record's ends, where the sine fits them."""
+    few = thinned(stretch)
+    basis = columns(few.theta, few.tau, 1)
+    fitted = np.linalg.lstsq(basis.T, few.channels[0], rcond=None)[0]
+    amplitude = float(np.hypot(*fitted[2:]))
+    cycle = 2.0 * np.pi / stretch.omega
+
+    def misfit(where: slice) -> float:
+        tau = (time[where] - stretch.centre) / stretch.half_width
+        model = fitted @ columns(np.asarray(stretch.phase(tau)), tau, 1)
+        return float(np.sqrt(np.mean((motion[where] - model) ** 2)))
+
+    start, stop = part.start, part.stop
+    inside = slice(start, int(np.searchsorted(time, time[start] + cycle)))
+    allowed = 1.5 * misfit(inside) + _STEADY_END * amplitude
+    if start > 0 and time[start] - time[0] < cycle and misfit(slice(0, start)) <= allowed:
+        start = 0
+    rest = slice(stop, time.size)
+    if stop < time.size and time[-1] - time[stop] < cycle and misfit(rest) <= allowed:
+        stop = time.size
+    return slice(start, stop)
+
+
+def _summary(refused: Sequence[str]) -> str:
+    """Return the first reason, and how many stretches have one."""
+    more = "" if len(refused) == 1 else f" ({len(refused)} stretches in all are not usable)"
+    return f"{refused[0]}{more}"
+
+
+def _table(
+    points: Sequence[Point],
+    record: Record,
+    settings: Settings,
+    level: ArrayLike | None,
+    provenance: dict[str, Any],
+) -> FrequencyResponse:
+    """Return one row for each harmonic of each point."""
+    rows = [len(point.harmonic) for point in points]
+
+    def per_point(values: Sequence[float]) -> FloatArray:
+        return np.repeat(np.asarray(values), rows)
+
+    def per_row(arrays: Sequence[FloatArray]) -> FloatArray:
+        return np.concatenate(arrays)
+
+    quality = {
+        name: np.concatenate(
+            [np.broadcast_to(p.quality[name], n) for p, n in zip(points, rows, strict=True)]
+        )
+        for name in points[0].quality
+    }
+    return FrequencyResponse(
+        per_point([p.frequency_hz for p in points]),
+        np.concatenate([p.response for p in points]),
+        amplitude=per_point([p.amplitude for p in points]),
+        drive=per_point([p.drive for p in points]),
+        covariance=per_row([p.covariance for p in points]),
+        dof=per_row([p.dof for p in points]),
+        amplitude_std=per_point([p.amplitude_std for p in points]),
+        amplitude_covariance=per_row([p.amplitude_covariance for p in points]),
+        level=level,
+        controlled=settings.controlled,
+        harmonic=[k for p in points for k in p.harmonic],
+        motion=record.motion,
+        quality=quality,
+        provenance=provenance,
+    )

@@ -1,0 +1,159 @@
+r"""Friction's memory: whether a stretch has settled, and what is left where it has not.
+
+After a change of level the force departs from its steady loop. For Dahl friction the departure
+fades along the path s travelled, whatever the direction,
+
+    D(s) = D_0 exp(-beta s/A),     beta = sigma A/f_max;     exp(-4 beta) a cycle
+
+so settling takes cycles, not seconds, and the more of them the smaller the amplitude. In the
+response D barely shows from cycle to cycle. But it has one sign, so the force's mean shows it
+plainly, and there it is estimated: least squares of the force on harmonics, offset and
+exp(-beta s/A). What D then adds to each harmonic, as that was fitted, is the remaining bias.
+
+The rate is estimated as well, as far as the decay shows it. Where it does not (so slow that the
+mean seems to drift, or faded long ago) it leans on the beta at which Dahl friction alone has the
+measured phase. The noise of D_0 is taken from the lines below the fundamental, as 1/f noise: the
+less favourable case.
+
+Where the force is controlled its mean cannot drift; there the displacement's mean shows it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import Dahl
+from dahl_ident.extraction.sine_fit import (
+    HARMONICS,
+    SineFit,
+    Stretch,
+    columns,
+    resolvable_orders,
+    thinned,
+)
+
+SIGNIFICANT = 3.0  # standard deviations of D_0
+_RATES = np.geomspace(1e-3, 64.0, 56)  # 4 beta
+_REFINEMENTS = 4  # of the grid of rates, by 5 each
+_RATE_SPREAD = 1.0  # standard deviation of ln(rate) about what the phase says
+_MOST_CYCLES = 256  # that D_0 and the rate are estimated from
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Departure of one channel from its steady loop: D_0 with its error, and 4 beta as `rate`.
+
+    D_0 is taken where the path of ``cos(theta + displacement_phase)`` is `start` amplitudes.
+    """
+
+    departure: float
+    departure_std: float
+    rate: float
+    displacement_phase: float
+    start: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether the departure stands out of the noise."""
+        return abs(self.departure) > SIGNIFICANT * self.departure_std
+
+    def waveform(self, stretch: Stretch) -> FloatArray:
+        """Return D at every sample of a stretch that continues the phase."""
+        path = _path(stretch.theta + self.displacement_phase) - self.start
+        return self.departure * np.exp(-0.25 * self.rate * path)
+
+    def phasors(self, stretch: Stretch) -> ComplexArray:
+        """Return what D adds to the fitted phasors 0, 1, ... of its channel."""
+        few = thinned(stretch)
+        basis = columns(few.theta, few.tau, _orders(few))
+        fitted = np.linalg.lstsq(basis.T, self.waveform(few), rcond=None)[0]
+        return np.asarray(fitted[::2] - 1j * fitted[1::2])
+
+
+def estimate_memory(
+    fit: SineFit, channel: int, displacement_phase: float, response: complex
+) -> Memory:
+    """Estimate the departure that a stretch starts with.
+
+    Parameters
+    ----------
+    fit : SineFit
+        Fit of the stretch, from where its amplitude became constant.
+    channel : {0, 1}
+        Where to look: 1, the force, unless the force is controlled.
+    displacement_phase : float
+        Phase of the displacement's phasor, rad.
+    response : complex
+        Dynamic stiffness; its phase tells beta where the decay does not.
+
+    Returns
+    -------
+    Memory
+        Departure at the first sample, and rate.
+    """
+    drifting = fit.residual[channel] + fit.coefficients[1, channel] * fit.stretch.tau
+    whole = replace(fit.stretch, channels=drifting[None])
+    end = np.searchsorted(whole.theta, whole.theta[0] + 2.0 * np.pi * _MOST_CYCLES)
+    few = thinned(whole.part(slice(0, int(end))))
+    basis = columns(few.theta, few.tau, _orders(few))
+    steady = np.linalg.qr(np.delete(basis, 1, axis=0).T)[0]
+    path = _path(few.theta + displacement_phase)
+    start = float(_path(whole.theta[:1] + displacement_phase)[0])
+
+    rates = _RATES
+    centre = np.log(_friction_rate(response))
+    for _ in range(_REFINEMENTS):
+        decays = np.exp(-0.25 * rates[:, None] * (path - start))
+        decays -= (decays @ steady) @ steady.T
+        power = np.einsum("ij,ij->i", decays, decays)
+        sizes = decays @ few.channels[0] / power
+        gain = sizes**2 * power
+        best = int(np.argmax(gain))
+        left = few.channels[0] - sizes[best] * decays[best]
+        variance = _slow_variance(left - steady @ (steady.T @ left), decays[best], few)
+        i = int(np.argmin(((np.log(rates) - centre) / _RATE_SPREAD) ** 2 - gain / variance))
+        departure, std, rate = sizes[i], np.sqrt(variance / power[i]), rates[i]
+        rates = np.geomspace(rates[max(i - 1, 0)], rates[min(i + 1, rates.size - 1)], 11)
+    return Memory(float(departure), float(std), float(rate), displacement_phase, start)
+
+
+def _orders(stretch: Stretch) -> int:
+    return min(HARMONICS, resolvable_orders(stretch))
+
+
+def _path(theta: FloatArray) -> FloatArray:
+    """Return the path of cos(theta) from theta = 0 on, in amplitudes: 4 a cycle."""
+    strokes = np.floor(theta / np.pi)
+    return 2.0 * strokes + 1.0 - np.cos(theta - np.pi * strokes)
+
+
+def _slow_variance(noise: FloatArray, decay: FloatArray, stretch: Stretch) -> float:
+    """Return the variance of white noise that moves D_0 as much as the noise below omega does.
+
+    The lines p/T below the fundamental are taken as c/f; the decay sees c times its own mean
+    of 1/f.
+    """
+    turns = (stretch.theta - stretch.theta[0]) / (2.0 * np.pi)
+    cycles = max(2, round(float(turns[-1])))
+    p = np.arange(1, min(cycles, 64))
+    tones = np.exp(-2j * np.pi / cycles * p[:, None] * turns)
+    level = float(np.mean(p * np.abs(tones @ noise) ** 2)) / noise.size
+    seen = np.abs(tones @ decay) ** 2
+    return level * float(np.sum(seen / p) / np.sum(seen)) if level > 0.0 else 1e-300
+
+
+def _friction_rate(response: complex) -> float:
+    """Return 4 beta of the Dahl friction that has the phase of the response."""
+    rates, phases = _friction_phases()
+    return float(np.interp(np.angle(response), phases, rates))
+
+
+@cache
+def _friction_phases() -> tuple[FloatArray, FloatArray]:
+    beta = np.geomspace(_RATES[0] / 4.0, 1e3, 600)
+    phase = Dahl(f_max=1.0, sigma=1.0).phase(beta)
+    return 4.0 * beta, phase

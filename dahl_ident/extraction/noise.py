@@ -1,0 +1,128 @@
+r"""Noise of the phasors, from what does not repeat from cycle to cycle.
+
+Over P whole cycles whatever repeats falls on the harmonics, also those above the fitted ones.
+What lies on the lines between them, at ``f = (k + m/P) f_0`` for ``0 < |m| < P``, does not
+repeat: it is noise. Cycles are not compared one by one, since under 1/f noise neighbouring
+cycles share their error; the lines see the noise at the frequency where it counts.
+
+With Z_i the two channels' content of the lines, the cross-spectral matrix at the harmonic is
+
+    C = sum_i f_i Z_i Z_i^H / sum_i f_i
+
+The lines lie evenly about the harmonic, so these weights make the expectation right for every
+noise spectrum ``a + b/f``, white and 1/f alike. With P >= 4 lines within half a harmonic are
+taken; fewer cycles have too few so close, and all lines up to the next harmonics serve as a
+spectral estimate. The noise is taken as circular (its phase is uniform), so n lines of equal
+weight give 2 n degrees of freedom.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.extraction.sine_fit import SineFit
+
+CYCLES_FOR_SCATTER = 4  # with fewer, lines beside the harmonic are few and far
+_MOST_LINES = 10  # a side: about 40 degrees of freedom, beyond which a region hardly shrinks
+_INDEPENDENT = 0.05  # of the largest eigenvalue: lines that gaps make alike are left out
+_BLOCK = 16384
+
+
+@dataclass(frozen=True)
+class LineNoise:
+    """Noise beside one harmonic, as that of white noise with the same density there.
+
+    `matrix` is ``E[e e^H]`` of a sample's errors (motion, force), 2 x 2 and Hermitian.
+    """
+
+    matrix: ComplexArray
+    dof: float
+
+
+def line_noise(
+    fit: SineFit, harmonics: Sequence[int], cycles: int, residual: FloatArray
+) -> list[LineNoise]:
+    """Return the noise beside each harmonic.
+
+    Parameters
+    ----------
+    fit : SineFit
+        Fit over a whole number of cycles.
+    harmonics : sequence of int
+        Which harmonics.
+    cycles : int
+        How many cycles, at least 2.
+    residual : ndarray, shape (2, n)
+        What the fit, and the memory, leave of motion and force.
+
+    Returns
+    -------
+    list of LineNoise
+        One for each harmonic.
+    """
+    reach = cycles // 2 if cycles >= CYCLES_FOR_SCATTER else cycles - 1
+    side = min(reach, _MOST_LINES)
+    content, window = _line_content(fit, harmonics, cycles, side, residual)
+    lines = np.concatenate([np.arange(-side, 0), np.arange(1, side + 1)])
+    half, kept = _orthogonal(window, lines)
+    noise = []
+    for harmonic, sums in zip(harmonics, content, strict=True):
+        frequency = harmonic + lines / cycles
+        weights = frequency / frequency.sum()
+        Z = sums @ half.T
+        matrix = (weights / _left_by_drift(frequency * cycles, cycles) * Z) @ Z.conj().T
+        noise.append(LineNoise(matrix, 2.0 * kept / (lines.size * float(weights @ weights))))
+    return noise
+
+
+def _line_content(
+    fit: SineFit, harmonics: Sequence[int], cycles: int, side: int, residual: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return ``sum r exp(-j (k + m/P) theta)`` and the window's own ``sum exp(-j q theta/P)``.
+
+    The first has shape (harmonics, 2, 2 side), the second is for q = 0 ... 2 side.
+    """
+    theta = fit.stretch.theta
+    content = np.zeros((len(harmonics), 2, 2 * side), dtype=np.complex128)
+    window = np.zeros(2 * side + 1, dtype=np.complex128)
+    for start in range(0, theta.size, _BLOCK):
+        part = slice(start, start + _BLOCK)
+        base = np.exp(-1j / cycles * theta[part])
+        tones = np.ones((side + 1, base.size), dtype=np.complex128)
+        for m in range(1, side + 1):
+            np.multiply(tones[m - 1], base, out=tones[m])
+        window[: side + 1] += tones.sum(axis=1)
+        window[side + 1 :] += tones[1:] @ tones[side]
+        lines = np.concatenate([tones[:0:-1].conj(), tones[1:]])
+        for i, k in enumerate(harmonics):
+            content[i] += (residual[:, part] * np.exp(-1j * k * theta[part])) @ lines.T
+    return content, window
+
+
+def _orthogonal(window: ComplexArray, lines: FloatArray) -> tuple[ComplexArray, int]:
+    """Return the matrix that gives each line the variance of a sample, and how many are free.
+
+    On an even grid the lines are orthogonal. Gaps mix them with one another and with the
+    harmonic between them, which the fit has removed.
+    """
+    apart = lines[:, None] - lines
+    gram = np.where(apart >= 0, window[np.abs(apart)], window[np.abs(apart)].conj())
+    onto = np.where(lines >= 0, window[np.abs(lines)], window[np.abs(lines)].conj())
+    gram -= np.outer(onto, onto.conj()) / window[0]
+    values, vectors = np.linalg.eigh(gram)
+    free = values > _INDEPENDENT * values[-1]
+    half = np.where(free, 1.0 / np.sqrt(np.where(free, values, 1.0)), 0.0)
+    return (vectors * half) @ vectors.conj().T, int(free.sum())
+
+
+def _left_by_drift(periods: FloatArray, cycles: int) -> FloatArray:
+    """Return the share of a line's power that fitting a drift leaves.
+
+    A straight line holds 6/(pi p)^2 of the sine with p periods in the record and nothing of
+    the cosine; its part in the harmonics, about 1/P^2, is theirs already.
+    """
+    return 1.0 - 3.0 / (np.pi * periods) ** 2 / (1.0 - 1.0 / cycles**2)

@@ -1,0 +1,64 @@
+"""What a stretch of samples shows about its own quality: steps, clipping, share of the sine.
+
+The describing function assumes a displacement that is one sine, seen by a sensor that is finer
+than the amplitude and wide enough for it. Each of these is measured here, for each stretch.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.extraction.sine_fit import HARMONICS, SineFit
+
+_LOOKED_AT = 20_000  # samples from which the sensor's step is found
+_SAME = 1e-9  # of the range: values nearer than this are equal but for rounding
+_RAIL_RUN = 5  # samples in a row at an extreme value
+
+
+def sensor_step(samples: FloatArray) -> float:
+    """Return the sensor's step, 0 where the values are not multiples of any."""
+    stride = max(1, samples.size // _LOOKED_AT)
+    values = np.sort(samples[::stride])
+    gaps = np.diff(values)
+    gaps = gaps[gaps > _SAME * (values[-1] - values[0])]
+    if gaps.size == 0:
+        return 0.0
+    few = gaps[gaps < 10.5 * gaps.min()] / gaps.min()
+    return float(gaps.min()) if np.abs(few - np.round(few)).max() < 0.05 else 0.0
+
+
+def clipped_share(samples: FloatArray, step: float, noise: float, longest: float) -> float:
+    """Return the share of samples that stand still at the highest or the lowest value.
+
+    A run of equal extreme values means clipping where the noise would not let the value stand
+    still, or where the run is longer than the waveform's own crest, `longest` samples.
+    """
+    tolerance = max(0.5 * step, _SAME * float(np.ptp(samples)))
+    allowed = _RAIL_RUN if noise > max(step, tolerance) else max(_RAIL_RUN, 1.5 * longest)
+    stuck = 0
+    for at_rail in (samples > samples.max() - tolerance, samples < samples.min() + tolerance):
+        edges = np.flatnonzero(np.diff(at_rail, prepend=False, append=False))
+        runs = edges[1::2] - edges[::2]
+        stuck += int(runs[runs > allowed].sum())
+    return stuck / samples.size
+
+
+def crest_samples(amplitude: float, step: float, sample_phase: float) -> float:
+    """Return how many samples of a sine lie within one sensor step of its crest."""
+    below = min(max(step / amplitude, _SAME), 2.0)
+    return float(2.0 * np.arccos(1.0 - below) / sample_phase) + 1.0
+
+
+def fundamental_share(fit: SineFit) -> FloatArray:
+    """Return the fundamental's share of the power of each channel, offset and drift apart."""
+    powers = np.array([np.abs(fit.phasors(k)) ** 2 / 2.0 for k in range(1, fit.orders + 1)])
+    return np.asarray(powers[0] / (powers.sum(axis=0) + np.mean(fit.residual**2, axis=1)))
+
+
+def distortion(fit: SineFit, integrations: int) -> float:
+    """Return the displacement's harmonics 2 to 9 over its fundamental, root of summed squares."""
+    orders = np.arange(1, min(HARMONICS, fit.orders) + 1)
+    motion = np.array([abs(fit.phasors(int(k))[0]) for k in orders])
+    displacement = motion / orders.astype(np.float64) ** integrations
+    return float(np.sqrt(np.sum(displacement[1:] ** 2)) / displacement[0])

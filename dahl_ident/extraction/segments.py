@@ -1,0 +1,189 @@
+"""Segments: the stretches of a record that hold one amplitude and one frequency, or a sweep.
+
+Cycle by cycle a piece grows while amplitude and frequency stay what they were on average, to
+within a tolerance that the noise may widen. A piece that is long enough and has no trend is a
+plateau, and becomes a point; the others are ramps, and are left out. Where there is more ramp
+than plateau the record is a sweep; it is cut into windows short enough that amplitude and
+frequency change little in each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.extraction.cycles import Cycles
+
+Mode = Literal["auto", "steps", "sweep"]
+MODES: tuple[Mode, ...] = ("auto", "steps", "sweep")
+_AMPLITUDE_TOLERANCE = 0.02
+_FREQUENCY_TOLERANCE = 0.01
+_NOISE_FACTOR = 5.0
+_NOISIEST = 0.2  # noise of a cycle's log amplitude above which it is no cycle
+_EDGE_TOLERANCE = 0.005  # of the amplitude: cycles at the ends of a plateau that stray more go
+_SWEEP_STEP = 0.2  # change of log amplitude or frequency in a cycle that a sweep may make
+_SWEEP_CHANGE = 0.1  # in a window
+_SWEEP_CYCLES = (4, 20)  # in a window
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Start and stop in s, and the frequency in the middle, Hz."""
+
+    start: float
+    stop: float
+    frequency_hz: float
+    sweep: bool = False
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Cycles first to last (not included) of one run of cycles."""
+
+    cycles: Cycles
+    first: int
+    last: int
+
+    def __len__(self) -> int:
+        return self.last - self.first
+
+    @property
+    def log_amplitude(self) -> FloatArray:
+        return self.cycles.log_amplitude[self.first : self.last]
+
+    @property
+    def log_frequency(self) -> FloatArray:
+        return self.cycles.log_frequency[self.first : self.last - 1]
+
+    @property
+    def noise(self) -> float:
+        return float(np.median(self.cycles.noise[self.first : self.last]))
+
+    @property
+    def trending(self) -> bool:
+        """Whether amplitude or frequency changes from end to end by more than the tolerance."""
+        amplitude, frequency = _tolerances(self.noise)
+        return (
+            abs(_change(self.log_amplitude)) > amplitude
+            or abs(_change(self.log_frequency)) > frequency
+        )
+
+    def segment(self, *, sweep: bool = False) -> Segment:
+        frequency = self.log_frequency
+        start, stop = self.cycles.start[self.first], self.cycles.stop[self.last - 1]
+        return Segment(float(start), float(stop), float(np.exp(np.mean(frequency))), sweep)
+
+
+def find_segments(
+    runs: Sequence[Cycles], mode: Mode, fewest: int, window: int | None
+) -> list[Segment]:
+    """Return the segments of a record in order of time.
+
+    Parameters
+    ----------
+    runs : sequence of Cycles
+        Runs of consecutive cycles.
+    mode : {"auto", "steps", "sweep"}
+        Plateaus, sweeps, or whichever there is more of.
+    fewest : int
+        Cycles that a plateau has at least.
+    window : int or None
+        Cycles in a window of a sweep; None: as many as change little.
+
+    Returns
+    -------
+    list of Segment
+        None where there is neither.
+    """
+    pieces = [piece for cycles in runs for piece in _pieces(cycles) if len(piece) >= 2]
+    plateaus = [p for p in pieces if len(p) >= fewest and not p.trending]
+    if mode == "auto":
+        trending = sum(len(p) for p in pieces if p.trending)
+        mode = "sweep" if trending > sum(map(len, plateaus)) else "steps"
+    if mode == "steps":
+        return [_trimmed(p, fewest).segment() for p in plateaus]
+    return [s for cycles in runs for sweep in _sweeps(cycles) for s in _windows(sweep, window)]
+
+
+def _tolerances(noise: float) -> tuple[float, float]:
+    """Return how much log amplitude and log frequency may vary within a plateau."""
+    return (
+        max(_AMPLITUDE_TOLERANCE, _NOISE_FACTOR * noise),
+        max(_FREQUENCY_TOLERANCE, _NOISE_FACTOR * noise / np.pi),
+    )
+
+
+def _change(values: FloatArray) -> float:
+    """Return the change from end to end of the straight line through the values."""
+    if values.size < 2:
+        return 0.0
+    place = np.linspace(-0.5, 0.5, values.size)
+    return float(place @ values / (place @ place))
+
+
+def _pieces(cycles: Cycles) -> Iterator[_Piece]:
+    """Grow pieces cycle by cycle against the mean of what they have."""
+    amplitude, frequency = cycles.log_amplitude.tolist(), cycles.log_frequency.tolist()
+    noise = cycles.noise.tolist()
+    first, a_sum, f_sum = 0, 0.0, 0.0
+    for j in range(len(cycles)):
+        if j > first:
+            held = j - first
+            a_tolerance, f_tolerance = _tolerances(max(noise[j], noise[first]))
+            f_mean = f_sum / (held - 1) if held > 1 else frequency[j - 1]
+            fits = (
+                max(noise[j], noise[first]) < _NOISIEST
+                and abs(amplitude[j] - a_sum / held) <= a_tolerance
+                and abs(frequency[j - 1] - f_mean) <= f_tolerance
+            )
+            if not fits:
+                yield _Piece(cycles, first, j)
+                first, a_sum, f_sum = j, 0.0, 0.0
+            else:
+                f_sum += frequency[j - 1]
+        a_sum += amplitude[j]
+    if len(cycles):
+        yield _Piece(cycles, first, len(cycles))
+
+
+def _trimmed(piece: _Piece, fewest: int) -> _Piece:
+    """Leave out cycles at the ends that stray from the plateau's level, the rest of a ramp."""
+    a = piece.log_amplitude
+    level = float(np.median(a))
+    scatter = 1.5 * float(np.median(np.abs(a - level)))
+    within = np.abs(a - level) <= max(_EDGE_TOLERANCE, _NOISE_FACTOR * max(piece.noise, scatter))
+    kept = np.flatnonzero(within)
+    if kept.size == 0 or kept[-1] + 1 - kept[0] < fewest:
+        return piece
+    return _Piece(piece.cycles, piece.first + int(kept[0]), piece.first + int(kept[-1]) + 1)
+
+
+def _sweeps(cycles: Cycles) -> Iterator[_Piece]:
+    """Return the parts of a run in which nothing jumps."""
+    if len(cycles) < 2:
+        return
+    jump = np.abs(np.diff(cycles.log_amplitude)) > _SWEEP_STEP
+    jump[1:] |= np.abs(np.diff(cycles.log_frequency)) > _SWEEP_STEP
+    jump |= np.maximum(cycles.noise[1:], cycles.noise[:-1]) > _NOISIEST
+    bounds = np.concatenate([[0], np.flatnonzero(jump) + 1, [len(cycles)]])
+    for first, last in pairwise(bounds.tolist()):
+        if last - first >= _SWEEP_CYCLES[0]:
+            yield _Piece(cycles, first, last)
+
+
+def _windows(sweep: _Piece, window: int | None) -> Iterator[Segment]:
+    """Cut a sweep into windows in which amplitude and frequency change little."""
+    least, most = _SWEEP_CYCLES
+    first = sweep.first
+    while sweep.last - first >= (window or least):
+        ahead = _Piece(sweep.cycles, first, min(first + most, sweep.last))
+        change = max(abs(_change(ahead.log_amplitude)), abs(_change(ahead.log_frequency)))
+        fitting = int(len(ahead) * min(1.0, _SWEEP_CHANGE / max(change, 1e-12)))
+        size = window or max(least, fitting)
+        yield _Piece(sweep.cycles, first, first + size).segment(sweep=True)
+        first += size

@@ -1,0 +1,302 @@
+r"""Sine fit: the phasors of motion and force in one stretch of steady sine excitation.
+
+Both channels are fitted with the same columns by linear least squares,
+
+    y(t) = offset + drift tau + sum_k c_k cos(k theta) + s_k sin(k theta),   k = 1 ... K
+
+so that what is fitted beside the fundamental (odd and even harmonics, offset, drift) does not
+leak into it, and samples are taken where they are: jitter, gaps and missing samples need no
+resampling. A phasor is ``Y_k = c_k - j s_k``, so that ``y = Re(Y_k exp(j k theta))``.
+
+The phase ``theta`` is a polynomial of ``tau``, time from -1 to 1 over the stretch: ``theta =
+omega (t - t_c)`` where the frequency is steady. With the middle of the stretch as origin an
+error of the frequency does not turn the phasors. The frequency is either known or estimated
+jointly with them from both channels, the four-parameter fit of IEEE Std 1057. In a sweep theta
+has a higher degree, and each harmonic may change linearly over the stretch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.polynomial import Polynomial
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.errors import ExtractionError
+
+HARMONICS = 9  # fitted at least, where the sampling can tell them apart
+_MOST_HARMONICS = 40  # fitted so that they do not leak where cycles are no whole samples
+_AFFORDABLE = 4e6  # samples times harmonics; leakage falls with the number of samples
+_NYQUIST_MARGIN = 0.45  # highest harmonic over the sampling rate
+_BLOCK = 16384  # samples whose columns stay in the cache
+_BLOCKS_PER_CYCLE = 64  # block means that lose 4e-4 of the fundamental
+_MAX_STEPS = 20
+_TRACKED = 0.1  # phase error that is left to the four-parameter fit, rad
+_STEP_TOLERANCE = 1e-4  # phase at the ends of the stretch, rad; its square is the error left
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Samples of motion (row 0) and force (row 1) with their phase, a polynomial of tau."""
+
+    time: FloatArray
+    channels: FloatArray
+    phase: Polynomial
+
+    @property
+    def centre(self) -> float:
+        """Middle of the stretch, s."""
+        return 0.5 * float(self.time[0] + self.time[-1])
+
+    @property
+    def half_width(self) -> float:
+        """Half the duration, s."""
+        return 0.5 * float(self.time[-1] - self.time[0])
+
+    @property
+    def tau(self) -> FloatArray:
+        """Time from -1 to 1."""
+        return (self.time - self.centre) / self.half_width
+
+    @property
+    def theta(self) -> FloatArray:
+        """Phase at every sample, rad."""
+        return np.asarray(self.phase(self.tau))
+
+    @property
+    def omega(self) -> float:
+        """Angular frequency in the middle, rad/s."""
+        return float(self.phase.deriv()(0.0)) / self.half_width
+
+    @property
+    def sample_phase(self) -> float:
+        """Phase from one sample to the next, rad."""
+        return self.omega * float(np.median(np.diff(self.time)))
+
+    def with_samples(self, time: FloatArray, channels: FloatArray) -> Stretch:
+        """Return other samples with the same phase as a function of time."""
+        new = Stretch(time, channels, self.phase)
+        inner = Polynomial(
+            [(new.centre - self.centre) / self.half_width, new.half_width / self.half_width]
+        )
+        return replace(new, phase=self.phase(inner))
+
+    def part(self, keep: slice) -> Stretch:
+        """Return some of the samples, each with the phase it had."""
+        return self.with_samples(self.time[keep], self.channels[:, keep])
+
+
+def steady_stretch(time: FloatArray, channels: FloatArray, omega: float) -> Stretch:
+    """Return a stretch of one angular frequency, rad/s."""
+    half_width = 0.5 * float(time[-1] - time[0])
+    return Stretch(time, channels, Polynomial([0.0, omega * half_width]))
+
+
+def last_cycles(stretch: Stretch, cycles: int) -> Stretch:
+    """Return the last so many cycles; a partial one at the start is left out."""
+    theta = stretch.theta
+    first = theta[-1] + 0.5 * stretch.sample_phase - 2.0 * np.pi * cycles
+    return stretch.part(slice(int(np.searchsorted(theta, first)), None))
+
+
+def whole_cycles(stretch: Stretch) -> int:
+    """Return the number of whole cycles, to within half a sample."""
+    theta = stretch.theta
+    turned = float(theta[-1] - theta[0]) + 1.5 * stretch.sample_phase
+    return int(turned / (2.0 * np.pi))
+
+
+@dataclass(frozen=True)
+class SineFit:
+    """Least-squares fit of both channels; coefficients in the order of the columns."""
+
+    stretch: Stretch
+    orders: int
+    trend: bool
+    coefficients: FloatArray  # (columns, 2)
+    inverse: FloatArray  # of the normal matrix
+    residual: FloatArray  # (2, n)
+
+    def phasors(self, harmonic: int) -> ComplexArray:
+        """Return the phasors of motion and force at one harmonic, shape (2,)."""
+        cos, sin = self.coefficients[2 * harmonic : 2 * harmonic + 2]
+        return np.asarray(cos - 1j * sin)
+
+    def phasor_variance(self, harmonic: int) -> float:
+        """Return E abs(phasor error)^2 for white noise of unit variance."""
+        i = 2 * harmonic
+        return float(self.inverse[i, i] + self.inverse[i + 1, i + 1])
+
+
+def resolvable_orders(stretch: Stretch) -> int:
+    """Return how many harmonics are fitted: those that the sampling can tell apart, or fewer."""
+    per_cycle = 2.0 * np.pi / stretch.sample_phase
+    affordable = np.clip(_AFFORDABLE / stretch.time.size, HARMONICS, _MOST_HARMONICS)
+    orders = int(min(affordable, _NYQUIST_MARGIN * per_cycle))
+    if orders < 1 or stretch.time.size < 2 * orders + 4:
+        raise ExtractionError(
+            f"{stretch.time.size} samples at {per_cycle:.3g} samples a cycle near "
+            f"t = {stretch.centre:.6g} s; expected at least 3 a cycle and 2 cycles: "
+            "sample faster or record longer"
+        )
+    return orders
+
+
+def sine_fit(stretch: Stretch, *, trend: bool = False) -> SineFit:
+    """Fit harmonics, offset and drift to both channels, the phase being known.
+
+    With `trend` every harmonic may also change linearly over the stretch, as in a sweep.
+    """
+    orders = resolvable_orders(stretch)
+    theta, tau = stretch.theta, stretch.tau
+    normal, right = _normal_equations(theta, tau, stretch.channels, orders, trend)
+    inverse = _inverse(normal, stretch)
+    coefficients = inverse @ right
+    residual = stretch.channels.copy()
+    for part, block in _column_blocks(theta, tau, orders, trend):
+        residual[:, part] -= coefficients.T @ block
+    return SineFit(stretch, orders, trend, coefficients, inverse, residual)
+
+
+def remainder(fit: SineFit, waveform: FloatArray) -> FloatArray:
+    """Return what the columns of a fit leave of a waveform on the same samples."""
+    theta, tau = fit.stretch.theta, fit.stretch.tau
+    _, right = _normal_equations(theta, tau, waveform[None], fit.orders, fit.trend)
+    coefficients = (fit.inverse @ right)[:, 0]
+    left = waveform.copy()
+    for part, block in _column_blocks(theta, tau, fit.orders, fit.trend):
+        left[part] -= coefficients @ block
+    return left
+
+
+def estimate_frequency(stretch: Stretch) -> Stretch:
+    """Return the stretch with the frequency that fits both channels best.
+
+    Gauss-Newton on the four-parameter fit; the channels are weighted by their residuals. The
+    start has to be within about half a cycle over the whole stretch, see `track_phase`.
+    """
+    for _ in range(_MAX_STEPS):
+        step = _frequency_step(thinned(stretch))
+        stretch = replace(stretch, phase=stretch.phase + Polynomial([0.0, step]))
+        if abs(step) < _STEP_TOLERANCE:
+            return stretch
+    raise ExtractionError(
+        f"the frequency near {stretch.omega / (2.0 * np.pi):.6g} Hz around t = "
+        f"{stretch.centre:.6g} s did not settle in {_MAX_STEPS} steps; expected one steady sine: "
+        "give frequency="
+    )
+
+
+def track_phase(stretch: Stretch, degree: int) -> Stretch:
+    """Return the stretch with its phase following the motion's, cycle by cycle.
+
+    The phase of each cycle's phasor is unwrapped and added to the phase as a polynomial, so a
+    start that is wrong by many cycles over the stretch is put right.
+    """
+    for _ in range(_MAX_STEPS):
+        bend = _phase_error(thinned(stretch), degree)
+        stretch = replace(stretch, phase=stretch.phase + bend)
+        if np.abs(bend.coef).sum() < _TRACKED:
+            break
+    return stretch
+
+
+def _phase_error(stretch: Stretch, degree: int) -> Polynomial:
+    """Return by how much the motion's phase departs, a polynomial of tau that is 0 at 0."""
+    theta = stretch.theta
+    motion = stretch.channels[0] - stretch.channels[0].mean()
+    turns = (theta - theta[0]) / (2.0 * np.pi)
+    starts = np.searchsorted(turns, np.arange(int(turns[-1] + 0.25)))
+    starts = np.unique(starts[starts < theta.size])
+    if starts.size <= degree:
+        return Polynomial([0.0])
+    counts = np.diff(starts, append=theta.size)
+    sums = np.add.reduceat(motion * np.exp(-1j * theta), starts)
+    at = np.add.reduceat(stretch.tau, starts) / counts
+    bend = Polynomial.fit(at, np.unwrap(np.angle(sums)), degree, w=np.abs(sums)).convert()
+    return bend - bend(0.0)
+
+
+def thinned(stretch: Stretch) -> Stretch:
+    """Return block means, about 64 a cycle, where there are twice as many samples."""
+    if stretch.sample_phase > np.pi / _BLOCKS_PER_CYCLE:
+        return stretch
+    theta = stretch.theta
+    block = np.floor((theta - theta[0]) * (_BLOCKS_PER_CYCLE / (2.0 * np.pi)))
+    starts = np.flatnonzero(np.diff(block, prepend=-1.0))
+    counts = np.diff(starts, append=theta.size)
+    means = np.add.reduceat(stretch.channels, starts, axis=1) / counts
+    return stretch.with_samples(np.add.reduceat(stretch.time, starts) / counts, means)
+
+
+def _frequency_step(stretch: Stretch) -> float:
+    """Return one Gauss-Newton step of the phase at tau = 1, rad."""
+    orders = min(HARMONICS, resolvable_orders(stretch))
+    theta, tau, y = stretch.theta, stretch.tau, stretch.channels
+    normal, right = _normal_equations(theta, tau, y, orders, trend=True)
+    n = 2 * orders + 2
+    inverse = _inverse(normal[:n, :n], stretch)
+    slope = step = 0.0
+    for channel in range(len(y)):
+        coefficients = inverse @ right[:n, channel]
+        cos, sin = coefficients[2:4]
+        change = np.zeros(normal.shape[0])  # tau (-cos sin(theta) + sin cos(theta))
+        change[n : n + 2] = sin, -cos
+        across = normal[:n] @ change
+        misfit = change @ right[:, channel] - across @ coefficients
+        power = change @ normal @ change - across @ inverse @ across
+        left = float(y[channel] @ y[channel] - right[:n, channel] @ coefficients)
+        weight = 1.0 / max(left, 1e-24 * float(y[channel] @ y[channel]))
+        slope += weight * float(power)
+        step += weight * float(misfit)
+    return step / slope
+
+
+def columns(theta: FloatArray, tau: FloatArray, orders: int, *, trend: bool = False) -> FloatArray:
+    """Return 1, tau, cos theta, sin theta, cos 2 theta, ...; with `trend` these times tau too."""
+    width = 2 * orders + 2
+    out = np.empty((width + 2 * orders * trend, theta.size))
+    out[0] = 1.0
+    out[1] = tau
+    rotor = np.cos(theta) + 1j * np.sin(theta)
+    power = rotor.copy()
+    for k in range(1, orders + 1):
+        out[2 * k] = power.real
+        out[2 * k + 1] = power.imag
+        power *= rotor
+    if trend:
+        np.multiply(out[2:width], tau, out=out[width:])
+    return out
+
+
+def _column_blocks(
+    theta: FloatArray, tau: FloatArray, orders: int, trend: bool
+) -> Iterator[tuple[slice, FloatArray]]:
+    """Yield slices of the samples with their columns."""
+    for start in range(0, theta.size, _BLOCK):
+        part = slice(start, start + _BLOCK)
+        yield part, columns(theta[part], tau[part], orders, trend=trend)
+
+
+def _normal_equations(
+    theta: FloatArray, tau: FloatArray, channels: FloatArray, orders: int, trend: bool
+) -> tuple[FloatArray, FloatArray]:
+    width = 2 * orders + 2 + 2 * orders * trend
+    normal = np.zeros((width, width))
+    right = np.zeros((width, len(channels)))
+    for part, block in _column_blocks(theta, tau, orders, trend):
+        normal += block @ block.T
+        right += block @ channels[:, part].T
+    return normal, right
+
+
+def _inverse(normal: FloatArray, stretch: Stretch) -> FloatArray:
+    if np.linalg.cond(normal) > 1e8:
+        raise ExtractionError(
+            f"the samples around t = {stretch.centre:.6g} s do not tell the harmonics of "
+            f"{stretch.omega / (2.0 * np.pi):.6g} Hz apart; expected samples spread over whole "
+            "cycles: check frequency= and the sampling"
+        )
+    return np.asarray(np.linalg.inv(normal))
