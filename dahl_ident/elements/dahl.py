@@ -382,8 +382,11 @@ class Dahl(Element):
         beta = sigma * amplitude / f_max
         if harmonic == 1:
             if _is_linear(alpha):
-                return np.asarray(sigma * linear_dahl.describing_function(beta))
-            return np.asarray(sigma * general_dahl.describing_function(beta, alpha))
+                h = linear_dahl.describing_function(beta)
+            else:
+                h = general_dahl.describing_function(beta, alpha)
+            h *= sigma
+            return h
         if _is_linear(alpha):
             c = linear_dahl.harmonic(beta, harmonic)
         else:
