@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import statistics
 import time
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison: `ours` and `peer` in seconds for the same work.
+    """One comparison: `ours` and `peer` for the same work, in seconds (or bytes, `unit` "B").
 
     `target` is the bound on the ratio ours/peer (at most), or on peer/ours where `faster`.
     """
@@ -21,6 +22,7 @@ class Row:
     peer_name: str
     target: float
     faster: bool = False
+    unit: str = "s"
 
     @property
     def ratio(self) -> float:
@@ -53,22 +55,35 @@ def seconds(work: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
+def peak_bytes(work: Callable[[], object]) -> int:
+    """Return the most memory that one call holds at a time, its result included."""
+    work()
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
 def print_table(title: str, rows: list[Row]) -> None:
     """Print the comparisons as a Markdown table."""
     print(f"\n## {title}\n")
     print("| work | ours | peer | peer is | ratio | to reach | reached |")
     print("|---|---|---|---|---|---|---|")
     for row in rows:
-        sign, unit = (">=", "x faster") if row.faster else ("<=", "x the time")
+        noun = "time" if row.unit == "s" else "size"
+        sign, unit = (">=", "x faster") if row.faster else ("<=", f"x the {noun}")
         print(
-            f"| {row.work} | {_pretty(row.ours)} | {_pretty(row.peer)} | {row.peer_name} "
+            f"| {row.work} | {_pretty(row.ours, row.unit)} | {_pretty(row.peer, row.unit)} "
+            f"| {row.peer_name} "
             f"| {row.ratio:.3g} {unit} | {sign} {row.target:g} "
             f"| {'yes' if row.reached else 'NO'} |"
         )
 
 
-def _pretty(value: float) -> str:
-    for factor, unit in ((1.0, "s"), (1e3, "ms"), (1e6, "us")):
+def _pretty(value: float, unit: str) -> str:
+    for factor, prefix in ((1e-6, "M"), (1e-3, "k"), (1.0, ""), (1e3, "m"), (1e6, "u")):
         if value * factor >= 1.0:
-            return f"{value * factor:.3g} {unit}"
-    return f"{value * 1e9:.3g} ns"
+            return f"{value * factor:.3g} {prefix}{unit}"
+    return f"{value * 1e9:.3g} n{unit}"
