@@ -74,6 +74,15 @@ def positive_array(value: ArrayLike, name: str) -> FloatArray:
     return array
 
 
+def array_between(value: ArrayLike, name: str, low: float, high: float) -> FloatArray:
+    """Return `value` as a finite float array of numbers from `low` to `high`."""
+    array = finite_array(value, name)
+    good = (array >= low) & (array <= high)
+    if not good.all():
+        _refuse(array, good, name, f"numbers from {low:g} to {high:g}")
+    return array
+
+
 def positive_number(value: Any, name: str) -> float:
     """Return `value` as one finite float above zero."""
     array = positive_array(value, name)
