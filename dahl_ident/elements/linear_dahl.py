@@ -9,7 +9,7 @@ displacement is (Eqn. 11, with `t = x/A` and Eqn. 8 for the reversal force `tanh
 
     F/f_max = -1 + (1 + tanh beta) exp(beta (t - 1)) = -1 + exp(beta t) / cosh(beta)
 
-and on the rising stretch the same turned about the origin. The even harmonics vanish therefore.
+and on the rising stretch the same turned about the origin, so the even harmonics vanish.
 
 **Harmonics.** Eqn. 22, which the paper leaves as a series, is a modified Bessel function of the
 first kind, and the sine coefficients are integrals over a Chebyshev polynomial of the second
@@ -247,7 +247,7 @@ def harmonic(beta: FloatArray, k: int) -> ComplexArray:
     -------
     ndarray of complex, the shape of `beta`
         Exactly 0 for even `k`; `beta h(beta)` for `k = 1`; else within 1e-12 of the larger part
-        (verified to `k = 15`).
+        up to `k = 15` and 1e-9 at 101, with the derivatives of `harmonic_gradient`.
 
     Examples
     --------
@@ -273,6 +273,13 @@ def harmonic_gradient(beta: FloatArray, k: int) -> tuple[ComplexArray, ComplexAr
     c_k, by_ln_beta : ndarray of complex, the shape of `beta`
         As in `harmonic`; `a_k - j b_k = f_max c_k` changes with `ln sigma` by
         `f_max by_ln_beta`, with `ln f_max` by `f_max (c_k - by_ln_beta)`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> c, by_ln_beta = harmonic_gradient(np.array([0.0, 50.0]), 3)
+    >>> by_ln_beta.round(6)
+    array([ 0.      +0.j     , -0.084862+0.06849j])
     """
     if k == 1:
         h, _, by_ln_sigma = describing_function_gradient(beta)
