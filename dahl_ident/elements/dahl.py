@@ -10,8 +10,7 @@ takes one quadrature, see :mod:`dahl_ident.elements.general_dahl`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -65,7 +64,7 @@ class Dahl(Element):
     0.003333
     >>> N = pivot.describing_function([1e-6, 1e-3, 1.0])
     >>> abs(N).round(4).tolist()
-    [29.9999, 28.8979, 0.1308]
+    [30.0, 29.2562, 0.1272]
     """
 
     def __init__(
@@ -123,13 +122,19 @@ class Dahl(Element):
         A = non_negative_array(amplitude, "amplitude")
         return self.stiffness(self.known_values(), A, np.zeros(()))[()]
 
-    def gradient(self, amplitude: ArrayLike) -> dict[str, ComplexArray]:
+    def gradient(
+        self, amplitude: ArrayLike, names: Iterable[str] | None = None
+    ) -> dict[str, ComplexArray]:
         """Return dN/dp for each parameter p of the element, and dN/dA as ``"amplitude"``.
 
         Parameters
         ----------
         amplitude : array_like
             Zero-to-peak displacement A >= 0, m.
+        names : iterable of str, optional
+            The derivatives wanted; all of them where left out. Without alpha, which takes a
+            quadrature, an element with alpha = 1 answers from closed forms, some twenty times
+            faster.
 
         Returns
         -------
@@ -141,7 +146,7 @@ class Dahl(Element):
         ModelError
             If a parameter has no value.
         ValidationError
-            If an amplitude is negative, NaN, infinite or complex.
+            If an amplitude is negative, NaN, infinite or complex, or a name is unknown.
 
         Examples
         --------
@@ -149,10 +154,15 @@ class Dahl(Element):
         ['alpha', 'amplitude', 'f_max', 'sigma']
         """
         A = non_negative_array(amplitude, "amplitude")
-        result = self._gradient(self.known_values(), A, 1, with_alpha=True)
-        names = (p.name for p in self.parameters)
-        by_parameter = dict(zip(names, (d[()] for d in result.by_parameter), strict=True))
-        return {**by_parameter, "amplitude": result.by_amplitude[()]}
+        known = [*(p.name for p in self.parameters), "amplitude"]
+        wanted = known if names is None else list(names)
+        unknown = [name for name in wanted if name not in known]
+        if unknown:
+            raise ValidationError(f"names has {unknown[0]!r}; expected some of {', '.join(known)}")
+        with_alpha = self.parameters[2].name in wanted
+        result = self._gradient(self.known_values(), A, 1, with_alpha=with_alpha)
+        found = dict(zip(known, (*result.by_parameter, result.by_amplitude), strict=True))
+        return {name: found[name][()] for name in wanted}
 
     def fourier_coefficients(
         self, amplitude: ArrayLike, harmonic: int = 1
@@ -226,7 +236,7 @@ class Dahl(Element):
 
         Examples
         --------
-        >>> Dahl(f_max=1.0, sigma=3.0).equivalent_stiffness(0.0)
+        >>> print(Dahl(f_max=1.0, sigma=3.0).equivalent_stiffness(0.0))
         3.0
         """
         return self.describing_function(amplitude).real[()]
@@ -353,7 +363,7 @@ class Dahl(Element):
         Examples
         --------
         >>> Dahl(f_max=1.0, sigma=1.0).force([0.0, 1.0, 0.5]).round(4).tolist()
-        [0.0, 0.6321, 0.0102]
+        [0.0, 0.6321, -0.0101]
         """
         x = finite_array(displacement, "displacement")
         if x.ndim > 1:
@@ -417,39 +427,46 @@ class Dahl(Element):
     ) -> StiffnessGradient:
         f_max, sigma, alpha = values
         beta = sigma * amplitude / f_max
-        closed = _is_linear(alpha) and not with_alpha
-        if harmonic == 1:
-            if closed:
-                h, by_f_max, by_sigma = linear_dahl.describing_function_gradient(beta)
-                by_alpha: Any = 0.0
-            else:
-                h, by_f_max, by_sigma, by_alpha = general_dahl.describing_function_gradient(
-                    beta, alpha
-                )
+        closed = _is_linear(alpha)
+        if harmonic == 1 and closed:
+            h, by_f_max, by_sigma = linear_dahl.describing_function_gradient(beta)
+        elif harmonic == 1:
+            h, by_f_max, by_sigma, by_alpha = general_dahl.describing_function_gradient(beta, alpha)
         else:
             if closed:
                 c, slope = linear_dahl.harmonic_gradient(beta, harmonic)
-                by_alpha = 0.0
             else:
                 c, slope, by_alpha = general_dahl.harmonic_gradient(beta, alpha, harmonic)
                 by_alpha = _per(by_alpha, beta)
             h, by_f_max, by_sigma = _per(c, beta), _per(c - slope, beta), _per(slope, beta)
-        shape = np.broadcast_shapes(h.shape, np.shape(alpha))
-        by_ln_amplitude = -sigma * by_f_max
-        by_amplitude = np.divide(
-            by_ln_amplitude,
+        if not with_alpha:
+            by_alpha = np.zeros(h.shape, dtype=np.complex128)
+        elif closed and harmonic == 1:
+            by_alpha = general_dahl.describing_function_gradient(beta, alpha)[3]
+        elif closed:
+            by_alpha = _per(general_dahl.harmonic_gradient(beta, alpha, harmonic)[2], beta)
+        by_amplitude = self._by_amplitude(values, amplitude, harmonic, by_f_max)
+        h *= sigma
+        by_f_max *= sigma / f_max
+        return StiffnessGradient(h, by_amplitude, (by_f_max, by_sigma, sigma * by_alpha))
+
+    @staticmethod
+    def _by_amplitude(
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        harmonic: int,
+        by_ln_f_max: ComplexArray,
+    ) -> ComplexArray:
+        """Return dN/dA = -(sigma/A) times the derivative of h by ln f_max, also at rest."""
+        sigma = values[1]
+        if np.all(amplitude > 0.0):
+            return np.asarray(by_ln_f_max * (-sigma / amplitude))
+        shape = by_ln_f_max.shape
+        return np.divide(
+            -sigma * by_ln_f_max,
             amplitude,
             out=_slope_at_rest(values, harmonic, shape),
             where=np.broadcast_to(amplitude > 0.0, shape),
-        )
-        return StiffnessGradient(
-            np.asarray(sigma * h),
-            by_amplitude,
-            (
-                np.asarray(sigma / f_max * by_f_max),
-                np.asarray(by_sigma + 0.0),
-                np.asarray(sigma * by_alpha + np.zeros(shape, dtype=np.complex128)),
-            ),
         )
 
 

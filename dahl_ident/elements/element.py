@@ -111,7 +111,7 @@ class Element(ABC):
         Examples
         --------
         >>> from dahl_ident import Mass, Spring
-        >>> (Mass(0.3) + Spring(0.3)).dynamic_stiffness(1e-3, 2.0)
+        >>> print((Mass(0.3) + Spring(0.3)).dynamic_stiffness(1e-3, 2.0))
         (-0.8999999999999999+0j)
         """
         A = non_negative_array(amplitude, "amplitude")

@@ -72,7 +72,7 @@ class Mass(_Lumped):
 
     Examples
     --------
-    >>> Mass(0.3).dynamic_stiffness(1e-3, 10.0)
+    >>> print(Mass(0.3).dynamic_stiffness(1e-3, 10.0))
     (-30+0j)
     """
 
@@ -115,7 +115,7 @@ class Damper(_Lumped):
 
     Examples
     --------
-    >>> Damper(0.24).dynamic_stiffness(1e-3, 10.0)
+    >>> print(Damper(0.24).dynamic_stiffness(1e-3, 10.0))
     2.4j
     """
 
@@ -158,7 +158,7 @@ class Spring(_Lumped):
 
     Examples
     --------
-    >>> Spring(0.3).dynamic_stiffness(1e-3, 10.0)
+    >>> print(Spring(0.3).dynamic_stiffness(1e-3, 10.0))
     (0.3+0j)
     """
 
