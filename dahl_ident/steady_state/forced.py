@@ -130,36 +130,37 @@ def response(
     f = non_negative_array(frequency_hz, "frequency_hz")
     u0 = positive_array(drive, "drive")
     shape = broadcast_shape(frequency_hz=f, drive=u0)
-    values, omega = plant.known_values(), 2.0 * np.pi * f
-    points, _ = flatten(plant, values, omega, u0)
+    points, _ = flatten(plant, plant.known_values(), 2.0 * np.pi * f, u0)
     roots = find_all(points)
     count = np.isfinite(roots).sum(axis=1).reshape(shape)
     message = _message(count, np.broadcast_to(f, shape), np.broadcast_to(u0, shape))
     if all_roots:
-        amplitude = roots.reshape(*shape, roots.shape[1])
-        f, u0, omega = f[..., None], u0[..., None], omega[..., None]
+        f, u0, shape = f[..., None], u0[..., None], (*shape, roots.shape[1])
     else:
-        amplitude = roots[:, 0].reshape(shape)
         if np.any(count > 1):
             text = f"{message}; the smallest is returned, all of them with all_roots=True"
             warnings.warn(text, MultipleSolutionsWarning, stacklevel=2)
-    found = np.isfinite(amplitude)
-    Z = plant.stiffness(values, np.where(found, amplitude, 0.0), omega)
-    displacement = amplitude * np.exp(-1j * np.angle(Z))
+        roots = roots[:, :1]
+    found = np.isfinite(roots)
+    force = points.force(np.where(found, roots, 1.0).T).T
+    amplitude = roots * points.unit[:, None]
+    with np.errstate(invalid="ignore"):  # no force at a resonance without friction
+        displacement = amplitude * (force.conj() / np.abs(force))
     return SteadyResponse(
-        frequency_hz=_read_only(f, amplitude.shape),
-        drive=_read_only(u0, amplitude.shape),
-        amplitude=_read_only(amplitude, amplitude.shape),
-        displacement=_read_only(displacement, amplitude.shape),
-        found=_read_only(found, amplitude.shape),
-        number_of_solutions=_read_only(count, shape),
+        frequency_hz=_read_only(np.broadcast_to(f, shape)),
+        drive=_read_only(np.broadcast_to(u0, shape)),
+        amplitude=_read_only(amplitude.reshape(shape)),
+        displacement=_read_only(displacement.reshape(shape)),
+        found=_read_only(found.reshape(shape)),
+        number_of_solutions=_read_only(count),
         message=message,
     )
 
 
-def _read_only(array: NDArray[_Scalar], shape: tuple[int, ...]) -> NDArray[_Scalar]:
-    """Return a view that cannot be written, or a scalar."""
-    return np.broadcast_to(array, shape)[()]
+def _read_only(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
+    """Return the array, closed to writing, or its scalar."""
+    array.flags.writeable = False
+    return array[()]
 
 
 def _message(count: IntArray, frequency_hz: FloatArray, drive: FloatArray) -> str:

@@ -27,7 +27,7 @@ def solve(
     several amplitudes the one nearest to `start` in ratio, else the smallest.
     """
     plant, shape = flatten(model, values, omega, drive)
-    roots = all_roots(plant)
+    roots = all_roots(plant) * plant.unit[:, None]
     if start is None or roots.shape[1] == 1:
         return roots[:, 0].reshape(shape)
     near = np.broadcast_to(start, shape).reshape(-1, 1)

@@ -78,7 +78,7 @@ class Plant:
     friction: Friction
     unit: FloatArray  # of amplitude, m
 
-    def at(self, points: IntArray) -> Plant:
+    def at(self, points: IntArray | slice) -> Plant:
         """Return the plant at some of its points."""
         return Plant(
             self.linear[points],
@@ -88,6 +88,10 @@ class Plant:
             self.friction,
             self.unit[points],
         )
+
+    def force(self, amplitude: FloatArray) -> ComplexArray:
+        """Return A (L + N), the phasor that a displacement phasor A takes."""
+        return amplitude * self.linear + self.friction.force(amplitude, self.vector)
 
     def largest_friction(self) -> FloatArray:
         """Return the friction force's fundamental in gross slip."""

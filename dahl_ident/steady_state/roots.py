@@ -13,6 +13,7 @@ each other than the grid's nodes, 1.8 % in amplitude, may be missed.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -20,32 +21,41 @@ import numpy as np
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.steady_state.plant import EPS, BoolArray, Friction, IntArray, Plant
 
-_NODES_PER_DECADE = (4, 96)
+_NODES_PER_DECADE = (4, 180)
 _SCAN_PER_DECADE = 128
 _SCAN_CELLS = 2**18  # points times nodes of the scan in work at once
 _CHUNK = 8192  # points solved together: their scratch arrays stay in the processor's cache
 
 
 def all_roots(plant: Plant) -> FloatArray:
-    """Return every amplitude of every point, rising, shape (points, most), NaN where fewer."""
+    """Return every amplitude of every point in its unit, shape (points, most).
+
+    They rise along a row; a row with fewer than the most is filled up with NaN.
+    """
     resonant = np.abs(plant.linear) <= plant.rounding
     if not plant.friction.elements:
         with np.errstate(divide="ignore", over="ignore"):
             amplitude = plant.drive / np.abs(plant.linear)
         return np.where(resonant, np.nan, amplitude)[:, None]
-    unbounded = resonant & (plant.drive >= plant.largest_friction())
     passive = plant.linear.imag >= -plant.rounding
+    single = passive & ~(resonant & (plant.drive >= plant.largest_friction()))
     roots = np.full((plant.drive.size, 1), np.nan)
-    single = np.flatnonzero(passive & ~unbounded)
-    if single.size:
-        table = _tabulate(plant.friction, single.size)
-        for first in range(0, single.size, _CHUNK):
-            points = single[first : first + _CHUNK]
-            roots[points, 0] = _single_roots(plant.at(points), table)
+    if single.any():
+        table = _tabulate(plant.friction, int(single.sum()))
+        for points in _chunks(single):
+            roots[points, 0] = _interpolated_roots(plant.at(points), table)
+        rest = np.flatnonzero(single & np.isnan(roots[:, 0]))
+        roots[rest, 0] = _bracketed_roots(plant.at(rest), table)
     active = np.flatnonzero(~passive)
-    if active.size:
-        roots = _insert(roots, *_scan(plant, active))
-    return roots * plant.unit[:, None]
+    return _insert(roots, *_scan(plant, active)) if active.size else roots
+
+
+def _chunks(chosen: BoolArray) -> Iterator[IntArray | slice]:
+    """Yield the chosen points in parts; as slices, which copy nothing, where all are chosen."""
+    points = None if chosen.all() else np.flatnonzero(chosen)
+    for first in range(0, chosen.size if points is None else points.size, _CHUNK):
+        part = slice(first, first + _CHUNK)
+        yield part if points is None else points[part]
 
 
 class _Table(NamedTuple):
@@ -63,8 +73,8 @@ def _tabulate(friction: Friction, points: int) -> _Table:
     A vector has about as many nodes as there are points to solve for it, within limits.
     """
     knees = [np.atleast_1d(f_max / sigma) for f_max, sigma, _ in friction.values]
-    low = np.log10(np.min(knees, axis=0)) - 4.0
-    high = np.log10(np.max(knees, axis=0)) + 4.0
+    low = np.log10(np.min(knees, axis=0)) - 6.0
+    high = np.log10(np.max(knees, axis=0)) + 5.0
     decades = np.max(high - low)
     least = np.clip(points / low.size, *(decades * n for n in _NODES_PER_DECADE))
     nodes = 2 ** int(np.ceil(np.log2(least))) - 1
@@ -73,27 +83,41 @@ def _tabulate(friction: Friction, points: int) -> _Table:
     return _Table(nodes, amplitude, *friction.force_and_slope(amplitude, vector))
 
 
-def _single_roots(plant: Plant, table: _Table) -> FloatArray:
-    """Return the one amplitude of each passive point."""
+def _interpolated_roots(plant: Plant, table: _Table) -> FloatArray:
+    """Return the one amplitude of each passive point where the table alone settles it, or NaN."""
     below = _search(plant, table)
-    first = plant.vector * table.nodes
-    left = first + np.maximum(below - 1, 0)
-    right = first + np.minimum(below, table.nodes - 1)
-    start, per_misfit = _inverse_cubic(plant, table, left, right)
+    start, per_misfit = _inverse_cubic(plant, table, *_cell(plant, table, below))
     with np.errstate(all="ignore"):  # beyond the table's ends the result is not used
         force = plant.friction.force(start, plant.vector)
         size = np.abs(start * plant.linear + force)
         step = -np.log(size / plant.drive) * per_misfit
-        amplitude = start * np.exp(step)
         settled = np.abs(step) * plant.conditioning(start, force) < 1e-9
-    settled &= (below > 0) & (below < table.nodes)
-    if not settled.all():
-        rest = np.flatnonzero(~settled)
-        part = plant.at(rest)
-        low, high, guess = _bracket(part, table, below[rest], left[rest], right[rest])
-        rising = np.ones(rest.shape, dtype=bool)
-        amplitude[rest] = _polish(part, low, high, guess, rising)
-    return amplitude
+        settled &= (below > 0) & (below < table.nodes)
+        return np.where(settled, start * np.exp(step), np.nan)
+
+
+def _bracketed_roots(plant: Plant, table: _Table) -> FloatArray:
+    """Return the one amplitude of each passive point, in its cell or beyond the table's ends."""
+    below = _search(plant, table)
+    left, right = _cell(plant, table, below)
+    A0, A1 = table.amplitude[left], table.amplitude[right]
+    stuck, slipping = below == 0, below == table.nodes
+    low, high = plant.bounds()
+    low = np.where(stuck, np.minimum(low, A1), A0)
+    high = np.where(slipping, np.maximum(high, A0), A1)
+    largest = plant.largest_friction()
+    with np.errstate(divide="ignore"):
+        linear = plant.drive / np.abs(plant.linear + table.force[left] / A0)
+        excess = np.sqrt(np.abs(plant.drive - largest)) * np.sqrt(plant.drive + largest)
+        start = np.where(stuck, linear, excess / np.abs(plant.linear))
+    start = np.where(stuck | slipping, start, np.nan)
+    return _polish(plant, low, high, start, np.ones(low.shape, dtype=bool))
+
+
+def _cell(plant: Plant, table: _Table, below: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the nodes on both sides of each solution; the end node twice beyond the ends."""
+    first = plant.vector * table.nodes
+    return first + np.maximum(below - 1, 0), first + np.minimum(below, table.nodes - 1)
 
 
 def _search(plant: Plant, table: _Table) -> IntArray:
@@ -131,36 +155,20 @@ def _inverse_cubic(
         return A0 * np.exp(y), slope / width
 
 
-def _bracket(
-    plant: Plant, table: _Table, below: IntArray, left: IntArray, right: IntArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return an amplitude below the solution, one above it, and a start between them."""
-    stuck, slipping = below == 0, below == table.nodes
-    A0, A1 = table.amplitude[left], table.amplitude[right]
-    least, most = plant.bounds()
-    low = np.where(stuck, np.minimum(least, A1), A0)
-    high = np.where(slipping, np.maximum(most, A0), A1)
-    largest = plant.largest_friction()
-    with np.errstate(divide="ignore"):
-        linear = plant.drive / np.abs(plant.linear + table.force[left] / A0)
-        excess = np.sqrt(np.abs(plant.drive - largest)) * np.sqrt(plant.drive + largest)
-        start = np.where(stuck, linear, excess / np.abs(plant.linear))
-    return low, high, np.where(stuck | slipping, start, np.sqrt(low) * np.sqrt(high))
-
-
 def _polish(
     plant: Plant, low: FloatArray, high: FloatArray, start: FloatArray, rising: BoolArray
 ) -> FloatArray:
     """Return the amplitude in each bracket, by Newton steps in ln A or else bisection.
 
-    A |Z| - u_0 changes sign once between `low` and `high`, upwards where `rising`.
+    A |Z| - u_0 changes sign once between `low` and `high`, upwards where `rising`. A `start`
+    outside its bracket, or NaN, stands for the middle.
     """
     low, high = low.copy(), high.copy()
     amplitude = np.where((start > low) & (start < high), start, np.sqrt(low) * np.sqrt(high))
     active = np.arange(amplitude.size)
     for _ in range(200):
         A, part = amplitude[active], plant.at(active)
-        force, slope = plant.friction.force_and_slope(A, part.vector)
+        force, slope = part.friction.force_and_slope(A, part.vector)
         g, s = part.misfit(A, force, slope)
         beyond = (g > 0.0) == rising[active]
         high[active[beyond]] = A[beyond]
@@ -226,8 +234,8 @@ def _scan_grid(plant: Plant, grid: FloatArray) -> tuple[IntArray, FloatArray]:
     after = np.concatenate((above[plain, whole + 1], over, above[at, cell + 1]))
     crossed = np.flatnonzero(before != after)
     point, low, high = point[crossed], low[crossed], high[crossed]
-    middle = np.sqrt(low) * np.sqrt(high)
-    return point, _polish(plant.at(point), low, high, middle, after[crossed])
+    start = np.full(point.shape, np.nan)
+    return point, _polish(plant.at(point), low, high, start, after[crossed])
 
 
 def _turning_point(
