@@ -45,6 +45,9 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.rows import Rows
 from dahl_ident.errors import DataError, ValidationError
 
+Rho = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
+"""A loss: z -> rho(z), rho'(z), rho''(z)."""
+
 NOISE_MODELS = ("measured", "relative", "absolute")
 
 _GAUSSIAN = 1e15  # degrees of freedom at which Student's t is the Gaussian to rounding
@@ -59,6 +62,11 @@ class Noise(ABC):
     scale_known: bool
     log_area: FloatArray
     """Sum over rows of ln |dy/dR|, the log of the whitening's determinant, plus constants."""
+
+    @property
+    @abstractmethod
+    def weights(self) -> FloatArray:
+        """One over the standard deviation of |R - R_model| at the data, up to the scale."""
 
     @abstractmethod
     def residual(self, predicted: ComplexArray) -> ComplexArray:
@@ -79,6 +87,14 @@ class Relative(Noise):
     log_area: FloatArray
     name: str = "relative"
     scale_known: bool = False
+
+    @property
+    def weights(self) -> FloatArray:
+        """1/|R|, for harmonics of the fundamental."""
+        size = np.abs(self.response)
+        if self.fundamental is not None:
+            size = np.where(self.fundamental > 0.0, self.fundamental, size)
+        return 1.0 / size
 
     def residual(self, predicted: ComplexArray) -> ComplexArray:
         """Return ln(R/R_model), or the scaled difference in rows of harmonics."""
@@ -106,6 +122,11 @@ class Absolute(Noise):
     name: str = "absolute"
     scale_known: bool = False
 
+    @property
+    def weights(self) -> FloatArray:
+        """1, in every row."""
+        return np.ones(self.response.shape)
+
     def residual(self, predicted: ComplexArray) -> ComplexArray:
         """Return R - R_model."""
         return self.response - predicted
@@ -127,6 +148,11 @@ class Measured(Noise):
     amplitude: AmplitudeError | None
     name: str = "measured"
     scale_known: bool = True
+
+    @property
+    def weights(self) -> FloatArray:
+        """One over the root mean square of the two parts' standard deviations."""
+        return np.sqrt(2.0 / (self.covariance.rr + self.covariance.ii))
 
     def residual(self, predicted: ComplexArray) -> ComplexArray:
         """Return L^-1 (R - R_model)."""
@@ -223,19 +249,26 @@ def correct_amplitude(
     return Corrected(whitening(r), whitening, found)
 
 
-def student(z: FloatArray, dof: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return rho(z) = (dof + 1) ln(1 + z/dof), the loss of an estimated covariance, and rho'."""
-    return (dof + 1.0) * np.log1p(z / dof), (dof + 1.0) / (dof + z)
+@dataclass(frozen=True)
+class Student:
+    """The loss of rows whose covariance was estimated: rho(z) = (dof + 1) ln(1 + z/dof)."""
+
+    dof: FloatArray
+
+    def __call__(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return rho and its first two derivatives."""
+        slope = (self.dof + 1.0) / (self.dof + z)
+        return (self.dof + 1.0) * np.log1p(z / self.dof), slope, -slope / (self.dof + z)
 
 
 def bend(
     y: ComplexArray,
     changes: list[ComplexArray],
-    rho: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    rho: Rho,
 ) -> tuple[ComplexArray, list[ComplexArray]]:
     """Return residuals of the same directions whose squares are rho(|y|^2), with derivatives."""
     z = y.real**2 + y.imag**2
-    loss, slope = rho(z)
+    loss, slope, _ = rho(z)
     flat = z <= 1e-12  # here rho(z) = rho'(0) z to rounding
     safe = np.where(flat, 1.0, z)
     factor = np.sqrt(np.where(flat, slope, loss / safe))

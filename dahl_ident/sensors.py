@@ -22,6 +22,7 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray, finite_number
 from dahl_ident.elements.parameter import Parameter
@@ -117,7 +118,7 @@ class Sensors:
 
 
 def measured_stiffness_factor(
-    values: Sequence[FloatArray], omega: FloatArray, harmonic: int
+    values: Sequence[FloatArray], omega: FloatArray, harmonic: int | NDArray[np.int64]
 ) -> ComplexArray:
     """Return measured over true F_k/X_1 for sensor `values` in the order of the parameters."""
     force_gain, displacement_gain, delay = values

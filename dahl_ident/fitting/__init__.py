@@ -1,1 +1,7 @@
-"""placeholder"""
+"""Least squares: from a problem to its optimum, or to the reason why there is none."""
+
+from dahl_ident.fitting.least_squares import solve
+from dahl_ident.fitting.optimum import Combination, Optimum, OptimumBatch
+from dahl_ident.fitting.status import Status
+
+__all__ = ["Combination", "Optimum", "OptimumBatch", "Status", "solve"]

@@ -77,6 +77,7 @@ class ProblemBatch(Problem):
             )
         batch = object.__new__(cls)
         batch.__dict__.update(problem.__dict__)
+        batch.__dict__.pop("stiffness_data", None)  # that of the original responses
         batch._set_rows(problem._rows.with_responses(responses), problem.noise)
         return batch
 

@@ -62,7 +62,7 @@ class Coordinates:
 
 def in_order(theta: FloatArray, interchangeable: Sequence[NDArray[np.intp]]) -> FloatArray:
     """Return `theta` with the columns of like Dahl elements exchanged until x_c rises."""
-    array = theta.copy()
+    array = theta.copy() if interchangeable else theta
     for columns in interchangeable:
         ln_x_c = array[..., columns[:, 0]] - array[..., columns[:, 1]]
         order = np.argsort(ln_x_c, axis=-1)

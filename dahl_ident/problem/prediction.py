@@ -28,6 +28,7 @@ from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Model, Parameter
 from dahl_ident.errors import DataError
 from dahl_ident.problem.coordinates import Coordinates
+from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import Sensors, measured_stiffness_factor
 
 _POWERS = {
@@ -63,7 +64,7 @@ class Predictor:
     def __init__(
         self, model: Model, sensors: Sensors, coordinates: Coordinates, rows: Rows
     ) -> None:
-        self._model, self._coordinates = model, coordinates
+        self._model, self._sensors, self._coordinates = model, sensors, coordinates
         self._neutral = sensors.are_exact
         names = coordinates.names
         self._slots = [_slot(p, names) for p in (*model.parameters, *sensors.parameters)]
@@ -76,14 +77,20 @@ class Predictor:
         self._operator = np.asarray((1j * rows.omega) ** power, dtype=np.complex128)
         self._guess = _measured_amplitude(rows, self._operator, self._exponent)
 
-    def measured_stiffness(self) -> ComplexArray:
-        """Return the data as dynamic stiffness, whatever their quantity."""
-        ratio = self._rows.response / self._operator
-        return ratio if self._exponent == 1 else 1.0 / ratio
-
-    def measured_amplitude(self) -> FloatArray:
-        """Return the measured amplitude, from the drive where it was not recorded."""
-        return self._guess
+    def as_stiffness(self, weights: FloatArray) -> StiffnessData:
+        """Return the data as dynamic stiffness; `weights` are those of the response."""
+        rows, starts = self._rows, [np.asarray(p.value) for p in self._sensors.parameters]
+        ratio = rows.response / self._operator
+        measured = ratio if self._exponent == 1 else 1.0 / ratio
+        factor = measured_stiffness_factor(starts, rows.omega, rows.harmonic)
+        Z = measured / factor
+        return StiffnessData(
+            Z,
+            self._guess / starts[1],
+            rows.omega,
+            rows.harmonic,
+            weights * np.abs(rows.response / Z),
+        )
 
     def __call__(
         self,

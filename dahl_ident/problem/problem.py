@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,10 +15,19 @@ from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.model import as_model
 from dahl_ident.errors import ModelError, ValidationError
-from dahl_ident.noise import Measured, bend, correct_amplitude, noise_for, student
+from dahl_ident.noise import Measured, Rho, Student, bend, correct_amplitude, noise_for
 from dahl_ident.problem.coordinates import Coordinates, in_order, interchangeable_elements
 from dahl_ident.problem.prediction import Predictor
+from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import EXACT, Prior, Sensors
+
+
+class Quadratic(NamedTuple):
+    """Half the sum of squares (or of losses), its gradient, and its Gauss-Newton Hessian."""
+
+    cost: FloatArray
+    gradient: FloatArray
+    hessian: FloatArray
 
 
 class Problem:
@@ -51,6 +62,8 @@ class Problem:
         The priors of sensor parameters that are free.
     scale_known : bool
         Whether the residuals have unit variance as they are.
+    gaussian : bool
+        Whether residuals are Gaussian; not where a covariance has few degrees of freedom.
     n_residuals : int
         Residuals of the data, two a row; those of priors come on top.
 
@@ -111,6 +124,9 @@ class Problem:
         self._noise = noise_for(rows, noise)
         self.noise = self._noise.name
         self.scale_known = self._noise.scale_known
+        dof = self._noise.dof if isinstance(self._noise, Measured) else None
+        self._tail: Rho | None = None if dof is None else Student(dof)
+        self.gaussian = dof is None
         self.n_residuals = 2 * rows.n
 
     def __repr__(self) -> str:
@@ -196,6 +212,11 @@ class Problem:
         changes = self._predictor(theta).changes
         return np.stack([np.broadcast_to(d, self._shape(theta)) for d in changes], axis=-1)
 
+    @cached_property
+    def stiffness_data(self) -> StiffnessData:
+        """The data as dynamic stiffness at known amplitudes, sensors at their starts."""
+        return self._predictor.as_stiffness(self._noise.weights)
+
     # Residuals
 
     def residuals(self, theta: ArrayLike, scale: ArrayLike = 1.0) -> FloatArray:
@@ -223,17 +244,63 @@ class Problem:
         return self.residuals_and_jacobian(theta, scale)[1]
 
     def residuals_and_jacobian(
-        self, theta: ArrayLike, scale: ArrayLike = 1.0
+        self, theta: ArrayLike, scale: ArrayLike = 1.0, *, tails: bool = True
     ) -> tuple[FloatArray, FloatArray]:
         """Return residuals and Jacobian, for the price of the Jacobian.
+
+        Without `tails`, a covariance of few degrees of freedom counts as if it were known.
 
         With noise in the amplitude the residuals are defined up to a rotation of each pair. The
         Jacobian leaves that out, so that J' r is the exact gradient of half the sum of squares.
         """
         theta = self._coordinates.checked(theta)
-        y, changes = self.whitened(theta)
+        y, changes = self.whitened(theta, tails=tails)
         residuals, jacobian = self._with_priors(theta, y, changes, scale)
         return residuals, jacobian.swapaxes(-1, -2)
+
+    def quadratic(
+        self, theta: FloatArray, scale: ArrayLike = 1.0, rho: Rho | None = None
+    ) -> Quadratic:
+        """Return half the sum of squares with its gradient and Hessian, unchecked.
+
+        Cost of shape () or (S,), infinite where there is no prediction. Where rows count as
+        rho(z), the gradient is exact and the Hessian is that of rho at a linear model,
+        rho' d' d + 2 rho'' (y' d)(y' d)', as far as that is positive.
+        """
+        y, changes = self.whitened(theta, tails=False)
+        if rho is None:
+            rho = self._tail
+        r, J = self._with_priors(theta, y, changes, scale)
+        if rho is None:
+            cost = 0.5 * np.einsum("...m,...m->...", r, r)
+            weighted = J
+        else:
+            weighted, r, cost = self._weighted(r, J, rho)
+        gradient = (J @ r[..., None])[..., 0]
+        return Quadratic(
+            np.where(np.isfinite(cost), cost, np.inf), gradient, weighted @ J.swapaxes(-1, -2)
+        )
+
+    def _weighted(
+        self, r: FloatArray, J: FloatArray, rho: Rho
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return weighted Jacobian and residuals, and the cost, of rows that count as rho."""
+        m = self.n_residuals
+        first, second = r[..., 0:m:2], r[..., 1:m:2]
+        z = first**2 + second**2
+        loss, slope, bend = rho(z)
+        cost = 0.5 * loss.sum(axis=-1) + 0.5 * (r[..., m:] ** 2).sum(axis=-1)
+        own, other = J[..., 0:m:2], J[..., 1:m:2]
+        along = np.maximum(2.0 * bend, -slope / np.maximum(z, 1e-300))[..., None, :] * (
+            first[..., None, :] * own + second[..., None, :] * other
+        )
+        weighted, factor = J.copy(), np.repeat(slope, 2, axis=-1)
+        weighted[..., :m] *= factor[..., None, :]
+        weighted[..., 0:m:2] += first[..., None, :] * along
+        weighted[..., 1:m:2] += second[..., None, :] * along
+        r = r.copy()
+        r[..., :m] *= factor
+        return weighted, r, cost
 
     def whitened(
         self, theta: FloatArray, *, derivatives: bool = True, tails: bool = True
@@ -246,10 +313,7 @@ class Problem:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
             if isinstance(noise, Measured):
                 y, changes = self._whitened_by_covariance(noise, theta, derivatives)
-                if tails and noise.dof is not None:
-                    dof = noise.dof
-                    y, changes = bend(y, changes, lambda z: student(z, dof))
-                return y, changes
+                return bend(y, changes, self._tail) if tails and self._tail else (y, changes)
             predicted, by, _ = self._predictor(theta, derivatives=derivatives)
             return noise.residual(predicted), [noise.change(predicted, d) for d in by]
 

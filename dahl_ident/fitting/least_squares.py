@@ -1,0 +1,236 @@
+"""Least squares for one problem: a start without guessing, a global look, an honest end.
+
+1. Starts by variable projection (:mod:`dahl_ident.fitting.start`); what the user gave is one more.
+2. Levenberg and Marquardt's method from all of them together, exact Jacobian, search coordinates.
+3. Where the best of them has not converged, or leaves friction badly determined, the valleys of
+   microslip and the limits at infinity are searched as well (:mod:`dahl_ident.fitting.limits`).
+4. Where there are bounds, or nothing has converged, scipy's trust-region reflective algorithm
+   goes on from there.
+
+A robust loss, and a prior beside noise of unknown scale, make the optimum depend on the scale;
+it is then estimated and the search repeated until both agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements import Dahl
+from dahl_ident.errors import FitError, ModelError
+from dahl_ident.fitting.ending import End, optimum
+from dahl_ident.fitting.levenberg_marquardt import Evaluate, Minima, minimise
+from dahl_ident.fitting.limits import Chart, Limit, limits, valleys, within_reach
+from dahl_ident.fitting.losses import Loss, loss_named
+from dahl_ident.fitting.optimum import Optimum, inverse
+from dahl_ident.fitting.start import starts
+from dahl_ident.fitting.trust_region import minimise_within
+from dahl_ident.problem import Problem, Quadratic
+
+_DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm
+_RESCALINGS = 100
+_SAME_SCALE = 1e-9
+_TIE, _NEARLY = 1e-13, 1e-7  # relative differences of cost at which a limit wins
+
+
+def solve(
+    problem: Problem, *, loss: str = "linear", start: Mapping[str, float] | None = None
+) -> Optimum:
+    """Return the minimum of a problem's sum of squares, wherever it lies.
+
+    Parameters
+    ----------
+    problem : Problem
+        What to solve.
+    loss : {"linear", "huber", "soft_l1", "student_t"}, default "linear"
+        See :mod:`dahl_ident.fitting.losses`.
+    start : mapping of str to float, optional
+        One more start: values of some or all free parameters; the others are completed.
+
+    Returns
+    -------
+    Optimum
+        Its `status` says how the search ended.
+
+    Raises
+    ------
+    FitError
+        If there are fewer residuals than parameters, or a parameter cannot be started.
+    ModelError
+        If `start` names a parameter that is not free.
+    ValidationError
+        If `loss` is unknown, or a prior is not normal.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dahl_ident import Dahl
+    >>> from dahl_ident.data import FrequencyResponse
+    >>> A = np.geomspace(1e-4, 1e-2, 5)
+    >>> N = Dahl(f_max=0.1, sigma=30.0).describing_function(A)
+    >>> optimum = solve(Problem(FrequencyResponse(np.ones(5), N, A), Dahl()))
+    >>> optimum.values.round(9).tolist()
+    [0.1, 30.0]
+    >>> optimum.status.name
+    'CONVERGED'
+    """
+    return _Search(problem, loss_named(loss)).run(start)
+
+
+class _Search:
+    """One call of `solve`: what its steps share."""
+
+    def __init__(self, problem: Problem, loss: Loss | None) -> None:
+        self.problem, self.loss = problem, loss
+        self.m = problem.n_residuals + len(problem.priors)
+        P = len(problem.parameters)
+        if self.m < P:
+            raise FitError(
+                f"{problem.n_residuals // 2} rows give {self.m} numbers, fewer than the {P} free "
+                f"parameters ({', '.join(problem.names)}); measure more points, or fix some"
+            )
+        self.logarithmic = np.array([p.transform == "log" for p in problem.parameters])
+        self.low, self.high = problem.bounds()
+        self.bounded = bool(np.isfinite(self.low).any() or np.isfinite(self.high).any())
+        self.rescales = not problem.scale_known and bool(loss is not None or problem.priors)
+        self.evaluations = 0
+
+    def run(self, start: Mapping[str, float] | None) -> Optimum:
+        """Search, with the noise's scale adapted where the optimum depends on it."""
+        begin, scale = self._starts(start), 1.0
+        if self.rescales:
+            y, _ = self.problem.whitened(begin[0], derivatives=False)
+            scale = float(np.median(np.abs(y))) / np.sqrt(np.log(4.0))
+        end = self._search(begin, scale)
+        for _ in range(_RESCALINGS if self.rescales else 0):
+            stretch = self._stretch(end, scale)
+            if abs(stretch - 1.0) < _SAME_SCALE or not 0.0 < scale * stretch < np.inf:
+                break
+            scale *= stretch
+            end = self._search(end.theta[None], scale)
+        return optimum(self.problem, end, scale, self.loss, self.evaluations)
+
+    def _starts(self, start: Mapping[str, float] | None) -> FloatArray:
+        begin, names = starts(self.problem), self.problem.names
+        if start:
+            unknown = [name for name in start if name not in names]
+            if unknown:
+                raise ModelError(
+                    f"start names {', '.join(unknown)}; the free parameters are {', '.join(names)}"
+                )
+            values = self.problem.to_values(begin[0])
+            given = [start.get(n, v) for n, v in zip(names, values, strict=True)]
+            begin = np.vstack([self.problem.to_search(given), begin])
+        return np.clip(begin, self.low, self.high) if self.bounded else begin
+
+    def _squares(self, theta: FloatArray, scale: float) -> FloatArray:
+        y, _ = self.problem.whitened(theta, derivatives=False, tails=self.loss is None)
+        return (y.real**2 + y.imag**2) / scale**2
+
+    def _stretch(self, end: End, scale: float) -> float:
+        """Return the factor by which the noise's scale has to change."""
+        z, dof = self._squares(end.theta, scale), self.m - end.determined
+        if dof <= 0:
+            return 1.0
+        ratio = z.sum() / dof if self.loss is None else self.loss.rescaled(z, dof)
+        return float(np.sqrt(ratio))
+
+    # Searches
+
+    def _search(self, begin: FloatArray, scale: float) -> End:
+        end = self._descend(begin, scale)
+        if not end.converged or self._doubtful(end, scale):
+            end = self._look_wider(end, begin, scale)
+        if end.limit is None and (self.bounded or not end.converged):
+            end = self._trust_region(end, begin, scale)
+        return end
+
+    def _evaluate(self, scale: float, chart: Chart | None = None) -> Evaluate:
+        problem, loss = self.problem, self.loss
+
+        def evaluate(at: FloatArray, _which: object) -> Quadratic:
+            if chart is None:
+                return problem.quadratic(at, scale, loss)
+            theta = chart.theta(at)
+            return chart.pulled_back(problem.quadratic(theta, scale, loss), theta)
+
+        return evaluate
+
+    def _descend(self, begin: FloatArray, scale: float) -> End:
+        """Return the best end of Levenberg and Marquardt's searches from `begin`."""
+        minima = minimise(
+            self._evaluate(scale),
+            begin,
+            self.logarithmic,
+            self.m,
+            inside=lambda theta: within_reach(self.problem, theta),
+        )
+        best = self._best(minima)
+        theta = minima.theta[best]
+        converged = bool(minima.converged[best]) and self._allowed(theta)
+        return End(theta, float(minima.cost[best]), minima.hessian[best], converged)
+
+    def _descend_in(
+        self, chart: Chart, begin: FloatArray, scale: float, limit: Limit | None = None
+    ) -> End:
+        """Return the best end of searches in a chart: at a limit, or along a valley."""
+        minima = minimise(
+            self._evaluate(scale, chart),
+            chart.phi(begin),
+            ~((chart.matrix != 0.0).T @ ~self.logarithmic),
+            self.m,
+            inside=None if limit else lambda phi: within_reach(self.problem, chart.theta(phi)),
+        )
+        best = self._best(minima)
+        phi = minima.theta[best]
+        theta = chart.theta(phi)
+        cost, _, hessian = self.problem.quadratic(theta, scale, self.loss)
+        converged = bool(minima.converged[best]) and self._allowed(theta)
+        return End(theta, float(cost), hessian, converged, limit, None if limit is None else phi)
+
+    def _best(self, minima: Minima) -> int:
+        self.evaluations += int(minima.evaluations.max())
+        return int(np.argmin(minima.cost))
+
+    def _look_wider(self, end: End, begin: FloatArray, scale: float) -> End:
+        """Return the best of `end`, the ends of microslip's valleys, and the limits."""
+        begin = np.vstack([end.theta, begin])
+        for chart in valleys(self.problem):
+            other = self._descend_in(chart, begin, scale)
+            if other.cost < end.cost or (other.converged and not end.converged):
+                end = other
+        ends = [self._descend_in(lim.chart, begin, scale, lim) for lim in limits(self.problem)]
+        ends = [e for e in ends if e.converged]
+        if not ends:
+            return end
+        lowest = min(ends, key=lambda e: e.cost)
+        slack = _TIE if end.converged else _NEARLY
+        return lowest if lowest.cost <= end.cost * (1.0 + slack) else end
+
+    def _trust_region(self, end: End, begin: FloatArray, scale: float) -> End:
+        """Return the best end of scipy's bounded searches."""
+        best = end
+        for start in np.clip(np.vstack([end.theta, begin]), self.low, self.high):
+            found = minimise_within(self.problem, start, scale, self.loss)
+            self.evaluations += found.evaluations
+            if found.cost < best.cost or not best.converged:
+                cost, _, hessian = self.problem.quadratic(found.theta, scale, self.loss)
+                inside = bool(within_reach(self.problem, found.theta[None])[0])
+                best = End(found.theta, float(cost), hessian, found.converged and inside)
+        return best
+
+    def _allowed(self, theta: FloatArray) -> bool:
+        return not self.bounded or bool(np.all((theta >= self.low) & (theta <= self.high)))
+
+    def _doubtful(self, end: End, scale: float) -> bool:
+        """Return whether a friction parameter could lie at a limit for all this optimum says."""
+        covariance, _ = inverse(end.hessian)
+        known = self.problem.scale_known or self.rescales
+        s2 = 1.0 if known else 2.0 * end.cost / max(self.m - len(end.theta), 1)
+        friction = {
+            p.name for e in self.problem.model.elements if isinstance(e, Dahl) for p in e.parameters
+        }
+        variances = zip(self.problem.names, np.diagonal(covariance), strict=True)
+        return any(s2 * v > _DOUBTFUL**2 for name, v in variances if name in friction)

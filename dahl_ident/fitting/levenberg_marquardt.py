@@ -1,0 +1,164 @@
+"""Levenberg and Marquardt's method for many least-squares problems at once.
+
+Each step solves (H + lambda D) delta = -g with g the gradient of the cost, H its Gauss-Newton
+Hessian and D = diag H, so it does not depend on the parameters' units. lambda starts at almost
+nothing, a Gauss-Newton step; it falls where a step does what H foretold, and rises where the cost
+does not fall. All problems take their steps together; those that have ended drop out.
+
+A problem has converged where its next step would move the residuals by less than 1e-8 of their
+standard deviation, or by no more than what rounding leaves of the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.problem import Quadratic
+
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+Evaluate = Callable[[FloatArray, IntArray | None], Quadratic]
+"""(theta (S, P), which of the problems they belong to, None for all) -> cost, gradient, Hessian."""
+
+_EPS = float(np.finfo(np.float64).eps)
+_FIRST_DAMPING = 1e-9
+_GAUSS_NEWTON = 1e-3  # with more damping a short step says nothing
+_MOST_DAMPING = 1e12
+_LONGEST_STEP = 2.0  # of a logarithm
+_NOISE_TOLERANCE = 1e-8
+_ROUNDING_TOLERANCE = 1e-13
+
+
+@dataclass(frozen=True)
+class Minima:
+    """Where S searches ended; arrays with a leading axis S."""
+
+    theta: FloatArray
+    cost: FloatArray
+    hessian: FloatArray
+    converged: BoolArray
+    evaluations: IntArray
+
+
+def minimise(
+    evaluate: Evaluate,
+    theta: FloatArray,
+    logarithmic: BoolArray,
+    n_residuals: int,
+    *,
+    inside: Callable[[FloatArray], BoolArray] | None = None,
+    steps: int = 80,
+) -> Minima:
+    """Return the minima of the costs that searches from `theta`, shape (S, P), find.
+
+    `logarithmic` says which coordinates are logarithms: their steps have a longest length.
+    Searches that leave the region `inside` end there, not converged.
+    """
+    with np.errstate(all="ignore"):
+        return _minimise(evaluate, theta, logarithmic, n_residuals, inside, steps)
+
+
+def _minimise(
+    evaluate: Evaluate,
+    theta: FloatArray,
+    logarithmic: BoolArray,
+    n_residuals: int,
+    inside: Callable[[FloatArray], BoolArray] | None,
+    steps: int,
+) -> Minima:
+    S, P = theta.shape
+    at = _State(theta, *evaluate(theta, None))
+    ends = at.take(np.arange(S))
+    converged, evaluations = np.full(S, P == 0), np.ones(S, dtype=np.intp)
+    active = np.arange(S)
+    damping, growth = np.full(S, _FIRST_DAMPING), np.full(S, 2.0)
+    for _ in range(steps if P else 0):
+        step, moves, foretold = _step(at, damping, logarithmic)
+        settled = (moves <= _tolerance(at, logarithmic, n_residuals)) | (foretold <= _EPS * at.cost)
+        settled &= damping < _GAUSS_NEWTON
+        lost = ~np.isfinite(at.cost) | (damping > _MOST_DAMPING)
+        if inside is not None:
+            lost |= ~inside(at.theta)
+        ended = settled | lost
+        if ended.any():
+            converged[active] = settled & ~lost
+            ends.put(active, at)
+            keep = ~ended
+            active, at = active[keep], at.take(keep)
+            if not active.size:
+                break
+            step, foretold = step[keep], foretold[keep]
+            damping, growth = damping[keep], growth[keep]
+        trial = at.theta + step
+        new = _State(trial, *evaluate(trial, None if active.size == S else active))
+        evaluations[active] += 1
+        better = new.cost < at.cost
+        gain = (at.cost - new.cost) / foretold
+        calmer = np.maximum(damping * np.maximum(0.05, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
+        damping = np.where(better, calmer, np.maximum(damping * growth, 1e-6))
+        growth = np.where(better, 2.0, 4.0 * growth)
+        at = new if better.all() else at.replaced(new, better)
+    ends.put(active, at)
+    return Minima(ends.theta, ends.cost, ends.hessian, converged, evaluations)
+
+
+@dataclass(frozen=True)
+class _State:
+    """Where each search stands."""
+
+    theta: FloatArray
+    cost: FloatArray
+    gradient: FloatArray
+    hessian: FloatArray
+
+    def take(self, keep: BoolArray | IntArray) -> _State:
+        return _State(self.theta[keep], self.cost[keep], self.gradient[keep], self.hessian[keep])
+
+    def put(self, where: IntArray, other: _State) -> None:
+        self.theta[where], self.cost[where] = other.theta, other.cost
+        self.gradient[where], self.hessian[where] = other.gradient, other.hessian
+
+    def replaced(self, new: _State, better: BoolArray) -> _State:
+        row = better[:, None]
+        return _State(
+            np.where(row, new.theta, self.theta),
+            np.where(better, new.cost, self.cost),
+            np.where(row, new.gradient, self.gradient),
+            np.where(row[:, :, None], new.hessian, self.hessian),
+        )
+
+
+def _step(
+    at: _State, damping: FloatArray, logarithmic: BoolArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the next step, its squared length among residuals, and the fall of cost foretold."""
+    P = at.theta.shape[1]
+    size = np.sqrt(at.hessian[:, range(P), range(P)])
+    size = np.where((size > 0.0) & np.isfinite(size), size, 1.0)
+    H = at.hessian / (size[:, :, None] * size[:, None, :])
+    g = at.gradient / size
+    damped = H + damping[:, None, None] * np.eye(P)
+    if not np.isfinite(damped).all():
+        bad = ~np.isfinite(damped).all(axis=(1, 2))
+        damped[bad], g[bad] = np.eye(P), 0.0
+    delta = -np.linalg.solve(damped, g[:, :, None])[:, :, 0]
+    longest = np.abs(delta / size * logarithmic).max(axis=1)
+    if longest.max() > _LONGEST_STEP:
+        delta *= np.minimum(1.0, _LONGEST_STEP / np.maximum(longest, 1e-300))[:, None]
+    moves = (delta[:, None, :] @ H @ delta[:, :, None])[:, 0, 0]
+    foretold = -(delta * g).sum(axis=1) - 0.5 * moves
+    return delta / size, moves, np.maximum(foretold, 1e-300)
+
+
+def _tolerance(at: _State, logarithmic: BoolArray, n_residuals: int) -> FloatArray:
+    """Return the squared length of a step that no longer matters."""
+    P = at.theta.shape[1]
+    noise = 2.0 * at.cost / max(n_residuals - P, 1)
+    lever = np.where(logarithmic, 1.0, at.theta)
+    signal = (at.hessian[:, range(P), range(P)] * lever**2).max(axis=1)
+    return np.asarray(np.maximum(_NOISE_TOLERANCE**2 * noise, _ROUNDING_TOLERANCE**2 * signal))

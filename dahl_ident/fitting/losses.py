@@ -1,0 +1,96 @@
+"""Robust losses: how much a row of data counts that lies far from the model.
+
+A row has two residuals, real and imaginary part or ln gain and phase; it counts as rho(z), with
+z the sum of their squares over the noise variance, in place of z itself. A point is an outlier as
+a whole, whichever way the coordinates are turned. Near the model rho(z) = z.
+
+- ``huber``: z up to 1.345^2, then growing with |y|;
+- ``soft_l1``: 2 (sqrt(1 + z) - 1), a smooth relative of it;
+- ``student_t``: 6 ln(1 + z/4), the likelihood of Student's t with 4 degrees of freedom; distant
+  points lose their influence altogether.
+
+**Scale.** Where the noise's scale s is unknown it has to be robust as well: Huber's proposal 2,
+Sum psi(z_i)^2 = (2 n - P)/2 E[psi^2], E taken for Gaussian noise, so that s is its standard
+deviation when there are no outliers. **Covariance**: s^2 kappa (J' J)^-1 with
+kappa = mean(psi^2) / mean(psi')^2 (Huber, Robust Statistics, 1981, section 7.6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.errors import ValidationError
+
+_KNEE = 1.345
+_TAIL_DOF = 4.0
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A loss rho(z) with its first two derivatives."""
+
+    name: str
+    rho: Callable[[FloatArray], FloatArray]
+    slope: Callable[[FloatArray], FloatArray]
+    bend: Callable[[FloatArray], FloatArray]
+
+    def __call__(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return rho and its first two derivatives."""
+        return self.rho(z), self.slope(z), self.bend(z)
+
+    def gaussian_square(self) -> float:
+        """Return the expectation of psi^2 = rho'(z)^2 z for Gaussian noise: z/2 exponential."""
+        nodes, weights = np.polynomial.laguerre.laggauss(100)
+        return float(weights @ (self.slope(2.0 * nodes) ** 2 * 2.0 * nodes))
+
+    def rescaled(self, z: FloatArray, dof: int) -> float:
+        """Return s_new^2/s^2 of proposal 2, for squares `z` in units of s^2."""
+        psi2 = self.slope(z) ** 2 * z
+        return float(psi2.sum() / (0.5 * dof * self.gaussian_square()))
+
+    def inflation(self, z: FloatArray, dof: int) -> float:
+        """Return kappa, by which the covariance exceeds that of least squares."""
+        psi2 = (self.slope(z) ** 2 * z).sum() / dof
+        return float(psi2 / np.mean(self.slope(z) + self.bend(z) * z) ** 2)
+
+
+def _huber(z: FloatArray) -> FloatArray:
+    return np.where(z <= _KNEE**2, z, 2.0 * _KNEE * np.sqrt(z) - _KNEE**2)
+
+
+def _huber_slope(z: FloatArray) -> FloatArray:
+    return np.where(z <= _KNEE**2, 1.0, _KNEE / np.sqrt(np.maximum(z, _KNEE**2)))
+
+
+def _huber_bend(z: FloatArray) -> FloatArray:
+    return np.where(z <= _KNEE**2, 0.0, -0.5 * _KNEE * np.maximum(z, _KNEE**2) ** -1.5)
+
+
+LOSSES = {
+    "huber": Loss("huber", _huber, _huber_slope, _huber_bend),
+    "soft_l1": Loss(
+        "soft_l1",
+        lambda z: 2.0 * z / (np.sqrt(1.0 + z) + 1.0),
+        lambda z: (1.0 + z) ** -0.5,
+        lambda z: -0.5 * (1.0 + z) ** -1.5,
+    ),
+    "student_t": Loss(
+        "student_t",
+        lambda z: (_TAIL_DOF + 2.0) * np.log1p(z / _TAIL_DOF),
+        lambda z: (_TAIL_DOF + 2.0) / (_TAIL_DOF + z),
+        lambda z: -(_TAIL_DOF + 2.0) / (_TAIL_DOF + z) ** 2,
+    ),
+}
+
+
+def loss_named(name: str) -> Loss | None:
+    """Return the loss called `name`, None for "linear"."""
+    if name == "linear":
+        return None
+    if name not in LOSSES:
+        raise ValidationError(f"loss is {name!r}; expected linear, {', '.join(LOSSES)}")
+    return LOSSES[name]

@@ -1,0 +1,278 @@
+r"""Where a search starts: variable projection, so that no user has to guess.
+
+A describing function is linear in sigma once x_c = f_max/sigma and alpha are given,
+
+    N = sigma h_alpha(A / x_c),
+
+and springs, dampers and masses are linear anyway. Least squares in dynamic stiffness, with
+amplitudes as measured and weights that the noise model has at the data, is therefore a search
+over x_c (and alpha, where free) of each Dahl element alone: at each node of a grid of those, the
+linear parameters are solved exactly. Every local minimum over the grid is a start.
+
+The grid has four nodes a decade from a hundredth of the smallest amplitude to a hundred times
+the largest, and one a decade beyond, down to 1e-8 and up to 1e6 times. Farther out the curve is
+its own limit to well below any noise; whether the optimum lies out there, at infinity, is for
+:mod:`dahl_ident.fitting.limits` to decide.
+
+h is read from a table over ln beta whose steps divide those of the grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import Dahl, Damper, Mass, Parameter, Spring
+from dahl_ident.errors import FitError
+from dahl_ident.problem import Problem
+from dahl_ident.problem.stiffness import StiffnessData
+
+IntArray = NDArray[np.intp]
+
+_STEP = 0.01
+_LOWEST, _NODES = -3200, 6400  # of ln beta in the table, in steps
+_FINE, _COARSE = 58, 230  # steps between nodes of the grid: four a decade, one a decade
+_DECADE = np.log(10.0) / _STEP
+_ALPHAS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0)
+_MOST_COMBINATIONS = 4000
+_MOST_STARTS = 4
+_LINEAR = (Mass, Damper, Spring)
+
+
+def starts(problem: Problem) -> FloatArray:
+    """Return the search coordinates of the best starts, best first, shape (starts, P).
+
+    Values that the user gave to free parameters make one more start, the last.
+    """
+    grid = _grid(problem)
+    cost, theta = grid.solved()
+    order = _local_minima(cost.reshape(grid.shape))[:_MOST_STARTS]
+    best = theta[order]
+    given = np.array([np.nan if p.value is None else p.value for p in problem.parameters])
+    if np.isnan(given).all():
+        return best
+    values = problem.to_values(best[0])
+    return np.vstack([best, problem.to_search(np.where(np.isnan(given), values, given))])
+
+
+def best_starts(problem: Problem) -> FloatArray:
+    """Return the best start of each table of a batch, shape (S, P)."""
+    cost, theta = _grid(problem).solved()
+    best = np.argmin(cost, axis=-1)[..., None, None]
+    return np.take_along_axis(theta, best, axis=-2)[..., 0, :]
+
+
+@dataclass(frozen=True)
+class _Friction:
+    """A Dahl element whose x_c or alpha is searched for; arrays have the grid's nodes first."""
+
+    f_max: Parameter
+    sigma: Parameter
+    alpha: Parameter
+    ln_x_c: FloatArray  # (..., K)
+    ln_alpha: FloatArray  # (K,)
+    curve: ComplexArray  # h at every row, (..., K, n)
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether sigma is to be solved for, or known at each node."""
+        return bool(self.f_max.free and self.sigma.free)
+
+    def known_sigma(self) -> FloatArray:
+        """Return sigma at each node where f_max or sigma is given, (..., K)."""
+        if not self.sigma.free:
+            return np.full(self.ln_x_c.shape, self.sigma.value)
+        assert self.f_max.value is not None
+        return self.f_max.value * np.exp(-self.ln_x_c)
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Linear least squares at every combination of the friction elements' nodes."""
+
+    problem: Problem
+    friction: list[_Friction]
+    nodes: IntArray  # (C, friction elements)
+    shape: tuple[int, ...]
+    target: ComplexArray  # weighted, (..., n)
+    weights: FloatArray  # (..., n)
+    columns: dict[str, ComplexArray]  # of linear parameters, weighted, (..., n)
+
+    def solved(self) -> tuple[FloatArray, FloatArray]:
+        """Return the sum of squares, (..., C), and the search coordinates, (..., C, P)."""
+        target = self.target[..., None, :]
+        columns = [c[..., None, :] for c in self.columns.values()]
+        fitted = []
+        for index, element in enumerate(self.friction):
+            chosen = self.nodes[:, index]
+            column = element.curve[..., chosen, :] * self.weights[..., None, :]
+            if element.is_linear:
+                fitted.append(index)
+                columns.append(column)
+            else:
+                target = target - element.known_sigma()[..., chosen, None] * column
+        cost, coefficients = _solve_linear(target, columns)
+        friction = coefficients[..., len(self.columns) :]
+        cost = np.where((friction > 0.0).all(axis=-1), cost, np.inf)
+        sigma = dict(zip(fitted, np.moveaxis(np.abs(friction), -1, 0), strict=True))
+        return cost, self._theta(cost.shape, coefficients, sigma)
+
+    def _theta(
+        self, shape: tuple[int, ...], coefficients: FloatArray, sigma: dict[int, FloatArray]
+    ) -> FloatArray:
+        known = {name: coefficients[..., i] for i, name in enumerate(self.columns)}
+        for index, element in enumerate(self.friction):
+            chosen = self.nodes[:, index]
+            ln_x_c = element.ln_x_c[..., chosen]
+            size = sigma[index] if element.is_linear else element.known_sigma()[..., chosen]
+            known[element.sigma.name] = np.maximum(size, 1e-300)
+            known[element.f_max.name] = np.maximum(size * np.exp(ln_x_c), 1e-300)
+            known[element.alpha.name] = np.exp(element.ln_alpha[chosen])
+        theta = np.empty((*shape, len(self.problem.parameters)))
+        for index, parameter in enumerate(self.problem.parameters):
+            value = known.get(parameter.name, parameter.value)
+            if value is None:
+                raise FitError(
+                    f"{parameter.name} has no value to start from, and only parameters of Dahl, "
+                    "Mass, Damper and Spring can be found without one; give it a start"
+                )
+            if parameter.transform == "log":
+                value = np.log(np.maximum(np.abs(value), 1e-300))
+            theta[..., index] = value
+        return theta
+
+
+def _grid(problem: Problem) -> _Grid:
+    view = problem.stiffness_data
+    searched = [e for e in problem.model.elements if isinstance(e, Dahl) and _is_free(e.parameters)]
+    each = _MOST_COMBINATIONS ** (1.0 / max(1, len(searched)))
+    friction = [_nodes(element, view, each) for element in searched]
+    counts = [element.curve.shape[-2] for element in friction]
+    nodes = np.array(list(product(*(range(count) for count in counts))), dtype=np.intp)
+    rest = np.zeros(view.stiffness.shape, dtype=np.complex128)
+    columns = {}
+    for element in problem.model.elements:
+        if isinstance(element, Dahl) and _is_free(element.parameters):
+            continue
+        if isinstance(element, _LINEAR) and element.parameters[0].free:
+            column = view.of(element, [np.ones(())])
+            columns[element.parameters[0].name] = column * view.weights
+        else:
+            rest = rest + view.of(element, _start_values(element.parameters))
+    return _Grid(
+        problem,
+        friction,
+        nodes,
+        tuple(counts),
+        (view.stiffness - rest) * view.weights,
+        view.weights,
+        columns,
+    )
+
+
+def _nodes(element: Dahl, view: StiffnessData, most: float) -> _Friction:
+    """Return the grid of one element, of at most `most` nodes."""
+    f_max, sigma, alpha = element.parameters
+    position = np.rint(np.log(view.amplitude) / _STEP).astype(np.intp)
+    if f_max.free or sigma.free:
+        low = position.min(axis=-1)
+        span = int((position.max(axis=-1) - low).max())
+        offsets = _offsets(span, max(6.0, most / (len(_ALPHAS) if alpha.free else 1)))
+    else:
+        x_c = _start_values((f_max,))[0] / _start_values((sigma,))[0]
+        low = np.rint(np.log(x_c) / _STEP).astype(np.intp)
+        offsets = np.zeros(1, dtype=np.intp)
+    ln_x_c = low[..., None] + offsets
+    at = np.clip(position[..., None, :] - ln_x_c[..., None] - _LOWEST, 0, _NODES)
+    alphas = _ALPHAS if alpha.free else (float(_start_values((alpha,))[0]),)
+    return _Friction(
+        f_max,
+        sigma,
+        alpha,
+        np.tile(ln_x_c * _STEP, len(alphas)),
+        np.repeat(np.log(alphas), offsets.size),
+        np.concatenate([_curve(a, view.harmonic, at) for a in alphas], axis=-2),
+    )
+
+
+@lru_cache(maxsize=256)
+def _offsets(span: int, most: float) -> IntArray:
+    """Return the nodes of ln x_c in steps above the smallest amplitude's."""
+    decade = round(_DECADE)
+    fine = max(_FINE, int(np.ceil((span + 4 * decade) / (0.7 * most))))
+    below = np.arange(-8 * decade, -2 * decade, _COARSE)
+    inner = np.arange(-2 * decade, span + 2 * decade + fine, fine)
+    above = np.arange(inner[-1] + _COARSE, span + 6 * decade + 1, _COARSE)
+    return np.concatenate([below, inner, above])
+
+
+def _curve(alpha: float, harmonic: NDArray[np.int64], at: IntArray) -> ComplexArray:
+    """Return h at places `at` of the table, row by row's harmonic."""
+    orders = np.unique(harmonic).tolist()
+    if len(orders) == 1:
+        return _table(alpha, orders[0])[at]
+    curve = np.empty(at.shape, dtype=np.complex128)
+    for k in orders:
+        curve[..., harmonic == k] = _table(alpha, k)[at[..., harmonic == k]]
+    return curve
+
+
+@lru_cache(maxsize=64)
+def _table(alpha: float, harmonic: int) -> ComplexArray:
+    """Return F_k/X_1 over sigma at ln beta = -32, -31.99, ..., 32."""
+    beta = np.exp(_STEP * np.arange(_LOWEST, _LOWEST + _NODES + 1))
+    one = np.ones(())
+    return Dahl().stiffness((one, one, np.asarray(alpha)), beta, one, harmonic)
+
+
+def _solve_linear(
+    target: ComplexArray, columns: list[ComplexArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the least sum of |target - sum of real coefficients times columns|^2, and those."""
+    shape = np.broadcast_shapes(target.shape, *(c.shape for c in columns))
+    size = (target.real**2 + target.imag**2).sum(axis=-1)
+    if not columns:
+        return np.broadcast_to(size, shape[:-1]), np.empty((*shape[:-1], 0))
+    if len(columns) == 1:
+        (c,) = columns
+        norm = (c.real**2 + c.imag**2).sum(axis=-1)
+        overlap = (c.real * target.real + c.imag * target.imag).sum(axis=-1)
+        coefficient = overlap / np.maximum(norm, 1e-300)
+        return size - coefficient * overlap, coefficient[..., None]
+    X = np.stack([np.broadcast_to(c, shape) for c in columns], axis=-2).view(np.float64)
+    t = np.ascontiguousarray(np.broadcast_to(target, shape)).view(np.float64)
+    norm = np.sqrt((X * X).sum(axis=-1))
+    norm[norm == 0.0] = 1.0
+    X = X / norm[..., None]
+    overlap = X @ t[..., None]
+    gram = X @ X.swapaxes(-1, -2) + 1e-13 * np.eye(len(columns))
+    scaled = np.linalg.solve(gram, overlap)
+    rest = t - (scaled.swapaxes(-1, -2) @ X)[..., 0, :]
+    return (rest * rest).sum(axis=-1), scaled[..., 0] / norm
+
+
+def _local_minima(cost: FloatArray) -> IntArray:
+    """Return the flat indices of a grid's local minima, the lowest first."""
+    lowest = np.isfinite(cost)
+    if not lowest.any():
+        return np.zeros(1, dtype=np.intp)
+    for axis in range(cost.ndim):
+        rows = np.moveaxis(cost, axis, 0)
+        mask = np.moveaxis(lowest, axis, 0)
+        mask[1:] &= rows[1:] <= rows[:-1]
+        mask[:-1] &= rows[:-1] < rows[1:]
+    places = np.flatnonzero(lowest)
+    return places[np.argsort(cost.ravel()[places])]
+
+
+def _is_free(parameters: tuple[Parameter, ...]) -> bool:
+    return any(p.free for p in parameters)
+
+
+def _start_values(parameters: tuple[Parameter, ...]) -> list[FloatArray]:
+    return [np.asarray(np.nan if p.value is None else p.value) for p in parameters]
