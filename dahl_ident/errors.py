@@ -9,6 +9,7 @@ from __future__ import annotations
 __all__ = [
     "DahlIdentError",
     "DataError",
+    "DataWarning",
     "ExtractionError",
     "FitError",
     "MissingDependencyError",
@@ -38,6 +39,10 @@ class UnitError(DahlIdentError, ValueError):
 
 class DataError(DahlIdentError, ValueError):
     """A file or table cannot be used; the message names file, row and column."""
+
+
+class DataWarning(UserWarning):
+    """Data that can be used but look wrong; the message lists the rows."""
 
 
 class ExtractionError(DahlIdentError, ValueError):

@@ -60,7 +60,8 @@ SI_UNITS: dict[str, tuple[str, str]] = {
 MOTIONS: tuple[Motion, ...] = get_args(Motion)
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 MOTION_KINDS = ("displacement", "velocity", "acceleration")
-_MECHANICAL = (*MOTION_KINDS, "force", *QUANTITIES)
+DRIVE_KINDS = ("force", "voltage", "current")
+MECHANICAL_KINDS = (*MOTION_KINDS, "force", *QUANTITIES, "force_per_voltage", "force_per_current")
 
 _TO_PEAK: dict[Marker, float] = {"zero to peak": 1.0, "rms": np.sqrt(2.0), "peak to peak": 0.5}
 _MARKERS: tuple[tuple[Marker, str], ...] = (
@@ -292,7 +293,7 @@ def from_si(values: ArrayLike, unit: str, kind: str, motion: Motion = "translati
     """
     target = parse_unit(unit)
     _, found, factor = kind_of(target, (kind,), kind)
-    if kind in _MECHANICAL and found != motion:
+    if kind in MECHANICAL_KINDS and found != motion:
         raise UnitError(f"{kind} in {motion} cannot be shown in [{unit}], a unit of {found}")
     return finite_array(values, kind) / (factor * target.to_peak)
 
@@ -345,7 +346,7 @@ def _without_angle(dimension: Dimension) -> Dimension:
 
 
 def _same(one: Dimension, other: Dimension, kind: str) -> bool:
-    if kind in QUANTITIES or kind == "force":
+    if kind in MECHANICAL_KINDS and kind not in MOTION_KINDS:
         # N m and N m/rad are both written for a rotary stiffness
         return _without_angle(one) == _without_angle(other)
     return one == other

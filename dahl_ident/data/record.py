@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray, finite_array, positive_number
 from dahl_ident.data.fields import column, frozen_copy, frozen_mapping, one_of, thawed
+from dahl_ident.data.sampling import gaps, is_even, sample_rate
 from dahl_ident.errors import ValidationError
 from dahl_ident.units import MOTION_KINDS, MOTIONS, Motion
 
 DriveUnit = Literal["N", "N m", "V", "A"]
-_GAP = 1.5  # a step of more than this many median steps misses a sample
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -179,23 +179,17 @@ class Record:
     @property
     def sample_rate(self) -> float:
         """Mean number of samples per second outside the gaps, Hz."""
-        steps = np.diff(self.time)
-        kept = steps[steps <= _GAP * np.median(steps)]
-        return float(kept.size / kept.sum())
+        return sample_rate(self.time)
 
     @property
     def uniform(self) -> bool:
         """Whether every sample lies within 1 % of a step of an even grid."""
-        grid = np.linspace(self.time[0], self.time[-1], self.n)
-        step = self.duration / (self.n - 1)
-        return bool(np.abs(self.time - grid).max() <= 0.01 * step)
+        return is_even(self.time)
 
     @property
     def gaps(self) -> FloatArray:
         """Start and end of every gap, (m, 2), s: steps above 1.5 times the median step."""
-        steps = np.diff(self.time)
-        before = np.flatnonzero(steps > _GAP * np.median(steps))
-        return np.column_stack([self.time[before], self.time[before + 1]])
+        return gaps(self.time)
 
 
 def _rebuild(arguments: dict[str, Any]) -> Record:

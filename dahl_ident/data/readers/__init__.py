@@ -1,0 +1,320 @@
+"""Readers: every usual laboratory file becomes a frequency response or a record.
+
+Formats are told by their content: text tables (CSV, TSV and kin, also packed with gzip, bzip2 or
+xz), Excel, Parquet, MATLAB, HDF5, universal files 58 and 58b, NI TDMS and LabVIEW LVM. What the
+file does not say, such as a unit or which column is the force, comes from a column map
+(:mod:`dahl_ident.data.columns`) or from keywords; what nobody says is an error. Every
+assumption that is left, such as amplitudes being zero to peak, is noted in the result.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from dahl_ident.data.columns import column_map
+from dahl_ident.data.frequency_response import FrequencyResponse
+from dahl_ident.data.readers.contents import FileContents, contents
+from dahl_ident.data.readers.file import File, open_file
+from dahl_ident.data.record import Record
+from dahl_ident.data.record_table import record_from
+from dahl_ident.data.response_table import ResponseOptions, response_from
+from dahl_ident.data.source import Source
+from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.units import Quantity
+
+__all__ = ["FileContents", "inspect", "read_frequency_response", "read_record"]
+
+PathLike = str | Path
+Columns = Mapping[str, Any] | str | Path
+
+
+def read_frequency_response(
+    path: PathLike | Sequence[PathLike],
+    *,
+    columns: Columns | None = None,
+    quantity: Quantity | None = None,
+    amplitude: str | None = None,
+    drive: str | None = None,
+    drive_factor: str | None = None,
+    level: str | float | None = None,
+    level_from_name: str | None = None,
+    controlled: str | Mapping[str, str] | None = None,
+    frequency_hz: tuple[float, float] | None = None,
+    sheet: str | None = None,
+    passive: bool = True,
+) -> FrequencyResponse:
+    r"""Read a table of complex response, or several of them into one.
+
+    Parameters
+    ----------
+    path : path, or sequence of paths
+        Files; ``"-"`` is standard input.
+    columns : mapping or path of a TOML file, optional
+        Column map: which column is ``frequency``, ``amplitude``, ``drive``, ``gain``, ``phase``,
+        ``real``, ``imag`` and so on, with unit, sign and factor where the file does not say
+        them. Columns that bear these names need no map.
+    quantity : str, optional
+        Which of the six standard quantities the response is; by default its unit tells.
+    amplitude, drive : str, optional
+        One displacement (velocity, acceleration) or force amplitude for the whole file, such
+        as ``"5 um rms"`` or ``"0.2 N"``. Braces are filled from the file's name: see
+        `level_from_name`.
+    drive_factor : str, optional
+        Force for one unit of a drive in V or A, such as ``"12.5 N/V"``.
+    level : str or float, optional
+        Label for all rows.
+    level_from_name : str, optional
+        Regular expression on the file's name; its first group is the level. Together with
+        ``drive="{level} N"`` it is the drive as well; a named group fills its own braces.
+    controlled : {"displacement", "force"} or mapping, optional
+        What the laboratory held; a mapping gives a pattern of level labels for each.
+    frequency_hz : (low, high), optional
+        Read this range only.
+    sheet : str, optional
+        Sheet of an Excel workbook.
+    passive : bool
+        Whether to refuse a table that creates energy as a whole. Turn it off only for
+        structures with a motor in the loop.
+
+    Returns
+    -------
+    FrequencyResponse
+        With provenance and the assumptions that were made.
+
+    Raises
+    ------
+    DataError, UnitError
+        Naming file, row and column, and what to do.
+    MissingDependencyError
+        If the format needs a package that is not installed.
+
+    Warns
+    -----
+    DataWarning
+        Where values can be used but look wrong; it lists the rows.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import mkdtemp
+    >>> table = Path(mkdtemp()) / "pivot.csv"
+    >>> _ = table.write_text(
+    ...     "frequency_hz,amplitude [um pp],gain [N/mm],phase_deg\n1,20,5,10\n1,40,4,20\n"
+    ... )
+    >>> read_frequency_response(table).amplitude
+    array([1.e-05, 2.e-05])
+    """
+    paths = [path] if isinstance(path, (str, Path)) else list(path)
+    if not paths:
+        raise DataError("no file to read; expected at least one path")
+    mapped = column_map(
+        columns, quantity=quantity, drive_factor=drive_factor, controlled=controlled
+    )
+    parts = []
+    for one in paths:
+        groups = _groups(one, level_from_name)
+        options = ResponseOptions(
+            amplitude=_filled(amplitude, groups, one),
+            drive=_filled(drive, groups, one),
+            level=groups.get("level", level),
+            frequency_hz=frequency_hz,
+            passive=passive,
+        )
+        parts.append(response_from(open_source(one, sheet), mapped, options))
+    if len(parts) == 1:
+        return parts[0]
+    try:
+        return FrequencyResponse.concatenate(parts)
+    except ValidationError as exc:
+        raise DataError(f"the files do not make one table: {exc}") from exc
+
+
+def read_record(
+    path: PathLike,
+    *,
+    columns: Columns | None = None,
+    time: str | Mapping[str, Any] | None = None,
+    displacement: str | Mapping[str, Any] | None = None,
+    velocity: str | Mapping[str, Any] | None = None,
+    acceleration: str | Mapping[str, Any] | None = None,
+    force: str | Mapping[str, Any] | None = None,
+    drive: str | Mapping[str, Any] | None = None,
+    drive_factor: str | None = None,
+    drive_factor_uncertainty: float | None = None,
+    sample_rate: float | None = None,
+    sheet: str | None = None,
+    missing: Literal["error", "drop"] = "error",
+) -> Record:
+    r"""Read sampled waveforms of motion and force.
+
+    Parameters
+    ----------
+    path : path
+        File; ``"-"`` is standard input.
+    columns : mapping or path of a TOML file, optional
+        Column map of the roles below.
+    time, displacement, velocity, acceleration, force, drive : str or mapping, optional
+        Name of a column, with its unit in brackets where the file does not say it
+        (``"x [mm]"``), or a table as in a column map. Exactly one motion is read.
+    drive_factor : str, optional
+        Force for one unit of a drive in V or A, such as ``"12.5 N/V"``.
+    drive_factor_uncertainty : float, optional
+        Its relative standard uncertainty.
+    sample_rate : float, optional
+        Hz, for files without a time column.
+    sheet : str, optional
+        Sheet of an Excel workbook.
+    missing : {"error", "drop"}
+        Whether samples with an empty or NaN cell are refused, or left out as gaps in time.
+
+    Returns
+    -------
+    Record
+        With provenance and the assumptions that were made.
+
+    Raises
+    ------
+    DataError, UnitError
+        Naming file, row and column, and what to do.
+    MissingDependencyError
+        If the format needs a package that is not installed.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import mkdtemp
+    >>> run = Path(mkdtemp()) / "run.csv"
+    >>> _ = run.write_text("t;LVDT;F\ns;mm;kN\n0,0;1,5;2\n0,1;1,6;3\n")
+    >>> read_record(run, displacement="LVDT").force
+    array([2000., 3000.])
+    """
+    if missing not in ("error", "drop"):
+        raise ValidationError(f"missing is {missing!r}; expected 'error' or 'drop'")
+    mapped = column_map(
+        columns,
+        time=time,
+        displacement=displacement,
+        velocity=velocity,
+        acceleration=acceleration,
+        force=force,
+        drive=drive,
+        drive_factor=drive_factor,
+        drive_factor_uncertainty=drive_factor_uncertainty,
+        sample_rate=sample_rate,
+    )
+    return record_from(open_source(path, sheet), mapped, missing)
+
+
+def inspect(path: PathLike, *, sheet: str | None = None) -> FileContents:
+    r"""Say what a file holds, and propose a column map for it.
+
+    Parameters
+    ----------
+    path : path
+        File; ``"-"`` is standard input.
+    sheet : str, optional
+        Sheet of an Excel workbook.
+
+    Returns
+    -------
+    FileContents
+        Prints as a list of channels with shapes, units and ranges, the sampling and its gaps,
+        and the proposed map in TOML.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read.
+    MissingDependencyError
+        If the format needs a package that is not installed.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import mkdtemp
+    >>> run = Path(mkdtemp()) / "run.csv"
+    >>> _ = run.write_text("time [s],x [mm],F [kN]\n0,1,2\n0.1,2,3\n0.2,1,2\n")
+    >>> inspect(run).sampling
+    '10 Hz, even, 3 samples in 0.2 s'
+    """
+    return contents(open_source(path, sheet))
+
+
+def open_source(path: PathLike, sheet: str | None = None) -> Source:
+    """Return the channels of a file of any format."""
+    file = open_file(path)
+    if sheet is not None and file.format != "excel":
+        raise DataError(f"{file.name}: sheet={sheet!r} is given, but the file is no workbook")
+    return _parsed(file, sheet)
+
+
+def _parsed(file: File, sheet: str | None) -> Source:
+    """Hand a file to its reader; each is imported when first used."""
+    match file.format:
+        case "excel":
+            from dahl_ident.data.readers.sheets import read_excel
+
+            return read_excel(file, sheet)
+        case "parquet":
+            from dahl_ident.data.readers.sheets import read_parquet
+
+            return read_parquet(file)
+        case "matlab":
+            from dahl_ident.data.readers.tree import read_matlab
+
+            return read_matlab(file)
+        case "hdf5":
+            from dahl_ident.data.readers.tree import read_hdf5
+
+            return read_hdf5(file)
+        case "uff" | "tdms" | "lvm":
+            from dahl_ident.data.readers import instruments
+
+            return {
+                "uff": instruments.read_uff,
+                "tdms": instruments.read_tdms,
+                "lvm": instruments.read_lvm,
+            }[file.format](file)
+        case _:
+            from dahl_ident.data.readers.delimited import read_text_table
+
+            return read_text_table(file.data, file.name, file.sha256)
+
+
+def _groups(path: PathLike, expression: str | None) -> dict[str, Any]:
+    """Return what the regular expression finds in a file's name, the level among it."""
+    if expression is None:
+        return {}
+    name = Path(path).name
+    try:
+        pattern = re.compile(expression)
+    except re.error as exc:
+        raise DataError(f"level_from_name {expression!r} is no regular expression: {exc}") from exc
+    found = pattern.search(name)
+    if found is None or not pattern.groups:
+        raise DataError(
+            f"{name}: level_from_name {expression!r} finds no group in the name; put what is the "
+            "level in round brackets, such as '([0-9.]+)N'"
+        )
+    groups: dict[str, Any] = {k: v for k, v in found.groupdict().items() if v is not None}
+    level = str(groups.get("level", found[1]))
+    try:
+        groups["level"] = float(level)
+    except ValueError:
+        groups["level"] = level
+    return groups
+
+
+def _filled(text: str | None, groups: Mapping[str, Any], path: PathLike) -> str | None:
+    if text is None:
+        return None
+    try:
+        return text.format(**groups)
+    except (KeyError, IndexError, ValueError) as exc:
+        raise DataError(
+            f"{path}: {text!r} cannot be filled from the file's name: level_from_name gives "
+            f"{sorted(groups) or 'nothing'}"
+        ) from exc

@@ -1,0 +1,243 @@
+"""Text tables: any delimiter, decimal comma, comments, several header lines, a row of units.
+
+The layout is found from the numbers: the delimiter and decimal mark are those under which the
+longest run of lines reads as numbers; the lines above it with as many fields are the header,
+and its last line is a row of units where each of its cells is one. Lines further up are the
+instrument's own preamble.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.data.readers.layout import Header, best_run, header
+from dahl_ident.data.source import Channel, Source
+from dahl_ident.errors import DataError
+
+METADATA_MARK = "dahl_ident:"
+_COMMENT = re.compile(r"\s*(?:#|%|//|!)")
+_LINE_END = re.compile(rb"\r\n|\n|\r")
+_HEAD_BYTES = 1 << 16
+_DIALECTS = (
+    ("\t", "."), (";", "."), (",", "."), ("|", "."),
+    ("\t", ","), (";", ","), ("|", ","), (None, "."), (None, ","),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Delimiter (None: blanks), decimal mark, first line of numbers, fields in it, header."""
+
+    delimiter: str | None
+    mark: str
+    line: int
+    offset: int
+    width: int
+    header: Header
+
+
+def read_text_table(data: bytes, name: str, sha256: str | None = None) -> Source:
+    """Return the columns of a text table.
+
+    Raises
+    ------
+    DataError
+        If the bytes are no text, or no table of numbers is found, or lines differ in width.
+    """
+    data = _as_utf8(data, name)
+    lines = _head(data)
+    layout = _layout(lines, name)
+    metadata = _metadata(lines, name)
+    body = data[layout.offset :]
+    _refuse_cut_end(body, layout, name)
+    columns = _parse(body, layout, metadata, name)
+    names = layout.header.names
+    channels = []
+    for i, values in enumerate(columns):
+        label = names[i] if names else ""
+        if not label and values.dtype.kind == "f" and np.isnan(values).all():
+            continue  # a trailing delimiter, or an empty column
+        unit = layout.header.units[i] if names else None
+        channels.append(Channel(label or f"column {i + 1}", values, unit))
+    return Source(
+        name,
+        "text table",
+        tuple(channels),
+        sha256,
+        headerless=not names,
+        row_name=lambda i: f"line {_line_of(body, layout.line, i)}",
+        metadata=metadata,
+    )
+
+
+def _as_utf8(data: bytes, name: str) -> bytes:
+    """Return the text in UTF-8 without a byte-order mark; instruments also write cp1252."""
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        text = data.decode("utf-16", errors="replace")
+        data = text.encode("utf-8")
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    if b"\0" in data:
+        raise DataError(
+            f"{name}: the file is binary (byte {data.index(0)} is 0); expected a text table"
+        )
+    if data.isascii():
+        return data
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", errors="replace").encode("utf-8")
+    return data
+
+
+def _head(data: bytes) -> list[tuple[int, str]]:
+    """Return offset and text of the first lines."""
+    lines, start = [], 0
+    for end in _LINE_END.finditer(data, 0, _HEAD_BYTES):
+        lines.append((start, data[start : end.start()].decode("utf-8", "replace")))
+        start = end.end()
+    if len(data) <= _HEAD_BYTES and start < len(data):
+        lines.append((start, data[start:].decode("utf-8", "replace")))
+    return lines
+
+
+def _split(line: str, delimiter: str | None) -> list[str]:
+    if delimiter is None:
+        return line.split()
+    if '"' not in line:
+        return line.split(delimiter)
+    try:
+        return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
+    except csv.Error:
+        return [line]
+
+
+def _layout(lines: list[tuple[int, str]], name: str) -> _Layout:
+    """Find dialect and start of the numbers, and read the header above them."""
+    passed = [not text.strip() or _COMMENT.match(text) is not None for _, text in lines]
+    best: _Layout | None = None
+    score = 0
+    for delimiter, mark in _DIALECTS:
+        rows = [
+            None if skip else _split(text, delimiter)
+            for (_, text), skip in zip(lines, passed, strict=True)
+        ]
+        run = best_run(rows, mark)
+        if run is not None and run.score > score:
+            above = [row for row in rows[: run.start] if row is not None]
+            found = header(above, run.width)
+            if not found.names:
+                found = header(_commented(lines[: run.start], delimiter), run.width)
+            offset = lines[run.start][0]
+            best = _Layout(delimiter, mark, run.start + 1, offset, run.width, found)
+            score = run.score
+    if best is None:
+        raise DataError(
+            f"{name}: no table of numbers found; expected at least two columns of numbers under a "
+            "header line"
+        )
+    return best
+
+
+def _commented(lines: list[tuple[int, str]], delimiter: str | None) -> list[list[str]]:
+    """Return the cells of the comment lines, without their marks."""
+    texts = [text[m.end() :] for _, text in lines if (m := _COMMENT.match(text))]
+    return [_split(text, delimiter) for text in texts if METADATA_MARK not in text]
+
+
+def _metadata(lines: list[tuple[int, str]], name: str) -> Mapping[str, Any]:
+    """Return what an earlier save of this package wrote into a comment line."""
+    for i, (_, text) in enumerate(lines):
+        found = re.match(rf"\s*#\s*{METADATA_MARK}(.*)", text)
+        if found:
+            try:
+                metadata = json.loads(found[1])
+            except json.JSONDecodeError:
+                metadata = None
+            if not isinstance(metadata, dict):
+                raise DataError(
+                    f"{name}, line {i + 1}: the comment after '{METADATA_MARK}' is not what this "
+                    "package wrote; delete the line to read the table without it"
+                )
+            return metadata
+    return {}
+
+
+def _refuse_cut_end(body: bytes, layout: _Layout, name: str) -> None:
+    """Refuse a last line with missing fields."""
+    ends = _LINE_END.split(body[-_HEAD_BYTES:])
+    last = next(t for t in reversed(ends) if _counts(t)).decode("utf-8", "replace")
+    fields = len(_split(last, layout.delimiter))
+    if fields < layout.width:
+        raise DataError(
+            f"{name}: the last line has {fields} fields, {last[:40]!r}, where the others have "
+            f"{layout.width}; the file looks cut off"
+        )
+
+
+def _counts(line: bytes) -> bool:
+    """Return whether a line among the numbers is one, and not blank or a comment."""
+    return bool(line.strip()) and not line.lstrip().startswith(b"#")
+
+
+def _parse(
+    body: bytes, layout: _Layout, metadata: Mapping[str, Any], name: str
+) -> list[NDArray[Any]]:
+    import pandas as pd
+
+    # pandas 3.1 reads to the last digit by default, earlier ones have to be asked
+    exact = tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1)
+    options: dict[str, Any] = {} if exact else {"float_precision": "round_trip"}
+    if b"#" in body:
+        options["comment"] = "#"
+    texts = metadata.get("text", [])
+    if texts:
+        options["dtype"] = {i: str for i, n in enumerate(layout.header.names) if n in texts}
+    try:
+        frame = pd.read_csv(
+            io.BytesIO(body),
+            sep=layout.delimiter or r"\s+",
+            decimal=layout.mark,
+            header=None,
+            names=list(range(layout.width)),
+            skipinitialspace=True,
+            keep_default_na=False,
+            na_values=[""],
+            low_memory=False,
+            encoding="utf-8",
+            **options,
+        )
+    except pd.errors.ParserError as exc:
+        raise DataError(f"{name}: {_where_ragged(str(exc), layout)}") from exc
+    except (ValueError, OverflowError) as exc:
+        raise DataError(f"{name}: the table cannot be read: {exc}") from exc
+    return [_plain(frame[i].to_numpy()) for i in range(layout.width)]
+
+
+def _where_ragged(message: str, layout: _Layout) -> str:
+    found = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", message)
+    if found is None:
+        return f"the table cannot be read: {message.strip()}"
+    line = int(found[2]) + layout.line - 1
+    return f"line {line} has {found[3]} fields; expected {found[1]} as in the lines above"
+
+
+def _plain(values: NDArray[Any]) -> NDArray[Any]:
+    """Return numbers or truth values as they are, anything else as text, empty cells as ''."""
+    if values.dtype.kind in "fiub":
+        return values
+    return np.array(["" if v is None or v != v else str(v) for v in values], dtype=np.str_)
+
+
+def _line_of(body: bytes, first: int, row: int) -> int:
+    """Return the line number of a row, past blank lines and comments."""
+    kept = [i for i, text in enumerate(_LINE_END.split(body)) if _counts(text)]
+    return first + kept[row]

@@ -1,0 +1,105 @@
+"""Where in a sheet of cells the numbers begin, and what stands above them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from dahl_ident.data.source import split_header
+from dahl_ident.errors import UnitError
+from dahl_ident.units import parse_unit
+
+_CELL = {
+    mark: re.compile(
+        rf"\s*[-+]?(?:(?:\d+(?:\{mark}\d*)?|\{mark}\d+)(?:[eE][-+]?\d+)?|nan|inf(?:inity)?)\s*",
+        re.IGNORECASE | re.ASCII,
+    )
+    for mark in ".,"
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """Consecutive rows of one width, each with a number in it, and how numeric they are."""
+
+    start: int
+    width: int
+    score: int
+
+
+@dataclass(frozen=True)
+class Header:
+    """Names and units of the columns; no names for a table without a header."""
+
+    names: tuple[str, ...]
+    units: tuple[str | None, ...]
+
+
+def best_run(rows: Iterable[Sequence[str] | None], mark: str) -> Run | None:
+    """Return the run with the most numbers, half weighed against by cells of text.
+
+    None stands for a line to look past: blank, or a comment. A line of another width belongs
+    to the run that it breaks; it is for the parser to refuse.
+    """
+    best: Run | None = None
+    run: Run | None = None
+    for i, row in enumerate(rows):
+        if row is None:
+            continue
+        numbers = sum(_CELL[mark].fullmatch(cell) is not None for cell in row)
+        if not numbers:
+            run = None
+            continue
+        if run is None:
+            run = Run(i, len(row), 0)
+        if len(row) == run.width > 1:
+            text = sum(bool(cell.strip()) for cell in row) - numbers
+            run = Run(run.start, run.width, run.score + 2 * numbers - text)
+        if best is None or run.score > best.score:
+            best = run
+    return best if best and best.score > 0 else None
+
+
+def header(above: Sequence[Sequence[str]], width: int) -> Header:
+    """Return names and units from the lines directly above the numbers, the nearest last."""
+    lines: list[list[str]] = []
+    for row in reversed(above):
+        cells = _without_trailing(row)
+        if not cells or not width - 1 <= len(cells) <= width or _holds_number(cells):
+            break
+        lines.insert(0, [*cells, *[""] * (width - len(cells))])
+    if not lines:
+        return Header((), ())
+    k = next((k for k in range(len(lines) - 1, 0, -1) if _are_units(lines[k])), None)
+    if k is None:
+        named = [split_header(cell) for cell in lines[-1]]
+        return Header(tuple(n for n, _ in named), tuple(u for _, u in named))
+    named = [split_header(cell) for cell in lines[k - 1]]
+    units = [own or _bare(cell) for (_, own), cell in zip(named, lines[k], strict=True)]
+    return Header(tuple(n for n, _ in named), tuple(units))
+
+
+def _without_trailing(row: Sequence[str]) -> list[str]:
+    cells = [cell.strip() for cell in row]
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _holds_number(cells: Sequence[str]) -> bool:
+    return any(_CELL["."].fullmatch(cell) or _CELL[","].fullmatch(cell) for cell in cells)
+
+
+def _bare(cell: str) -> str | None:
+    """Return the unit in a cell of a row of units; None for an empty one."""
+    text = re.sub(r"^[\[(](.*)[\])]$", r"\1", cell.strip())
+    return "1" if text == "-" else text or None
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    try:
+        found = [parse_unit(unit) for cell in cells if (unit := _bare(cell)) is not None]
+    except UnitError:
+        return False
+    return bool(found)

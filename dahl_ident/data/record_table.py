@@ -1,0 +1,123 @@
+"""From the columns of a table to a record of waveforms."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data.binding import Binding
+from dahl_ident.data.columns import RECORD_NAMES, ColumnMap
+from dahl_ident.data.record import DriveUnit, Record
+from dahl_ident.data.source import Channel, Source
+from dahl_ident.errors import DataError, UnitError, ValidationError
+from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS
+
+_DRIVE_UNITS: dict[str, DriveUnit] = {"voltage": "V", "current": "A"}
+
+
+def record_from(
+    source: Source, columns: ColumnMap, missing: Literal["error", "drop"] = "error"
+) -> Record:
+    """Return the record that a source holds.
+
+    Raises
+    ------
+    DataError, UnitError
+        Naming file, row and column.
+    """
+    bound = Binding(source, columns, RECORD_NAMES)
+    channels = _channels(bound)
+    bound.same_length(channels)
+    if missing == "drop":
+        complete = np.all([np.isfinite(_numeric(c)) for c in channels.values()], axis=0)
+        bound.source = source.rows(complete)
+        channels = _channels(bound)
+        if not complete.all():
+            bound.notes.append(f"{np.sum(~complete)} samples with missing values left out")
+    values: dict[str, Any] = {
+        role: _samples(bound, role, channel) for role, channel in channels.items()
+    }
+    if "drive" in channels:
+        values |= _drive(bound, channels["drive"])
+    if "time" not in values:
+        values["time"] = _even_time(bound, next(iter(values.values())).size)
+    try:
+        return Record(**values, motion=bound.motion(), provenance=bound.provenance())
+    except ValidationError as exc:
+        raise DataError(f"{source.name}: {exc}") from exc
+
+
+def _channels(bound: Binding) -> dict[str, Channel]:
+    """Return the channels of the roles that the record has, exactly one motion among them."""
+    roles = bound.map.roles
+    named = [kind for kind in MOTION_KINDS if kind in roles]
+    motions = named or [kind for kind in MOTION_KINDS if bound.has(kind)]
+    if len(motions) != 1:
+        raise DataError(
+            f"{bound.source.name}: {' and '.join(motions) or 'no motion'} found; expected one of "
+            "displacement, velocity and acceleration. Name it, such as displacement='x'"
+        )
+    found = {role: bound.required(role) for role in motions}
+    if bound.map.sample_rate is None:
+        found["time"] = bound.required("time")
+    for role in ("force", "drive"):
+        channel = bound.channel(role)
+        if channel is not None:
+            found[role] = channel
+    if not {"force", "drive"} & found.keys():
+        bound.required("force")
+    return found
+
+
+def _numeric(channel: Channel) -> FloatArray:
+    """Return the numbers of a channel for finding gaps; text counts as present."""
+    if channel.values.dtype.kind in "fiu":
+        return channel.values.astype(np.float64)
+    return np.array([np.nan if not str(v).strip() else 0.0 for v in channel.values])
+
+
+def _samples(bound: Binding, role: str, channel: Channel) -> FloatArray:
+    """Return SI samples; for a drive in V or A, volts or amperes."""
+    values = bound.numbers(role, channel)
+    unit = bound.unit(role, channel)
+    kinds = DRIVE_KINDS if role == "drive" else (role,)
+    _, factor = bound.kind(role, unit, kinds)
+    if role == "time":
+        _require_increasing(bound.source, channel, values)
+    if unit.marker in ("rms", "peak to peak") or unit.decibel:
+        raise UnitError(
+            f"{bound.source.name}: column {channel.name!r} has the unit [{unit.text}]; expected "
+            "the samples of a waveform, not amplitudes"
+        )
+    return values * factor
+
+
+def _drive(bound: Binding, channel: Channel) -> dict[str, Any]:
+    kind, _ = bound.kind("drive", bound.unit("drive", channel), DRIVE_KINDS)
+    if kind == "force":
+        return {"drive_unit": "N" if bound.motions["drive"] == "translation" else "N m"}
+    unit = _DRIVE_UNITS[kind]
+    if bound.map.drive_factor is None:
+        return {"drive_unit": unit}
+    factor, uncertainty = bound.force_per(kind)
+    return {"drive_unit": unit, "drive_factor": factor, "drive_factor_uncertainty": uncertainty}
+
+
+def _even_time(bound: Binding, n: int) -> FloatArray:
+    rate = bound.map.sample_rate
+    assert rate is not None  # _channels has asked for a time column otherwise
+    bound.notes.append(f"time counted from the sample rate of {rate:g} Hz")
+    return np.arange(n) / rate
+
+
+def _require_increasing(source: Source, channel: Channel, time: FloatArray) -> None:
+    steps = np.diff(time)
+    back = np.flatnonzero(~(steps > 0.0))
+    if back.size:
+        i = int(back[0]) + 1
+        raise DataError(
+            f"{source.where(channel, i)}: time is {time[i]:.9g} after {time[i - 1]:.9g} "
+            f"({back.size} such steps); expected it to increase with every row"
+        )

@@ -1,0 +1,412 @@
+"""From the columns of a table to a frequency response.
+
+A row holds a frequency, an amplitude or a drive, and a response: ``real`` and ``imag``,
+``gain`` or ``gain_db`` with ``phase``, or complex numbers; where amplitude and drive are both
+there, ``phase`` alone will do. The unit of the response says which quantity it is: N/m is a
+dynamic stiffness, (m/s^2)/N an accelerance. Amplitudes may be those of a velocity or an
+acceleration; they are divided by the angular frequency, and the phase stays that of the
+response. Standard deviations without a unit have that of their column.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.binding import Binding, by_level, peak_note, per_frequency
+from dahl_ident.data.columns import RESPONSE_NAMES, ColumnMap
+from dahl_ident.data.fields import CONTROLLED
+from dahl_ident.data.frequency_response import FrequencyResponse
+from dahl_ident.data.source import Source
+from dahl_ident.data.suspicion import doubt_drive, doubt_phase_unit, refuse_created_energy
+from dahl_ident.errors import DataError, UnitError, ValidationError
+from dahl_ident.units import (
+    DRIVE_KINDS,
+    MOTION_KINDS,
+    QUANTITIES,
+    Quantity,
+    factor_to,
+    parse_quantity,
+    si_unit,
+)
+
+_FORMS = (("response",), ("real", "imag"), ("gain", "phase"), ("gain_db", "phase"))
+_ERROR_FORMS = (
+    ("covariance_real_real", "covariance_real_imag", "covariance_imag_imag"),
+    ("std",),
+    ("real_std", "imag_std"),
+    ("gain_std", "phase_std"),
+)
+
+
+@dataclass(frozen=True)
+class ResponseOptions:
+    """What a user says about a whole table; see :func:`read_frequency_response`."""
+
+    amplitude: str | None = None
+    drive: str | None = None
+    level: str | float | None = None
+    frequency_hz: tuple[float, float] | None = None
+    passive: bool = True
+
+
+def response_from(
+    source: Source, columns: ColumnMap, options: ResponseOptions
+) -> FrequencyResponse:
+    """Return the frequency response that a source holds, all its levels in one table.
+
+    Raises
+    ------
+    DataError, UnitError
+        Naming file, row and column.
+    """
+    parts = []
+    for label, one in by_level(source, columns).items():
+        level = options.level if label is None else label
+        parts.append(_Table(source, one, replace(options, level=level)).response())
+    if len(parts) == 1:
+        return parts[0]
+    joined = FrequencyResponse.concatenate(parts)
+    return replace(joined, provenance=parts[0].provenance)
+
+
+class _Table:
+    """One table with one column for each role."""
+
+    def __init__(self, source: Source, columns: ColumnMap, options: ResponseOptions) -> None:
+        self.options = options
+        self.bound = Binding(source, columns, RESPONSE_NAMES)
+        self._within_range()
+
+    def response(self) -> FrequencyResponse:
+        bound, source = self.bound, self.bound.source
+        frequency_hz = self._frequency()
+        amplitude = self._amplitude(frequency_hz)
+        drive = self._drive(frequency_hz)
+        if amplitude is None and drive is None:
+            raise DataError(
+                f"{source.name}: neither an amplitude nor a drive is given; friction answers "
+                "every amplitude differently. Name a column, or give drive='0.2 N' or "
+                "amplitude='5 um' for the whole file"
+            )
+        quantity, response = self._response(frequency_hz, amplitude, drive)
+        harmonic = self._whole_numbers("harmonic")
+        self._refuse_zero(response, harmonic)
+        try:
+            data = FrequencyResponse(
+                frequency_hz,
+                response,
+                amplitude,
+                drive,
+                level=self._level(),
+                controlled=self._controlled(drive is not None and amplitude is None),
+                harmonic=1 if harmonic is None else harmonic,
+                quantity=quantity,
+                motion=bound.motion(),
+                quality=self._quality(),
+                **self._errors(quantity, response),
+            )
+        except ValidationError as exc:
+            raise DataError(f"{source.name}: {exc}") from exc
+        doubt_drive(source.name, data, source.row_name)
+        if self.options.passive:
+            refuse_created_energy(source.name, data, source.row_name)
+        return replace(data, provenance=self.bound.provenance())
+
+    def _within_range(self) -> None:
+        """Leave out the frequencies that the user does not want, before anything is judged."""
+        channel = self.bound.required("frequency")
+        lengths = {c: self.bound.channel(c) for c in RESPONSE_NAMES}
+        self.bound.same_length({r: c for r, c in lengths.items() if c is not None})
+        if self.options.frequency_hz is None:
+            return
+        low, high = self.options.frequency_hz
+        frequency_hz = self._hertz(self.bound.numbers("frequency", channel))
+        keep = (frequency_hz >= low) & (frequency_hz <= high)
+        if not keep.any():
+            raise DataError(
+                f"{self.bound.source.name}: no frequency lies from {low:g} to {high:g} Hz"
+            )
+        self.bound.source = self.bound.source.rows(keep)
+
+    def _hertz(self, values: FloatArray) -> FloatArray:
+        channel = self.bound.required("frequency")
+        unit = self.bound.unit("frequency", channel)
+        kind, factor = self.bound.kind("frequency", unit, ("frequency", "angular_frequency"))
+        return values * factor / (2.0 * np.pi if kind == "angular_frequency" else 1.0)
+
+    def _frequency(self) -> FloatArray:
+        channel = self.bound.required("frequency")
+        values = self.bound.numbers("frequency", channel)
+        self.bound.source.require(
+            values > 0.0, channel, "a frequency > 0; frequency_hz=(low, high) leaves rows out"
+        )
+        return self._hertz(values)
+
+    def _amplitude(self, frequency_hz: FloatArray) -> FloatArray | None:
+        channel = self.bound.channel("amplitude")
+        if channel is None:
+            return self._constant("amplitude", frequency_hz, MOTION_KINDS)
+        values = self.bound.numbers("amplitude", channel)
+        self.bound.source.require(values > 0.0, channel, "an amplitude > 0")
+        unit = self.bound.unit("amplitude", channel)
+        kind, factor = self.bound.kind("amplitude", unit, MOTION_KINDS)
+        self.bound.notes += peak_note("amplitude", unit)
+        return per_frequency(values * factor * unit.to_peak, frequency_hz, kind)
+
+    def _drive(self, frequency_hz: FloatArray) -> FloatArray | None:
+        channel = self.bound.channel("drive")
+        if channel is None:
+            return self._constant("drive", frequency_hz, DRIVE_KINDS)
+        values = self.bound.numbers("drive", channel)
+        self.bound.source.require(values > 0.0, channel, "a drive amplitude > 0")
+        unit = self.bound.unit("drive", channel)
+        kind, factor = self.bound.kind("drive", unit, DRIVE_KINDS)
+        self.bound.notes += peak_note("drive", unit)
+        return values * factor * unit.to_peak * self._force_per(kind)
+
+    def _constant(
+        self, role: str, frequency_hz: FloatArray, kinds: tuple[str, ...]
+    ) -> FloatArray | None:
+        """Return one amplitude or drive that holds for the whole file."""
+        text = getattr(self.options, role)
+        if text is None:
+            return None
+        value, kind, motion = parse_quantity(text, kinds, f"{self.bound.source.name}: {role}")
+        if not 0.0 < value < np.inf:
+            raise DataError(f"{self.bound.source.name}: {role} is {text!r}; expected a value > 0")
+        values = np.full(frequency_hz.shape, value)
+        if kind in ("voltage", "current"):
+            return values * self._force_per(kind)
+        self.bound.motions[role] = motion
+        return values if role == "drive" else per_frequency(values, frequency_hz, kind)
+
+    def _force_per(self, kind: str) -> float:
+        """Return the force for one SI unit of the drive."""
+        factor, uncertainty = self.bound.force_per(kind)
+        if uncertainty:
+            self.bound.notes.append(f"drive factor uncertain by {uncertainty:.2%}, all rows alike")
+        return factor
+
+    def _response(
+        self, frequency_hz: FloatArray, amplitude: FloatArray | None, drive: FloatArray | None
+    ) -> tuple[Quantity, ComplexArray]:
+        form = self._form(_FORMS)
+        match form:
+            case ("response",):
+                return self._complex()
+            case ("real", "imag"):
+                quantity, real = self._part("real")
+                _, imag = self._part("imag", default=self._unit_text("real"))
+                return quantity, real + 1j * imag
+            case (role, "phase"):
+                quantity, gain = self._part(role)
+                return quantity, gain * np.exp(1j * self._phase())
+        quantity_named = self.bound.map.quantity
+        if amplitude is None or drive is None or not self.bound.has("phase"):
+            raise DataError(
+                f"{self.bound.source.name}: no response; expected real and imag, gain (or "
+                "gain_db) and phase, complex numbers, or a phase beside amplitude and drive"
+            )
+        if quantity_named is None:
+            raise DataError(
+                f"{self.bound.source.name}: the phase stands without a gain; say which quantity's "
+                "it is with quantity='receptance' or another"
+            )
+        receptance = FrequencyResponse(
+            frequency_hz, amplitude / drive, amplitude, quantity="receptance"
+        )
+        return quantity_named, receptance.to(quantity_named).gain * np.exp(1j * self._phase())
+
+    def _form(self, forms: tuple[tuple[str, ...], ...]) -> tuple[str, ...] | None:
+        """Return the one form whose columns are all there; the map decides between several."""
+        found = [f for f in forms if all(self.bound.has(role) for role in f)]
+        named = [f for f in found if f[0] in self.bound.map.roles]
+        found = named or found
+        if len(found) > 1:
+            raise DataError(
+                f"{self.bound.source.name}: both {' and '.join(found[0])} and "
+                f"{' and '.join(found[1])} are there; name one of them in columns="
+            )
+        return found[0] if found else None
+
+    def _unit_text(self, role: str) -> str:
+        return self.bound.unit(role, self.bound.required(role)).text
+
+    def _factor(self, role: str, default: str | None = None) -> tuple[Quantity, float, bool]:
+        """Return which quantity a column's unit makes it, its factor, and whether it is in dB."""
+        bound = self.bound
+        unit = bound.unit(role, bound.required(role), default)
+        kind, factor = bound.kind(role, unit, QUANTITIES)
+        wanted = bound.map.quantity
+        if wanted is not None and kind != wanted:
+            raise UnitError(
+                f"{bound.source.name}: the {role} in [{unit.text}] is {kind}, not {wanted}"
+            )
+        return cast(Quantity, kind), factor, unit.decibel
+
+    def _part(self, role: str, default: str | None = None) -> tuple[Quantity, FloatArray]:
+        """Return the quantity and the SI values of a gain, or of a real or imaginary part."""
+        channel = self.bound.required(role)
+        quantity, factor, decibel = self._factor(role, default)
+        values = self.bound.numbers(role, channel)
+        if decibel or role == "gain_db":
+            self.bound.source.require(np.abs(values) < 1000.0, channel, "a level within 1000 dB")
+            return quantity, factor * 10.0 ** (values / 20.0)
+        if role == "gain":
+            self.bound.source.require(values >= 0.0, channel, "a gain >= 0")
+        return quantity, factor * values
+
+    def _complex(self) -> tuple[Quantity, ComplexArray]:
+        channel = self.bound.required("response")
+        quantity, factor, _ = self._factor("response")
+        values = np.atleast_1d(channel.values)
+        if values.dtype.kind != "c":
+            raise DataError(
+                f"{self.bound.source.name}: column {channel.name!r} holds no complex numbers; "
+                "name the columns of real and imag, or of gain and phase"
+            )
+        self.bound.source.require(np.isfinite(values), channel, "finite numbers")
+        return quantity, factor * values.astype(np.complex128)
+
+    def _phase(self) -> FloatArray:
+        channel = self.bound.required("phase")
+        values = self.bound.numbers("phase", channel)
+        unit = self.bound.unit("phase", channel)
+        _, factor = self.bound.kind("phase", unit, ("angle",))
+        source = self.bound.source
+        doubt_phase_unit(source.name, values, factor != 1.0, source.row_name, channel.name)
+        return values * factor
+
+    def _errors(self, quantity: Quantity, response: ComplexArray) -> dict[str, Any]:
+        """Return the constructor's arguments on errors that the table has columns for."""
+        motion = self.bound.motion()
+        amplitude, part = si_unit("displacement", motion), si_unit(quantity, motion)
+        form, inherited = self._form(_ERROR_FORMS), self._error_unit("amplitude")
+        out: dict[str, Any] = {
+            "covariance": None if form is None else self._covariance(form, part, response),
+            "dof": self._plain("dof"),
+            "amplitude_std": self._scaled("amplitude_std", amplitude, inherited),
+        }
+        cross = ("covariance_amplitude_real", "covariance_amplitude_imag")
+        if all(self.bound.has(role) for role in cross):
+            unit = f"({amplitude})*({part})"
+            out["amplitude_covariance"] = np.stack([self._scaled(r, unit) for r in cross], -1)
+        return out
+
+    def _covariance(
+        self, form: tuple[str, ...], unit: str, response: ComplexArray
+    ) -> NDArray[np.float64]:
+        zero = np.zeros(response.shape)
+        match form:
+            case ("std",):
+                std = self._scaled("std", unit, self._error_unit("gain", "real", "response"))
+                rr = ii = std**2
+                ri = zero
+            case ("real_std", "imag_std"):
+                default = self._error_unit("real", "response")
+                rr, ii = (self._scaled(role, unit, default) ** 2 for role in form)
+                ri = zero
+            case ("gain_std", "phase_std"):
+                along = self._scaled("gain_std", unit, self._error_unit("gain")) ** 2
+                across = (np.abs(response) * self._scaled("phase_std", "rad")) ** 2
+                c, s = np.cos(np.angle(response)), np.sin(np.angle(response))
+                rr, ii = along * c**2 + across * s**2, along * s**2 + across * c**2
+                ri = (along - across) * c * s
+            case _:
+                rr, ri, ii = (self._scaled(role, f"({unit})^2") for role in form)
+        return np.stack([np.stack([rr, ri], -1), np.stack([ri, ii], -1)], -2)
+
+    def _error_unit(self, *roles: str) -> str | None:
+        """Return the unit that a standard deviation inherits from the column it belongs to."""
+        for role in roles:
+            channel = self.bound.channel(role)
+            if channel is not None:
+                unit = self.bound.unit(role, channel)
+                return None if unit.decibel else unit.text
+        return None
+
+    def _scaled(self, role: str, si: str, default: str | None = None) -> Any:
+        """Return an error column in the SI unit given, or None where there is none."""
+        channel = self.bound.channel(role)
+        if channel is None:
+            return None
+        unit = self.bound.unit(role, channel, default)
+        values = self.bound.numbers(role, channel)
+        if not role.startswith("covariance"):
+            self.bound.source.require(values >= 0.0, channel, "a standard deviation >= 0")
+        what = f"{self.bound.source.name}: column {channel.name!r}"
+        return values * factor_to(unit, si, what) * unit.to_peak
+
+    def _plain(self, role: str) -> FloatArray | None:
+        channel = self.bound.channel(role)
+        return None if channel is None else np.atleast_1d(channel.values)
+
+    def _whole_numbers(self, role: str) -> FloatArray | None:
+        channel = self.bound.channel(role)
+        if channel is None:
+            return None
+        values = self.bound.numbers(role, channel)
+        good = (values >= 1.0) & (values == np.round(values))
+        self.bound.source.require(good, channel, "a whole number >= 1")
+        return values
+
+    def _refuse_zero(self, response: ComplexArray, harmonic: FloatArray | None) -> None:
+        fundamental = np.ones(response.shape, bool) if harmonic is None else harmonic == 1
+        zero = np.flatnonzero((response == 0.0) & fundamental)
+        if zero.size:
+            source = self.bound.source
+            raise DataError(
+                f"{source.name}, {source.row_name(int(zero[0]))}: the response is 0 "
+                f"({zero.size} such rows); expected a measured value"
+            )
+
+    def _level(self) -> Any:
+        channel = self.bound.channel("level")
+        if channel is None:
+            return self.options.drive if self.options.level is None else self.options.level
+        if channel.values.dtype.kind == "U":
+            return np.atleast_1d(channel.values)
+        return self.bound.source.numbers(channel)
+
+    def _controlled(self, force_only: bool) -> Any:
+        held = self.bound.map.controlled
+        if isinstance(held, Mapping):
+            label = str(self._level())
+            found = [w for w in CONTROLLED if fnmatch.fnmatchcase(label, held.get(w, ""))]
+            if len(found) != 1:
+                raise DataError(
+                    f"{self.bound.source.name}: level {label!r} matches "
+                    f"{'both patterns' if found else 'no pattern'} of controlled: {dict(held)}"
+                )
+            return found[0]
+        if held is not None:
+            return held
+        channel = self.bound.channel("controlled")
+        if channel is not None:
+            words = np.char.strip(np.atleast_1d(channel.values).astype(str))
+            self.bound.source.require(np.isin(words, CONTROLLED), channel, "displacement or force")
+            return words
+        word = "force" if force_only else "displacement"
+        self.bound.notes.append(f"controlled: {word}, as the table does not say")
+        return word
+
+    def _quality(self) -> dict[str, NDArray[Any]]:
+        """Return the verdicts that an earlier save listed, in the types they had."""
+        kinds = self.bound.source.metadata.get("quality", {})
+        found = {name: self.bound.source.find(name).values for name in kinds}
+        return {name: _typed(found[name], kind) for name, kind in kinds.items()}
+
+
+def _typed(values: NDArray[Any], kind: str) -> NDArray[Any]:
+    """Return a column of a text file in the type it was saved from."""
+    if kind == "b" and values.dtype.kind == "U":
+        return np.asarray(np.char.lower(values) == "true")
+    types: dict[str, type] = {"b": np.bool_, "i": np.int64, "u": np.uint64, "f": np.float64}
+    return np.asarray(values, dtype=types.get(kind, np.str_))

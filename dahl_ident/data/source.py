@@ -1,0 +1,182 @@
+"""What a file holds before anyone says what it means: named channels with their units."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data.summary import listed
+from dahl_ident.errors import DataError, UnitError
+from dahl_ident.units import parse_unit
+
+_NUMBER = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\s*|nan", re.ASCII)
+_INDEX = re.compile(r"[\d:, ]+")
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One named array of a file.
+
+    `role` is set where the format itself says what the channel is (UFF does), in the words of
+    a column map; `short` is the last part of a path, by which a role is found without a map.
+    """
+
+    name: str
+    values: NDArray[Any]
+    unit: str | None = None
+    role: str | None = None
+    short: str | None = None
+
+    @property
+    def header(self) -> str:
+        """Name and unit as a table would print them."""
+        return self.name if self.unit is None else f"{self.name} [{self.unit}]"
+
+
+@dataclass(frozen=True)
+class Source:
+    """All channels of one file.
+
+    `row_name` turns the index of a value into the words that find it in the file. `metadata`
+    is what an earlier save of this package left in the file.
+    """
+
+    name: str
+    format: str
+    channels: tuple[Channel, ...]
+    sha256: str | None = None
+    headerless: bool = False
+    row_name: Callable[[int], str] = field(default=lambda i: f"row {i + 1}")
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def rows(self, keep: NDArray[np.bool_]) -> Source:
+        """Return the rows to `keep` of every channel that has this length."""
+        kept = np.flatnonzero(keep)
+        channels = tuple(
+            replace(c, values=c.values[keep]) if c.values.shape == keep.shape else c
+            for c in self.channels
+        )
+        return replace(self, channels=channels, row_name=lambda i: self.row_name(int(kept[i])))
+
+    def where(self, channel: Channel, index: int) -> str:
+        """Return file, row and column of a value."""
+        return f"{self.name}, {self.row_name(index)}, column {channel.name!r}"
+
+    def find(self, text: str) -> Channel:
+        """Return the one channel that `text` names, with or without its unit in brackets.
+
+        Raises
+        ------
+        DataError
+            If there is none, or more than one.
+        """
+        exact = [c for c in self.channels if text in (c.name, c.header)]
+        loose = [c for c in self.channels if plain(c.name) == plain(text)]
+        for found in (exact, loose):
+            if len(found) > 1:
+                raise DataError(
+                    f"{self.name}: {len(found)} columns are called {text!r}; expected one. "
+                    "Rename them in the file"
+                )
+            if found:
+                return found[0]
+        name, unit = split_header(text)
+        if unit is not None:
+            channel = self.find(name)
+            return replace(channel, unit=unit)
+        names = [c.name for c in self.channels]
+        close = difflib.get_close_matches(text, names, 3) or names
+        raise DataError(f"{self.name}: no column is called {text!r}; there are {listed(close, 20)}")
+
+    def matching(self, pattern: str) -> dict[str, Channel]:
+        """Return the channels that a path with ``*`` matches, by the part that varies."""
+        first, last = pattern.index("*"), pattern.rindex("*")
+        last += pattern[last + 1 :].startswith("]")
+        parts = (pattern[:first], pattern[first : last + 1], pattern[last + 1 :])
+        before, varying, after = (re.escape(part).replace(r"\*", r"[^.\[\]/]*") for part in parts)
+        expression = re.compile(f"{before}({varying}){after}")
+        found = {m[1]: c for c in self.channels if (m := expression.fullmatch(c.name))}
+        if not found:
+            raise DataError(
+                f"{self.name}: nothing matches {pattern!r}; there are "
+                f"{listed([c.name for c in self.channels], 20)}"
+            )
+        return found
+
+    def numbers(self, channel: Channel) -> FloatArray:
+        """Return a channel's finite numbers, or say which cell holds something else.
+
+        Raises
+        ------
+        DataError
+            If a cell holds text, is empty, NaN or infinite.
+        """
+        values = channel.values
+        if values.dtype.kind == "c":
+            raise DataError(
+                f"{self.name}: column {channel.name!r} holds complex numbers; expected real ones"
+            )
+        if values.dtype.kind not in "fiu":
+            values = self._from_text(channel)
+        values = np.atleast_1d(values).astype(np.float64)
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            i = int(bad[0])
+            what = "empty or NaN" if np.isnan(values[i]) else f"{values[i]}"
+            raise DataError(
+                f"{self.where(channel, i)}: the cell is {what} ({bad.size} such cells); expected "
+                "a number"
+            )
+        return values
+
+    def require(self, good: NDArray[np.bool_], channel: Channel, expected: str) -> None:
+        """Raise a DataError that names the first cell that is not `good`."""
+        bad = np.flatnonzero(~good)
+        if bad.size:
+            i = int(bad[0])
+            raise DataError(
+                f"{self.where(channel, i)}: found {channel.values.flat[i]} ({bad.size} such "
+                f"cells); expected {expected}"
+            )
+
+    def _from_text(self, channel: Channel) -> FloatArray:
+        numbers = np.empty(channel.values.size)
+        for i, cell in enumerate(channel.values.flat):
+            text = str(cell)
+            if not _NUMBER.fullmatch(text):
+                raise DataError(f"{self.where(channel, i)}: {text[:40]!r} is not a number")
+            numbers[i] = float(text)
+        return numbers
+
+
+def plain(name: str) -> str:
+    """Return a name without case, and with any run of blanks, dots and hyphens as one _."""
+    return re.sub(r"[\s._-]+", "_", name.strip().casefold())
+
+
+def split_header(text: str) -> tuple[str, str | None]:
+    """Split ``"force [kN]"`` or ``"force (kN)"`` into name and unit.
+
+    Round brackets count only where what they hold is a unit, square ones always, unless it is
+    an index.
+    """
+    square = re.fullmatch(r"\s*(.*?)(\s*)\[([^\[\]]*)\]\s*", text)
+    if square and square[1] and square[3].strip():
+        unit = square[3].strip()
+        if not _INDEX.fullmatch(unit) or (unit == "1" and square[2]):
+            return square[1], unit
+    curved = re.fullmatch(r"\s*(.*?)\s*\((.*)\)\s*", text)
+    if curved and curved[1]:
+        try:
+            return curved[1], parse_unit(curved[2]).text
+        except UnitError:
+            pass
+    return text.strip(), None

@@ -1,0 +1,118 @@
+"""Doubts about a table: warnings that list the rows, an error where no doubt is left.
+
+A structure without a motor in it takes energy from its drive: each cycle loses
+``pi A^2 Im Z`` at the fundamental, Z the dynamic stiffness. Single rows below zero may be
+noise; a whole table whose sum is below zero by more than its noise has its phase's sign, or its
+columns, wrong.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import stdtrit
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data.frequency_response import FrequencyResponse
+from dahl_ident.errors import DataError, DataWarning
+
+RowName = Callable[[int], str]
+_SIGNIFICANT = 0.00135  # one-sided; three standard deviations of a normal distribution
+_ASSUMED_ERROR = 0.1  # of the gain, where no covariance is known
+_MISMATCH = 0.1
+_SHOWN = 10
+
+
+def doubt(file: str, rows: NDArray[np.bool_], row_name: RowName, message: str) -> None:
+    """Warn about the rows that are marked, if there are any."""
+    found = np.flatnonzero(rows)
+    if not found.size:
+        return
+    names = ", ".join(row_name(int(i)) for i in found[:_SHOWN])
+    more = f" and {found.size - _SHOWN} more" if found.size > _SHOWN else ""
+    warnings.warn(f"{file}: {message}: {names}{more}", DataWarning, stacklevel=2)
+
+
+def doubt_phase_unit(
+    file: str, phase: FloatArray, degrees: bool, row_name: RowName, name: str
+) -> None:
+    """Warn where a phase in degrees looks like radians, or the reverse."""
+    largest = np.abs(phase).max()
+    everywhere = np.ones(phase.shape, dtype=bool)
+    if degrees and 0.5 <= largest <= 2.0 * np.pi and phase.size > 1:
+        doubt(
+            file, everywhere, row_name,
+            f"column {name!r} is in degrees, yet no phase is above 2 pi; are they radians?",
+        )  # fmt: skip
+    if not degrees:
+        doubt(
+            file, np.abs(phase) > 4.0 * np.pi, row_name,
+            f"column {name!r} is in radians, yet these phases are above 4 pi; are they degrees?",
+        )  # fmt: skip
+
+
+def doubt_drive(file: str, data: FrequencyResponse, row_name: RowName) -> None:
+    """Warn where the drive is not the response times the amplitude."""
+    amplitude, drive, fundamental = data.amplitude, data.drive, data.harmonic == 1
+    if amplitude is None or drive is None or not fundamental.any():
+        return
+    gain = data.select(harmonic=1).to("dynamic_stiffness").gain
+    mismatch = np.zeros(data.n)
+    mismatch[fundamental] = np.log(gain) + np.log(amplitude / drive)[fundamental]
+    doubt(
+        file, np.abs(mismatch) > _MISMATCH, row_name,
+        "drive and amplitude do not agree with the response by more than "
+        f"{_MISMATCH:.0%} (rms against zero to peak?)",
+    )  # fmt: skip
+
+
+def refuse_created_energy(file: str, data: FrequencyResponse, row_name: RowName) -> None:
+    """Warn of single rows that create energy, refuse a table that does as a whole.
+
+    Raises
+    ------
+    DataError
+        If the sum of A^2 Im Z is significantly below zero. Without a covariance an error of
+        10 % of each response is allowed for.
+    """
+    fundamental = data.harmonic == 1
+    if not fundamental.any():
+        return
+    part = data.select(harmonic=1).to("dynamic_stiffness")
+    amplitude = _amplitude(part)
+    stiffness = part.gain.max()  # scaled by the largest, squares stay within range
+    weight = (amplitude / amplitude.max()) ** 2
+    loss = weight * part.response.imag / stiffness
+    if part.covariance is None:
+        std = weight * _ASSUMED_ERROR * part.gain / stiffness
+    else:
+        std = weight * np.sqrt(part.covariance[:, 1, 1]) / stiffness
+    dof = np.full(part.n, np.inf) if part.dof is None else part.dof
+    total, total_std = loss.sum(), np.linalg.norm(std)
+    spread = np.sum((std / max(total_std, np.finfo(float).tiny)) ** 4 / dof)
+    total_dof = np.inf if spread == 0.0 else 1.0 / spread  # Welch and Satterthwaite
+    if total < -_limit(total_dof) * total_std:
+        raise DataError(
+            f"{file}: the table as a whole creates energy: the sum of A^2 Im(F/X) is negative, "
+            f"{-total / total_std if total_std else np.inf:.3g} times its standard error. Does the "
+            "instrument count the phase the other way round (sign = -1 for the phase), or do the "
+            "columns hold another quantity?"
+        )
+    creating = np.zeros(data.n, dtype=bool)
+    creating[fundamental] = loss < -_limit(dof) * std
+    doubt(file, creating, row_name, "the phase's sign creates energy")
+
+
+def _amplitude(part: FrequencyResponse) -> FloatArray:
+    if part.amplitude is not None:
+        return part.amplitude
+    assert part.drive is not None  # one of the two is always there
+    return part.drive / part.gain
+
+
+def _limit(dof: ArrayLike) -> FloatArray:
+    """Student's t at the level of significance; the normal distribution for infinite dof."""
+    return -np.asarray(stdtrit(np.minimum(dof, 1e9), _SIGNIFICANT))
