@@ -25,8 +25,8 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError
 
-_KNEE = 1.345
-_TAIL_DOF = 4.0
+KNEE = 1.345
+TAIL_DOF = 4.0
 
 
 @dataclass(frozen=True)
@@ -59,15 +59,15 @@ class Loss:
 
 
 def _huber(z: FloatArray) -> FloatArray:
-    return np.where(z <= _KNEE**2, z, 2.0 * _KNEE * np.sqrt(z) - _KNEE**2)
+    return np.where(z <= KNEE**2, z, 2.0 * KNEE * np.sqrt(z) - KNEE**2)
 
 
 def _huber_slope(z: FloatArray) -> FloatArray:
-    return np.where(z <= _KNEE**2, 1.0, _KNEE / np.sqrt(np.maximum(z, _KNEE**2)))
+    return np.where(z <= KNEE**2, 1.0, KNEE / np.sqrt(np.maximum(z, KNEE**2)))
 
 
 def _huber_bend(z: FloatArray) -> FloatArray:
-    return np.where(z <= _KNEE**2, 0.0, -0.5 * _KNEE * np.maximum(z, _KNEE**2) ** -1.5)
+    return np.where(z <= KNEE**2, 0.0, -0.5 * KNEE * np.maximum(z, KNEE**2) ** -1.5)
 
 
 LOSSES = {
@@ -80,9 +80,9 @@ LOSSES = {
     ),
     "student_t": Loss(
         "student_t",
-        lambda z: (_TAIL_DOF + 2.0) * np.log1p(z / _TAIL_DOF),
-        lambda z: (_TAIL_DOF + 2.0) / (_TAIL_DOF + z),
-        lambda z: -(_TAIL_DOF + 2.0) / (_TAIL_DOF + z) ** 2,
+        lambda z: (TAIL_DOF + 2.0) * np.log1p(z / TAIL_DOF),
+        lambda z: (TAIL_DOF + 2.0) / (TAIL_DOF + z),
+        lambda z: -(TAIL_DOF + 2.0) / (TAIL_DOF + z) ** 2,
     ),
 }
 
