@@ -170,6 +170,9 @@ def _units(friction: _Parts) -> tuple[FloatArray, FloatArray, _Parts]:
 
 
 def _flat(array: NDArray[_Scalar], shape: tuple[int, ...]) -> NDArray[_Scalar]:
+    """Return the broadcast array in one dimension; one number is not copied."""
+    if np.size(array) == 1:
+        return np.broadcast_to(np.ravel(array), int(np.prod(shape)))
     return np.broadcast_to(array, shape).ravel()
 
 

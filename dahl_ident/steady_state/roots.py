@@ -39,15 +39,16 @@ def all_roots(plant: Plant) -> FloatArray:
         return np.where(resonant, np.nan, amplitude)[:, None]
     passive = plant.linear.imag >= -plant.rounding
     single = passive & ~(resonant & (plant.drive >= plant.largest_friction()))
-    roots = np.full((plant.drive.size, 1), np.nan)
+    roots = np.full(plant.drive.shape, np.nan)
     if single.any():
         table = _tabulate(plant.friction, int(single.sum()))
+        settled = ~single
         for points in _chunks(single):
-            roots[points, 0] = _interpolated_roots(plant.at(points), table)
-        rest = np.flatnonzero(single & np.isnan(roots[:, 0]))
-        roots[rest, 0] = _bracketed_roots(plant.at(rest), table)
+            roots[points], settled[points] = _interpolated_roots(plant.at(points), table)
+        rest = np.flatnonzero(~settled)
+        roots[rest] = _bracketed_roots(plant.at(rest), table, roots[rest])
     active = np.flatnonzero(~passive)
-    return _insert(roots, *_scan(plant, active)) if active.size else roots
+    return _insert(roots, *_scan(plant, active)) if active.size else roots[:, None]
 
 
 def _chunks(chosen: BoolArray) -> Iterator[IntArray | slice]:
@@ -83,8 +84,8 @@ def _tabulate(friction: Friction, points: int) -> _Table:
     return _Table(nodes, amplitude, *friction.force_and_slope(amplitude, vector))
 
 
-def _interpolated_roots(plant: Plant, table: _Table) -> FloatArray:
-    """Return the one amplitude of each passive point where the table alone settles it, or NaN."""
+def _interpolated_roots(plant: Plant, table: _Table) -> tuple[FloatArray, BoolArray]:
+    """Return the one amplitude of each passive point, and whether one step has settled it."""
     below = _search(plant, table)
     start, per_misfit = _inverse_cubic(plant, table, *_cell(plant, table, below))
     with np.errstate(all="ignore"):  # beyond the table's ends the result is not used
@@ -93,10 +94,10 @@ def _interpolated_roots(plant: Plant, table: _Table) -> FloatArray:
         step = -np.log(size / plant.drive) * per_misfit
         settled = np.abs(step) * plant.conditioning(start, force) < 1e-9
         settled &= (below > 0) & (below < table.nodes)
-        return np.where(settled, start * np.exp(step), np.nan)
+        return start * np.exp(step), settled
 
 
-def _bracketed_roots(plant: Plant, table: _Table) -> FloatArray:
+def _bracketed_roots(plant: Plant, table: _Table, guess: FloatArray) -> FloatArray:
     """Return the one amplitude of each passive point, in its cell or beyond the table's ends."""
     below = _search(plant, table)
     left, right = _cell(plant, table, below)
@@ -109,8 +110,7 @@ def _bracketed_roots(plant: Plant, table: _Table) -> FloatArray:
     with np.errstate(divide="ignore"):
         linear = plant.drive / np.abs(plant.linear + table.force[left] / A0)
         excess = np.sqrt(np.abs(plant.drive - largest)) * np.sqrt(plant.drive + largest)
-        start = np.where(stuck, linear, excess / np.abs(plant.linear))
-    start = np.where(stuck | slipping, start, np.nan)
+        start = np.where(stuck, linear, np.where(slipping, excess / np.abs(plant.linear), guess))
     return _polish(plant, low, high, start, np.ones(low.shape, dtype=bool))
 
 
@@ -257,6 +257,6 @@ def _insert(roots: FloatArray, point: IntArray, amplitude: FloatArray) -> FloatA
     counts = np.bincount(point, minlength=len(roots))
     place = np.arange(point.size) - np.repeat(np.cumsum(counts) - counts, counts)
     wide = np.full((len(roots), max(1, counts.max())), np.nan)
-    wide[:, :1] = roots
+    wide[:, 0] = roots
     wide[point, place] = amplitude
     return wide
