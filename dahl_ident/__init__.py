@@ -10,18 +10,47 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dahl_ident.data import FrequencyResponse, Record, read_frequency_response, read_record
     from dahl_ident.elements import Dahl, Damper, LinearSystem, Mass, Model, Spring
+    from dahl_ident.problem import Problem
+    from dahl_ident.results import FitResult, fit
+    from dahl_ident.sensors import Sensors
     from dahl_ident.steady_state import response
 
 __version__ = "0.1.0"
 
 _ROOMS = {
+    "dahl_ident.data": (
+        "FrequencyResponse",
+        "Record",
+        "read_frequency_response",
+        "read_record",
+    ),
     "dahl_ident.elements": ("Dahl", "Damper", "LinearSystem", "Mass", "Model", "Spring"),
+    "dahl_ident.problem": ("Problem",),
+    "dahl_ident.results": ("FitResult", "fit"),
+    "dahl_ident.sensors": ("Sensors",),
     "dahl_ident.steady_state": ("response",),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["Dahl", "Damper", "LinearSystem", "Mass", "Model", "Spring", "response"]
+__all__ = [
+    "Dahl",
+    "Damper",
+    "FitResult",
+    "FrequencyResponse",
+    "LinearSystem",
+    "Mass",
+    "Model",
+    "Problem",
+    "Record",
+    "Sensors",
+    "Spring",
+    "fit",
+    "read_frequency_response",
+    "read_record",
+    "response",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -6,6 +6,8 @@ and nothing else. A message says what was found, what was expected and what to d
 
 from __future__ import annotations
 
+from typing import Any
+
 __all__ = [
     "DahlIdentError",
     "DataError",
@@ -50,7 +52,19 @@ class ExtractionError(DahlIdentError, ValueError):
 
 
 class FitError(DahlIdentError, RuntimeError):
-    """An estimate cannot be made, or cannot be trusted and ``throw=True``."""
+    """An estimate cannot be made, or has no finite optimum and ``throw=True``.
+
+    Parameters
+    ----------
+    message : str
+        What happened, and what to do.
+    result : FitResult, optional
+        What was found all the same: status, and the combinations that are determined.
+    """
+
+    def __init__(self, message: str, result: Any = None) -> None:
+        super().__init__(message)
+        self.result = result
 
 
 class SamplingError(DahlIdentError, RuntimeError):

@@ -16,10 +16,18 @@ ROOT = Path(__file__).parents[1]
 PUBLIC_NAMES = [
     "Dahl",
     "Damper",
+    "FitResult",
+    "FrequencyResponse",
     "LinearSystem",
     "Mass",
     "Model",
+    "Problem",
+    "Record",
+    "Sensors",
     "Spring",
+    "fit",
+    "read_frequency_response",
+    "read_record",
     "response",
 ]
 
