@@ -1,0 +1,337 @@
+"""What every element promises, one contract over all of them and over sums."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import mpmath
+import numpy as np
+import pytest
+from mpmath import mpf
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements import Dahl, Damper, Element, LinearSystem, Mass, Model, Parameter, Spring
+from dahl_ident.elements.model import as_model
+from dahl_ident.errors import ModelError, ValidationError
+
+control: Any = importlib.import_module("control")
+
+
+def mode(mass: float, damping: float, stiffness: float) -> Any:
+    return control.tf([1.0], [mass, damping, stiffness])
+
+
+def base() -> LinearSystem:
+    """Return a linear system whose arguments declare their units."""
+    return LinearSystem(
+        mode,
+        quantity="receptance",
+        parameters={
+            "mass": Parameter("", "kg", "mass", 0.3),
+            "damping": Parameter("", "N s/m", "damping", 0.24),
+            "stiffness": Parameter("", "N/m", "stiffness", 7.0),
+        },
+        name="base",
+    )
+
+
+FRICTION = {
+    "linear Dahl": Dahl(0.5, 30.0),
+    "Dahl, alpha 1/2": Dahl(0.5, 30.0, 0.5),
+    "Dahl, alpha 2": Dahl(0.5, 30.0, 2.0),
+}
+LINEAR = {"mass": Mass(0.3), "damper": Damper(0.24), "spring": Spring(7.0)}
+SUMS: dict[str, Element] = {
+    "plant": Dahl(0.5, 30.0) + Mass(0.3) + Damper(0.24) + Spring(7.0),
+    "two frictions": Dahl(0.5, 30.0, name="a") + Dahl(0.2, 40.0, 2.0, name="b") + Spring(1.0),
+}
+WITH_FORCE: dict[str, Element] = {**FRICTION, **LINEAR, **SUMS}
+EVERY: dict[str, Element] = {
+    **WITH_FORCE,
+    "transfer function": LinearSystem(mode(0.3, 0.24, 7.0), quantity="receptance"),
+    "function": base(),
+    "plant with function": Dahl(0.5, 30.0) + base(),
+}
+AMPLITUDE = np.array([[0.004], [0.03], [0.5]])  # beta = 0.24, 1.8 and 30 for f_max, sigma above
+OMEGA = np.array([0.7, 3.0, 11.0, 40.0])
+
+every_element = pytest.mark.parametrize("element", EVERY.values(), ids=EVERY.keys())
+
+
+def all_free(element: Element) -> Model:
+    """Return the element with every parameter free, so that every derivative is computed."""
+    return as_model(element).with_free([p.name for p in element.parameters])
+
+
+# shapes
+
+
+@every_element
+def test_scalars_give_scalars_and_arrays_broadcast(element: Element) -> None:
+    one = element.dynamic_stiffness(0.03, 3.0)
+    assert isinstance(one, complex)
+    grid = element.dynamic_stiffness(AMPLITUDE, OMEGA)
+    assert grid.shape == (3, 4)
+    assert grid[1, 1] == pytest.approx(one, rel=1e-14)
+    assert element.dynamic_stiffness(np.zeros((0, 1)), OMEGA).shape == (0, 4)
+
+
+@every_element
+@pytest.mark.parametrize("harmonic", [1, 2, 3])
+def test_batches_of_parameters_are_each_alone(element: Element, harmonic: int) -> None:
+    model = all_free(element)
+    rng = np.random.default_rng(5)
+    vectors = np.array([float(v) for v in model.known_values()]) * rng.uniform(
+        0.7, 1.4, (5, len(model.parameters))
+    )
+    A, omega = AMPLITUDE.ravel(), OMEGA[:3]
+    together = model.stiffness_gradient(list(vectors.T[:, :, None]), A, omega, harmonic)
+    assert len(together.by_parameter) == len(model.parameters)
+    value = model.stiffness(list(vectors.T[:, :, None]), A, omega, harmonic)
+    np.testing.assert_allclose(together.value, value, rtol=1e-13)
+    for s, vector in enumerate(vectors):
+        alone = model.stiffness_gradient([np.asarray(v) for v in vector], A, omega, harmonic)
+        pairs = zip(
+            (together.value, together.by_amplitude, *together.by_parameter),
+            (alone.value, alone.by_amplitude, *alone.by_parameter),
+            strict=True,
+        )
+        for batch, single in pairs:
+            np.testing.assert_allclose(np.broadcast_to(batch, (5, 3))[s], single, rtol=1e-10)
+
+
+# values and derivatives
+
+
+ORDER: dict[type[Element], int] = {Mass: 2, Damper: 1, Spring: 0}
+
+
+@lru_cache
+def friction_exactly(p: tuple[mpf, ...], A: mpf, harmonic: int) -> Any:
+    """Return F_k/X_1 by quadrature over half of the closed loop of Eqn. 2."""
+    f_max, sigma, alpha = p
+    beta = sigma * A / f_max
+
+    def margin(start: mpf, path: mpf) -> mpf:
+        if alpha == 1:
+            return start * mpmath.exp(-path)
+        left = start ** (1 - alpha) - (1 - alpha) * path
+        return left ** (1 / (1 - alpha)) if left > 0 else mpf(0)
+
+    full_slip = alpha < 1 and 2 ** (1 - alpha) <= (1 - alpha) * 2 * beta
+    f0 = mpf(1)
+    if not full_slip:
+        f0 = mpmath.findroot(
+            lambda f: margin(1 + f, 2 * beta) - (1 - f), (mpf(0), mpf(1)), solver="anderson"
+        )
+    stops = [mpf(0), mpmath.pi / 2, mpmath.pi]
+    if full_slip:
+        path = 2 ** (1 - alpha) / (1 - alpha)
+        stops = sorted([*stops, mpmath.acos(1 - path / beta)])
+
+    def integrand(theta: mpf) -> Any:
+        force = margin(1 + f0, beta * (1 - mpmath.cos(theta))) - 1
+        return force * mpmath.expj(-harmonic * theta)
+
+    return f_max / A * 2 / mpmath.pi * mpmath.quad(integrand, stops)
+
+
+def exactly(element: Element, p: Sequence[mpf], A: mpf, omega: mpf, harmonic: int) -> Any:
+    """Return F_k/X_1 of any element or sum, in mpmath."""
+    total, first = mpmath.mpc(0), 0
+    s = 1j * omega
+    for part in as_model(element).elements:
+        own = p[first : first + len(part.parameters)]
+        first += len(own)
+        if isinstance(part, Dahl):
+            total += friction_exactly(tuple(own), A, harmonic)
+        elif harmonic != 1:
+            continue
+        elif isinstance(part, LinearSystem):
+            mass, damping, stiffness = own or (mpf(0.3), mpf(0.24), mpf(7.0))
+            total += mass * s**2 + damping * s + stiffness
+        else:
+            total += own[0] * s ** ORDER[type(part)]
+    return total
+
+
+@every_element
+@pytest.mark.parametrize("harmonic", [1, 3])
+def test_values_and_all_derivatives_against_30_digits(element: Element, harmonic: int) -> None:
+    model = all_free(element)
+    values = model.known_values()
+    A, w = float(AMPLITUDE[1, 0]), float(OMEGA[1])
+    ours = model.stiffness_gradient(values, np.asarray(A), np.asarray(w), harmonic)
+    with mpmath.workdps(30):
+        p = [mpf(float(v)) for v in values]
+        step = mpf(10) ** -9
+
+        def at(change: mpf, index: int | None = None) -> Any:
+            q = [v + change if i == index else v for i, v in enumerate(p)]
+            return exactly(element, q, mpf(A) + (change if index is None else 0), mpf(w), harmonic)
+
+        def slope(size: float, index: int | None = None) -> complex:
+            change = step * mpf(size)
+            return complex((at(change, index) - at(-change, index)) / (2 * change))
+
+        value = complex(at(mpf(0)))
+        assert complex(ours.value) == pytest.approx(value, rel=1e-11, abs=1e-300)
+        assert complex(ours.by_amplitude) == pytest.approx(slope(A), rel=1e-9, abs=1e-300)
+        for i, (derivative, size) in enumerate(zip(ours.by_parameter, values, strict=True)):
+            # a function's derivatives are differences: good to 1e-11 of Z/p, not of themselves
+            allowed = 1e-10 * abs(value / float(size))
+            assert complex(derivative) == pytest.approx(
+                slope(float(size), i), rel=1e-8, abs=allowed
+            )
+
+
+@every_element
+def test_linear_elements_answer_no_harmonic(element: Element) -> None:
+    friction = [e for e in as_model(element).elements if isinstance(e, Dahl)]
+    third = element.dynamic_stiffness(AMPLITUDE, OMEGA, harmonic=3)
+    expected = sum(
+        (e.dynamic_stiffness(AMPLITUDE, OMEGA, harmonic=3) for e in friction), np.zeros((3, 4))
+    )
+    np.testing.assert_array_equal(third, expected)
+    assert third.any() == bool(friction)
+    assert not element.dynamic_stiffness(AMPLITUDE, OMEGA, harmonic=2).any()
+
+
+# units
+
+
+DIMENSION = {"N": (1, 0), "N/m": (1, -1), "kg": (1, -1), "N s/m": (1, -1), "": (0, 0)}
+"""Powers of the units of force and displacement in the unit of a parameter."""
+
+
+@every_element
+@pytest.mark.parametrize(("force", "displacement"), [(1e3, 1.0), (1.0, 1e-6), (4.448, 0.0254)])
+def test_other_units_scale_parameters_as_their_units_say(
+    element: Element, force: float, displacement: float
+) -> None:
+    if isinstance(element, LinearSystem) and not element.parameters:
+        return  # a fixed system has no parameter to scale
+    model = as_model(element)
+    scaled = model.with_parameters(
+        {
+            p.name: replace(
+                p,
+                value=float(p.value or 0.0)
+                * force ** DIMENSION[p.unit][0]
+                * displacement ** DIMENSION[p.unit][1],
+            )
+            for p in model.parameters
+        }
+    )
+    for harmonic in (1, 3):
+        ours = scaled.dynamic_stiffness(AMPLITUDE * displacement, OMEGA, harmonic=harmonic)
+        expected = model.dynamic_stiffness(AMPLITUDE, OMEGA, harmonic=harmonic)
+        np.testing.assert_allclose(ours, expected * force / displacement, rtol=1e-11)
+
+
+# physics
+
+
+@every_element
+def test_no_element_gives_energy(element: Element) -> None:
+    A = np.geomspace(1e-9, 1e6, 61)[:, None]
+    Z = element.dynamic_stiffness(A, OMEGA)
+    assert np.all(Z.imag >= -1e-14 * np.abs(Z))
+    assert np.max(Z.imag) > 0.0 or type(element) in (Mass, Spring)
+
+
+@pytest.mark.parametrize("element", WITH_FORCE.values(), ids=WITH_FORCE.keys())
+@pytest.mark.parametrize("A", [0.03, 0.5])
+def test_force_over_time_has_the_harmonics_of_the_describing_function(
+    element: Element, A: float
+) -> None:
+    omega, samples, cycles = 3.0, 2**14, 12
+    theta = 2.0 * np.pi * np.arange(samples * cycles) / samples
+    force = element.force(
+        A * np.cos(theta),
+        velocity=-A * omega * np.sin(theta),
+        acceleration=-A * omega**2 * np.cos(theta),
+    )
+    spectrum = 2.0 / samples * np.fft.rfft(force[-samples:]) / A
+    size = abs(element.dynamic_stiffness(A, omega))
+    assert abs(spectrum[0]) < 1e-7 * size
+    for k in (1, 2, 3, 5, 7):
+        expected = element.dynamic_stiffness(A, omega, harmonic=k)
+        assert abs(spectrum[k] - expected) < 1e-7 * size
+
+
+# bookkeeping
+
+
+def test_a_sum_is_the_sum_of_its_parts() -> None:
+    parts = [Dahl(0.5, 30.0), Mass(0.3), base()]
+    total = all_free(parts[0] + parts[1] + parts[2])
+    ours = total.stiffness_gradient(total.known_values(), AMPLITUDE, OMEGA)
+    alone = [
+        all_free(part).stiffness_gradient(part.known_values(), AMPLITUDE, OMEGA) for part in parts
+    ]
+    np.testing.assert_allclose(ours.value, sum(g.value for g in alone), rtol=1e-14)
+    np.testing.assert_allclose(ours.by_amplitude, sum(g.by_amplitude for g in alone), rtol=1e-14)
+    columns = [d for g in alone for d in g.by_parameter]
+    for mine, theirs in zip(ours.by_parameter, columns, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+@every_element
+def test_amplitudes_and_frequencies_are_checked(element: Element) -> None:
+    cases: list[tuple[Any, str]] = [
+        ([0.1, -1.0], r"amplitude\[1\] is -1\.0"),
+        (np.nan, r"amplitude is nan"),
+        (1j, r"amplitude: expected real numbers, got complex"),
+    ]
+    for wrong, text in cases:
+        with pytest.raises(ValidationError, match=text):
+            element.dynamic_stiffness(wrong, 1.0)
+    with pytest.raises(ValidationError, match=r"omega\[0\] is -2\.0"):
+        element.dynamic_stiffness(1.0, [-2.0])
+    with pytest.raises(ValidationError, match=r"amplitude \(2,\), omega \(3,\)"):
+        element.dynamic_stiffness([1.0, 2.0], [1.0, 2.0, 3.0])
+    no_harmonics: list[Any] = [0, 1.5, True]
+    for harmonic in no_harmonics:
+        with pytest.raises(ValidationError, match="harmonic is"):
+            element.dynamic_stiffness(1.0, 1.0, harmonic=harmonic)
+
+
+@pytest.mark.parametrize(
+    ("element", "missing"),
+    [
+        (Dahl(sigma=1.0), "f_max"),
+        (Dahl(name="pivot"), "pivot_f_max, pivot_sigma"),
+        (Mass(), "mass"),
+        (Damper(), "damping"),
+        (Spring(), "stiffness"),
+        (Dahl(1.0) + Mass() + Spring(1.0), "sigma, mass"),
+        (LinearSystem(mode, quantity="receptance", parameters={"mass": None}), "mass"),
+    ],
+)
+def test_a_missing_value_is_named(element: Element, missing: str) -> None:
+    with pytest.raises(ModelError, match=f"has no value for {missing};"):
+        element.dynamic_stiffness(1.0, 1.0)
+
+
+def test_histories_that_an_element_needs_are_asked_for() -> None:
+    x: FloatArray = np.array([0.0, 1.0])
+    with pytest.raises(ValidationError, match=r"Mass\(mass=0\.3\) needs acceleration"):
+        Mass(0.3).force(x)
+    with pytest.raises(ValidationError, match=r"Damper\(damping=0\.24\) needs velocity"):
+        (Spring(1.0) + Damper(0.24)).force(x)
+    with pytest.raises(ValidationError, match=r"velocity\[1\] is nan"):
+        Damper(0.24).force(x, velocity=[0.0, np.nan])
+
+
+def test_names_clash_or_are_refused() -> None:
+    with pytest.raises(ModelError, match=r"share the parameter names f_max, sigma, alpha"):
+        Dahl(1.0, 1.0) + Dahl(2.0, 2.0)
+    with pytest.raises(ValidationError, match=r"name is 'two words'"):
+        Spring(1.0, name="two words")
+    with pytest.raises(ModelError, match="at least one element"):
+        Model()
