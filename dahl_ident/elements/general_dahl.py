@@ -56,8 +56,8 @@ from dahl_ident.arrays import ComplexArray, FloatArray, array_between, positive_
 _LEAST_BETA = 1e-200
 """Below this the loop is a straight line to all digits: c_1 = beta, the others vanish."""
 
-_DEEPEST = 36.0
-"""exp(-36) is below the resolution of a double: z has reached full slip."""
+_DEEPEST = 44.0
+"""Integrals over l end here: exp(-44) is nothing, even over a root where slip sets in."""
 
 _NODES_PER_BLOCK = 8192
 """Nodes in work at once, so that the scratch arrays stay small and in the cache."""
@@ -318,7 +318,7 @@ def _rule(nodes: int) -> _Rule:
 
 
 def _number_of_nodes(k: int) -> int:
-    return 40 + 8 * k
+    return 48 + 8 * k
 
 
 class _Branch:
@@ -337,10 +337,10 @@ class _Branch:
         self.half = np.where(beta < _LEAST_BETA, 0.0, reach / 2.0)
         self.l = reach * self.rule.rise
         rest = (self.length - reach) + reach * self.rule.fall
-        done = -np.expm1(-self.p * self.l)  # p E(l)
-        self.sin2 = done / (self.p * path)  # sin^2(theta/2)
-        slipped = 1.0 - 1.0 / np.maximum(self.p * path, 1.0)
-        cos2 = (1.0 - done) * -np.expm1(-self.p * rest) / (self.p * path) + slipped
+        scaled = self.p * path  # p E(L)
+        self.sin2 = -np.expm1(-self.p * self.l) / scaled  # of theta/2, as cos2
+        slipped = 1.0 - 1.0 / np.maximum(scaled, 1.0)
+        cos2 = np.exp(-self.p * self.l) * -np.expm1(-self.p * rest) / scaled + slipped
         self.z = np.exp(self.log_z0 - self.l)
         self.curved = self.z * -np.expm1(-alpha * rest)
 

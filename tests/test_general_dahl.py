@@ -1,0 +1,292 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.polynomial import Chebyshev
+from scipy.integrate import solve_ivp
+
+from benchmarks.general_dahl_accuracy import errors
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import linear_dahl
+from dahl_ident.elements.general_dahl import (
+    DescribingFunctionTable,
+    describing_function,
+    describing_function_gradient,
+    harmonic,
+    harmonic_gradient,
+    turning_force,
+)
+from dahl_ident.errors import ValidationError
+
+ODD = (1, 3, 5, 7, 9, 11, 13, 15)
+ALPHAS = st.floats(0.25, 4.0)
+BETAS = st.floats(-6.0, 6.0).map(lambda exponent: 10.0**exponent)
+
+
+def at(value: float) -> FloatArray:
+    return np.asarray(value, dtype=np.float64)
+
+
+def larger_part(c: ComplexArray) -> FloatArray:
+    return np.maximum(np.abs(c.real), np.abs(c.imag))
+
+
+@pytest.mark.parametrize(
+    ("beta", "alpha", "expected"),
+    [
+        (1.0, 2.0, 0.544039 + 0.354193j),
+        (10.0, 2.0, 0.044846 + 0.103836j),
+        (1.0, 0.5, 0.866025 + 0.212207j),
+    ],
+)
+def test_agrees_with_independent_computation(beta: float, alpha: float, expected: complex) -> None:
+    assert complex(describing_function(at(beta), at(alpha)).round(6)) == expected
+
+
+@pytest.mark.parametrize(
+    ("beta", "alpha"),
+    [(2e-6, 3.7), (1.12, 0.25), (1.13, 0.25), (0.9, 1 - 1e-8), (30.0, 1.4), (7e5, 4.0)],
+)
+def test_agrees_with_fifty_digit_integration(beta: float, alpha: float) -> None:
+    found = errors(beta, alpha, (1, 15))
+    assert np.max(found[:, 0]) < 1e-12
+    assert np.max(found[:, 1:]) < 1e-10
+
+
+def exact_at_one_half(beta: FloatArray, k: int) -> ComplexArray:
+    """c_k at alpha = 1/2 before full slip, where the force is a parabola in cos(theta)."""
+    real = beta * np.sqrt(1.0 - beta**2 / 4.0) * (k == 1)
+    return np.asarray(real - 2j * beta**2 / (np.pi * k * (k**2 - 4)))
+
+
+@pytest.mark.parametrize("k", ODD)
+def test_is_a_parabola_at_one_half(k: int) -> None:
+    beta = np.geomspace(1e-12, np.sqrt(2.0) * (1.0 - 1e-13), 300)
+    exact = exact_at_one_half(beta, k)
+    c, by_ln_beta, _ = harmonic_gradient(beta, at(0.5), k)
+    slope = 2.0 * exact - beta / np.sqrt(1.0 - beta**2 / 4.0) * (k == 1)
+    assert np.max(np.abs(c - exact) / larger_part(exact)) < 1e-12
+    assert np.max(np.abs(by_ln_beta - slope) / np.abs(slope)) < 1e-10
+
+
+@pytest.mark.parametrize(
+    ("alpha", "exact"),
+    [
+        (0.5, lambda beta: np.where(beta < np.sqrt(2.0), beta * np.sqrt(1 - beta**2 / 4), 1.0)),
+        (1.0, np.tanh),
+        (2.0, lambda beta: np.tanh(np.arcsinh(2.0 * beta) / 2.0)),
+    ],
+)
+def test_turning_force_in_closed_form(alpha: float, exact: np.ufunc) -> None:
+    beta = np.geomspace(1e-60, 1.99, 400)
+    np.testing.assert_allclose(turning_force(beta, at(alpha)), exact(beta), rtol=2e-15)
+
+
+@pytest.mark.parametrize("k", ODD)
+def test_meets_the_linear_model(k: int) -> None:
+    beta = np.geomspace(1e-6, 1e6, 400)
+    exact, slope = linear_dahl.harmonic_gradient(beta, k)
+    c, by_ln_beta, by_alpha = harmonic_gradient(beta, at(1.0), k)
+    assert np.max(np.abs(c - exact) / larger_part(exact)) < 1e-12
+    assert np.max(np.abs(by_ln_beta - slope) / np.abs(slope)) < 1e-10
+    for step in (1e-12, -1e-12, 1e-8, -1e-8, 1e-4, -1e-4):
+        near = harmonic(beta, at(1.0 + step), k)
+        straight = exact + step * by_alpha
+        assert np.max(np.abs(near - straight) / larger_part(exact)) < 1e-12 + 1000 * k * step**2
+
+
+def test_meets_the_linear_models_stiffness() -> None:
+    beta = np.geomspace(1e-6, 1e6, 400)
+    for ours, exact in zip(
+        describing_function_gradient(beta, at(1.0)),
+        linear_dahl.describing_function_gradient(beta),
+        strict=False,
+    ):
+        assert np.max(np.abs(ours / exact - 1.0)) < 1e-10
+
+
+@pytest.mark.parametrize("alpha", [0.25, 0.5, 0.9, 1.0, 1.1, 1.5, 1.9, 2.1, 3.0, 4.0])
+def test_loss_balances_the_energy(alpha: float) -> None:
+    # around the loop f_max A times 4 - (2/beta) Int z dd, where dd = z^-alpha dz
+    beta = np.geomspace(0.2, 1e6, 300)
+    f_0, q = turning_force(beta, at(alpha)), 2.0 - alpha
+    integral = ((1.0 + f_0) ** q - (1.0 - f_0) ** q) / q
+    loss = 4.0 - 2.0 * integral / beta
+    np.testing.assert_allclose(np.pi * harmonic(beta, at(alpha), 1).imag, loss, rtol=1e-11)
+
+
+def steady_harmonics(beta: float, alpha: float, cycles: int) -> ComplexArray:
+    """c_k from Eqn. 2 by a general ODE solver, turning point to turning point, and an FFT."""
+
+    def rate(t: float, force: FloatArray, direction: float) -> FloatArray:
+        left = 1.0 - direction * force
+        return np.asarray(direction * beta * np.sin(t) * np.abs(left) ** alpha * np.sign(left))
+
+    theta = np.linspace(0.0, np.pi, 4096, endpoint=False)
+    start = 0.0
+    for half in range(2 * cycles):
+        direction = 1.0 if half % 2 else -1.0
+        half_cycle = solve_ivp(
+            rate, (0.0, np.pi), [start], "DOP853", args=(direction,), rtol=1e-12, atol=1e-13
+        )
+        start = half_cycle.y[0, -1]
+    falling = solve_ivp(
+        rate, (0.0, np.pi), [start], "DOP853", theta, args=(-1.0,), rtol=1e-12, atol=1e-13
+    ).y[0]
+    return np.asarray(np.fft.fft(np.concatenate([falling, -falling])) / theta.size)
+
+
+@pytest.mark.parametrize(("beta", "alpha", "cycles"), [(2.5, 0.7, 3), (1.5, 1.6, 6), (6.0, 3.0, 8)])
+def test_agrees_with_an_ode_solver(beta: float, alpha: float, cycles: int) -> None:
+    solved = steady_harmonics(beta, alpha, cycles)
+    for k in ODD:
+        assert abs(harmonic(at(beta), at(alpha), k) - solved[k]) < 1e-9
+
+
+def spectral_slope(values: ComplexArray, nodes: FloatArray, width: float) -> ComplexArray:
+    """The derivative at the middle of the last axis, `values` being at Chebyshev nodes."""
+    fit = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, nodes.size - 1))
+    at_middle = [Chebyshev.basis(n).deriv()(0.0) for n in range(nodes.size)]
+    return np.asarray(values @ (fit.T @ np.array(at_middle)) / width)
+
+
+@pytest.mark.parametrize("k", [1, 5, 15])
+def test_derivatives_are_those_of_the_values(k: int) -> None:
+    nodes = np.cos(np.pi * (np.arange(14) + 0.5) / 14)
+    beta = np.geomspace(1e-3, 1e6, 46)[:, None]
+    alpha = np.array([0.3, 0.6, 0.95, 1.0, 1.3, 2.0, 3.9])
+    _, by_ln_beta, by_alpha = harmonic_gradient(beta, alpha, k)
+    wide = 0.02
+    along_beta = harmonic(beta[..., None] * np.exp(wide * nodes), alpha[:, None], k)
+    along_alpha = harmonic(beta[..., None], alpha[:, None] + wide * nodes, k)
+    onset = np.array([2.0**-a / (1.0 - a) if a < 1.0 else np.inf for a in alpha])
+    smooth = np.abs(beta / onset - 1.0) > 0.3
+    for analytic, values in ((by_ln_beta, along_beta), (by_alpha, along_alpha)):
+        slope = spectral_slope(values, nodes, wide)
+        assert np.max((np.abs(analytic - slope) / np.abs(slope))[smooth]) < 1e-8
+
+
+@given(beta=BETAS, alpha=ALPHAS)
+def test_dissipates_and_stays_below_the_limit(beta: float, alpha: float) -> None:
+    c = complex(harmonic(at(beta), at(alpha), 1))
+    assert c.real > 0.0
+    assert 0.0 < c.imag < 4.0 / np.pi  # W = pi Im(c) f_max A <= 4 f_max A
+    assert 0.0 < turning_force(at(beta), at(alpha)) <= 1.0
+
+
+@given(exponent=st.floats(-4.0, 6.0), alpha=ALPHAS, ratio=st.floats(1.001, 100.0))
+def test_softens_with_amplitude(exponent: float, alpha: float, ratio: float) -> None:
+    beta = 10.0**exponent * np.array([1.0, ratio])
+    small, large = np.abs(describing_function(beta, at(alpha)))
+    assert large < small
+
+
+@given(
+    factors=st.tuples(*[st.floats(-30.0, 30.0).map(lambda x: 10.0**x)] * 2),
+    amplitude=st.floats(0.01, 100.0),
+    alpha=ALPHAS,
+)
+def test_scales_with_units(factors: tuple[float, float], amplitude: float, alpha: float) -> None:
+    # N of f_max = 0.1, sigma = 30 in other units of force and length
+    force, length = factors
+    f_max, sigma, A = 0.1 * force, 30.0 * force / length, amplitude * length
+    N = sigma * describing_function(at(sigma * A / f_max), at(alpha))
+    plain = 30.0 * describing_function(at(300.0 * amplitude), at(alpha))
+    assert complex(N * length / force) == pytest.approx(complex(plain), rel=1e-12)
+
+
+@given(exponent=st.floats(-60.0, -5.0), alpha=ALPHAS)
+def test_small_amplitudes_show_alpha_times_beta(exponent: float, alpha: float) -> None:
+    beta = 10.0**exponent
+    h, by_ln_f_max, _, by_alpha = describing_function_gradient(at(beta), at(alpha))
+    loss = 4.0 * alpha * beta / (3.0 * np.pi)
+    assert h.real == pytest.approx(1.0, abs=20.0 * beta**2 + 1e-15)
+    assert h.imag == pytest.approx(loss, rel=1e-8)
+    assert complex(by_ln_f_max) == pytest.approx(-1j * loss, rel=1e-4)
+    assert complex(by_alpha) == pytest.approx(1j * loss / alpha, rel=1e-4)
+
+
+@given(beta=st.floats(-60.0, 60.0), alpha=st.floats(0.01, 50.0), k=st.sampled_from(ODD))
+def test_stays_finite_far_outside(beta: float, alpha: float, k: int) -> None:
+    b, a = at(10.0**beta), at(alpha)
+    c, by_ln_beta, by_alpha = harmonic_gradient(b, a, k)
+    h, by_ln_f_max, by_ln_sigma, _ = describing_function_gradient(b, a)
+    assert np.isfinite([c, by_ln_beta, by_alpha, h, by_ln_f_max, by_ln_sigma]).all()
+    assert abs(by_ln_f_max + by_ln_sigma - h) <= 1e-12 * abs(h)
+
+
+def test_slips_like_a_square_wave_at_large_amplitudes() -> None:
+    for alpha in (0.25, 1.0, 2.0, 4.0):
+        for k in ODD:
+            c = harmonic(at(1e60), at(alpha), k)
+            assert complex(c) == pytest.approx(4j / (np.pi * k), rel=1e-10)
+
+
+def test_no_amplitude_is_a_spring() -> None:
+    h, by_ln_f_max, by_ln_sigma, by_alpha = describing_function_gradient(
+        np.array([0.0, 1e-250]), np.array([[0.3], [1.0], [3.0]])
+    )
+    assert np.all(h == 1.0)
+    assert np.all(by_ln_f_max == 0.0)
+    assert np.all(by_ln_sigma == 1.0)
+    assert np.all(by_alpha == 0.0)
+    for k in ODD:
+        for c in harmonic_gradient(at(0.0), at(2.0), k):
+            assert complex(c) == 0.0
+    assert turning_force(at(0.0), at(2.0)) == 0.0
+
+
+@pytest.mark.parametrize("k", [2, 4, 14])
+def test_even_harmonics_vanish(k: int) -> None:
+    beta, alpha = np.array([0.0, 1.0, 1e6]), np.array([[0.5], [2.0]])
+    assert harmonic(beta, alpha, k).shape == (2, 3)
+    for part in harmonic_gradient(beta, alpha, k):
+        assert np.all(part == 0.0)
+
+
+def test_broadcasts_and_does_not_depend_on_company() -> None:
+    beta, alpha = np.geomspace(1e-3, 1e3, 500), np.array([[0.5], [1.0], [2.5]])
+    together = describing_function_gradient(beta, alpha)
+    for part in together:
+        assert part.shape == (3, 500)
+    alone = describing_function_gradient(beta[123:124], alpha[2])
+    for part, one in zip(together, alone, strict=True):
+        assert part[2, 123] == pytest.approx(complex(one[0]), rel=1e-13)
+    assert describing_function(np.zeros((0, 2)), at(2.0)).shape == (0, 2)
+
+
+@pytest.mark.parametrize("alpha", [0.25, 0.5, 0.95, 1.0, 2.0, 4.0])
+def test_table_holds_the_describing_function(alpha: float) -> None:
+    table = DescribingFunctionTable(alpha)
+    rng = np.random.default_rng(1)
+    beta = np.concatenate([10.0 ** rng.uniform(-6.0, 6.0, 3000), [1e-6, 1e6]])
+    if alpha < 1.0:
+        onset = 2.0**-alpha / (1.0 - alpha)
+        gaps = np.geomspace(1e-6, 0.1, 100)
+        beta = np.concatenate([beta, onset * (1.0 - gaps), onset * (1.0 + gaps)])
+    h, minus_slope, _, _ = describing_function_gradient(beta, at(alpha))
+    by_table, slope = table.gradient(beta)
+    assert np.max(np.abs(table(beta) / h - 1.0)) < 1e-10
+    assert np.all(by_table == table(beta))
+    assert np.max(np.abs(slope / -minus_slope - 1.0)) < 1e-8
+
+
+def test_table_keeps_its_values_at_the_onset_of_slip() -> None:
+    onset = 2.0**-0.25 / 0.75
+    beta = onset * (1.0 + np.concatenate([-np.geomspace(1e-16, 1e-6, 50), [0.0, 1e-12, 1e-9]]))
+    table = DescribingFunctionTable(0.25, 0.1, 10.0)
+    assert np.max(np.abs(table(beta) / describing_function(beta, at(0.25)) - 1.0)) < 1e-10
+
+
+def test_table_refuses_what_it_does_not_hold() -> None:
+    table = DescribingFunctionTable(2.0, 1e-2, 1e2)
+    with pytest.raises(ValidationError, match=r"beta\[1\] is 0\.001; expected numbers from 0\.01"):
+        table(np.array([1.0, 1e-3]))
+    with pytest.raises(ValidationError, match=r"beta is 200\.0; expected numbers .* to 100"):
+        table.gradient(at(200.0))
+    with pytest.raises(ValidationError, match=r"alpha is -1\.0; expected numbers > 0"):
+        DescribingFunctionTable(-1.0)
+    with pytest.raises(ValidationError, match=r"beta_max is 0\.5; expected numbers from 1 "):
+        DescribingFunctionTable(1.0, 1.0, 0.5)
