@@ -9,9 +9,10 @@ dissipating element has a positive imaginary part of its dynamic stiffness.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +24,7 @@ from dahl_ident.arrays import (
     non_negative_array,
     positive_array,
 )
+from dahl_ident.data.columnwise import combined, shape_of
 from dahl_ident.data.fields import (
     check_covariance,
     column,
@@ -39,23 +41,12 @@ from dahl_ident.data.fields import (
     thawed,
 )
 from dahl_ident.data.quantities import converted, jacobian
-from dahl_ident.data.summary import as_html, as_text, distinct, extent, listed, noted
+from dahl_ident.data.summary import as_html, as_text, distinct, listed, response_lines
 from dahl_ident.errors import ValidationError
 from dahl_ident.units import MOTIONS, QUANTITIES, Motion, Quantity, si_unit
 
-_ROW_FIELDS = (
-    "frequency_hz",
-    "response",
-    "amplitude",
-    "drive",
-    "covariance",
-    "dof",
-    "amplitude_std",
-    "amplitude_covariance",
-    "level",
-    "controlled",
-    "harmonic",
-)
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -209,38 +200,10 @@ class FrequencyResponse:
         return self.frequency_hz.size
 
     def __repr__(self) -> str:
-        return as_text(*self._summary())
+        return as_text(*response_lines(self))
 
     def _repr_html_(self) -> str:
-        return as_html(*self._summary())
-
-    def _summary(self) -> tuple[str, list[tuple[str, str]]]:
-        """Title, and levels, ranges and units."""
-        name = self.quantity.replace("_", " ")
-        lines = [("frequency", extent(self.frequency_hz, "Hz"))]
-        if self.levels:
-            lines.append((f"{len(self.levels)} levels", listed(self.levels)))
-        for field, kind in (("amplitude", "displacement"), ("drive", "force")):
-            values = getattr(self, field)
-            if values is not None:
-                unit = si_unit(kind, self.motion)
-                lines.append((field, f"{extent(values, unit)}, zero to peak"))
-        lines += [
-            ("gain", extent(self.gain, self.unit)),
-            ("phase", extent(np.degrees(self.phase), "deg")),
-            ("controlled", listed(distinct(self.controlled))),
-        ]
-        if (self.harmonic > 1).any():
-            lines.append(("harmonics", listed(distinct(self.harmonic))))
-        if self.covariance is None:
-            lines.append(("covariance", "unknown"))
-        else:
-            dof = "" if self.dof is None else f", {extent(self.dof, 'degrees of freedom')}"
-            lines.append(("covariance", f"known{dof}"))
-        if self.quality:
-            lines.append(("quality", listed(self.quality)))
-        lines += noted(self.provenance)
-        return f"FrequencyResponse: {self.n} points of {name}, {self.motion}", lines
+        return as_html(*response_lines(self))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuild, (thawed((f.name, getattr(self, f.name)) for f in fields(self)),)
@@ -379,7 +342,7 @@ class FrequencyResponse:
             keep &= mask
         if not keep.any():
             raise ValidationError(f"none of the {self.n} points meets the conditions")
-        return replace(self, **_combined([self], lambda arrays: arrays[0][keep]))
+        return replace(self, **combined([self], lambda arrays: arrays[0][keep]))
 
     @staticmethod
     def concatenate(parts: Sequence[FrequencyResponse]) -> FrequencyResponse:
@@ -410,7 +373,7 @@ class FrequencyResponse:
             raise ValidationError("concatenate needs at least one table, got none")
         first = parts[0]
         for i, part in enumerate(parts):
-            ours, theirs = _kind(first), _kind(part)
+            ours, theirs = shape_of(first), shape_of(part)
             if ours != theirs:
                 raise ValidationError(
                     f"parts[{i}] ({listed(sorted(theirs - ours)) or 'less'}) does not go with "
@@ -419,30 +382,156 @@ class FrequencyResponse:
                 )
         sources = [dict(p.provenance) for p in parts if p.provenance is not None]
         provenance = {"parts": sources} if sources else None
-        return replace(first, **_combined(parts, np.concatenate), provenance=provenance)
+        return replace(first, **combined(parts, np.concatenate), provenance=provenance)
 
+    def to_frame(self, *, polar: bool = False) -> pd.DataFrame:
+        """Return a pandas table with one row for each point and units in the headers.
 
-def _combined(
-    parts: Sequence[FrequencyResponse], combine: Callable[[list[NDArray[Any]]], NDArray[Any]]
-) -> dict[str, Any]:
-    """Apply `combine` to each column of all parts; returns constructor arguments."""
-    columns: dict[str, Any] = {
-        name: combine([getattr(part, name) for part in parts])
-        for name in _ROW_FIELDS
-        if getattr(parts[0], name) is not None
-    }
-    columns["quality"] = {
-        name: combine([part.quality[name] for part in parts]) for name in parts[0].quality
-    }
-    return columns
+        Parameters
+        ----------
+        polar : bool
+            Whether the response is given as ``gain`` and ``phase_deg`` with their standard
+            deviations, instead of ``real`` and ``imag`` with their covariance. Only the latter
+            keeps everything.
 
+        Returns
+        -------
+        pandas.DataFrame
 
-def _kind(data: FrequencyResponse) -> set[str]:
-    """Return what two tables must share to become one."""
-    columns = {name for name in _ROW_FIELDS if getattr(data, name) is not None}
-    if data.level is not None:
-        columns.add("text levels" if data.level.dtype.kind == "U" else "numeric levels")
-    return columns | set(data.quality) | {data.quantity, data.motion}
+        Examples
+        --------
+        >>> data = FrequencyResponse([1.0], [4.0 + 3.0j], amplitude=[1e-3])
+        >>> list(data.to_frame(polar=True).columns[:4])
+        ['frequency_hz', 'amplitude [m]', 'gain [N/m]', 'phase_deg']
+        """
+        from dahl_ident.data.table import response_frame
+
+        return response_frame(self, polar=polar)
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: pd.DataFrame,
+        *,
+        columns: Mapping[str, Any] | str | Path | None = None,
+        amplitude: str | None = None,
+        drive: str | None = None,
+        passive: bool = True,
+    ) -> FrequencyResponse:
+        """Return the frequency response in a pandas table.
+
+        Parameters
+        ----------
+        frame : pandas.DataFrame
+            Columns as :func:`~dahl_ident.data.read_frequency_response` expects them in a file,
+            units in brackets in their names.
+        columns, amplitude, drive, passive
+            As there.
+
+        Returns
+        -------
+        FrequencyResponse
+
+        Raises
+        ------
+        DataError, UnitError
+            Naming row and column.
+
+        Examples
+        --------
+        >>> data = FrequencyResponse([1.0], [4.0 + 3.0j], amplitude=[1e-3])
+        >>> FrequencyResponse.from_frame(data.to_frame()).response
+        array([4.+3.j])
+        """
+        from dahl_ident.data.columns import column_map
+        from dahl_ident.data.readers.sheets import frame_source
+        from dahl_ident.data.response_table import ResponseOptions, response_from
+
+        options = ResponseOptions(amplitude=amplitude, drive=drive, passive=passive)
+        data = response_from(frame_source(frame), column_map(columns), options)
+        origin = (data.provenance or {}).get("origin")
+        return data if origin is None else replace(data, provenance=origin)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the table to a file that :func:`~dahl_ident.data.read_frequency_response` reads.
+
+        Parameters
+        ----------
+        path : path
+            Ending in ``.csv``, ``.csv.gz``, ``.tsv``, ``.parquet``, ``.h5`` or ``.hdf5``.
+
+        Returns
+        -------
+        Path
+            The file, complete; an interrupted run leaves none.
+
+        Raises
+        ------
+        ValidationError
+            If the ending is another one.
+        DataError
+            If the place cannot be written to.
+
+        Examples
+        --------
+        >>> from tempfile import mkdtemp
+        >>> data = FrequencyResponse([1.0], [4.0 + 3.0j], amplitude=[1e-3])
+        >>> data.save(Path(mkdtemp()) / "levels.csv").name
+        'levels.csv'
+        """
+        from dahl_ident.data.storage import save_frame
+
+        return save_frame(self.to_frame(), path)
+
+    def to_control(self) -> dict[Any, Any]:
+        """Return one python-control frequency response for each level.
+
+        Returns
+        -------
+        dict
+            ``control.FrequencyResponseData`` by level label, in the quantity of this table,
+            over omega in rad/s; the key is None where the table has no levels.
+
+        Raises
+        ------
+        ValidationError
+            If rows hold harmonics, or a level has a frequency twice.
+
+        Examples
+        --------
+        >>> data = FrequencyResponse([1.0, 2.0], [1.0j, 2.0j], drive=[0.1, 0.1], level="0.1 N")
+        >>> list(data.to_control())
+        ['0.1 N']
+        """
+        from dahl_ident.data.table import control_systems
+
+        return control_systems(self)
+
+    def plot(self, ax: Any = None) -> tuple[Any, Any]:
+        """Draw gain and phase of the fundamental, over frequency or over amplitude.
+
+        Over frequency, one curve a level, where a level has more than one frequency; over
+        amplitude, with error bars where the covariance is known, otherwise.
+
+        Parameters
+        ----------
+        ax : sequence of two matplotlib Axes, optional
+            For gain and for phase; new ones where left out.
+
+        Returns
+        -------
+        tuple of Axes
+
+        Examples
+        --------
+        >>> data = FrequencyResponse([1.0, 1.0], [2.0 + 1.0j, 1.0 + 1.0j], amplitude=[1e-3, 2e-3])
+        >>> top, bottom = data.plot()
+        >>> top.get_ylabel()
+        'dynamic stiffness [N/m]'
+        """
+        from dahl_ident.data.picture import draw_response
+
+        return draw_response(self, ax)
 
 
 def _rebuild(arguments: dict[str, Any]) -> FrequencyResponse:

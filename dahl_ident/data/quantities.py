@@ -55,3 +55,13 @@ def jacobian(derivative: ComplexArray) -> FloatArray:
     """Return the (n, 2, 2) real Jacobian of a complex derivative on (Re, Im)."""
     re, im = derivative.real, derivative.imag
     return np.stack([np.stack([re, -im], -1), np.stack([im, re], -1)], -2)
+
+
+def polar_std(response: ComplexArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the standard deviations of gain and of phase (rad), to first order."""
+    along = np.stack([response.real, response.imag], -1) / np.abs(response)[:, None]
+    across = np.stack([-along[:, 1], along[:, 0]], -1)
+    gain, arc = (
+        np.sqrt(np.einsum("ni,nij,nj->n", v, covariance, v).clip(0.0)) for v in (along, across)
+    )
+    return gain, arc / np.abs(response)

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,8 +18,12 @@ from numpy.typing import ArrayLike
 from dahl_ident.arrays import FloatArray, finite_array, positive_number
 from dahl_ident.data.fields import column, frozen_copy, frozen_mapping, one_of, thawed
 from dahl_ident.data.sampling import gaps, is_even, sample_rate
+from dahl_ident.data.summary import as_html, as_text, record_lines
 from dahl_ident.errors import ValidationError
 from dahl_ident.units import MOTION_KINDS, MOTIONS, Motion
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 DriveUnit = Literal["N", "N m", "V", "A"]
 
@@ -190,6 +195,60 @@ class Record:
     def gaps(self) -> FloatArray:
         """Start and end of every gap, (m, 2), s: steps above 1.5 times the median step."""
         return gaps(self.time)
+
+    def __repr__(self) -> str:
+        return as_text(*record_lines(self))
+
+    def _repr_html_(self) -> str:
+        return as_html(*record_lines(self))
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return a pandas table with one row for each sample and units in the headers.
+
+        Returns
+        -------
+        pandas.DataFrame
+
+        Examples
+        --------
+        >>> record = Record([0.0, 0.1], displacement=[0.0, 1.0], force=[0.0, 2.0])
+        >>> list(record.to_frame().columns)
+        ['time [s]', 'displacement [m]', 'force [N]']
+        """
+        from dahl_ident.data.table import record_frame
+
+        return record_frame(self)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the samples to a file that :func:`~dahl_ident.data.read_record` reads.
+
+        Parameters
+        ----------
+        path : path
+            Ending in ``.csv``, ``.csv.gz``, ``.tsv``, ``.parquet``, ``.h5`` or ``.hdf5``.
+
+        Returns
+        -------
+        Path
+            The file, complete; an interrupted run leaves none.
+
+        Raises
+        ------
+        ValidationError
+            If the ending is another one.
+        DataError
+            If the place cannot be written to.
+
+        Examples
+        --------
+        >>> from tempfile import mkdtemp
+        >>> record = Record([0.0, 0.1], displacement=[0.0, 1.0], force=[0.0, 2.0])
+        >>> record.save(Path(mkdtemp()) / "run.parquet").name
+        'run.parquet'
+        """
+        from dahl_ident.data.storage import save_frame
+
+        return save_frame(self.to_frame(), path)
 
 
 def _rebuild(arguments: dict[str, Any]) -> Record:

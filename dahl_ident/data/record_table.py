@@ -12,7 +12,7 @@ from dahl_ident.data.columns import RECORD_NAMES, ColumnMap
 from dahl_ident.data.record import DriveUnit, Record
 from dahl_ident.data.source import Channel, Source
 from dahl_ident.errors import DataError, UnitError, ValidationError
-from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS
+from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS, si_unit
 
 _DRIVE_UNITS: dict[str, DriveUnit] = {"voltage": "V", "current": "A"}
 
@@ -97,12 +97,15 @@ def _samples(bound: Binding, role: str, channel: Channel) -> FloatArray:
 def _drive(bound: Binding, channel: Channel) -> dict[str, Any]:
     kind, _ = bound.kind("drive", bound.unit("drive", channel), DRIVE_KINDS)
     if kind == "force":
-        return {"drive_unit": "N" if bound.motions["drive"] == "translation" else "N m"}
-    unit = _DRIVE_UNITS[kind]
-    if bound.map.drive_factor is None:
-        return {"drive_unit": unit}
-    factor, uncertainty = bound.force_per(kind)
-    return {"drive_unit": unit, "drive_factor": factor, "drive_factor_uncertainty": uncertainty}
+        return {"drive_unit": si_unit("force", bound.motions["drive"])}
+    values: dict[str, Any] = {"drive_unit": _DRIVE_UNITS[kind]}
+    if bound.map.drive_factor is not None:
+        factor, uncertainty = bound.force_per(kind)
+        values |= {"drive_factor": factor, "drive_factor_uncertainty": uncertainty}
+    else:
+        saved = ("drive_factor", "drive_factor_uncertainty")
+        values |= {k: bound.source.metadata[k] for k in saved if k in bound.source.metadata}
+    return values
 
 
 def _even_time(bound: Binding, n: int) -> FloatArray:

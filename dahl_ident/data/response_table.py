@@ -288,10 +288,11 @@ class _Table:
         """Return the constructor's arguments on errors that the table has columns for."""
         motion = self.bound.motion()
         amplitude, part = si_unit("displacement", motion), si_unit(quantity, motion)
+        dof = self.bound.channel("dof")
         form, inherited = self._form(_ERROR_FORMS), self._error_unit("amplitude")
         out: dict[str, Any] = {
             "covariance": None if form is None else self._covariance(form, part, response),
-            "dof": self._plain("dof"),
+            "dof": None if dof is None else self.bound.source.numbers(dof, infinite=True),
             "amplitude_std": self._scaled("amplitude_std", amplitude, inherited),
         }
         cross = ("covariance_amplitude_real", "covariance_amplitude_imag")
@@ -343,10 +344,6 @@ class _Table:
             self.bound.source.require(values >= 0.0, channel, "a standard deviation >= 0")
         what = f"{self.bound.source.name}: column {channel.name!r}"
         return values * factor_to(unit, si, what) * unit.to_peak
-
-    def _plain(self, role: str) -> FloatArray | None:
-        channel = self.bound.channel(role)
-        return None if channel is None else np.atleast_1d(channel.values)
 
     def _whole_numbers(self, role: str) -> FloatArray | None:
         channel = self.bound.channel(role)

@@ -16,7 +16,7 @@ from dahl_ident.data.summary import listed
 from dahl_ident.errors import DataError, UnitError
 from dahl_ident.units import parse_unit
 
-_NUMBER = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\s*|nan", re.ASCII)
+_NUMBER = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\s*|[-+]?inf|nan", re.ASCII)
 _INDEX = re.compile(r"[\d:, ]+")
 
 
@@ -111,8 +111,8 @@ class Source:
             )
         return found
 
-    def numbers(self, channel: Channel) -> FloatArray:
-        """Return a channel's finite numbers, or say which cell holds something else.
+    def numbers(self, channel: Channel, *, infinite: bool = False) -> FloatArray:
+        """Return a channel's numbers, finite unless said, or name the cell that holds another.
 
         Raises
         ------
@@ -127,7 +127,7 @@ class Source:
         if values.dtype.kind not in "fiu":
             values = self._from_text(channel)
         values = np.atleast_1d(values).astype(np.float64)
-        bad = np.flatnonzero(~np.isfinite(values))
+        bad = np.flatnonzero(np.isnan(values) if infinite else ~np.isfinite(values))
         if bad.size:
             i = int(bad[0])
             what = "empty or NaN" if np.isnan(values[i]) else f"{values[i]}"

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.units import si_unit
+
+if TYPE_CHECKING:
+    from dahl_ident.data.frequency_response import FrequencyResponse
+    from dahl_ident.data.record import Record
 
 Lines = Sequence[tuple[str, str]]
 _SHOWN = 8
@@ -61,3 +66,54 @@ def noted(provenance: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     notes = dict.fromkeys(note for part in parts for note in part.get("notes", []))
     lines = [("from", listed(files, shown=3))] if files else []
     return lines + [("note", note) for note in notes]
+
+
+def response_lines(data: FrequencyResponse) -> tuple[str, Lines]:
+    """Return a title, and levels, ranges and units."""
+    name = data.quantity.replace("_", " ")
+    lines = [("frequency", extent(data.frequency_hz, "Hz"))]
+    if data.levels:
+        lines.append((f"{len(data.levels)} levels", listed(data.levels)))
+    for field, kind in (("amplitude", "displacement"), ("drive", "force")):
+        values = getattr(data, field)
+        if values is not None:
+            unit = si_unit(kind, data.motion)
+            lines.append((field, f"{extent(values, unit)}, zero to peak"))
+    lines += [
+        ("gain", extent(data.gain, data.unit)),
+        ("phase", extent(np.degrees(data.phase), "deg")),
+        ("controlled", listed(distinct(data.controlled))),
+    ]
+    if (data.harmonic > 1).any():
+        lines.append(("harmonics", listed(distinct(data.harmonic))))
+    if data.covariance is None:
+        lines.append(("covariance", "unknown"))
+    else:
+        dof = "" if data.dof is None else f", {extent(data.dof, 'degrees of freedom')}"
+        lines.append(("covariance", f"known{dof}"))
+    if data.quality:
+        lines.append(("quality", listed(data.quality)))
+    lines += noted(data.provenance)
+    return f"FrequencyResponse: {data.n} points of {name}, {data.motion}", lines
+
+
+def record_lines(record: Record) -> tuple[str, Lines]:
+    """Return a title, and sampling, ranges and units."""
+    kind = record.motion_channel
+    spacing = "even" if record.uniform else "uneven"
+    lines = [
+        ("sampling", f"{record.sample_rate:.6g} Hz, {spacing}, {record.duration:.6g} s"),
+        (kind, extent(record.motion_samples, si_unit(kind, record.motion))),
+    ]
+    if len(record.gaps):
+        lines.insert(1, ("gaps", str(len(record.gaps))))
+    if record.force is not None:
+        lines.append(("force", extent(record.force, si_unit("force", record.motion))))
+    if record.drive is not None:
+        lines.append(("drive", extent(record.drive, record.drive_unit)))
+    if record.drive_unit in ("V", "A") and record.drive_factor is not None:
+        unit = f"{si_unit('force', record.motion)}/{record.drive_unit}"
+        uncertain = f" within {record.drive_factor_uncertainty:.2%}"
+        lines.append(("drive factor", f"{record.drive_factor:.6g} {unit}{uncertain}"))
+    lines += noted(record.provenance)
+    return f"Record: {record.n} samples of {kind} in {record.motion}", lines

@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 
 from dahl_ident.data.readers.layout import Header, best_run, header
 from dahl_ident.data.source import Channel, Source
+from dahl_ident.data.storage import METADATA_MARK
 from dahl_ident.errors import DataError
 
-METADATA_MARK = "dahl_ident:"
 _COMMENT = re.compile(r"\s*(?:#|%|//|!)")
+_COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|%|//|!)[^\r\n]*", re.MULTILINE)
 _LINE_END = re.compile(rb"\r\n|\n|\r")
 _HEAD_BYTES = 1 << 16
 _DIALECTS = (
@@ -100,12 +101,14 @@ def _as_utf8(data: bytes, name: str) -> bytes:
 
 def _head(data: bytes) -> list[tuple[int, str]]:
     """Return offset and text of the first lines."""
-    lines, start = [], 0
-    for end in _LINE_END.finditer(data, 0, _HEAD_BYTES):
+    lines: list[tuple[int, str]] = []
+    start, numbers = 0, 0
+    for end in _LINE_END.finditer(data + b"\n" if len(data) < _HEAD_BYTES else data):
         lines.append((start, data[start : end.start()].decode("utf-8", "replace")))
         start = end.end()
-    if len(data) <= _HEAD_BYTES and start < len(data):
-        lines.append((start, data[start:].decode("utf-8", "replace")))
+        numbers = numbers or (0 if _COMMENT.match(lines[-1][1]) else start)
+        if numbers and start > numbers + _HEAD_BYTES:
+            break
     return lines
 
 
@@ -185,7 +188,7 @@ def _refuse_cut_end(body: bytes, layout: _Layout, name: str) -> None:
 
 def _counts(line: bytes) -> bool:
     """Return whether a line among the numbers is one, and not blank or a comment."""
-    return bool(line.strip()) and not line.lstrip().startswith(b"#")
+    return bool(line.strip()) and not _COMMENT_LINE.match(line)
 
 
 def _parse(
@@ -196,8 +199,8 @@ def _parse(
     # pandas 3.1 reads to the last digit by default, earlier ones have to be asked
     exact = tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1)
     options: dict[str, Any] = {} if exact else {"float_precision": "round_trip"}
-    if b"#" in body:
-        options["comment"] = "#"
+    if any(mark in body for mark in (b"#", b"%", b"//", b"!")):
+        body = _COMMENT_LINE.sub(b"", body)
     texts = metadata.get("text", [])
     if texts:
         options["dtype"] = {i: str for i, n in enumerate(layout.header.names) if n in texts}
