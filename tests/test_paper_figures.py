@@ -1,0 +1,125 @@
+"""The numbers that the paper states about its Figs. 2 to 7, each from a few public calls.
+
+Helmick and Messner, *Describing Function Analysis of Dahl Model Friction*; corrected where the
+paper misprints: gain 4 f_max/(pi A) in gross slip, sigma = 3.2 in Fig. 6, phase 22.51 degrees
+where sigma A = f_max.
+"""
+
+from __future__ import annotations
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from dahl_ident import Dahl, Damper, Mass, Spring, response
+from dahl_ident.arrays import FloatArray
+from tests import paper_series
+
+SIGMA_OF_FIG = {3: 10.0, 4: 3.0, 5: 1.0}
+PLANT = Dahl(f_max=0.1, sigma=30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
+LEVELS = np.geomspace(1e-4, 1e1, 51)[:, None]
+
+
+def test_fig_2_force_at_the_reversals() -> None:
+    x, force = Dahl(f_max=1.0, sigma=1.0).loop(1.0, points=5)
+    np.testing.assert_allclose(x[[0, 2]], [1.0, -1.0])
+    np.testing.assert_allclose(force[[0, 2]], [np.tanh(1.0), -np.tanh(1.0)], rtol=1e-14)
+
+
+def partial_sum(friction: Dahl, theta: FloatArray, last: int) -> FloatArray:
+    """Return the Fourier series of Eqn. 1 for A = 1 up to a harmonic."""
+    total = np.zeros(theta.shape)
+    for k in range(1, last + 1):
+        a, b = friction.fourier_coefficients(1.0, harmonic=k)
+        total += a * np.cos(k * theta) + b * np.sin(k * theta)
+    return total
+
+
+def left_over(beta: float, last: int) -> float:
+    """Return the r.m.s. force beyond a harmonic, from Eqn. 11 and the paper's own series."""
+
+    def force(theta: float) -> float:
+        return -1.0 + (1.0 + math.tanh(beta)) * math.exp(beta * (math.cos(theta) - 1.0))
+
+    power = quad(lambda theta: force(theta) ** 2, 0.0, np.pi, epsabs=1e-13)[0] / np.pi
+    with mpmath.workdps(40):
+        for k in range(1, last + 1, 2):
+            a = paper_series.cosine_coefficient(mpmath.mpf(beta), k)
+            b = paper_series.sine_coefficient(mpmath.mpf(beta), k)
+            power -= float(a**2 + b**2) / 2.0
+    return float(np.sqrt(power))
+
+
+@pytest.mark.parametrize("sigma", SIGMA_OF_FIG.values(), ids=lambda s: f"sigma={s:g}")
+def test_figs_3_to_5_partial_sums_approach_the_loop(sigma: float) -> None:
+    friction = Dahl(f_max=1.0, sigma=sigma)
+    points = 4097
+    _, force = friction.loop(1.0, points=points)
+    theta = np.linspace(0.0, 2.0 * np.pi, points)
+    left = [
+        np.sqrt(np.mean((force - partial_sum(friction, theta, k))[:-1] ** 2)) for k in (1, 3, 9, 31)
+    ]
+    assert left[0] > left[1] > left[2] > left[3]
+    assert left[3] < 0.03
+    for error, last in zip(left, (1, 3, 9, 31), strict=True):
+        assert error == pytest.approx(left_over(sigma, last), rel=1e-4)
+
+
+@pytest.mark.parametrize("sigma", SIGMA_OF_FIG.values(), ids=lambda s: f"sigma={s:g}")
+def test_figs_3_to_5_no_power_is_missing(sigma: float) -> None:
+    friction = Dahl(f_max=1.0, sigma=sigma)
+    _, force = friction.loop(1.0, points=2**16 + 1)
+    coefficients = np.array([friction.fourier_coefficients(1.0, harmonic=k) for k in range(1, 400)])
+    power = 0.5 * np.sum(coefficients**2)
+    assert power == pytest.approx(np.mean(force[:-1] ** 2), rel=1e-6)
+
+
+@pytest.mark.parametrize("sigma", [0.1, 0.32, 1.0, 3.2, 10.0])
+def test_fig_6_gain_and_phase(sigma: float) -> None:
+    friction = Dahl(f_max=1.0, sigma=sigma)
+    knee = friction.characteristic_displacement
+    assert friction.gain(1e-6 * knee) == pytest.approx(sigma, rel=1e-9)
+    assert friction.gain(knee) == pytest.approx(0.79291 * sigma, rel=1e-5)
+    assert np.degrees(friction.phase(knee)) == pytest.approx(22.51, abs=5e-3)
+    assert friction.gain(2.2 * knee) == pytest.approx(0.4988 * sigma, rel=1e-4)
+    assert np.degrees(friction.phase(2.7 * knee)) == pytest.approx(44.96, abs=5e-3)
+    far = 1e8 * knee
+    assert friction.gain(far) == pytest.approx(4.0 / (np.pi * far), rel=1e-6)
+    assert np.degrees(friction.phase(far)) == pytest.approx(90.0, abs=0.02)
+
+
+def test_fig_6_curves_are_one_curve_shifted() -> None:
+    A = np.geomspace(0.1, 100.0, 61)
+    one = Dahl(f_max=1.0, sigma=1.0)
+    for sigma in (0.1, 0.32, 3.2, 10.0):
+        other = Dahl(f_max=1.0, sigma=sigma)
+        np.testing.assert_allclose(other.gain(A / sigma), sigma * one.gain(A), rtol=1e-13)
+        np.testing.assert_allclose(other.phase(A / sigma), one.phase(A), rtol=1e-12)
+
+
+def test_fig_7_static_gain_changes_over_between_two_drives() -> None:
+    gain = np.abs(response(PLANT, 0.0, [1e-4, 0.1, 0.2, 10.0]).receptance)
+    assert gain[0] == pytest.approx(1.0 / (0.3 + 30.0), rel=1e-3)
+    assert gain[1] == pytest.approx(0.0515, abs=5e-5)
+    assert gain[2] == pytest.approx(2.36, abs=5e-3)
+    assert gain[3] == pytest.approx(1.0 / 0.3, rel=2e-3)
+
+
+def test_fig_7_resonance_moves_from_stiff_and_sharp_to_soft_and_damped() -> None:
+    f = np.geomspace(0.01, 10.0, 2000)
+    gain = np.abs(response(PLANT, f, LEVELS).receptance)
+    peak = f[np.argmax(gain, axis=1)]
+    sharpness = gain.max(axis=1) / gain[:, 0]
+    assert gain.shape == (51, 2000)
+    stuck, free = np.sqrt([30.3 / 0.3, 0.3 / 0.3]) / (2.0 * np.pi)
+    assert peak[0] == pytest.approx(stuck, rel=5e-3)
+    assert peak[-1] < 1.05 * free
+    # the damping of the stiff resonance grows as u0 comes near 0.1, before it jumps
+    stiff = LEVELS.ravel() < 0.1
+    assert np.all(np.diff(sharpness[stiff]) < 0.0)
+    # the transition takes a small range of u0
+    between = (peak < 0.9 * stuck) & (peak > 1.2 * free)
+    assert 0 < between.sum() < 12
