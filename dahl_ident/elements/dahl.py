@@ -268,9 +268,10 @@ class Dahl(Element):
         >>> print(f"{Dahl(f_max=1.0, sigma=1.0).equivalent_damping(1.0, 2.0):.4f}")
         0.1518
         """
+        A = non_negative_array(amplitude, "amplitude")
         w = positive_array(omega, "omega")
-        broadcast_shape(amplitude=np.asarray(amplitude), omega=w)
-        return (self.describing_function(amplitude).imag / w)[()]
+        broadcast_shape(amplitude=A, omega=w)
+        return (self.describing_function(A).imag / w)[()]
 
     def dissipated_energy(self, amplitude: ArrayLike) -> FloatArray:
         """Return W = pi A abs(b_1), the energy lost in one cycle.
