@@ -1,0 +1,399 @@
+r"""Least squares by IPOPT: constraints between parameters, and noise in the drive as well.
+
+The problem is that of :mod:`dahl_ident.fitting.least_squares`, written as casadi expressions, so
+IPOPT has the exact Hessian. From the least-squares optimum it takes a step or two.
+
+**Form.** Rows with controlled displacement enter in reduced form: the response is an explicit
+function of the parameters. Rows with controlled force enter in full space: each displacement
+phasor is a pair of unknowns tied to the drive by the balance of forces Z(A, omega) X = u_0
+(Eqn. 53). No root is searched for; the balance holds when IPOPT has converged. Errors of a
+measured amplitude or drive are unknowns as well, see :mod:`dahl_ident.fitting.casadi_rows`.
+
+**Constraints** are comparisons of casadi expressions, see
+:mod:`dahl_ident.fitting.casadi_constraints`. An equality takes one parameter's worth of freedom
+away: the covariance is that of the estimate on the constraint. An inequality that holds with
+equality acts as a bound does; the covariance is that without it.
+
+**Coordinates.** Search coordinates relative to the start, each in the unit that changes the
+residuals by their own size, so that nothing depends on physical units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import null_space
+
+from dahl_ident.arrays import FloatArray, finite_array, non_negative_array
+from dahl_ident.errors import FitError, ValidationError
+from dahl_ident.fitting import least_squares
+from dahl_ident.fitting.casadi_constraints import Constraints, Relations
+from dahl_ident.fitting.casadi_nlp import RowwiseProblem, SharedTerms
+from dahl_ident.fitting.casadi_rows import Target, check_elements, parameter_values, row_blocks
+from dahl_ident.fitting.ending import End, optimum
+from dahl_ident.fitting.losses import loss_named
+from dahl_ident.fitting.optimum import Optimum, inverse
+from dahl_ident.fitting.start import starts
+from dahl_ident.fitting.status import Status
+from dahl_ident.noise import AmplitudeError
+from dahl_ident.problem import Problem
+
+if TYPE_CHECKING:
+    import casadi as ca
+
+_TOLERANCE = 1e-11
+_ITERATIONS = 300
+_LEAST_RESIDUAL = 1e-4  # of the largest change that a parameter's own size makes
+_ACTIVE = 1e-6
+_RESCALINGS = 30
+_SAME_SCALE = 1e-10
+_SAME_COST = 1e-6
+_WORDS = {
+    "Maximum_Iterations_Exceeded": f"it was still moving after {_ITERATIONS} steps",
+    "Restoration_Failed": "it could not get back to where the constraints hold",
+    "Diverging_Iterates": "a parameter ran away",
+    "Search_Direction_Becomes_Too_Small": "its steps became too small to make a difference",
+    "Invalid_Number_Detected": "the model or a constraint gave no number",
+    "Error_In_Step_Computation": "it could not compute a step",
+    "Not_Enough_Degrees_Of_Freedom": "there are more equations than unknowns",
+}
+
+
+def solve_ipopt(
+    problem: Problem,
+    *,
+    constraints: Constraints | None = None,
+    start: Mapping[str, float] | None = None,
+    loss: str = "linear",
+    drive_std: ArrayLike | None = None,
+    drive_covariance: ArrayLike | None = None,
+) -> Optimum:
+    """Return the minimum of a problem's sum of squares under constraints.
+
+    Parameters
+    ----------
+    problem : Problem
+        One table; models of Dahl, Mass, Damper, Spring, and LinearSystem without free parameters.
+    constraints : callable, optional
+        Takes a mapping of every parameter's name to its casadi symbol, returns comparisons with
+        ``<=``, ``>=`` or ``==``.
+    start : mapping of str to float, optional
+        One more start for the search that precedes, see `least_squares.solve`.
+    loss : {"linear", "huber", "soft_l1", "student_t"}, default "linear"
+        See :mod:`dahl_ident.fitting.losses`.
+    drive_std : (n,) array_like or float, optional
+        Standard deviation of the measured drive, N, in force-controlled rows. Needs
+        ``noise="measured"``.
+    drive_covariance : (n, 2) array_like, optional
+        Covariance of the drive with the real and the imaginary part of the response.
+
+    Returns
+    -------
+    Optimum
+        With ``method="ipopt"``. Where there are no constraints and the optimum lies at infinity,
+        that of `least_squares.solve`. With noise in the drive its `cost` and `covariance` take
+        that into account; its `residuals` are those at the drives as measured.
+
+    Raises
+    ------
+    FitError
+        If no parameters satisfy the constraints, or the model cannot be written as expressions.
+    ModelError
+        If a constraint or `start` names an unknown parameter.
+    ValidationError
+        If a constraint is no comparison, or the drive's errors are given where they mean nothing.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dahl_ident import Dahl
+    >>> from dahl_ident.data import FrequencyResponse
+    >>> A = np.geomspace(1e-4, 1e-2, 5)
+    >>> N = Dahl(f_max=0.1, sigma=30.0).describing_function(A)
+    >>> problem = Problem(FrequencyResponse(np.ones(5), N, A), Dahl())
+    >>> free = solve_ipopt(problem)
+    >>> free.values.round(6).tolist()
+    [0.1, 30.0]
+    >>> tied = solve_ipopt(problem, constraints=lambda p: [p["sigma"] == 250 * p["f_max"]])
+    >>> print(f"{tied.values[1] / tied.values[0]:.6f}")
+    250.000000
+    """
+    check_elements(problem.model)
+    drive_error = _drive_error(problem, loss, drive_std, drive_covariance)
+    relations = Relations.of(problem, constraints)
+    begin = least_squares.solve(problem, loss=loss, start=start)
+    if begin.status.at_infinity and not relations.texts and drive_error is None:
+        return replace(begin, method="ipopt")
+    theta = begin.theta if begin.success else _finite_start(problem)
+    adapts = not problem.scale_known and bool(loss != "linear" or problem.priors)
+    target = Target(problem, begin.scale if adapts else 1.0, loss, drive_error)
+    found = _descend(target, theta, relations)
+    for _ in range(_RESCALINGS if adapts and relations.texts else 0):
+        scale = target.scale * _stretch(target, found.theta, relations.freedom_lost)
+        if abs(scale / target.scale - 1.0) < _SAME_SCALE:
+            break
+        target = replace(target, scale=scale)
+        found = _descend(target, found.theta, relations)
+    return _ended(target, found, relations, begin.nfev + found.evaluations)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Where IPOPT ended, in search coordinates."""
+
+    theta: FloatArray
+    cost: float
+    return_status: str
+    evaluations: int
+    slopes: FloatArray
+    """Of the relations' differences by theta, (C, P)."""
+    active: tuple[bool, ...]
+    cost_unit: float
+    """A cost whose residuals are all of the size that the coordinates were scaled by."""
+    information: FloatArray | None
+    """That of the data with the drive's errors; None where there are none."""
+
+
+def _descend(target: Target, start: FloatArray, relations: Relations) -> _Found:
+    """Run IPOPT from `start`."""
+    import casadi as ca
+
+    problem = target.problem
+    unit, weight = _units(target, start)
+    xi = ca.SX.sym("xi", start.size)
+    theta = ca.DM(start) + ca.DM(unit) * xi
+    values = parameter_values(problem, theta)
+    differences = relations.at(values)
+    slopes = ca.Function("slopes", [xi], [ca.jacobian(differences, xi)])
+    size = np.linalg.norm(np.asarray(slopes(0.0)), axis=1)
+    size[~np.isfinite(size) | (size == 0.0)] = 1.0
+    priors = [((values[name] - p.mean()) / p.std()) ** 2 for name, p in problem.priors.items()]
+    shared = SharedTerms(xi, weight * ca.sum1(ca.vertcat(0.0, *priors)), differences / ca.DM(size))
+    nlp = RowwiseProblem(shared, row_blocks(target, theta, start), weight)
+    solution, stats = _run(nlp, problem, start, unit, relations)
+    x, g = (np.asarray(solution[key]).ravel() for key in ("x", "g"))
+    inequalities = zip(g[nlp.n_balances :], relations.equal, strict=True)
+    return _Found(
+        theta=start + unit * x[: start.size],
+        cost=0.5 * float(solution["f"]) / weight,
+        return_status=str(stats["return_status"]),
+        evaluations=int(stats["n_call_nlp_f"]),
+        slopes=np.asarray(slopes(x[: start.size])) / unit,
+        active=tuple(not equal and c > -_ACTIVE for c, equal in inequalities),
+        cost_unit=0.5 / weight,
+        information=nlp.information(x, _counts(problem)) / np.outer(unit, unit)
+        if target.drive_error is not None
+        else None,
+    )
+
+
+def _units(target: Target, start: FloatArray) -> tuple[FloatArray, float]:
+    """Return the unit of each coordinate, and the factor from the sum of losses to f."""
+    problem = target.problem
+    at = problem.quadratic(start, target.scale, loss_named(target.loss))
+    m = problem.n_residuals + len(problem.priors)
+    reach = np.sqrt(np.diagonal(at.hessian) / m)  # rms change of the residuals per unit
+    reach = np.where((reach > 0.0) & np.isfinite(reach), reach, 1.0)
+    logarithmic = np.array([p.transform == "log" for p in problem.parameters])
+    whole = np.max(reach * np.where(logarithmic, 1.0, np.abs(start)))
+    residual = max(float(np.sqrt(2.0 * at.cost / m)), _LEAST_RESIDUAL * float(whole))
+    return residual / reach, 0.5 / (m * residual**2)
+
+
+def _run(
+    nlp: RowwiseProblem,
+    problem: Problem,
+    start: FloatArray,
+    unit: FloatArray,
+    relations: Relations,
+) -> tuple[dict[str, ca.DM], dict[str, Any]]:
+    import casadi as ca
+
+    low, high = ((bound - start) / unit for bound in problem.bounds())
+    own = np.full(nlp.n_variables - start.size, np.inf)
+    balanced = np.zeros(nlp.n_balances)
+    least = np.where(relations.equal, 0.0, -np.inf)
+    bounded = not all(relations.equal) or bool(np.isfinite([low, high]).any())
+    solver = ca.nlpsol(
+        "ipopt",
+        "ipopt",
+        nlp.values(),
+        {
+            "grad_f": nlp.gradient(),
+            "jac_g": nlp.jacobian(),
+            "hess_lag": nlp.hessian(),
+            "print_time": False,
+            "show_eval_warnings": False,
+            "ipopt.print_level": 0,
+            "ipopt.sb": "yes",
+            "ipopt.tol": _TOLERANCE,
+            "ipopt.max_iter": _ITERATIONS,
+            "ipopt.nlp_scaling_method": "none",
+            "ipopt.bound_relax_factor": 0.0,
+            "ipopt.mu_init": 1e-3 if bounded else _TOLERANCE,
+        },
+    )
+    solution = solver(
+        x0=0.0,
+        lbx=np.concatenate((low, -own)),
+        ubx=np.concatenate((high, own)),
+        lbg=np.concatenate((balanced, least)),
+        ubg=0.0,
+    )
+    return solution, solver.stats()
+
+
+def _stretch(target: Target, theta: FloatArray, freedom_lost: int) -> float:
+    """Return the factor by which the noise's scale has to change."""
+    problem, loss = target.problem, loss_named(target.loss)
+    y, _ = problem.whitened(theta, derivatives=False, tails=loss is None)
+    z = (y.real**2 + y.imag**2) / target.scale**2
+    dof = problem.n_residuals + len(problem.priors) - theta.size + freedom_lost
+    if dof <= 0:
+        return 1.0
+    return float(np.sqrt(z.sum() / dof if loss is None else loss.rescaled(z, dof)))
+
+
+def _counts(problem: Problem) -> FloatArray:
+    """Return what each row's information counts, as in `Problem.information`."""
+    dof = problem.data.dof
+    if dof is None:
+        return np.ones(problem.data.n)
+    finite = np.where(np.isinf(dof), 1.0, dof)
+    share = (finite + 1.0) * (finite - 1.0) / (finite * (finite + 3.0))
+    return np.where(np.isinf(dof), 1.0, share)
+
+
+def _finite_start(problem: Problem) -> FloatArray:
+    low, high = problem.bounds()
+    return np.asarray(np.clip(starts(problem)[0], low, high))
+
+
+def _drive_error(
+    problem: Problem, loss: str, std: ArrayLike | None, covariance: ArrayLike | None
+) -> AmplitudeError | None:
+    """Return the error of ln u_0 in force-controlled rows, checked."""
+    if std is None:
+        if covariance is not None:
+            raise ValidationError("drive_covariance is given without drive_std")
+        return None
+    data = problem.data
+    forced = data.controlled == "force"
+    if data.drive is None or not forced.any():
+        raise ValidationError(
+            "drive_std is given, but no row is force-controlled; an error of the displacement "
+            "amplitude belongs into the data, as amplitude_std"
+        )
+    if problem.noise != "measured" or loss != "linear":
+        raise ValidationError(
+            f"drive_std is given with {problem.noise} noise and {loss} loss; how much it weighs "
+            "beside the response's error is known only with noise='measured', loss='linear'"
+        )
+    spread = np.broadcast_to(non_negative_array(std, "drive_std"), data.drive.shape)
+    together = np.zeros((data.n, 2))
+    if covariance is not None:
+        together = np.broadcast_to(finite_array(covariance, "drive_covariance"), (data.n, 2))
+    per_drive = np.where(forced, 1.0 / data.drive, 0.0)
+    cross = together @ np.array([1.0, 1.0j]) * per_drive
+    return AmplitudeError((spread * per_drive) ** 2, cross)
+
+
+def _ended(target: Target, found: _Found, relations: Relations, evaluations: int) -> Optimum:
+    """Return the optimum with status, sentence and covariance."""
+    problem, loss = target.problem, loss_named(target.loss)
+    if found.return_status == "Infeasible_Problem_Detected":
+        raise FitError(
+            f"no parameters satisfy the constraints {'; '.join(relations.texts)} within the "
+            "bounds; IPOPT found the least violation elsewhere: relax one of them"
+        )
+    at = problem.quadratic(found.theta, target.scale, loss)
+    words = _failure(found)
+    elsewhere = abs(float(at.cost) - found.cost) > _SAME_COST * found.cost_unit
+    if not words and elsewhere and found.information is None:
+        words = "it ended at another of the plant's several amplitudes than the one measured"
+    hessian = at.hessian if found.information is None else found.information
+    end = End(found.theta, found.cost, hessian, not words)
+    result = replace(optimum(problem, end, target.scale, loss, evaluations), method="ipopt")
+    if words:
+        return replace(result, message=f"{result.message} IPOPT says: {words}.")
+    if not relations.texts and found.information is None:
+        return result
+    return _constrained(result, target, found, relations)
+
+
+def _failure(found: _Found) -> str:
+    """Return in words why IPOPT has no optimum, nothing where it has."""
+    if found.return_status in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
+        return ""
+    return _WORDS.get(found.return_status, found.return_status.replace("_", " ").lower())
+
+
+def _constrained(result: Optimum, target: Target, found: _Found, relations: Relations) -> Optimum:
+    """Return `result` as found, not reordered, with the covariance on the constraints."""
+    problem, loss = target.problem, loss_named(target.loss)
+    dof = result.dof + relations.freedom_lost
+    scale = target.scale
+    if not problem.scale_known and loss is None and not problem.priors:
+        scale = float(np.sqrt(2.0 * found.cost / dof))
+    covariance, undetermined = _on_constraints(
+        _information(target, found, dof), found.slopes[np.array(relations.equal, dtype=np.bool_)]
+    )
+    active = [text for text, hit in zip(relations.texts, found.active, strict=True) if hit]
+    status, message = result.status, result.message
+    if undetermined.any():
+        names = [n for n, lost in zip(problem.names, undetermined, strict=True) if lost]
+        status = Status.SINGULAR
+        message = f"{status.value} Involved: {', '.join(names)}."
+    elif active:
+        status = Status.AT_BOUND
+        message = (
+            f"Converged on the constraint {'; '.join(active)}: the sum of squares falls beyond "
+            "it, so the interval is one-sided. Widen it, or hold it with equality."
+        )
+    elif status is Status.SINGULAR:
+        status = Status.CONVERGED
+        message = status.value
+    return replace(
+        result,
+        theta=found.theta,
+        values=problem.to_values(found.theta),
+        covariance=covariance * (scale / target.scale) ** 2,
+        scale=scale,
+        dof=dof,
+        status=status,
+        message=message,
+    )
+
+
+def _information(target: Target, found: _Found, dof: int) -> FloatArray:
+    """Return the information of theta, constraints aside."""
+    problem, loss = target.problem, loss_named(target.loss)
+    r, J = problem.residuals_and_jacobian(found.theta, target.scale, tails=False)
+    m = problem.n_residuals
+    if found.information is not None:
+        return np.asarray(found.information + J[m:].T @ J[m:])
+    if loss is None:
+        return problem.information(found.theta, target.scale)
+    kappa = loss.inflation(r[:m:2] ** 2 + r[1:m:2] ** 2, dof)
+    return np.asarray(J[:m].T @ J[:m] / kappa + J[m:].T @ J[m:])
+
+
+def _on_constraints(
+    information: FloatArray, slopes: FloatArray
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return the covariance where slopes @ dtheta = 0, and which parameters are undetermined."""
+    if not len(slopes):
+        return inverse(information)
+    size = np.sqrt(np.diagonal(information))
+    size = np.where(size > 0.0, size, 1.0)
+    along = null_space(slopes / size) / size[:, None]
+    inner, lost = inverse(along.T @ information @ along)
+    undetermined = np.abs(along) @ lost.astype(np.float64) > 0.0
+    covariance = along @ np.where(np.isinf(inner), 0.0, inner) @ along.T
+    covariance[undetermined, :] = covariance[:, undetermined] = 0.0
+    covariance[undetermined, undetermined] = np.inf
+    return covariance, undetermined

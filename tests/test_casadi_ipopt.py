@@ -1,0 +1,380 @@
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import casadi as ca
+import control
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring, response
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.data.quantities import converted
+from dahl_ident.elements import Element
+from dahl_ident.errors import FitError, ModelError, ValidationError
+from dahl_ident.fitting import least_squares
+from dahl_ident.fitting.ipopt import solve_ipopt
+from dahl_ident.fitting.optimum import Optimum
+from dahl_ident.fitting.status import Status
+from dahl_ident.problem import Problem
+from dahl_ident.sensors import Sensors
+
+Symbols = Mapping[str, ca.SX]
+
+AMPLITUDE = np.geomspace(1e-5, 1e-1, 24)
+FRICTION = Dahl(f_max=0.1, sigma=30.0)
+PLANT = FRICTION + Mass(0.3) + Damper(0.24) + Spring(0.3)
+UNKNOWN_PLANT = Dahl() + Mass() + Damper() + Spring()
+
+
+def noise(n: int, size: float = 0.02, seed: int = 1) -> ComplexArray:
+    rng = np.random.default_rng(seed)
+    return np.asarray(size * (rng.standard_normal(n) + 1j * rng.standard_normal(n)))
+
+
+def friction_data(
+    truth: Element = FRICTION, size: float = 0.02, **columns: Any
+) -> FrequencyResponse:
+    N = truth.dynamic_stiffness(AMPLITUDE, 2.0 * np.pi)
+    measured = N * np.exp(noise(AMPLITUDE.size, size))
+    return FrequencyResponse(np.ones(AMPLITUDE.size), measured, AMPLITUDE, **columns)
+
+
+def covariance_of(truth: Element = FRICTION, size: float = 0.02) -> FloatArray:
+    N = truth.dynamic_stiffness(AMPLITUDE, 2.0 * np.pi)
+    return np.abs(N)[:, None, None] ** 2 * size**2 * np.eye(2)
+
+
+def plant_data(
+    levels: int = 5, frequencies: int = 12, quantity: Any = "receptance", size: float = 0.02
+) -> FrequencyResponse:
+    drive = np.repeat(np.geomspace(0.02, 5.0, levels), frequencies)
+    frequency = np.tile(np.geomspace(0.03, 3.0, frequencies), levels)
+    receptance = response(PLANT, frequency, drive).receptance
+    R, _ = converted(receptance, 2.0 * np.pi * frequency, "receptance", quantity)
+    return FrequencyResponse(
+        frequency,
+        R * np.exp(noise(drive.size, size)),
+        drive=drive,
+        controlled="force",
+        quantity=quantity,
+    )
+
+
+def assert_same(found: Optimum, expected: Optimum) -> None:
+    """The same optimum to 1e-7 of each value or, near zero, of its error; the same covariance."""
+    assert found.status is expected.status
+    assert found.method == "ipopt"
+    spread = np.sqrt(np.diagonal(expected.covariance))
+    size = np.where(expected.problem.value_slopes(expected.theta) == 1.0, np.abs(expected.theta), 1)
+    assert np.all(np.abs(found.theta - expected.theta) <= 1e-7 * np.maximum(size, spread))
+    assert found.cost == pytest.approx(expected.cost, rel=1e-9)
+    assert found.scale == pytest.approx(expected.scale, rel=1e-9)
+    assert np.all(np.abs(found.covariance - expected.covariance) <= 1e-6 * np.outer(spread, spread))
+
+
+CASES: dict[str, Callable[[], Problem]] = {
+    "relative": lambda: Problem(friction_data(), Dahl()),
+    "absolute": lambda: Problem(friction_data(), Dahl(), noise="absolute"),
+    "measured": lambda: Problem(friction_data(covariance=covariance_of()), Dahl()),
+    "few degrees of freedom": lambda: Problem(
+        friction_data(covariance=covariance_of(), dof=5.0), Dahl()
+    ),
+    "error of the amplitude": lambda: Problem(
+        friction_data(
+            covariance=covariance_of(),
+            dof=9.0,
+            amplitude_std=0.03 * AMPLITUDE,
+            amplitude_covariance=-2e-4
+            * np.outer(AMPLITUDE, [20.0, 10.0])
+            / (1.0 + np.outer(AMPLITUDE, [300.0, 300.0])),
+        ),
+        Dahl(),
+    ),
+    "alpha free": lambda: Problem(friction_data(), Dahl(alpha=None)),
+    "alpha fixed": lambda: Problem(friction_data(Dahl(0.1, 30.0, 2.0)), Dahl(alpha=2.0)),
+    "two elements": lambda: Problem(
+        friction_data(Dahl(0.1, 30.0) + Dahl(0.01, 300.0, name="fine")),
+        Dahl(name="coarse") + Dahl(name="fine"),
+    ),
+    "sensors": lambda: Problem(
+        friction_data(),
+        Dahl(),
+        sensors=Sensors(
+            force_gain=stats.norm(1.01, 0.01), displacement_gain=stats.norm(0.99, 0.02), delay=None
+        ),
+    ),
+    "known linear system": lambda: Problem(
+        friction_data(FRICTION + Spring(2.0)),
+        Dahl() + LinearSystem(control.tf([1.0], [2.0]), quantity="receptance"),
+    ),
+    "plant": lambda: Problem(plant_data(), UNKNOWN_PLANT),
+    "plant, mass known": lambda: Problem(
+        plant_data(quantity="accelerance"),
+        Dahl() + Mass(0.3) + Damper() + Spring(),
+        sensors=Sensors(delay=None),
+    ),
+    "plant, any exponent": lambda: Problem(
+        plant_data(levels=4, frequencies=6), Dahl(alpha=None) + Mass() + Damper() + Spring()
+    ),
+    "plant in other units": lambda: Problem(
+        FrequencyResponse(
+            plant_data().frequency_hz * 1e3,
+            plant_data().response * 1e-9,
+            drive=np.asarray(plant_data().drive) * 1e6,
+            controlled="force",
+            quantity="receptance",
+        ),
+        UNKNOWN_PLANT,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_same_optimum_as_least_squares(case: str) -> None:
+    problem = CASES[case]()
+    assert_same(solve_ipopt(problem), least_squares.solve(problem))
+
+
+@pytest.mark.parametrize(
+    "quantity",
+    ["mobility", "accelerance", "dynamic_stiffness", "mechanical_impedance", "apparent_mass"],
+)
+def test_all_quantities(quantity: str) -> None:
+    problem = Problem(plant_data(4, 6, quantity), UNKNOWN_PLANT)
+    assert_same(solve_ipopt(problem), least_squares.solve(problem))
+
+
+@pytest.mark.parametrize("loss", ["huber", "soft_l1", "student_t"])
+def test_robust_losses(loss: str) -> None:
+    data = friction_data(covariance=covariance_of())
+    spoiled = data.response * np.where(np.arange(data.n) == 7, 1.3, 1.0)
+    problem = Problem(
+        FrequencyResponse(data.frequency_hz, spoiled, data.amplitude, covariance=data.covariance),
+        Dahl(),
+    )
+    assert_same(solve_ipopt(problem, loss=loss), least_squares.solve(problem, loss=loss))
+
+
+def test_harmonics_and_controlled_sides_together() -> None:
+    amplitude = np.tile(np.geomspace(1e-3, 1e-1, 6), 3)
+    harmonic = np.repeat([1, 3, 5], 6)
+    Z = np.array(
+        [
+            PLANT.dynamic_stiffness(a, 2.0 * np.pi, harmonic=int(k))
+            for a, k in zip(amplitude, harmonic, strict=True)
+        ]
+    )
+    stiff = Z + np.tile(np.abs(Z[:6]), 3) * noise(18, seed=3)
+    driven = plant_data(3, 6, "dynamic_stiffness")
+    table = FrequencyResponse(
+        np.concatenate((np.ones(18), driven.frequency_hz)),
+        np.concatenate((stiff, driven.response)),
+        np.concatenate((amplitude, np.asarray(driven.drive) / np.abs(driven.response))),
+        np.concatenate((amplitude * np.abs(Z), np.asarray(driven.drive))),
+        controlled=np.repeat(["displacement", "force"], 18),
+        harmonic=np.concatenate((harmonic, np.ones(18, dtype=int))),
+    )
+    problem = Problem(table, UNKNOWN_PLANT)
+    assert_same(solve_ipopt(problem), least_squares.solve(problem))
+
+
+def test_data_without_noise() -> None:
+    problem = Problem(friction_data(size=0.0), Dahl())
+    assert solve_ipopt(problem).values == pytest.approx([0.1, 30.0], rel=1e-12)
+
+
+def test_bound() -> None:
+    model = Dahl()
+    f_max = model.parameters[0]
+    bounded = model + Spring(1e-3)
+    bounded = bounded.with_parameters({"f_max": type(f_max)("f_max", "N", "", lower=0.12)})
+    problem = Problem(friction_data(), bounded)
+    found = solve_ipopt(problem)
+    assert found.status is Status.AT_BOUND
+    assert found.values == pytest.approx(least_squares.solve(problem).values, rel=1e-6)
+
+
+def test_equality_is_the_estimate_of_the_ratio_fixed() -> None:
+    problem = Problem(friction_data(), Dahl())
+    found = solve_ipopt(problem, constraints=lambda p: [p["sigma"] == 250 * p["f_max"]])
+
+    def cost(ln_f_max: float) -> float:
+        theta = np.array([ln_f_max, ln_f_max + np.log(250.0)])
+        return float(np.sum(problem.residuals(theta) ** 2))
+
+    expected = optimize.minimize_scalar(cost, bracket=(-2.5, -2.0), tol=1e-12)
+    assert found.success
+    assert found.theta[0] == pytest.approx(expected.x, abs=1e-7)
+    assert found.dof == 2 * AMPLITUDE.size - 1
+    assert found.scale == pytest.approx(np.sqrt(expected.fun / found.dof), rel=1e-9)
+    along = problem.jacobian(found.theta) @ np.ones(2)
+    variance = found.scale**2 / (along @ along)
+    assert found.covariance == pytest.approx(np.full((2, 2), variance), rel=1e-6)
+
+
+def test_equality_can_make_an_undetermined_parameter_known() -> None:
+    problem = Problem(friction_data(), Dahl() + Spring(name="own") + Spring(name="other"))
+    alone = solve_ipopt(problem)
+    assert alone.status is Status.SINGULAR
+    tied = solve_ipopt(
+        problem, constraints=lambda p: [p["own_stiffness"] == 3 * p["other_stiffness"]]
+    )
+    assert tied.status is Status.CONVERGED
+    assert np.isfinite(tied.covariance).all()
+    single = least_squares.solve(Problem(friction_data(), Dahl() + Spring()))
+    assert tied.values[2] + tied.values[3] == pytest.approx(single.values[2], abs=1e-6)
+    assert tied.values[2] == pytest.approx(3.0 * tied.values[3], rel=1e-9)
+
+
+def test_inequality_binds_only_where_it_has_to() -> None:
+    problem = Problem(friction_data(), Dahl())
+    free = least_squares.solve(problem)
+    loose = solve_ipopt(problem, constraints=lambda p: [p["sigma"] >= 250 * p["f_max"]])
+    assert loose.status is Status.CONVERGED
+    assert loose.values == pytest.approx(free.values, rel=1e-7)
+    tight = solve_ipopt(problem, constraints=lambda p: [p["sigma"] <= 250 * p["f_max"]])
+    equal = solve_ipopt(problem, constraints=lambda p: [p["sigma"] == 250 * p["f_max"]])
+    assert tight.status is Status.AT_BOUND
+    assert "Converged on the constraint sigma<=(250*f_max)" in tight.message
+    assert tight.values == pytest.approx(equal.values, rel=1e-6)
+
+
+def test_constraint_holds_a_plant_together() -> None:
+    problem = Problem(plant_data(4, 6), UNKNOWN_PLANT)
+
+    def ratio(p: Symbols) -> list[ca.SX]:
+        return [p["damping"] ** 2 == 0.36 * p["mass"] * p["stiffness"]]
+
+    found = solve_ipopt(problem, constraints=ratio)
+    _, _, mass, damping, stiffness = found.values
+    assert found.success
+    assert damping**2 == pytest.approx(0.36 * mass * stiffness, rel=1e-8)
+
+    def tied(x: FloatArray) -> FloatArray:
+        m, k = np.exp(x[2:])
+        return problem.residuals(np.array([x[0], x[1], m, 0.6 * np.sqrt(m * k), k]))
+
+    begin = np.log(found.values[[0, 1, 2, 4]]) + 0.05
+    expected = optimize.least_squares(tied, begin, xtol=1e-14, ftol=1e-14)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-10)
+
+
+def test_constraint_makes_an_optimum_at_infinity_finite() -> None:
+    small = np.geomspace(1e-7, 1e-6, 12)
+    N = FRICTION.describing_function(small) * (1.0 + noise(12, 0.02, seed=5))
+    problem = Problem(FrequencyResponse(np.ones(12), N, small), Dahl())
+    assert solve_ipopt(problem).status is least_squares.solve(problem).status
+    found = solve_ipopt(problem, constraints=lambda p: [p["f_max"] <= 1.0])
+    assert found.values[0] <= 1.0 + 1e-9
+    assert np.isfinite(found.values).all()
+
+
+def test_noise_of_the_drive() -> None:
+    """Against the joint least squares over parameters and true drives."""
+    n, s, own = 24, 0.03, 0.02
+    exact = plant_data(4, 6, size=0.0)
+    assert exact.drive is not None
+    force_error = noise(n, s, seed=8)
+    drive = exact.drive * np.exp(force_error.real)
+    R = exact.response * np.exp(noise(n, own, seed=9) - force_error)
+    C = np.abs(R)[:, None, None] ** 2 * (own**2 + s**2) * np.eye(2)
+    cross = -(s**2) * (R * drive)
+    shared = np.stack([cross.real, cross.imag], axis=1)
+
+    def table(true_drive: FloatArray) -> FrequencyResponse:
+        return FrequencyResponse(
+            exact.frequency_hz, R, drive=true_drive, controlled="force", quantity="receptance",
+            covariance=C,
+        )  # fmt: skip
+
+    problem = Problem(table(drive), UNKNOWN_PLANT)
+    found = solve_ipopt(problem, drive_std=s * drive, drive_covariance=shared)
+    joint = np.empty((n, 3, 3))
+    joint[:, 0, 0], joint[:, 1:, 1:] = s**2, C
+    joint[:, 0, 1:] = joint[:, 1:, 0] = shared / drive[:, None]
+    whiten = np.linalg.inv(np.linalg.cholesky(joint))
+
+    def residuals(x: FloatArray) -> FloatArray:
+        r = R - Problem(table(drive * np.exp(-x[5:])), UNKNOWN_PLANT).predict(x[:5])
+        together = np.stack([x[5:], r.real, r.imag], axis=1)
+        return np.asarray(np.einsum("nij,nj->ni", whiten, together)).ravel()
+
+    expected = optimize.least_squares(
+        residuals, np.concatenate((found.theta + 0.01, np.zeros(n))), x_scale="jac",
+        jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15,
+    )  # fmt: skip
+    assert found.success
+    assert found.cost == pytest.approx(expected.cost, rel=1e-9)
+    spread = np.sqrt(np.diagonal(found.covariance))
+    assert np.all(np.abs(found.theta - expected.x[:5]) < 1e-5 * spread)
+    jacobian = np.asarray(expected.jac)
+    covariance = np.linalg.inv(jacobian.T @ jacobian)[:5, :5]
+    assert np.all(np.abs(found.covariance - covariance) < 1e-5 * np.outer(spread, spread))
+    exact_drive = solve_ipopt(problem)
+    assert exact_drive.cost > 1.5 * found.cost
+
+
+@pytest.mark.parametrize(
+    ("constraints", "error", "message"),
+    [
+        (lambda p: [p["sgma"] <= 1], ModelError, "names 'sgma'; the parameters are f_max, sigma"),
+        (lambda p: [p["sigma"] / 2], ValidationError, r"constraints\[0\] is .*expected a compar"),
+        (lambda p: [p["alpha"] <= 2], ValidationError, r"\(alpha<=2\), holds no free parameter"),
+        (lambda p: [1 <= p["sigma"] <= 2], ValidationError, "chains comparisons"),
+        (
+            lambda p: [p["sigma"] <= 1, p["sigma"] >= 2],
+            FitError,
+            "no parameters satisfy the constraints sigma<=1; 2<=sigma",
+        ),
+    ],
+)
+def test_bad_constraints(constraints: Any, error: type[Exception], message: str) -> None:
+    problem = Problem(friction_data(), Dahl())
+    with pytest.raises(error, match=message):
+        solve_ipopt(problem, constraints=constraints)
+
+
+def test_no_constraints_in_the_list() -> None:
+    problem = Problem(friction_data(), Dahl())
+    assert_same(solve_ipopt(problem, constraints=lambda _: []), least_squares.solve(problem))
+
+
+def test_free_linear_system_is_refused() -> None:
+    def mode(stiffness: float) -> Any:
+        return control.tf([1.0], [stiffness])
+
+    element = LinearSystem(mode, quantity="receptance", parameters={"stiffness": None})
+    problem = Problem(friction_data(FRICTION + Spring(2.0)), Dahl() + element)
+    with pytest.raises(FitError, match="with stiffness free; method='ipopt' takes Dahl, Mass"):
+        solve_ipopt(problem)
+
+
+def test_misplaced_errors_of_the_drive() -> None:
+    with pytest.raises(ValidationError, match="no row is force-controlled"):
+        solve_ipopt(Problem(friction_data(), Dahl()), drive_std=0.1)
+    with pytest.raises(ValidationError, match="relative noise and linear loss"):
+        solve_ipopt(Problem(plant_data(3, 4), UNKNOWN_PLANT), drive_std=0.1)
+    with pytest.raises(ValidationError, match="without drive_std"):
+        solve_ipopt(Problem(plant_data(3, 4), UNKNOWN_PLANT), drive_covariance=np.zeros((12, 2)))
+
+
+def test_response_without_error_of_its_own_is_refused() -> None:
+    data = friction_data(covariance=covariance_of())
+    assert data.covariance is not None
+    std = 0.01 * AMPLITUDE
+    cross = np.stack([np.sqrt(data.covariance[:, 0, 0]) * std, np.zeros(data.n)], axis=1)
+    tied = FrequencyResponse(
+        data.frequency_hz, data.response, AMPLITUDE, covariance=data.covariance,
+        amplitude_std=std, amplitude_covariance=cross,
+    )  # fmt: skip
+    with pytest.raises(FitError, match=r"row 0: .* leaves|accounts for all of the response's"):
+        solve_ipopt(Problem(tied, Dahl()))
+
+
+def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
+    solve_ipopt(Problem(friction_data(), Dahl()), constraints=lambda p: [p["sigma"] <= 29])
+    assert capfd.readouterr() == ("", "")
