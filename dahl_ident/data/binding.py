@@ -176,6 +176,11 @@ class Binding:
         }
         return {key: value for key, value in found.items() if value}
 
+    def note_peak(self, role: str, unit: Unit) -> None:
+        """Note the assumption that an unmarked amplitude rests on; our own files need none."""
+        if unit.marker is None and not self.source.metadata:
+            self.notes.append(f"{role} [{unit.text}] taken as zero to peak: the table does not say")
+
     def same_length(self, roles: Mapping[str, Channel]) -> None:
         """Refuse columns of different lengths."""
         sizes = {role: channel.values.size for role, channel in roles.items()}
@@ -216,13 +221,6 @@ def by_level(source: Source, columns: ColumnMap) -> dict[str | None, ColumnMap]:
         )
         for label in found[first]
     }
-
-
-def peak_note(role: str, unit: Unit) -> list[str]:
-    """Return the assumption that an unmarked amplitude rests on."""
-    if unit.marker is not None:
-        return []
-    return [f"{role} [{unit.text}] taken as zero to peak: the table does not say"]
 
 
 def per_frequency(values: FloatArray, frequency_hz: FloatArray, kind: str) -> FloatArray:

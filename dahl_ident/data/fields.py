@@ -83,7 +83,7 @@ def degrees_of_freedom(value: ArrayLike, name: str) -> FloatArray:
     bad = np.flatnonzero(~(array > 0.0))
     if bad.size:
         raise ValidationError(
-            f"{name}[{bad[0]}] is {array.flat[bad[0]]!r}; expected a number > 0 or infinity"
+            f"{name}[{bad[0]}] is {float(array.flat[bad[0]])!r}; expected a number > 0 or infinity"
         )
     return array
 
@@ -109,7 +109,7 @@ def harmonic_numbers(value: ArrayLike, name: str) -> NDArray[np.int64]:
     array = positive_array(value, name)
     broken = array != np.round(array)
     if broken.any():
-        raise ValidationError(f"{name}: expected whole numbers, got {array[broken][0]!r}")
+        raise ValidationError(f"{name}: expected whole numbers, got {float(array[broken][0])!r}")
     return array.astype(np.int64)
 
 

@@ -195,6 +195,8 @@ class FrequencyResponse:
             )
         if self.covariance is not None:
             check_covariance(self.covariance, self.amplitude_std, self.amplitude_covariance)
+            even = (self.covariance + self.covariance.swapaxes(1, 2)) / 2.0  # but for rounding
+            object.__setattr__(self, "covariance", frozen_copy(even))
 
     def __len__(self) -> int:
         return self.frequency_hz.size

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.data.binding import Binding, by_level, peak_note, per_frequency
+from dahl_ident.data.binding import Binding, by_level, per_frequency
 from dahl_ident.data.columns import RESPONSE_NAMES, ColumnMap
 from dahl_ident.data.fields import CONTROLLED
 from dahl_ident.data.frequency_response import FrequencyResponse
-from dahl_ident.data.source import Source
+from dahl_ident.data.source import LARGEST, SMALLEST, Source
 from dahl_ident.data.suspicion import doubt_drive, doubt_phase_unit, refuse_created_energy
 from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import (
@@ -145,7 +145,7 @@ class _Table:
         channel = self.bound.required("frequency")
         values = self.bound.numbers("frequency", channel)
         self.bound.source.require(
-            values > 0.0, channel, "a frequency > 0; frequency_hz=(low, high) leaves rows out"
+            values > SMALLEST, channel, "a frequency > 0; frequency_hz=(low, high) leaves rows out"
         )
         return self._hertz(values)
 
@@ -154,10 +154,10 @@ class _Table:
         if channel is None:
             return self._constant("amplitude", frequency_hz, MOTION_KINDS)
         values = self.bound.numbers("amplitude", channel)
-        self.bound.source.require(values > 0.0, channel, "an amplitude > 0")
+        self.bound.source.require(values > SMALLEST, channel, "an amplitude > 0")
         unit = self.bound.unit("amplitude", channel)
         kind, factor = self.bound.kind("amplitude", unit, MOTION_KINDS)
-        self.bound.notes += peak_note("amplitude", unit)
+        self.bound.note_peak("amplitude", unit)
         return per_frequency(values * factor * unit.to_peak, frequency_hz, kind)
 
     def _drive(self, frequency_hz: FloatArray) -> FloatArray | None:
@@ -165,10 +165,10 @@ class _Table:
         if channel is None:
             return self._constant("drive", frequency_hz, DRIVE_KINDS)
         values = self.bound.numbers("drive", channel)
-        self.bound.source.require(values > 0.0, channel, "a drive amplitude > 0")
+        self.bound.source.require(values > SMALLEST, channel, "a drive amplitude > 0")
         unit = self.bound.unit("drive", channel)
         kind, factor = self.bound.kind("drive", unit, DRIVE_KINDS)
-        self.bound.notes += peak_note("drive", unit)
+        self.bound.note_peak("drive", unit)
         return values * factor * unit.to_peak * self._force_per(kind)
 
     def _constant(
@@ -272,7 +272,7 @@ class _Table:
                 f"{self.bound.source.name}: column {channel.name!r} holds no complex numbers; "
                 "name the columns of real and imag, or of gain and phase"
             )
-        self.bound.source.require(np.isfinite(values), channel, "finite numbers")
+        self.bound.source.require(np.abs(values) < LARGEST, channel, "finite numbers")
         return quantity, factor * values.astype(np.complex128)
 
     def _phase(self) -> FloatArray:
@@ -356,7 +356,7 @@ class _Table:
 
     def _refuse_zero(self, response: ComplexArray, harmonic: FloatArray | None) -> None:
         fundamental = np.ones(response.shape, bool) if harmonic is None else harmonic == 1
-        zero = np.flatnonzero((response == 0.0) & fundamental)
+        zero = np.flatnonzero((np.abs(response) < SMALLEST) & fundamental)
         if zero.size:
             source = self.bound.source
             raise DataError(

@@ -17,6 +17,7 @@ from dahl_ident.errors import DataError, UnitError
 from dahl_ident.units import parse_unit
 
 _NUMBER = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\s*|[-+]?inf|nan", re.ASCII)
+LARGEST, SMALLEST = 1e100, 1e-100  # what can be measured, and squared without overflow
 _INDEX = re.compile(r"[\d:, ]+")
 
 
@@ -127,13 +128,13 @@ class Source:
         if values.dtype.kind not in "fiu":
             values = self._from_text(channel)
         values = np.atleast_1d(values).astype(np.float64)
-        bad = np.flatnonzero(np.isnan(values) if infinite else ~np.isfinite(values))
+        bad = np.flatnonzero(np.isnan(values) if infinite else ~(np.abs(values) < LARGEST))
         if bad.size:
             i = int(bad[0])
-            what = "empty or NaN" if np.isnan(values[i]) else f"{values[i]}"
+            what = "empty or NaN" if np.isnan(values[i]) else f"{values[i]:g}"
             raise DataError(
                 f"{self.where(channel, i)}: the cell is {what} ({bad.size} such cells); expected "
-                "a number"
+                "a measured number"
             )
         return values
 

@@ -91,9 +91,10 @@ def refuse_created_energy(file: str, data: FrequencyResponse, row_name: RowName)
     else:
         std = weight * np.sqrt(part.covariance[:, 1, 1]) / stiffness
     dof = np.full(part.n, np.inf) if part.dof is None else part.dof
-    total, total_std = loss.sum(), np.linalg.norm(std)
-    spread = np.sum((std / max(total_std, np.finfo(float).tiny)) ** 4 / dof)
-    total_dof = np.inf if spread == 0.0 else 1.0 / spread  # Welch and Satterthwaite
+    share = (std / std.max()) ** 2 if std.any() else std
+    total, total_std = loss.sum(), std.max() * np.sqrt(share.sum())
+    spread = np.sum(share**2 / dof)
+    total_dof = np.inf if spread == 0.0 else share.sum() ** 2 / spread  # Welch and Satterthwaite
     if total < -_limit(total_dof) * total_std:
         raise DataError(
             f"{file}: the table as a whole creates energy: the sum of A^2 Im(F/X) is negative, "

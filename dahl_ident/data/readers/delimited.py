@@ -127,21 +127,22 @@ def _layout(lines: list[tuple[int, str]], name: str) -> _Layout:
     """Find dialect and start of the numbers, and read the header above them."""
     passed = [not text.strip() or _COMMENT.match(text) is not None for _, text in lines]
     best: _Layout | None = None
-    score = 0
+    merit = (False, 0)  # a header that fits the columns tells more than another number
     for delimiter, mark in _DIALECTS:
         rows = [
             None if skip else _split(text, delimiter)
             for (_, text), skip in zip(lines, passed, strict=True)
         ]
         run = best_run(rows, mark)
-        if run is not None and run.score > score:
-            above = [row for row in rows[: run.start] if row is not None]
-            found = header(above, run.width)
-            if not found.names:
-                found = header(_commented(lines[: run.start], delimiter), run.width)
+        if run is None:
+            continue
+        found = header([row for row in rows[: run.start] if row is not None], run.width)
+        if not found.names:
+            found = header(_commented(lines[: run.start], delimiter), run.width)
+        if (bool(found.names), run.score) > merit:
+            merit = (bool(found.names), run.score)
             offset = lines[run.start][0]
             best = _Layout(delimiter, mark, run.start + 1, offset, run.width, found)
-            score = run.score
     if best is None:
         raise DataError(
             f"{name}: no table of numbers found; expected at least two columns of numbers under a "

@@ -136,7 +136,8 @@ def _plain(series: pd.Series[Any]) -> NDArray[Any]:
     values = series.to_numpy()
     if values.dtype.kind in "fiubcU":
         return values
-    try:
-        return series.to_numpy(dtype=np.float64, na_value=np.nan)  # nullable numbers
-    except (TypeError, ValueError):
-        return np.array([_text(cell) if cell is not None else "" for cell in values], dtype=np.str_)
+    from pandas.api.types import is_numeric_dtype
+
+    if is_numeric_dtype(series.dtype):
+        return series.to_numpy(dtype=np.float64, na_value=np.nan)  # pandas' nullable numbers
+    return np.array([_text(cell) for cell in values], dtype=np.str_)
