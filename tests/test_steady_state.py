@@ -354,6 +354,24 @@ def test_missing_amplitude_has_no_derivative() -> None:
     assert np.isnan(ours.by_parameter[0]).tolist() == [True, False]
 
 
+TWO = Dahl(1.0, 5.0, name="a") + Dahl(0.2, 9.0, name="b") + Mass(0.1) + Damper(0.05)
+
+
+@pytest.mark.parametrize("plant", [FIG_7, TWO], ids=["one", "two"])
+@pytest.mark.parametrize("index", range(6))
+@pytest.mark.parametrize("overflow", [np.inf, np.nan])
+def test_a_search_that_overflows_gets_no_amplitude(
+    plant: Model, index: int, overflow: float
+) -> None:
+    vectors = np.tile([float(v) for v in plant.known_values()], (3, 1))
+    vectors[1, index] = overflow
+    columns = list(vectors.T[:, :, None])
+    with np.errstate(invalid="ignore"):  # of the element itself: infinity times zero
+        A = solve(plant, columns, 2.0 * np.pi * np.array([0.5, 1.0, 2.0]), np.full(3, 0.1))
+    assert np.isnan(A[1]).all()
+    assert np.isfinite(A[[0, 2]]).all()
+
+
 # arguments and results
 
 

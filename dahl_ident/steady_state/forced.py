@@ -115,8 +115,8 @@ def response(
     Notes
     -----
     ``A |Z| = u_0`` holds within 1e-12 max(1, kappa/4), kappa = (abs(L) + abs(N))/abs(Z): near a
-    sharp resonance L and N nearly cancel. Of several amplitudes that differ by less than 1.8 %
-    some may be missed.
+    sharp resonance L and N nearly cancel. Two of several amplitudes may be missed where A abs(Z)
+    turns twice within 1.8 % of amplitude.
 
     Examples
     --------

@@ -17,25 +17,29 @@ from dahl_ident.elements.model import as_model
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 _Scalar = TypeVar("_Scalar", bound=np.generic)
-_Parts = list[tuple[Dahl, Sequence[FloatArray]]]
+_Values = list[Sequence[FloatArray]]
 
 EPS = float(np.finfo(np.float64).eps)
 _ROUNDING = 8.0 * EPS  # of k - m omega^2 and its like, relative to the terms' sizes
 _LARGEST = 1e300  # stands for an amplitude without bound
+_DAHL = Dahl()  # evaluated at any values; its alpha is fixed, so that dN/dalpha is left out
+_AT_REST = np.zeros(())
 
 
 @dataclass(frozen=True)
 class Friction:
-    """The elements that depend on the amplitude, with one or many vectors of their parameters."""
+    """The elements that depend on the amplitude, with one or many vectors of their parameters.
 
-    elements: tuple[Dahl, ...]
-    values: tuple[tuple[FloatArray, ...], ...]  # all of shape (), or all of shape (vectors,)
+    `values` has f_max, sigma and alpha of each element, all of shape () or all (vectors,).
+    """
+
+    values: tuple[tuple[FloatArray, ...], ...]
 
     def force(self, amplitude: FloatArray, vector: IntArray) -> ComplexArray:
         """Return A N, the force's fundamental; `vector` says whose parameters each row has."""
         force = np.zeros(amplitude.shape, dtype=np.complex128)
-        for element, values in zip(self.elements, self.values, strict=True):
-            force += element.stiffness(_rows(values, vector), amplitude, np.zeros(()))
+        for values in self.values:
+            force += _DAHL.stiffness(_rows(values, vector), amplitude, _AT_REST)
         force *= amplitude
         return force
 
@@ -45,8 +49,8 @@ class Friction:
         """Return A N and its derivative by ln A."""
         force = np.zeros(amplitude.shape, dtype=np.complex128)
         slope = np.zeros(amplitude.shape, dtype=np.complex128)
-        for element, values in zip(self.elements, self.values, strict=True):
-            Z = element.stiffness_gradient(_rows(values, vector), amplitude, np.zeros(()))
+        for values in self.values:
+            Z = _DAHL.stiffness_gradient(_rows(values, vector), amplitude, _AT_REST)
             force += amplitude * Z.value
             slope += amplitude * (Z.value + amplitude * Z.by_amplitude)
         return force, slope
@@ -128,45 +132,57 @@ def flatten(
     """Return the plant at every point of the broadcast arguments, and their shape."""
     shape = np.broadcast_shapes(np.shape(omega), np.shape(drive), *(np.shape(v) for v in values))
     linear, size = np.zeros((), dtype=np.complex128), np.zeros(())
-    friction: _Parts = []
+    friction: _Values = []
     first = 0
     for element in as_model(model).elements:
         own = values[first : first + len(element.parameters)]
         first += len(element.parameters)
         if isinstance(element, Dahl):
-            friction.append((element, own))
+            friction.append(own)
         else:
-            part = element.stiffness(own, np.zeros(()), omega)
+            part = element.stiffness(own, _AT_REST, omega)
             linear, size = linear + part, size + np.abs(part)
+    linear, friction = _without_overflow(linear, friction)
     force, stiffness, friction = _units(friction)
-    batch = np.broadcast_shapes(*(np.shape(v) for _, own in friction for v in own))
+    batch = np.broadcast_shapes(*(np.shape(v) for own in friction for v in own))
     vectors = np.arange(np.prod(batch, dtype=np.intp)).reshape(batch)
-    flat_values = tuple(
-        tuple(np.reshape(v, ()) if vectors.size == 1 else _flat(v, batch) for v in own)
-        for _, own in friction
-    )
     plant = Plant(
         _flat(linear / stiffness, shape),
         _flat(_ROUNDING * size / stiffness, shape),
         _flat(drive / force, shape),
         _flat(vectors, shape),
-        Friction(tuple(element for element, _ in friction), flat_values),
+        Friction(tuple(tuple(_flat_values(v, batch) for v in own) for own in friction)),
         _flat(force / stiffness, shape),
     )
     return plant, shape
 
 
-def _units(friction: _Parts) -> tuple[FloatArray, FloatArray, _Parts]:
+def _without_overflow(linear: ComplexArray, friction: _Values) -> tuple[ComplexArray, _Values]:
+    """Put values at which a search overflowed out of the way: no L, and no amplitude, there."""
+    finite = [np.isfinite(v) for own in friction for v in own]
+    if all(np.all(f) for f in finite):
+        return linear, friction
+    sound = np.all(np.broadcast_arrays(*finite), axis=0)
+    return np.where(sound, linear, np.nan), [
+        [np.where(sound, v, 1.0) for v in own] for own in friction
+    ]
+
+
+def _units(friction: _Values) -> tuple[FloatArray, FloatArray, _Values]:
     """Return units of force and stiffness, and the friction in them.
 
     In units of f_max and sigma one element of one exponent is the same for every vector.
     """
     one = np.ones(())
     if len(friction) == 1:
-        [(element, (f_max, sigma, alpha))] = friction
+        f_max, sigma, alpha = friction[0]
         if np.size(alpha) and np.all(alpha == np.ravel(alpha)[0]):
-            return f_max, sigma, [(element, (one, one, np.ravel(alpha)[0]))]
+            return f_max, sigma, [(one, one, np.ravel(alpha)[0])]
     return one, one, friction
+
+
+def _flat_values(values: FloatArray, batch: tuple[int, ...]) -> FloatArray:
+    return _flat(values, batch) if np.prod(batch) > 1 else np.reshape(values, ())
 
 
 def _flat(array: NDArray[_Scalar], shape: tuple[int, ...]) -> NDArray[_Scalar]:

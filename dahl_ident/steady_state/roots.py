@@ -33,11 +33,12 @@ def all_roots(plant: Plant) -> FloatArray:
     They rise along a row; a row with fewer than the most is filled up with NaN.
     """
     resonant = np.abs(plant.linear) <= plant.rounding
-    if not plant.friction.elements:
+    if not plant.friction.values:
         with np.errstate(divide="ignore", over="ignore"):
             amplitude = plant.drive / np.abs(plant.linear)
         return np.where(resonant, np.nan, amplitude)[:, None]
-    passive = plant.linear.imag >= -plant.rounding
+    known = np.isfinite(plant.linear)
+    passive = known & (plant.linear.imag >= -plant.rounding)
     single = passive & ~(resonant & (plant.drive >= plant.largest_friction()))
     roots = np.full(plant.drive.shape, np.nan)
     if single.any():
@@ -47,7 +48,7 @@ def all_roots(plant: Plant) -> FloatArray:
             roots[points], settled[points] = _interpolated_roots(plant.at(points), table)
         rest = np.flatnonzero(~settled)
         roots[rest] = _bracketed_roots(plant.at(rest), table, roots[rest])
-    active = np.flatnonzero(~passive)
+    active = np.flatnonzero(known & ~passive)
     return _insert(roots, *_scan(plant, active)) if active.size else roots[:, None]
 
 
