@@ -134,13 +134,15 @@ NEAR_ONE = (1 - 1e-4, 1 - 1e-8, 1 - 1e-12, 1.0, 1 + 1e-12, 1 + 1e-8, 1 + 1e-4)
 EXPONENTS = (0.25, 0.3, 0.5, 0.8, *NEAR_ONE, 1.2, 1.5, 2.0, 3.0, 4.0)
 
 
+def onset(alpha: float) -> float:
+    """Return the amplitude from which friction slips fully in every half cycle."""
+    return 2.0**-alpha / (1.0 - alpha) if alpha < 1.0 else np.inf
+
+
 def amplitudes(alpha: float, rng: np.random.Generator) -> FloatArray:
     """Return beta at one random place in each decade, and about the onset of full slip."""
     beta = 10.0 ** (np.arange(-6, 6) + rng.random(12))
-    if alpha >= 1.0:
-        return beta
-    onset = 2.0**-alpha / (1.0 - alpha)
-    near = onset * (1.0 + np.array([-1e-2, -1e-5, -1e-9, 0.0, 1e-9, 1e-5, 1e-2]))
+    near = onset(alpha) * (1.0 + np.array([-1e-2, -1e-5, -1e-9, 1e-9, 1e-5, 1e-2]))
     return np.concatenate([beta, near[near < 1e6]])
 
 
@@ -151,8 +153,16 @@ def main() -> None:
     print("|---|---|---|---|---|---|")
     for alpha in EXPONENTS:
         worst = np.max([errors(b, alpha, HARMONICS) for b in amplitudes(alpha, rng)], axis=0)
-        for k, row in zip(HARMONICS, worst, strict=True):
-            print(f"| {alpha!r} | {k} |", " | ".join(f"{e:.1e}" for e in row), "|", flush=True)
+        print_rows(alpha, HARMONICS, worst)
+    print("\nAt the onset of full slip itself, to the last place of beta\n")
+    for alpha in (a for a in EXPONENTS if a < 0.9):
+        print_rows(alpha, HARMONICS[:1], errors(onset(alpha), alpha, HARMONICS[:1]))
+
+
+def print_rows(alpha: float, harmonics: Sequence[int], found: FloatArray) -> None:
+    """Print the errors of each harmonic as a row of a Markdown table."""
+    for k, row in zip(harmonics, found, strict=True):
+        print(f"| {alpha!r} | {k} |", " | ".join(f"{e:.1e}" for e in row), "|", flush=True)
 
 
 if __name__ == "__main__":

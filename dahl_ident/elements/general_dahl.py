@@ -35,10 +35,10 @@ turning points: the midpoint rule for integrals over sin(k theta), Fejer's weigh
 cos(k theta). Both converge geometrically.
 
 **Accuracy**, for alpha from 0.25 to 4 and beta from 1e-6 to 1e6: N and the harmonics up to the
-15th to 1e-12, derivatives to 1e-10 (``python -m benchmarks.general_dahl_accuracy``). Where
-full slip sets in at alpha < 1 the derivatives turn as ``|beta - beta_slip|^(alpha/p)``; for alpha
-below 1/3, one unit in the last place of beta changes them by up to 1e-5, and no more can be had
-within 1e-12 of that point.
+15th to 1e-12, derivatives to 1e-10 (``python -m benchmarks.general_dahl_accuracy``). One place
+is excepted. Where full slip sets in, at ``beta_s = 2^-alpha / (1 - alpha)``, derivatives go as
+``|1 - beta/beta_s|^(alpha/p)``; for alpha below 1/3 this is so steep that one unit in the last
+place of beta changes them by up to 1e-5, and within 1e-12 of beta_s that is their error.
 """
 
 from __future__ import annotations
@@ -198,69 +198,87 @@ class DescribingFunctionTable:
         self.alpha = positive_number(alpha, "alpha")
         self.beta_min = positive_number(beta_min, "beta_min")
         self.beta_max = float(array_between(beta_max, "beta_max", self.beta_min, np.inf))
-        edges, value, slope = _fit_panels(self.alpha, np.log([self.beta_min, self.beta_max]))
+        panels = _fit_panels(self.alpha, *np.log([self.beta_min, self.beta_max]))
 
         from scipy.interpolate import PPoly  # here, because it would slow down every import
 
-        self._value, self._slope = PPoly(value, edges), PPoly(slope, edges)
+        self._value = PPoly(panels.value, panels.edges)
+        self._slope = PPoly(panels.slope, panels.edges)
 
     def __call__(self, beta: FloatArray) -> ComplexArray:
         """Return h = N/sigma at `beta`, an array within the range."""
-        return self._h(self._checked(beta))
+        beta = self._checked(beta)
+        return np.asarray(self._value(np.log(beta)) / (1.0 + beta))
 
     def gradient(self, beta: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Return h and ``beta dh/dbeta`` at `beta`, an array within the range."""
         beta = self._checked(beta)
-        return self._h(beta), np.asarray(self._slope(np.log(beta)) * beta / (1.0 + beta) ** 2)
-
-    def _h(self, beta: FloatArray) -> ComplexArray:
-        return np.asarray(self._value(np.log(beta)) / (1.0 + beta))
+        ln_beta, scale = np.log(beta), 1.0 / (1.0 + beta)
+        value, slope = self._value(ln_beta), self._slope(ln_beta)
+        return np.asarray(value * scale), np.asarray(slope * (beta * scale**2))
 
     def _checked(self, beta: FloatArray) -> FloatArray:
         return array_between(beta, "beta", self.beta_min, self.beta_max)
 
 
 _DEGREE = 12
-_TOLERANCE = 1e-10  # of a panel's last Chebyshev coefficients; values are of order one
+_TOLERANCE = 1e-10  # of a panel's last two Chebyshev coefficients; values are of order one
 _NARROWEST = 1e-8  # a panel in ln beta; only a singularity asks for less
 
 
-def _fit_panels(alpha: float, ends: FloatArray) -> tuple[FloatArray, ComplexArray, ComplexArray]:
-    """Return edges over ln beta and PPoly coefficients of h (1 + beta), h' (1 + beta)^2.
+class _Panels(NamedTuple):
+    """Edges over ln beta, and the coefficients that PPoly takes (powers falling, panels).
 
-    The factors make both of order one from the smallest to the largest amplitudes.
+    Of h (1 + beta) and of h' (1 + beta)^2, which are of order one at all amplitudes.
     """
-    unit = (1.0 - np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))) / 2.0
-    basis = [Chebyshev.basis(n, domain=[0.0, 1.0]) for n in range(_DEGREE + 1)]
-    to_chebyshev = np.linalg.inv([b(unit) for b in basis])
-    to_powers = np.zeros((_DEGREE + 1, _DEGREE + 1))
-    for n, b in enumerate(basis):
-        to_powers[n, : n + 1] = b.convert(kind=Polynomial).coef
 
-    cuts = np.linspace(ends[0], ends[1], 2 + int(ends[1] - ends[0]))
-    if alpha < 1.0:
-        onset = -alpha * np.log(2.0) - np.log1p(-alpha)
-        cuts = np.sort(np.append(cuts, onset if ends[0] < onset < ends[1] else []))
-    left, width = cuts[:-1], np.diff(cuts)
-    done = []
+    edges: FloatArray
+    value: ComplexArray
+    slope: ComplexArray
+
+
+def _fit_panels(alpha: float, low: float, high: float) -> _Panels:
+    """Halve panels over ln beta until each is a polynomial to the tolerance."""
+    nodes, to_chebyshev, to_powers = _panel_rule()
+    edges = _first_edges(alpha, low, high)
+    left, width = edges[:-1], np.diff(edges)
+    fitted = []
     while left.size:
-        beta = np.exp(left[:, None] + width[:, None] * unit)
+        beta = np.exp(left[:, None] + width[:, None] * nodes)
         h, minus_slope, _, _ = describing_function_gradient(beta, np.asarray(alpha))
-        fitted = (
-            np.stack([h * (1.0 + beta), -minus_slope * (1.0 + beta) ** 2 / beta]) @ to_chebyshev
-        )
-        good = (np.abs(fitted[..., -2:]).max(axis=(0, 2)) < _TOLERANCE) | (width < _NARROWEST)
-        done.append((left[good], width[good], fitted[:, good]))
+        scaled = np.stack([h * (1.0 + beta), -minus_slope * (1.0 + beta) ** 2 / beta], axis=1)
+        series = scaled @ to_chebyshev
+        good = np.abs(series[..., -2:]).max(axis=(1, 2)) < _TOLERANCE
+        good |= width < _NARROWEST
+        powers = series[good] @ to_powers / width[good, None, None] ** np.arange(_DEGREE + 1)
+        fitted.append((left[good], powers))
         left, width = left[~good], width[~good] / 2.0
         left, width = np.concatenate([left, left + width]), np.tile(width, 2)
 
-    left = np.concatenate([d[0] for d in done])
-    order = np.argsort(left)
-    width = np.concatenate([d[1] for d in done])[order]
-    fitted = np.concatenate([d[2] for d in done], axis=1)[:, order]
-    powers = fitted @ to_powers / width[:, None] ** np.arange(_DEGREE + 1)
-    value, slope = np.moveaxis(powers, 2, 1)[:, ::-1]  # PPoly wants the highest power first
-    return np.append(left[order], ends[1]), value, slope
+    starts, powers = (np.concatenate(parts) for parts in zip(*fitted, strict=True))
+    order = np.argsort(starts)
+    value, slope = powers[order].transpose(1, 2, 0)[:, ::-1]
+    return _Panels(np.append(starts[order], high), value, slope)
+
+
+def _first_edges(alpha: float, low: float, high: float) -> FloatArray:
+    """Return edges about 1 apart, one of them where full slip sets in."""
+    edges = np.linspace(low, high, 2 + int(high - low))
+    if alpha >= 1.0:
+        return edges
+    onset = -alpha * np.log(2.0) - np.log1p(-alpha)
+    return np.sort(np.append(edges, onset)) if low < onset < high else edges
+
+
+@lru_cache
+def _panel_rule() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return Chebyshev nodes on (0, 1), and matrices from values to series to powers."""
+    nodes = (1.0 - np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))) / 2.0
+    basis = [Chebyshev.basis(n, domain=[0.0, 1.0]) for n in range(_DEGREE + 1)]
+    to_powers = np.zeros((_DEGREE + 1, _DEGREE + 1))
+    for n, polynomial in enumerate(basis):
+        to_powers[n, : n + 1] = polynomial.convert(kind=Polynomial).coef
+    return nodes, np.linalg.inv([polynomial(nodes) for polynomial in basis]), to_powers
 
 
 class _Closure(NamedTuple):
@@ -295,30 +313,28 @@ def _length(p: FloatArray, path: FloatArray, slips: NDArray[np.bool_]) -> FloatA
     return np.where(full, np.inf, -np.log1p(-np.where(full, 0.0, p * path)) / p)
 
 
-class _Rule(NamedTuple):
+class Rule(NamedTuple):
     """Quadrature over l = L sin^2(phi/2): integrals are L/2 times a weighted sum."""
 
     rise: FloatArray  # sin^2(phi/2)
     fall: FloatArray  # cos^2(phi/2)
-    midpoint: FloatArray  # for integrands odd in phi, such as sin(theta); a column
-    fejer: FloatArray  # for integrands even in phi, such as cos(theta); a column
+    midpoint: FloatArray  # for integrands odd in phi, such as sin(theta)
+    fejer: FloatArray  # for integrands even in phi, such as cos(theta)
 
 
 @lru_cache
-def _rule(nodes: int) -> _Rule:
+def quadrature_rule(k: int) -> Rule:
+    """Return nodes and weights that resolve harmonic k; the number of nodes comes from trials."""
+    nodes = 48 + 8 * k
     phi = (np.arange(nodes) + 0.5) * np.pi / nodes
     order = np.arange(1, nodes // 2 + 1)
     series = np.cos(2.0 * np.outer(phi, order)) @ (1.0 / (4.0 * order**2 - 1.0))
-    return _Rule(
+    return Rule(
         rise=np.sin(phi / 2.0) ** 2,
         fall=np.cos(phi / 2.0) ** 2,
-        midpoint=(np.pi / nodes * np.sin(phi))[:, None],
-        fejer=(2.0 / nodes * (1.0 - 2.0 * series))[:, None],
+        midpoint=np.pi / nodes * np.sin(phi),
+        fejer=2.0 / nodes * (1.0 - 2.0 * series),
     )
-
-
-def _number_of_nodes(k: int) -> int:
-    return 48 + 8 * k
 
 
 class _Branch:
@@ -332,7 +348,7 @@ class _Branch:
         self.line = np.exp(alpha * (self.log_z0 - self.length))  # C
         self.line_force = self.line * beta if k == 1 else np.zeros(beta.shape)
 
-        self.rule = _rule(_number_of_nodes(k))
+        self.rule = quadrature_rule(k)
         reach = np.minimum(self.length, _DEEPEST)
         self.half = np.where(beta < _LEAST_BETA, 0.0, reach / 2.0)
         self.l = reach * self.rule.rise
@@ -350,20 +366,17 @@ class _Branch:
             theta = 2.0 * np.arctan2(np.sqrt(self.sin2), np.sqrt(cos2))
             self.sin_k, self.cos_k = np.sin(k * theta), np.cos(k * theta)
 
-    @property
-    def turn(self) -> FloatArray:
-        """W = 1 / (1 + exp(alpha L))."""
-        decay = np.exp(-self.alpha * self.length)
-        return np.asarray(decay / (1.0 + decay))
+        decay = np.exp(-alpha * self.length)
+        self.turn = decay / (1.0 + decay)  # w
 
     def coefficient(self) -> ComplexArray:
-        """Return c_k without its line."""
-        real = (self.sin_k * self.curved) @ self.rule.midpoint
-        imag = (self.cos_k * self.curved) @ self.rule.fejer
+        """Return c_k without C beta [k = 1]."""
+        real = (self.sin_k * self.curved) @ self.rule.midpoint[:, None]
+        imag = (self.cos_k * self.curved) @ self.rule.fejer[:, None]
         return np.asarray(2.0 / (np.pi * self.k) * self.half * (real + 1j * imag))
 
     def by_ln_beta(self) -> ComplexArray:
-        """Return beta dc_k/dbeta without the line's part that stays straight."""
+        """Return beta dc_k/dbeta without C beta [k = 1]; Int exp(-j k theta) dtheta = -2j/k."""
         tilt = self.line * self.beta * np.tanh(self.alpha * self.length / 2.0)
         moved = self._moved((self.turn - self.sin2) * self.curved)
         return np.asarray(moved + 4j / (np.pi * self.k) * tilt)
@@ -378,8 +391,8 @@ class _Branch:
     def _moved(self, shift: FloatArray) -> ComplexArray:
         """Return (2/pi) Int exp(-j k theta) 2 shift/sin(theta) dl."""
         shift = shift / self.sin
-        real = (self.cos_k * shift) @ self.rule.midpoint
-        imag = (self.sin_k * shift) @ self.rule.fejer
+        real = (self.cos_k * shift) @ self.rule.midpoint[:, None]
+        imag = (self.sin_k * shift) @ self.rule.fejer[:, None]
         return np.asarray(4.0 / np.pi * self.half * (real - 1j * imag))
 
 
@@ -400,7 +413,7 @@ def _stiffness_gradient(branch: _Branch) -> tuple[ComplexArray, ...]:
     curved, moved = branch.coefficient() / branch.beta, branch.by_ln_beta() / branch.beta
     return (
         branch.line + curved,
-        curved - moved,  # the line cancels
+        curved - moved,  # C cancels
         branch.line + moved,
         branch.by_alpha() / branch.beta,
     )
@@ -424,7 +437,7 @@ def _by_blocks(
     """Return the `quantities` of all loops, a block of loops at a time."""
     beta, alpha = np.broadcast_arrays(beta, alpha)
     b, a = beta.reshape(-1, 1), alpha.reshape(-1, 1)
-    rows = max(1, _NODES_PER_BLOCK // _number_of_nodes(k))
+    rows = max(1, _NODES_PER_BLOCK // quadrature_rule(k).rise.size)
     starts = range(0, max(1, b.size), rows)
     blocks = [quantities(_Branch(b[i : i + rows], a[i : i + rows], k)) for i in starts]
     return [np.concatenate(pieces).reshape(beta.shape) for pieces in zip(*blocks, strict=True)]

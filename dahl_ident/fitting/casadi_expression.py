@@ -161,7 +161,7 @@ def general_describing_function(beta: ca.SX, alpha: ca.SX | float, harmonic: int
     beyond = ca.if_else(beyond > 0.0, beyond, 0.0)
     z0 = 1.0 + ca.tanh(length / 2.0)
 
-    rule = general_dahl._rule(general_dahl._number_of_nodes(harmonic))
+    rule = general_dahl.quadrature_rule(harmonic)
     rise, fall, midpoint, fejer = (column.tolist() for column in rule)
     risen = [_path(length * node, p) / path for node in rise]
     real, imag = ca.SX(0.0), ca.SX(0.0)
