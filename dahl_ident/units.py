@@ -256,7 +256,9 @@ def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float,
     >>> parse_quantity("20 um pp", ("displacement",), "amplitude")
     (..., 'displacement', 'translation')
     """
-    found = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)\s*", text)
+    found = re.fullmatch(
+        r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\s\d.,].*?)\s*", text
+    )
     if not found:
         raise UnitError(f"{what} is {text!r}; expected a number and its unit, such as '0.2 N'")
     unit = parse_unit(found[2])

@@ -263,7 +263,7 @@ def _time(value: ArrayLike) -> FloatArray:
     if backwards.size:
         i = int(backwards[0])
         raise ValidationError(
-            f"time[{i + 1}] is {time[i + 1]!r} after time[{i}] = {time[i]!r} "
+            f"time[{i + 1}] is {float(time[i + 1])!r} after time[{i}] = {float(time[i])!r} "
             f"({backwards.size} such steps); expected strictly increasing time"
         )
     return frozen_copy(time)

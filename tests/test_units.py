@@ -1,0 +1,222 @@
+"""Units as laboratories write them, against factors worked out by hand or defined by law."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dahl_ident.errors import UnitError
+from dahl_ident.units import (
+    DRIVE_KINDS,
+    MOTION_KINDS,
+    QUANTITIES,
+    SI_UNITS,
+    Unit,
+    factor_to,
+    from_si,
+    kind_of,
+    parse_quantity,
+    parse_unit,
+    si_unit,
+)
+
+POUND_FORCE = 0.45359237 * 9.80665  # international avoirdupois pound, standard gravity
+
+
+@pytest.mark.parametrize(
+    ("text", "factor"),
+    [
+        ("m", 1.0),
+        ("um", 1e-6),
+        ("µm", 1e-6),
+        ("μm", 1e-6),
+        ("in", 0.0254),
+        ("in/s", 0.0254),
+        ("lbf", POUND_FORCE),
+        ("kip", 1000 * POUND_FORCE),
+        ("kgf", 9.80665),
+        ("m/s2", 1.0),
+        ("m/s^2", 1.0),
+        ("m/s**2", 1.0),
+        ("mm/s²", 1e-3),
+        ("m s⁻²", 1.0),
+        ("m s^-2", 1.0),
+        ("g_n", 9.80665),
+        ("Nm", 1.0),
+        ("N m", 1.0),
+        ("N·m", 1.0),
+        ("N-m", 1.0),
+        ("N.m", 1.0),
+        ("kN*m", 1e3),
+        ("lbf-in", POUND_FORCE * 0.0254),
+        ("in-lbf", POUND_FORCE * 0.0254),
+        ("N/mm", 1e3),
+        ("(mm/s)/kN", 1e-6),
+        ("deg", math.pi / 180),
+        ("°", math.pi / 180),
+        ("rpm", 2 * math.pi / 60),
+        ("mrad", 1e-3),
+        ("sec", 1.0),
+        ("ms", 1e-3),
+        ("HZ", 1.0),
+        ("kHz", 1e3),
+        ("mV", 1e-3),
+        ("1", 1.0),
+    ],
+)
+def test_factors(text: str, factor: float) -> None:
+    assert parse_unit(text).factor == pytest.approx(factor, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("text", "marker", "to_peak"),
+    [
+        ("um", None, 1.0),
+        ("um pk", "zero to peak", 1.0),
+        ("um peak", "zero to peak", 1.0),
+        ("um 0-p", "zero to peak", 1.0),
+        ("um zero-to-peak", "zero to peak", 1.0),
+        ("um rms", "rms", math.sqrt(2)),
+        ("Vrms", "rms", math.sqrt(2)),
+        ("m_RMS", "rms", math.sqrt(2)),
+        ("mm pp", "peak to peak", 0.5),
+        ("mVpp", "peak to peak", 0.5),
+        ("mm p-p", "peak to peak", 0.5),
+        ("mm pk-pk", "peak to peak", 0.5),
+        ("mm peak-to-peak", "peak to peak", 0.5),
+    ],
+)
+def test_amplitude_markers(text: str, marker: str | None, to_peak: float) -> None:
+    unit = parse_unit(text)
+    assert (unit.marker, unit.to_peak) == (marker, to_peak)
+
+
+@pytest.mark.parametrize("text", ["dB re 1 N/m", "dB re N/m", "dB N/m", "db re. 1 N/m"])
+def test_decibels_keep_their_reference(text: str) -> None:
+    unit = parse_unit(text)
+    assert unit.decibel
+    assert kind_of(unit, QUANTITIES, "gain")[0] == "dynamic_stiffness"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is not a unit"),
+        ("furlongs per fortnight!", "is not a unit"),
+        ("blorp", "not a known unit"),
+        ("3 m", "is not a unit"),
+        ("m^22", "is not a unit"),
+        ("9^9^9", "is not a unit"),
+        ("10**1000000000*m", "is not a unit"),
+        ("x" * 100, "is not a unit"),
+        ("m**m", "is not a unit"),
+        ("/", "not a known unit"),
+        ("__class__", "not a known unit"),
+        ("dB", "does not say what 0 dB is"),
+    ],
+)
+def test_what_is_no_unit(text: str, message: str) -> None:
+    with pytest.raises(UnitError, match=message):
+        parse_unit(text)
+
+
+@given(st.text(max_size=70))
+def test_any_text_is_a_unit_or_a_unit_error(text: str) -> None:
+    try:
+        unit = parse_unit(text)
+    except UnitError:
+        return
+    assert unit.factor > 0.0
+    assert np.isfinite(unit.factor)
+
+
+@given(
+    st.lists(
+        st.sampled_from(
+            ["m", "s", "N", "kg", "^2", "^-1", "/", "*", " ", "(", ")", "1", "9", "pp"]
+        ),
+        max_size=12,
+    )
+)
+def test_any_combination_of_symbols_ends(parts: list[str]) -> None:
+    with contextlib.suppress(UnitError):
+        assert isinstance(parse_unit("".join(parts)), Unit)
+
+
+@pytest.mark.parametrize("kind", SI_UNITS)
+def test_si_units_are_their_own_kind(kind: str) -> None:
+    for motion, text in zip(("translation", "rotation"), SI_UNITS[kind], strict=True):
+        found = kind_of(parse_unit(text), (kind,), "it")
+        assert found[0] == kind
+        assert found[2] == pytest.approx(1.0, rel=1e-15)
+        if SI_UNITS[kind][0] != SI_UNITS[kind][1]:
+            assert found[1] == motion
+            assert si_unit(kind, found[1]) == text
+
+
+def test_the_six_quantities_are_told_by_their_units() -> None:
+    """No two of the twelve units have the same dimension."""
+    for kind in QUANTITIES:
+        for text in SI_UNITS[kind]:
+            assert kind_of(parse_unit(text), QUANTITIES, "gain")[0] == kind
+
+
+@pytest.mark.parametrize(
+    ("text", "kinds", "expected"),
+    [
+        ("mm", MOTION_KINDS, ("displacement", "translation", 1e-3)),
+        ("deg", MOTION_KINDS, ("displacement", "rotation", math.pi / 180)),
+        ("in/s", MOTION_KINDS, ("velocity", "translation", 0.0254)),
+        ("g", MOTION_KINDS, ("acceleration", "translation", 9.80665)),
+        ("g rms", MOTION_KINDS, ("acceleration", "translation", 9.80665)),
+        ("g/N", QUANTITIES, ("accelerance", "translation", 9.80665)),
+        ("1/kg", QUANTITIES, ("accelerance", "translation", 1.0)),
+        ("N m", QUANTITIES, ("dynamic_stiffness", "rotation", 1.0)),
+        ("N m/deg", QUANTITIES, ("dynamic_stiffness", "rotation", 180 / math.pi)),
+        ("V", DRIVE_KINDS, ("voltage", "translation", 1.0)),
+        ("rad/s", ("frequency", "angular_frequency"), ("angular_frequency", "translation", 1.0)),
+        ("Hz", ("frequency", "angular_frequency"), ("frequency", "translation", 1.0)),
+    ],
+)
+def test_kinds(text: str, kinds: tuple[str, ...], expected: tuple[str, str, float]) -> None:
+    kind, motion, factor = kind_of(parse_unit(text), kinds, "it")
+    assert (kind, motion) == expected[:2]
+    assert factor == pytest.approx(expected[2], rel=1e-14)
+
+
+def test_misfits_name_what_was_expected() -> None:
+    with pytest.raises(
+        UnitError, match=r"force has the unit \[lb\].* N or N m \(pound-force is lbf"
+    ):
+        kind_of(parse_unit("lb"), ("force",), "force")
+    with pytest.raises(UnitError, match=r"x has the unit \[%\]; expected .* m or rad or m/s"):
+        kind_of(parse_unit("%"), MOTION_KINDS, "x")
+    with pytest.raises(UnitError, match=r"variance has the unit \[m\]; .* \(N/m\)\^2"):
+        factor_to(parse_unit("m"), "(N/m)^2", "variance")
+
+
+def test_quantities_in_words() -> None:
+    assert parse_quantity("0.2 N", DRIVE_KINDS, "drive") == (0.2, "force", "translation")
+    value, kind, motion = parse_quantity("-3e1um rms", MOTION_KINDS, "amplitude")
+    assert value == pytest.approx(-3e-5 * math.sqrt(2))
+    assert (kind, motion) == ("displacement", "translation")
+    for text in ("N", "0.2", "0,2 N", "a lot"):
+        with pytest.raises(UnitError, match="expected a number and its unit, such as"):
+            parse_quantity(text, DRIVE_KINDS, "drive")
+
+
+@given(st.floats(1e-9, 1e9), st.sampled_from(["um", "in", "mm rms", "km pp"]))
+def test_there_and_back(value: float, text: str) -> None:
+    unit = parse_unit(text)
+    shown = from_si([value], text, "displacement")
+    np.testing.assert_allclose(shown * unit.factor * unit.to_peak, value, rtol=1e-14)
+
+
+def test_rotation_is_not_shown_in_metres() -> None:
+    with pytest.raises(UnitError, match=r"rotation cannot be shown in \[mm\]"):
+        from_si([1.0], "mm", "displacement", "rotation")
