@@ -13,6 +13,7 @@ cycle have the noise of a sine fit, and not that of a few samples near zero.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from dahl_ident.arrays import FloatArray
 
 _THRESHOLD = 0.3  # of the amplitude; sine noise may be a tenth of it
 _HIGH = 0.995  # quantile that stands for the amplitude
-_QUIET = 1.5  # times the time beyond the threshold: longer within it, and another level is there
+_QUIET = 1.5  # lobes beyond the threshold: a longer time within it may hold another level
 _FEWEST_SAMPLES = 16
 _DEEPEST = 12
 _SAMPLED = 50_000  # samples that the quantiles are taken from
@@ -77,51 +78,33 @@ def _crossing_runs(time: FloatArray, motion: FloatArray, depth: int) -> list[Flo
     moved = motion - middle
     beyond = np.flatnonzero(np.abs(moved) > threshold)
     above = moved[beyond] > 0.0
-    turn = np.flatnonzero(above[1:] != above[:-1])
-    bounds = np.concatenate([[0], turn + 1, [beyond.size]])
-    spent = time[beyond[bounds[1:] - 1]] - time[beyond[bounds[:-1]]]
-    pause = time[beyond[1:]] - time[beyond[:-1]]
-    usual = np.repeat(np.maximum(spent, 0.0), np.diff(bounds))
-    samples = np.diff(beyond) - 1
-    quiet = (pause > _QUIET * np.maximum(usual[1:], usual[:-1])) & (samples >= _FEWEST_SAMPLES)
-    return [
-        *_split_crossings(time, moved, beyond, above, quiet),
-        *_within(time, motion, beyond, quiet, depth),
-    ]
-
-
-def _split_crossings(
-    time: FloatArray,
-    moved: FloatArray,
-    beyond: NDArray[np.intp],
-    above: NDArray[np.bool_],
-    quiet: NDArray[np.bool_],
-) -> list[FloatArray]:
-    """Return the times of rising crossings in runs that no quiet part interrupts."""
-    rising = np.flatnonzero(~above[:-1] & above[1:] & ~quiet)
-    before, after = beyond[rising], beyond[rising + 1]
-    share = moved[before] / (moved[before] - moved[after])
-    crossing = time[before] + share * (time[after] - time[before])
-    interruptions = np.cumsum(quiet)[rising]
-    runs = np.split(crossing, np.flatnonzero(np.diff(interruptions)) + 1)
-    return [run for run in runs if run.size >= 2]
-
-
-def _within(
-    time: FloatArray,
-    motion: FloatArray,
-    beyond: NDArray[np.intp],
-    quiet: NDArray[np.bool_],
-    depth: int,
-) -> list[FloatArray]:
-    """Return what is found in the quiet parts, those at the ends of the record included."""
-    where = np.flatnonzero(quiet)
-    starts = np.concatenate([[0], beyond[where] + 1, beyond[-1:] + 1])
-    stops = np.concatenate([beyond[:1], beyond[where + 1], [time.size]])
+    turns = np.flatnonzero(above[1:] != above[:-1])
+    lobe = np.diff(np.concatenate([[0], turns + 1, [beyond.size]]))
+    usual = np.repeat(lobe, lobe)
+    pause = np.diff(beyond) - 1
+    quiet = (pause > _QUIET * np.maximum(usual[1:], usual[:-1])) & (pause >= _FEWEST_SAMPLES)
+    breaks = np.concatenate([[0], np.flatnonzero(quiet) + 1, [beyond.size]])
     found: list[FloatArray] = []
-    for start, stop in zip(starts, stops, strict=True):
-        found += _crossing_runs(time[start:stop], motion[start:stop], depth + 1)
+    done = 0
+    for first, last in pairwise(breaks.tolist()):
+        rising = first + np.flatnonzero(~above[first : last - 1] & above[first + 1 : last])
+        if rising.size < 2:
+            continue
+        found.append(_crossings(time, moved, beyond[rising], beyond[rising + 1]))
+        before = slice(done, int(beyond[first]))
+        found += _crossing_runs(time[before], motion[before], depth + 1)
+        done = int(beyond[last - 1]) + 1
+    if done:
+        found += _crossing_runs(time[done:], motion[done:], depth + 1)
     return found
+
+
+def _crossings(
+    time: FloatArray, moved: FloatArray, before: NDArray[np.intp], after: NDArray[np.intp]
+) -> FloatArray:
+    """Return where the straight lines between samples before and after cross zero."""
+    share = moved[before] / (moved[before] - moved[after])
+    return np.asarray(time[before] + share * (time[after] - time[before]))
 
 
 def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray) -> Cycles:

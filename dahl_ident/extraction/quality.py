@@ -24,8 +24,9 @@ def sensor_step(samples: FloatArray) -> float:
     gaps = gaps[gaps > _SAME * (values[-1] - values[0])]
     if gaps.size == 0:
         return 0.0
-    few = gaps[gaps < 10.5 * gaps.min()] / gaps.min()
-    return float(gaps.min()) if np.abs(few - np.round(few)).max() < 0.05 else 0.0
+    step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
+    few = gaps[gaps < 5.5 * step] / step
+    return step if np.abs(few - np.round(few)).max() < 0.05 else 0.0
 
 
 def clipped_share(samples: FloatArray, step: float, noise: float, longest: float) -> float:

@@ -1,0 +1,233 @@
+"""Whether extraction is unbiased, efficient, honest about its errors, and right about settling.
+
+Records are made from a Dahl element's exact force, with noise added to both channels, and
+extracted as a user would, frequency unknown. Run ``python -m benchmarks.extraction_validation``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy import stats
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.elements import Dahl
+from dahl_ident.extraction import extract
+
+RATE = 100.0  # samples per second
+FRICTION = Dahl(f_max=1.0, sigma=1.0)
+Noise = Callable[[np.random.Generator, int], FloatArray]
+
+
+def white(rng: np.random.Generator, n: int) -> FloatArray:
+    """Return white noise of unit variance."""
+    return rng.standard_normal(n)
+
+
+def one_over_f(rng: np.random.Generator, n: int) -> FloatArray:
+    """Return a part of a longer 1/f noise, density 1 at the sampling rate over 100."""
+    whole = 8 * n
+    spectrum = np.fft.rfft(rng.standard_normal(whole))
+    line = np.maximum(np.arange(spectrum.size), 1)
+    noise = np.fft.irfft(spectrum * np.sqrt(whole / 100.0 / line), whole)
+    start = rng.integers(whole - n)
+    return np.asarray(noise[start : start + n])
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Errors of one row over many records.
+
+    `bias` is the mean error in its own standard errors, `efficiency` the rms error over the
+    Cramer-Rao bound for white noise, `coverage` how often the 95 % region holds the truth.
+    """
+
+    records: int
+    bias: float
+    efficiency: float
+    coverage: float
+
+
+def accuracy(
+    beta: float,
+    noise: Noise,
+    records: int,
+    *,
+    seed: int,
+    harmonic: int = 1,
+    cycles: int = 12,
+    force_noise: float = 0.02,
+    displacement_noise: float = 0.005,
+) -> Accuracy:
+    """Extract many records of one steady level and compare with the exact describing function.
+
+    The noise is relative to the friction limit and to the amplitude.
+    """
+    rng = np.random.default_rng(seed)
+    a, b = FRICTION.fourier_coefficients(beta, harmonic)
+    exact = (a - 1j * b) / beta
+    errors, inside = np.empty(records, dtype=complex), np.empty(records, dtype=bool)
+    n = 0
+    for i in range(records):
+        frequency = rng.uniform(0.9, 1.1)
+        n = round(cycles * RATE / frequency)
+        theta = rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * frequency / RATE * np.arange(n)
+        x, force = steady(beta, theta)
+        x = x + beta * displacement_noise * noise(rng, n)
+        force = force + force_noise * noise(rng, n)
+        data = extract(
+            Record(np.arange(n) / RATE, displacement=x, force=force), harmonics=(harmonic,)
+        )
+        errors[i] = data.response[0] - exact
+        inside[i] = covers(data, 0, exact)
+    relative = abs(exact) * (1.0 if harmonic == 1 else np.sqrt(0.5 * (1.0 + harmonic**2)))
+    bound = np.sqrt(4.0 / n * (force_noise**2 / beta**2 + (relative * displacement_noise) ** 2))
+    rms = float(np.sqrt(np.mean(np.abs(errors) ** 2)))
+    bias = float(abs(errors.mean()) / (rms / np.sqrt(records)))
+    return Accuracy(records, bias, rms / float(bound), float(inside.mean()))
+
+
+def steady(beta: float, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return displacement beta cos(theta) and its force on the steady loop."""
+    turns = np.pi * np.arange(np.floor(theta[0] / np.pi) - 40.0, np.ceil(theta[-1] / np.pi))
+    with_turns = np.concatenate([turns, theta])
+    order = np.argsort(with_turns, kind="stable")
+    force = np.empty(order.size)
+    force[order] = FRICTION.force(beta * np.cos(with_turns[order]))
+    return beta * np.cos(theta), force[turns.size :]
+
+
+def covers(data: FrequencyResponse, row: int, exact: complex, level: float = 0.95) -> bool:
+    """Return whether the stated region of a row holds the truth."""
+    assert data.covariance is not None
+    assert data.dof is not None
+    error = data.response[row] - exact
+    d = np.array([error.real, error.imag])
+    statistic = float(d @ np.linalg.solve(data.covariance[row], d)) / 2.0
+    return statistic <= float(stats.f.ppf(level, 2, data.dof[row]))
+
+
+@dataclass(frozen=True)
+class Settling:
+    """How verdicts compare with the true bias of each point."""
+
+    points: int
+    biased: int
+    caught: float
+    settled: int
+    flagged: float
+    found: float
+
+
+def settling(records: int, *, seed: int, noise: Noise = white, fixed: bool = True) -> Settling:
+    """Extract descending levels with too few cycles, and compare verdicts with the true bias.
+
+    With `fixed` one settling period is left out, as is the habit; otherwise as many as judged.
+    The true bias is that of the same cycles without noise, in true standard errors.
+    """
+    rng = np.random.default_rng(seed)
+    ratios, flags, expected = [], [], 0
+    for _ in range(records):
+        levels = 10.0 ** rng.uniform(-2.0, 1.0) * rng.uniform(0.5, 0.8) ** np.arange(6)
+        cycles = int(rng.integers(4, 16))
+        scale = 10.0 ** rng.uniform(-4.0, -2.0) * np.tanh(levels[-1])
+        expected += levels.size
+        t, x, force = descending(levels, cycles, 100)
+        errors = scale * noise(rng, t.size)
+        left_out = 1 if fixed else None
+        data = extract(
+            Record(t, displacement=x, force=force + errors),
+            harmonics=(1,),
+            settling_periods=left_out,
+        )
+        for row in range(data.n):
+            A = float(data.amplitude[row])
+            used = slice(*np.searchsorted(t, _span(data, row, 0.5 / RATE)))
+            clean = fundamental(t[used], force[used], data.frequency_hz[row])
+            moved = fundamental(t[used], x[used], data.frequency_hz[row])
+            bias = abs(clean / moved - FRICTION.describing_function(abs(moved)))
+            error = np.sqrt(2.0 / t[used].size) * scale / A
+            ratios.append(bias / error)
+            flags.append(not data.quality["settled"][row])
+    ratio, flag = np.array(ratios), np.array(flags)
+    biased, good = ratio > 3.0, ratio < 1.0
+    return Settling(
+        ratio.size,
+        int(biased.sum()),
+        float(flag[biased].mean()) if biased.any() else 1.0,
+        int(good.sum()),
+        float(flag[good].mean()) if good.any() else 0.0,
+        ratio.size / expected,
+    )
+
+
+def descending(
+    levels: FloatArray, cycles: int, samples: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return time, displacement and force of levels held for some cycles, a cycle between them."""
+    held = np.repeat(levels, cycles * samples)
+    ramp = np.linspace(0.0, 1.0, samples, endpoint=False)
+    envelope = held[: cycles * samples]
+    for before, after in pairwise(levels):
+        down = before + (after - before) * ramp
+        envelope = np.concatenate([envelope, down, np.full(cycles * samples, after)])
+    t = np.arange(envelope.size) / RATE
+    fine = np.linspace(t[0], t[-1], 16 * (t.size - 1) + 1)
+    x = np.interp(fine, t, envelope) * np.sin(2.0 * np.pi * RATE / samples * fine)
+    return t, x[::16], FRICTION.force(x)[::16]
+
+
+def fundamental(time: FloatArray, samples: FloatArray, frequency: float) -> complex:
+    """Return the fundamental phasor by plain least squares on what extraction fits as well."""
+    theta = 2.0 * np.pi * frequency * time
+    k = np.arange(1, 41)[:, None]
+    basis = np.vstack(
+        [np.ones_like(theta), time - time.mean(), np.cos(k * theta), np.sin(k * theta)]
+    )
+    fitted = np.linalg.lstsq(basis.T, samples, rcond=None)[0]
+    return complex(fitted[2] - 1j * fitted[42])
+
+
+def _span(data: FrequencyResponse, row: int, margin: float) -> list[float]:
+    start, end = (float(data.quality[name][row]) for name in ("start_time", "end_time"))
+    return [start - margin, end + margin]
+
+
+def main() -> None:
+    """Print every study as a Markdown table."""
+    print("| noise | beta | harmonic | cycles | records | bias/se | rms/bound | coverage |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name, noise in (("white", white), ("1/f", one_over_f)):
+        for beta, harmonic, cycles in CASES:
+            a = accuracy(beta, noise, 1500, seed=1, harmonic=harmonic, cycles=cycles)
+            print(
+                f"| {name} | {beta:g} | {harmonic} | {cycles} | {a.records} | {a.bias:.2f} "
+                f"| {a.efficiency:.3f} | {100.0 * a.coverage:.1f} % |"
+            )
+    print(
+        "\n| noise | settling periods | levels found | biased > 3 se | caught | settled | flagged |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    for name, noise in (("white", white), ("1/f", one_over_f)):
+        for fixed in (True, False):
+            s = settling(150, seed=2, noise=noise, fixed=fixed)
+            print(
+                f"| {name} | {'one' if fixed else 'as judged'} | {100.0 * s.found:.1f} % "
+                f"| {s.biased} | {100.0 * s.caught:.1f} % | {s.settled} "
+                f"| {100.0 * s.flagged:.1f} % |"
+            )
+
+
+CASES = [
+    *((beta, 1, 12) for beta in (0.3, 3.0, 30.0)),
+    *((beta, 3, 12) for beta in (0.3, 3.0, 30.0)),
+    (3.0, 1, 3),
+    (3.0, 1, 60),
+]
+
+if __name__ == "__main__":
+    main()
