@@ -24,7 +24,7 @@ class End:
     theta: FloatArray
     cost: float
     hessian: FloatArray
-    """Of the cost by theta, by Gauss and Newton."""
+    """Of the cost by theta, at a limit by phi, by Gauss and Newton."""
     converged: bool
     limit: Limit | None = None
     phi: FloatArray | None = None
@@ -47,22 +47,22 @@ def optimum(
     final = scale
     if not problem.scale_known and loss is None and not problem.priors:
         final = float(np.sqrt(2.0 * end.cost / dof)) if dof > 0 else np.nan
+    chart = None if end.limit is None else end.limit.chart.derivative(theta)
     information = end.hessian
     if loss is not None:
-        information = _robust_information(problem, theta, scale, loss, dof)
+        information = _robust_information(problem, theta, scale, loss, dof, chart)
     elif theta is not end.theta or not problem.gaussian:
-        information = problem.information(theta, scale)
+        information = problem.information(theta, scale, chart)
+    inner, lost = inverse(information)
+    inner = inner * (final / scale) ** 2
     values = problem.to_values(theta)
     combinations: tuple[Combination, ...] = ()
-    if end.limit is None:
-        covariance, undetermined = inverse(information)
-        covariance = covariance * (final / scale) ** 2
-    else:
-        covariance, undetermined, combinations = _at_limit(
-            end.limit, end.phi, theta, information, final / scale
-        )
-        runaway = end.limit.extremes
-        values = np.array([runaway.get(n, v) for n, v in zip(problem.names, values, strict=True)])
+    covariance, undetermined = inner, lost
+    if end.limit is not None and end.phi is not None and chart is not None:
+        combinations = _combinations(end.limit, end.phi, inner)
+        covariance, undetermined = _spread(end.limit, chart, inner, lost)
+        extremes = end.limit.extremes
+        values = np.array([extremes.get(n, v) for n, v in zip(problem.names, values, strict=True)])
     covariance = np.where(np.isnan(covariance), np.inf, covariance)
     status = _status(problem, end, theta, undetermined)
     return Optimum(
@@ -84,40 +84,43 @@ def optimum(
 
 
 def _robust_information(
-    problem: Problem, theta: FloatArray, scale: float, loss: Loss, dof: int
+    problem: Problem,
+    theta: FloatArray,
+    scale: float,
+    loss: Loss,
+    dof: int,
+    chart: FloatArray | None,
 ) -> FloatArray:
     """Return the inverse of a robust estimate's covariance."""
     r, J = problem.residuals_and_jacobian(theta, scale, tails=False)
+    if chart is not None:
+        J = J @ chart
     m = problem.n_residuals
     kappa = loss.inflation(r[:m:2] ** 2 + r[1:m:2] ** 2, dof)
     return np.asarray(J[:m].T @ J[:m] / kappa + J[m:].T @ J[m:])
 
 
-def _at_limit(
-    limit: Limit,
-    phi: FloatArray | None,
-    theta: FloatArray,
-    information: FloatArray,
-    stretch: float,
-) -> tuple[FloatArray, NDArray[np.bool_], tuple[Combination, ...]]:
-    """Return covariance, undetermined parameters and combinations at a limit."""
-    assert phi is not None
-    by_phi = limit.chart.derivative(theta)
-    inner, lost = inverse(by_phi.T @ information @ by_phi)
-    inner = inner * stretch**2
-    combinations = []
+def _combinations(limit: Limit, phi: FloatArray, covariance: FloatArray) -> tuple[Combination, ...]:
+    """Return what a limit determines."""
+    found = []
     for expression, index, logarithmic in limit.kept:
         value = float(np.exp(phi[index]) if logarithmic else phi[index])
-        error = float(np.sqrt(inner[index, index])) * (value if logarithmic else 1.0)
-        combinations.append(Combination(expression, value, error))
-    with np.errstate(invalid="ignore"):
-        covariance = by_phi @ np.where(np.isinf(inner), 0.0, inner) @ by_phi.T
-    runaway = np.array([name in limit.extremes for name in limit.names])
-    runaway |= np.abs(by_phi) @ lost.astype(np.float64) > 0.0
-    runaway |= ~by_phi.any(axis=1)
-    covariance[runaway, :] = covariance[:, runaway] = 0.0
-    covariance[runaway, runaway] = np.inf
-    return covariance, runaway, tuple(combinations)
+        error = float(np.sqrt(covariance[index, index])) * (value if logarithmic else 1.0)
+        found.append(Combination(expression, value, error))
+    return tuple(found)
+
+
+def _spread(
+    limit: Limit, chart: FloatArray, inner: FloatArray, lost: NDArray[np.bool_]
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return the covariance of theta, and which of it is undetermined, from that of phi."""
+    covariance = chart @ np.where(np.isfinite(inner), inner, 0.0) @ chart.T
+    gone = np.array([name in limit.extremes for name in limit.names])
+    gone |= np.abs(chart) @ lost.astype(np.float64) > 0.0
+    gone |= ~chart.any(axis=1)
+    covariance[gone, :] = covariance[:, gone] = 0.0
+    covariance[gone, gone] = np.inf
+    return covariance, gone
 
 
 def _status(

@@ -32,7 +32,9 @@ from dahl_ident.problem import Problem, Quadratic
 _DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm
 _RESCALINGS = 100
 _SAME_SCALE = 1e-9
-_TIE, _NEARLY = 1e-13, 1e-7  # relative differences of cost at which a limit wins
+_PATIENCE = 1000  # steps where friction is so faint that each takes little
+_AT_LIMIT = 1e4  # looseness: so far out, large terms cancel
+_TIE, _NEARLY = 1e-12, 1e-4  # relative differences of cost at which a limit wins
 
 
 def solve(
@@ -92,6 +94,9 @@ class _Search:
                 f"parameters ({', '.join(problem.names)}); measure more points, or fix some"
             )
         self.logarithmic = np.array([p.transform == "log" for p in problem.parameters])
+        elements = [e for e in problem.model.elements if isinstance(e, Dahl)]
+        friction = {p.name for element in elements for p in element.parameters}
+        self.is_friction = np.array([name in friction for name in problem.names])
         self.low, self.high = problem.bounds()
         self.bounded = bool(np.isfinite(self.low).any() or np.isfinite(self.high).any())
         self.rescales = not problem.scale_known and bool(loss is not None or problem.priors)
@@ -141,7 +146,7 @@ class _Search:
 
     def _search(self, begin: FloatArray, scale: float) -> End:
         end = self._descend(begin, scale)
-        if not end.converged or self._doubtful(end, scale):
+        if not end.converged or self._friction_error(end, scale) > _DOUBTFUL:
             end = self._look_wider(end, begin, scale)
         if end.limit is None and (self.bounded or not end.converged):
             end = self._trust_region(end, begin, scale)
@@ -154,11 +159,11 @@ class _Search:
             if chart is None:
                 return problem.quadratic(at, scale, loss)
             theta = chart.theta(at)
-            return chart.pulled_back(problem.quadratic(theta, scale, loss), theta)
+            return problem.quadratic(theta, scale, loss, chart.derivative(theta))
 
         return evaluate
 
-    def _descend(self, begin: FloatArray, scale: float) -> End:
+    def _descend(self, begin: FloatArray, scale: float, steps: int = 80) -> End:
         """Return the best end of Levenberg and Marquardt's searches from `begin`."""
         minima = minimise(
             self._evaluate(scale),
@@ -166,6 +171,7 @@ class _Search:
             self.logarithmic,
             self.m,
             inside=lambda theta: within_reach(self.problem, theta),
+            steps=steps,
         )
         best = self._best(minima)
         theta = minima.theta[best]
@@ -182,17 +188,22 @@ class _Search:
             ~((chart.matrix != 0.0).T @ ~self.logarithmic),
             self.m,
             inside=None if limit else lambda phi: within_reach(self.problem, chart.theta(phi)),
+            looseness=1.0 if limit is None else _AT_LIMIT,
         )
         best = self._best(minima)
         phi = minima.theta[best]
         theta = chart.theta(phi)
-        cost, _, hessian = self.problem.quadratic(theta, scale, self.loss)
+        cost, hessian = float(minima.cost[best]), minima.hessian[best]
         converged = bool(minima.converged[best]) and self._allowed(theta)
-        return End(theta, float(cost), hessian, converged, limit, None if limit is None else phi)
+        if limit is not None:
+            return End(theta, cost, hessian, converged, limit, phi)
+        return End(theta, cost, self.problem.quadratic(theta, scale, self.loss).hessian, converged)
 
     def _best(self, minima: Minima) -> int:
         self.evaluations += int(minima.evaluations.max())
-        return int(np.argmin(minima.cost))
+        lowest = minima.cost.min()
+        good = minima.converged & (minima.cost <= lowest * (1.0 + _NEARLY))
+        return int(np.argmin(np.where(good, minima.cost, np.inf) if good.any() else minima.cost))
 
     def _look_wider(self, end: End, begin: FloatArray, scale: float) -> End:
         """Return the best of `end`, the ends of microslip's valleys, and the limits."""
@@ -201,12 +212,15 @@ class _Search:
             other = self._descend_in(chart, begin, scale)
             if other.cost < end.cost or (other.converged and not end.converged):
                 end = other
+        if not end.converged and within_reach(self.problem, end.theta[None])[0]:
+            end = self._descend(end.theta[None], scale, steps=_PATIENCE)
         ends = [self._descend_in(lim.chart, begin, scale, lim) for lim in limits(self.problem)]
         ends = [e for e in ends if e.converged]
         if not ends:
             return end
         lowest = min(ends, key=lambda e: e.cost)
-        slack = _TIE if end.converged else _NEARLY
+        real = end.converged and np.isfinite(self._friction_error(end, scale))
+        slack = _TIE if real else _NEARLY
         return lowest if lowest.cost <= end.cost * (1.0 + slack) else end
 
     def _trust_region(self, end: End, begin: FloatArray, scale: float) -> End:
@@ -224,13 +238,10 @@ class _Search:
     def _allowed(self, theta: FloatArray) -> bool:
         return not self.bounded or bool(np.all((theta >= self.low) & (theta <= self.high)))
 
-    def _doubtful(self, end: End, scale: float) -> bool:
-        """Return whether a friction parameter could lie at a limit for all this optimum says."""
+    def _friction_error(self, end: End, scale: float) -> float:
+        """Return the largest standard deviation of the logarithm of a friction parameter."""
         covariance, _ = inverse(end.hessian)
-        known = self.problem.scale_known or self.rescales
-        s2 = 1.0 if known else 2.0 * end.cost / max(self.m - len(end.theta), 1)
-        friction = {
-            p.name for e in self.problem.model.elements if isinstance(e, Dahl) for p in e.parameters
-        }
-        variances = zip(self.problem.names, np.diagonal(covariance), strict=True)
-        return any(s2 * v > _DOUBTFUL**2 for name, v in variances if name in friction)
+        adapted = self.problem.scale_known or self.rescales
+        variance = 1.0 if adapted else 2.0 * end.cost / max(self.m - len(end.theta), 1)
+        diagonal = np.where(self.is_friction, np.diagonal(covariance), 0.0)
+        return float(np.sqrt(variance * diagonal.max()))

@@ -52,15 +52,17 @@ def minimise(
     n_residuals: int,
     *,
     inside: Callable[[FloatArray], BoolArray] | None = None,
+    looseness: float = 1.0,
     steps: int = 80,
 ) -> Minima:
     """Return the minima of the costs that searches from `theta`, shape (S, P), find.
 
     `logarithmic` says which coordinates are logarithms: their steps have a longest length.
-    Searches that leave the region `inside` end there, not converged.
+    Searches that leave the region `inside` end there, not converged. `looseness` multiplies the
+    length of the step at which a search has converged.
     """
     with np.errstate(all="ignore"):
-        return _minimise(evaluate, theta, logarithmic, n_residuals, inside, steps)
+        return _minimise(evaluate, theta, logarithmic, n_residuals, inside, looseness, steps)
 
 
 def _minimise(
@@ -69,6 +71,7 @@ def _minimise(
     logarithmic: BoolArray,
     n_residuals: int,
     inside: Callable[[FloatArray], BoolArray] | None,
+    looseness: float,
     steps: int,
 ) -> Minima:
     S, P = theta.shape
@@ -79,7 +82,8 @@ def _minimise(
     damping, growth = np.full(S, _FIRST_DAMPING), np.full(S, 2.0)
     for _ in range(steps if P else 0):
         step, moves, foretold = _step(at, damping, logarithmic)
-        settled = (moves <= _tolerance(at, logarithmic, n_residuals)) | (foretold <= _EPS * at.cost)
+        shortest = looseness**2 * _tolerance(at, logarithmic, n_residuals)
+        settled = (moves <= shortest) | (foretold <= looseness**2 * _EPS * at.cost)
         settled &= damping < _GAUSS_NEWTON
         lost = ~np.isfinite(at.cost) | (damping > _MOST_DAMPING)
         if inside is not None:

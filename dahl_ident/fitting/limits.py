@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Dahl, Parameter, Spring
 from dahl_ident.fitting.status import Status
-from dahl_ident.problem import Problem, Quadratic
+from dahl_ident.problem import Problem
 
 _MICROSLIP = 1e5  # x_c over the largest amplitude
 _NO_LOSS = 1e9
@@ -41,6 +41,7 @@ _GROSS_SLIP = 1e-16  # x_c over the smallest amplitude
 _NO_FRICTION = 1e-18  # sigma over the median stiffness
 _LEAST_FRICTION = -60.0  # ln of sigma over the median stiffness that a search may reach
 _EDGES = (1e-14, 1e8)  # x_c over the smallest and largest amplitude that a search may reach
+_TIED_EDGE = 1e4  # the same where microslip has a limit: short of it
 
 
 @dataclass(frozen=True)
@@ -71,13 +72,6 @@ class Chart:
             derivative[..., spring, :] -= size * self.matrix[sigma]
         return derivative
 
-    def pulled_back(self, at: Quadratic, theta: FloatArray) -> Quadratic:
-        """Return cost, gradient and Hessian by phi from those by theta."""
-        T = self.derivative(theta)
-        transposed = T.swapaxes(-1, -2)
-        gradient = (transposed @ at.gradient[..., None])[..., 0]
-        return Quadratic(at.cost, gradient, transposed @ at.hessian @ T)
-
     def phi(self, theta: FloatArray) -> FloatArray:
         """Return a phi near theta, (Q,) or (S, Q)."""
         theta = theta.copy()
@@ -105,12 +99,14 @@ def within_reach(problem: Problem, theta: FloatArray) -> NDArray[np.bool_]:
     """Return whether friction is neither at a limit nor negligible, for each theta of (S, P)."""
     view, inside = problem.stiffness_data, np.ones(len(theta), dtype=np.bool_)
     least = np.log(view.amplitude.min(axis=-1) * _EDGES[0])
-    most = np.log(view.amplitude.max(axis=-1) * _EDGES[1])
+    largest = view.amplitude.max(axis=-1)
     softest = np.log(np.median(np.abs(view.stiffness), axis=-1)) + _LEAST_FRICTION
     columns = dict(zip(problem.names, theta.T, strict=True))
     for element in problem.model.elements:
         if isinstance(element, Dahl):
             f_max, sigma = (columns.get(p.name, _ln(p)) for p in element.parameters[:2])
+            tied = all(p.free for p in element.parameters[:2]) and bool(_free_springs(problem))
+            most = np.log(largest * (_TIED_EDGE if tied else _EDGES[1]))
             inside &= (f_max - sigma > least) & (f_max - sigma < most) & (sigma > softest)
     return inside
 

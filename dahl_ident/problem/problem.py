@@ -259,9 +259,15 @@ class Problem:
         return residuals, jacobian.swapaxes(-1, -2)
 
     def quadratic(
-        self, theta: FloatArray, scale: ArrayLike = 1.0, rho: Rho | None = None
+        self,
+        theta: FloatArray,
+        scale: ArrayLike = 1.0,
+        rho: Rho | None = None,
+        chart: FloatArray | None = None,
     ) -> Quadratic:
         """Return half the sum of squares with its gradient and Hessian, unchecked.
+
+        Derivatives are by theta, or with `chart` = dtheta/dphi, (P, Q) or (S, P, Q), by phi.
 
         Cost of shape () or (S,), infinite where there is no prediction. Where rows count as
         rho(z), the gradient is exact and the Hessian is that of rho at a linear model,
@@ -271,6 +277,8 @@ class Problem:
         if rho is None:
             rho = self._tail
         r, J = self._with_priors(theta, y, changes, scale)
+        if chart is not None:
+            J = chart.swapaxes(-1, -2) @ J
         if rho is None:
             cost = 0.5 * np.einsum("...m,...m->...", r, r)
             weighted = J
@@ -394,11 +402,14 @@ class Problem:
             result = self._noise.log_area - n * np.log(2.0 * np.pi * s2) - 0.5 * squares / s2
         return np.where(np.isnan(result), -np.inf, result)[()]
 
-    def information(self, theta: ArrayLike, scale: ArrayLike = 1.0) -> FloatArray:
+    def information(
+        self, theta: ArrayLike, scale: ArrayLike = 1.0, chart: FloatArray | None = None
+    ) -> FloatArray:
         """Return the Fisher information of theta, shape (P, P) or (S, P, P), priors included.
 
         J' J of the whitened residuals; a row whose covariance was estimated with nu degrees of
-        freedom counts (nu + 1)(nu - 1)/(nu (nu + 3)), the expectation for Student's t.
+        freedom counts (nu + 1)(nu - 1)/(nu (nu + 3)), the expectation for Student's t. With
+        `chart` = dtheta/dphi, (P, Q), the information of phi.
         """
         theta = self._coordinates.checked(theta)
         y, changes = self.whitened(theta, tails=False)
@@ -406,8 +417,10 @@ class Problem:
         if dof is not None:
             weight = np.sqrt((dof + 1.0) * (dof - 1.0) / (dof * (dof + 3.0)))
             changes = [weight * d for d in changes]
-        _, jacobian = self._with_priors(theta, y, changes, scale)
-        return jacobian @ jacobian.swapaxes(-1, -2)
+        _, J = self._with_priors(theta, y, changes, scale)
+        if chart is not None:
+            J = chart.T @ J
+        return J @ J.swapaxes(-1, -2)
 
     def _shape(self, theta: FloatArray) -> tuple[int, ...]:
         """Return the shape of the rows' numbers for `theta`."""
