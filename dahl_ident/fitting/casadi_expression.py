@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from math import factorial
 from typing import TYPE_CHECKING
 
@@ -151,8 +152,16 @@ def general_describing_function(beta: ca.SX, alpha: ca.SX | float, harmonic: int
 
     if harmonic % 2 == 0:
         return Phasor(ca.SX(0.0), ca.SX(0.0))
-    beta = ca.if_else(beta > _LEAST_BETA, beta, _LEAST_BETA)
-    alpha = ca.SX(alpha)
+    return Phasor(*_quadrature(harmonic).call([ca.SX(beta), ca.SX(alpha)]))
+
+
+@cache
+def _quadrature(harmonic: int) -> ca.Function:
+    """Return (beta, alpha) -> real and imaginary part; writing it out takes longer than a call."""
+    import casadi as ca
+
+    given, alpha = ca.SX.sym("beta"), ca.SX.sym("alpha")
+    beta = ca.if_else(given > _LEAST_BETA, given, _LEAST_BETA)
     p = 1.0 - alpha
     path, length, is_deep = _close_loop(beta, p)
     # past _DEEPEST the far end of the branch holds no force: z_1 counts as 0
@@ -174,7 +183,9 @@ def general_describing_function(beta: ca.SX, alpha: ca.SX | float, harmonic: int
         real += midpoint[i] * sine * excess
         imag += fejer[i] * cosine * excess
     scale = length / (np.pi * harmonic * beta)
-    return Phasor(scale * real + (line if harmonic == 1 else 0.0), scale * imag)
+    if harmonic == 1:
+        return ca.Function("h", [given, alpha], [scale * real + line, scale * imag])
+    return ca.Function("h", [given, alpha], [scale * real, scale * imag])
 
 
 def _close_loop(beta: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
