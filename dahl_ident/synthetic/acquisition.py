@@ -1,0 +1,219 @@
+"""Sensors and their recorder: what stands between the true motion and the stored numbers.
+
+A channel stores, at its nominal sampling times t,
+
+    clip(quantise(gain y(t + jitter - delay) + offset + drift t + hum + white + 1/f noise))
+
+where y is the true signal after a first-order anti-alias filter. Jitter is common to the
+channels, since one clock samples both; noise is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.signal import lfilter
+
+from dahl_ident.arrays import ComplexArray, FloatArray, finite_number, positive_number
+from dahl_ident.errors import ValidationError
+from dahl_ident.synthetic.checks import non_negative_number
+from dahl_ident.synthetic.mechanism import Signal
+from dahl_ident.synthetic.randomness import Draws
+
+_FILTER_OVERSAMPLING = 16
+_WAVEFORM_FAULTS = (
+    "noise_std", "flicker_std", "hum_amplitude", "offset", "drift", "resolution", "limit",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One sensor; by default an ideal one.
+
+    Parameters
+    ----------
+    gain : float, default 1
+        Measured over true value, > 0.
+    delay : float, default 0
+        Time by which the channel lags, s.
+    antialias_hz : float, optional
+        Corner frequency of a first-order low-pass filter, Hz.
+    noise_std : float, default 0
+        Standard deviation of white noise, in the channel's unit.
+    flicker_std : float, default 0
+        Standard deviation over the record of 1/f noise, in the channel's unit.
+    hum_amplitude : float, default 0
+        Amplitude of mains hum, in the channel's unit; its phase is random.
+    hum_hz : float, default 50
+        Mains frequency, Hz.
+    offset : float, default 0
+        Added constant, in the channel's unit.
+    drift : float, default 0
+        Added slope, in the channel's unit per second.
+    resolution : float, default 0
+        Step of the quantiser, in the channel's unit; 0 for none.
+    limit : float, optional
+        Values beyond plus or minus this are clipped to it.
+
+    Raises
+    ------
+    ValidationError
+        If a value is not as said here.
+
+    Examples
+    --------
+    >>> Channel(noise_std=1e-6, resolution=5e-6).gain
+    1.0
+    """
+
+    gain: float = 1.0
+    delay: float = 0.0
+    antialias_hz: float | None = None
+    noise_std: float = 0.0
+    flicker_std: float = 0.0
+    hum_amplitude: float = 0.0
+    hum_hz: float = 50.0
+    offset: float = 0.0
+    drift: float = 0.0
+    resolution: float = 0.0
+    limit: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("gain", "hum_hz"):
+            object.__setattr__(self, name, positive_number(getattr(self, name), name))
+        for name in ("delay", "offset", "drift"):
+            object.__setattr__(self, name, finite_number(getattr(self, name), name))
+        for name in ("noise_std", "flicker_std", "hum_amplitude", "resolution"):
+            object.__setattr__(self, name, non_negative_number(getattr(self, name), name))
+        for name in ("antialias_hz", "limit"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, positive_number(getattr(self, name), name))
+
+    def response(self, omega: FloatArray) -> ComplexArray:
+        """Return measured over true phasor at angular frequencies: gain, filter and delay."""
+        shown = self.gain * np.exp(-1j * omega * self.delay)
+        if self.antialias_hz is not None:
+            shown = shown / (1.0 + 1j * omega / (2.0 * np.pi * self.antialias_hz))
+        return np.asarray(shown)
+
+    def measure(
+        self, signal: Signal, time: FloatArray, jitter: FloatArray, draws: Draws, name: str
+    ) -> FloatArray:
+        """Return what the channel called `name` stores at its nominal sampling times."""
+        seen = self._filtered(signal, time[0], time[-1], time[1] - time[0])
+        y = self.gain * seen(time + jitter - self.delay) + self.offset + self.drift * time
+        if self.hum_amplitude > 0.0:
+            turn = draws.uniform(f"{name} hum", 1)
+            y = y + self.hum_amplitude * np.sin(2.0 * np.pi * (self.hum_hz * time + turn))
+        if self.noise_std > 0.0:
+            y = y + self.noise_std * draws.normal(f"{name} noise", time.size)
+        if self.flicker_std > 0.0:
+            y = y + self.flicker_std * draws.flicker(f"{name} flicker", time.size)
+        if self.resolution > 0.0:
+            y = self.resolution * np.round(y / self.resolution)
+        return y if self.limit is None else np.clip(y, -self.limit, self.limit)
+
+    def _filtered(self, signal: Signal, start: float, stop: float, step: float) -> Signal:
+        """Return the signal after the anti-alias filter, which was at rest with it at `start`.
+
+        The filter is exact for a signal that is straight between 16 points a sample.
+        """
+        if self.antialias_hz is None:
+            return signal
+        early = start - abs(self.delay) - step
+        grid = np.arange(early, stop + abs(self.delay) + 2.0 * step, step / _FILTER_OVERSAMPLING)
+        y = signal(grid)
+        d = 2.0 * np.pi * self.antialias_hz * (grid[1] - grid[0])
+        pole = np.exp(-d)
+        late = 1.0 + np.expm1(-d) / d  # weight of a cell's later end, first-order hold
+        taps = [late, 1.0 - pole - late]
+        filtered, _ = lfilter(taps, [1.0, -pole], y, zi=[y[0] * (1.0 - late)])
+        return CubicSpline(grid, filtered)
+
+
+@dataclass(frozen=True)
+class Acquisition:
+    """The recorder with its two channels.
+
+    Parameters
+    ----------
+    sample_rate_hz : float, optional
+        Samples per second; by default 64 in the shortest period of the excitation.
+    displacement, force : Channel
+        The sensors; their unit is m (rad) and N (N m).
+    jitter_std : float, default 0
+        Standard deviation of the sampling instants about the stored times, s.
+    dropped_fraction : float, default 0
+        Share of the samples, chosen at random, that are missing from the record.
+
+    Raises
+    ------
+    ValidationError
+        If a value is not as said here.
+
+    Examples
+    --------
+    >>> Acquisition(sample_rate_hz=1000.0, force=Channel(noise_std=1e-3)).displacement.noise_std
+    0.0
+    """
+
+    sample_rate_hz: float | None = None
+    displacement: Channel = field(default_factory=Channel)
+    force: Channel = field(default_factory=Channel)
+    jitter_std: float = 0.0
+    dropped_fraction: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.sample_rate_hz is not None:
+            rate = positive_number(self.sample_rate_hz, "sample_rate_hz")
+            object.__setattr__(self, "sample_rate_hz", rate)
+        for name in ("jitter_std", "dropped_fraction"):
+            object.__setattr__(self, name, non_negative_number(getattr(self, name), name))
+        if self.dropped_fraction > 0.9:
+            raise ValidationError(
+                f"dropped_fraction is {self.dropped_fraction!r}; expected a share from 0 to 0.9"
+            )
+
+    def faults_of_records(self) -> list[str]:
+        """Return the names of the settings that only waveforms can show."""
+        no_fault = Channel()
+        faults = [
+            f"{name} {fault}"
+            for name in ("displacement", "force")
+            for fault in _WAVEFORM_FAULTS
+            if getattr(getattr(self, name), fault) != getattr(no_fault, fault)
+        ]
+        return faults + [f for f in ("jitter_std", "dropped_fraction") if getattr(self, f) > 0.0]
+
+    def sampling_times(self, duration: float, highest_hz: float) -> FloatArray:
+        """Return the nominal sampling times over a run.
+
+        Raises
+        ------
+        ValidationError
+            If the rate is not above two samples a period.
+        """
+        rate = self.sample_rate_hz if self.sample_rate_hz is not None else 64.0 * highest_hz
+        if rate <= 2.0 * highest_hz:
+            raise ValidationError(
+                f"sample_rate_hz is {rate:g}; expected more than {2.0 * highest_hz:g}, two samples "
+                "in the shortest period"
+            )
+        return np.arange(int(np.floor(duration * rate * (1.0 + 1e-12))) + 1) / rate
+
+    def record(
+        self, displacement: Signal, force: Signal, time: FloatArray, draws: Draws
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the stored time, displacement and force."""
+        jitter = np.zeros_like(time)
+        if self.jitter_std > 0.0:
+            jitter = self.jitter_std * draws.normal("jitter", time.size)
+        x = self.displacement.measure(displacement, time, jitter, draws, "displacement")
+        F = self.force.measure(force, time, jitter, draws, "force")
+        if self.dropped_fraction == 0.0:
+            return time, x, F
+        kept = draws.uniform("dropped samples", time.size) >= self.dropped_fraction
+        kept[[0, -1]] = True
+        return time[kept], x[kept], F[kept]

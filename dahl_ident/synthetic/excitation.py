@@ -1,0 +1,219 @@
+"""What the laboratory does to the mechanism: stepped sines, frequency sweeps, amplitude ramps.
+
+Each excitation says which of displacement and force it holds, and its levels are zero-to-peak
+amplitudes of that one. Before the first step the mechanism is at rest without force.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from dahl_ident.arrays import positive_array, positive_number, whole_number
+from dahl_ident.data.fields import one_of
+from dahl_ident.errors import ValidationError
+from dahl_ident.synthetic.checks import non_negative_number
+from dahl_ident.synthetic.randomness import Draws
+from dahl_ident.synthetic.waveform import Waveform, WaveformBuilder
+
+Controlled = Literal["displacement", "force"]
+Order = Literal["given", "ascending", "descending", "random"]
+Spacing = Literal["linear", "log"]
+
+
+@dataclass(frozen=True)
+class SteppedSine:
+    """A sine at every frequency and level of a grid: ramp, settle, measure; rest if wanted.
+
+    Parameters
+    ----------
+    levels : sequence of float
+        Zero-to-peak amplitudes, m (rad) or N (N m).
+    frequencies_hz : sequence of float, default (1.0,)
+        Hz. All levels are run at one frequency before the next.
+    controlled : {"displacement", "force"}
+        What the levels are amplitudes of.
+    order : {"given", "ascending", "descending", "random"}
+        How the levels follow each other; "random" shuffles the whole grid by the seed.
+    settling_periods : int, default 10
+        Periods at the full level before measuring starts.
+    num_periods : int, default 5
+        Measured periods of each step.
+    ramp_periods : float, default 2
+        Periods of the smooth passage to the next level and frequency; 0 jumps.
+    rest : float, default 0
+        Seconds at rest between the steps, each then ramped down and up; 0 goes straight on.
+
+    Raises
+    ------
+    ValidationError
+        If a value is not as said here.
+
+    Examples
+    --------
+    >>> steps = SteppedSine(levels=(1e-3, 2e-3), order="descending")
+    >>> [level for level, _ in steps.grid(seed=0)]
+    [0.002, 0.001]
+    """
+
+    levels: Sequence[float]
+    frequencies_hz: Sequence[float] = (1.0,)
+    controlled: Controlled = "displacement"
+    order: Order = "given"
+    settling_periods: int = 10
+    num_periods: int = 5
+    ramp_periods: float = 2.0
+    rest: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("levels", "frequencies_hz"):
+            values = positive_array(getattr(self, name), name)
+            if values.ndim != 1 or values.size == 0:
+                raise ValidationError(f"{name}: expected some numbers, got shape {values.shape}")
+            object.__setattr__(self, name, tuple(values.tolist()))
+        one_of(self.controlled, "controlled", get_args(Controlled))
+        one_of(self.order, "order", get_args(Order))
+        whole_number(self.settling_periods, "settling_periods", 0)
+        whole_number(self.num_periods, "num_periods", 1)
+        object.__setattr__(
+            self, "ramp_periods", non_negative_number(self.ramp_periods, "ramp_periods")
+        )
+        object.__setattr__(self, "rest", non_negative_number(self.rest, "rest"))
+
+    def grid(self, seed: int) -> list[tuple[float, float]]:
+        """Return level and frequency of every step in the order of the run."""
+        levels = list(self.levels)
+        if self.order in ("ascending", "descending"):
+            levels.sort(reverse=self.order == "descending")
+        steps = [(level, f) for f in self.frequencies_hz for level in levels]
+        if self.order == "random":
+            steps = [steps[i] for i in Draws(seed).permutation("order of steps", len(steps))]
+        return steps
+
+    def waveform(self, seed: int) -> Waveform:
+        """Return the run as one smooth waveform with its measured windows."""
+        steps = self.grid(seed)
+        run = WaveformBuilder(steps[0][1])
+        for level, f in steps:
+            run.go_to(level, f, self.ramp_periods / f)
+            run.stay(self.settling_periods / f)
+            run.measure(self.num_periods / f)
+            if self.rest > 0.0:
+                run.go_to(0.0, f, self.ramp_periods / f)
+                run.stay(self.rest)
+        return run.finish()
+
+
+@dataclass(frozen=True)
+class FrequencySweep:
+    """One level, its frequency moving steadily from start to stop.
+
+    Parameters
+    ----------
+    level : float
+        Zero-to-peak amplitude, m (rad) or N (N m).
+    start_hz, stop_hz : float
+        Hz, in either direction.
+    duration : float
+        Seconds from start to stop, after the ramp.
+    spacing : {"log", "linear"}
+        Equal times for equal ratios, or for equal differences.
+    controlled : {"displacement", "force"}
+        What the level is an amplitude of.
+    ramp_periods : float, default 2
+        Periods at the first frequency in which the level is reached.
+
+    Raises
+    ------
+    ValidationError
+        If a value is not as said here.
+
+    Examples
+    --------
+    >>> FrequencySweep(level=0.1, start_hz=1.0, stop_hz=10.0, duration=60.0).waveform(0).duration
+    62.0
+    """
+
+    level: float
+    start_hz: float
+    stop_hz: float
+    duration: float
+    spacing: Spacing = "log"
+    controlled: Controlled = "force"
+    ramp_periods: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name in ("level", "start_hz", "stop_hz", "duration"):
+            object.__setattr__(self, name, positive_number(getattr(self, name), name))
+        one_of(self.spacing, "spacing", get_args(Spacing))
+        one_of(self.controlled, "controlled", get_args(Controlled))
+        object.__setattr__(
+            self, "ramp_periods", non_negative_number(self.ramp_periods, "ramp_periods")
+        )
+
+    def waveform(self, seed: int) -> Waveform:
+        """Return the ramp and the sweep."""
+        run = WaveformBuilder(self.start_hz)
+        run.go_to(self.level, self.start_hz, self.ramp_periods / self.start_hz)
+        run.go_to(self.level, self.stop_hz, self.duration, self.spacing)
+        return run.finish()
+
+
+@dataclass(frozen=True)
+class AmplitudeRamp:
+    """One frequency, its level moving steadily from start to stop.
+
+    Parameters
+    ----------
+    start_level, stop_level : float
+        Zero-to-peak amplitudes, m (rad) or N (N m), in either direction.
+    frequency_hz : float
+        Hz.
+    duration : float
+        Seconds from start to stop, after the ramp.
+    spacing : {"log", "linear"}
+        Equal times for equal ratios, or for equal differences.
+    controlled : {"displacement", "force"}
+        What the levels are amplitudes of.
+    ramp_periods : float, default 2
+        Periods in which the first level is reached.
+
+    Raises
+    ------
+    ValidationError
+        If a value is not as said here.
+
+    Examples
+    --------
+    >>> ramp = AmplitudeRamp(start_level=1e-5, stop_level=1e-2, frequency_hz=2.0, duration=100.0)
+    >>> ramp.waveform(0).duration
+    101.0
+    """
+
+    start_level: float
+    stop_level: float
+    frequency_hz: float
+    duration: float
+    spacing: Spacing = "log"
+    controlled: Controlled = "displacement"
+    ramp_periods: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name in ("start_level", "stop_level", "frequency_hz", "duration"):
+            object.__setattr__(self, name, positive_number(getattr(self, name), name))
+        one_of(self.spacing, "spacing", get_args(Spacing))
+        one_of(self.controlled, "controlled", get_args(Controlled))
+        object.__setattr__(
+            self, "ramp_periods", non_negative_number(self.ramp_periods, "ramp_periods")
+        )
+
+    def waveform(self, seed: int) -> Waveform:
+        """Return the smooth start and the ramp."""
+        run = WaveformBuilder(self.frequency_hz)
+        run.go_to(self.start_level, self.frequency_hz, self.ramp_periods / self.frequency_hz)
+        run.go_to(self.stop_level, self.frequency_hz, self.duration, self.spacing)
+        return run.finish()
+
+
+Excitation = SteppedSine | FrequencySweep | AmplitudeRamp

@@ -1,0 +1,245 @@
+"""An experiment described: mechanism, excitation, sensors, and what is wanted of it.
+
+The description is frozen, prints as TOML, and goes to JSON or TOML and back. Together with a
+seed it determines every number of the data.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from dahl_ident.data.fields import one_of
+from dahl_ident.elements import Element
+from dahl_ident.elements.description import describe_model, model_from_description
+from dahl_ident.elements.model import as_model
+from dahl_ident.errors import DahlIdentError, DataError, ValidationError
+from dahl_ident.synthetic.acquisition import Acquisition, Channel
+from dahl_ident.synthetic.excitation import (
+    AmplitudeRamp,
+    Excitation,
+    FrequencySweep,
+    SteppedSine,
+)
+from dahl_ident.synthetic.table_errors import Table
+from dahl_ident.synthetic.toml_text import toml_text
+from dahl_ident.units import Motion
+
+_T = TypeVar("_T")
+_EXCITATIONS: dict[str, type[Excitation]] = {
+    "stepped_sine": SteppedSine,
+    "frequency_sweep": FrequencySweep,
+    "amplitude_ramp": AmplitudeRamp,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """One run of the synthetic laboratory.
+
+    Parameters
+    ----------
+    plant : Element
+        The mechanism, every parameter with a value: friction alone, such as ``Dahl(0.1, 30)``,
+        or a sum.
+    excitation : SteppedSine, FrequencySweep or AmplitudeRamp
+        What drives it.
+    acquisition : Acquisition
+        Sensors and recorder; ideal ones by default. A table sees their gain, delay and
+        anti-alias filter.
+    table : Table, optional
+        Ask for a table of response with these errors; None: a record of waveforms.
+    motion : {"translation", "rotation"}
+        Whether displacement is m or rad.
+
+    Raises
+    ------
+    ModelError
+        If a parameter of the plant has no value.
+    ValidationError
+        If a table is asked of anything but a stepped sine, or of sensors whose faults have no
+        place in a table.
+
+    Examples
+    --------
+    >>> from dahl_ident import Dahl
+    >>> run = Experiment(Dahl(0.1, 30.0), SteppedSine(levels=(1e-3, 2e-3)), table=Table())
+    >>> Experiment.from_json(run.to_json()) == run
+    True
+    """
+
+    plant: Element
+    excitation: Excitation
+    acquisition: Acquisition = field(default_factory=Acquisition)
+    table: Table | None = None
+    motion: Motion = "translation"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "plant", as_model(self.plant))
+        self.plant.known_values()
+        one_of(self.motion, "motion", ("translation", "rotation"))
+        if self.table is not None:
+            self._check_table(self.table)
+
+    @property
+    def truth(self) -> dict[str, float]:
+        """The value of every parameter of the plant, by name."""
+        return {p.name: float(p.value) for p in self.plant.parameters if p.value is not None}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the description as plain data; what is None is left out."""
+        kinds = {cls: kind for kind, cls in _EXCITATIONS.items()}
+        description: dict[str, Any] = {
+            "motion": self.motion,
+            "plant": describe_model(self.plant),
+            "excitation": {"kind": kinds[type(self.excitation)], **asdict(self.excitation)},
+            "acquisition": asdict(self.acquisition),
+            "table": None if self.table is None else asdict(self.table),
+        }
+        return {k: _plain(v) for k, v in description.items() if v is not None}
+
+    @classmethod
+    def from_dict(cls, description: Mapping[str, Any]) -> Experiment:
+        """Return the experiment that :meth:`to_dict` described; what is left out has its default.
+
+        Raises
+        ------
+        DataError
+            If a key is unknown or missing; it names those that are known.
+        """
+        given = _checked(description, cls, "the experiment")
+        excitation = dict(given["excitation"])
+        kind = excitation.pop("kind", None)
+        if kind not in _EXCITATIONS:
+            raise DataError(
+                f"the excitation has the kind {kind!r}; expected one of {', '.join(_EXCITATIONS)}"
+            )
+        acquisition = _checked(given.get("acquisition", {}), Acquisition, "acquisition")
+        for name in acquisition.keys() & {"displacement", "force"}:
+            acquisition[name] = _built(Channel, acquisition[name], f"acquisition.{name}")
+        table = given.get("table")
+        return cls(
+            plant=model_from_description(given["plant"]),
+            excitation=_built(_EXCITATIONS[kind], excitation, "excitation"),
+            acquisition=Acquisition(**acquisition),
+            table=None if table is None else _built(Table, table, "table"),
+            motion=given.get("motion", "translation"),
+        )
+
+    def to_json(self) -> str:
+        """Return the description as JSON."""
+        return json.dumps(self.to_dict(), indent=2)
+
+    @classmethod
+    def from_json(cls, text: str) -> Experiment:
+        """Return the experiment that a JSON text describes.
+
+        Raises
+        ------
+        DataError
+            If the text is no JSON, or no experiment.
+        """
+        try:
+            return cls.from_dict(json.loads(text))
+        except json.JSONDecodeError as exc:
+            raise DataError(f"the experiment is no JSON: {exc}") from exc
+
+    def to_toml(self) -> str:
+        """Return the description as TOML."""
+        return toml_text(self.to_dict())
+
+    @classmethod
+    def from_toml(cls, text: str) -> Experiment:
+        """Return the experiment that a TOML text describes.
+
+        Raises
+        ------
+        DataError
+            If the text is no TOML, or no experiment.
+        """
+        try:
+            return cls.from_dict(tomllib.loads(text))
+        except tomllib.TOMLDecodeError as exc:
+            raise DataError(f"the experiment is no TOML: {exc}") from exc
+
+    @classmethod
+    def read(cls, path: str | Path) -> Experiment:
+        """Return the experiment in a file, ending in ``.toml`` or ``.json``.
+
+        Raises
+        ------
+        DataError
+            If the file cannot be read, or holds no experiment.
+        """
+        place = Path(path)
+        readers = {".toml": cls.from_toml, ".json": cls.from_json}
+        if place.suffix not in readers:
+            raise DataError(f"{place}: expected an experiment in .toml or .json")
+        try:
+            text = place.read_text(encoding="utf-8")
+        except OSError as exc:
+            raise DataError(f"{place}: cannot be read: {exc.strerror or exc}") from exc
+        try:
+            return readers[place.suffix](text)
+        except DahlIdentError as exc:
+            raise DataError(f"{place}: {exc}") from exc
+
+    def __str__(self) -> str:
+        return self.to_toml()
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Experiment):
+            return NotImplemented
+        return self.to_dict() == other.to_dict()
+
+    def __hash__(self) -> int:
+        return hash(self.to_json())
+
+    def _check_table(self, table: Table) -> None:
+        if not isinstance(self.excitation, SteppedSine):
+            raise ValidationError(
+                f"a table was asked of a {type(self.excitation).__name__}; only a SteppedSine has "
+                "one response for each step: leave table out to record waveforms"
+            )
+        if self.excitation.controlled == "force" and table.harmonics != (1,):
+            raise ValidationError(
+                f"harmonics is {table.harmonics} where force is controlled; expected (1,)"
+            )
+        faults = self.acquisition.faults_of_records()
+        if faults:
+            raise ValidationError(
+                f"{', '.join(faults)} have no place in a table; leave table out to record "
+                "waveforms, or say how the table scatters in Table"
+            )
+
+
+def _built(cls: type[_T], given: Mapping[str, Any], where: str) -> _T:
+    """Return the dataclass that plain data describe."""
+    return cls(**_checked(given, cls, where))
+
+
+def _checked(given: Any, cls: type[Any], where: str) -> dict[str, Any]:
+    """Return plain data as arguments of a dataclass, or name the keys that do not fit."""
+    if not isinstance(given, Mapping):
+        raise DataError(f"{where} is {given!r}; expected a table of named values")
+    known = {f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(cls)}
+    unknown = [key for key in given if key not in known]
+    missing = [key for key, required in known.items() if required and key not in given]
+    if unknown or missing:
+        found = [f"the unknown {', '.join(unknown)}"] if unknown else []
+        found += [f"no {', '.join(missing)}"] if missing else []
+        raise DataError(f"{where} has {' and '.join(found)}; expected {', '.join(known)}")
+    return dict(given)
+
+
+def _plain(value: Any) -> Any:
+    """Return nested data with lists for tuples and without None."""
+    if isinstance(value, Mapping):
+        return {k: _plain(v) for k, v in value.items() if v is not None}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    return value

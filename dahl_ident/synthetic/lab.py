@@ -1,0 +1,162 @@
+"""Run an experiment: from its description and a seed to data as a laboratory would store them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray, whole_number
+from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.steady_state import response
+from dahl_ident.synthetic.excitation import SteppedSine
+from dahl_ident.synthetic.experiment import Experiment
+from dahl_ident.synthetic.mechanism import Mechanism, Signal
+from dahl_ident.synthetic.plant_motion import Progress
+from dahl_ident.synthetic.randomness import Draws
+from dahl_ident.synthetic.table_errors import Phasors, Table, receptance_table, stiffness_table
+from dahl_ident.synthetic.waveform import Waveform
+
+GENERATOR = "dahl_ident.synthetic 1"
+"""Raised whenever the same experiment and seed would give other values."""
+
+IntArray = NDArray[np.int64]
+Steps = tuple[FloatArray, FloatArray]
+"""Level and frequency, Hz, of every step."""
+
+
+def simulate(
+    experiment: Experiment, *, seed: int, progress: Progress | None = None
+) -> Record | FrequencyResponse:
+    """Return the data of one experiment, sensors and all.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Mechanism, excitation, sensors, and whether a record or a table is wanted.
+    seed : int
+        Whole number >= 0. The same seed gives the same values to 1e-12 on every platform.
+    progress : callable, optional
+        Told the fraction that is done, now and then, while a plant is simulated.
+
+    Returns
+    -------
+    Record or FrequencyResponse
+        A table where the experiment asks for one, else waveforms. Its provenance holds the
+        experiment, the seed, the true parameters and, for a stepped sine, the measured windows.
+
+    Raises
+    ------
+    ModelError
+        If the plant has no motion in time, no steady state, or moves beyond all bounds.
+    ValidationError
+        If `experiment` is no Experiment, `seed` no whole number, or the sampling rate too low.
+
+    Notes
+    -----
+    A displacement-controlled mechanism is exact (Eqn. 3 from turning point to turning point).
+    A force-controlled plant (Eqn. 53) is solved to about 1e-11 of its motion, reversals located;
+    the describing function plays no part in it. Tables hold the describing-function steady
+    state, :func:`dahl_ident.response`.
+
+    Examples
+    --------
+    >>> from dahl_ident import Dahl
+    >>> from dahl_ident.synthetic import Experiment, SteppedSine, Table
+    >>> run = Experiment(Dahl(0.1, 30.0), SteppedSine(levels=(1e-3, 1e-2)), table=Table())
+    >>> abs(simulate(run, seed=1).response).round(3).tolist()
+    [29.256, 11.58]
+    """
+    if not isinstance(experiment, Experiment):
+        raise ValidationError(
+            f"experiment is a {type(experiment).__name__}; expected a dahl_ident.synthetic."
+            "Experiment, such as Experiment.read('run.toml')"
+        )
+    draws = Draws(whole_number(seed, "seed", 0))
+    provenance: dict[str, Any] = {
+        "generator": GENERATOR,
+        "seed": int(seed),
+        "truth": experiment.truth,
+        "experiment": experiment.to_dict(),
+    }
+    excitation = experiment.excitation
+    if experiment.table is not None and isinstance(excitation, SteppedSine):
+        level, frequency_hz = np.array(excitation.grid(seed)).T
+        data = _table(experiment, (level, frequency_hz), experiment.table, draws)
+        outliers = experiment.table.outlier_rows(data.n, draws)
+        return replace(
+            data, motion=experiment.motion, provenance=provenance | {"outlier_rows": outliers}
+        )
+    waveform = excitation.waveform(seed)
+    windows = [list(window) for window in waveform.windows]
+    return _record(experiment, waveform, draws, provenance | {"windows": windows}, progress)
+
+
+def _record(
+    experiment: Experiment,
+    waveform: Waveform,
+    draws: Draws,
+    provenance: dict[str, Any],
+    progress: Progress | None,
+) -> Record:
+    mechanism = Mechanism.of(experiment.plant)
+    displacement: Signal = waveform.value
+    force: Signal = waveform.value
+    if experiment.excitation.controlled == "force":
+        displacement = mechanism.displacement_under(waveform, progress)
+    else:
+        force = mechanism.force_under(waveform, progress)
+    acquisition = experiment.acquisition
+    times = acquisition.sampling_times(waveform.duration, waveform.highest_frequency_hz)
+    time, x, F = acquisition.record(displacement, force, times, draws)
+    return Record(time, displacement=x, force=F, motion=experiment.motion, provenance=provenance)
+
+
+def _table(experiment: Experiment, steps: Steps, table: Table, draws: Draws) -> FrequencyResponse:
+    """Return the table of a stepped sine: the true phasors, as the sensors show them."""
+    if experiment.excitation.controlled == "force":
+        phasors = _forced_phasors(experiment, *steps)
+        return receptance_table(phasors, table, draws)
+    phasors = _held_phasors(experiment, *steps, np.array(table.harmonics))
+    return stiffness_table(phasors, table, draws)
+
+
+def _held_phasors(
+    experiment: Experiment, level: FloatArray, frequency_hz: FloatArray, harmonics: IntArray
+) -> Phasors:
+    """Return a row for every step and harmonic, the displacement held at its level."""
+    step, k = (g.ravel() for g in np.meshgrid(np.arange(level.size), harmonics, indexing="ij"))
+    A, f = level[step], frequency_hz[step]
+    omega = 2.0 * np.pi * f
+    force = np.zeros(step.size, dtype=np.complex128)
+    for harmonic in harmonics.tolist():
+        rows = k == harmonic
+        stiffness = experiment.plant.dynamic_stiffness(A[rows], omega[rows], harmonic=harmonic)
+        force[rows] = stiffness * A[rows]
+    fundamental = np.abs(experiment.plant.dynamic_stiffness(A, omega)) * A
+    sensors = experiment.acquisition
+    return Phasors(
+        f, A, k, step,
+        displacement=A * sensors.displacement.response(omega),
+        force=force * sensors.force.response(k * omega),
+        force_size=fundamental * np.abs(sensors.force.response(omega)),
+    )  # fmt: skip
+
+
+def _forced_phasors(experiment: Experiment, drive: FloatArray, frequency_hz: FloatArray) -> Phasors:
+    """Return a row for every step, the force held at its level."""
+    steady = response(experiment.plant, frequency_hz, drive)
+    if not steady.found.all():
+        raise ModelError(steady.message)
+    omega = 2.0 * np.pi * frequency_hz
+    sensors = experiment.acquisition
+    force = drive * sensors.force.response(omega)
+    return Phasors(
+        frequency_hz, drive, np.ones(drive.size, dtype=np.int64), np.arange(drive.size),
+        displacement=steady.displacement * sensors.displacement.response(omega),
+        force=force,
+        force_size=np.abs(force),
+    )  # fmt: skip

@@ -1,0 +1,163 @@
+"""Tables of response as a laboratory would have extracted them, errors included.
+
+With the true phasors X and F and relative errors e of each part, the table holds
+F (1 + e_F) over X (1 + e_X) and the amplitude |X (1 + e_X)|, so that response and amplitude
+share the displacement's error; the covariance says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import ComplexArray, FloatArray, whole_number
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.errors import ValidationError
+from dahl_ident.synthetic.checks import non_negative_number
+from dahl_ident.synthetic.randomness import Draws
+
+
+@dataclass(frozen=True)
+class Table:
+    """Ask for a table of response, and say how good it is.
+
+    Parameters
+    ----------
+    displacement_std, force_std : float, default 0
+        Relative standard deviation of the real and of the imaginary part of each phasor; of
+        the fundamental's size for higher harmonics of the force.
+    harmonics : sequence of int, default (1,)
+        Harmonics of the force that get a row, where displacement is controlled.
+    outlier_fraction : float, default 0
+        Share of the rows, chosen at random, with a gross error.
+    outlier_size : float, default 0.5
+        That error relative to the response, in a random direction of the complex plane.
+
+    Raises
+    ------
+    ValidationError
+        If a value is not as said here.
+
+    Examples
+    --------
+    >>> Table(force_std=0.01).harmonics
+    (1,)
+    """
+
+    displacement_std: float = 0.0
+    force_std: float = 0.0
+    harmonics: Sequence[int] = (1,)
+    outlier_fraction: float = 0.0
+    outlier_size: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("displacement_std", "force_std", "outlier_fraction", "outlier_size"):
+            object.__setattr__(self, name, non_negative_number(getattr(self, name), name))
+        if self.outlier_fraction > 1.0:
+            raise ValidationError(
+                f"outlier_fraction is {self.outlier_fraction!r}; expected a share from 0 to 1"
+            )
+        harmonics = tuple(whole_number(k, "harmonics", 1) for k in self.harmonics)
+        if not harmonics:
+            raise ValidationError("harmonics is empty; expected at least the fundamental, (1,)")
+        object.__setattr__(self, "harmonics", harmonics)
+
+    def outlier_rows(self, rows: int, draws: Draws) -> list[int]:
+        """Return the rows that get a gross error, rising."""
+        count = round(self.outlier_fraction * rows)
+        return sorted(draws.permutation("outlier rows", rows)[:count])
+
+
+class Phasors(NamedTuple):
+    """What the sensors show of each row, without their noise; F_k is referred to t = 0."""
+
+    frequency_hz: FloatArray
+    level: FloatArray
+    harmonic: NDArray[np.int64]
+    step: NDArray[np.int64]
+    displacement: ComplexArray
+    force: ComplexArray
+    force_size: FloatArray
+
+
+def stiffness_table(phasors: Phasors, table: Table, draws: Draws) -> FrequencyResponse:
+    """Return F_k/X_1, its phase referred to k times the displacement's (displacement held)."""
+    k = phasors.harmonic
+    X, F = _with_errors(phasors, table, draws)
+    response = F / np.abs(X) * np.exp(-1j * k * np.angle(X))
+    along, across = response, 1j * k * response  # changes with |X| and with its phase
+    force_part = (table.force_std * phasors.force_size / np.abs(X)) ** 2
+    covariance = table.displacement_std**2 * (_outer(along) + _outer(across)) + force_part[
+        :, None, None
+    ] * np.eye(2)
+    data = FrequencyResponse(
+        phasors.frequency_hz, response, np.abs(X), harmonic=k, level=phasors.level,
+        controlled="displacement",
+    )  # fmt: skip
+    return _finished(data, covariance, -response, table, draws)
+
+
+def receptance_table(phasors: Phasors, table: Table, draws: Draws) -> FrequencyResponse:
+    """Return X/F (force held)."""
+    X, F = _with_errors(phasors, table, draws)
+    response = X / F
+    relative = table.displacement_std**2 + table.force_std**2
+    covariance = relative * np.abs(response)[:, None, None] ** 2 * np.eye(2)
+    data = FrequencyResponse(
+        phasors.frequency_hz, response, np.abs(X), np.abs(F), level=phasors.level,
+        controlled="force", quantity="receptance",
+    )  # fmt: skip
+    return _finished(data, covariance, response, table, draws)
+
+
+def _with_errors(phasors: Phasors, table: Table, draws: Draws) -> tuple[ComplexArray, ComplexArray]:
+    """Return X and F_k with their noise; the rows of one step share the displacement's."""
+    steps, which = np.unique(phasors.step, return_inverse=True)
+    e_x = _complex_normal("displacement phasor", steps.size, draws)[which]
+    e_f = _complex_normal("force phasor", phasors.force.size, draws)
+    turned = np.exp(1j * np.angle(phasors.force))
+    return (
+        phasors.displacement * (1.0 + table.displacement_std * e_x),
+        phasors.force + table.force_std * phasors.force_size * turned * e_f,
+    )
+
+
+def _finished(
+    data: FrequencyResponse,
+    covariance: FloatArray,
+    with_amplitude: ComplexArray,
+    table: Table,
+    draws: Draws,
+) -> FrequencyResponse:
+    """Add what is known of the errors, and the outliers, which nobody knows of."""
+    rows = table.outlier_rows(data.n, draws)
+    angle = 2.0 * np.pi * draws.uniform("outlier direction", data.n)[rows]
+    response = data.response.copy()
+    response[rows] *= 1.0 + table.outlier_size * np.exp(1j * angle)
+    data = replace(data, response=response)
+    if data.amplitude is None or table.displacement_std == table.force_std == 0.0:
+        return data
+    shared = table.displacement_std**2 * data.amplitude * with_amplitude
+    return replace(
+        data,
+        covariance=covariance,
+        dof=np.full(data.n, np.inf),
+        amplitude_std=table.displacement_std * data.amplitude,
+        amplitude_covariance=np.column_stack([shared.real, shared.imag]),
+    )
+
+
+def _complex_normal(purpose: str, n: int, draws: Draws) -> ComplexArray:
+    return np.asarray(
+        draws.normal(f"{purpose}, real", n) + 1j * draws.normal(f"{purpose}, imaginary", n)
+    )
+
+
+def _outer(v: ComplexArray) -> FloatArray:
+    """Return the (n, 2, 2) products of a complex vector's parts with each other."""
+    parts = np.column_stack([v.real, v.imag])
+    return np.asarray(parts[:, :, None] * parts[:, None, :])

@@ -1,0 +1,218 @@
+"""Smooth excitation waveforms: sines whose amplitude and frequency move from step to step.
+
+A waveform is a chain of segments, each a(t) sin(phi(t)) with the phase carried on, so value,
+velocity and acceleration are known in closed form at every instant. A level or a frequency
+changes along the quintic 10 tau^3 - 15 tau^4 + 6 tau^5, whose first two derivatives vanish at
+both ends: the acceleration has no jump for a mass to feel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+
+Course = Literal["smooth", "linear", "log"]
+
+
+class Motion(NamedTuple):
+    """A waveform's value with its first and second derivative in time."""
+
+    value: FloatArray
+    velocity: FloatArray
+    acceleration: FloatArray
+
+
+class Window(NamedTuple):
+    """The whole periods of one step that are meant to be measured."""
+
+    level: float
+    frequency_hz: float
+    start: float
+    stop: float
+
+
+@dataclass(frozen=True)
+class Segment:
+    """a(t) sin(phi(t)) from `start` for `duration` s; amplitude and frequency take one `course`."""
+
+    start: float
+    duration: float
+    amplitude: tuple[float, float]
+    frequency_hz: tuple[float, float]
+    phase: float
+    course: Course = "smooth"
+
+    @property
+    def stop(self) -> float:
+        """End of the segment, s."""
+        return self.start + self.duration
+
+    @property
+    def final_phase(self) -> float:
+        """Phase at the end, rad."""
+        return float(self._phase(np.asarray(1.0)))
+
+    def value(self, time: FloatArray) -> FloatArray:
+        """Return the waveform at times within the segment."""
+        tau = (time - self.start) / self.duration
+        return np.asarray(_between(*self.amplitude, self.course, tau) * np.sin(self._phase(tau)))
+
+    def motion(self, time: FloatArray) -> Motion:
+        """Return the waveform and its derivatives at times within the segment."""
+        T = self.duration
+        tau = (time - self.start) / T
+        a, a1, a2 = _between_with_slopes(*self.amplitude, self.course, tau)
+        f, f1, _ = _between_with_slopes(*self.frequency_hz, self.course, tau)
+        w, w1 = 2.0 * np.pi * f, 2.0 * np.pi * f1 / T
+        phase = self._phase(tau)
+        sin, cos = np.sin(phase), np.cos(phase)
+        return Motion(
+            a * sin,
+            a1 / T * sin + a * w * cos,
+            (a2 / T**2 - a * w**2) * sin + (2.0 * a1 / T * w + a * w1) * cos,
+        )
+
+    def _phase(self, tau: FloatArray) -> FloatArray:
+        return np.asarray(
+            self.phase
+            + 2.0 * np.pi * self.duration * _integral(*self.frequency_hz, self.course, tau)
+        )
+
+
+@dataclass(frozen=True)
+class Waveform:
+    """Segments that follow each other without a gap, and the windows meant to be measured."""
+
+    segments: tuple[Segment, ...]
+    windows: tuple[Window, ...] = ()
+
+    @property
+    def duration(self) -> float:
+        """End of the last segment, s; the first begins at 0."""
+        return self.segments[-1].stop
+
+    @property
+    def highest_frequency_hz(self) -> float:
+        """Highest instantaneous frequency, Hz."""
+        return max(max(s.frequency_hz) for s in self.segments)
+
+    def motion(self, time: FloatArray) -> Motion:
+        """Return value and derivatives at any times; still at its end values outside."""
+        t = np.clip(np.asarray(time), 0.0, self.duration)
+        starts = np.array([s.start for s in self.segments])
+        which = np.searchsorted(starts, t, side="right") - 1
+        parts = np.zeros((3, *t.shape))
+        for i in np.unique(which):
+            here = which == i
+            parts[:, here] = self.segments[i].motion(t[here])
+        parts[1:, t != time] = 0.0
+        return Motion(*parts)
+
+    def value(self, time: FloatArray) -> FloatArray:
+        """Return the waveform at any times."""
+        return self.motion(time).value
+
+    def turning_times(self) -> FloatArray:
+        """Return the instants between which the motion is monotone, from 0 to the end, s."""
+        turns = [_turning_times(segment) for segment in self.segments]
+        ends = [segment.stop for segment in self.segments]
+        return np.unique(np.concatenate([[0.0], ends, *turns]))
+
+
+class WaveformBuilder:
+    """Appends segments at the phase, amplitude and frequency where the last one ended."""
+
+    def __init__(self, frequency_hz: float) -> None:
+        self._segments: list[Segment] = []
+        self._windows: list[Window] = []
+        self._time = self._phase = self._amplitude = 0.0
+        self._frequency = frequency_hz
+
+    def go_to(
+        self, amplitude: float, frequency_hz: float, duration: float, course: Course = "smooth"
+    ) -> None:
+        """Move to an amplitude and a frequency within `duration`; at once where that is 0."""
+        if duration > 0.0:
+            segment = Segment(
+                self._time,
+                duration,
+                (self._amplitude, amplitude),
+                (self._frequency, frequency_hz),
+                self._phase,
+                course,
+            )
+            self._segments.append(segment)
+            self._time = segment.stop
+            self._phase = segment.final_phase if amplitude > 0.0 else 0.0
+        self._amplitude, self._frequency = amplitude, frequency_hz
+
+    def stay(self, duration: float) -> None:
+        """Hold amplitude and frequency."""
+        self.go_to(self._amplitude, self._frequency, duration)
+
+    def measure(self, duration: float) -> None:
+        """Hold amplitude and frequency, and mark the time as measured."""
+        start = self._time
+        self.stay(duration)
+        self._windows.append(Window(self._amplitude, self._frequency, start, self._time))
+
+    def finish(self) -> Waveform:
+        """Return the waveform built so far."""
+        return Waveform(tuple(self._segments), tuple(self._windows))
+
+
+def _between(q0: float, q1: float, course: Course, tau: FloatArray) -> FloatArray | float:
+    """Return what moves from q0 to q1 as tau goes from 0 to 1."""
+    if q0 == q1:
+        return q0
+    return _between_with_slopes(q0, q1, course, tau)[0]
+
+
+def _between_with_slopes(
+    q0: float, q1: float, course: Course, tau: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what moves from q0 to q1, with two derivatives by tau."""
+    step = q1 - q0
+    if course == "linear" or step == 0.0:
+        return q0 + step * tau, np.full_like(tau, step), np.zeros_like(tau)
+    if course == "log":
+        rate = np.log(q1 / q0)
+        q = q0 * np.exp(rate * tau)
+        return q, rate * q, rate**2 * q
+    return (
+        q0 + step * tau**3 * (10.0 - tau * (15.0 - 6.0 * tau)),
+        step * 30.0 * (tau * (1.0 - tau)) ** 2,
+        step * 60.0 * tau * (1.0 - tau) * (1.0 - 2.0 * tau),
+    )
+
+
+def _integral(q0: float, q1: float, course: Course, tau: FloatArray) -> FloatArray:
+    """Return the integral of what moves from q0 to q1, from 0 to tau."""
+    step = q1 - q0
+    if step == 0.0:
+        return q0 * tau
+    if course == "linear":
+        return tau * (q0 + 0.5 * step * tau)
+    if course == "log":
+        rate = np.log(q1 / q0)
+        return np.asarray(q0 * np.expm1(rate * tau) / rate)
+    return q0 * tau + step * tau**4 * (2.5 - tau * (3.0 - tau))
+
+
+def _turning_times(segment: Segment, per_period: int = 64, halvings: int = 44) -> FloatArray:
+    """Return where the velocity changes sign: bracketed on a grid, then bisected."""
+    cells = int(np.ceil(segment.duration * max(segment.frequency_hz) * per_period)) + 1
+    grid = np.linspace(segment.start, segment.stop, cells + 1)
+    sign = np.sign(segment.motion(grid).velocity)
+    turns = np.flatnonzero(sign[1:] * sign[:-1] < 0.0)
+    exact = grid[1:-1][(sign[1:-1] == 0.0) & (sign[:-2] * sign[2:] < 0.0)]
+    low, high, before = grid[turns], grid[turns + 1], sign[turns]
+    for _ in range(halvings):
+        middle = 0.5 * (low + high)
+        same = np.sign(segment.motion(middle).velocity) == before
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    return np.sort(np.concatenate([0.5 * (low + high), exact]))
