@@ -54,6 +54,13 @@ class Binding:
     motions: dict[str, Motion] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        if self.source.headerless and not self.map.roles:
+            raise DataError(
+                f"{self.source.name}: the table has no header line; expected names and units "
+                "above the numbers, such as 'frequency_hz, amplitude [um], gain [N/m], phase_deg'"
+            )
+
     def channel(self, role: str) -> Channel | None:
         """Return the channel of a role, or None where the file has none.
 
@@ -89,11 +96,6 @@ class Binding:
 
     def required(self, role: str) -> Channel:
         """Return the channel of a role that must be there."""
-        if self.source.headerless and not self.map.roles:
-            raise DataError(
-                f"{self.source.name}: the table has no header line; expected names and units "
-                "above the numbers, such as 'frequency_hz, amplitude [um], gain [N/m], phase_deg'"
-            )
         channel = self.channel(role)
         if channel is None:
             raise DataError(

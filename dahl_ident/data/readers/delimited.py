@@ -28,6 +28,7 @@ _COMMENT = re.compile(r"\s*(?:#|%|//|!)")
 _COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|%|//|!)[^\r\n]*", re.MULTILINE)
 _LINE_END = re.compile(rb"\r\n|\n|\r")
 _HEAD_BYTES = 1 << 16
+_MISSING = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "n/a", "#N/A", "null", "1.#QNAN"]
 _DIALECTS = (
     ("\t", "."), (";", "."), (",", "."), ("|", "."),
     ("\t", ","), (";", ","), ("|", ","), (None, "."), (None, ","),
@@ -202,19 +203,21 @@ def _parse(
     options: dict[str, Any] = {} if exact else {"float_precision": "round_trip"}
     if any(mark in body for mark in (b"#", b"%", b"//", b"!")):
         body = _COMMENT_LINE.sub(b"", body)
-    texts = metadata.get("text", [])
-    if texts:
-        options["dtype"] = {i: str for i, n in enumerate(layout.header.names) if n in texts}
+    names = layout.header.names
+    keys = [str(i) for i in range(layout.width)]
+    known = metadata.get("text", [])
+    texts = {key for key, name in zip(keys, names, strict=False) if name in known}
     try:
         frame = pd.read_csv(
             io.BytesIO(body),
             sep=layout.delimiter or r"\s+",
             decimal=layout.mark,
             header=None,
-            names=list(range(layout.width)),
+            names=keys,
             skipinitialspace=True,
             keep_default_na=False,
-            na_values=[""],
+            na_values={key: [""] if key in texts else _MISSING for key in keys},
+            dtype=dict.fromkeys(texts, str),
             low_memory=False,
             encoding="utf-8",
             **options,
@@ -223,7 +226,7 @@ def _parse(
         raise DataError(f"{name}: {_where_ragged(str(exc), layout)}") from exc
     except (ValueError, OverflowError) as exc:
         raise DataError(f"{name}: the table cannot be read: {exc}") from exc
-    return [_plain(frame[i].to_numpy()) for i in range(layout.width)]
+    return [_plain(frame[key].to_numpy()) for key in keys]
 
 
 def _where_ragged(message: str, layout: _Layout) -> str:

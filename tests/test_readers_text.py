@@ -1,0 +1,297 @@
+"""Text tables: dialects, headers, units, and every way in which they can be wrong."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import hashlib
+import lzma
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dahl_ident.data import FrequencyResponse, Record, read_frequency_response, read_record
+from dahl_ident.errors import DataError, UnitError
+
+TIME, X, F = [0.0, 0.5, 1.0], [1e-3, 2.5e-3, -3e-3], [1000.0, 2000.0, 3500.0]
+
+
+def written(tmp_path: Path, text: str | bytes, name: str = "run.csv") -> Path:
+    path = tmp_path / name
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return path
+
+
+def assert_the_run(record: Record) -> None:
+    np.testing.assert_allclose(record.time, TIME, rtol=1e-15)
+    assert record.displacement is not None
+    assert record.force is not None
+    np.testing.assert_allclose(record.displacement, X, rtol=1e-15)
+    np.testing.assert_allclose(record.force, F, rtol=1e-15)
+
+
+PLAIN = "time [s],x [mm],F [kN]\n0,1,1\n0.5,2.5,2\n1,-3,3.5\n"
+
+
+class TestDialects:
+    @pytest.mark.parametrize(
+        "text",
+        [
+            PLAIN,
+            PLAIN.rstrip(),
+            PLAIN.replace("\n", "\r\n"),
+            PLAIN.replace("\n", "\r"),
+            PLAIN.replace(",", ";"),
+            PLAIN.replace(",", "\t"),
+            PLAIN.replace(",", "|"),
+            PLAIN.replace(",", ", "),
+            PLAIN.replace(",", ";").replace(".", ","),
+            PLAIN.replace(",", "\t").replace(".", ","),
+            PLAIN.replace(" [", "[").replace(",", "   "),
+            PLAIN.replace(" [", "[").replace(",", " ").replace(".", ",").replace("\n", "\n  "),
+            PLAIN.replace("[", "(").replace("]", ")"),
+            "time,x,F\ns,mm,kN\n0,1,1\n0.5,2.5,2\n1,-3,3.5\n",
+            "time,x,F\n[s],[mm],[kN]\n0,1,1\n0.5,2.5,2\n1,-3,3.5\n",
+            "Test rig 5\nSample rate,2\nOperator;A. Hill\n\n" + PLAIN,
+            "Channel 1,Channel 2,Channel 3\n" + PLAIN,
+            "# made by a logger\n# 3 channels\n" + PLAIN,
+            "% made by a logger\n" + PLAIN + "% the end\n",
+            "# " + PLAIN,
+            PLAIN.replace("0.5", "# a pause\n\n0.5"),
+            "time [s],x [mm],F [kN],\n0,1,1,\n0.5,2.5,2,\n1,-3,3.5,\n",
+            "time [s],x [mm],F [kN]\n0,1,1,\n0.5,2.5,2,\n1,-3,3.5,\n",
+            "time [s]\tx [mm]\tF [kN]\t\n0\t1\t1\t\n0.5\t2.5\t2\t\n1\t-3\t3.5\t\n",
+            "time [s],,x [mm],F [kN]\n0,,1,1\n0.5,,2.5,2\n1,,-3,3.5\n",
+            '"time [s]","x [mm]","F [kN]"\n"0","1","1"\n"0.5","2.5","2"\n"1","-3","3.5"\n',
+            'time [s],"note, long","x [mm]",F [kN]\n0,a,1,1\n0.5,"b, c",2.5,2\n1,,-3,3.5\n',
+            "time [s],x [mm],F [kN]\n0,1.0e0,1\n.5,+2.5E+0,2.\n1,-3,35e-1\n",
+        ],
+    )
+    def test_every_dialect_reads_alike(self, tmp_path: Path, text: str) -> None:
+        assert_the_run(read_record(written(tmp_path, text)))
+
+    @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+    def test_encodings(self, tmp_path: Path, encoding: str) -> None:
+        text = PLAIN.replace("mm", "µm").replace("1,-3", "1,-3")
+        record = read_record(written(tmp_path, text.encode(encoding)))
+        assert record.displacement is not None
+        np.testing.assert_allclose(record.displacement, np.array(X) * 1e-3)
+
+    @pytest.mark.parametrize(
+        ("ending", "pack"),
+        [(".gz", gzip.compress), (".bz2", bz2.compress), (".xz", lzma.compress)],
+    )
+    def test_packed(self, tmp_path: Path, ending: str, pack: Any) -> None:
+        assert_the_run(read_record(written(tmp_path, pack(PLAIN.encode()), f"run.csv{ending}")))
+
+    def test_standard_input(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        with written(tmp_path, PLAIN).open() as stream:
+            monkeypatch.setattr("sys.stdin", stream)
+            assert_the_run(read_record("-"))
+
+    def test_numbers_are_read_to_the_last_digit(self, tmp_path: Path) -> None:
+        rng = np.random.default_rng(11)
+        numbers = np.exp(rng.uniform(-200, 200, (2000, 2))) * rng.choice([-1.0, 1.0], (2000, 2))
+        lines = [f"{i},{x!r},{f!r}" for i, (x, f) in enumerate(numbers.tolist())]
+        text = "time [s],x [m],F [N]\n" + "\n".join(lines)
+        record = read_record(written(tmp_path, text))
+        np.testing.assert_array_equal(record.displacement, numbers[:, 0])
+        np.testing.assert_array_equal(record.force, numbers[:, 1])
+
+
+class TestColumns:
+    def test_names_units_signs_and_factors(self, tmp_path: Path) -> None:
+        path = written(tmp_path, "t,LVDT 2,cell,amp\n0,1,1,1\n0.5,2.5,2,2\n1,-3,3.5,3\n")
+        columns = tmp_path / "lab.toml"
+        columns.write_text(
+            'drive_factor = "12.5 N/V"\ndrive_factor_uncertainty = 0.01\n'
+            '[time]\ncolumn = "t"\nunit = "s"\n'
+            '[displacement]\ncolumn = "LVDT 2"\nunit = "mm"\nsign = -1\n'
+            '[force]\ncolumn = "cell"\nunit = "kN"\nfactor = 2.0\n'
+            '[drive]\ncolumn = "amp"\nunit = "mV"\n'
+        )
+        record = read_record(path, columns=columns)
+        np.testing.assert_allclose(record.displacement, -np.array(X))  # type: ignore[arg-type]
+        np.testing.assert_allclose(record.force, 2.0 * np.array(F))  # type: ignore[arg-type]
+        np.testing.assert_allclose(record.drive, [1e-3, 2e-3, 3e-3])  # type: ignore[arg-type]
+        assert (record.drive_unit, record.drive_factor) == ("V", 12.5)
+        assert record.drive_factor_uncertainty == 0.01
+
+    def test_keywords_name_columns_with_their_units(self, tmp_path: Path) -> None:
+        path = written(tmp_path, "a,b,c\n0,1,1\n0.5,2.5,2\n1,-3,3.5\n")
+        assert_the_run(read_record(path, time="a [s]", displacement="b [mm]", force="c [kN]"))
+
+    def test_keywords_override_the_map(self, tmp_path: Path) -> None:
+        path = written(tmp_path, "t [s],x [mm],y [mm],F [kN]\n0,9,1,1\n0.5,9,2.5,2\n1,9,-3,3.5\n")
+        assert_the_run(read_record(path, columns={"displacement": "x"}, displacement="y"))
+
+    def test_headerless_table_with_a_map(self, tmp_path: Path) -> None:
+        path = written(tmp_path, "0,1,1\n0.5,2.5,2\n1,-3,3.5\n")
+        columns = {"time": "column 1 [s]", "displacement": "column 2 [mm]"}
+        assert_the_run(read_record(path, columns=columns, force="column 3 [kN]"))
+
+    def test_sample_rate_instead_of_time(self, tmp_path: Path) -> None:
+        record = read_record(
+            written(tmp_path, "x [mm],F [kN]\n1,1\n2.5,2\n-3,3.5\n"), sample_rate=2.0
+        )
+        assert_the_run(record)
+        assert record.provenance is not None
+        assert record.provenance["notes"] == ["time counted from the sample rate of 2 Hz"]
+
+    def test_provenance(self, tmp_path: Path) -> None:
+        path = written(tmp_path, PLAIN)
+        provenance = read_record(path).provenance
+        assert provenance == {
+            "file": str(path),
+            "format": "text table",
+            "sha256": hashlib.sha256(PLAIN.encode()).hexdigest(),
+        }
+
+    def test_rotation(self, tmp_path: Path) -> None:
+        record = read_record(
+            written(tmp_path, "t [s],position [deg],torque [lbf-in]\n0,90,1\n1,180,2\n")
+        )
+        assert record.motion == "rotation"
+        np.testing.assert_allclose(record.displacement, [np.pi / 2, np.pi])  # type: ignore[arg-type]
+
+    @pytest.mark.parametrize(
+        ("header", "channel", "factor"),
+        [("vel [mm/s]", "velocity", 1e-3), ("acc [g]", "acceleration", 9.80665)],
+    )
+    def test_other_motions(self, tmp_path: Path, header: str, channel: str, factor: float) -> None:
+        record = read_record(written(tmp_path, f"t [s],{header},F [N]\n0,1,1\n1,2,2\n"))
+        np.testing.assert_allclose(getattr(record, channel), [factor, 2 * factor])
+
+    def test_missing_samples_become_gaps_on_request(self, tmp_path: Path) -> None:
+        text = "t [s],x [mm],F [N]\n0,1,1\n1,,2\n2,3,3\n3,4,nan\n4,5,5\n5,6,6\n"
+        with pytest.raises(
+            DataError, match=r"line 3, column 'x': the cell is empty or NaN \(1 such"
+        ):
+            read_record(written(tmp_path, text))
+        record = read_record(written(tmp_path, text), missing="drop")
+        assert record.time.tolist() == [0.0, 2.0, 4.0, 5.0]
+        assert "2 samples with missing values left out" in record.provenance["notes"]  # type: ignore[index]
+
+
+class TestRefusal:
+    """Never a number from bad input; the message says where and what to do."""
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("", "the file is empty"),
+            (" \n\n", "the file is empty"),
+            ("just some words\nand more words\n", "no table of numbers found"),
+            ("1\n2\n3\n", "no table of numbers found"),
+            ("0,1,1\n0.5,2.5,2\n", "no header line; expected names and units above the numbers"),
+            (PLAIN + "2,3\n", r"the last line has 2 fields, '2,3', where the others have 3"),
+            (PLAIN + "end of data\n", "the last line has 1 fields, 'end of data'"),
+            (PLAIN + "2,3,4,5\n3,4,5\n", "line 5 has 4 fields; expected 3 as in the lines above"),
+            (PLAIN.replace("2.5", "two"), r"run.csv, line 3, column 'x': 'two' is not a number"),
+            (PLAIN.replace("2.5", "2,5"), "line 3 has 4 fields; expected 3"),
+            (PLAIN.replace("2.5", "1_000"), r"line 3, column 'x': '1_000' is not a number"),
+            (PLAIN.replace("2.5", ""), r"line 3, column 'x': the cell is empty or NaN"),
+            (PLAIN.replace("2.5", "NaN"), r"line 3, column 'x': the cell is empty or NaN"),
+            (PLAIN.replace("2.5", "inf"), r"line 3, column 'x': the cell is inf"),
+            (PLAIN.replace("2.5", "1e300"), r"line 3, column 'x': the cell is 1e\+300"),
+            (PLAIN.replace("2.5", "True"), r"line 3, column 'x': 'True' is not a number"),
+            (PLAIN.replace("\n1,", "\n0.2,"), r"line 4, column 'time': time is 0.2 after 0.5 \(1 "),
+            (PLAIN.replace("\n1,", "\n0.5,"), "time is 0.5 after 0.5"),
+            (PLAIN.replace("F [kN]", "x [mm]"), "2 columns may be the displacement: x \\[mm\\]"),
+            (PLAIN.replace("F [kN]", "disp [mm]"), "say which one with columns={'displacement'"),
+            (
+                PLAIN.replace("x [mm]", "v [mm/s]").replace("F [kN]", "x [mm]"),
+                "displacement and vel",
+            ),
+            (PLAIN.replace("x [", "u ["), "no motion found; expected one of displacement"),
+            (PLAIN.replace("F [", "load ["), r"no column holds the force; there are time \[s\], x"),
+            (PLAIN.replace("time [s]", "clock [s]"), "no column holds the time"),
+            (PLAIN.replace("mm", "um rms"), r"unit \[um rms\]; expected the samples of a waveform"),
+            ("time [s],x [mm],F [kN]\n0,1,1\n", "time: expected at least two samples"),
+        ],
+    )
+    def test_bad_tables(self, tmp_path: Path, text: str, message: str) -> None:
+        with pytest.raises((DataError, UnitError), match=message):
+            read_record(written(tmp_path, text))
+
+    def test_line_numbers_count_preamble_comments_and_blanks(self, tmp_path: Path) -> None:
+        text = "rig 5\n\n# c\n" + PLAIN.replace("0.5", "\n# pause\n0.5").replace("2.5", "two")
+        with pytest.raises(DataError, match="line 8, column 'x'"):
+            read_record(written(tmp_path, text))
+
+    def test_units(self, tmp_path: Path) -> None:
+        with pytest.raises(UnitError, match=r"'x' has no unit; .*'x \[um\]'.*'unit': 'um'"):
+            read_record(written(tmp_path, PLAIN.replace("x [mm]", "x")))
+        with pytest.raises(UnitError, match=r"the force has the unit \[mm\]; expected"):
+            read_record(written(tmp_path, PLAIN.replace("kN", "mm")))
+        with pytest.raises(UnitError, match=r"column 'F': \[wat\] is not a known unit"):
+            read_record(written(tmp_path, PLAIN.replace("kN", "wat")))
+        path = written(tmp_path, "t [s],x [deg],F [N],T [Nm]\n0,1,1,1\n1,2,2,2\n")
+        with pytest.raises(
+            UnitError, match=r"units disagree: .*force is translation, drive is rot"
+        ):
+            read_record(path, drive="T", force="F")
+
+    def test_binary_behind_a_text_extension(self, tmp_path: Path) -> None:
+        with pytest.raises(DataError, match=r"the file is binary \(byte 5 is 0\)"):
+            read_record(written(tmp_path, b"hello\0world"))
+
+    def test_damaged_packing(self, tmp_path: Path) -> None:
+        packed = gzip.compress(PLAIN.encode())[:-9]
+        with pytest.raises(DataError, match="the compressed file is damaged"):
+            read_record(written(tmp_path, packed, "run.csv.gz"))
+
+    def test_absent_file(self, tmp_path: Path) -> None:
+        with pytest.raises(DataError, match="cannot be read: No such file"):
+            read_record(tmp_path / "absent.csv")
+
+    def test_edited_metadata(self, tmp_path: Path) -> None:
+        with pytest.raises(DataError, match="line 1: the comment after 'dahl_ident:' is not what"):
+            read_record(written(tmp_path, "# dahl_ident: {oops\n" + PLAIN))
+
+    @pytest.mark.parametrize(
+        ("columns", "message"),
+        [
+            ({"froce": "F"}, "columns: unknown entry 'froce'; expected one of time, displacement"),
+            ({"force": 3}, "force is 3; expected a column's name"),
+            ({"force": {"col": "F"}}, "force: unknown entry 'col'"),
+            ({"force": {"column": 3}}, "force.column is 3; expected text"),
+            ({"force": {"column": "F", "sign": 2}}, "force.sign is 2; expected 1 or -1"),
+            ({"force": {"column": "F", "factor": -2}}, "force.factor is -2.0"),
+            ({"force": "load"}, r"no column is called 'load'; there are time, x, F"),
+            ({"displacement": {"unit": "mm"}, "force": {"column": "X"}}, None),
+            ({"velocity": {"unit": "mm/s"}}, "no column is called velocity or vel or v"),
+            ({"sample_rate": 0}, "sample_rate is 0.0"),
+            ({"drive_factor": 12.5}, "drive_factor is 12.5; expected text such as '12.5 N/V'"),
+            ({"quantity": "stiffness"}, "quantity is 'stiffness'"),
+            ({"controlled": 5}, "controlled is 5; expected 'displacement' or 'force'"),
+        ],
+    )
+    def test_bad_column_maps(self, tmp_path: Path, columns: Any, message: str | None) -> None:
+        path = written(tmp_path, PLAIN)
+        if message is None:
+            with pytest.raises(UnitError, match="the force has the unit"):
+                read_record(path, columns=columns)
+            return
+        with pytest.raises(DataError, match=message):
+            read_record(path, columns=columns)
+
+    def test_bad_column_map_files(self, tmp_path: Path) -> None:
+        path = written(tmp_path, PLAIN)
+        with pytest.raises(DataError, match="the column map cannot be read: No such file"):
+            read_record(path, columns=tmp_path / "absent.toml")
+        broken = written(tmp_path, "time = = 3", "lab.toml")
+        with pytest.raises(DataError, match="not a TOML file"):
+            read_record(path, columns=broken)
+
+
+class TestReadsAgain:
+    def test_text_quality_survives_look_alikes(self, tmp_path: Path) -> None:
+        data = FrequencyResponse(
+            [1.0, 2.0], [1j, 2j], [1e-3, 1e-3], quality={"note": ["007", "1e5"]}, level=["", "nan"]
+        )
+        back = read_frequency_response(data.save(tmp_path / "t.csv"))
+        assert back.quality["note"].tolist() == ["007", "1e5"]
+        assert back.levels == ["", "nan"]
