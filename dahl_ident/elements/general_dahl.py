@@ -302,7 +302,7 @@ def _close_loop(beta: FloatArray, alpha: FloatArray) -> _Closure:
         slope = 1.0 + np.exp(-alpha * length) * p * path / (1.0 + back)
         step = np.where(slips, 0.0, residual / slope)
         path = path * np.exp(-step)
-        if np.max(np.abs(step), initial=0.0) < 1e-9:  # the next one would be of its square
+        if np.max(np.abs(step), initial=0.0) < 1e-8:  # the next one would be of its square
             break
     return _Closure(p, path, _length(p, path, slips))
 
