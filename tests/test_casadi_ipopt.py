@@ -15,7 +15,8 @@ from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.quantities import converted
 from dahl_ident.elements import Element
 from dahl_ident.errors import FitError, ModelError, ValidationError
-from dahl_ident.fitting import least_squares
+from dahl_ident.fitting import ipopt, least_squares
+from dahl_ident.fitting.casadi_rows import Target, row_blocks
 from dahl_ident.fitting.ipopt import solve_ipopt
 from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.fitting.status import Status
@@ -373,6 +374,44 @@ def test_response_without_error_of_its_own_is_refused() -> None:
     )  # fmt: skip
     with pytest.raises(FitError, match=r"row 0: .* leaves|accounts for all of the response's"):
         solve_ipopt(Problem(tied, Dahl()))
+
+
+def test_plant_with_several_amplitudes_stays_on_the_one_measured() -> None:
+    plant = FRICTION + Mass(0.3) + Damper(-0.4) + Spring(20.0)
+    frequency, drive = np.tile(np.linspace(0.3, 2.6, 13), 2), np.repeat([0.05, 0.1], 13)
+    every = response(plant, frequency, drive, all_roots=True)
+    assert every.number_of_solutions.max() == 3
+    largest = (np.arange(frequency.size), every.number_of_solutions - 1)
+    data = FrequencyResponse(
+        frequency,
+        every.receptance[largest] * np.exp(noise(frequency.size, 0.01)),
+        every.amplitude[largest],
+        drive,
+        controlled="force",
+        quantity="receptance",
+    )
+    problem = Problem(data, UNKNOWN_PLANT)
+    assert_same(solve_ipopt(problem), least_squares.solve(problem))
+
+
+def test_search_that_runs_out_of_steps_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ipopt, "_ITERATIONS", 1)
+    problem = Problem(friction_data(), Dahl())
+    found = solve_ipopt(problem, constraints=lambda p: [p["sigma"] <= 250 * p["f_max"]])
+    assert found.status is Status.NOT_CONVERGED
+    assert "IPOPT says: it was still moving when its steps ran out." in found.message
+
+
+def test_start_without_steady_amplitude() -> None:
+    resonance = Dahl() + Mass(1.0) + Spring((2.0 * np.pi) ** 2)
+    data = FrequencyResponse(
+        [0.5, 0.7, 1.0], [0.03 - 0.001j, 0.05 - 0.002j, 0.1 - 1.0j], drive=np.full(3, 5.0),
+        controlled="force", quantity="receptance",
+    )  # fmt: skip
+    problem = Problem(data, resonance)
+    theta = problem.to_search([0.1, 30.0])
+    with pytest.raises(FitError, match="row 2: the plant has no steady amplitude for drive 5"):
+        row_blocks(Target(problem), ca.SX.sym("theta", 2), theta)
 
 
 def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:

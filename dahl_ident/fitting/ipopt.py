@@ -53,7 +53,7 @@ _RESCALINGS = 30
 _SAME_SCALE = 1e-10
 _SAME_COST = 1e-6
 _WORDS = {
-    "Maximum_Iterations_Exceeded": f"it was still moving after {_ITERATIONS} steps",
+    "Maximum_Iterations_Exceeded": "it was still moving when its steps ran out",
     "Restoration_Failed": "it could not get back to where the constraints hold",
     "Diverging_Iterates": "a parameter ran away",
     "Search_Direction_Becomes_Too_Small": "its steps became too small to make a difference",
