@@ -228,11 +228,9 @@ class TestRefusal:
             read_record(written(tmp_path, PLAIN.replace("kN", "mm")))
         with pytest.raises(UnitError, match=r"column 'F': \[wat\] is not a known unit"):
             read_record(written(tmp_path, PLAIN.replace("kN", "wat")))
-        path = written(tmp_path, "t [s],x [deg],F [N],T [Nm]\n0,1,1,1\n1,2,2,2\n")
-        with pytest.raises(
-            UnitError, match=r"units disagree: .*force is translation, drive is rot"
-        ):
-            read_record(path, drive="T", force="F")
+        path = written(tmp_path, "t [s],x [deg],F [N],M [Nm]\n0,1,1,1\n1,2,2,2\n")
+        with pytest.raises(UnitError, match=r"units disagree: .*translation, drive is rot"):
+            read_record(path, drive="M", force="F")
 
     def test_binary_behind_a_text_extension(self, tmp_path: Path) -> None:
         with pytest.raises(DataError, match=r"the file is binary \(byte 5 is 0\)"):

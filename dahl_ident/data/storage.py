@@ -11,7 +11,6 @@ import gzip
 import io
 import json
 import os
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -57,15 +56,15 @@ def write_whole(path: Path, content: bytes) -> None:
     DataError
         If the place cannot be written to.
     """
+    # not a file of tempfile, which nobody else may read
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
         try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(content)
-            Path(name).replace(path)
+            part.write_bytes(content)
+            part.replace(path)
         except BaseException:
             with contextlib.suppress(OSError):
-                Path(name).unlink()
+                part.unlink()
             raise
     except OSError as exc:
         raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
