@@ -54,7 +54,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray, array_between, positive_number
 
 _LEAST_BETA = 1e-200
-"""Below this the loop is a straight line to all digits: c_1 = beta, the others vanish."""
+"""Smaller loops are computed as one of this size, whose curvature underflows to zero."""
 
 _DEEPEST = 44.0
 """Integrals over l end here: exp(-44) is nothing, even over a root where slip sets in."""
@@ -350,7 +350,7 @@ class _Branch:
 
         self.rule = quadrature_rule(k)
         reach = np.minimum(self.length, _DEEPEST)
-        self.half = np.where(beta < _LEAST_BETA, 0.0, reach / 2.0)
+        self.half = reach / 2.0
         self.l = reach * self.rule.rise
         rest = (self.length - reach) + reach * self.rule.fall
         scaled = self.p * path  # p E(L)
