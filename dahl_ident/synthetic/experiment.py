@@ -87,8 +87,15 @@ class Experiment:
 
     @property
     def truth(self) -> dict[str, float]:
-        """The value of every parameter of the plant, by name."""
-        return {p.name: float(p.value) for p in self.plant.parameters if p.value is not None}
+        """The value of every parameter, by name; of the sensors those that are not ideal."""
+        values = {p.name: float(p.value) for p in self.plant.parameters if p.value is not None}
+        x, F = self.acquisition.displacement, self.acquisition.force
+        sensors = {
+            "force_gain": (F.gain, 1.0),
+            "displacement_gain": (x.gain, 1.0),
+            "delay": (x.delay - F.delay, 0.0),
+        }
+        return values | {name: v for name, (v, ideal) in sensors.items() if v != ideal}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the description as plain data; what is None is left out."""

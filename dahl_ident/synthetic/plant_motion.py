@@ -242,15 +242,15 @@ class _Run:
         forwards = np.flatnonzero(speed[:first] > 0.0)
         if forwards.size == 0:
             return 0.0
-        slope = DERIVATIVE @ x
-        return float(
-            brentq(
-                lambda tau: float(chebyshev.chebval(2.0 * tau - 1.0, slope)),
-                FINE[forwards[-1]],
-                FINE[first],
-                xtol=1e-15,
-            )
-        )
+        slope = self._friction.direction * (DERIVATIVE @ x)
+
+        def speed_at(tau: float) -> float:
+            return float(chebyshev.chebval(2.0 * tau - 1.0, slope))
+
+        low, high = float(FINE[forwards[-1]]), float(FINE[first])
+        if speed_at(low) <= 0.0:  # forwards by rounding alone
+            return low
+        return float(brentq(speed_at, low, high, xtol=1e-15))
 
     def _keep(self, t: float, length: float, interval: _Interval) -> None:
         self.starts.append(t)

@@ -1,0 +1,218 @@
+"""The data sets that ship: which experiment each is, what it teaches, what it can determine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dahl_ident.elements import Dahl, Damper, Mass, Spring
+from dahl_ident.synthetic.acquisition import Acquisition, Channel
+from dahl_ident.synthetic.excitation import SteppedSine
+from dahl_ident.synthetic.experiment import Experiment
+from dahl_ident.synthetic.table_errors import Table
+
+_F_MAX, _SIGMA = 0.1, 30.0
+_X_C = _F_MAX / _SIGMA
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """One shipped data set.
+
+    Attributes
+    ----------
+    name : str
+        What ``load_dataset`` calls it; its files bear this name.
+    experiment : Experiment
+        How it was made.
+    seed : int
+        With which random numbers.
+    teaches : str
+        Why it is there, in a line.
+    identifiable : tuple of str
+        Parameters that the data determine (standard deviation of the logarithm below 0.25).
+    not_identifiable : tuple of str
+        Parameters that they do not; a fit has to say so.
+    caution : str
+        The flaw that an honest analysis names, or an empty string.
+    """
+
+    name: str
+    experiment: Experiment
+    seed: int
+    teaches: str
+    identifiable: tuple[str, ...]
+    not_identifiable: tuple[str, ...] = ()
+    caution: str = ""
+
+    @property
+    def kind(self) -> str:
+        """What the set holds: "frequency_response" or "record"."""
+        return "record" if self.experiment.table is None else "frequency_response"
+
+    @property
+    def file(self) -> str:
+        """Name of the data file."""
+        return f"{self.name}.csv.gz" if self.kind == "record" else f"{self.name}.csv"
+
+
+def _spread(low: float, high: float, n: int, unit: float = 1.0) -> tuple[float, ...]:
+    """Return `n` levels of three digits, evenly spread over their logarithm."""
+    return tuple(float(f"{v:.3g}") for v in unit * np.geomspace(low, high, n))
+
+
+def _friction(
+    beta: tuple[float, float], table: Table, *, alpha: float = 1.0, levels: int = 30
+) -> Experiment:
+    """Return friction alone, the displacement held at levels from one beta to another."""
+    steps = SteppedSine(_spread(*beta, levels, unit=_X_C))
+    return Experiment(Dahl(_F_MAX, _SIGMA, alpha), steps, table=table)
+
+
+_PLANT = Dahl(_F_MAX, _SIGMA) + Mass(0.3) + Damper(0.24) + Spring(0.3)
+_ONE_PERCENT = Table(force_std=0.01)
+_BOTH = ("f_max", "sigma")
+_ALL_OF_PLANT = ("f_max", "sigma", "mass", "damping", "stiffness")
+
+DATA_SETS: dict[str, DataSet] = {
+    one.name: one
+    for one in (
+        DataSet(
+            "clean",
+            _friction((0.1, 10.0), Table()),
+            seed=1,
+            teaches="friction alone about its knee, without noise: an estimate is exact",
+            identifiable=_BOTH,
+        ),
+        DataSet(
+            "noisy",
+            _friction((0.1, 10.0), _ONE_PERCENT),
+            seed=2,
+            teaches="the same with 1 % noise: what every estimate should look like",
+            identifiable=_BOTH,
+        ),
+        DataSet(
+            "microslip",
+            _friction((0.001, 0.01), _ONE_PERCENT),
+            seed=3,
+            teaches="small amplitudes alone show sigma at once, f_max only through the loss",
+            identifiable=("sigma",),
+            not_identifiable=("f_max",),
+        ),
+        DataSet(
+            "gross_slip",
+            _friction((1e4, 1e5), _ONE_PERCENT),
+            seed=4,
+            teaches="large amplitudes alone show f_max at once, sigma hardly",
+            identifiable=("f_max",),
+            not_identifiable=("sigma",),
+        ),
+        DataSet(
+            "alpha_2",
+            _friction((0.1, 30.0), _ONE_PERCENT, alpha=2.0, levels=40),
+            seed=5,
+            teaches="friction that no linear Dahl model fits: free alpha, and compare",
+            identifiable=("f_max", "sigma", "alpha"),
+        ),
+        DataSet(
+            "fig_7_plant",
+            Experiment(
+                _PLANT,
+                SteppedSine(
+                    levels=(0.001, 0.01, 0.05, 0.1, 0.15, 0.2, 0.5, 2.0),
+                    frequencies_hz=_spread(0.05, 5.0, 25),
+                    controlled="force",
+                ),
+                table=Table(displacement_std=0.01, force_std=0.001),
+            ),
+            seed=6,
+            teaches="a plant driven by force, from stuck to sliding: linear elements come along",
+            identifiable=_ALL_OF_PLANT,
+        ),
+        DataSet(
+            "unsettled",
+            Experiment(
+                Dahl(_F_MAX, _SIGMA),
+                SteppedSine(
+                    _spread(0.02, 10.0, 10, unit=_X_C),
+                    order="descending",
+                    settling_periods=1,
+                    num_periods=4,
+                ),
+                Acquisition(
+                    sample_rate_hz=64.0,
+                    displacement=Channel(noise_std=1e-7),
+                    force=Channel(noise_std=1e-5),
+                ),
+            ),
+            seed=7,
+            teaches="descending levels without time to settle: the loss of small ones is corrupt",
+            identifiable=_BOTH,
+            caution="the small levels have not settled",
+        ),
+        DataSet(
+            "quantised",
+            Experiment(
+                Dahl(_F_MAX, _SIGMA),
+                SteppedSine(_spread(0.05, 5.0, 8, unit=_X_C), order="ascending", num_periods=4),
+                Acquisition(
+                    sample_rate_hz=100.0,
+                    displacement=Channel(noise_std=1e-6, resolution=1e-4),
+                    force=Channel(noise_std=1e-4),
+                ),
+            ),
+            seed=8,
+            teaches="a displacement sensor whose steps are as large as the smallest levels",
+            identifiable=_BOTH,
+            caution="the displacement is quantised coarsely at small levels",
+        ),
+        DataSet(
+            "outliers",
+            _friction((0.1, 10.0), Table(force_std=0.01, outlier_fraction=0.1)),
+            seed=9,
+            teaches="3 rows of 30 with errors of 50 %: robust losses, and residuals that show them",
+            identifiable=_BOTH,
+            caution="three rows are outliers",
+        ),
+        DataSet(
+            "delayed",
+            Experiment(
+                Dahl(_F_MAX, _SIGMA),
+                SteppedSine(_spread(0.1, 10.0, 10, unit=_X_C), (1.0, 5.0, 20.0)),
+                Acquisition(displacement=Channel(delay=2e-3), force=Channel(gain=1.2)),
+                _ONE_PERCENT,
+            ),
+            seed=10,
+            teaches="displacement 2 ms late, force 20 % high: the delay shows, the gain does not",
+            identifiable=("delay",),
+            not_identifiable=("f_max", "sigma", "force_gain"),
+            caution="the phase depends on frequency, as no friction alone can do",
+        ),
+        DataSet(
+            "plant_recording",
+            Experiment(
+                _PLANT,
+                SteppedSine(
+                    levels=(0.02, 0.06, 0.12, 0.4),
+                    frequencies_hz=(0.3, 0.8, 2.0),
+                    controlled="force",
+                    order="ascending",
+                    settling_periods=20,
+                    num_periods=10,
+                ),
+                Acquisition(
+                    sample_rate_hz=100.0,
+                    displacement=Channel(noise_std=2e-6, offset=1e-4, antialias_hz=400.0),
+                    force=Channel(
+                        noise_std=1e-4, flicker_std=1e-5, hum_amplitude=1e-4, antialias_hz=400.0
+                    ),
+                ),
+            ),
+            seed=11,
+            teaches="what a laboratory stores: twelve steps of a plant, noise, hum and offset",
+            identifiable=_ALL_OF_PLANT,
+        ),
+    )
+}
+"""Every shipped data set by its name."""
