@@ -1,0 +1,62 @@
+"""The commands together, and what happens when one fails."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from dahl_ident import __version__
+from dahl_ident.cli import telling
+from dahl_ident.cli.demo import demo
+from dahl_ident.cli.fit import fit
+from dahl_ident.errors import DahlIdentError
+
+app = typer.Typer(
+    name="dahl-ident",
+    help="Identify Dahl friction from sine-sweep measurements, with error bars that are true.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for command in (demo, fit):
+    app.command()(command)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        telling.say(f"dahl-ident {__version__}")
+        raise typer.Exit
+
+
+@app.callback(
+    epilog="Exit status: 0 trusted, 1 bad input, 2 wrong use, 3 result not to be trusted."
+)
+def common(
+    color: Annotated[
+        bool, typer.Option("--color/--no-color", help="Colour; NO_COLOR turns it off as well.")
+    ] = True,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Identify Dahl friction from sine-sweep measurements, with error bars that are true."""
+    telling.use_color(color)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; always ends with SystemExit.
+
+    Parameters
+    ----------
+    arguments : list of str, optional
+        As typed after ``dahl-ident``; by default those of the process.
+    """
+    telling.warnings_in_one_line()
+    try:
+        app(args=arguments)
+    except DahlIdentError as exc:
+        telling.doubt(f"error: {' '.join(str(exc).split())}")
+        sys.exit(telling.BAD_INPUT)

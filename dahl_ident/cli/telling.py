@@ -1,0 +1,90 @@
+"""What a command says: text for people on standard output, doubts on standard error."""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from dahl_ident.cli.options import plain
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+BAD_INPUT = 1
+NOT_TRUSTED = 3
+_state = {"color": True}
+
+
+def use_color(color: bool) -> None:
+    """Turn colour on or off for all that follows."""
+    _state["color"] = color
+
+
+def console() -> Console:
+    """Return where people read; colour and width follow the terminal."""
+    from rich.console import Console
+
+    terminal = sys.stdout.isatty()
+    return Console(
+        no_color=None if _state["color"] else True,
+        highlight=False,
+        soft_wrap=True,
+        width=None if terminal else 100,
+    )
+
+
+def say(text: str) -> None:
+    """Print one text as it is."""
+    sys.stdout.write(f"{text}\n")
+
+
+def doubt(text: str) -> None:
+    """Print one line on standard error."""
+    sys.stderr.write(f"{text}\n")
+
+
+def say_json(value: Any) -> None:
+    """Print one JSON document."""
+    say(json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table; text from files is not taken for markup."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    drawn = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+    for name in header:
+        drawn.add_column(Text(name), overflow="fold")
+    for row in rows:
+        drawn.add_row(*(Text(cell) for cell in row))
+    console().print(drawn)
+
+
+def heading(text: str) -> None:
+    """Print the name of a step."""
+    from rich.text import Text
+
+    console().print(Text(text, style="bold cyan"))
+
+
+def finish(trusted: bool, reason: str) -> None:
+    """End a command with the status that its result deserves."""
+    if not trusted:
+        doubt(f"not to be trusted: {reason}")
+        raise typer.Exit(NOT_TRUSTED)
+
+
+def warnings_in_one_line() -> None:
+    """Show Python warnings as lines for people, without file and code."""
+
+    def show(message: Warning | str, *_: Any) -> None:
+        doubt(f"warning: {message}")
+
+    warnings.showwarning = show
