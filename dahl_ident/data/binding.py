@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -24,7 +23,6 @@ from dahl_ident.units import (
     si_unit,
 )
 
-_SUFFIXES = {"_hz": "Hz", "_deg": "deg", "_rad": "rad", "_s": "s"}
 _EXAMPLES = {
     "time": "s",
     "frequency": "Hz",
@@ -119,9 +117,8 @@ class Binding:
             If there is none, or it cannot be read.
         """
         text = self.map.roles.get(role, Column()).unit or channel.unit
-        name = plain(channel.short or channel.name)
-        if text is None and name in self.names[role]:
-            text = _SUFFIXES.get(re.sub(r"^.*(?=_)", "", name))
+        if text is None and plain(channel.short or channel.name) in self.names[role]:
+            text = channel.unit_in_name
         text = text or default
         if text is None:
             example = _EXAMPLES.get(role, "um")

@@ -203,7 +203,12 @@ class _Table:
                 return self._complex()
             case ("real", "imag"):
                 quantity, real = self._part("real")
-                _, imag = self._part("imag", default=self._unit_text("real"))
+                other, imag = self._part("imag", default=self._unit_text("real"))
+                if other != quantity:
+                    raise UnitError(
+                        f"{self.bound.source.name}: units disagree: real is {quantity}, imag "
+                        f"{other}"
+                    )
                 return quantity, real + 1j * imag
             case (role, "phase"):
                 quantity, gain = self._part(role)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,11 @@ class Rows:
     def n(self) -> int:
         """Number of rows of one table."""
         return int(self.response.shape[-1])
+
+    @cached_property
+    def orders(self) -> tuple[int, ...]:
+        """The harmonics that occur."""
+        return tuple(np.unique(self.harmonic).tolist())
 
     @classmethod
     def of(cls, data: FrequencyResponse) -> Rows:

@@ -17,6 +17,7 @@ from dahl_ident.errors import DataError, UnitError
 from dahl_ident.units import parse_unit
 
 _NUMBER = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\s*|[-+]?inf|nan", re.ASCII)
+_SUFFIXES = {"hz": "Hz", "deg": "deg", "rad": "rad", "s": "s"}
 LARGEST, SMALLEST = 1e100, 1e-100  # what can be measured, and squared without overflow
 _INDEX = re.compile(r"[\d:, ]+")
 
@@ -34,6 +35,11 @@ class Channel:
     unit: str | None = None
     role: str | None = None
     short: str | None = None
+
+    @property
+    def unit_in_name(self) -> str | None:
+        """Unit that a name such as ``frequency_hz`` or ``phase_deg`` ends in."""
+        return _SUFFIXES.get(plain(self.short or self.name).rpartition("_")[2])
 
     @property
     def header(self) -> str:

@@ -137,7 +137,10 @@ def _named(channel: Channel, role: str, names: Mapping[str, tuple[str, ...]]) ->
 def _proposal(source: Source) -> str:
     """Return a column map in TOML: roles by name first, by unit where no name claims them."""
     groups = _patterns(source)
-    response = any(_named(c, "frequency", RESPONSE_NAMES) for c in groups.values())
+    response = any(
+        _named(c, "frequency", RESPONSE_NAMES) or _of_kind(c, _RESPONSE_UNITS["frequency"])
+        for c in groups.values()
+    )
     names = RESPONSE_NAMES if response else RECORD_NAMES
     units = _RESPONSE_UNITS if response else _RECORD_UNITS
     roles: dict[str, str] = {}
@@ -168,10 +171,11 @@ def _entry(role: str, path: str, channel: Channel) -> Iterator[str]:
     yield f"column = {json.dumps(path, ensure_ascii=False)}"
     if role in _NO_UNIT:
         return
-    if channel.unit is None:
+    unit = channel.unit or channel.unit_in_name
+    if unit is None:
         yield 'unit = ""  # the file does not say: fill in'
     else:
-        yield f"unit = {json.dumps(channel.unit, ensure_ascii=False)}"
+        yield f"unit = {json.dumps(unit, ensure_ascii=False)}"
 
 
 def _patterns(source: Source) -> dict[str, Channel]:

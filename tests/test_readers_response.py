@@ -1,0 +1,491 @@
+"""Tables of response: every form they come in, doubts about them, many files into one."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+
+from dahl_ident.data import FrequencyResponse, inspect, read_frequency_response
+from dahl_ident.errors import DataError, DataWarning, UnitError
+
+FREQUENCY = np.array([1.0, 2.0, 4.0])
+OMEGA = 2 * np.pi * FREQUENCY
+AMPLITUDE = np.array([1e-3, 2e-3, 4e-3])
+STIFFNESS = np.array([3e3 + 4e3j, 1e3 + 2e3j, 5e2 + 1e2j])
+
+
+def read(table: dict[str, Any], **options: Any) -> FrequencyResponse:
+    """Read columns as a table, without its file."""
+    frame = pd.DataFrame(table)
+    return FrequencyResponse.from_frame(frame, **options)
+
+
+def known(array: NDArray[Any] | None) -> NDArray[Any]:
+    assert array is not None
+    return array
+
+
+BASE = {"frequency_hz": FREQUENCY, "amplitude [mm]": AMPLITUDE * 1e3}
+RECTANGULAR = {**BASE, "real [N/m]": STIFFNESS.real, "imag [N/m]": STIFFNESS.imag}
+
+
+class TestForms:
+    @pytest.mark.parametrize(
+        "columns",
+        [
+            {"real [N/m]": STIFFNESS.real, "imag [N/m]": STIFFNESS.imag},
+            {"Re [kN/m]": STIFFNESS.real / 1e3, "Im": STIFFNESS.imag / 1e3},
+            {"gain [N/mm]": abs(STIFFNESS) / 1e3, "phase_deg": np.angle(STIFFNESS, deg=True)},
+            {"Magnitude (N/m)": abs(STIFFNESS), "Phase (rad)": np.angle(STIFFNESS)},
+            {
+                "gain_db [N/m]": 20 * np.log10(abs(STIFFNESS)),
+                "phase_deg": np.angle(STIFFNESS, deg=True),
+            },
+            {
+                "gain [dB re 1 kN/m]": 20 * np.log10(abs(STIFFNESS) / 1e3),
+                "phase [deg]": np.angle(STIFFNESS, deg=True),
+            },
+            {"response [N/m]": STIFFNESS},
+        ],
+    )
+    def test_all_forms_agree(self, columns: dict[str, Any]) -> None:
+        data = read({**BASE, **columns})
+        np.testing.assert_allclose(data.response, STIFFNESS, rtol=1e-13)
+        np.testing.assert_allclose(known(data.amplitude), AMPLITUDE)
+        assert (data.quantity, data.motion) == ("dynamic_stiffness", "translation")
+
+    @pytest.mark.parametrize(
+        ("header", "power"),
+        [
+            ("amplitude [um]", 0),
+            ("amplitude [um pk]", 0),
+            ("amplitude [um/s]", 1),
+            ("amplitude [um/s^2]", 2),
+        ],
+    )
+    def test_amplitudes_of_any_motion(self, header: str, power: int) -> None:
+        columns = {**RECTANGULAR, header: AMPLITUDE * OMEGA**power * 1e6}
+        del columns["amplitude [mm]"]
+        np.testing.assert_allclose(known(read(columns).amplitude), AMPLITUDE, rtol=1e-13)
+
+    @pytest.mark.parametrize(
+        ("header", "factor"), [("[N]", 1.0), ("[N rms]", math.sqrt(2)), ("[N pp]", 0.5)]
+    )
+    def test_markers(self, header: str, factor: float) -> None:
+        force = AMPLITUDE * abs(STIFFNESS)
+        data = read({**RECTANGULAR, f"drive {header}": force / factor})
+        np.testing.assert_allclose(known(data.drive), force, rtol=1e-14)
+
+    @pytest.mark.parametrize(
+        ("header", "values"),
+        [
+            ("frequency [Hz]", FREQUENCY),
+            ("frequency [rad/s]", OMEGA),
+            ("frequency [rpm]", FREQUENCY * 60),
+            ("freq [kHz]", FREQUENCY / 1e3),
+        ],
+    )
+    def test_frequencies(self, header: str, values: Any) -> None:
+        columns = {**RECTANGULAR, header: values}
+        del columns["frequency_hz"]
+        np.testing.assert_allclose(read(columns).frequency_hz, FREQUENCY, rtol=1e-14)
+
+    @pytest.mark.parametrize(
+        ("unit", "quantity", "response"),
+        [
+            ("mm/N", "receptance", 1e3 / STIFFNESS),
+            ("(m/s)/N", "mobility", 1j * OMEGA / STIFFNESS),
+            ("g/N", "accelerance", -(OMEGA**2) / STIFFNESS / 9.80665),
+            ("N s/m", "mechanical_impedance", STIFFNESS / (1j * OMEGA)),
+            ("kg", "apparent_mass", -STIFFNESS / OMEGA**2),
+        ],
+    )
+    def test_the_unit_tells_the_quantity(self, unit: str, quantity: str, response: Any) -> None:
+        data = read({**BASE, f"real [{unit}]": response.real, f"imag [{unit}]": response.imag})
+        assert data.quantity == quantity
+        np.testing.assert_allclose(data.to("dynamic_stiffness").response, STIFFNESS, rtol=1e-13)
+
+    def test_rotation(self) -> None:
+        data = read(
+            {
+                "frequency_hz": FREQUENCY,
+                "amplitude [deg]": np.degrees(AMPLITUDE),
+                "real [lbf-in/deg]": STIFFNESS.real,
+                "imag [lbf-in/deg]": STIFFNESS.imag,
+            }
+        )
+        assert data.motion == "rotation"
+        factor = 0.45359237 * 9.80665 * 0.0254 * 180 / np.pi
+        np.testing.assert_allclose(data.response, STIFFNESS * factor)
+        assert data.unit == "N m/rad"
+
+    def test_phase_beside_amplitude_and_drive(self) -> None:
+        """The phase is that of the quantity named, whatever motion the amplitude is."""
+        columns = {
+            "frequency_hz": FREQUENCY,
+            "amplitude [m/s^2]": AMPLITUDE * OMEGA**2,
+            "force [N]": AMPLITUDE * abs(STIFFNESS),
+            "phase [rad]": -np.angle(STIFFNESS),
+        }
+        data = read(columns, columns={"quantity": "receptance"})
+        np.testing.assert_allclose(data.response, 1.0 / STIFFNESS)
+        with pytest.raises(DataError, match="say which quantity's it is"):
+            read(columns)
+
+    def test_one_amplitude_or_drive_for_all(self) -> None:
+        response = {"real [N/m]": STIFFNESS.real, "imag [N/m]": STIFFNESS.imag}
+        columns = {"frequency_hz": FREQUENCY, **response}
+        data = read(columns, drive="200 mN pp")
+        np.testing.assert_array_equal(known(data.drive), 0.1)
+        assert data.amplitude is None
+        assert data.controlled.tolist() == ["force"] * 3
+        assert data.levels == ["200 mN pp"]
+        data = read(columns, amplitude="2 mm/s rms")
+        np.testing.assert_allclose(known(data.amplitude), 2e-3 * math.sqrt(2) / OMEGA)
+        with pytest.raises(DataError, match=r"neither an amplitude nor a drive .* drive='0.2 N'"):
+            read(columns)
+        with pytest.raises(DataError, match="drive is '0 N'; expected a value > 0"):
+            read(columns, drive="0 N")
+
+    def test_drive_in_volts(self) -> None:
+        columns = {**RECTANGULAR, "drive [mV]": AMPLITUDE * abs(STIFFNESS) / 12.5 * 1e3}
+        mapped = {"drive_factor": "12.5 N/V", "drive_factor_uncertainty": 0.02}
+        data = read(columns, columns=mapped)
+        np.testing.assert_allclose(known(data.drive), AMPLITUDE * abs(STIFFNESS))
+        assert data.provenance is not None
+        assert "drive factor uncertain by 2.00%, all rows alike" in data.provenance["notes"]
+        with pytest.raises(UnitError, match="the drive is a voltage; give drive_factor"):
+            read(columns)
+        with pytest.raises(UnitError, match=r"drive_factor has the unit \[N/A\]; expected"):
+            read(columns, columns={"drive_factor": "12.5 N/A"})
+
+    def test_what_is_assumed_is_said(self) -> None:
+        data = read(RECTANGULAR)
+        assert data.provenance is not None
+        assert data.provenance["notes"] == [
+            "amplitude [mm] taken as zero to peak: the table does not say",
+            "controlled: displacement, as the table does not say",
+        ]
+        assert "taken as zero to peak" in repr(data)
+        silent = read({**RECTANGULAR, "amplitude [mm pk]": 1.0, "controlled": "force"}, columns={
+            "amplitude": "amplitude [mm pk]"})  # fmt: skip
+        assert "notes" not in known_provenance(silent)
+
+    def test_sign_of_the_phase(self) -> None:
+        columns = {
+            **BASE,
+            "gain [N/m]": abs(STIFFNESS),
+            "phase_deg": -np.angle(STIFFNESS, deg=True),
+        }
+        data = read(columns, columns={"phase": {"sign": -1}})
+        np.testing.assert_allclose(data.response, STIFFNESS)
+
+
+def known_provenance(data: FrequencyResponse) -> dict[str, Any]:
+    assert data.provenance is not None
+    return dict(data.provenance)
+
+
+class TestErrors:
+    def test_standard_deviations(self) -> None:
+        n = len(STIFFNESS)
+        data = read({**RECTANGULAR, "std": [1.0, 2.0, 3.0], "dof": [3.0, np.inf, 5.0]})
+        np.testing.assert_allclose(
+            known(data.covariance), np.eye(2) * np.array([1.0, 4.0, 9.0])[:, None, None]
+        )
+        np.testing.assert_array_equal(known(data.dof), [3.0, np.inf, 5.0])
+        data = read({**RECTANGULAR, "real_std [kN/m]": [1.0] * n, "imag_std": [2.0] * n})
+        np.testing.assert_allclose(known(data.covariance), [np.diag([1e6, 4.0])] * n)
+
+    def test_polar_standard_deviations(self) -> None:
+        """Against the sample covariance of drawn gains and phases."""
+        rng = np.random.default_rng(5)
+        data = read(
+            {
+                **BASE,
+                "gain [N/m]": abs(STIFFNESS),
+                "phase_deg": np.angle(STIFFNESS, deg=True),
+                "gain_std": 0.01 * abs(STIFFNESS),
+                "phase_std_deg": [0.2, 0.5, 1.0],
+                "amplitude_std [um]": [1.0, 2.0, 3.0],
+            }
+        )
+        np.testing.assert_allclose(known(data.amplitude_std), [1e-6, 2e-6, 3e-6])
+        for k, phase_std in enumerate(np.radians([0.2, 0.5, 1.0])):
+            gain = abs(STIFFNESS[k]) * (1 + 0.01 * rng.normal(size=200_000))
+            draws = gain * np.exp(
+                1j * (np.angle(STIFFNESS[k]) + phase_std * rng.normal(size=200_000))
+            )
+            sample = np.cov(draws.real, draws.imag)
+            np.testing.assert_allclose(
+                known(data.covariance)[k], sample, rtol=0.02, atol=0.02 * np.abs(sample).max()
+            )
+
+    def test_polar_table_reads_back(self) -> None:
+        data = read({**RECTANGULAR, "std": [30.0, 20.0, 10.0]})
+        again = FrequencyResponse.from_frame(data.to_frame(polar=True))
+        np.testing.assert_allclose(again.response, data.response)
+        np.testing.assert_allclose(known(again.covariance), known(data.covariance), atol=1e-9)
+
+    @pytest.mark.parametrize(
+        ("columns", "error", "message"),
+        [
+            (
+                {"std": [1.0, -1.0, 1.0]},
+                DataError,
+                "row 2, column 'std'.*a standard dev",
+            ),
+            (
+                {"std": 1.0, "real_std": 1.0, "imag_std": 1.0},
+                DataError,
+                "both std and real_std",
+            ),
+            ({"amplitude_std [N]": 1.0}, UnitError, r"unit \[N\]; expected .* of m"),
+            ({"std": 1.0, "dof": [1.0, 0.0, 1.0]}, DataError, r"dof\[1\] is 0.0"),
+            ({"dof": 3.0}, DataError, "dof is given without the covariance"),
+        ],
+    )
+    def test_bad_errors(self, columns: Any, error: type[Exception], message: str) -> None:
+        with pytest.raises(error, match=message):
+            read({**RECTANGULAR, **columns})
+
+
+class TestRefusal:
+    @pytest.mark.parametrize(
+        ("columns", "message"),
+        [
+            (
+                {"frequency_hz": [1.0, 0.0, 2.0]},
+                r"row 2, column 'frequency_hz': found 0.0 .*a f",
+            ),
+            ({"amplitude [mm]": [1.0, -2.0, 3.0]}, "row 2, column 'amplitude'.*an amplitude > 0"),
+            ({"drive [N]": [1.0, 2.0, 0.0]}, "row 3, column 'drive': found 0.0"),
+            ({"real [N/m]": [1.0, np.nan, 1.0]}, "row 2, column 'real': the cell is empty or NaN"),
+            ({"real [N/m]": [1.0, "x", 1.0]}, "row 2, column 'real': 'x' is not a number"),
+            ({"real [N/m]": 0.0, "imag [N/m]": [1.0, 1.0, 0.0]}, "row 3: the response is 0"),
+            ({"real [m]": STIFFNESS.real}, "2 columns may be the real"),
+            ({"gain [N/m]": 1.0, "phase_deg": 1.0}, "both real and imag and gain and phase are"),
+            ({"harmonic": [1, 2.5, 3]}, "row 2, column 'harmonic'.*a whole number >= 1"),
+            ({"controlled": "speed"}, "row 1, column 'controlled': found speed"),
+        ],
+    )
+    def test_bad_cells(self, columns: dict[str, Any], message: str) -> None:
+        with pytest.raises(DataError, match=message):
+            read({**RECTANGULAR, **columns})
+
+    def test_negative_gain(self) -> None:
+        with pytest.raises(DataError, match=r"row 3, column 'gain': found -1.0 .* a gain >= 0"):
+            read({**BASE, "gain [N/m]": [1.0, 1.0, -1.0], "phase_deg": 10.0})
+
+    def test_no_response(self) -> None:
+        with pytest.raises(DataError, match="no response; expected real and imag, gain"):
+            read(BASE)
+        with pytest.raises(DataError, match="'response' holds no complex numbers"):
+            read({**BASE, "response [N/m]": 1.0})
+
+    def test_units(self) -> None:
+        with pytest.raises(UnitError, match=r"imag in \[N s/m\] is mechanical_impedance"):
+            read({**RECTANGULAR, "imag [N s/m]": 1.0}, columns={"imag": "imag [N s/m]",
+                 "quantity": "dynamic_stiffness"})  # fmt: skip
+        with pytest.raises(UnitError, match=r"'phase' has no unit; .*'phase \[deg\]'"):
+            read({**BASE, "gain [N/m]": 1.0, "phase": 1.0})
+        with pytest.raises(UnitError, match="amplitude is translation, real is rotation"):
+            read({**BASE, "real [N m/rad]": 1.0, "imag [N m/rad]": 1.0})
+        with pytest.raises(UnitError, match="does not say what 0 dB is"):
+            read({**BASE, "gain [dB]": 1.0, "phase_deg": 1.0})
+
+    def test_real_and_imaginary_part_are_of_one_quantity(self) -> None:
+        with pytest.raises(UnitError, match="real is dynamic_stiffness, imag mechanical_impedance"):
+            read({**BASE, "real [N/m]": 1.0, "imag [N s/m]": 1.0})
+
+    def test_zero_hertz_can_be_left_out(self) -> None:
+        columns = {**RECTANGULAR, "frequency_hz": [0.0, 1.0, 2.0], "real [N/m]": [np.nan, 1.0, 1.0]}
+        frame = pd.DataFrame(columns)
+        with pytest.raises(DataError, match=r"a frequency > 0; frequency_hz=\(low, high\) leaves"):
+            FrequencyResponse.from_frame(frame)
+
+    def test_empty_frame(self) -> None:
+        with pytest.raises(DataError, match="the table is empty"):
+            FrequencyResponse.from_frame(pd.DataFrame())
+
+
+class TestDoubts:
+    def test_clean_tables_raise_no_doubt(self) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            read({**RECTANGULAR, "drive [N]": AMPLITUDE * abs(STIFFNESS)})
+
+    def test_radians_in_a_degree_column(self) -> None:
+        with pytest.warns(DataWarning, match=r"no phase is above 2 pi; .*: row 1, row 2, row 3"):
+            read({**BASE, "gain [N/m]": 1.0, "phase_deg": np.angle(STIFFNESS)})
+
+    def test_degrees_in_a_radian_column(self) -> None:
+        with pytest.warns(DataWarning, match=r"above 4 pi; are they degrees\?: row 1, row 2$"):
+            read({**BASE, "gain [N/m]": 1.0, "phase [rad]": [53.13, 63.43, 11.31]}, passive=False)
+
+    def test_rms_against_zero_to_peak(self) -> None:
+        force = AMPLITUDE * abs(STIFFNESS) * [1.0, 1.0, 1 / math.sqrt(2)]
+        with pytest.warns(DataWarning, match=r"\(rms against zero to peak\?\): row 3$"):
+            read({**RECTANGULAR, "drive [N]": force})
+
+    def test_single_rows_that_create_energy(self) -> None:
+        with pytest.warns(DataWarning, match="the phase's sign creates energy: row 2$"):
+            read({**RECTANGULAR, "imag [N/m]": STIFFNESS.imag * [1.0, -1.0, 1.0],
+                  "amplitude [mm]": [1.0, 1.0, 1.0]})  # fmt: skip
+
+    def test_a_table_that_creates_energy(self) -> None:
+        wrong = {**RECTANGULAR, "imag [N/m]": -STIFFNESS.imag}
+        with pytest.raises(DataError, match=r"creates energy: .* 10.4 times its standard error"):
+            read(wrong)
+        assert read(wrong, passive=False).n == 3
+
+    def test_receptance_with_the_sign_of_a_stiffness(self) -> None:
+        with pytest.raises(DataError, match="count the phase the other way round"):
+            read({**BASE, "gain [m/N]": 1e-3, "phase_deg": [10.0, 20.0, 30.0]})
+
+    def test_noise_is_no_created_energy(self) -> None:
+        """Loss below the noise is negative half the time; three sigma refuses 1 in 740."""
+        rng = np.random.default_rng(20)
+        refused = 0
+        for _ in range(300):
+            imag = rng.normal(0.0, 1.0, 3)
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", DataWarning)
+                    read({**RECTANGULAR, "imag [N/m]": imag, "std": 1.0})
+            except DataError:
+                refused += 1
+        assert refused <= 4  # a binomial of 300 and 0.00135 exceeds 4 once in 20,000 seeds
+
+    def test_known_loss_below_zero_is_refused(self) -> None:
+        with pytest.raises(DataError, match="creates energy"):
+            read({**RECTANGULAR, "imag [N/m]": -4.0, "std": 1.0})
+        with pytest.warns(DataWarning, match="creates energy"):
+            # four standard errors from two degrees of freedom are no proof
+            read({**RECTANGULAR, "imag [N/m]": [-9.0, 300.0, 300.0], "std": 1.0})
+
+    def test_harmonics_may_have_any_sign(self) -> None:
+        data = read({**RECTANGULAR, "imag [N/m]": [-1e3, 2e3, -1e3], "harmonic": [3, 1, 5]})
+        assert data.harmonic.tolist() == [3, 1, 5]
+
+    def test_many_rows_are_counted(self) -> None:
+        n = 30
+        columns = {"frequency_hz": np.arange(1.0, n + 1), "amplitude [m]": 1.0, "gain [N/m]": 1.0}
+        with pytest.warns(DataWarning, match="row 10 and 20 more$"):
+            read({**columns, "phase_deg": np.linspace(0.5, 1.5, n)})
+
+
+def exported(folder: Path, name: str, drive: float) -> Path:
+    """One file of an analyser: frequency and response, the level in the name alone."""
+    frame = pd.DataFrame(
+        {
+            "Frequency (Hz)": FREQUENCY,
+            "Real (m/N)": (1 / STIFFNESS).real * drive,
+            "Imag (m/N)": (1 / STIFFNESS).imag * drive,
+        }
+    )
+    frame.to_csv(folder / name, index=False)
+    return folder / name
+
+
+class TestManyFiles:
+    def test_level_and_drive_from_the_name(self, tmp_path: Path) -> None:
+        paths = [exported(tmp_path, f"beam_{u}N_a.csv", u) for u in (0.2, 0.5, 1.5)]
+        data = read_frequency_response(
+            paths, level_from_name=r"_([\d.]+)N", drive="{level} N rms", controlled="force"
+        )
+        assert data.levels == [0.2, 0.5, 1.5]
+        np.testing.assert_allclose(known(data.drive), np.repeat([0.2, 0.5, 1.5], 3) * math.sqrt(2))
+        assert [p["file"] for p in known_provenance(data)["parts"]] == [str(p) for p in paths]
+
+    def test_named_groups(self, tmp_path: Path) -> None:
+        path = exported(tmp_path, "runB_5um.csv", 1.0)
+        data = read_frequency_response(
+            path, level_from_name=r"(?P<level>run.)_(?P<x>\w+)\.", amplitude="{x}"
+        )
+        assert data.levels == ["runB"]
+        np.testing.assert_allclose(known(data.amplitude), 5e-6)
+
+    def test_range(self, tmp_path: Path) -> None:
+        path = exported(tmp_path, "a.csv", 1.0)
+        assert read_frequency_response(path, drive="1 N", frequency_hz=(1.5, 9.0)).n == 2
+        with pytest.raises(DataError, match="no frequency lies from 7 to 9 Hz"):
+            read_frequency_response(path, drive="1 N", frequency_hz=(7.0, 9.0))
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"level_from_name": "_([0-9.]+)V", "drive": "1 N"}, "finds no group in the name"),
+            ({"level_from_name": "_[0-9.]+N", "drive": "1 N"}, "put what is the level in round"),
+            ({"level_from_name": "(", "drive": "1 N"}, "is no regular expression"),
+            ({"drive": "{level} N"}, "level_from_name gives nothing"),
+            ({"drive": "5 um"}, r"drive has the unit \[um\]"),
+            ({"sheet": "x", "drive": "1 N"}, "the file is no workbook"),
+        ],
+    )
+    def test_refusal(self, tmp_path: Path, options: Any, message: str) -> None:
+        path = exported(tmp_path, "beam_0.2N.csv", 0.2)
+        with pytest.raises((DataError, UnitError), match=message):
+            read_frequency_response([path], **options)
+
+    def test_files_that_do_not_go_together(self, tmp_path: Path) -> None:
+        one = exported(tmp_path, "a.csv", 1.0)
+        other = tmp_path / "b.csv"
+        other.write_text("frequency_hz,real [N/m],imag [N/m]\n1,1,1\n")
+        with pytest.raises(DataError, match=r"do not make one table: parts\[1\]"):
+            read_frequency_response([one, other], drive="1 N")
+        with pytest.raises(DataError, match="at least one path"):
+            read_frequency_response([])
+
+
+class TestInspect:
+    def test_proposes_a_map_that_reads(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.csv"
+        path.write_text(
+            "f0 [Hz],Weg [um],Kraft [N],|H| [um/N],arg H [deg],n\n1,2,1,2,-30,7\n2,4,1,4,-60,7\n"
+        )
+        contents = inspect(path)
+        assert [c.name for c in contents.channels] == ["f0", "Weg", "Kraft", "|H|", "arg H", "n"]
+        assert contents.channels[1].range == "2 to 4"
+        assert "# not used: n" in contents.column_map
+        assert "Kraft" in repr(contents)
+        assert "<td" in contents._repr_html_()
+
+    def test_missing_units_are_left_to_fill_in(self, tmp_path: Path) -> None:
+        path, columns = tmp_path / "a.csv", tmp_path / "lab.toml"
+        path.write_text("frequency,drive [N],gain,phase_deg\n1,1,1,10\n2,1,1,20\n")
+        blank = 'unit = ""  # the file does not say: fill in'
+        text = inspect(path).column_map
+        assert text.count(blank) == 2
+        columns.write_text(text)
+        with pytest.raises(UnitError, match="'frequency' has no unit"):
+            read_frequency_response(path, columns=columns)
+        text = text.replace(blank, 'unit = "Hz"', 1).replace(blank, 'unit = "N/m"', 1)
+        columns.write_text(text)
+        assert read_frequency_response(path, columns=columns).quantity == "dynamic_stiffness"
+
+    def test_sampling_and_gaps(self, tmp_path: Path) -> None:
+        path = tmp_path / "run.csv"
+        time = np.r_[0:50, 60:99] / 100.0
+        pd.DataFrame({"time [s]": time, "x [mm]": 1.0, "F [N]": 1.0}).to_csv(path, index=False)
+        contents = inspect(path)
+        assert contents.sampling == "100 Hz, uneven, 89 samples in 0.98 s"
+        assert contents.gaps == ("0.49 to 0.6 s",)
+        assert '[force]\ncolumn = "F"\nunit = "N"' in contents.column_map
+        path.write_text("time [s],x [mm]\n1,1\n0,1\n")
+        assert inspect(path).sampling == "time does not increase with every sample"
+        path.write_text("x [mm],note,empty\n1,a,\n2,b,\n")
+        contents = inspect(path)
+        assert contents.sampling == ""
+        assert [c.range for c in contents.channels] == [
+            "1 to 2",
+            "'a', 'b'",
+            "nothing finite, 2 not finite",
+        ]
