@@ -49,6 +49,7 @@ _TOLERANCE = 1e-11
 _ITERATIONS = 300
 _LEAST_RESIDUAL = 1e-4  # of the largest change that a parameter's own size makes
 _ACTIVE = 1e-6
+_MOST_STARTS = 6
 _RESCALINGS = 30
 _SAME_SCALE = 1e-10
 _SAME_COST = 1e-6
@@ -128,17 +129,16 @@ def solve_ipopt(
     begin = least_squares.solve(problem, loss=loss, start=start)
     if begin.status.at_infinity and not relations.texts and drive_error is None:
         return replace(begin, method="ipopt")
-    theta = begin.theta if begin.success else _finite_start(problem)
     adapts = not problem.scale_known and bool(loss != "linear" or problem.priors)
     target = Target(problem, begin.scale if adapts else 1.0, loss, drive_error)
-    found = _descend(target, theta, relations)
+    found = _search(target, begin, relations)
     for _ in range(_RESCALINGS if adapts and relations.texts else 0):
         scale = target.scale * _stretch(target, found.theta, relations.freedom_lost)
         if abs(scale / target.scale - 1.0) < _SAME_SCALE:
             break
         target = replace(target, scale=scale)
-        found = _descend(target, found.theta, relations)
-    return _ended(target, found, relations, begin.nfev + found.evaluations)
+        found = _descend(target, found.theta, relations, found.evaluations)
+    return _ended(target, found, relations, begin.nfev)
 
 
 @dataclass(frozen=True)
@@ -157,9 +157,41 @@ class _Found:
     information: FloatArray | None
     """That of the data with the drive's errors; None where there are none."""
 
+    @property
+    def failure(self) -> str:
+        """Why IPOPT has no optimum, in words; nothing where it has one."""
+        if self.return_status in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
+            return ""
+        return _WORDS.get(self.return_status, self.return_status.replace("_", " ").lower())
 
-def _descend(target: Target, start: FloatArray, relations: Relations) -> _Found:
-    """Run IPOPT from `start`."""
+
+def _search(target: Target, begin: Optimum, relations: Relations) -> _Found:
+    """Return the best end of IPOPT's searches.
+
+    The least-squares optimum is the one start, unless it is not finite or a constraint binds:
+    the minimum on a constraint may lie in another valley.
+    """
+    problem, found = target.problem, []
+    if begin.success:
+        found.append(_descend(target, begin.theta, relations))
+        if not found[0].failure and not relations.freedom_lost and not any(found[0].active):
+            return found[0]
+    low, high = problem.bounds()
+    for theta in np.clip(starts(problem)[:_MOST_STARTS], low, high):
+        try:
+            found.append(_descend(target, theta, relations))
+        except FitError:  # no steady amplitude there
+            continue
+    if not found:
+        raise FitError("no start has a steady amplitude in every row; give another start")
+    best = min(found, key=lambda end: (bool(end.failure), end.cost))
+    return replace(best, evaluations=sum(end.evaluations for end in found))
+
+
+def _descend(
+    target: Target, start: FloatArray, relations: Relations, evaluations: int = 0
+) -> _Found:
+    """Run IPOPT from `start`; `evaluations` were made before."""
     import casadi as ca
 
     problem = target.problem
@@ -181,7 +213,7 @@ def _descend(target: Target, start: FloatArray, relations: Relations) -> _Found:
         theta=start + unit * x[: start.size],
         cost=0.5 * float(solution["f"]) / weight,
         return_status=str(stats["return_status"]),
-        evaluations=int(stats["n_call_nlp_f"]),
+        evaluations=evaluations + int(stats["n_call_nlp_f"]),
         slopes=np.asarray(slopes(x[: start.size])) / unit,
         active=tuple(not equal and c > -_ACTIVE for c, equal in inequalities),
         cost_unit=0.5 / weight,
@@ -268,11 +300,6 @@ def _counts(problem: Problem) -> FloatArray:
     return np.where(np.isinf(dof), 1.0, share)
 
 
-def _finite_start(problem: Problem) -> FloatArray:
-    low, high = problem.bounds()
-    return np.asarray(np.clip(starts(problem)[0], low, high))
-
-
 def _drive_error(
     problem: Problem, loss: str, std: ArrayLike | None, covariance: ArrayLike | None
 ) -> AmplitudeError | None:
@@ -302,7 +329,7 @@ def _drive_error(
     return AmplitudeError((spread * per_drive) ** 2, cross)
 
 
-def _ended(target: Target, found: _Found, relations: Relations, evaluations: int) -> Optimum:
+def _ended(target: Target, found: _Found, relations: Relations, nfev: int) -> Optimum:
     """Return the optimum with status, sentence and covariance."""
     problem, loss = target.problem, loss_named(target.loss)
     if found.return_status == "Infeasible_Problem_Detected":
@@ -311,25 +338,20 @@ def _ended(target: Target, found: _Found, relations: Relations, evaluations: int
             "bounds; IPOPT found the least violation elsewhere: relax one of them"
         )
     at = problem.quadratic(found.theta, target.scale, loss)
-    words = _failure(found)
+    words = found.failure
     elsewhere = abs(float(at.cost) - found.cost) > _SAME_COST * found.cost_unit
     if not words and elsewhere and found.information is None:
         words = "it ended at another of the plant's several amplitudes than the one measured"
     hessian = at.hessian if found.information is None else found.information
     end = End(found.theta, found.cost, hessian, not words)
-    result = replace(optimum(problem, end, target.scale, loss, evaluations), method="ipopt")
+    result = replace(
+        optimum(problem, end, target.scale, loss, nfev + found.evaluations), method="ipopt"
+    )
     if words:
         return replace(result, message=f"{result.message} IPOPT says: {words}.")
     if not relations.texts and found.information is None:
         return result
     return _constrained(result, target, found, relations)
-
-
-def _failure(found: _Found) -> str:
-    """Return in words why IPOPT has no optimum, nothing where it has."""
-    if found.return_status in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
-        return ""
-    return _WORDS.get(found.return_status, found.return_status.replace("_", " ").lower())
 
 
 def _constrained(result: Optimum, target: Target, found: _Found, relations: Relations) -> Optimum:
