@@ -115,7 +115,7 @@ def read_frequency_response(
     )
     parts = []
     for one in paths:
-        groups = _groups(one, level_from_name)
+        groups = groups_in_name(one, level_from_name)
         options = ResponseOptions(
             amplitude=_filled(amplitude, groups, one),
             drive=_filled(drive, groups, one),
@@ -284,7 +284,7 @@ def _parsed(file: File, sheet: str | None) -> Source:
             return read_text_table(file.data, file.name, file.sha256)
 
 
-def _groups(path: PathLike, expression: str | None) -> dict[str, Any]:
+def groups_in_name(path: PathLike, expression: str | None) -> dict[str, Any]:
     """Return what the regular expression finds in a file's name, the level among it."""
     if expression is None:
         return {}
