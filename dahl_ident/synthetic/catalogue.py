@@ -94,7 +94,7 @@ DATA_SETS: dict[str, DataSet] = {
         ),
         DataSet(
             "microslip",
-            _friction((0.001, 0.01), _ONE_PERCENT),
+            _friction((0.0002, 0.002), _ONE_PERCENT),
             seed=3,
             teaches="small amplitudes alone show sigma at once, f_max only through the loss",
             identifiable=("sigma",),
@@ -102,10 +102,14 @@ DATA_SETS: dict[str, DataSet] = {
         ),
         DataSet(
             "gross_slip",
-            _friction((1e4, 1e5), _ONE_PERCENT),
+            Experiment(
+                Dahl(_F_MAX, _SIGMA) + Spring(30.0),
+                SteppedSine(_spread(50.0, 500.0, 30, unit=_X_C)),
+                table=_ONE_PERCENT,
+            ),
             seed=4,
-            teaches="large amplitudes alone show f_max at once, sigma hardly",
-            identifiable=("f_max",),
+            teaches="large amplitudes beside a spring show f_max; sigma is lost in the spring",
+            identifiable=("f_max", "stiffness"),
             not_identifiable=("sigma",),
         ),
         DataSet(
@@ -135,10 +139,11 @@ DATA_SETS: dict[str, DataSet] = {
             Experiment(
                 Dahl(_F_MAX, _SIGMA),
                 SteppedSine(
-                    _spread(0.02, 10.0, 10, unit=_X_C),
+                    _spread(0.02, 10.0, 8, unit=_X_C),
                     order="descending",
                     settling_periods=1,
-                    num_periods=4,
+                    num_periods=5,
+                    ramp_periods=0.0,
                 ),
                 Acquisition(
                     sample_rate_hz=64.0,
@@ -194,23 +199,24 @@ DATA_SETS: dict[str, DataSet] = {
             Experiment(
                 _PLANT,
                 SteppedSine(
-                    levels=(0.02, 0.06, 0.12, 0.4),
-                    frequencies_hz=(0.3, 0.8, 2.0),
+                    # high enough for the mass to filter the harmonics of friction
+                    levels=(0.05, 0.15, 0.5, 1.0, 2.0),
+                    frequencies_hz=(2.5, 3.5, 5.0),
                     controlled="force",
                     order="ascending",
-                    settling_periods=20,
+                    settling_periods=40,
                     num_periods=10,
                 ),
                 Acquisition(
-                    sample_rate_hz=100.0,
-                    displacement=Channel(noise_std=2e-6, offset=1e-4, antialias_hz=400.0),
+                    sample_rate_hz=200.0,
+                    displacement=Channel(noise_std=1e-5, offset=1e-3, antialias_hz=1000.0),
                     force=Channel(
-                        noise_std=1e-4, flicker_std=1e-5, hum_amplitude=1e-4, antialias_hz=400.0
+                        noise_std=3e-3, flicker_std=1e-3, hum_amplitude=5e-3, antialias_hz=1000.0
                     ),
                 ),
             ),
             seed=11,
-            teaches="what a laboratory stores: twelve steps of a plant, noise, hum and offset",
+            teaches="what a laboratory stores: fifteen steps of a plant, with noise, hum and offset",
             identifiable=_ALL_OF_PLANT,
         ),
     )
