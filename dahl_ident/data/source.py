@@ -105,9 +105,11 @@ class Source:
 
     def matching(self, pattern: str) -> dict[str, Channel]:
         """Return the channels that a path with ``*`` matches, by the part that varies."""
-        first, last = pattern.index("*"), pattern.rindex("*")
-        last += pattern[last + 1 :].startswith("]")
-        parts = (pattern[:first], pattern[first : last + 1], pattern[last + 1 :])
+        start = re.search(r"[^./]*\*", pattern)
+        end = re.search(r"\*[^.*/]*(?=[./][^*]*$|$)", pattern)
+        assert start is not None  # callers pass patterns with a star in them
+        assert end is not None
+        parts = (pattern[: start.start()], pattern[start.start() : end.end()], pattern[end.end() :])
         before, varying, after = (re.escape(part).replace(r"\*", r"[^.\[\]/]*") for part in parts)
         expression = re.compile(f"{before}({varying}){after}")
         found = {m[1]: c for c in self.channels if (m := expression.fullmatch(c.name))}

@@ -1,0 +1,531 @@
+"""Files other than text, each written by the library of its format and read back."""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+from scipy.io import savemat
+
+from dahl_ident.data import Record, inspect, read_frequency_response, read_record
+from dahl_ident.errors import DataError, DataWarning, MissingDependencyError, UnitError
+
+h5py: Any = importlib.import_module("h5py")
+openpyxl: Any = importlib.import_module("openpyxl")
+
+TIME = np.arange(64) / 128.0
+X = 1e-3 * np.sin(8 * np.pi * TIME)
+F = 5.0 * np.cos(8 * np.pi * TIME)
+FREQUENCY = np.array([10.0, 12.5, 15.0])
+RECEPTANCE = np.array([1e-4 - 2e-4j, -3e-5 - 5e-4j, -4e-4 - 1e-5j])
+RUN = {"time": "time [s]", "displacement": "x [mm]", "force": "F [kN]"}
+
+
+def assert_the_run(record: Record, rtol: float = 1e-14) -> None:
+    for name, expected in (("time", TIME), ("displacement", X), ("force", F)):
+        np.testing.assert_allclose(
+            getattr(record, name), expected, rtol=rtol, atol=rtol * np.abs(expected).max()
+        )
+
+
+def cells() -> list[list[Any]]:
+    return [[t, x, f] for t, x, f in zip(TIME, X * 1e3, F / 1e3, strict=True)]
+
+
+class TestExcel:
+    def book(self, path: Path, *, sheets: tuple[str, ...] = ("run",), top: Any = ()) -> Path:
+        book = openpyxl.Workbook()
+        book.remove(book.worksheets[0])
+        for name in sheets:
+            sheet = book.create_sheet(name)
+            for row in [*top, ["time [s]", "x [mm]", "F [kN]"], *cells()]:
+                sheet.append(row)
+        book.create_sheet("notes").append(["measured on a Friday"])
+        book.save(path)
+        return path
+
+    def test_only_table(self, tmp_path: Path) -> None:
+        top = [["Rig", None, "5"], [None, None, None]]
+        assert_the_run(read_record(self.book(tmp_path / "run.xlsx", top=top)))
+
+    def test_row_of_units(self, tmp_path: Path) -> None:
+        book = openpyxl.Workbook()
+        sheet = book.worksheets[0]
+        for row in [["time", "x", "F"], ["s", "mm", "kN"], *cells()]:
+            sheet.append(row)
+        book.save(tmp_path / "run.xlsx")
+        assert_the_run(read_record(tmp_path / "run.xlsx"))
+
+    def test_sheets(self, tmp_path: Path) -> None:
+        path = self.book(tmp_path / "run.xlsx", sheets=("a", "b"))
+        with pytest.raises(DataError, match="sheets a, b hold tables; name one with sheet='a'"):
+            read_record(path)
+        assert_the_run(read_record(path, sheet="b"))
+        with pytest.raises(DataError, match="no sheet 'c'; there are a, b, notes"):
+            read_record(path, sheet="c")
+        with pytest.raises(DataError, match="no table of numbers on notes"):
+            read_record(path, sheet="notes")
+
+    def test_text_in_a_cell(self, tmp_path: Path) -> None:
+        path = self.book(tmp_path / "run.xlsx", top=[["rig"]])
+        book = openpyxl.load_workbook(path)
+        book["run"]["B5"] = "broken"
+        book.save(path)
+        with pytest.raises(DataError, match="sheet 'run', row 5, column 'x': 'broken' is not"):
+            read_record(path)
+        book["run"]["B5"] = None
+        book.save(path)
+        with pytest.raises(DataError, match="row 5, column 'x': the cell is empty or NaN"):
+            read_record(path)
+
+    def test_damaged(self, tmp_path: Path) -> None:
+        path = self.book(tmp_path / "run.xlsx")
+        path.write_bytes(path.read_bytes()[:-300])
+        with pytest.raises(DataError, match="the workbook is damaged"):
+            read_record(path)
+
+
+class TestParquet:
+    def test_columns(self, tmp_path: Path) -> None:
+        frame = pd.DataFrame(cells(), columns=["time [s]", "x [mm]", "F [kN]"])
+        frame.to_parquet(tmp_path / "run.parquet")
+        assert_the_run(read_record(tmp_path / "run.parquet"))
+
+    def test_nullable_numbers(self, tmp_path: Path) -> None:
+        frame = pd.DataFrame(cells(), columns=["time [s]", "x [mm]", "F [kN]"]).convert_dtypes()
+        frame.to_parquet(tmp_path / "run.parquet")
+        assert_the_run(read_record(tmp_path / "run.parquet"))
+        frame.loc[3, "x [mm]"] = pd.NA
+        frame.to_parquet(tmp_path / "run.parquet")
+        with pytest.raises(DataError, match="row 4, column 'x': the cell is empty or NaN"):
+            read_record(tmp_path / "run.parquet")
+
+    def test_damaged(self, tmp_path: Path) -> None:
+        path = tmp_path / "run.parquet"
+        pd.DataFrame(cells(), columns=list("abc")).to_parquet(path)
+        path.write_bytes(path.read_bytes()[:200])
+        with pytest.raises(DataError, match="the file is damaged"):
+            read_record(path)
+
+
+def matlab_content() -> dict[str, Any]:
+    levels = [
+        {"f": FREQUENCY, "H": RECEPTANCE * k, "u0": np.full(3, float(k)), "name": f"level {k}"}
+        for k in (1, 2, 3)
+    ]
+    return {
+        "rig": {"run": {"t": TIME, "x": X * 1e3, "F": F[:, None] / 1e3}, "fs": 128.0},
+        "sweep": {"levels": np.array(levels, dtype=object), "note": "checked"},
+        "cells": np.array([FREQUENCY, np.array(["text"])], dtype=object),
+        "table": np.column_stack([TIME, X * 1e3, F / 1e3]),
+        "flag": np.array([True, False]),
+    }
+
+
+def write_v73(path: Path) -> Path:
+    """The same content as MATLAB lays it out in HDF5: transposed, structs as groups."""
+    with h5py.File(path, "w", userblock_size=512) as root:
+        refs = root.create_group("#refs#")
+
+        def put(group: Any, name: str, value: Any, kind: bytes = b"double") -> None:
+            if isinstance(value, str):
+                value, kind = np.array([[ord(c)] for c in value], dtype=np.uint16), b"char"
+            array = np.atleast_2d(value)
+            if array.dtype.kind == "c":
+                pairs = np.empty(array.shape, dtype=[("real", "f8"), ("imag", "f8")])
+                pairs["real"], pairs["imag"] = array.real, array.imag
+                array = pairs
+            group.create_dataset(name, data=array).attrs["MATLAB_class"] = np.bytes_(kind)
+
+        def references(group: Any, name: str, values: list[Any], cell: bool) -> None:
+            found = []
+            for i, value in enumerate(values):
+                put(refs, f"{name}{i}", value)
+                found.append(refs[f"{name}{i}"].ref)
+            item = group.create_dataset(
+                name, data=np.array([found], dtype=h5py.ref_dtype), dtype=h5py.ref_dtype
+            )
+            if cell:
+                item.attrs["MATLAB_class"] = np.bytes_(b"cell")
+
+        content = matlab_content()
+        run = root.create_group("rig/run")
+        for name, value in content["rig"]["run"].items():
+            put(run, name, value)
+        put(root["rig"], "fs", 128.0)
+        levels = root.create_group("sweep/levels")
+        for name in ("f", "H", "u0", "name"):
+            references(levels, name, [level[name] for level in content["sweep"]["levels"]], False)
+        put(root["sweep"], "note", "checked")
+        references(root, "cells", [FREQUENCY, "text"], True)
+        put(root, "table", content["table"].T)
+        put(root, "flag", np.array([1, 0], dtype=np.uint8), b"logical")
+        empty = root.create_dataset("nothing", data=np.zeros(2, dtype=np.uint64))
+        empty.attrs["MATLAB_empty"] = 1
+    data = bytearray(path.read_bytes())
+    data[: len(b"MATLAB 7.3 MAT-file")] = b"MATLAB 7.3 MAT-file"
+    path.write_bytes(bytes(data))
+    return path
+
+
+@pytest.fixture(params=["v5", "v7", "v7.3"])
+def matlab(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    path = tmp_path / "lab.mat"
+    if request.param == "v7.3":
+        return write_v73(path)
+    savemat(path, matlab_content(), do_compression=request.param == "v7")
+    return path
+
+
+class TestMatlab:
+    def test_paths_into_structs(self, matlab: Path) -> None:
+        run = {"time": "rig.run.t [s]", "displacement": "rig.run.x [mm]", "force": "rig.run.F [kN]"}
+        assert_the_run(read_record(matlab, columns=run))
+
+    def test_columns_of_a_matrix(self, matlab: Path) -> None:
+        run = {"time": "table[:,0]", "displacement": "table[:,1]", "force": "table[:,2]"}
+        units = {"time": "s", "displacement": "mm", "force": "kN"}
+        columns = {role: {"column": name, "unit": units[role]} for role, name in run.items()}
+        assert_the_run(read_record(matlab, columns=columns))
+
+    def test_one_struct_of_an_array(self, matlab: Path) -> None:
+        columns = {
+            "frequency": "sweep.levels[2].f [Hz]",
+            "response": "sweep.levels[2].H [m/N]",
+            "drive": "sweep.levels[2].u0 [N]",
+        }
+        data = read_frequency_response(matlab, columns=columns)
+        np.testing.assert_allclose(data.response, 3 * RECEPTANCE)
+        assert data.levels == []
+
+    def test_all_structs_of_an_array(self, matlab: Path) -> None:
+        columns = {
+            "frequency": {"column": "sweep.levels[*].f", "unit": "Hz"},
+            "response": {"column": "sweep.levels[*].H", "unit": "m/N"},
+            "drive": {"column": "sweep.levels[*].u0", "unit": "N"},
+            "controlled": {"force": "*0?", "displacement": "*[12]?"},
+        }
+        data = read_frequency_response(matlab, columns=columns)
+        assert data.levels == ["levels[0]", "levels[1]", "levels[2]"]
+        assert data.controlled.tolist() == ["force"] * 3 + ["displacement"] * 6
+        np.testing.assert_allclose(data.response, (RECEPTANCE * np.array([[1], [2], [3]])).ravel())
+        columns["controlled"] = {"force": "*0?"}
+        with pytest.raises(
+            DataError, match=r"level 'levels\[1\]' matches no pattern of controlled"
+        ):
+            read_frequency_response(matlab, columns=columns)
+
+    def test_contents(self, matlab: Path) -> None:
+        contents = inspect(matlab)
+        names = {c.name: c for c in contents.channels}
+        assert names["rig.run.t"].shape == (64,)
+        assert names["rig.fs"].range == "128"
+        assert names["cells[0]"].range == "10 to 15"
+        assert names["sweep.levels[1].name"].range == "'level 2'"
+        assert "nothing" not in names
+        assert 'column = "sweep.levels[*].H"' not in contents.column_map  # H is no usual name
+
+    def test_no_such_path(self, matlab: Path) -> None:
+        with pytest.raises(DataError, match=r"no column is called 'rig.run.q'; there are .*rig"):
+            read_record(matlab, time="rig.run.q", displacement="rig.run.x", force="rig.run.F")
+        with pytest.raises(DataError, match=r"nothing matches 'sweep.\*.f'"):
+            read_frequency_response(matlab, columns={"frequency": "sweep.*.f"})
+        with pytest.raises(DataError, match=r"same levels; only one .* levels\[1\], levels\[2\]"):
+            read_frequency_response(
+                matlab,
+                columns={"frequency": "sweep.levels[*].f", "response": "sweep.level*[0].H"},
+            )
+
+    def test_lengths(self, matlab: Path) -> None:
+        with pytest.raises(DataError, match="differ in length: displacement 64, time 64, force 3"):
+            read_record(
+                matlab, time="rig.run.t [s]", displacement="rig.run.x [mm]", force="cells[0] [N]"
+            )
+
+    def test_units_are_asked_for(self, matlab: Path) -> None:
+        with pytest.raises(UnitError, match=r"column 'rig.run.t' has no unit"):
+            read_record(matlab, force="rig.run.F [kN]", displacement="rig.run.x [mm]")
+
+    def test_nan_names_its_index(self, tmp_path: Path) -> None:
+        savemat(tmp_path / "a.mat", {"t": TIME, "x": np.where(TIME[9] == TIME, np.nan, X), "F": F})
+        with pytest.raises(DataError, match="index 9, column 'x': the cell is empty or NaN"):
+            read_record(tmp_path / "a.mat", time="t [s]", displacement="x [m]", force="F [N]")
+
+    def test_damaged(self, matlab: Path) -> None:
+        matlab.write_bytes(matlab.read_bytes()[:900])
+        with pytest.raises(DataError, match="the file is damaged"):
+            read_record(matlab)
+
+    def test_no_matlab_file(self, tmp_path: Path) -> None:
+        (tmp_path / "a.mat").write_bytes(b"\x07\x08\x09" * 99)
+        with pytest.raises(DataError, match="the file is damaged or no MATLAB file"):
+            read_record(tmp_path / "a.mat")
+
+    def test_nothing_but_text(self, tmp_path: Path) -> None:
+        savemat(tmp_path / "a.mat", {"cube": np.zeros((3, 4, 5))})
+        with pytest.raises(DataError, match="holds no array of numbers"):
+            read_record(tmp_path / "a.mat")
+
+
+class TestHdf5:
+    def test_datasets_with_units(self, tmp_path: Path) -> None:
+        with h5py.File(tmp_path / "run.h5", "w") as root:
+            for name, values, unit in (("time", TIME, "s"), ("x", X * 1e3, "mm"), ("F", F, b"N")):
+                root.create_dataset(f"rig/{name}", data=values).attrs["units"] = unit
+        assert_the_run(read_record(tmp_path / "run.h5"))
+
+    def test_compound(self, tmp_path: Path) -> None:
+        rows = np.array(list(zip(TIME, X, F, strict=True)), dtype=[(n, "f8") for n in "txF"])
+        with h5py.File(tmp_path / "run.h5", "w") as root:
+            root["data"] = rows
+        run = {"time": "data.t [s]", "displacement": "data.x [m]", "force": "data.F [N]"}
+        assert_the_run(read_record(tmp_path / "run.h5", columns=run))
+
+    def test_damaged(self, tmp_path: Path) -> None:
+        with h5py.File(tmp_path / "run.h5", "w") as root:
+            root["x"] = X
+        (tmp_path / "run.h5").write_bytes((tmp_path / "run.h5").read_bytes()[:600])
+        with pytest.raises(DataError, match="the file is damaged"):
+            read_record(tmp_path / "run.h5")
+
+
+def uff_function(
+    data: NDArray[Any], x: NDArray[Any], kind: int, numerator: int, **changes: Any
+) -> dict[str, Any]:
+    """One data set 58."""
+    return {
+        "type": 58, "func_type": kind, "rsp_node": 1, "rsp_dir": 3, "ref_node": 2, "ref_dir": 3,
+        "data": data, "x": x, "id1": "test", "rsp_ent_name": "rig", "ref_ent_name": "rig",
+        "abscissa_spacing": 1, "abscissa_spec_data_type": 18 if kind == 4 else 17,
+        "ordinate_spec_data_type": numerator,
+        "orddenom_spec_data_type": 13 if kind == 4 else 0, **changes,
+    }  # fmt: skip
+
+
+def write_uff(path: Path, *sets: dict[str, Any]) -> Path:
+    pyuff: Any = importlib.import_module("pyuff")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)  # pyuff leaves binary files open
+        pyuff.UFF(str(path)).write_sets(list(sets), mode="overwrite")
+        gc.collect()
+    return path
+
+
+SI = {"type": 164, "units_code": 1, "units_description": "SI", "temp_mode": 1,
+      "length": 1.0, "force": 1.0, "temp": 1.0, "temp_offset": 273.15}  # fmt: skip
+MILLIMETRES = {**SI, "units_code": 5, "length": 1e3, "force": 1e3}
+
+
+class TestUniversalFile:
+    @pytest.mark.parametrize("binary", [0, 1])
+    def test_frequency_response(self, tmp_path: Path, binary: int) -> None:
+        path = write_uff(
+            tmp_path / "beam.uff", SI, uff_function(RECEPTANCE, FREQUENCY, 4, 8, binary=binary)
+        )
+        data = read_frequency_response(path, drive="0.2 N")
+        assert data.quantity == "receptance"
+        np.testing.assert_allclose(data.response, RECEPTANCE, rtol=1e-11)
+        np.testing.assert_allclose(data.frequency_hz, FREQUENCY)
+
+    @pytest.mark.parametrize(
+        ("numerator", "quantity"), [(8, "receptance"), (11, "mobility"), (12, "accelerance")]
+    )
+    def test_data_types_and_unit_systems(
+        self, tmp_path: Path, numerator: int, quantity: str
+    ) -> None:
+        """Millimetres over millinewtons are metres over newtons."""
+        function = uff_function(-1j * RECEPTANCE, FREQUENCY, 4, numerator)
+        path = write_uff(tmp_path / "beam.unv", MILLIMETRES, function)
+        data = read_frequency_response(path, drive="0.2 N", passive=False)
+        assert data.quantity == quantity
+        np.testing.assert_allclose(data.response, -1j * RECEPTANCE, rtol=1e-11)
+
+    def test_labels_come_first(self, tmp_path: Path) -> None:
+        function = uff_function(
+            RECEPTANCE, FREQUENCY, 4, 8, ordinate_axis_units_lab="mm", orddenom_axis_units_lab="N"
+        )
+        data = read_frequency_response(write_uff(tmp_path / "a.uff", SI, function), drive="1 N")
+        np.testing.assert_allclose(data.response, 1e-3 * RECEPTANCE, rtol=1e-11)
+
+    def test_directions_turn_the_sign(self, tmp_path: Path) -> None:
+        function = uff_function(-RECEPTANCE, FREQUENCY, 4, 8, rsp_dir=-3)
+        data = read_frequency_response(write_uff(tmp_path / "a.uff", SI, function), drive="1 N")
+        np.testing.assert_allclose(data.response, RECEPTANCE, rtol=1e-11)
+        assert data.provenance is not None
+        assert "FRF 1:-Z/2:+Z: sign turned, as its directions say" in data.provenance["notes"]
+
+    def test_rotation(self, tmp_path: Path) -> None:
+        function = uff_function(RECEPTANCE, FREQUENCY, 4, 8, rsp_dir=6, ref_dir=6)
+        inches = {**SI, "units_code": 7, "length": 1 / 0.0254, "force": 1 / 4.4482216152605}
+        path = write_uff(tmp_path / "a.uff", inches, function)
+        data = read_frequency_response(path, drive="1 N m")
+        assert data.motion == "rotation"
+        np.testing.assert_allclose(
+            data.response, RECEPTANCE / (4.4482216152605 * 0.0254), rtol=1e-11
+        )
+
+    def test_several_functions(self, tmp_path: Path) -> None:
+        functions = [uff_function(k * RECEPTANCE, FREQUENCY, 4, 8, rsp_node=k) for k in (1, 2)]
+        path = write_uff(tmp_path / "a.uff", SI, *functions)
+        with pytest.raises(DataError, match=r"2 columns may be the response: FRF 1:\+Z/2:\+Z"):
+            read_frequency_response(path, drive="1 N")
+        data = read_frequency_response(path, drive="1 N", columns={"response": "FRF 2:+Z/2:+Z"})
+        np.testing.assert_allclose(data.response, 2 * RECEPTANCE, rtol=1e-11)
+
+    def test_time_records(self, tmp_path: Path) -> None:
+        path = write_uff(
+            tmp_path / "run.uff",
+            SI,
+            uff_function(X, TIME, 1, 8),
+            uff_function(F, TIME, 1, 13, rsp_node=2),
+        )
+        assert_the_run(read_record(path), rtol=1e-10)
+
+    def test_refusal(self, tmp_path: Path) -> None:
+        function = uff_function(RECEPTANCE, FREQUENCY, 4, 8)
+        with pytest.raises(UnitError, match=r"column 'FRF 1:\+Z/2:\+Z' has no unit"):
+            read_frequency_response(write_uff(tmp_path / "a.uff", function), drive="1 N")
+        path = write_uff(tmp_path / "b.uff", {**SI, "length": 39.37}, function)
+        with pytest.raises(DataError, match=r"units code 1 means m, a length factor of 1, .* 39"):
+            read_frequency_response(path, drive="1 N")
+        path = write_uff(tmp_path / "c.uff", SI)
+        with pytest.raises(DataError, match=r"no frequency response or time record .* \[164\]"):
+            read_frequency_response(path, drive="1 N")
+        path = write_uff(tmp_path / "d.uff", SI, {**function, "binary": 1})
+        path.write_bytes(path.read_bytes()[:-40])
+        with pytest.raises(DataError, match=r"damaged|cut off|no frequency response"):
+            read_frequency_response(path, drive="1 N")
+
+
+class TestTdms:
+    def write(self, path: Path, **properties: Any) -> Path:
+        nptdms: Any = importlib.import_module("nptdms")
+        wave = {"wf_increment": 1 / 128.0, "wf_start_offset": 0.0, **properties}
+        channels = [
+            nptdms.ChannelObject("rig", "displacement", X * 1e3, {"unit_string": "mm", **wave}),
+            nptdms.ChannelObject("rig", "force", F, {"NI_UnitDescription": "N", **wave}),
+        ]
+        with nptdms.TdmsWriter(str(path)) as writer:
+            writer.write_segment(channels)
+        return path
+
+    def test_waveforms(self, tmp_path: Path) -> None:
+        assert_the_run(read_record(self.write(tmp_path / "run.tdms")))
+
+    def test_without_timing(self, tmp_path: Path) -> None:
+        path = self.write(tmp_path / "run.tdms", wf_increment=0.0)
+        with pytest.raises(DataError, match=r"no column holds the time; there are rig/disp"):
+            read_record(path)
+        assert_the_run(read_record(path, sample_rate=128.0))
+
+    def test_damaged(self, tmp_path: Path) -> None:
+        path = self.write(tmp_path / "run.tdms")
+        path.write_bytes(path.read_bytes()[:60])
+        with pytest.raises(DataError, match=r"the TDMS file is damaged|holds no channels"):
+            read_record(path)
+
+
+LVM = """LabVIEW Measurement
+Writer_Version\t2
+Reader_Version\t2
+Separator\tTab
+Decimal_Separator\t{mark}
+Multi_Headings\tYes
+X_Columns\tOne
+Time_Pref\tAbsolute
+***End_of_Header***
+
+Channels\t2
+Samples\t64\t64
+Y_Unit_Label\tmm\tN
+X_Dimension\tTime\tTime
+X0\t0\t0
+Delta_X\t0{mark}0078125\t0{mark}0078125
+***End_of_Header***
+X_Value\tdisplacement\tforce\tComment
+"""
+
+
+class TestLvm:
+    @pytest.mark.parametrize("mark", [".", ","])
+    def test_channels(self, tmp_path: Path, mark: str) -> None:
+        rows = (f"{t!r}\t{x * 1e3!r}\t{f!r}" for t, x, f in zip(
+            TIME.tolist(), X.tolist(), F.tolist(), strict=True))  # fmt: skip
+        text = LVM.format(mark=mark) + "\n".join(rows).replace(".", mark) + "\n"
+        (tmp_path / "run.lvm").write_text(text)
+        assert_the_run(read_record(tmp_path / "run.lvm"))
+
+    def test_damaged(self, tmp_path: Path) -> None:
+        (tmp_path / "run.lvm").write_text(LVM.format(mark=".").split("Channels")[0].rstrip())
+        with pytest.raises(DataError, match="the LVM file is damaged"):
+            read_record(tmp_path / "run.lvm")
+
+
+class TestWrongExtension:
+    @pytest.mark.parametrize(
+        ("name", "content", "message"),
+        [
+            ("a.csv", b"\x89HDF\r\n\x1a\n123", "extension .csv says a text table, .* is HDF5"),
+            ("a.xlsx", b"t,x\n1,2\n", "extension .xlsx says an Excel workbook, .* a text table"),
+            ("a.h5", b"PAR1xxx", "extension .h5 says HDF5 .*, the content is Parquet"),
+            ("a.mat", b"TDSm....", "extension .mat says MATLAB .*, the content is NI TDMS"),
+            ("a.tdms", b"    -1\n    58\n", "the content is a universal file"),
+            ("a.uff", b"LabVIEW Measurement\n", "the content is LabVIEW LVM"),
+            ("a.csv", b"PK\x03\x04....", "the content is a ZIP archive"),
+            ("a.xls", b"\xd0\xcf\x11\xe0....", "Excel 97 workbook is not read; save it as .xlsx"),
+            ("a.foo", b"PK\x03\x04....", "a ZIP archive is not read"),
+        ],
+    )
+    def test_content_decides(self, tmp_path: Path, name: str, content: bytes, message: str) -> None:
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(DataError, match=message):
+            inspect(tmp_path / name)
+
+    def test_unknown_extensions_are_read_by_content(self, tmp_path: Path) -> None:
+        savemat(tmp_path / "run.mat", {"t": TIME, "x": X, "F": F})
+        (tmp_path / "run.mat").rename(tmp_path / "run.bin")
+        run = {"time": "t [s]", "displacement": "x [m]", "force": "F [N]"}
+        assert_the_run(read_record(tmp_path / "run.bin", columns=run))
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "name", "content"),
+    [
+        ("openpyxl", "excel", "a.xlsx", b"PK\x03\x04 xl/workbook"),
+        ("pyarrow", "parquet", "a.parquet", b"PAR1"),
+        ("pyuff", "uff", "a.uff", b"    -1\n    58\n"),
+        ("nptdms", "tdms", "a.tdms", b"TDSm"),
+        ("lvm_read", "lvm", "a.lvm", b"LabVIEW Measurement"),
+    ],
+)
+def test_missing_packages_are_named(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    module: str,
+    extra: str,
+    name: str,
+    content: bytes,
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    monkeypatch.setitem(sys.modules, module, None)
+    message = rf"{module} is needed .* pip install 'dahl_ident\[{extra}\]'"
+    with pytest.raises(MissingDependencyError, match=message):
+        inspect(tmp_path / name)
+
+
+def test_doubts_name_indices(tmp_path: Path) -> None:
+    savemat(tmp_path / "a.mat", {"f": FREQUENCY, "u": np.ones(3), "H": RECEPTANCE.conj()})
+    columns = {"frequency": "f [Hz]", "drive": "u [N]", "response": "H [m/N]"}
+    with pytest.raises(DataError, match="creates energy"):
+        read_frequency_response(tmp_path / "a.mat", columns=columns)
+    savemat(tmp_path / "a.mat", {"f": FREQUENCY, "u": np.ones(3), "H": RECEPTANCE * [1, 1, -1j]})
+    with pytest.warns(DataWarning, match="creates energy: index 2"):
+        read_frequency_response(tmp_path / "a.mat", columns=columns)
