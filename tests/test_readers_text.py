@@ -186,6 +186,11 @@ class TestRefusal:
             ("just some words\nand more words\n", "no table of numbers found"),
             ("1\n2\n3\n", "no table of numbers found"),
             ("0,1,1\n0.5,2.5,2\n", "no header line; expected names and units above the numbers"),
+            (
+                "a,b\n1,2,3\n",
+                "the header names 2 columns, the rows have 3; expected a name",
+            ),
+            ("a,b,c,d\n1,2,3\n", "no header line"),
             (PLAIN + "2,3\n", r"the last line has 2 fields, '2,3', where the others have 3"),
             (PLAIN + "end of data\n", "the last line has 1 fields, 'end of data'"),
             (PLAIN + "2,3,4,5\n3,4,5\n", "line 5 has 4 fields; expected 3 as in the lines above"),

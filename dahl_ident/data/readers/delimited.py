@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.readers.layout import Header, best_run, header
-from dahl_ident.data.source import Channel, Source
+from dahl_ident.data.readers.layout import Header, best_run, header, named_channels
+from dahl_ident.data.source import Source
 from dahl_ident.data.storage import METADATA_MARK
 from dahl_ident.errors import DataError
 
@@ -62,20 +62,13 @@ def read_text_table(data: bytes, name: str, sha256: str | None = None) -> Source
     body = data[layout.offset :]
     _refuse_cut_end(body, layout, name)
     columns = _parse(body, layout, metadata, name)
-    names = layout.header.names
-    channels = []
-    for i, values in enumerate(columns):
-        label = names[i] if names else ""
-        if not label and values.dtype.kind == "f" and np.isnan(values).all():
-            continue  # a trailing delimiter, or an empty column
-        unit = layout.header.units[i] if names else None
-        channels.append(Channel(label or f"column {i + 1}", values, unit))
+    channels = named_channels(columns, layout.header, name)
     return Source(
         name,
         "text table",
-        tuple(channels),
+        channels,
         sha256,
-        headerless=not names,
+        headerless=not layout.header.names,
         row_name=lambda i: f"line {_line_of(body, layout.line, i)}",
         metadata=metadata,
     )

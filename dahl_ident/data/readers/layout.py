@@ -5,9 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from dahl_ident.data.source import split_header
-from dahl_ident.errors import UnitError
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.data.source import Channel, split_header
+from dahl_ident.errors import DataError, UnitError
 from dahl_ident.units import parse_unit
 
 _CELL = {
@@ -30,10 +34,14 @@ class Run:
 
 @dataclass(frozen=True)
 class Header:
-    """Names and units of the columns; no names for a table without a header."""
+    """Names and units of the columns; no names for a table without a header.
+
+    `cells` is how many columns the header line has; rows may end in a delimiter besides.
+    """
 
     names: tuple[str, ...]
     units: tuple[str | None, ...]
+    cells: int
 
 
 def best_run(rows: Iterable[Sequence[str] | None], mark: str) -> Run | None:
@@ -66,18 +74,23 @@ def header(above: Sequence[Sequence[str]], width: int) -> Header:
     lines: list[list[str]] = []
     for row in reversed(above):
         cells = _without_trailing(row)
-        if not cells or not width - 1 <= len(cells) <= width or _holds_number(cells):
+        fits = width - 1 <= len(cells) <= width and len(row) == len(above[-1])
+        if not cells or not fits or _holds_number(cells):
             break
         lines.insert(0, [*cells, *[""] * (width - len(cells))])
     if not lines:
-        return Header((), ())
+        return Header((), (), 0)
     k = next((k for k in range(len(lines) - 1, 0, -1) if _are_units(lines[k])), None)
     if k is None:
         named = [split_header(cell) for cell in lines[-1]]
-        return Header(tuple(n for n, _ in named), tuple(u for _, u in named))
+        return _header([n for n, _ in named], [u for _, u in named])
     named = [split_header(cell) for cell in lines[k - 1]]
     units = [own or _bare(cell) for (_, own), cell in zip(named, lines[k], strict=True)]
-    return Header(tuple(n for n, _ in named), tuple(units))
+    return _header([n for n, _ in named], units)
+
+
+def _header(names: list[str], units: list[str | None]) -> Header:
+    return Header(tuple(names), tuple(units), len(_without_trailing(names)))
 
 
 def _without_trailing(row: Sequence[str]) -> list[str]:
@@ -103,3 +116,34 @@ def _are_units(cells: Sequence[str]) -> bool:
     except UnitError:
         return False
     return bool(found)
+
+
+def named_channels(
+    columns: Sequence[NDArray[Any]], named: Header, file: str
+) -> tuple[Channel, ...]:
+    """Return the columns with their names and units, blank ones without a name left out.
+
+    Raises
+    ------
+    DataError
+        If rows are longer than the header.
+    """
+    channels = []
+    for i, values in enumerate(columns):
+        label = named.names[i] if named.names else ""
+        if not label and _is_blank(values):
+            continue
+        if named.names and i >= named.cells:
+            raise DataError(
+                f"{file}: the header names {named.cells} columns, the rows have {len(columns)}; "
+                "expected a name for each"
+            )
+        unit = named.units[i] if named.names else None
+        channels.append(Channel(label or f"column {i + 1}", values, unit))
+    return tuple(channels)
+
+
+def _is_blank(values: NDArray[Any]) -> bool:
+    if values.dtype.kind == "U":
+        return not np.char.strip(values).astype(bool).any()
+    return values.dtype.kind == "f" and bool(np.isnan(values).all())

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.readers.file import File, library
-from dahl_ident.data.readers.layout import best_run, header
+from dahl_ident.data.readers.layout import best_run, header, named_channels
 from dahl_ident.data.source import Channel, Source, split_header
 from dahl_ident.data.summary import listed
 from dahl_ident.errors import DataError
@@ -70,17 +70,12 @@ def _table(file: File, sheet: str, frame: pd.DataFrame) -> Source | None:
     above = [row for row in rows[: run.start] if row is not None]
     named = header(above, run.width)
     filled = [i for i in range(run.start, len(cells)) if any(_text(c) for c in cells[i])]
-    channels = []
-    for k in range(run.width):
-        values = _column(cells[filled, k])
-        label = named.names[k] if named.names else ""
-        if label or not np.all(values == "" if values.dtype.kind == "U" else np.isnan(values)):
-            unit = named.units[k] if named.names else None
-            channels.append(Channel(label or f"column {k + 1}", values, unit))
+    columns = [_column(cells[filled, k]) for k in range(run.width)]
+    where = f"{file.name}, sheet {sheet!r}"
     return Source(
         file.name,
         "Excel",
-        tuple(channels),
+        named_channels(columns, named, where),
         file.sha256,
         headerless=not named.names,
         row_name=lambda i: f"sheet {sheet!r}, row {filled[i] + 1}",

@@ -1,0 +1,170 @@
+"""Whatever the bytes: a valid object, or an error that this package raises on purpose."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.io import savemat
+
+from dahl_ident.data import FrequencyResponse, Record, inspect, read_frequency_response, read_record
+from dahl_ident.data.readers.delimited import read_text_table
+from dahl_ident.errors import DahlIdentError, DataWarning
+
+NAMES = [
+    "time", "t [s]", "x [mm]", "displacement", "F [kN]", "force (N)", "drive [V]", "frequency_hz",
+    "frequency [rad/s]", "amplitude [um rms]", "amplitude", "gain [N/m]", "gain_db [dB re N/m]",
+    "phase_deg", "phase [rad]", "real [m/N]", "imag", "level", "harmonic", "controlled", "std",
+    "dof", "[", "]", "[]", "x [", "(N", "a (b) (c)", "", '"', "#", "%", "=1+1", "nan",
+]  # fmt: skip
+CELLS = [
+    "0", "1", "2", "-1", "1.5", "2,5", "1e3", "1e-400", "1e400", "nan", "NaN", "inf", "-inf", "",
+    " ", "x", "force", "True", "0x10", "1_0", "1,000.5", '"', '"1"', "'", "#", "--", "1+2j", "\x0c",
+    "٣", "−1", "½", "1d3", "\u2028", "1" * 30, "0." + "3" * 40,
+]  # fmt: skip
+
+
+@st.composite
+def tables(draw: st.DrawFn) -> bytes:
+    """Tables that are nearly right."""
+    delimiter = draw(st.sampled_from([",", ";", "\t", "|", " ", ", "]))
+    width = draw(st.integers(1, 6))
+    good = st.one_of(st.integers(1, 99).map(str), st.floats(0.1, 1e4).map(repr))
+    cell = st.one_of(good, good, good, st.sampled_from(CELLS))
+    header = draw(st.lists(st.sampled_from(NAMES), min_size=width, max_size=width))
+    row = st.lists(cell, min_size=max(1, width - 1), max_size=width + 1)
+    full = st.lists(cell, min_size=width, max_size=width)
+    rows = draw(st.lists(st.one_of(full, full, full, row), max_size=8))
+    preamble = draw(
+        st.lists(st.sampled_from(["# note", "", "rate,3", "% x", "\ufeff"]), max_size=2)
+    )
+    end = draw(st.sampled_from(["\n", "\r\n", "\r", "\n\n"]))
+    lines = [*preamble, delimiter.join(header), *(delimiter.join(r) for r in rows)]
+    encoding = draw(st.sampled_from(["utf-8", "utf-8-sig", "utf-16"]))
+    return (end.join(lines) + draw(st.sampled_from(["", end]))).encode(encoding, "replace")
+
+
+def check_record(record: Record) -> None:
+    assert np.isfinite(record.time).all()
+    assert (np.diff(record.time) > 0.0).all()
+    assert np.isfinite(record.motion_samples).all()
+    assert record.motion_samples.shape == record.time.shape
+    repr(record)
+
+
+def check_response(data: FrequencyResponse) -> None:
+    assert (data.frequency_hz > 0.0).all()
+    assert np.isfinite(data.response).all()
+    for values in (data.amplitude, data.drive):
+        assert values is None or (np.isfinite(values) & (values > 0.0)).all()
+    repr(data)
+
+
+def read_every_way(path: Path) -> None:
+    """Read a file as everything it may be; only this package's errors and doubts may come out."""
+    record_map = {"time": "column 1 [s]", "displacement": "column 2 [m]", "force": "column 3 [N]"}
+    ways: list[Any] = [
+        lambda: check_record(read_record(path)),
+        lambda: check_record(read_record(path, missing="drop", sample_rate=10.0)),
+        lambda: check_record(read_record(path, columns=record_map)),
+        lambda: check_response(read_frequency_response(path)),
+        lambda: check_response(
+            read_frequency_response(path, drive="1 N", amplitude="1 mm/s", quantity="mobility")
+        ),
+        lambda: repr(inspect(path)),
+    ]
+    for way in ways:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)
+            with contextlib.suppress(DahlIdentError):
+                way()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fuzz")
+
+
+@settings(max_examples=300)
+@given(tables())
+def test_tables_that_are_nearly_right(folder: Path, content: bytes) -> None:
+    path = folder / "table.csv"
+    path.write_bytes(content)
+    read_every_way(path)
+
+
+@settings(max_examples=200)
+@given(st.one_of(st.binary(max_size=400), st.text(max_size=200).map(lambda t: t.encode())))
+def test_any_bytes(folder: Path, content: bytes) -> None:
+    path = folder / "file.txt"
+    path.write_bytes(content)
+    read_every_way(path)
+
+
+def response_table() -> bytes:
+    Z = 1e3 * (1.0 + 0.3j) * np.linspace(1.0, 0.5, 6)
+    data = FrequencyResponse(
+        np.linspace(1, 9, 6), Z, np.geomspace(1e-5, 1e-3, 6), covariance=[np.eye(2)] * 6, dof=4.0,
+        level=list("abcabc"), quality={"settled": [True, False] * 3},
+    )  # fmt: skip
+    buffer = io.BytesIO()
+    data.to_frame().to_csv(buffer, index=False)
+    return buffer.getvalue()
+
+
+TABLE = response_table()
+
+
+@settings(max_examples=200)
+@given(
+    st.integers(0, len(TABLE) - 1), st.integers(0, 255), st.sampled_from(["cut", "swap", "drop"])
+)
+def test_one_damaged_byte(folder: Path, place: int, byte: int, how: str) -> None:
+    damaged = {
+        "cut": TABLE[:place],
+        "swap": TABLE[:place] + bytes([byte]) + TABLE[place + 1 :],
+        "drop": TABLE[:place] + TABLE[place + 1 :],
+    }
+    path = folder / "damaged.csv"
+    path.write_bytes(damaged[how])
+    read_every_way(path)
+
+
+@settings(max_examples=100)
+@given(st.integers(0, 10_000), st.integers(0, 255), st.booleans())
+def test_damaged_matlab_file(folder: Path, place: int, byte: int, cut: bool) -> None:
+    buffer = io.BytesIO()
+    content = {"time": np.arange(9.0), "lab": {"x": np.arange(9.0), "F": [1.0, 2.0]}}
+    save: Any = savemat
+    save(buffer, content, do_compression=True)
+    data = bytearray(buffer.getvalue())
+    assume(place < len(data))
+    data[place] = byte
+    path = folder / "damaged.mat"
+    path.write_bytes(bytes(data[:place] if cut else data))
+    read_every_way(path)
+
+
+@given(
+    st.lists(st.tuples(st.floats(-1e50, 1e50), st.floats(-1e50, 1e50)), min_size=1, max_size=20),
+    st.sampled_from([(",", "."), (";", "."), (";", ","), ("\t", ","), ("|", "."), (" ", ",")]),
+    st.sampled_from(["\n", "\r\n", "\r"]),
+    st.sampled_from(["", "# made by a logger\n", "Rig 5\n\n", "rate;5\n"]),
+)
+def test_good_tables_are_read_to_the_last_digit(
+    rows: list[tuple[float, float]], dialect: tuple[str, str], end: str, preamble: str
+) -> None:
+    delimiter, mark = dialect
+    lines = [f"{a!r}{delimiter}{b!r}".replace(".", mark) for a, b in rows]
+    text = preamble + end.join([f"a{delimiter}b", *lines])
+    source = read_text_table(text.encode(), "t.csv")
+    assert [c.name for c in source.channels] == ["a", "b"]
+    np.testing.assert_array_equal(source.channels[0].values, [a for a, _ in rows])
+    np.testing.assert_array_equal(source.channels[1].values, [b for _, b in rows])
