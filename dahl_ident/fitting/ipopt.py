@@ -90,7 +90,8 @@ def solve_ipopt(
         Standard deviation of the measured drive, N, in force-controlled rows. Needs
         ``noise="measured"``.
     drive_covariance : (n, 2) array_like, optional
-        Covariance of the drive with the real and the imaginary part of the response.
+        Covariance of the drive with the real and the imaginary part of the response: the
+        response is a quotient with the force, so they share the force's error.
 
     Returns
     -------
@@ -320,13 +321,18 @@ def _drive_error(
             f"drive_std is given with {problem.noise} noise and {loss} loss; how much it weighs "
             "beside the response's error is known only with noise='measured', loss='linear'"
         )
-    spread = np.broadcast_to(non_negative_array(std, "drive_std"), data.drive.shape)
-    together = np.zeros((data.n, 2))
-    if covariance is not None:
-        together = np.broadcast_to(finite_array(covariance, "drive_covariance"), (data.n, 2))
+    spread = _for_rows(non_negative_array(std, "drive_std"), "drive_std", (data.n,))
+    together = finite_array(0.0 if covariance is None else covariance, "drive_covariance")
+    together = _for_rows(together, "drive_covariance", (data.n, 2))
     per_drive = np.where(forced, 1.0 / data.drive, 0.0)
     cross = together @ np.array([1.0, 1.0j]) * per_drive
     return AmplitudeError((spread * per_drive) ** 2, cross)
+
+
+def _for_rows(value: FloatArray, name: str, shape: tuple[int, ...]) -> FloatArray:
+    if value.shape not in ((), shape):
+        raise ValidationError(f"{name} has shape {value.shape}; expected one number or {shape}")
+    return np.broadcast_to(value, shape)
 
 
 def _ended(target: Target, found: _Found, relations: Relations, nfev: int) -> Optimum:
@@ -360,7 +366,7 @@ def _constrained(result: Optimum, target: Target, found: _Found, relations: Rela
     dof = result.dof + relations.freedom_lost
     scale = target.scale
     if not problem.scale_known and loss is None and not problem.priors:
-        scale = float(np.sqrt(2.0 * found.cost / dof))
+        scale = float(np.sqrt(2.0 * found.cost / dof)) if dof > 0 else np.nan
     covariance, undetermined = _on_constraints(
         _information(target, found, dof), found.slopes[np.array(relations.equal, dtype=np.bool_)]
     )
