@@ -9,8 +9,12 @@ import typer
 
 from dahl_ident import __version__
 from dahl_ident.cli import telling
+from dahl_ident.cli.datasets import datasets
 from dahl_ident.cli.demo import demo
+from dahl_ident.cli.extract import extract
 from dahl_ident.cli.fit import fit
+from dahl_ident.cli.inspect import inspect
+from dahl_ident.cli.simulate import simulate
 from dahl_ident.errors import DahlIdentError
 
 app = typer.Typer(
@@ -21,11 +25,11 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (demo, fit):
+for command in (demo, inspect, extract, fit, simulate, datasets):
     app.command()(command)
 
 
-def _version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         telling.say(f"dahl-ident {__version__}")
         raise typer.Exit
@@ -38,8 +42,9 @@ def common(
     color: Annotated[
         bool, typer.Option("--color/--no-color", help="Colour; NO_COLOR turns it off as well.")
     ] = True,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    _version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print it."),
     ] = False,
 ) -> None:
     """Identify Dahl friction from sine-sweep measurements, with error bars that are true."""

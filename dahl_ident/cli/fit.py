@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dahl_ident.cli import telling
 from dahl_ident.cli.groups import grouped
-from dahl_ident.cli.options import Config, Files, Json, ModelOptions, Reading
+from dahl_ident.cli.options import Files, General, ModelOptions, Reading
 
 if TYPE_CHECKING:
     from dahl_ident.results import FitResult
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
 @grouped
 def fit(
     files: Files,
+    general: General,
     reading: Reading,
     model: ModelOptions,
     noise: Annotated[
@@ -26,18 +26,16 @@ def fit(
     loss: Annotated[
         str, typer.Option(help="linear, huber, soft_l1 or student_t; the latter mind outliers.")
     ] = "linear",
-    json: Json = False,
-    config: Config = None,
 ) -> None:
     """Estimate f_max and sigma, and say whether the data determine them.
 
-    Example: dahl-ident simulate --f-max 0.1 --sigma 30 -o levels.csv && dahl-ident fit levels.csv
+    Example: dahl-ident datasets noisy -o - | dahl-ident fit -
     """
     from dahl_ident.results import fit as fit_data
 
     elements, free = model.build()
     result = fit_data(reading.read(files), elements, free=free, noise=noise, loss=loss, throw=False)
-    show(result, json=json)
+    show(result, json=general.json)
     telling.finish(result.success, result.message)
 
 

@@ -45,19 +45,24 @@ def _from_config(ctx: typer.Context, path: Path | None) -> Path | None:
     return path
 
 
-Config = Annotated[
-    Path | None,
-    typer.Option(
-        "--config",
-        is_eager=True,
-        callback=_from_config,
-        help="TOML file of options; a table named after the command, such as \\[fit], is for it "
-        "alone. The command line wins.",
-    ),
-]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 Files = Annotated[list[str], typer.Argument(help="Files to read; - is standard input.")]
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
+
+
+@dataclass(frozen=True)
+class General:
+    """What every command knows."""
+
+    json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            is_eager=True,
+            callback=_from_config,
+            help="TOML file of options; a table named after the command, such as \\[fit], is for "
+            "it alone. The command line wins.",
+        ),
+    ] = None
 
 
 @dataclass(frozen=True)

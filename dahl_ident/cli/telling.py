@@ -87,4 +87,5 @@ def warnings_in_one_line() -> None:
     def show(message: Warning | str, *_: Any) -> None:
         doubt(f"warning: {message}")
 
-    warnings.showwarning = show
+    # setattr, because the signature here has no use for file and line
+    setattr(warnings, "showwarning", show)  # noqa: B010

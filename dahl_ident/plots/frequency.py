@@ -55,7 +55,7 @@ def plot_frequency_response(
     if fitted:
         drawn = {"marker": marker or "o", "linestyle": "none"}
     for i, ((label, frequency, response), colour) in enumerate(zip(levels, colours, strict=True)):
-        name = label if i in labelled else None
+        name = label if label and i in labelled else None
         order = np.argsort(frequency)
         f, R = np.asarray(frequency)[order], np.asarray(response)[order]
         top.plot(f, np.abs(R), color=colour, label=name, **drawn)
@@ -71,5 +71,6 @@ def plot_frequency_response(
         axis.set_xscale("log" if wide else "linear")
     top.set(yscale="log", ylabel=gain_label)
     bottom.set(xlabel="frequency [Hz]", ylabel="phase [degrees]")
-    top.legend(ncols=2)
+    if any(label for label, _, _ in levels):
+        top.legend(ncols=2)
     return top, bottom

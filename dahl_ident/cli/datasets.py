@@ -1,0 +1,62 @@
+"""``dahl-ident datasets``: the data that ship, what each teaches, and a copy of any."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from dahl_ident.cli import telling
+from dahl_ident.cli.files import write_data
+from dahl_ident.cli.groups import grouped
+from dahl_ident.cli.options import General
+from dahl_ident.errors import ValidationError
+
+
+@grouped
+def datasets(
+    general: General,
+    name: Annotated[
+        str | None, typer.Argument(help="The one to describe or copy; all if left out.")
+    ] = None,
+    output: Annotated[
+        str | None,
+        typer.Option("--output", "-o", help="Copy it here; - is standard output, as CSV."),
+    ] = None,
+) -> None:
+    """List the shipped synthetic data sets, or copy one to a file.
+
+    Example: dahl-ident datasets noisy -o noisy.csv
+    """
+    from dahl_ident.synthetic.catalogue import DATA_SETS
+    from dahl_ident.synthetic.shipped import load_dataset
+
+    if output is not None and name is None:
+        raise ValidationError("--output needs the name of a data set; leave it out to list them")
+    if name is not None:
+        data = load_dataset(name)
+        if output is not None:
+            write_data(data, output)
+        elif general.json:
+            telling.say_json(data.provenance)
+        else:
+            telling.say(repr(data))
+        return
+    if general.json:
+        telling.say_json([_facts(one.name) for one in DATA_SETS.values()])
+        return
+    telling.table(
+        "Shipped data sets",
+        ("name", "kind", "what it teaches", "determines"),
+        [
+            (one.name, one.kind.replace("_", " "), one.teaches, ", ".join(one.identifiable))
+            for one in DATA_SETS.values()
+        ],
+    )
+
+
+def _facts(name: str) -> dict[str, object]:
+    from dahl_ident.synthetic.catalogue import DATA_SETS
+
+    facts = vars(DATA_SETS[name])
+    return {k: v for k, v in facts.items() if k != "experiment"} | {"kind": DATA_SETS[name].kind}

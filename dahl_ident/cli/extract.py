@@ -1,0 +1,208 @@
+"""``dahl-ident extract``: from recorded waveforms to a table of response with verdicts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from dahl_ident.cli import telling
+from dahl_ident.cli.files import STANDARD, with_progress, write_data, write_picture
+from dahl_ident.cli.groups import grouped
+from dahl_ident.cli.options import Files, General
+
+if TYPE_CHECKING:
+    from dahl_ident.data import FrequencyResponse
+
+_READING = "Reading"
+_EXTRACTING = "Extracting"
+Channel = Annotated[
+    str | None,
+    typer.Option(help='Its column, with unit if need be: "x [mm]".', rich_help_panel=_READING),
+]
+
+
+@dataclass(frozen=True)
+class RecordReading:
+    """How records are read; the words of ``read_record``."""
+
+    columns: Annotated[
+        Path | None, typer.Option(help="Column map, a TOML file.", rich_help_panel=_READING)
+    ] = None
+    time: Channel = None
+    displacement: Channel = None
+    velocity: Channel = None
+    acceleration: Channel = None
+    force: Channel = None
+    drive: Channel = None
+    drive_factor: Annotated[
+        str | None,
+        typer.Option(help='Force for one unit of drive, "12.5 N/V".', rich_help_panel=_READING),
+    ] = None
+    drive_factor_uncertainty: Annotated[
+        float | None,
+        typer.Option(help="Its relative standard uncertainty.", rich_help_panel=_READING),
+    ] = None
+    sample_rate: Annotated[
+        float | None,
+        typer.Option(help="Hz, for files without a time column.", rich_help_panel=_READING),
+    ] = None
+    sheet: Annotated[
+        str | None, typer.Option(help="Sheet of an Excel workbook.", rich_help_panel=_READING)
+    ] = None
+    missing: Annotated[
+        str,
+        typer.Option(
+            help="error or drop: what is done about empty samples.", rich_help_panel=_READING
+        ),
+    ] = "error"
+
+
+@dataclass(frozen=True)
+class Extracting:
+    """How points are measured; the words of ``extract``."""
+
+    frequency: Annotated[
+        float | None,
+        typer.Option(help="Excitation frequency where known, Hz.", rich_help_panel=_EXTRACTING),
+    ] = None
+    mode: Annotated[
+        str, typer.Option(help="auto, steps or sweep.", rich_help_panel=_EXTRACTING)
+    ] = "auto"
+    num_periods: Annotated[
+        int | None,
+        typer.Option(help="Last periods of each stretch to use.", rich_help_panel=_EXTRACTING),
+    ] = None
+    settling_periods: Annotated[
+        int | None,
+        typer.Option(help="Leading ones of these to leave out.", rich_help_panel=_EXTRACTING),
+    ] = None
+    harmonics: Annotated[
+        str | None,
+        typer.Option(
+            help="Which become rows: by default 1,3,5,7,9, with force controlled 1 alone.",
+            rich_help_panel=_EXTRACTING,
+        ),
+    ] = None
+    controlled: Annotated[
+        str,
+        typer.Option(
+            help="What the laboratory held: displacement or force.", rich_help_panel=_EXTRACTING
+        ),
+    ] = "displacement"
+    min_share: Annotated[
+        float,
+        typer.Option(help="Least share of the sine in the power.", rich_help_panel=_EXTRACTING),
+    ] = 0.6
+
+    def keywords(self) -> dict[str, Any]:
+        """Return the arguments of ``extract``."""
+        from dahl_ident.errors import ValidationError
+
+        given = self.harmonics or ("1" if self.controlled == "force" else "1,3,5,7,9")
+        try:
+            harmonics = [int(k) for k in given.split(",")]
+        except ValueError as exc:
+            raise ValidationError(
+                f"harmonics is {given!r}; expected whole numbers such as 1,3,5"
+            ) from exc
+        return {**vars(self), "harmonics": harmonics}
+
+
+@grouped
+def extract(
+    files: Files,
+    general: General,
+    reading: RecordReading,
+    extracting: Extracting,
+    output: Annotated[
+        str | None,
+        typer.Option("--output", "-o", help="Table to write; - is standard output, as CSV."),
+    ] = None,
+    plot: Annotated[str | None, typer.Option(help="Picture to write, such as points.png.")] = None,
+    level_from_name: Annotated[
+        str | None,
+        typer.Option(help="Regular expression on the file's name; its group is the level."),
+    ] = None,
+) -> None:
+    """Turn recorded waveforms into dynamic stiffness with covariance and verdicts.
+
+    Ends with status 3 if a point is not good; the table names each with its verdict.
+
+    Example: dahl-ident datasets plant_recording -o - | dahl-ident extract - --controlled force
+    """
+    from dahl_ident.data import FrequencyResponse
+
+    parts = [
+        _points(file, reading, extracting, level_from_name)
+        for file in with_progress(files, "extracting")
+    ]
+    data = parts[0] if len(parts) == 1 else FrequencyResponse.concatenate(parts)
+    if output is not None:
+        write_data(data, output)
+    if plot is not None:
+        write_picture(data.plot(), plot)
+    if general.json:
+        telling.say_json(_rows(data))
+    elif output != STANDARD:
+        show(data)
+    judge(data)
+
+
+def _points(
+    file: str, reading: RecordReading, extracting: Extracting, level_from_name: str | None
+) -> FrequencyResponse:
+    from dahl_ident.data import read_record
+    from dahl_ident.data.readers import groups_in_name
+    from dahl_ident.extraction import extract as extract_record
+
+    record = read_record(file, **vars(reading))
+    level = groups_in_name(file, level_from_name).get("level")
+    return extract_record(record, level=level, **extracting.keywords())
+
+
+def show(data: FrequencyResponse) -> None:
+    """Print the fundamental of every point with its verdict."""
+    import numpy as np
+
+    from dahl_ident.units import si_unit
+
+    points = data.select(harmonic=1)
+    motion = si_unit("displacement", data.motion)
+    header = (
+        "frequency [Hz]",
+        f"amplitude [{motion}]",
+        "gain",
+        "phase [deg]",
+        "periods",
+        "verdict",
+    )
+    assert points.amplitude is not None  # extraction measures it
+    used = points.quality["num_periods"] - points.quality["settling_periods"]
+    telling.table(
+        f"{points.n} points of {points.quantity.replace('_', ' ')} [{points.unit}]",
+        header,
+        [
+            (f"{f:.5g}", f"{A:.4g}", f"{g:.4g}", f"{p:.2f}", f"{u:g}", str(v))
+            for f, A, g, p, u, v in zip(
+                points.frequency_hz, points.amplitude, points.gain, np.degrees(points.phase),
+                used, points.quality["verdict"], strict=True,
+            )
+        ],
+    )  # fmt: skip
+
+
+def judge(data: FrequencyResponse) -> None:
+    """End with status 3 where a point is not good, and say which and why."""
+    verdicts = data.select(harmonic=1).quality["verdict"]
+    bad = [(i, str(v)) for i, v in enumerate(verdicts) if v != "good"]
+    named = "; ".join(f"point {i}: {verdict}" for i, verdict in bad[:3])
+    more = "" if len(bad) <= 3 else "; ..."
+    telling.finish(not bad, f"{len(bad)} of {len(verdicts)} points are not good ({named}{more})")
+
+
+def _rows(data: FrequencyResponse) -> list[dict[str, Any]]:
+    frame = data.to_frame()
+    return [dict(zip(frame.columns, row, strict=True)) for row in frame.to_numpy().tolist()]

@@ -1,0 +1,149 @@
+"""``dahl-ident simulate``: data of the synthetic laboratory, from options or from a file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from dahl_ident.cli import telling
+from dahl_ident.cli.files import progress_bar, write_data
+from dahl_ident.cli.groups import grouped
+from dahl_ident.cli.options import General, ModelOptions, Seed
+from dahl_ident.errors import ValidationError
+
+if TYPE_CHECKING:
+    from dahl_ident.elements import Element
+    from dahl_ident.synthetic import Experiment
+
+_EXCITATION = "Excitation"
+_ERRORS = "Errors"
+_SPAN = (0.1, 10.0)  # of the characteristic displacement, where no levels are given
+_COUNT = 30
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """A stepped sine; anything else takes an experiment file."""
+
+    levels: Annotated[
+        str | None,
+        typer.Option(
+            help="Amplitudes, 1e-4,1e-3 or low:high:count; by default 30 about f_max/sigma.",
+            rich_help_panel=_EXCITATION,
+        ),
+    ] = None
+    frequencies_hz: Annotated[
+        str, typer.Option(help="The same for frequencies, Hz.", rich_help_panel=_EXCITATION)
+    ] = "1"
+    controlled: Annotated[
+        str,
+        typer.Option(help="displacement or force: what is held.", rich_help_panel=_EXCITATION),
+    ] = "displacement"
+    order: Annotated[
+        str,
+        typer.Option(help="given, ascending, descending or random.", rich_help_panel=_EXCITATION),
+    ] = "given"
+    settling_periods: Annotated[
+        int, typer.Option(help="Before measuring.", rich_help_panel=_EXCITATION)
+    ] = 10
+    num_periods: Annotated[int, typer.Option(help="Measured.", rich_help_panel=_EXCITATION)] = 5
+    record: Annotated[
+        bool, typer.Option("--record", help="Waveforms, not a table.", rich_help_panel=_EXCITATION)
+    ] = False
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Noise: relative in a table, absolute in a record."""
+
+    displacement_std: Annotated[
+        float,
+        typer.Option(help="Of the table, relative; of samples, m.", rich_help_panel=_ERRORS),
+    ] = 0.0
+    force_std: Annotated[
+        float,
+        typer.Option(help="Of the table, relative; of samples, N.", rich_help_panel=_ERRORS),
+    ] = 0.0
+
+
+@grouped
+def simulate(
+    general: General,
+    model: ModelOptions,
+    excitation: Excitation,
+    errors: Errors,
+    experiment: Annotated[
+        str | None, typer.Argument(help="Experiment file, .toml or .json, instead of options.")
+    ] = None,
+    seed: Seed = 1,
+    output: Annotated[
+        str | None,
+        typer.Option("--output", "-o", help="File to write; - is standard output, as CSV."),
+    ] = None,
+) -> None:
+    """Simulate an experiment whose truth is known; without an output, print its description.
+
+    Example: dahl-ident simulate --f-max 0.1 --sigma 30 --force-std 0.01 -o synthetic.csv
+    """
+    from dahl_ident.synthetic import Experiment
+    from dahl_ident.synthetic import simulate as run
+
+    described = (
+        Experiment.read(experiment)
+        if experiment is not None
+        else _experiment(model.build()[0], excitation, errors)
+    )
+    if output is None:
+        telling.say(described.to_json() if general.json else described.to_toml())
+        return
+    with progress_bar() as bar:
+        task = bar.add_task("simulating", total=1.0)
+        data = run(described, seed=seed, progress=lambda done: bar.update(task, completed=done))
+    write_data(data, output)
+
+
+def _experiment(plant: Element, excitation: Excitation, errors: Errors) -> Experiment:
+    from dahl_ident.synthetic import Acquisition, Channel, Experiment, SteppedSine, Table
+
+    given: dict[str, Any] = dict(vars(excitation))
+    as_record = given.pop("record")
+    given["levels"] = _numbers("levels", excitation.levels or _usual_levels(plant, excitation))
+    given["frequencies_hz"] = _numbers("frequencies_hz", excitation.frequencies_hz)
+    steps = SteppedSine(**given)
+    if not as_record:
+        return Experiment(plant, steps, table=Table(**vars(errors)))
+    sensors = Acquisition(
+        displacement=Channel(noise_std=errors.displacement_std),
+        force=Channel(noise_std=errors.force_std),
+    )
+    return Experiment(plant, steps, sensors)
+
+
+def _usual_levels(plant: Element, excitation: Excitation) -> str:
+    """Return levels about the knee of friction, of displacement or of force."""
+    values = {p.name: p.value for p in plant.parameters}
+    f_max, sigma = values["f_max"], values["sigma"]
+    if f_max is None or sigma is None:
+        missing = [name for name in ("f_max", "sigma") if values[name] is None]
+        raise ValidationError(
+            f"no value for {' and '.join(missing)}; a simulation needs --f-max and --sigma"
+        )
+    knee = f_max if excitation.controlled == "force" else f_max / sigma
+    return f"{_SPAN[0] * knee}:{_SPAN[1] * knee}:{_COUNT}"
+
+
+def _numbers(name: str, text: str) -> list[float]:
+    """Return the numbers of ``1,2,5`` or of ``low:high:count``, evenly spread in logarithm."""
+    import numpy as np
+
+    try:
+        if ":" in text:
+            low, high, count = text.split(":")
+            return [float(v) for v in np.geomspace(float(low), float(high), int(count))]
+        return [float(part) for part in text.split(",")]
+    except ValueError as exc:
+        raise ValidationError(
+            f"{name} is {text!r}; expected numbers such as 1e-4,1e-3, or low:high:count"
+        ) from exc
