@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,11 @@ class End:
     limit: Limit | None = None
     phi: FloatArray | None = None
 
+    @cached_property
+    def inverse(self) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """The Hessian's inverse, and which parameters are undetermined."""
+        return inverse(self.hessian)
+
     @property
     def determined(self) -> int:
         """Number of parameters that the optimum has: fewer than P at a limit."""
@@ -48,12 +54,12 @@ def optimum(
     if not problem.scale_known and loss is None and not problem.priors:
         final = float(np.sqrt(2.0 * end.cost / dof)) if dof > 0 else np.nan
     chart = None if end.limit is None else end.limit.chart.derivative(theta)
-    information = end.hessian
     if loss is not None:
-        information = _robust_information(problem, theta, scale, loss, dof, chart)
+        inner, lost = inverse(_robust_information(problem, theta, scale, loss, dof, chart))
     elif theta is not end.theta or not problem.gaussian:
-        information = problem.information(theta, scale, chart)
-    inner, lost = inverse(information)
+        inner, lost = inverse(problem.information(theta, scale, chart))
+    else:
+        inner, lost = end.inverse
     inner = inner * (final / scale) ** 2
     values = problem.to_values(theta)
     combinations: tuple[Combination, ...] = ()

@@ -14,6 +14,7 @@ it is then estimated and the search repeated until both agree.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 
 import numpy as np
 
@@ -21,10 +22,15 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Dahl
 from dahl_ident.errors import FitError, ModelError
 from dahl_ident.fitting.ending import End, optimum
-from dahl_ident.fitting.levenberg_marquardt import Evaluate, Minima, minimise
-from dahl_ident.fitting.limits import Chart, Limit, limits, valleys, within_reach
+from dahl_ident.fitting.levenberg_marquardt import (
+    Evaluate,
+    Minima,
+    gauss_newton,
+    minimise,
+)
+from dahl_ident.fitting.limits import Chart, Limit, Reach, limits, valleys
 from dahl_ident.fitting.losses import Loss, loss_named
-from dahl_ident.fitting.optimum import Optimum, inverse
+from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.fitting.start import starts
 from dahl_ident.fitting.trust_region import minimise_within
 from dahl_ident.problem import Problem, Quadratic
@@ -96,11 +102,16 @@ class _Search:
         self.logarithmic = np.array([p.transform == "log" for p in problem.parameters])
         elements = [e for e in problem.model.elements if isinstance(e, Dahl)]
         friction = {p.name for element in elements for p in element.parameters}
-        self.is_friction = np.array([name in friction for name in problem.names])
+        self.friction = [i for i, name in enumerate(problem.names) if name in friction]
         self.low, self.high = problem.bounds()
-        self.bounded = bool(np.isfinite(self.low).any() or np.isfinite(self.high).any())
+        self.bounded = bool(np.isfinite([self.low, self.high]).any())
         self.rescales = not problem.scale_known and bool(loss is not None or problem.priors)
         self.evaluations = 0
+
+    @cached_property
+    def reach(self) -> Reach:
+        """Where a search is still at a finite optimum."""
+        return Reach(self.problem)
 
     def run(self, start: Mapping[str, float] | None) -> Optimum:
         """Search, with the noise's scale adapted where the optimum depends on it."""
@@ -165,12 +176,20 @@ class _Search:
 
     def _descend(self, begin: FloatArray, scale: float, steps: int = 80) -> End:
         """Return the best end of Levenberg and Marquardt's searches from `begin`."""
-        minima = minimise(
+        minima = None
+        if len(begin) == 1 and self.loss is None:
+            minima = gauss_newton(
+                lambda theta: self.problem.quadratic(theta, scale),
+                begin[0],
+                self.logarithmic,
+                self.m,
+            )
+        minima = minima or minimise(
             self._evaluate(scale),
             begin,
             self.logarithmic,
             self.m,
-            inside=lambda theta: within_reach(self.problem, theta),
+            inside=self.reach,
             steps=steps,
         )
         best = self._best(minima)
@@ -187,7 +206,7 @@ class _Search:
             chart.phi(begin),
             ~((chart.matrix != 0.0).T @ ~self.logarithmic),
             self.m,
-            inside=None if limit else lambda phi: within_reach(self.problem, chart.theta(phi)),
+            inside=None if limit else lambda phi: self.reach(chart.theta(phi)),
             looseness=1.0 if limit is None else _AT_LIMIT,
         )
         best = self._best(minima)
@@ -212,7 +231,7 @@ class _Search:
             other = self._descend_in(chart, begin, scale)
             if other.cost < end.cost or (other.converged and not end.converged):
                 end = other
-        if not end.converged and within_reach(self.problem, end.theta[None])[0]:
+        if not end.converged and self.reach(end.theta):
             end = self._descend(end.theta[None], scale, steps=_PATIENCE)
         ends = [self._descend_in(lim.chart, begin, scale, lim) for lim in limits(self.problem)]
         ends = [e for e in ends if e.converged]
@@ -231,7 +250,7 @@ class _Search:
             self.evaluations += found.evaluations
             if found.cost < best.cost or not best.converged:
                 cost, _, hessian = self.problem.quadratic(found.theta, scale, self.loss)
-                inside = bool(within_reach(self.problem, found.theta[None])[0])
+                inside = bool(self.reach(found.theta))
                 best = End(found.theta, float(cost), hessian, found.converged and inside)
         return best
 
@@ -240,8 +259,7 @@ class _Search:
 
     def _friction_error(self, end: End, scale: float) -> float:
         """Return the largest standard deviation of the logarithm of a friction parameter."""
-        covariance, _ = inverse(end.hessian)
+        covariance, _ = end.inverse
         adapted = self.problem.scale_known or self.rescales
         variance = 1.0 if adapted else 2.0 * end.cost / max(self.m - len(end.theta), 1)
-        diagonal = np.where(self.is_friction, np.diagonal(covariance), 0.0)
-        return float(np.sqrt(variance * diagonal.max()))
+        return float(np.sqrt(variance * covariance.diagonal()[self.friction].max(initial=0.0)))

@@ -65,6 +65,42 @@ def minimise(
         return _minimise(evaluate, theta, logarithmic, n_residuals, inside, looseness, steps)
 
 
+def gauss_newton(
+    evaluate: Callable[[FloatArray], Quadratic],
+    theta: FloatArray,
+    logarithmic: BoolArray,
+    n_residuals: int,
+    steps: int = 12,
+) -> Minima | None:
+    """Return the minimum near a good start of one problem, shape (P,), by undamped steps alone.
+
+    None at the first sign of trouble; :func:`minimise` takes longer and copes.
+    """
+    at, last = evaluate(theta), 1e-300
+    for count in range(1, steps):
+        diagonal = at.hessian.diagonal()
+        if not (np.isfinite(at.cost) and diagonal.min() > 0.0):
+            return None
+        size = np.sqrt(diagonal)
+        step = np.linalg.solve(at.hessian / np.outer(size, size), at.gradient / -size) / size
+        if not np.abs(step[logarithmic]).max(initial=0.0) < _LONGEST_STEP:
+            return None
+        lever = np.where(logarithmic, 1.0, theta)
+        noise, signal = 2.0 * float(at.cost) / max(n_residuals - theta.size, 1), diagonal * lever**2
+        shortest = max(_NOISE_TOLERANCE**2 * noise, _ROUNDING_TOLERANCE**2 * float(signal.max()))
+        moves = float(step @ at.hessian @ step)
+        theta = theta + step
+        if moves * min(1.0, moves / last) <= shortest:  # the length of the step after this one
+            converged, counts = np.ones(1, dtype=np.bool_), np.array([count])
+            cost = np.maximum(at.cost - 0.5 * moves, 0.0)
+            return Minima(theta[None], cost[None], at.hessian[None], converged, counts)
+        cost, last = at.cost, moves
+        at = evaluate(theta)
+        if not at.cost < cost:
+            return None
+    return None
+
+
 def _minimise(
     evaluate: Evaluate,
     theta: FloatArray,

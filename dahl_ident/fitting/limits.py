@@ -25,6 +25,7 @@ finite. The chart (kappa, x_c, sigma + stiffness) straightens it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,20 +96,46 @@ class Limit:
     """Determined combinations: expression, index into phi, whether phi is the logarithm."""
 
 
-def within_reach(problem: Problem, theta: FloatArray) -> NDArray[np.bool_]:
-    """Return whether friction is neither at a limit nor negligible, for each theta of (S, P)."""
-    view, inside = problem.stiffness_data, np.ones(len(theta), dtype=np.bool_)
-    least = np.log(view.amplitude.min(axis=-1) * _EDGES[0])
-    largest = view.amplitude.max(axis=-1)
-    softest = np.log(np.median(np.abs(view.stiffness), axis=-1)) + _LEAST_FRICTION
-    columns = dict(zip(problem.names, theta.T, strict=True))
-    for element in problem.model.elements:
-        if isinstance(element, Dahl):
-            f_max, sigma = (columns.get(p.name, _ln(p)) for p in element.parameters[:2])
-            tied = all(p.free for p in element.parameters[:2]) and bool(_free_springs(problem))
-            most = np.log(largest * (_TIED_EDGE if tied else _EDGES[1]))
-            inside &= (f_max - sigma > least) & (f_max - sigma < most) & (sigma > softest)
-    return inside
+class Reach:
+    """Where friction is neither at a limit nor negligible: what a search may pass through."""
+
+    def __init__(self, problem: Problem) -> None:
+        view = problem.stiffness_data
+        smallest, largest = view.amplitude.min(axis=-1), view.amplitude.max(axis=-1)
+        softest = np.log(np.median(np.abs(view.stiffness), axis=-1)) + _LEAST_FRICTION
+        springs = bool(_free_springs(problem))
+        rows, limits = [], []
+        for element in problem.model.elements:
+            if isinstance(element, Dahl):
+                f_max, sigma = (_row(problem, p) for p in element.parameters[:2])
+                x_c = f_max[0] - sigma[0], f_max[1] - sigma[1]
+                tied = springs and all(p.free for p in element.parameters[:2])
+                edge = np.log(largest * (_TIED_EDGE if tied else _EDGES[1]))
+                rows += [x_c[0], -x_c[0], sigma[0]]
+                limits += [
+                    np.log(smallest * _EDGES[0]) - x_c[1], x_c[1] - edge, softest - sigma[1]
+                ]  # fmt: skip
+        self._rows = np.array(rows).reshape(-1, len(problem.parameters)).T
+        self._limits = np.moveaxis(np.array(limits), 0, -1)
+
+    def __call__(self, theta: FloatArray) -> NDArray[np.bool_]:
+        """Return whether theta is inside, () for (P,), (S,) for (S, P)."""
+        return np.asarray((theta @ self._rows > self._limits).all(axis=-1))
+
+    def of(self, tables: NDArray[np.intp]) -> Reach:
+        """Return the reach of some tables of a batch."""
+        part = copy(self)
+        part._limits = self._limits[tables]
+        return part
+
+
+def _row(problem: Problem, parameter: Parameter) -> tuple[FloatArray, float]:
+    """Return a logarithm as row times theta plus number."""
+    row = np.zeros(len(problem.parameters))
+    if parameter.free:
+        row[problem.names.index(parameter.name)] = 1.0
+        return row, 0.0
+    return row, _ln(parameter)
 
 
 def valleys(problem: Problem) -> list[Chart]:

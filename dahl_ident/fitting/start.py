@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,11 +52,28 @@ def starts(problem: Problem) -> FloatArray:
     cost, theta = grid.solved()
     order = _local_minima(cost.reshape(grid.shape))[:_MOST_STARTS]
     best = theta[order]
-    given = np.array([np.nan if p.value is None else p.value for p in problem.parameters])
-    if np.isnan(given).all():
+    if grid.shape == cost.shape:
+        best[0] = _vertex(cost, theta, order[0])
+    if all(p.value is None for p in problem.parameters):
         return best
     values = problem.to_values(best[0])
-    return np.vstack([best, problem.to_search(np.where(np.isnan(given), values, given))])
+    given = [
+        v if p.value is None else p.value for p, v in zip(problem.parameters, values, strict=True)
+    ]
+    return np.vstack([best, problem.to_search(given)])
+
+
+def _vertex(cost: FloatArray, theta: FloatArray, at: int) -> FloatArray:
+    """Return theta where the parabola through three neighbouring nodes has its vertex."""
+    if not 0 < at < len(cost) - 1:
+        return np.asarray(theta[at])
+    left, middle, right = cost[at - 1 : at + 2]
+    bend = left - 2.0 * middle + right
+    if not 0.0 < bend < np.inf:
+        return np.asarray(theta[at])
+    u = 0.5 * (left - right) / bend
+    weights = np.array([0.5 * u * (u - 1.0), 1.0 - u * u, 0.5 * u * (u + 1.0)])
+    return np.asarray(weights @ theta[at - 1 : at + 2])
 
 
 def best_starts(problem: Problem) -> FloatArray:
@@ -153,7 +169,7 @@ def _grid(problem: Problem) -> _Grid:
     each = _MOST_COMBINATIONS ** (1.0 / max(1, len(searched)))
     friction = [_nodes(element, view, each) for element in searched]
     counts = [element.curve.shape[-2] for element in friction]
-    nodes = np.array(list(product(*(range(count) for count in counts))), dtype=np.intp)
+    nodes = np.indices(counts).reshape(len(counts), -1).T
     rest = np.zeros(view.stiffness.shape, dtype=np.complex128)
     columns = {}
     for element in problem.model.elements:
@@ -196,7 +212,7 @@ def _nodes(element: Dahl, view: StiffnessData, most: float) -> _Friction:
         alpha,
         np.tile(ln_x_c * _STEP, len(alphas)),
         np.repeat(np.log(alphas), offsets.size),
-        np.concatenate([_curve(a, view.harmonic, at) for a in alphas], axis=-2),
+        np.concatenate([_curve(a, view, at) for a in alphas], axis=-2),
     )
 
 
@@ -211,14 +227,13 @@ def _offsets(span: int, most: float) -> IntArray:
     return np.concatenate([below, inner, above])
 
 
-def _curve(alpha: float, harmonic: NDArray[np.int64], at: IntArray) -> ComplexArray:
+def _curve(alpha: float, view: StiffnessData, at: IntArray) -> ComplexArray:
     """Return h at places `at` of the table, row by row's harmonic."""
-    orders = np.unique(harmonic).tolist()
-    if len(orders) == 1:
-        return _table(alpha, orders[0])[at]
+    if len(view.orders) == 1:
+        return _table(alpha, view.orders[0])[at]
     curve = np.empty(at.shape, dtype=np.complex128)
-    for k in orders:
-        curve[..., harmonic == k] = _table(alpha, k)[at[..., harmonic == k]]
+    for k in view.orders:
+        curve[..., view.harmonic == k] = _table(alpha, k)[at[..., view.harmonic == k]]
     return curve
 
 
@@ -258,16 +273,15 @@ def _solve_linear(
 
 def _local_minima(cost: FloatArray) -> IntArray:
     """Return the flat indices of a grid's local minima, the lowest first."""
-    lowest = np.isfinite(cost)
+    lowest = cost < np.inf
     if not lowest.any():
         return np.zeros(1, dtype=np.intp)
     for axis in range(cost.ndim):
-        rows = np.moveaxis(cost, axis, 0)
-        mask = np.moveaxis(lowest, axis, 0)
+        rows, mask = cost.swapaxes(axis, 0), lowest.swapaxes(axis, 0)
         mask[1:] &= rows[1:] <= rows[:-1]
         mask[:-1] &= rows[:-1] < rows[1:]
     places = np.flatnonzero(lowest)
-    return places[np.argsort(cost.ravel()[places])]
+    return places[cost.ravel()[places].argsort()]
 
 
 def _is_free(parameters: tuple[Parameter, ...]) -> bool:

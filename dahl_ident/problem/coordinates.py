@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -50,8 +51,9 @@ class Coordinates:
         """Return d value / d theta: the value itself for positive parameters, 1 for others."""
         return np.where(self.positive, values, 1.0)
 
+    @cached_property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Return the parameters' lower and upper bounds in search coordinates."""
+        """The parameters' lower and upper bounds in search coordinates."""
         lower = np.array([p.lower for p in self.parameters])
         upper = np.array([p.upper for p in self.parameters])
         with np.errstate(divide="ignore"):

@@ -16,7 +16,8 @@ The measured amplitude of such a row serves only to choose among several solutio
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -50,12 +51,17 @@ class Prediction(NamedTuple):
     by_ln_amplitude: ComplexArray
 
 
-class _Group(NamedTuple):
-    """Rows that are computed together."""
+@dataclass(frozen=True)
+class _Group:
+    """Rows that are computed together; `operator` is (j omega)^p."""
 
     rows: slice | NDArray[np.intp]
     harmonic: int
     forced: bool
+    omega: FloatArray
+    operator: ComplexArray
+    amplitude: FloatArray
+    drive: FloatArray | None
 
 
 class Predictor:
@@ -72,25 +78,36 @@ class Predictor:
 
     def _set_rows(self, rows: Rows) -> None:
         self._rows = rows
-        self._groups = _groups(rows)
+        _check(rows)
         power, self._exponent = _POWERS[rows.quantity]
         self._operator = np.asarray((1j * rows.omega) ** power, dtype=np.complex128)
         self._guess = _measured_amplitude(rows, self._operator, self._exponent)
+        self._groups = [
+            _Group(
+                part,
+                harmonic,
+                forced,
+                rows.omega[..., part],
+                self._operator[..., part],
+                self._guess[..., part],
+                None if rows.drive is None else rows.drive[..., part],
+            )
+            for part, harmonic, forced in _parts(rows)
+        ]
 
     def as_stiffness(self, weights: FloatArray) -> StiffnessData:
         """Return the data as dynamic stiffness; `weights` are those of the response."""
-        rows, starts = self._rows, [np.asarray(p.value) for p in self._sensors.parameters]
+        rows = self._rows
         ratio = rows.response / self._operator
-        measured = ratio if self._exponent == 1 else 1.0 / ratio
-        factor = measured_stiffness_factor(starts, rows.omega, rows.harmonic)
-        Z = measured / factor
-        return StiffnessData(
-            Z,
-            self._guess / starts[1],
-            rows.omega,
-            rows.harmonic,
-            weights * np.abs(rows.response / Z),
-        )
+        Z = ratio if self._exponent == 1 else 1.0 / ratio
+        amplitude = self._guess
+        if not self._neutral:
+            starts = [np.asarray(p.value) for p in self._sensors.parameters]
+            Z = Z / measured_stiffness_factor(starts, rows.omega, rows.harmonic)
+            amplitude = amplitude / starts[1]
+        if rows.quantity != "dynamic_stiffness":
+            weights = weights * np.abs(rows.response / Z)
+        return StiffnessData(Z, amplitude, rows.omega, rows.harmonic, rows.orders, weights)
 
     def __call__(
         self,
@@ -131,17 +148,16 @@ class Predictor:
         amplitude_error: FloatArray | None,
     ) -> Prediction:
         own, sensed = values[:-3], values[-3:]
-        omega = self._rows.omega[..., group.rows]
         amplitude, found = self._amplitude(group, own, sensed, amplitude_error)
-        factor = self._operator[..., group.rows]
+        factor = group.operator
         if not self._neutral:
-            sensor = measured_stiffness_factor(sensed, omega, group.harmonic)
+            sensor = measured_stiffness_factor(sensed, group.omega, group.harmonic)
             factor = factor * sensor**self._exponent
         if not derivatives:
-            Z = self._model.stiffness(own, amplitude, omega, group.harmonic)
+            Z = self._model.stiffness(own, amplitude, group.omega, group.harmonic)
             return Prediction(factor * _where(found, Z) ** self._exponent, [], _NONE)
         Z, by_amplitude, by_parameter = self._model.stiffness_gradient(
-            own, amplitude, omega, group.harmonic
+            own, amplitude, group.omega, group.harmonic
         )
         Z = _where(found, Z)
         by_ln_amplitude = amplitude * by_amplitude
@@ -159,18 +175,18 @@ class Predictor:
         by_ln_amplitude = slope * by_ln_amplitude
         if not self._neutral:
             direct = by_ln_amplitude if stretch is None else by_ln_amplitude * stretch
-            changes += self._sensor_changes(group, response, direct, omega)
+            changes += self._sensor_changes(group, response, direct)
         return Prediction(response, changes, by_ln_amplitude)
 
     def _sensor_changes(
-        self, group: _Group, response: ComplexArray, direct: ComplexArray, omega: FloatArray
+        self, group: _Group, response: ComplexArray, direct: ComplexArray
     ) -> list[ComplexArray]:
         """Return dR by the free sensor parameters; `direct` is dR/dln A or dR/dln u_0."""
         own = self._exponent * response
         by_sensor = (
             own - direct if group.forced else own,
             -own if group.forced else -own - direct,
-            1j * group.harmonic * omega * own,
+            1j * group.harmonic * group.omega * own,
         )
         slots = self._slots[-3:]
         return [d for d, (index, _) in zip(by_sensor, slots, strict=True) if index is not None]
@@ -183,16 +199,12 @@ class Predictor:
         error: FloatArray | None,
     ) -> tuple[FloatArray, NDArray[np.bool_] | None]:
         """Return the true amplitude of each row, and where there is one unless everywhere."""
-        rows = group.rows
-        amplitude = self._guess[..., rows]
-        if not self._neutral:
-            amplitude = amplitude / sensed[1]
+        amplitude = group.amplitude if self._neutral else group.amplitude / sensed[1]
         if not group.forced:
-            return amplitude if error is None else amplitude * np.exp(-error[..., rows]), None
-        assert self._rows.drive is not None
-        drive = self._rows.drive[..., rows] / sensed[0]
-        omega = self._rows.omega[..., rows]
-        amplitude = steady_state.solve(self._model, own, omega, drive, amplitude)
+            return amplitude if error is None else amplitude * np.exp(-error[..., group.rows]), None
+        assert group.drive is not None
+        drive = group.drive / sensed[0]
+        amplitude = steady_state.solve(self._model, own, group.omega, drive, amplitude)
         found = np.isfinite(amplitude)
         return (amplitude, None) if found.all() else (np.where(found, amplitude, 1.0), found)
 
@@ -208,27 +220,30 @@ def _slot(parameter: Parameter, names: tuple[str, ...]) -> tuple[int | None, Flo
     return None, np.asarray(parameter.value)
 
 
-def _groups(rows: Rows) -> list[_Group]:
-    """Split rows by harmonic and by what was controlled, and check that each can be predicted."""
+def _check(rows: Rows) -> None:
+    """Check that every row can be predicted."""
     if rows.amplitude is None:
         _require(~rows.forced, "displacement", "amplitude")
     if rows.drive is None:
         _require(rows.forced, "force", "drive")
     bad = rows.forced & (rows.harmonic > 1)
-    if bad.any():
+    if rows.orders != (1,) and bad.any():
         row = int(np.argmax(bad))
         raise DataError(
             f"row {row} is force-controlled and holds harmonic {rows.harmonic[row]}; the steady "
             "state of a driven plant is solved for its fundamental only: leave such rows out, or "
             "say controlled='displacement' if the measured amplitude is to be used"
         )
-    kinds = sorted({*zip(rows.harmonic.tolist(), rows.forced.tolist(), strict=True)})
-    if len(kinds) == 1:
-        return [_Group(slice(None), *kinds[0])]
-    return [
-        _Group(np.flatnonzero((rows.harmonic == k) & (rows.forced == forced)), k, forced)
-        for k, forced in kinds
-    ]
+
+
+def _parts(rows: Rows) -> Iterator[tuple[slice | NDArray[np.intp], int, bool]]:
+    """Yield rows, harmonic and whether force-controlled for each kind of row."""
+    forced = int(rows.forced.sum())
+    if len(rows.orders) == 1 and forced in (0, rows.n):
+        yield slice(None), rows.orders[0], forced > 0
+        return
+    for k, force in sorted({*zip(rows.harmonic.tolist(), rows.forced.tolist(), strict=True)}):
+        yield np.flatnonzero((rows.harmonic == k) & (rows.forced == force)), k, force
 
 
 def _require(rows: NDArray[np.bool_], controlled: str, name: str) -> None:

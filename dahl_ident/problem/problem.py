@@ -177,7 +177,7 @@ class Problem:
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Return the parameters' lower and upper bounds in search coordinates."""
-        return self._coordinates.bounds()
+        return self._coordinates.bounds
 
     def in_order(self, theta: ArrayLike) -> FloatArray:
         """Return theta with interchangeable Dahl elements ordered by rising x_c.
@@ -344,13 +344,17 @@ class Problem:
         self, theta: FloatArray, y: ComplexArray, changes: list[ComplexArray], scale: ArrayLike
     ) -> tuple[FloatArray, FloatArray]:
         """Return real residuals and the transposed Jacobian, those of priors last."""
-        lead, m = self._shape(theta)[:-1], self.n_residuals
-        residuals = np.empty((*lead, m + len(self.priors)))
-        jacobian = np.zeros((*lead, len(changes), m + len(self.priors)))
-        size = np.asarray(scale)[..., None]
-        residuals[..., :m] = _parts(y) / size
-        for index, change in enumerate(changes):
-            jacobian[..., index, :m] = _parts(change) / size
+        lead, m, extra = self._shape(theta)[:-1], self.n_residuals, len(self.priors)
+        pairs = np.empty((*lead, len(changes) + 1, m // 2), dtype=np.complex128)
+        pairs[..., 0, :] = y
+        for index, change in enumerate(changes, start=1):
+            pairs[..., index, :] = change
+        rows = pairs.view(np.float64)
+        if np.ndim(scale) or scale != 1.0:
+            rows /= np.asarray(scale)[..., None, None]
+        if extra:
+            rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], extra))], axis=-1)
+        residuals, jacobian = rows[..., 0, :], rows[..., 1:, :]
         if self.priors:
             values = self._coordinates.to_values(theta)
             slopes = self._coordinates.slopes(values)
@@ -450,8 +454,3 @@ def _normal(name: str, prior: Prior) -> tuple[float, float]:
             "(scipy.stats.norm), any other needs sampling"
         )
     return float(prior.mean()), float(prior.std())
-
-
-def _parts(values: ComplexArray) -> FloatArray:
-    """Return real and imaginary parts side by side in the last axis."""
-    return np.ascontiguousarray(values).view(np.float64)

@@ -23,6 +23,8 @@ class StiffnessData:
     amplitude, omega : ndarray, shape (n,) or (S, n)
         True amplitude and angular frequency.
     harmonic : ndarray of int, shape (n,)
+    orders : tuple of int
+        The harmonics that occur.
     weights : ndarray, shape (n,) or (S, n)
         One over the standard deviation of Z that the noise model has at the data, up to the
         unknown scale and the ellipse's shape.
@@ -32,15 +34,15 @@ class StiffnessData:
     amplitude: FloatArray
     omega: FloatArray
     harmonic: NDArray[np.int64]
+    orders: tuple[int, ...]
     weights: FloatArray
 
     def of(self, element: Element, values: Sequence[FloatArray]) -> ComplexArray:
         """Return an element's Z_k at every row."""
-        orders = np.unique(self.harmonic).tolist()
-        if len(orders) == 1:
-            return element.stiffness(values, self.amplitude, self.omega, orders[0])
+        if len(self.orders) == 1:
+            return element.stiffness(values, self.amplitude, self.omega, self.orders[0])
         result = np.empty(self.stiffness.shape, dtype=np.complex128)
-        for k in orders:
+        for k in self.orders:
             rows = self.harmonic == k
             A, w = self.amplitude[..., rows], self.omega[..., rows]
             result[..., rows] = element.stiffness(values, A, w, k)
