@@ -35,7 +35,7 @@ class Row:
         return self.ratio >= self.target if self.faster else self.ratio <= self.target
 
 
-def best_of_pairs(
+def median_of_pairs(
     ours: Callable[[], object], peer: Callable[[], object], repeats: int = 7
 ) -> tuple[float, float]:
     """Return the median seconds of each, run in turn `repeats` times after one warm-up."""
@@ -68,18 +68,26 @@ def peak_bytes(work: Callable[[], object]) -> int:
 
 def print_table(title: str, rows: list[Row]) -> None:
     """Print the comparisons as a Markdown table."""
-    print(f"\n## {title}\n")
-    print("| work | ours | peer | peer is | ratio | to reach | reached |")
-    print("|---|---|---|---|---|---|---|")
+    print(as_table(title, rows))
+
+
+def as_table(title: str, rows: list[Row]) -> str:
+    """Return the comparisons as a Markdown table."""
+    lines = [
+        f"\n## {title}\n",
+        "| work | ours | peer | peer is | ratio | to reach | reached |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for row in rows:
         noun = "time" if row.unit == "s" else "size"
         sign, unit = (">=", "x faster") if row.faster else ("<=", f"x the {noun}")
-        print(
+        lines.append(
             f"| {row.work} | {_pretty(row.ours, row.unit)} | {_pretty(row.peer, row.unit)} "
             f"| {row.peer_name} "
             f"| {row.ratio:.3g} {unit} | {sign} {row.target:g} "
             f"| {'yes' if row.reached else 'NO'} |"
         )
+    return "\n".join(lines)
 
 
 def _pretty(value: float, unit: str) -> str:

@@ -16,6 +16,9 @@ F_MAX, SIGMA = 0.1, 30.0
 OURS, PEERS = 1_000_000, 300
 
 
+TITLE = "Force for a displacement history"
+
+
 def run() -> list[Row]:
     """Return the seconds per sample of both, a reversal at almost every sample."""
     rng = np.random.Generator(np.random.PCG64(0))
@@ -55,4 +58,4 @@ def by_solver(x: FloatArray, alpha: float) -> float:
 
 
 if __name__ == "__main__":
-    print_table("Force for a displacement history", run())
+    print_table(TITLE, run())
