@@ -69,23 +69,27 @@ def accuracy(
     """
     rng = np.random.default_rng(seed)
     a, b = FRICTION.fourier_coefficients(beta, harmonic)
-    exact = (a - 1j * b) / beta
+    exact = complex(a - 1j * b) / beta
     errors, inside = np.empty(records, dtype=complex), np.empty(records, dtype=bool)
-    n = 0
+    samples = 0
     for i in range(records):
         frequency = rng.uniform(0.9, 1.1)
-        n = round(cycles * RATE / frequency)
-        theta = rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * frequency / RATE * np.arange(n)
+        n = int(np.ceil(cycles * RATE / frequency))
+        angle = 2.0 * np.pi * frequency / RATE
+        theta: FloatArray = rng.uniform(0.0, 2.0 * np.pi) + angle * np.arange(n, dtype=np.float64)
         x, force = steady(beta, theta)
         x = x + beta * displacement_noise * noise(rng, n)
         force = force + force_noise * noise(rng, n)
         data = extract(
             Record(np.arange(n) / RATE, displacement=x, force=force), harmonics=(harmonic,)
         )
+        samples += n
         errors[i] = data.response[0] - exact
         inside[i] = covers(data, 0, exact)
     relative = abs(exact) * (1.0 if harmonic == 1 else np.sqrt(0.5 * (1.0 + harmonic**2)))
-    bound = np.sqrt(4.0 / n * (force_noise**2 / beta**2 + (relative * displacement_noise) ** 2))
+    bound = np.sqrt(
+        4.0 * records / samples * (force_noise**2 / beta**2 + (relative * displacement_noise) ** 2)
+    )
     rms = float(np.sqrt(np.mean(np.abs(errors) ** 2)))
     bias = float(abs(errors.mean()) / (rms / np.sqrt(records)))
     return Accuracy(records, bias, rms / float(bound), float(inside.mean()))
@@ -145,12 +149,11 @@ def settling(records: int, *, seed: int, noise: Noise = white, fixed: bool = Tru
             settling_periods=left_out,
         )
         for row in range(data.n):
-            A = float(data.amplitude[row])
             used = slice(*np.searchsorted(t, _span(data, row, 0.5 / RATE)))
             clean = fundamental(t[used], force[used], data.frequency_hz[row])
             moved = fundamental(t[used], x[used], data.frequency_hz[row])
             bias = abs(clean / moved - FRICTION.describing_function(abs(moved)))
-            error = np.sqrt(2.0 / t[used].size) * scale / A
+            error = np.sqrt(2.0 / t[used].size) * scale / abs(moved)
             ratios.append(bias / error)
             flags.append(not data.quality["settled"][row])
     ratio, flag = np.array(ratios), np.array(flags)

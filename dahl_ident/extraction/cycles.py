@@ -12,14 +12,14 @@ cycle have the noise of a sine fit, and not that of a few samples near zero.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import ComplexArray, FloatArray
 
 _THRESHOLD = 0.3  # of the amplitude; sine noise may be a tenth of it
 _HIGH = 0.995  # quantile that stands for the amplitude
@@ -28,6 +28,7 @@ _FEWEST_SAMPLES = 16
 _DEEPEST = 12
 _SAMPLED = 50_000  # samples that the quantiles are taken from
 _FEWEST_A_CYCLE = 3
+_NOISIEST_CROSSING = 0.04  # noise of the log amplitude that a cycle between crossings may have
 _HOLE = 1.0 / 3.0  # of a cycle without samples: its amplitude is not known
 
 
@@ -53,7 +54,7 @@ def find_cycles(time: FloatArray, motion: FloatArray) -> list[Cycles]:
     """Cut a record of unknown frequencies into runs of consecutive cycles, in order of time."""
     runs = _crossing_runs(time, motion, 0)
     runs.sort(key=lambda edges: float(edges[0]))
-    return [_measured(time, motion, edges) for edges in runs]
+    return [_without_noise(_measured(time, motion, edges)) for edges in runs]
 
 
 def cut_cycles(time: FloatArray, motion: FloatArray, frequency_hz: float) -> list[Cycles]:
@@ -64,6 +65,12 @@ def cut_cycles(time: FloatArray, motion: FloatArray, frequency_hz: float) -> lis
         return []
     edges = time[0] - 0.5 * interval + np.arange(count + 1) / frequency_hz
     return [_measured(time, motion, edges)]
+
+
+def _without_noise(cycles: Cycles) -> Cycles:
+    """Return the cycles with infinite noise for those that noise alone may have made."""
+    doubtful = cycles.noise > _NOISIEST_CROSSING
+    return replace(cycles, noise=np.where(doubtful, np.inf, cycles.noise))
 
 
 def _crossing_runs(time: FloatArray, motion: FloatArray, depth: int) -> list[FloatArray]:
@@ -116,24 +123,33 @@ def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray) -> Cycles
     inside = slice(int(cuts[0]), int(cuts[-1]))
     turn = np.repeat(2.0 * np.pi / np.diff(edges), counts)
     theta = (time[inside] - np.repeat(edges[:-1], counts)) * turn
-    y = motion[inside]
     bounds = np.column_stack([cuts[known], cuts[known + 1]]).ravel() - cuts[0]
-    mean = _sums(y, bounds) / n
-    phasor = (
-        2.0
-        / n
-        * (_sums(y * np.exp(-1j * theta), bounds) - mean * _sums(np.exp(-1j * theta), bounds))
-    )
-    power = _sums(y * y, bounds) / n - mean**2
+    phasor, left = _sine_in_each(theta, motion[inside], bounds, n)
     amplitude = np.maximum(np.abs(phasor), np.finfo(np.float64).tiny)
-    left = np.sqrt(np.maximum(power - 0.5 * amplitude**2, 0.0))
+    noise = np.sqrt(2.0 * left / n) / amplitude
     return Cycles(
-        start,
-        stop,
-        np.log(amplitude),
-        left / amplitude * np.sqrt(2.0 / n),
-        _log_frequency(start, stop, np.angle(phasor)),
+        start, stop, np.log(amplitude), noise, _log_frequency(start, stop, np.angle(phasor))
     )
+
+
+def _sine_in_each(
+    theta: FloatArray, y: FloatArray, bounds: NDArray[np.intp], n: NDArray[np.intp]
+) -> tuple[ComplexArray, FloatArray]:
+    """Return the phasor of each cycle, offset fitted as well, and the variance it leaves."""
+    middle = 0.5 * float(y.min() + y.max()) if y.size else 0.0
+    y = y - middle
+    rotor = np.exp(-1j * theta)
+    one, two, with_y = (_sums(v, bounds) for v in (rotor, rotor * rotor, rotor * y))
+    total, power = _sums(y, bounds), _sums(y * y, bounds)
+    c, s = one.real, -one.imag
+    cc, ss, cs = 0.5 * (n + two.real), 0.5 * (n - two.real), -0.5 * two.imag
+    normal = np.array([[n, c, s], [c, cc, cs], [s, cs, ss]]).transpose(2, 0, 1)
+    right = np.array([total, with_y.real, -with_y.imag]).T
+    fitted = np.linalg.solve(normal + 1e-9 * n[:, None, None] * np.eye(3), right[:, :, None])[
+        ..., 0
+    ]
+    left = np.maximum(power - np.sum(fitted * right, axis=1), 0.0) / n
+    return fitted[:, 1] - 1j * fitted[:, 2], left
 
 
 def _sums(values: NDArray[Any], bounds: NDArray[np.intp]) -> NDArray[Any]:

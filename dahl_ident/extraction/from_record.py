@@ -26,6 +26,8 @@ from dahl_ident.extraction.sine_fit import (
 )
 
 _PLATEAU_CYCLES = 3  # fewer only where no plateau has so many
+_QUIET_CROSSINGS = 0.01  # noise of a cycle's log amplitude that no crossing suffers from
+_WELL_COVERED = 0.5  # of a record: where crossings find segments so long, they are right
 _SWEEP_DEGREE = 3  # of the phase in a window
 _STEADY_END = 0.005  # of the amplitude, that the ends of a record may stray from the sine
 
@@ -197,18 +199,27 @@ def _segments(
     mode: Mode,
     window: int | None,
 ) -> list[Segment]:
-    """Return the segments of a record, or say that it has none."""
-    guess = frequency
-    for attempt in range(2):
-        runs = find_cycles(time, motion) if guess is None else cut_cycles(time, motion, guess)
-        for fewest in (_PLATEAU_CYCLES, FEWEST_CYCLES):
-            segments = find_segments(runs, mode, fewest, window)
-            if segments:
-                return segments
-        if guess is not None or attempt:
-            break
-        guess = _strongest_line(time, motion)
+    """Return the segments of a record, or say that it has none.
+
+    In noise that drowns the crossings, periods of the strongest line are tried as well.
+    """
+    runs = find_cycles(time, motion) if frequency is None else cut_cycles(time, motion, frequency)
+    noisy = [float(np.median(run.noise)) for run in runs if len(run)]
+    for fewest in (_PLATEAU_CYCLES, FEWEST_CYCLES):
+        segments = find_segments(runs, mode, fewest, window)
+        doubtful = max(noisy, default=np.inf) > _QUIET_CROSSINGS or _covered(
+            segments
+        ) < _WELL_COVERED * (time[-1] - time[0])
+        if frequency is None and doubtful:
+            periods = cut_cycles(time, motion, _strongest_line(time, motion))
+            segments = max(segments, find_segments(periods, mode, fewest, window), key=_covered)
+        if segments:
+            return segments
     raise ExtractionError(_no_segments(time, motion, runs, frequency))
+
+
+def _covered(segments: Sequence[Segment]) -> float:
+    return sum(segment.stop - segment.start for segment in segments)
 
 
 def _strongest_line(time: FloatArray, motion: FloatArray) -> float:
@@ -252,7 +263,7 @@ def _with_ends(time: FloatArray, motion: FloatArray, stretch: Stretch, part: sli
     """Return the slice with the partial cycles at the record's ends, where the sine fits them."""
     few = thinned(stretch)
     basis = columns(few.theta, few.tau, 1)
-    fitted = np.linalg.lstsq(basis.T, few.channels[0], rcond=None)[0]
+    fitted = np.linalg.solve(basis @ basis.T, basis @ few.channels[0])
     amplitude = float(np.hypot(*fitted[2:]))
     cycle = 2.0 * np.pi / stretch.omega
 

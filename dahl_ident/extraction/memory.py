@@ -27,6 +27,7 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Dahl
+from dahl_ident.extraction.noise import powers
 from dahl_ident.extraction.sine_fit import (
     HARMONICS,
     SineFit,
@@ -37,10 +38,13 @@ from dahl_ident.extraction.sine_fit import (
 )
 
 SIGNIFICANT = 3.0  # standard deviations of D_0
-_RATES = np.geomspace(1e-3, 64.0, 56)  # 4 beta
-_REFINEMENTS = 4  # of the grid of rates, by 5 each
+_RATES = np.geomspace(1e-3, 64.0, 29)  # 4 beta
+_REFINEMENTS = 5  # of the grid of rates, by 5 each
 _RATE_SPREAD = 1.0  # standard deviation of ln(rate) about what the phase says
-_MOST_CYCLES = 256  # that D_0 and the rate are estimated from
+_FADED = 28.0  # decrements after which a departure of 1 is 1e-12
+_SLOW_LINES = 24  # from which the noise of D_0 is judged
+_TINY = np.finfo(np.float64).tiny
+MOST_CYCLES = 256  # that D_0 and the rate are estimated from
 
 
 @dataclass(frozen=True)
@@ -66,12 +70,12 @@ class Memory:
         path = _path(stretch.theta + self.displacement_phase) - self.start
         return self.departure * np.exp(-0.25 * self.rate * path)
 
-    def phasors(self, stretch: Stretch) -> ComplexArray:
+    def phasors(self, fit: SineFit) -> ComplexArray:
         """Return what D adds to the fitted phasors 0, 1, ... of its channel."""
-        few = thinned(stretch)
-        basis = columns(few.theta, few.tau, _orders(few))
-        fitted = np.linalg.lstsq(basis.T, self.waveform(few), rcond=None)[0]
-        return np.asarray(fitted[::2] - 1j * fitted[1::2])
+        theta = fit.stretch.theta
+        faded = theta[0] + 2.0 * np.pi * _FADED / self.rate
+        part = slice(0, max(2, int(np.searchsorted(theta, faded))))
+        return fit.phasors_of(self.waveform(fit.stretch.part(part)))
 
 
 def estimate_memory(
@@ -82,7 +86,7 @@ def estimate_memory(
     Parameters
     ----------
     fit : SineFit
-        Fit of the stretch, from where its amplitude became constant.
+        Fit from where the amplitude became constant, over at most `MOST_CYCLES`.
     channel : {0, 1}
         Where to look: 1, the force, unless the force is controlled.
     displacement_phase : float
@@ -96,14 +100,13 @@ def estimate_memory(
         Departure at the first sample, and rate.
     """
     drifting = fit.residual[channel] + fit.coefficients[1, channel] * fit.stretch.tau
-    whole = replace(fit.stretch, channels=drifting[None])
-    end = np.searchsorted(whole.theta, whole.theta[0] + 2.0 * np.pi * _MOST_CYCLES)
-    few = thinned(whole.part(slice(0, int(end))))
+    few = thinned(replace(fit.stretch, channels=drifting[None]))
     basis = columns(few.theta, few.tau, _orders(few))
     steady = np.linalg.qr(np.delete(basis, 1, axis=0).T)[0]
     path = _path(few.theta + displacement_phase)
-    start = float(_path(whole.theta[:1] + displacement_phase)[0])
+    start = float(_path(fit.stretch.theta[:1] + displacement_phase)[0])
 
+    slow = _SlowLines.of(few)
     rates = _RATES
     centre = np.log(_friction_rate(response))
     for _ in range(_REFINEMENTS):
@@ -114,7 +117,7 @@ def estimate_memory(
         gain = sizes**2 * power
         best = int(np.argmax(gain))
         left = few.channels[0] - sizes[best] * decays[best]
-        variance = _slow_variance(left - steady @ (steady.T @ left), decays[best], few)
+        variance = slow.variance(left - steady @ (steady.T @ left), decays[best])
         i = int(np.argmin(((np.log(rates) - centre) / _RATE_SPREAD) ** 2 - gain / variance))
         departure, std, rate = sizes[i], np.sqrt(variance / power[i]), rates[i]
         rates = np.geomspace(rates[max(i - 1, 0)], rates[min(i + 1, rates.size - 1)], 11)
@@ -122,6 +125,7 @@ def estimate_memory(
 
 
 def _orders(stretch: Stretch) -> int:
+    """Return how many harmonics a departure is told apart from."""
     return min(HARMONICS, resolvable_orders(stretch))
 
 
@@ -131,19 +135,28 @@ def _path(theta: FloatArray) -> FloatArray:
     return 2.0 * strokes + 1.0 - np.cos(theta - np.pi * strokes)
 
 
-def _slow_variance(noise: FloatArray, decay: FloatArray, stretch: Stretch) -> float:
-    """Return the variance of white noise that moves D_0 as much as the noise below omega does.
+@dataclass(frozen=True)
+class _SlowLines:
+    """The lines p/T below the fundamental, and their tones at the samples of a stretch."""
 
-    The lines p/T below the fundamental are taken as c/f; the decay sees c times its own mean
-    of 1/f.
-    """
-    turns = (stretch.theta - stretch.theta[0]) / (2.0 * np.pi)
-    cycles = max(2, round(float(turns[-1])))
-    p = np.arange(1, min(cycles, 64))
-    tones = np.exp(-2j * np.pi / cycles * p[:, None] * turns)
-    level = float(np.mean(p * np.abs(tones @ noise) ** 2)) / noise.size
-    seen = np.abs(tones @ decay) ** 2
-    return level * float(np.sum(seen / p) / np.sum(seen)) if level > 0.0 else 1e-300
+    p: FloatArray
+    tones: ComplexArray
+
+    @classmethod
+    def of(cls, stretch: Stretch) -> _SlowLines:
+        angle = stretch.theta - stretch.theta[0]
+        cycles = max(2, round(float(angle[-1]) / (2.0 * np.pi)))
+        p = np.arange(1.0, min(cycles, _SLOW_LINES + 1))
+        return cls(p, powers(np.exp(-1j / cycles * angle), p.size)[1:])
+
+    def variance(self, noise: FloatArray, decay: FloatArray) -> float:
+        """Return the variance of white noise that moves D_0 as much as the slow noise does.
+
+        The lines are taken as c/f; the decay sees c times its own mean of 1/f.
+        """
+        level = float(np.mean(self.p * np.abs(self.tones @ noise) ** 2)) / noise.size
+        seen = np.abs(self.tones @ decay) ** 2
+        return max(level * float(np.sum(seen / self.p) / np.sum(seen)), _TINY)
 
 
 def _friction_rate(response: complex) -> float:

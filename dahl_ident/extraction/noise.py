@@ -29,7 +29,7 @@ from dahl_ident.extraction.sine_fit import SineFit
 CYCLES_FOR_SCATTER = 4  # with fewer, lines beside the harmonic are few and far
 _MOST_LINES = 10  # a side: about 40 degrees of freedom, beyond which a region hardly shrinks
 _INDEPENDENT = 0.05  # of the largest eigenvalue: lines that gaps make alike are left out
-_BLOCK = 16384
+_BLOCK = 8192
 
 
 @dataclass(frozen=True)
@@ -87,20 +87,30 @@ def _line_content(
     The first has shape (harmonics, 2, 2 side), the second is for q = 0 ... 2 side.
     """
     theta = fit.stretch.theta
-    content = np.zeros((len(harmonics), 2, 2 * side), dtype=np.complex128)
+    products = np.zeros((2, len(harmonics), 2, 2, side))
     window = np.zeros(2 * side + 1, dtype=np.complex128)
     for start in range(0, theta.size, _BLOCK):
         part = slice(start, start + _BLOCK)
-        base = np.exp(-1j / cycles * theta[part])
-        tones = np.ones((side + 1, base.size), dtype=np.complex128)
-        for m in range(1, side + 1):
-            np.multiply(tones[m - 1], base, out=tones[m])
+        tones = powers(np.exp(-1j / cycles * theta[part]), side)
         window[: side + 1] += tones.sum(axis=1)
         window[side + 1 :] += tones[1:] @ tones[side]
-        lines = np.concatenate([tones[:0:-1].conj(), tones[1:]])
-        for i, k in enumerate(harmonics):
-            content[i] += (residual[:, part] * np.exp(-1j * k * theta[part])) @ lines.T
-    return content, window
+        turned = powers(np.exp(-1j * theta[part]), max(harmonics))[list(harmonics), None]
+        turned = turned * residual[:, part]
+        left = np.stack([turned.real, turned.imag])
+        right = np.concatenate([tones[1:].real, tones[1:].imag])
+        products += np.tensordot(left, right, axes=(-1, -1)).reshape(products.shape)
+    (re_re, re_im), (im_re, im_im) = np.moveaxis(products, 3, 1)
+    above = re_re - im_im + 1j * (re_im + im_re)
+    below = re_re + im_im + 1j * (im_re - re_im)
+    return np.concatenate([below[..., ::-1], above], axis=-1), window
+
+
+def powers(rotor: ComplexArray, highest: int) -> ComplexArray:
+    """Return the powers 0 to `highest`, one a row."""
+    powers = np.ones((highest + 1, rotor.size), dtype=np.complex128)
+    for k in range(1, highest + 1):
+        np.multiply(powers[k - 1], rotor, out=powers[k])
+    return powers
 
 
 def _orthogonal(window: ComplexArray, lines: FloatArray) -> tuple[ComplexArray, int]:

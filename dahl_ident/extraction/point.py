@@ -13,14 +13,14 @@ or twice.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.errors import ExtractionError
-from dahl_ident.extraction.memory import Memory, estimate_memory
+from dahl_ident.extraction.memory import MOST_CYCLES, Memory, estimate_memory
 from dahl_ident.extraction.noise import CYCLES_FOR_SCATTER, LineNoise, line_noise
 from dahl_ident.extraction.quality import (
     clipped_share,
@@ -32,9 +32,10 @@ from dahl_ident.extraction.quality import (
 from dahl_ident.extraction.sine_fit import (
     SineFit,
     Stretch,
+    first_cycles,
     last_cycles,
-    remainder,
     sine_fit,
+    thinned,
     whole_cycles,
 )
 
@@ -86,16 +87,38 @@ class Point:
 
 @dataclass(frozen=True)
 class _Phasors:
-    """Displacement and force of one stretch, noise included."""
+    """Displacement and force of one stretch with their noise.
+
+    `fit` is without the memory where that is significant; `remembered` is what the memory adds
+    to the phasors of its channel, and belongs to the response.
+    """
 
     fit: SineFit
-    harmonics: tuple[int, ...]
-    integrator: complex
+    cycles: int
+    settings: Settings
     noise: tuple[LineNoise, ...]
+    memory: Memory
+    remembered: ComplexArray
+
+    @property
+    def harmonics(self) -> list[int]:
+        return [k for k in self.settings.harmonics if k <= self.fit.orders]
+
+    @property
+    def integrator(self) -> complex:
+        """Displacement over the motion channel at the fundamental."""
+        return complex((1j * self.fit.stretch.omega) ** -self.settings.integrations)
+
+    def phasors(self, harmonic: int) -> ComplexArray:
+        """Return the phasors of the motion channel and the force, shape (2,)."""
+        both = self.fit.phasors(harmonic)
+        if self.memory.significant:
+            both[self.settings.memory_channel] += self.remembered[harmonic]
+        return both
 
     @property
     def displacement(self) -> complex:
-        return complex(self.fit.phasors(1)[0] * self.integrator)
+        return complex(self.phasors(1)[0] * self.integrator)
 
     @property
     def errors(self) -> ComplexArray:
@@ -110,7 +133,17 @@ class _Phasors:
         return complex(force * (abs(X) / X) ** harmonic / abs(X))
 
     def response(self, harmonic: int) -> complex:
-        return self.referred(complex(self.fit.phasors(harmonic)[1]), harmonic)
+        return self.referred(complex(self.phasors(harmonic)[1]), harmonic)
+
+    def changed(self, motion: complex, force: ComplexArray) -> ComplexArray:
+        """Return how the responses change where the motion's and the force's phasors do."""
+        relative = motion / self.phasors(1)[0]
+        changes = [
+            self.referred(complex(f), k)
+            - self.response(k) * complex(relative.real, k * relative.imag)
+            for k, f in zip(self.harmonics, force, strict=True)
+        ]
+        return np.array(changes)
 
 
 def measure(stretch: Stretch, settings: Settings, *, sweep: bool = False) -> Point:
@@ -138,26 +171,19 @@ def measure(stretch: Stretch, settings: Settings, *, sweep: bool = False) -> Poi
             f"{FEWEST_CYCLES} more than for settling: record longer, or lower settling_periods="
         )
     whole = last_cycles(stretch, cycles)
-    fit = sine_fit(whole, trend=sweep)
     steps = np.array([sensor_step(channel) for channel in whole.channels])
-    _check_sine(fit, steps, settings)
-    before = _phasors(fit, None, cycles, settings)
-    memory = estimate_memory(
-        fit, settings.memory_channel, np.angle(before.displacement), before.response(1)
-    )
-    if memory.significant:
-        before = _phasors(fit, memory, cycles, settings)
+    rough = sine_fit(thinned(first_cycles(whole, MOST_CYCLES)), trend=sweep)
+    _check_sine(rough, steps, settings)
+    memory = _memory(rough, settings)
     if sweep:
         dropped = 0
     elif settings.settling_periods is not None:
         dropped = settings.settling_periods
     else:
-        dropped = _settling_periods(before, memory, cycles, settings)
-    after = before
-    if dropped:
-        fit = sine_fit(last_cycles(whole, cycles - dropped))
-        after = _phasors(fit, memory, cycles - dropped, settings)
-    return _point(after, memory, cycles, dropped, steps, settings)
+        dropped = _settling_periods(rough.stretch, memory, cycles, settings)
+    used = last_cycles(whole, cycles - dropped)
+    phasors = _phasors(used, memory, cycles - dropped, settings, sweep=sweep)
+    return _point(phasors, cycles, dropped, steps)
 
 
 def _check_sine(fit: SineFit, steps: FloatArray, settings: Settings) -> None:
@@ -181,30 +207,45 @@ def _check_sine(fit: SineFit, steps: FloatArray, settings: Settings) -> None:
             )
 
 
-def _phasors(fit: SineFit, memory: Memory | None, cycles: int, settings: Settings) -> _Phasors:
-    """Join a fit with the noise of its phasors, which the memory is not part of."""
-    residual = fit.residual
-    if memory is not None:
-        residual = residual.copy()
-        residual[settings.memory_channel] -= remainder(fit, memory.waveform(fit.stretch))
-    harmonics = tuple(k for k in settings.harmonics if k <= fit.orders)
-    noise = line_noise(fit, (1, *harmonics), cycles, residual)
-    integrator = (1j * fit.stretch.omega) ** -settings.integrations
-    return _Phasors(fit, harmonics, integrator, tuple(noise))
+def _memory(fit: SineFit, settings: Settings) -> Memory:
+    X = complex(fit.phasors(1)[0] * (1j * fit.stretch.omega) ** -settings.integrations)
+    response = complex(fit.phasors(1)[1]) / X
+    return estimate_memory(fit, settings.memory_channel, float(np.angle(X)), response)
 
 
-def _bias(phasors: _Phasors, memory: Memory, settings: Settings) -> ComplexArray:
+def _phasors(
+    stretch: Stretch, memory: Memory, cycles: int, settings: Settings, *, sweep: bool
+) -> _Phasors:
+    """Fit a stretch without its memory, which is no noise, and join the phasors' noise."""
+    if memory.significant:
+        channels = stretch.channels.copy()
+        channels[settings.memory_channel] -= memory.waveform(stretch)
+        stretch = replace(stretch, channels=channels)
+    fit = sine_fit(stretch, trend=sweep)
+    harmonics = [k for k in settings.harmonics if k <= fit.orders]
+    noise = line_noise(fit, [1, *harmonics], cycles, fit.residual)
+    return _Phasors(fit, cycles, settings, tuple(noise), memory, memory.phasors(fit))
+
+
+def _bias(phasors: _Phasors) -> ComplexArray:
     """Return what the memory adds to the response of each harmonic."""
-    added = memory.phasors(phasors.fit.stretch)
-    if settings.memory_channel == 1:
-        return np.array([phasors.referred(added[k], k) for k in phasors.harmonics])
-    relative = added[1] / phasors.displacement
-    responses = np.array([phasors.response(k) for k in phasors.harmonics])
-    k = np.array(phasors.harmonics)
-    return np.asarray(-responses * (relative.real + 1j * k * relative.imag))
+    added = phasors.remembered
+    if phasors.settings.memory_channel == 0:
+        return phasors.changed(complex(added[1]), np.zeros(len(phasors.harmonics), complex))
+    return phasors.changed(0.0, added[phasors.harmonics])
 
 
-def _settling_periods(phasors: _Phasors, memory: Memory, cycles: int, settings: Settings) -> int:
+def _lag(phasors: _Phasors) -> ComplexArray:
+    """Return half of what the response of each harmonic changes in a cycle of a sweep.
+
+    The force lags the amplitude by less than half a cycle, whatever beta is.
+    """
+    fit = phasors.fit
+    force = np.array([fit.slopes(k)[1] for k in phasors.harmonics])
+    return phasors.changed(complex(fit.slopes(1)[0]), force) / phasors.cycles
+
+
+def _settling_periods(stretch: Stretch, memory: Memory, cycles: int, settings: Settings) -> int:
     """Return how many leading cycles to leave out.
 
     As few as bring the bias below a fifth of the standard error; where none do, those with the
@@ -212,14 +253,13 @@ def _settling_periods(phasors: _Phasors, memory: Memory, cycles: int, settings: 
     """
     if not memory.significant or cycles <= FEWEST_CYCLES:
         return 0
+    looked_at = min(cycles, MOST_CYCLES)
+    only_first = replace(settings, harmonics=(1,))
+    phasors = _phasors(stretch, memory, looked_at, only_first, sweep=False)
     q = np.arange(cycles - FEWEST_CYCLES + 1)
-    kept = cycles / (cycles - q)
-    response, covariance, _, _ = _fundamental(phasors)
-    added = complex(memory.phasors(phasors.fit.stretch)[1])
-    if settings.memory_channel == 0:
-        added *= -response
-    bias = abs(added / phasors.displacement) * np.exp(-memory.rate * q) * kept
-    error = np.sqrt(covariance[0, 0] * kept)
+    kept = looked_at / (cycles - q)
+    bias = abs(_bias(phasors)[0]) * np.exp(-memory.rate * q) * kept
+    error = np.sqrt(_fundamental(phasors)[1][0, 0] * kept)
     good = bias <= _NEGLIGIBLE * error
     return int(np.argmax(good) if good.any() else np.argmin(bias**2 + 2.0 * error**2))
 
@@ -255,43 +295,37 @@ def _harmonic(phasors: _Phasors, k: int) -> tuple[complex, FloatArray, FloatArra
     return N, covariance, -along * relative * A, dof
 
 
-def _point(
-    phasors: _Phasors,
-    memory: Memory,
-    cycles: int,
-    dropped: int,
-    steps: FloatArray,
-    settings: Settings,
-) -> Point:
+def _point(phasors: _Phasors, cycles: int, dropped: int, steps: FloatArray) -> Point:
     rows = [_fundamental(phasors) if k == 1 else _harmonic(phasors, k) for k in phasors.harmonics]
     response, covariance, amplitude_covariance, dof = (
         np.array(column) for column in zip(*rows, strict=True)
     )
     stretch = phasors.fit.stretch
-    bias = _bias(phasors, memory, settings)
+    memory, bias = phasors.memory, _bias(phasors)
+    lagging = _lag(phasors) if phasors.fit.trend else np.zeros(len(rows))
     error = np.sqrt(0.5 * np.trace(covariance, axis1=1, axis2=2))
     excess = np.abs(bias) / (_TOLERATED * error)
-    settled = (excess <= 1.0) | (not memory.significant)
-    missing = np.where(settled, 0.0, np.ceil(np.log(np.maximum(excess, 1.0)) / memory.rate))
+    forgotten = (excess <= 1.0) | (not memory.significant)
+    missing = np.where(forgotten, 0.0, np.ceil(np.log(np.maximum(excess, 1.0)) / memory.rate))
     quality = {
-        "settled": settled,
-        "bias_real": bias.real,
-        "bias_imag": bias.imag,
+        "settled": forgotten & (np.abs(lagging) <= _TOLERATED * error),
+        "bias_real": (bias + lagging).real,
+        "bias_imag": (bias + lagging).imag,
         "more_periods": missing.astype(np.int64),
         "num_periods": cycles,
         "settling_periods": dropped,
-        "covariance_from": "cycles" if cycles - dropped >= CYCLES_FOR_SCATTER else "spectrum",
+        "covariance_from": "cycles" if phasors.cycles >= CYCLES_FOR_SCATTER else "spectrum",
         "start_time": stretch.time[0],
         "end_time": stretch.time[-1],
-        **_channel_quality(phasors, steps, settings),
+        **_channel_quality(phasors, steps),
     }
     quality["verdict"] = _verdicts(quality)
     return Point(
         frequency_hz=stretch.omega / (2.0 * np.pi),
         amplitude=abs(phasors.displacement),
         amplitude_std=float(np.sqrt(0.5 * phasors.errors[0, 0].real)),
-        drive=float(abs(phasors.fit.phasors(1)[1])),
-        harmonic=list(phasors.harmonics),
+        drive=float(abs(phasors.phasors(1)[1])),
+        harmonic=phasors.harmonics,
         response=response,
         covariance=covariance,
         dof=dof,
@@ -300,7 +334,7 @@ def _point(
     )
 
 
-def _channel_quality(phasors: _Phasors, steps: FloatArray, settings: Settings) -> dict[str, Any]:
+def _channel_quality(phasors: _Phasors, steps: FloatArray) -> dict[str, Any]:
     """Return the columns that judge the two waveforms."""
     fit = phasors.fit
     shares = fundamental_share(fit)
@@ -313,7 +347,7 @@ def _channel_quality(phasors: _Phasors, steps: FloatArray, settings: Settings) -
     return {
         "displacement_share": shares[0],
         "force_share": shares[1],
-        "displacement_distortion": distortion(fit, settings.integrations),
+        "displacement_distortion": distortion(fit, phasors.settings.integrations),
         "displacement_steps": in_steps[0],
         "force_steps": in_steps[1],
         "displacement_clipped": clipped_share(motion, steps[0], noise[0], crest),
@@ -332,6 +366,10 @@ def _verdicts(quality: dict[str, Any]) -> list[str]:
         if quality[f"{name}_clipped"]:
             shared.append(f"{name} clipped in {100 * quality[f'{name}_clipped']:.2g} % of samples")
     return [
-        "; ".join(([] if settled else [f"not settled, {more} more periods"]) + shared) or "good"
+        "; ".join(([] if settled else [_unsettled(int(more))]) + shared) or "good"
         for settled, more in zip(quality["settled"], quality["more_periods"], strict=True)
     ]
+
+
+def _unsettled(more: int) -> str:
+    return f"not settled, {more} more periods" if more else "swept too fast to settle"

@@ -11,7 +11,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.extraction.sine_fit import HARMONICS, SineFit
 
-_LOOKED_AT = 20_000  # samples from which the sensor's step is found
+_LOOKED_AT = 5_000  # samples from which the sensor's step is found
 _SAME = 1e-9  # of the range: values nearer than this are equal but for rounding
 _RAIL_RUN = 5  # samples in a row at an extreme value
 
@@ -58,8 +58,14 @@ def fundamental_share(fit: SineFit) -> FloatArray:
 
 
 def distortion(fit: SineFit, integrations: int) -> float:
-    """Return the displacement's harmonics 2 to 9 over its fundamental, root of summed squares."""
+    """Return the displacement's harmonics 2 to 9 over its fundamental, root of summed squares.
+
+    What the noise adds to their power is subtracted.
+    """
     orders = np.arange(1, min(HARMONICS, fit.orders) + 1)
-    motion = np.array([abs(fit.phasors(int(k))[0]) for k in orders])
-    displacement = motion / orders.astype(np.float64) ** integrations
-    return float(np.sqrt(np.sum(displacement[1:] ** 2)) / displacement[0])
+    noise = float(np.mean(fit.residual[0] ** 2))
+    power = np.array(
+        [abs(fit.phasors(k)[0]) ** 2 - noise * fit.phasor_variance(k) for k in orders.tolist()]
+    )
+    power /= orders.astype(np.float64) ** (2 * integrations)
+    return float(np.sqrt(max(power[1:].sum(), 0.0) / power[0]))

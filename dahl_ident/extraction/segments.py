@@ -26,6 +26,8 @@ _FREQUENCY_TOLERANCE = 0.01
 _NOISE_FACTOR = 5.0
 _NOISIEST = 0.2  # noise of a cycle's log amplitude above which it is no cycle
 _EDGE_TOLERANCE = 0.005  # of the amplitude: cycles at the ends of a plateau that stray more go
+_MOSTLY_HELD = 0.5  # plateaus over cycles that change smoothly: with less it is a sweep
+_SWEEP_RANGE = 0.2  # change of log amplitude or frequency that makes a sweep
 _SWEEP_STEP = 0.2  # change of log amplitude or frequency in a cycle that a sweep may make
 _SWEEP_CHANGE = 0.1  # in a window
 _SWEEP_CYCLES = (4, 20)  # in a window
@@ -100,14 +102,16 @@ def find_segments(
     list of Segment
         None where there is neither.
     """
-    pieces = [piece for cycles in runs for piece in _pieces(cycles) if len(piece) >= 2]
-    plateaus = [p for p in pieces if len(p) >= fewest and not p.trending]
-    if mode == "auto":
-        trending = sum(len(p) for p in pieces if p.trending)
-        mode = "sweep" if trending > sum(map(len, plateaus)) else "steps"
+    pieces = [piece for cycles in runs for piece in _pieces(cycles) if len(piece) >= fewest]
+    plateaus = [_trimmed(p, fewest).segment() for p in pieces if not p.trending]
     if mode == "steps":
-        return [_trimmed(p, fewest).segment() for p in plateaus]
-    return [s for cycles in runs for sweep in _sweeps(cycles) for s in _windows(sweep, window)]
+        return plateaus
+    sweeps = [sweep for cycles in runs for sweep in _sweeps(cycles)]
+    swept = sum(map(len, sweeps))
+    held = sum(len(p) for p in pieces if not p.trending)
+    if mode == "auto" and held >= _MOSTLY_HELD * swept:
+        return plateaus
+    return [segment for sweep in sweeps for segment in _windows(sweep, window)]
 
 
 def _tolerances(noise: float) -> tuple[float, float]:
@@ -164,7 +168,7 @@ def _trimmed(piece: _Piece, fewest: int) -> _Piece:
 
 
 def _sweeps(cycles: Cycles) -> Iterator[_Piece]:
-    """Return the parts of a run in which nothing jumps."""
+    """Return the parts of a run in which nothing jumps, yet something changes much."""
     if len(cycles) < 2:
         return
     jump = np.abs(np.diff(cycles.log_amplitude)) > _SWEEP_STEP
@@ -172,8 +176,10 @@ def _sweeps(cycles: Cycles) -> Iterator[_Piece]:
     jump |= np.maximum(cycles.noise[1:], cycles.noise[:-1]) > _NOISIEST
     bounds = np.concatenate([[0], np.flatnonzero(jump) + 1, [len(cycles)]])
     for first, last in pairwise(bounds.tolist()):
-        if last - first >= _SWEEP_CYCLES[0]:
-            yield _Piece(cycles, first, last)
+        sweep = _Piece(cycles, first, last)
+        ranges = [np.ptp(v) for v in (sweep.log_amplitude, sweep.log_frequency) if v.size]
+        if len(sweep) >= _SWEEP_CYCLES[0] and max(ranges) > _SWEEP_RANGE:
+            yield sweep
 
 
 def _windows(sweep: _Piece, window: int | None) -> Iterator[Segment]:

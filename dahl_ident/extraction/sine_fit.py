@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -28,9 +29,10 @@ from dahl_ident.errors import ExtractionError
 
 HARMONICS = 9  # fitted at least, where the sampling can tell them apart
 _MOST_HARMONICS = 40  # fitted so that they do not leak where cycles are no whole samples
-_AFFORDABLE = 4e6  # samples times harmonics; leakage falls with the number of samples
+_AFFORDABLE = 4e5  # samples times harmonics; leakage falls with the number of samples
 _NYQUIST_MARGIN = 0.45  # highest harmonic over the sampling rate
-_BLOCK = 16384  # samples whose columns stay in the cache
+_FREQUENCY_HARMONICS = 3  # fitted beside the frequency; the others hardly pull it
+_BLOCK = 8192  # samples whose columns stay in the cache
 _BLOCKS_PER_CYCLE = 64  # block means that lose 4e-4 of the fundamental
 _MAX_STEPS = 20
 _TRACKED = 0.1  # phase error that is left to the four-parameter fit, rad
@@ -55,12 +57,12 @@ class Stretch:
         """Half the duration, s."""
         return 0.5 * float(self.time[-1] - self.time[0])
 
-    @property
+    @cached_property
     def tau(self) -> FloatArray:
         """Time from -1 to 1."""
         return (self.time - self.centre) / self.half_width
 
-    @property
+    @cached_property
     def theta(self) -> FloatArray:
         """Phase at every sample, rad."""
         return np.asarray(self.phase(self.tau))
@@ -70,7 +72,7 @@ class Stretch:
         """Angular frequency in the middle, rad/s."""
         return float(self.phase.deriv()(0.0)) / self.half_width
 
-    @property
+    @cached_property
     def sample_phase(self) -> float:
         """Phase from one sample to the next, rad."""
         return self.omega * float(np.median(np.diff(self.time)))
@@ -92,6 +94,13 @@ def steady_stretch(time: FloatArray, channels: FloatArray, omega: float) -> Stre
     """Return a stretch of one angular frequency, rad/s."""
     half_width = 0.5 * float(time[-1] - time[0])
     return Stretch(time, channels, Polynomial([0.0, omega * half_width]))
+
+
+def first_cycles(stretch: Stretch, cycles: int) -> Stretch:
+    """Return the first so many cycles, or all where there are fewer."""
+    theta = stretch.theta
+    end = theta[0] - 0.5 * stretch.sample_phase + 2.0 * np.pi * cycles
+    return stretch.part(slice(0, int(np.searchsorted(theta, end))))
 
 
 def last_cycles(stretch: Stretch, cycles: int) -> Stretch:
@@ -121,8 +130,24 @@ class SineFit:
 
     def phasors(self, harmonic: int) -> ComplexArray:
         """Return the phasors of motion and force at one harmonic, shape (2,)."""
-        cos, sin = self.coefficients[2 * harmonic : 2 * harmonic + 2]
+        return self._pair(2 * harmonic)
+
+    def slopes(self, harmonic: int) -> ComplexArray:
+        """Return the change of the phasors with tau, shape (2,), of a fit with trend."""
+        return self._pair(2 * (self.orders + harmonic))
+
+    def _pair(self, i: int) -> ComplexArray:
+        cos, sin = self.coefficients[i : i + 2]
         return np.asarray(cos - 1j * sin)
+
+    def phasors_of(self, waveform: FloatArray) -> ComplexArray:
+        """Return phasors 0, 1, ... that the fit would give a waveform; 0 after its last sample."""
+        theta, tau = self.stretch.theta[: waveform.size], self.stretch.tau[: waveform.size]
+        right = np.zeros(self.inverse.shape[0])
+        for part, block in _column_blocks(theta, tau, self.orders, self.trend):
+            right += block @ waveform[part]
+        fitted = (self.inverse @ right)[: 2 * self.orders + 2]
+        return np.asarray(fitted[::2] - 1j * fitted[1::2])
 
     def phasor_variance(self, harmonic: int) -> float:
         """Return E abs(phasor error)^2 for white noise of unit variance."""
@@ -158,17 +183,6 @@ def sine_fit(stretch: Stretch, *, trend: bool = False) -> SineFit:
     for part, block in _column_blocks(theta, tau, orders, trend):
         residual[:, part] -= coefficients.T @ block
     return SineFit(stretch, orders, trend, coefficients, inverse, residual)
-
-
-def remainder(fit: SineFit, waveform: FloatArray) -> FloatArray:
-    """Return what the columns of a fit leave of a waveform on the same samples."""
-    theta, tau = fit.stretch.theta, fit.stretch.tau
-    _, right = _normal_equations(theta, tau, waveform[None], fit.orders, fit.trend)
-    coefficients = (fit.inverse @ right)[:, 0]
-    left = waveform.copy()
-    for part, block in _column_blocks(theta, tau, fit.orders, fit.trend):
-        left[part] -= coefficients @ block
-    return left
 
 
 def estimate_frequency(stretch: Stretch) -> Stretch:
@@ -233,7 +247,7 @@ def thinned(stretch: Stretch) -> Stretch:
 
 def _frequency_step(stretch: Stretch) -> float:
     """Return one Gauss-Newton step of the phase at tau = 1, rad."""
-    orders = min(HARMONICS, resolvable_orders(stretch))
+    orders = min(_FREQUENCY_HARMONICS, resolvable_orders(stretch))
     theta, tau, y = stretch.theta, stretch.tau, stretch.channels
     normal, right = _normal_equations(theta, tau, y, orders, trend=True)
     n = 2 * orders + 2
@@ -260,12 +274,13 @@ def columns(theta: FloatArray, tau: FloatArray, orders: int, *, trend: bool = Fa
     out = np.empty((width + 2 * orders * trend, theta.size))
     out[0] = 1.0
     out[1] = tau
-    rotor = np.cos(theta) + 1j * np.sin(theta)
-    power = rotor.copy()
-    for k in range(1, orders + 1):
-        out[2 * k] = power.real
-        out[2 * k + 1] = power.imag
-        power *= rotor
+    np.cos(theta, out=out[2])
+    np.sin(theta, out=out[3])
+    twice = 2.0 * out[2]
+    for i in range(4, width):  # cos k = 2 cos 1 cos(k - 1) - cos(k - 2), and so for sin
+        np.multiply(twice, out[i - 2], out=out[i])
+        if i != 5:
+            out[i] -= out[i - 4] if i > 5 else 1.0
     if trend:
         np.multiply(out[2:width], tau, out=out[width:])
     return out
