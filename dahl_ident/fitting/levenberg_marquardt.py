@@ -31,6 +31,7 @@ _GAUSS_NEWTON = 1e-3  # with more damping a short step says nothing
 _MOST_DAMPING = 1e12
 _LONGEST_STEP = 2.0  # of a logarithm
 _NOISE_TOLERANCE = 1e-8
+_REMAINDER = 3e-7
 _ROUNDING_TOLERANCE = 1e-13
 
 
@@ -74,25 +75,27 @@ def gauss_newton(
 ) -> Minima | None:
     """Return the minimum near a good start of one problem, shape (P,), by undamped steps alone.
 
-    None at the first sign of trouble; :func:`minimise` takes longer and copes.
+    It ends with the step after which, as the steps shrink, less than 3e-7 standard deviations
+    are left. None at the first sign of trouble; :func:`minimise` takes longer and copes.
     """
-    at, last = evaluate(theta), 1e-300
+    at, last, dof = evaluate(theta), 1e-300, max(n_residuals - theta.size, 1)
     for count in range(1, steps):
-        diagonal = at.hessian.diagonal()
-        if not (np.isfinite(at.cost) and diagonal.min() > 0.0):
+        size = np.sqrt(at.hessian.diagonal())
+        lever = size * np.where(logarithmic, 1.0, theta)
+        if not 0.0 < size.min() <= size.max() < np.inf:
             return None
-        size = np.sqrt(diagonal)
-        step = np.linalg.solve(at.hessian / np.outer(size, size), at.gradient / -size) / size
-        if not np.abs(step[logarithmic]).max(initial=0.0) < _LONGEST_STEP:
+        step = np.linalg.solve(at.hessian / size / size[:, None], at.gradient / size) / -size
+        if not (np.abs(step) * logarithmic).max() < _LONGEST_STEP:
             return None
-        lever = np.where(logarithmic, 1.0, theta)
-        noise, signal = 2.0 * float(at.cost) / max(n_residuals - theta.size, 1), diagonal * lever**2
-        shortest = max(_NOISE_TOLERANCE**2 * noise, _ROUNDING_TOLERANCE**2 * float(signal.max()))
-        moves = float(step @ at.hessian @ step)
+        moves = -float(step @ at.gradient)
         theta = theta + step
-        if moves * min(1.0, moves / last) <= shortest:  # the length of the step after this one
-            converged, counts = np.ones(1, dtype=np.bool_), np.array([count])
+        shortest = max(
+            2.0 * _REMAINDER**2 * float(at.cost) / dof,
+            _ROUNDING_TOLERANCE**2 * float(lever @ lever),
+        )
+        if moves * min(1.0, moves / last) <= shortest:
             cost = np.maximum(at.cost - 0.5 * moves, 0.0)
+            converged, counts = np.ones(1, dtype=np.bool_), np.array([count])
             return Minima(theta[None], cost[None], at.hessian[None], converged, counts)
         cost, last = at.cost, moves
         at = evaluate(theta)

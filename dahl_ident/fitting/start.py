@@ -195,24 +195,25 @@ def _nodes(element: Dahl, view: StiffnessData, most: float) -> _Friction:
     """Return the grid of one element, of at most `most` nodes."""
     f_max, sigma, alpha = element.parameters
     position = np.rint(np.log(view.amplitude) / _STEP).astype(np.intp)
+    alphas = _ALPHAS if alpha.free else (float(_start_values((alpha,))[0]),)
     if f_max.free or sigma.free:
         low = position.min(axis=-1)
         span = int((position.max(axis=-1) - low).max())
-        offsets = _offsets(span, max(6.0, most / (len(_ALPHAS) if alpha.free else 1)))
+        offsets = _offsets(span, max(6.0, most / len(alphas)))
     else:
         x_c = _start_values((f_max,))[0] / _start_values((sigma,))[0]
         low = np.rint(np.log(x_c) / _STEP).astype(np.intp)
         offsets = np.zeros(1, dtype=np.intp)
     ln_x_c = low[..., None] + offsets
-    at = np.clip(position[..., None, :] - ln_x_c[..., None] - _LOWEST, 0, _NODES)
-    alphas = _ALPHAS if alpha.free else (float(_start_values((alpha,))[0]),)
+    at = position[..., None, :] - (ln_x_c[..., None] + _LOWEST)
+    curves = [_curve(a, view, at) for a in alphas]
     return _Friction(
         f_max,
         sigma,
         alpha,
-        np.tile(ln_x_c * _STEP, len(alphas)),
+        np.concatenate([ln_x_c] * len(alphas), axis=-1) * _STEP,
         np.repeat(np.log(alphas), offsets.size),
-        np.concatenate([_curve(a, view, at) for a in alphas], axis=-2),
+        curves[0] if len(curves) == 1 else np.concatenate(curves, axis=-2),
     )
 
 
@@ -230,10 +231,12 @@ def _offsets(span: int, most: float) -> IntArray:
 def _curve(alpha: float, view: StiffnessData, at: IntArray) -> ComplexArray:
     """Return h at places `at` of the table, row by row's harmonic."""
     if len(view.orders) == 1:
-        return _table(alpha, view.orders[0])[at]
+        return _table(alpha, view.orders[0]).take(at, mode="clip")
     curve = np.empty(at.shape, dtype=np.complex128)
     for k in view.orders:
-        curve[..., view.harmonic == k] = _table(alpha, k)[at[..., view.harmonic == k]]
+        curve[..., view.harmonic == k] = _table(alpha, k).take(
+            at[..., view.harmonic == k], mode="clip"
+        )
     return curve
 
 

@@ -237,7 +237,7 @@ class Problem:
         """
         theta = self._coordinates.checked(theta)
         y, _ = self.whitened(theta, derivatives=False)
-        return self._with_priors(theta, y, [], scale)[0]
+        return self._with_priors(theta, y, [], scale)[..., 0, :]
 
     def jacobian(self, theta: ArrayLike, scale: ArrayLike = 1.0) -> FloatArray:
         """Return the residuals' derivative by theta, shape (m, P) or (S, m, P)."""
@@ -254,9 +254,8 @@ class Problem:
         Jacobian leaves that out, so that J' r is the exact gradient of half the sum of squares.
         """
         theta = self._coordinates.checked(theta)
-        y, changes = self.whitened(theta, tails=tails)
-        residuals, jacobian = self._with_priors(theta, y, changes, scale)
-        return residuals, jacobian.swapaxes(-1, -2)
+        rows = self._with_priors(theta, *self.whitened(theta, tails=tails), scale)
+        return rows[..., 0, :], rows[..., 1:, :].swapaxes(-1, -2)
 
     def quadratic(
         self,
@@ -273,42 +272,36 @@ class Problem:
         rho(z), the gradient is exact and the Hessian is that of rho at a linear model,
         rho' d' d + 2 rho'' (y' d)(y' d)', as far as that is positive.
         """
-        y, changes = self.whitened(theta, tails=False)
-        if rho is None:
-            rho = self._tail
-        r, J = self._with_priors(theta, y, changes, scale)
+        rho = rho or self._tail
+        rows = self._with_priors(theta, *self.whitened(theta, tails=False), scale)
         if chart is not None:
-            J = chart.swapaxes(-1, -2) @ J
+            r, J = rows[..., :1, :], rows[..., 1:, :]
+            rows = np.concatenate([r, chart.swapaxes(-1, -2) @ J], axis=-2)
         if rho is None:
-            cost = 0.5 * np.einsum("...m,...m->...", r, r)
-            weighted = J
+            products = rows @ rows.swapaxes(-1, -2)
+            cost = 0.5 * products[..., 0, 0]
         else:
-            weighted, r, cost = self._weighted(r, J, rho)
-        gradient = (J @ r[..., None])[..., 0]
-        return Quadratic(
-            np.where(np.isfinite(cost), cost, np.inf), gradient, weighted @ J.swapaxes(-1, -2)
-        )
+            cost, weighted = self._weighted(rows, rho)
+            products = weighted @ rows.swapaxes(-1, -2)
+        cost = np.where(cost < np.inf, cost, np.inf)
+        return Quadratic(cost, products[..., 0, 1:], products[..., 1:, 1:])
 
-    def _weighted(
-        self, r: FloatArray, J: FloatArray, rho: Rho
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return weighted Jacobian and residuals, and the cost, of rows that count as rho."""
+    def _weighted(self, rows: FloatArray, rho: Rho) -> tuple[FloatArray, FloatArray]:
+        """Return the cost where rows of data count as rho, and residuals and Jacobian weighted."""
         m = self.n_residuals
+        r, J = rows[..., 0, :], rows[..., 1:, :]
         first, second = r[..., 0:m:2], r[..., 1:m:2]
         z = first**2 + second**2
         loss, slope, bend = rho(z)
         cost = 0.5 * loss.sum(axis=-1) + 0.5 * (r[..., m:] ** 2).sum(axis=-1)
-        own, other = J[..., 0:m:2], J[..., 1:m:2]
+        weighted = rows.copy()
+        weighted[..., :m] *= np.repeat(slope, 2, axis=-1)[..., None, :]
         along = np.maximum(2.0 * bend, -slope / np.maximum(z, 1e-300))[..., None, :] * (
-            first[..., None, :] * own + second[..., None, :] * other
+            first[..., None, :] * J[..., 0:m:2] + second[..., None, :] * J[..., 1:m:2]
         )
-        weighted, factor = J.copy(), np.repeat(slope, 2, axis=-1)
-        weighted[..., :m] *= factor[..., None, :]
-        weighted[..., 0:m:2] += first[..., None, :] * along
-        weighted[..., 1:m:2] += second[..., None, :] * along
-        r = r.copy()
-        r[..., :m] *= factor
-        return weighted, r, cost
+        weighted[..., 1:, 0:m:2] += first[..., None, :] * along
+        weighted[..., 1:, 1:m:2] += second[..., None, :] * along
+        return cost, weighted
 
     def whitened(
         self, theta: FloatArray, *, derivatives: bool = True, tails: bool = True
@@ -342,8 +335,8 @@ class Problem:
 
     def _with_priors(
         self, theta: FloatArray, y: ComplexArray, changes: list[ComplexArray], scale: ArrayLike
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return real residuals and the transposed Jacobian, those of priors last."""
+    ) -> FloatArray:
+        """Return residuals and, below them, their derivatives: (..., 1 + P, m), priors last."""
         lead, m, extra = self._shape(theta)[:-1], self.n_residuals, len(self.priors)
         pairs = np.empty((*lead, len(changes) + 1, m // 2), dtype=np.complex128)
         pairs[..., 0, :] = y
@@ -354,17 +347,15 @@ class Problem:
             rows /= np.asarray(scale)[..., None, None]
         if extra:
             rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], extra))], axis=-1)
-        residuals, jacobian = rows[..., 0, :], rows[..., 1:, :]
-        if self.priors:
             values = self._coordinates.to_values(theta)
             slopes = self._coordinates.slopes(values)
-            for row, (name, prior) in enumerate(self.priors.items(), start=m):
+            for place, (name, prior) in enumerate(self.priors.items(), start=m):
                 index = self.names.index(name)
                 mean, std = _normal(name, prior)
-                residuals[..., row] = (values[..., index] - mean) / std
+                rows[..., 0, place] = (values[..., index] - mean) / std
                 if changes:
-                    jacobian[..., index, row] = slopes[..., index] / std
-        return residuals, jacobian
+                    rows[..., 1 + index, place] = slopes[..., index] / std
+        return rows
 
     # Likelihood
 
@@ -421,7 +412,7 @@ class Problem:
         if dof is not None:
             weight = np.sqrt((dof + 1.0) * (dof - 1.0) / (dof * (dof + 3.0)))
             changes = [weight * d for d in changes]
-        _, J = self._with_priors(theta, y, changes, scale)
+        J = self._with_priors(theta, y, changes, scale)[..., 1:, :]
         if chart is not None:
             J = chart.T @ J
         return J @ J.swapaxes(-1, -2)
