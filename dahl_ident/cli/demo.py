@@ -1,28 +1,66 @@
-"""``dahl-ident demo``: the whole chain on shipped data."""
+"""``dahl-ident demo``: the whole chain on shipped data, from waveforms to a report."""
 
 from __future__ import annotations
 
-from dahl_ident.cli import telling
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dahl_ident.cli import extract, telling
+from dahl_ident.cli.files import progress_bar
 from dahl_ident.cli.fit import show
 
+if TYPE_CHECKING:
+    from dahl_ident.results import FitResult
 
-def demo() -> None:
-    """Run the whole chain on shipped data, with the true values beside the estimates.
+_DATASET = "plant_recording"
+
+
+def demo(
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for the table and the report.")
+    ] = Path("out"),
+) -> None:
+    """Run the whole chain on a shipped recording of a plant, the true values beside the result.
 
     Example: dahl-ident demo
     """
-    from dahl_ident.data import FrequencyResponse
-    from dahl_ident.elements import Dahl
+    from dahl_ident.data import inspect, read_record
+    from dahl_ident.elements import Dahl, Damper, Mass, Spring
+    from dahl_ident.extraction import extract as extract_record
+    from dahl_ident.reporting import report
     from dahl_ident.results import fit
-    from dahl_ident.synthetic.shipped import load_dataset
+    from dahl_ident.synthetic.shipped import datasets_directory, load_dataset
 
-    data = load_dataset("noisy")
-    assert isinstance(data, FrequencyResponse)
-    telling.heading("data")
-    telling.say(repr(data))
-    telling.heading("fit")
-    result = fit(data, Dahl(), throw=False)
+    output.mkdir(parents=True, exist_ok=True)
+    recording = load_dataset(_DATASET)
+    facts = recording.provenance or {}
+    file = datasets_directory() / facts["file"]
+
+    telling.heading(f"1. inspect: {file}")
+    telling.say(repr(inspect(file)))
+    telling.heading("2. extract: waveforms to dynamic stiffness")
+    data = extract_record(read_record(file), controlled="force", harmonics=[1])
+    extract.show(data)
+    table = data.save(output / "levels.csv")
+    telling.heading("3. fit: friction, mass, damper and spring, nothing known beforehand")
+    result = fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
     show(result, json=False)
-    truth = (data.provenance or {})["truth"]
+    truth = facts["truth"]
     telling.say("the truth: " + ", ".join(f"{k} = {v:g}" for k, v in truth.items()))
+    telling.heading("4. identifiability: what the data determine")
+    _tell_identifiability(result)
+    telling.heading("6. report")
+    with progress_bar() as bar:
+        bar.add_task("drawing", total=None)
+        page = report(result, output / "report.html")
+    telling.say(f"table: {table}\nreport: {page.resolve()}")
     telling.finish(result.success, result.message)
+
+
+def _tell_identifiability(result: FitResult) -> None:
+    from dahl_ident.diagnostics.identifiability import judged
+    from dahl_ident.diagnostics.intervals import profile_intervals
+
+    telling.say(str(judged(result.optimum, profile_intervals(result.optimum))))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,6 +14,28 @@ from dahl_ident.cli.options import Files, General, ModelOptions, Reading
 if TYPE_CHECKING:
     from dahl_ident.results import FitResult
 
+_ESTIMATING = "Estimating"
+
+
+@dataclass(frozen=True)
+class Estimating:
+    """How the estimate is made; the words of ``fit``."""
+
+    noise: Annotated[
+        str | None,
+        typer.Option(
+            help="measured, relative or absolute; by default measured where a covariance is known.",
+            rich_help_panel=_ESTIMATING,
+        ),
+    ] = None
+    loss: Annotated[
+        str,
+        typer.Option(
+            help="linear, huber, soft_l1 or student_t; all but the first make outliers count less.",
+            rich_help_panel=_ESTIMATING,
+        ),
+    ] = "linear"
+
 
 @grouped
 def fit(
@@ -20,23 +43,32 @@ def fit(
     general: General,
     reading: Reading,
     model: ModelOptions,
-    noise: Annotated[
-        str | None, typer.Option(help="measured, relative or absolute; by default what fits.")
+    estimating: Estimating,
+    report: Annotated[
+        str | None, typer.Option(help="Report to write: .html, .pdf, .md or .json.")
     ] = None,
-    loss: Annotated[
-        str, typer.Option(help="linear, huber, soft_l1 or student_t; the latter mind outliers.")
-    ] = "linear",
 ) -> None:
     """Estimate f_max and sigma, and say whether the data determine them.
 
     Example: dahl-ident datasets noisy -o - | dahl-ident fit -
     """
+    result = fitted(files, reading, model, estimating)
+    show(result, json=general.json)
+    if report is not None:
+        from dahl_ident.reporting import report as write_report
+
+        telling.doubt(f"report: {write_report(result, report)}")
+    finish(result)
+
+
+def fitted(
+    files: list[str], reading: Reading, model: ModelOptions, estimating: Estimating
+) -> FitResult:
+    """Return the fit of the model to the files."""
     from dahl_ident.results import fit as fit_data
 
     elements, free = model.build()
-    result = fit_data(reading.read(files), elements, free=free, noise=noise, loss=loss, throw=False)
-    show(result, json=general.json)
-    telling.finish(result.success, result.message)
+    return fit_data(reading.read(files), elements, free=free, throw=False, **vars(estimating))
 
 
 def show(result: FitResult, *, json: bool) -> None:
@@ -56,3 +88,8 @@ def as_json(result: FitResult) -> dict[str, Any]:
         "message": result.message,
         "params": {name: vars(estimate) for name, estimate in result.params.items()},
     }
+
+
+def finish(result: FitResult) -> None:
+    """End with status 3 where the fit is not to be trusted."""
+    telling.finish(result.success, result.message)

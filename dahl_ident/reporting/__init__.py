@@ -1,1 +1,5 @@
-"""placeholder"""
+"""Reports to hand on: HTML, PDF, Markdown and JSON from the same content."""
+
+from dahl_ident.reporting.publish import report
+
+__all__ = ["report"]

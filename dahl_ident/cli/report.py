@@ -1,0 +1,49 @@
+"""``dahl-ident report``: from tables to a report that can be handed on."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from typing import Annotated
+
+import typer
+
+from dahl_ident.cli import telling
+from dahl_ident.cli.fit import Estimating, finish, fitted
+from dahl_ident.cli.groups import grouped
+from dahl_ident.cli.options import Files, General, ModelOptions, Reading
+
+
+@grouped
+def report(
+    files: Files,
+    general: General,
+    reading: Reading,
+    model: ModelOptions,
+    estimating: Estimating,
+    output: Annotated[
+        list[str],
+        typer.Option("--output", "-o", help="Report: .html, .pdf, .md, .json; or several."),
+    ] = ["report.html"],  # noqa: B006 - typer takes lists as lists
+    title: Annotated[str | None, typer.Option(help="First line of the report.")] = None,
+) -> None:
+    """Fit, judge and write a report.
+
+    Example: dahl-ident datasets noisy -o - | dahl-ident report - -o report.html
+    """
+    from dahl_ident.reporting import report as write_report
+
+    result = fitted(files, reading, model, estimating)
+    written = [
+        str(write_report(result, place, title=title, command=typed_command())) for place in output
+    ]
+    if general.json:
+        telling.say_json(written)
+    else:
+        telling.say("\n".join(written))
+    finish(result)
+
+
+def typed_command() -> str:
+    """Return the command line of this process, as it would be typed again."""
+    return shlex.join(["dahl-ident", *sys.argv[1:]])

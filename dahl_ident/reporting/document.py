@@ -1,0 +1,134 @@
+"""A report as plain content: what it says, before any format gives it a look.
+
+Every writer (HTML, PDF, Markdown, JSON) takes the same :class:`Document`, so that all formats
+tell the same story.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A number in a table: as people read it, and as it is copied and sorted."""
+
+    text: str
+    value: float | None = None
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """Running text."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Bullets:
+    """A list of sentences."""
+
+    items: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Listing:
+    """Text to be copied as it stands: a command, a program."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells under a header; units are in the header."""
+
+    caption: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure that is drawn when a writer asks for it.
+
+    Attributes
+    ----------
+    name : str
+        Short, for a file name.
+    caption : str
+        What is shown.
+    alt : str
+        What it shows, for readers who cannot see it: the finding, not the axes.
+    draw : callable
+        Makes the figure anew.
+    """
+
+    name: str
+    caption: str
+    alt: str
+    draw: Callable[[], Figure]
+
+    def rendered(self, kind: str) -> bytes:
+        """Return the picture as "svg" or "png"; the same each time."""
+        import matplotlib as mpl
+        import matplotlib.pyplot as plt
+
+        buffer = io.BytesIO()
+        with mpl.rc_context({"svg.hashsalt": "dahl_ident", "svg.fonttype": "path"}):
+            figure = self.draw()
+            metadata = {"Date": None} if kind == "svg" else None
+            figure.savefig(buffer, format=kind, dpi=160, metadata=metadata)
+            plt.close(figure)
+        return buffer.getvalue()
+
+
+Block = Paragraph | Bullets | Listing | Table | Picture
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading and what stands under it."""
+
+    title: str
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True)
+class Document:
+    """A whole report.
+
+    Attributes
+    ----------
+    title : str
+        First line.
+    trusted : bool
+        Whether the results can be used as they are.
+    verdict : tuple of str
+        The first lines a reader sees: what was found, and what speaks against it.
+    sections : tuple of Section
+        The rest, in reading order.
+    facts : mapping
+        The same for machines.
+    """
+
+    title: str
+    trusted: bool
+    verdict: tuple[str, ...]
+    sections: tuple[Section, ...]
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+
+def words(*texts: str) -> tuple[Cell, ...]:
+    """Return a row of texts."""
+    return tuple(Cell(text) for text in texts)
+
+
+def number(value: float, digits: int = 4) -> Cell:
+    """Return a number with so many digits; all of them are kept for copying."""
+    return Cell(f"{value:.{digits}g}", float(value))

@@ -1,0 +1,29 @@
+"""One HTML file that needs nothing else: styles, script and pictures are in it."""
+
+from __future__ import annotations
+
+import base64
+from importlib.resources import files
+
+import jinja2
+
+from dahl_ident.reporting.document import Document, Picture
+
+
+def html(document: Document) -> bytes:
+    """Return the page; text is escaped, and a policy in the page forbids any network access."""
+    room = files("dahl_ident.reporting")
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+    )
+    environment.filters["svg"] = _as_uri
+    page = environment.from_string((room / "page.html.j2").read_text(encoding="utf-8"))
+    return page.render(
+        document=document,
+        style=(room / "page.css").read_text(encoding="utf-8"),
+        script=(room / "page.js").read_text(encoding="utf-8"),
+    ).encode()
+
+
+def _as_uri(picture: Picture) -> str:
+    return "data:image/svg+xml;base64," + base64.b64encode(picture.rendered("svg")).decode()

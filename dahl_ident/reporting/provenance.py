@@ -1,0 +1,74 @@
+"""Where a result comes from: files and their hashes, options, versions, and how to repeat it."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import platform
+import shlex
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import dahl_ident
+
+if TYPE_CHECKING:
+    from dahl_ident.data import FrequencyResponse
+    from dahl_ident.results import FitResult
+
+_PACKAGES = ("numpy", "scipy", "casadi", "emcee", "pandas", "matplotlib", "pint")
+_ELEMENT_OPTIONS = {"mass", "damping", "stiffness"}
+_TOLD_APART = {"parts", "file", "sha256", "notes"}
+
+
+def sources(data: FrequencyResponse) -> Iterator[tuple[str, str]]:
+    """Yield name and SHA-256 of every file that the data came from."""
+    for part in _parts(data):
+        if "file" in part:
+            yield str(part["file"]), str(part.get("sha256", ""))
+
+
+def notes(data: FrequencyResponse) -> list[str]:
+    """Return what had to be assumed on reading."""
+    return list(dict.fromkeys(str(note) for part in _parts(data) for note in part.get("notes", [])))
+
+
+def options(data: FrequencyResponse) -> list[tuple[str, str]]:
+    """Return how the data were made, key by key, where they say so."""
+    found: dict[str, str] = {}
+    for part in _parts(data):
+        for key, value in part.items():
+            if key not in _TOLD_APART and not isinstance(value, Mapping):
+                found.setdefault(str(key), str(value))
+        for key, value in dict(part.get("extraction") or {}).items():
+            found.setdefault(f"extraction {key}", str(value))
+    return list(found.items())
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python, of this package and of those that it computes with."""
+    found = {"dahl_ident": dahl_ident.__version__, "python": platform.python_version()}
+    return found | {name: importlib.metadata.version(name) for name in _PACKAGES}
+
+
+def today() -> str:
+    """Return date and time of day, with the offset to UTC."""
+    return datetime.datetime.now().astimezone().isoformat(timespec="minutes")
+
+
+def fit_command(fit: FitResult) -> str:
+    """Return the command that fits the same model to the same files."""
+    files = [name for name, _ in sources(fit.data)] or ["DATA.csv"]
+    words = ["dahl-ident", "fit", *files]
+    for name, estimate in fit.params.items():
+        option = f"--{name.replace('_', '-')}"
+        if not estimate.vary and (name, estimate.value) != ("alpha", 1.0):
+            words += [option, f"{estimate.value:.12g}"]
+        elif estimate.vary and name in _ELEMENT_OPTIONS | {"alpha"}:
+            words += [option, "free"]
+    words += ["--noise", fit.noise]
+    return shlex.join(words)
+
+
+def _parts(data: FrequencyResponse) -> list[Mapping[str, Any]]:
+    provenance = data.provenance or {}
+    return list(provenance.get("parts", [provenance]))

@@ -1,0 +1,115 @@
+"""``report(results, path)``: results to a file that others can read, trust and repeat."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from dahl_ident.data.storage import write_whole
+from dahl_ident.errors import ValidationError
+from dahl_ident.reporting.contents import document
+from dahl_ident.reporting.document import Document, Picture
+from dahl_ident.reporting.html import html
+from dahl_ident.reporting.markdown import markdown
+from dahl_ident.results import FitResult
+
+SCHEMA = 1
+FORMATS = (".html", ".pdf", ".md", ".json")
+
+
+def report(
+    results: FitResult | Sequence[FitResult],
+    path: str | Path,
+    *,
+    title: str | None = None,
+    command: str | None = None,
+) -> Path:
+    """Write a report on one or several results.
+
+    Parameters
+    ----------
+    results : FitResult, or sequence of them
+        What to report on; all on the same data.
+    path : path
+        Ending in ``.html`` (one file, no network), ``.pdf``, ``.md`` (pictures in a folder
+        beside it) or ``.json``.
+    title : str, optional
+        First line; by default the file's name.
+    command : str, optional
+        The command that repeats it; by default the one that fits the same model.
+
+    Returns
+    -------
+    Path
+        The file, complete; an interrupted run leaves none.
+
+    Raises
+    ------
+    ValidationError
+        If there is no result, or the ending is another one.
+    DataError
+        If the place cannot be written to.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> import dahl_ident as di
+    >>> from dahl_ident.synthetic.shipped import load_dataset
+    >>> fit = di.fit(load_dataset("noisy"), di.Dahl())
+    >>> report(fit, Path(mkdtemp()) / "report.json").name
+    'report.json'
+    """
+    place = Path(path)
+    told = [results] if isinstance(results, FitResult) else list(results)
+    if not told:
+        raise ValidationError("there is no result to report on; expected at least one")
+    kind = place.suffix.lower()
+    if kind not in FORMATS:
+        raise ValidationError(f"{place}: reports are written as {', '.join(FORMATS)}")
+    whole = document(told, title=title, command=command)
+    write_whole(place, _content(whole, place, kind))
+    return place
+
+
+def _content(whole: Document, place: Path, kind: str) -> bytes:
+    if kind == ".html":
+        return html(whole)
+    if kind == ".pdf":
+        from dahl_ident.reporting.pdf import pdf
+
+        return pdf(whole)
+    if kind == ".md":
+        folder = place.with_name(f"{place.stem}_pictures")
+        for picture in _pictures(whole):
+            folder.mkdir(parents=True, exist_ok=True)
+            write_whole(folder / f"{picture.name}.png", picture.rendered("png"))
+        return markdown(whole, folder.name)
+    return machine_readable(whole)
+
+
+def machine_readable(whole: Document) -> bytes:
+    """Return title, verdict and facts as JSON; numbers that are not finite become null."""
+    facts = {
+        "schema": SCHEMA,
+        "title": whole.title,
+        "trusted": whole.trusted,
+        "verdict": list(whole.verdict),
+        **whole.facts,
+    }
+    return json.dumps(_finite(facts), indent=2, ensure_ascii=False, allow_nan=False).encode()
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _pictures(whole: Document) -> list[Picture]:
+    blocks = (block for section in whole.sections for block in section.blocks)
+    return [block for block in blocks if isinstance(block, Picture)]

@@ -1,0 +1,117 @@
+"""The tables of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dahl_ident.diagnostics.formatting import interval, rounded
+from dahl_ident.elements import Dahl
+from dahl_ident.reporting.document import Cell, Table, number, words
+from dahl_ident.reporting.predictions import held_amplitude
+from dahl_ident.units import si_unit
+
+if TYPE_CHECKING:
+    from dahl_ident.data import FrequencyResponse
+    from dahl_ident.diagnostics import ConfidenceIntervals
+    from dahl_ident.results import FitResult
+
+_EQUIVALENT_ROWS = 9
+_LEVEL = 0.9545
+
+
+def parameters(fit: FitResult, intervals: Sequence[ConfidenceIntervals]) -> Table:
+    """Return every parameter with its intervals, one column a method."""
+    at = [one.at(_LEVEL) for one in intervals]
+    rows = []
+    for name, estimate in fit.params.items():
+        value, error = rounded(estimate.value, estimate.stderr)
+        row = [
+            Cell(name),
+            Cell(value, estimate.value),
+            Cell(error if estimate.vary else "fixed", estimate.stderr),
+            Cell(estimate.unit or "-"),
+        ]
+        for found in at:
+            limits = found.get(name)
+            row.append(Cell(interval(limits.lower, limits.upper, "") if limits else "-"))
+        rows.append((*row, Cell(estimate.description)))
+    methods = [f"95.45 % {one.method} interval" for one in intervals]
+    header = ("parameter", "estimate", "standard error", "unit", *methods, "what it is")
+    return Table("Parameters", header, tuple(rows))
+
+
+def equivalents(fit: FitResult) -> Table | None:
+    """Return equivalent stiffness, damping and loss of the friction over amplitude."""
+    friction = [element for element in fit.model.elements if isinstance(element, Dahl)]
+    if not friction or not all(np.isfinite(e.value) for e in fit.params.values()):
+        return None
+    data = fit.data.select(harmonic=1)
+    A = data.amplitude
+    if A is None:
+        A = held_amplitude(data) * np.abs(data.to("receptance").response)
+    sizes = np.geomspace(A.min(), A.max(), _EQUIVALENT_ROWS)
+    f = float(np.median(data.frequency_hz))
+    stiffness = sum(e.equivalent_stiffness(sizes) for e in friction)
+    damping = sum(e.equivalent_damping(sizes, 2.0 * np.pi * f) for e in friction)
+    energy = sum(e.dissipated_energy(sizes) for e in friction)
+    motion = data.motion
+    header = (
+        f"amplitude [{si_unit('displacement', motion)}]",
+        f"equivalent stiffness [{si_unit('dynamic_stiffness', motion)}]",
+        f"equivalent damping at {f:.4g} Hz [{si_unit('mechanical_impedance', motion)}]",
+        "energy lost in a cycle [J]",
+    )
+    columns = np.array([sizes, stiffness, damping, energy]).T
+    return Table(
+        "Friction as an equivalent spring and damper",
+        header,
+        tuple(tuple(number(v) for v in row) for row in columns),
+    )
+
+
+def measured(data: FrequencyResponse) -> Table:
+    """Return the data as they went into the fit."""
+    columns: list[tuple[str, list[Cell]]] = [
+        ("frequency [Hz]", [number(v, 5) for v in data.frequency_hz])
+    ]
+    if data.level is not None:
+        columns.append(("level", [_label(v) for v in data.level]))
+    for name, kind in (("amplitude", "displacement"), ("drive", "force")):
+        values = getattr(data, name)
+        if values is not None:
+            cells = [number(v) for v in values]
+            columns.append((f"{name} [{si_unit(kind, data.motion)}]", cells))
+    columns += [
+        (f"gain [{data.unit}]", [number(v, 5) for v in data.gain]),
+        ("phase [deg]", [number(v, 4) for v in np.degrees(data.phase)]),
+    ]
+    if (data.harmonic > 1).any():
+        columns.append(("harmonic", [Cell(str(k), float(k)) for k in data.harmonic]))
+    if "verdict" in data.quality:
+        columns.append(("verdict", [Cell(str(v)) for v in data.quality["verdict"]]))
+    rows = tuple(zip(*(cells for _, cells in columns), strict=True))
+    return Table("Data", tuple(name for name, _ in columns), rows)
+
+
+def goodness(fit: FitResult) -> Table:
+    """Return the numbers that say how well the model describes the data."""
+    scale = "known" if fit.scale_known else f"{fit.scale:.4g}, estimated"
+    rows = [
+        words("data (real numbers)", f"{fit.ndata}"),
+        words("degrees of freedom", f"{fit.nfree}"),
+        (Cell("chi-square"), number(fit.chisqr)),
+        (Cell("reduced chi-square"), number(fit.redchi)),
+        words("noise scale", scale),
+        (Cell("AIC"), number(fit.aic, 6)),
+        (Cell("BIC"), number(fit.bic, 6)),
+    ]
+    return Table("Goodness of fit", ("measure", "value"), tuple(rows))
+
+
+def _label(value: object) -> Cell:
+    if isinstance(value, (int, float, np.number)):
+        return number(float(value))
+    return Cell(str(value))
