@@ -119,6 +119,8 @@ def _sampling(source: Source) -> tuple[str, tuple[str, ...]]:
             time = channel.values * parse_unit(channel.unit or "s").factor
         except UnitError:
             continue
+        if not np.isfinite(time).all():
+            return "time is not finite everywhere", ()
         if time.ndim == 1 and time.size > 1 and np.all(np.diff(time) > 0.0):
             evenness = "even" if is_even(time) else "uneven"
             text = (
