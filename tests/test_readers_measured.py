@@ -1,0 +1,137 @@
+"""Measurements made by others, read as their laboratories left them."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from dahl_ident.data import FrequencyResponse, inspect, read_frequency_response, read_record
+
+MEASURED = os.environ.get("DAHL_IDENT_MEASURED_DATA")
+pytestmark = pytest.mark.skipif(
+    MEASURED is None,
+    reason="DAHL_IDENT_MEASURED_DATA does not name the folder of the measured data",
+)
+FOLDER = Path(MEASURED or "")
+
+# An acceleration's amplitude with a displacement's phase, as the file's own README says.
+BRAKE_REUSS = """
+quantity = "receptance"
+[frequency]
+column = "FRdata.*[*].frequency"
+unit = "Hz"
+[drive]
+column = "FRdata.*[*].force"
+unit = "N"
+[amplitude]
+column = "FRdata.*[*].amplitude"
+unit = "m/s^2"
+[phase]
+column = "FRdata.*[*].phase"
+unit = "rad"
+[controlled]
+force = "ForceControl*"
+displacement = "ResponseControl*"
+"""
+
+
+@pytest.fixture(scope="module")
+def beam(tmp_path_factory: pytest.TempPathFactory) -> FrequencyResponse:
+    columns = tmp_path_factory.mktemp("lab") / "brb.toml"
+    columns.write_text(BRAKE_REUSS)
+    return read_frequency_response(FOLDER / "brb" / "ForcedFrequencyResponses.mat", columns=columns)
+
+
+class TestBrakeReussBeam:
+    def test_twelve_levels_with_one_map(self, beam: FrequencyResponse) -> None:
+        assert beam.n == 12 * 41
+        assert beam.levels == [f"ForceControl[{i}]" for i in range(4)] + [
+            f"ResponseControl[{i}]" for i in range(8)
+        ]
+        assert (beam.quantity, beam.unit) == ("receptance", "m/N")
+        for label in beam.levels:
+            held = "force" if label.startswith("Force") else "displacement"
+            assert set(beam.select(level=label).controlled) == {held}
+
+    def test_numbers_are_the_file_s(self, beam: FrequencyResponse) -> None:
+        content = loadmat(
+            str(FOLDER / "brb" / "ForcedFrequencyResponses.mat"), simplify_cells=True
+        )["FRdata"]
+        for label in beam.levels:
+            kind, index = label.rstrip("]").split("[")
+            raw, part = content[kind][int(index)], beam.select(level=label)
+            displacement = raw["amplitude"] / (2 * np.pi * raw["frequency"]) ** 2
+            assert part.amplitude is not None
+            np.testing.assert_allclose(part.amplitude, displacement, rtol=1e-14)
+            np.testing.assert_array_equal(part.drive, raw["force"])
+            expected = displacement / raw["force"] * np.exp(1j * raw["phase"])
+            np.testing.assert_allclose(part.response, expected, rtol=1e-13)
+
+    def test_the_beam_dissipates(self, beam: FrequencyResponse) -> None:
+        """Passive at every point, and resonant within the band, as a displacement's phase says."""
+        Z = beam.to("dynamic_stiffness")
+        assert (Z.response.imag > 0.0).all()
+        for label in beam.levels:
+            real = Z.select(level=label).response.real
+            assert real[0] > 0.0 > real[-1]
+
+    def test_force_of_a_response_controlled_level_varies(self, beam: FrequencyResponse) -> None:
+        for label in beam.levels[4:]:
+            part = beam.select(level=label)
+            assert part.drive is not None
+            assert part.amplitude is not None
+            assert part.drive.min() < 0.5 * part.drive.max()
+            assert part.amplitude.max() < 1.2 * part.amplitude.min()
+
+    def test_inspect_proposes_the_paths(self) -> None:
+        contents = inspect(FOLDER / "brb" / "ForcedFrequencyResponses.mat")
+        for name in ("frequency", "amplitude", "force", "phase"):
+            assert f'column = "FRdata.*[*].{name}"' in contents.column_map
+
+    def test_survives_a_file(self, beam: FrequencyResponse, tmp_path: Path) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            back = read_frequency_response(beam.save(tmp_path / "brb.csv.gz"))
+        np.testing.assert_array_equal(back.response, beam.response)
+        assert back.levels == beam.levels
+
+
+class TestFrictionDamper:
+    @pytest.mark.parametrize("path", sorted((FOLDER / "brfd").glob("*.csv")), ids=lambda p: p.stem)
+    def test_every_file_is_a_record(self, path: Path) -> None:
+        record = read_record(path, displacement="displacement", force="friction force")
+        raw = np.loadtxt(path, delimiter=",", skiprows=1)
+        np.testing.assert_array_equal(record.time, raw[:, 0])
+        kip = 1000.0 * 0.45359237 * 9.80665
+        assert record.displacement is not None
+        assert record.force is not None
+        np.testing.assert_allclose(record.displacement, raw[:, 1] * 0.0254, rtol=1e-14)
+        np.testing.assert_allclose(record.force, raw[:, 2] * kip, rtol=1e-14)
+        assert record.sample_rate == pytest.approx(1024.0, rel=1e-6)
+        assert record.uniform
+        assert not len(record.gaps)
+
+    def test_there_are_ten(self) -> None:
+        assert len(list((FOLDER / "brfd").glob("*.csv"))) == 10
+
+    def test_the_damper_dissipates(self) -> None:
+        """Work over a whole test is positive, in joules that kip and inch alone would not give."""
+        record = read_record(
+            FOLDER / "brfd" / "band30lb_0.5Hz_1in.csv",
+            displacement="displacement",
+            force="friction force",
+        )
+        assert record.displacement is not None
+        work = float(np.trapezoid(record.force_samples, record.displacement))
+        assert 1e3 < work < 1e5
+
+    def test_motions_have_to_be_chosen(self) -> None:
+        from dahl_ident.errors import DataError
+
+        with pytest.raises(DataError, match="displacement and velocity found; expected one"):
+            read_record(FOLDER / "brfd" / "band30lb_2Hz_0.5in.csv", force="friction force")
