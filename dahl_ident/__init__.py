@@ -10,7 +10,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dahl_ident.control_interop import DahlNonlinearity
     from dahl_ident.data import FrequencyResponse, Record, read_frequency_response, read_record
+    from dahl_ident.diagnostics import identifiability
     from dahl_ident.elements import Dahl, Damper, LinearSystem, Mass, Model, Spring
     from dahl_ident.problem import Problem
     from dahl_ident.results import FitResult, fit
@@ -20,12 +22,14 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _ROOMS = {
+    "dahl_ident.control_interop": ("DahlNonlinearity",),
     "dahl_ident.data": (
         "FrequencyResponse",
         "Record",
         "read_frequency_response",
         "read_record",
     ),
+    "dahl_ident.diagnostics": ("identifiability",),
     "dahl_ident.elements": ("Dahl", "Damper", "LinearSystem", "Mass", "Model", "Spring"),
     "dahl_ident.problem": ("Problem",),
     "dahl_ident.results": ("FitResult", "fit"),
@@ -36,6 +40,7 @@ _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = [
     "Dahl",
+    "DahlNonlinearity",
     "Damper",
     "FitResult",
     "FrequencyResponse",
@@ -47,6 +52,7 @@ __all__ = [
     "Sensors",
     "Spring",
     "fit",
+    "identifiability",
     "read_frequency_response",
     "read_record",
     "response",

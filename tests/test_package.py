@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[1]
 
 PUBLIC_NAMES = [
     "Dahl",
+    "DahlNonlinearity",
     "Damper",
     "FitResult",
     "FrequencyResponse",
@@ -26,6 +27,7 @@ PUBLIC_NAMES = [
     "Sensors",
     "Spring",
     "fit",
+    "identifiability",
     "read_frequency_response",
     "read_record",
     "response",

@@ -1,1 +1,13 @@
-"""placeholder"""
+"""Judging an estimate: how far to trust its numbers, and what the data cannot say."""
+
+from dahl_ident.diagnostics.verdicts import Identifiability, Verdict, identifiability
+from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval, IntervalComparison
+
+__all__ = [
+    "ConfidenceIntervals",
+    "Identifiability",
+    "Interval",
+    "IntervalComparison",
+    "Verdict",
+    "identifiability",
+]

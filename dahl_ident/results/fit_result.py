@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -12,11 +12,20 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.diagnostics.verdicts import Identifiability, judged
+from dahl_ident.diagnostics.intervals import (
+    ConfidenceIntervals,
+    IntervalComparison,
+    Method,
+    compare,
+    intervals,
+)
+from dahl_ident.diagnostics.levels import LEVELS
 from dahl_ident.elements import Model, Parameter
 from dahl_ident.fitting.optimum import Combination, Optimum
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem
-from dahl_ident.results.formatting import with_unit
 
 
 @dataclass(frozen=True)
@@ -91,6 +100,7 @@ class FitResult:
 
     def __init__(self, optimum: Optimum) -> None:
         self._optimum = optimum
+        self._intervals: dict[tuple[str, tuple[float, ...]], ConfidenceIntervals] = {}
 
     @property
     def optimum(self) -> Optimum:
@@ -246,6 +256,65 @@ class FitResult:
         values = self.problem.to_values(self._optimum.theta).tolist()
         found = dict(zip(self.var_names, values, strict=True))
         return model.with_values({name: v for name, v in found.items() if name in own})
+
+    # Judging
+
+    def conf_interval(
+        self, method: Method = "profile", levels: Sequence[float] = LEVELS
+    ) -> ConfidenceIntervals:
+        """Return confidence intervals of every free parameter.
+
+        Parameters
+        ----------
+        method : {"profile", "wald"}, default "profile"
+            See :mod:`dahl_ident.diagnostics.intervals`, which says what to use when.
+        levels : sequence of float, default 0.6827, 0.9545, 0.9973
+            Confidence levels.
+
+        Returns
+        -------
+        ConfidenceIntervals
+            A mapping from the parameter's name to its intervals; a side on which the data set no
+            limit is open. Profiles never raise, however badly a parameter is determined.
+
+        Raises
+        ------
+        ValidationError
+            If `method` is unknown or a level is not between 0 and 1.
+        """
+        key = (method, tuple(levels))
+        if key not in self._intervals:
+            self._intervals[key] = intervals(self._optimum, method, levels)
+        return self._intervals[key]
+
+    def compare_intervals(
+        self, methods: Sequence[Method] = ("wald", "profile"), levels: Sequence[float] = LEVELS
+    ) -> IntervalComparison:
+        """Return the intervals of several methods side by side, and where they disagree.
+
+        Parameters
+        ----------
+        methods : sequence of str, default ("wald", "profile")
+            The last is the most trusted.
+        levels : sequence of float, default 0.6827, 0.9545, 0.9973
+            Confidence levels.
+
+        Returns
+        -------
+        IntervalComparison
+            Printed, a table with the disagreements.
+
+        Raises
+        ------
+        ValidationError
+            If there are fewer than two methods, one is unknown, or a level is impossible.
+        """
+        return compare(self._optimum, [self.conf_interval(method, levels) for method in methods])
+
+    @cached_property
+    def identifiability(self) -> Identifiability:
+        """Which parameters, or which combinations of them, the data determine."""
+        return judged(self._optimum, self.conf_interval())
 
     def __repr__(self) -> str:
         estimates = ", ".join(str(self.params[name]) for name in self.var_names)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 
 def rounded(value: float, uncertainty: float | None) -> tuple[str, str]:
@@ -67,6 +68,17 @@ def with_unit(value: float, uncertainty: float | None, unit: str) -> str:
     """
     number, error = rounded(value, uncertainty)
     return f"{number} +- {error} {unit}".rstrip()
+
+
+def listed(words: Sequence[str]) -> str:
+    """Return ``"a, b and c"``.
+
+    Examples
+    --------
+    >>> listed(["f_max", "sigma", "alpha"])
+    'f_max, sigma and alpha'
+    """
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def interval(lower: float, upper: float, unit: str) -> str:

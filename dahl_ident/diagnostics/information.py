@@ -1,0 +1,78 @@
+"""Fisher information at an optimum: how well each direction of parameter space is determined."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.fitting import Optimum
+
+_NULL = 1e-13  # eigenvalue of the scaled information below which a direction is undetermined
+_PART = 1e-4  # of a direction in the undetermined ones that matters
+
+
+class Information:
+    """First-order variances of anything that depends on the parameters.
+
+    Where the covariance is finite it is the optimum's own. Where data leave a direction open,
+    what does not depend on that direction still has a finite variance here.
+    """
+
+    def __init__(self, optimum: Optimum) -> None:
+        self._covariance = optimum.covariance
+        self.regular = bool(np.isfinite(optimum.covariance).all())
+        scale = optimum.scale if np.isfinite(optimum.scale) and optimum.scale > 0.0 else 1.0
+        information = optimum.problem.information(optimum.theta, scale)
+        size = np.sqrt(np.diagonal(information))
+        self._size = np.where((size > 0.0) & np.isfinite(size), size, 1.0)
+        scaled = information / np.outer(self._size, self._size)
+        self.eigenvalues, self._vectors = np.linalg.eigh(np.where(np.isfinite(scaled), scaled, 0.0))
+        self._null = self.eigenvalues <= _NULL * max(1.0, float(self.eigenvalues[-1]))
+
+    @property
+    def rank(self) -> int:
+        """Number of directions that the data determine at all."""
+        return int((~self._null).sum())
+
+    def variance(self, directions: FloatArray) -> FloatArray:
+        """Return the variance of directions . theta, shape (...), for directions (..., P)."""
+        if self.regular:
+            C = self._covariance
+            return np.asarray(np.einsum("...i,ij,...j->...", directions, C, directions))
+        scaled = directions / self._size
+        parts = scaled @ self._vectors
+        length = np.linalg.norm(scaled, axis=-1, keepdims=True)
+        lost = np.abs(parts[..., self._null]) > _PART * length
+        known = parts[..., ~self._null] ** 2 / self.eigenvalues[~self._null]
+        return np.where(lost.any(axis=-1), np.inf, known.sum(axis=-1))
+
+    def std(self, directions: FloatArray) -> FloatArray:
+        """Return the standard deviation of directions . theta."""
+        return np.sqrt(self.variance(directions))
+
+    def weakest(self, natural: FloatArray) -> FloatArray:
+        """Return the least determined direction of theta/natural, a unit vector, shape (P,)."""
+        information = (self._vectors * np.maximum(self.eigenvalues, 0.0)) @ self._vectors.T
+        lever = self._size * natural
+        vector = np.linalg.eigh(information * np.outer(lever, lever))[1][:, 0]
+        return np.asarray(vector * np.sign(vector[np.argmax(np.abs(vector))]))
+
+
+def shares(optimum: Optimum) -> FloatArray:
+    """Return each row's share of what the data say about each parameter, shape (P, n).
+
+    The part of a parameter's information that no other parameter can explain away; the shares
+    of one parameter sum to 1.
+    """
+    m = optimum.problem.n_residuals
+    J = optimum.jacobian[:m]
+    result = []
+    for i in range(J.shape[1]):
+        others = np.delete(J, i, axis=1)
+        size = np.linalg.norm(others, axis=0)
+        others = others / np.where(size > 0.0, size, 1.0)
+        own = J[:, i] - others @ np.linalg.lstsq(others, J[:, i], rcond=None)[0]
+        squares = own[0::2] ** 2 + own[1::2] ** 2
+        total = squares.sum()
+        result.append(squares / total if total > 0.0 else np.full(m // 2, np.nan))
+    return np.array(result)

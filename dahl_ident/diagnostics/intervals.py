@@ -1,0 +1,292 @@
+"""Confidence intervals: which numbers the data leave possible for each parameter.
+
+Three ways, from quick to thorough:
+
+``wald``
+    Estimate plus and minus standard errors, in search coordinates (for positive parameters a
+    factor). Right where the problem is nearly linear over the interval.
+``profile``
+    Where the deviance, with all other parameters optimal, rises to its threshold
+    (:mod:`dahl_ident.diagnostics.profile`). Follows curvature; a side on which the data set no
+    limit is open.
+``bootstrap``
+    Fits to simulated repetitions of the measurement, studentised
+    (:mod:`dahl_ident.diagnostics.bootstrap`). Follows the estimate's actual distribution.
+
+Which when: ``wald`` comes with every fit and is enough while ``compare_intervals`` shows no
+disagreement; ``profile`` whenever a parameter is badly determined; ``bootstrap`` to check both.
+Where the noise's scale was estimated, thresholds are those of Student's t and F.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.levels import LEVELS, checked_levels, percent, thresholds
+from dahl_ident.diagnostics.profile import Profiler
+from dahl_ident.errors import ValidationError
+from dahl_ident.fitting import Optimum
+
+Method = Literal["wald", "profile", "bootstrap"]
+
+
+class Interval(NamedTuple):
+    """One confidence interval; an open end is infinite, or zero for a positive parameter."""
+
+    level: float
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
+    """Intervals of every free parameter at several levels; a mapping by the parameter's name.
+
+    Attributes
+    ----------
+    method : str
+        How they were made.
+    levels : ndarray, shape (L,)
+        Rising.
+    names, units : tuple of str
+        The P parameters.
+    estimate : ndarray, shape (P,)
+        The estimates.
+    lower, upper : ndarray, shape (L, P)
+        Limits in the parameters' units.
+    note : str
+        What the method assumes here, such as the degrees of freedom of its threshold.
+    """
+
+    method: Method
+    levels: FloatArray
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    estimate: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    note: str
+
+    def __getitem__(self, name: str) -> tuple[Interval, ...]:
+        if name not in self.names:
+            raise KeyError(f"{name} is no free parameter; there are {', '.join(self.names)}")
+        i = self.names.index(name)
+        rows = zip(self.levels, self.lower[:, i], self.upper[:, i], strict=True)
+        return tuple(Interval(float(c), float(a), float(b)) for c, a, b in rows)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def at(self, level: float) -> dict[str, Interval]:
+        """Return the intervals of one level, by name."""
+        (row,) = np.flatnonzero(np.isclose(self.levels, level))
+        return {name: self[name][row] for name in self.names}
+
+    def __str__(self) -> str:
+        head = ["", *(f"-{percent(c)}" for c in self.levels[::-1]), "estimate"]
+        head += [percent(c) for c in self.levels]
+        rows = [head]
+        for i, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
+            numbers = [*self.lower[::-1, i], self.estimate[i], *self.upper[:, i]]
+            rows.append([f"{name} [{unit}]" if unit else name, *(f"{v:.5g}" for v in numbers)])
+        widths = [max(len(row[c]) for row in rows) for c in range(len(head))]
+        lines = [
+            "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])])
+            for row in rows
+        ]
+        return "\n".join([f"{self.method} intervals ({self.note})", *lines])
+
+    def to_frame(self) -> Any:
+        """Return a pandas table: one row a parameter and level."""
+        import pandas as pd
+
+        rows = [
+            {"parameter": name, "unit": unit, "method": self.method, **interval._asdict()}
+            for name, unit in zip(self.names, self.units, strict=True)
+            for interval in self[name]
+        ]
+        return pd.DataFrame(rows)
+
+
+def intervals(
+    optimum: Optimum, method: Method, levels: Sequence[float] = LEVELS
+) -> ConfidenceIntervals:
+    """Return the intervals of one method."""
+    if method not in _METHODS:
+        raise ValidationError(f"method is {method!r}; expected one of {', '.join(_METHODS)}")
+    return _METHODS[method](optimum, levels)
+
+
+def wald_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> ConfidenceIntervals:
+    """Return theta +- q stderr, transformed to parameter values.
+
+    Parameters
+    ----------
+    optimum : Optimum
+        The estimate.
+    levels : sequence of float, default 0.6827, 0.9545, 0.9973
+        Confidence levels.
+
+    Returns
+    -------
+    ConfidenceIntervals
+        Everything possible where a parameter is undetermined.
+
+    Raises
+    ------
+    ValidationError
+        If a level is not between 0 and 1.
+    """
+    array = checked_levels(levels)
+    error = np.sqrt(np.diagonal(optimum.covariance))
+    width = thresholds(optimum, array)[:, None] * error
+    width = np.where(np.isfinite(width), width, np.inf)
+    return intervals_from_search(
+        optimum, "wald", array, optimum.theta - width, optimum.theta + width
+    )
+
+
+def profile_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> ConfidenceIntervals:
+    """Return where the profile of the deviance meets the thresholds; never raises for a hard one.
+
+    Parameters
+    ----------
+    optimum : Optimum
+        The estimate.
+    levels : sequence of float, default 0.6827, 0.9545, 0.9973
+        Confidence levels.
+
+    Returns
+    -------
+    ConfidenceIntervals
+        Ends are open where the data set no limit; a bound of the parameter ends an interval.
+
+    Raises
+    ------
+    ValidationError
+        If a level is not between 0 and 1.
+    """
+    array = checked_levels(levels)
+    lower, upper = Profiler(optimum).limits(thresholds(optimum, array))
+    return intervals_from_search(optimum, "profile", array, lower, upper)
+
+
+def intervals_from_search(
+    optimum: Optimum, method: Method, levels: FloatArray, lower: FloatArray, upper: FloatArray
+) -> ConfidenceIntervals:
+    """Return intervals whose limits are given in search coordinates, shape (L, P)."""
+    problem = optimum.problem
+    low, high = problem.bounds()
+    if optimum.scale_known:
+        note = "noise as given by the data: normal and chi-square"
+    else:
+        note = f"noise scale estimated: t and F with {optimum.dof} degrees of freedom"
+    return ConfidenceIntervals(
+        method,
+        levels,
+        problem.names,
+        tuple(p.unit for p in problem.parameters),
+        optimum.values,
+        problem.to_values(np.maximum(lower, low)),
+        problem.to_values(np.minimum(upper, high)),
+        note,
+    )
+
+
+_METHODS: dict[str, Callable[[Optimum, Sequence[float]], ConfidenceIntervals]] = {
+    "wald": wald_intervals,
+    "profile": profile_intervals,
+}
+
+
+class Disagreement(NamedTuple):
+    """A limit on which two methods differ."""
+
+    name: str
+    level: float
+    side: str
+    methods: tuple[str, str]
+    limits: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class IntervalComparison:
+    """Intervals of several methods side by side, with the limits on which they disagree."""
+
+    intervals: tuple[ConfidenceIntervals, ...]
+    disagreements: tuple[Disagreement, ...]
+
+    def __str__(self) -> str:
+        parts = [str(one) for one in self.intervals]
+        if not self.disagreements:
+            return "\n\n".join([*parts, "The methods agree."])
+        lines = [
+            f"{d.name}: the {d.side} {percent(d.level)} limit is "
+            f"{' and '.join(f'{v:.5g} by {m}' for v, m in zip(d.limits, d.methods, strict=True))}"
+            "; trust the latter"
+            for d in self.disagreements
+        ]
+        return "\n\n".join([*parts, "\n".join(["The methods disagree:", *lines])])
+
+
+def compare(
+    optimum: Optimum, intervals: Sequence[ConfidenceIntervals], tolerance: float = 0.2
+) -> IntervalComparison:
+    """Return where each method differs from the last by more than `tolerance` half widths.
+
+    Parameters
+    ----------
+    optimum : Optimum
+        The estimate.
+    intervals : sequence of ConfidenceIntervals
+        At least two, of the same levels; the last is the most trusted.
+    tolerance : float, default 0.2
+        Difference of a limit that counts, over its distance from the estimate.
+
+    Returns
+    -------
+    IntervalComparison
+        With every limit that disagrees.
+
+    Raises
+    ------
+    ValidationError
+        If there are fewer than two, or their levels differ.
+    """
+    if len(intervals) < 2:
+        raise ValidationError(f"{len(intervals)} intervals given; a comparison needs two or more")
+    last, found = intervals[-1], []
+    for other in intervals[:-1]:
+        if not np.array_equal(other.levels, last.levels):
+            raise ValidationError(f"{other.method} and {last.method} intervals differ in level")
+        for side in ("lower", "upper"):
+            ours, theirs = (_search(optimum, getattr(one, side)) for one in (last, other))
+            with np.errstate(invalid="ignore"):
+                apart = np.abs(ours - theirs) > tolerance * np.abs(ours - optimum.theta)
+            apart |= np.isinf(ours) != np.isinf(theirs)
+            found += [
+                Disagreement(
+                    last.names[i],
+                    float(last.levels[level]),
+                    side,
+                    (other.method, last.method),
+                    (getattr(other, side)[level, i], getattr(last, side)[level, i]),
+                )
+                for level, i in np.argwhere(apart).tolist()
+            ]
+    return IntervalComparison(tuple(intervals), tuple(found))
+
+
+def _search(optimum: Optimum, values: FloatArray) -> FloatArray:
+    """Return search coordinates, infinite where a value has none."""
+    positive = np.array([p.transform == "log" for p in optimum.problem.parameters])
+    with np.errstate(divide="ignore"):
+        return np.where(positive, np.log(np.where(positive, values, 1.0)), values)

@@ -1,0 +1,45 @@
+"""Confidence levels, and how many standard errors each of them takes.
+
+Where the noise's scale is known, an estimate's error is normal and the rise of -2 ln L follows
+chi-square; where the scale was estimated with nu degrees of freedom, they follow Student's t and
+F(1, nu). Both are said here by one number a level: the threshold q, with ``theta_hat +- q stderr``
+on one side and a rise of the deviance by q^2 on the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import special
+
+from dahl_ident.arrays import FloatArray, array_between
+from dahl_ident.errors import ValidationError
+from dahl_ident.fitting import Optimum
+
+LEVELS = (0.6827, 0.9545, 0.9973)
+
+
+def checked_levels(levels: Sequence[float]) -> FloatArray:
+    """Return confidence levels as an array, rising, or say what is wrong with them."""
+    array = np.sort(np.atleast_1d(array_between(levels, "levels", 0.0, 1.0)))
+    if array.ndim != 1 or array.size == 0 or array[0] <= 0.0 or array[-1] >= 1.0:
+        raise ValidationError(
+            f"levels is {levels!r}; expected numbers between 0 and 1, such as 0.95"
+        )
+    return array
+
+
+def thresholds(optimum: Optimum, levels: FloatArray) -> FloatArray:
+    """Return q of each level: normal where the scale is known, else Student's t (or NaN)."""
+    upper = 0.5 * (1.0 + levels)
+    if optimum.scale_known:
+        return np.asarray(special.ndtri(upper))
+    if optimum.dof <= 0:
+        return np.full(levels.shape, np.nan)
+    return np.asarray(special.stdtrit(optimum.dof, upper))
+
+
+def percent(level: float) -> str:
+    """Return a level as text: ``"95.45 %"``."""
+    return f"{100.0 * level:.4g} %"

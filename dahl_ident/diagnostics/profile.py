@@ -1,0 +1,409 @@
+r"""Profile likelihood: how far a parameter can go while the others make the best of it.
+
+The deviance of a parameter at a value is the rise of -2 ln L, with that parameter held there and
+all others optimal,
+
+    D(theta_i) = (min S(theta | theta_i) - min S(theta)) / s^2,
+
+s the noise's scale. Its square root with the sign of the side is nearly a straight line where the
+problem is nearly linear, and its slope is known without another search (the envelope theorem), so
+Newton's method on that root finds a limit in few steps. All parameters, both sides and all levels
+are searched together; each step solves all their constrained problems at once, from the tangent
+of the last solution.
+
+A profile that stays below its threshold out to where the model has become its own limit has no
+limit on that side: the interval is open there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements import Dahl, LinearSystem, Parameter, Spring
+from dahl_ident.fitting import Optimum
+from dahl_ident.fitting.levenberg_marquardt import minimise
+from dahl_ident.fitting.limits import Chart, valleys
+from dahl_ident.fitting.losses import loss_named
+from dahl_ident.fitting.status import Status
+from dahl_ident.problem import Quadratic
+
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+
+_STEPS = 60
+_SEARCH_STEPS = 40
+_LOOSENESS = 1e5  # a search this loose still gives the deviance, flat at its minimum, to 1e-6
+_NEAR = 1e-3  # in the root of the deviance; one more Newton step needs no solution
+_LONGEST = 3.0  # step of a logarithm
+_GROWTH, _SHRINKAGE = 3.0, 0.3  # of a step over the last, until the limit is bracketed
+_NARROW = 1e-4  # width of a bracket over its distance
+_FARTHEST = 1e6  # conditional standard errors of a parameter that is no logarithm
+_LEAST_X_C = 1e-14  # over the smallest amplitude
+_MOST_X_C, _MOST_X_C_BESIDE = 1e8, 1e5  # over the largest, alone and beside a spring
+_SOFTEST = 1e-12  # sigma over the median stiffness
+_FARTHEST_LOG = 80.0
+_FARTHEST_RATIO = 4.0  # of the logarithm of a pure number: an exponent or a gain
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The deviance of one parameter over its search coordinate."""
+
+    coordinate: FloatArray
+    deviance: FloatArray
+
+
+class Profiler:
+    """Profiles of every free parameter of one optimum."""
+
+    def __init__(self, optimum: Optimum) -> None:
+        self._optimum, self._problem = optimum, optimum.problem
+        self._scale = 1.0 if optimum.scale_known else optimum.scale
+        self._loss = loss_named(optimum.loss)
+        self._logarithmic = np.array([p.transform == "log" for p in self._problem.parameters])
+        self._low, self._high = self._problem.bounds()
+
+    # Limits
+
+    def limits(self, thresholds: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return lower and upper limits in search coordinates, each of shape (levels, P).
+
+        `thresholds` are roots of the deviance. Minus and plus infinity where a side is open.
+        """
+        P, L = len(self._problem.names), len(thresholds)
+        lower, upper = np.full((L, P), -np.inf), np.full((L, P), np.inf)
+        if np.isfinite(self._scale) and np.isfinite(thresholds).all():
+            ends = np.stack([lower, upper])
+            side, level, index = (a.ravel() for a in np.indices((2, L, P)))
+            search = np.flatnonzero(~self._open[side, index])
+            ends[side[search], level[search], index[search]] = self._ends(
+                index[search], 2.0 * side[search] - 1.0, thresholds[level[search]]
+            )
+            lower, upper = ends
+        return lower, upper
+
+    def _ends(self, index: IntArray, sign: FloatArray, target: FloatArray) -> FloatArray:
+        """Return where the profile of parameter `index` meets `target` on the side of `sign`."""
+        rows, S = np.arange(len(index)), len(index)
+        theta = np.tile(self._optimum.theta, (S, 1))
+        origin = theta[rows, index]
+        step = self._first_step[index] * target
+        tangent = self._tangents[index]
+        inner, outer, end = np.zeros(S), np.full(S, np.inf), np.full(S, np.nan)
+        furthest = np.where(sign > 0.0, self._high[index] - origin, origin - self._low[index])
+        jump = self._jump(index, sign)
+        jumps = np.isfinite(jump)
+        position = np.minimum(np.where(jumps, jump, step), furthest)  # distance from the optimum
+        step = np.where(jumps, np.abs(origin + sign * position), step)
+        active, entered = rows, np.zeros(S, dtype=np.bool_)
+        for _ in range(_STEPS):
+            a = active
+            moved = sign[a] * position[a] + origin[a] - theta[a, index[a]]
+            at = self._from_best_start(index[a], theta[a], self._along(tangent[a], moved))
+            root = np.sqrt(np.maximum(at.deviance, 0.0))
+            below = root < target[a]
+            inner[a[below]] = position[a[below]]
+            outer[a[~below]] = position[a[~below]]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                newton = (target[a] - root) * root / (sign[a] * at.slope)
+            stuck = below & (position[a] >= furthest[a])
+            reached = self._reachable(at.theta, index[a], position[a])
+            entered[a] |= reached
+            open_ = below & (stuck | (entered[a] & ~reached))
+            near = (np.abs(root - target[a]) < _NEAR) & np.isfinite(newton)
+            with np.errstate(invalid="ignore"):
+                near |= np.isfinite(outer[a]) & (outer[a] - inner[a] <= _NARROW * outer[a])
+            newton = np.where(np.isfinite(newton), newton, np.inf)
+            last = np.where(np.abs(newton) < step[a], position[a] + newton, position[a])
+            end[a[near]] = last[near]
+            end[a[open_ & ~near]] = np.where(stuck, furthest[a], np.inf)[open_ & ~near]
+            theta[a[below]], tangent[a[below]] = at.theta[below], at.tangent[below]
+            keep = ~(near | open_)
+            active = a[keep]
+            if not active.size:
+                break
+            position[active], step[active] = self._next(
+                position[active],
+                newton[keep],
+                np.where(below[keep], step[active], np.inf),
+                inner[active],
+                outer[active],
+                furthest[active],
+                self._logarithmic[index[active]],
+            )
+        end[active] = outer[active]  # not met exactly: the wider limit
+        return np.asarray(origin + sign * end)
+
+    def _from_best_start(self, index: IntArray, theta: FloatArray, change: FloatArray) -> _Solution:
+        """Return constrained optima near theta + change, also from along microslip's valleys."""
+        best = self._constrained(index, theta + change)
+        for chart in self._valleys:
+            bent, applies = _along_valley(chart, index, theta, change)
+            if applies.any():
+                other = self._constrained(index[applies], bent[applies])
+                best = best.replaced(other, applies)
+        return best
+
+    @cached_property
+    def _valleys(self) -> list[Chart]:
+        return valleys(self._problem)
+
+    def _along(self, tangent: FloatArray, moved: FloatArray) -> FloatArray:
+        """Return the change of theta along its tangent, in logarithms of bearable length."""
+        change = moved[:, None] * tangent
+        short = np.clip(change, -_LONGEST, _LONGEST)
+        return np.where(self._logarithmic & (change != moved[:, None]), short, change)
+
+    @staticmethod
+    def _next(
+        position: FloatArray,
+        newton: FloatArray,
+        step: FloatArray,
+        inner: FloatArray,
+        outer: FloatArray,
+        furthest: FloatArray,
+        logarithmic: BoolArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the next distance from the optimum, inside what is known, and the step there."""
+        shortest = np.where(np.isfinite(outer), 0.0, _SHRINKAGE * step)
+        longest = np.where(logarithmic, np.minimum(_LONGEST, _GROWTH * step), _GROWTH * step)
+        new = position + np.clip(np.where(newton > 0.0, newton, np.inf), shortest, longest)
+        backward = position + newton  # where the last step went too far
+        new = np.where(position >= outer, backward, new)
+        bounded = np.isfinite(outer)
+        width = np.where(bounded, outer - inner, 1.0)
+        outside = bounded & ~((new > inner + 0.02 * width) & (new < outer - 0.02 * width))
+        new = np.where(outside, inner + 0.5 * width, new)
+        new = np.minimum(new, furthest)
+        return new, np.maximum(np.abs(new - position), 1e-300)
+
+    # Constrained problems
+
+    def curve(self, index: int, coordinate: FloatArray) -> FloatArray:
+        """Return the deviance of parameter `index` at each of `coordinate`."""
+        order = np.argsort(np.abs(coordinate - self._optimum.theta[index]))
+        deviance = np.empty(len(coordinate))
+        known = {0.0: self._optimum.theta, 1.0: self._optimum.theta}
+        for i in order:
+            side = float(coordinate[i] > self._optimum.theta[index])
+            start = known[side].copy()
+            start[index] = coordinate[i]
+            at = self._constrained(np.array([index]), start[None])
+            known[side], deviance[i] = at.theta[0], at.deviance[0]
+        return np.maximum(deviance, 0.0)
+
+    def _constrained(self, index: IntArray, start: FloatArray) -> _Solution:
+        """Return the optima with parameter `index` of each row held at its start."""
+        rows = np.arange(len(index))
+        held = np.zeros(start.shape, dtype=np.bool_)
+        held[rows, index] = True
+        theta = self._minimised(held, start)
+        beyond = ((theta < self._low) | (theta > self._high)) & ~held
+        if beyond.any():
+            theta = self._minimised(held | beyond, np.clip(theta, self._low, self._high))
+        cost, gradient, hessian = self._quadratic(theta)
+        deviance = 2.0 * (cost - self._least) * self._stretch
+        slope = gradient[rows, index] * self._stretch
+        return _Solution(theta, deviance, slope, _tangent(hessian, index))
+
+    def _minimised(self, held: BoolArray, start: FloatArray) -> FloatArray:
+        def evaluate(at: FloatArray, which: IntArray | None) -> Quadratic:
+            cost, gradient, hessian = self._quadratic(at)
+            fixed = held if which is None else held[which]
+            gradient = np.where(fixed, 0.0, gradient)
+            either = fixed[:, :, None] | fixed[:, None, :]
+            return Quadratic(cost, gradient, np.where(either, 0.0, hessian))
+
+        return minimise(
+            evaluate,
+            start,
+            self._logarithmic,
+            self._problem.n_residuals,
+            looseness=_LOOSENESS,
+            steps=_SEARCH_STEPS,
+        ).theta
+
+    def _quadratic(self, theta: FloatArray) -> Quadratic:
+        return self._problem.quadratic(theta, self._scale, self._loss)
+
+    @cached_property
+    def _least(self) -> float:
+        return self._optimum.cost / self._scale**2
+
+    @cached_property
+    def _at_optimum(self) -> Quadratic:
+        cost, gradient, hessian = self._quadratic(self._optimum.theta[None])
+        return Quadratic(cost[0], gradient[0], hessian[0])
+
+    @cached_property
+    def _tangents(self) -> FloatArray:
+        P = len(self._optimum.theta)
+        hessian = np.broadcast_to(self._at_optimum.hessian, (P, P, P))
+        return _tangent(hessian, np.arange(P))
+
+    @cached_property
+    def _stretch(self) -> float:
+        """Return the factor that gives a robust loss's deviance the spread of a chi-square."""
+        if self._loss is None:
+            return 1.0
+        expected = np.diagonal(np.linalg.pinv(self._at_optimum.hessian)) * self._scale**2
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = expected / np.diagonal(self._optimum.covariance)
+        ratio = ratio[np.isfinite(ratio) & (ratio > 0.0)]
+        return float(np.median(ratio)) if ratio.size else 1.0
+
+    # Where a search begins and where it gives up
+
+    @cached_property
+    def _conditional(self) -> FloatArray:
+        """Standard error of each parameter if all others were known."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(1.0 / np.sqrt(np.diagonal(self._at_optimum.hessian)))
+
+    @cached_property
+    def _first_step(self) -> FloatArray:
+        """Return the first step of a threshold of 1: a standard error, in logarithms at most 1."""
+        error = np.sqrt(np.diagonal(self._optimum.covariance))
+        step = np.where(np.isfinite(error) & (error > 0.0), error, self._conditional)
+        step = np.where(np.isfinite(step) & (step > 0.0), step, 1.0)
+        return np.where(self._logarithmic, np.minimum(step, 1.0), step)
+
+    @cached_property
+    def _open(self) -> BoolArray:
+        """Return which sides need no search, below and above, shape (2, P).
+
+        Those where the optimum lies at infinity or zero, and those of parameters that can change
+        without any change of the prediction.
+        """
+        values, status = self._optimum.values, self._optimum.status
+        flat = np.isinf(np.diagonal(self._optimum.covariance)) & (status is Status.SINGULAR)
+        flat |= status is Status.NOT_CONVERGED
+        below = (values == -np.inf) | (self._logarithmic & (values == 0.0))
+        return np.array([below | flat, (values == np.inf) | flat])
+
+    def _jump(self, index: IntArray, sign: FloatArray) -> FloatArray:
+        """Return the first distance where a spring lies at minus infinity: to where it is seen."""
+        jump, theta = np.full(len(index), np.nan), self._optimum.theta
+        for chart in self._valleys:
+            assert chart.tied is not None
+            spring, _ = chart.tied
+            total = float(chart.phi(theta[None])[0, spring])
+            if self._optimum.values[spring] == -np.inf:
+                far = (index == spring) & (sign > 0.0)
+                jump[far] = total - 2.0 * abs(total) - theta[spring]
+        return jump
+
+    def _reachable(self, theta: FloatArray, index: IntArray, position: FloatArray) -> BoolArray:
+        """Return whether the model still changes farther out."""
+        near = position < self._farthest[index]
+        columns = dict(zip(self._problem.names, theta.T, strict=True))
+        for f_max, sigma in self._friction:
+            own = np.isin(np.array(self._problem.names)[index], (f_max.name, sigma.name))
+            ln_f_max, ln_sigma = (columns.get(p.name, _ln(p)) for p in (f_max, sigma))
+            ln_x_c = ln_f_max - ln_sigma
+            seen = (ln_x_c > self._reach.least) & (ln_x_c < self._reach.most)
+            near &= ~own | (seen & (ln_sigma > self._reach.softest))
+        return near
+
+    @cached_property
+    def _friction(self) -> list[tuple[Parameter, Parameter]]:
+        """f_max and sigma of every Dahl element."""
+        elements = self._problem.model.elements
+        return [(e.parameters[0], e.parameters[1]) for e in elements if isinstance(e, Dahl)]
+
+    @cached_property
+    def _reach(self) -> _Reach:
+        view, springs = self._problem.stiffness_data, (Spring, LinearSystem)
+        beside = any(isinstance(e, springs) for e in self._problem.model.elements)
+        return _Reach(
+            float(np.log(view.amplitude.min() * _LEAST_X_C)),
+            float(np.log(view.amplitude.max() * (_MOST_X_C_BESIDE if beside else _MOST_X_C))),
+            float(np.log(np.median(np.abs(view.stiffness)) * _SOFTEST)),
+        )
+
+    @cached_property
+    def _farthest(self) -> FloatArray:
+        """Distance from the optimum beyond which a search gives up."""
+        pure = np.array([p.unit == "" for p in self._problem.parameters])
+        logarithms = np.where(pure, _FARTHEST_RATIO, _FARTHEST_LOG)
+        far = _FARTHEST * self._conditional + 2.0 * np.abs(self._optimum.theta)
+        return np.where(self._logarithmic, logarithms, far)
+
+
+class _Reach(NamedTuple):
+    """Range of ln x_c, and least ln sigma, outside of which friction is its own limit."""
+
+    least: float
+    most: float
+    softest: float
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Constrained optima: where, deviance, half its slope by the held coordinate, tangent."""
+
+    theta: FloatArray
+    deviance: FloatArray
+    slope: FloatArray
+    tangent: FloatArray
+
+    def replaced(self, other: _Solution, where: BoolArray) -> _Solution:
+        """Return these solutions with those of another search of the rows `where`, if better."""
+        places = np.flatnonzero(where)
+        better = other.deviance < self.deviance[places]
+        merged = [array.copy() for array in vars(self).values()]
+        for array, new in zip(merged, vars(other).values(), strict=True):
+            array[places[better]] = new[better]
+        return _Solution(*merged)
+
+
+def _along_valley(
+    chart: Chart, index: IntArray, theta: FloatArray, change: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return theta with one coordinate moved at constant sigma^2/f_max and sigma + stiffness.
+
+    Also which rows this is for: those whose coordinate is part of the valley.
+    """
+    assert chart.tied is not None
+    spring, sigma = chart.tied
+    (f_max,) = (int(i) for i in np.flatnonzero(chart.matrix[sigma]) if i != sigma)
+    wanted = (theta + change)[np.arange(len(index)), index]
+    phi = chart.phi(theta)
+    ln_kappa, total = phi[:, sigma], phi[:, spring]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ln_x_c: dict[int, FloatArray] = {
+            f_max: 0.5 * (wanted - ln_kappa),
+            sigma: wanted - ln_kappa,
+            spring: np.log(total - wanted) - ln_kappa,
+        }
+    for column, value in ln_x_c.items():
+        phi[:, f_max] = np.where(index == column, value, phi[:, f_max])
+    bent = chart.theta(phi)
+    bent[np.arange(len(index)), index] = wanted
+    return bent, np.isin(index, np.array([*ln_x_c])) & np.isfinite(bent).all(axis=1)
+
+
+def _tangent(hessian: FloatArray, index: IntArray) -> FloatArray:
+    """Return dtheta/dtheta_index along the profile, shape (S, P), 1 at `index` itself."""
+    S, P = hessian.shape[:2]
+    rows = np.arange(S)
+    H = np.where(np.isfinite(hessian), hessian, 0.0).copy()
+    b = -H[rows, :, index].copy()
+    b[rows, index] = 1.0
+    H[rows, index, :] = 0.0
+    H[rows, :, index] = 0.0
+    H[rows, index, index] = 1.0
+    size = np.sqrt(np.maximum(H[:, range(P), range(P)], 0.0))
+    size = np.where(size > 0.0, size, 1.0)
+    scaled = H / (size[:, :, None] * size[:, None, :]) + 1e-12 * np.eye(P)
+    return np.asarray(np.linalg.solve(scaled, (b / size)[:, :, None])[:, :, 0] / size)
+
+
+def _ln(parameter: Parameter) -> float:
+    return float("nan") if parameter.value is None else float(np.log(parameter.value))

@@ -1,0 +1,315 @@
+"""Identifiability: which parameter, or which combination, the data determine, and what to do.
+
+A parameter is **identified** where the standard deviation of its logarithm is below 0.25,
+**not identified** above 1, and **weakly identified** between. The standard deviation is the larger
+of two: the first-order one (Fisher information), and that of the profile (width of its 95.45 %
+interval over the widths of the threshold). A profile still open at 99.73 % is not identified
+whatever else is said. Parameters that may be zero or negative have no logarithm; theirs is the
+standard deviation over their size, or over a tenth of the size at which they would make up the
+whole response, if that is more.
+
+Where parameters are not identified, combinations of them may be
+(:mod:`dahl_ident.diagnostics.combinations`); where no known combination fits, the least
+determined direction is given as a vector.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Protocol
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.advice import advice
+from dahl_ident.diagnostics.combinations import Candidate, candidates
+from dahl_ident.diagnostics.formatting import interval as interval_text
+from dahl_ident.diagnostics.formatting import listed, with_unit
+from dahl_ident.diagnostics.information import Information, shares
+from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval
+from dahl_ident.diagnostics.levels import LEVELS, percent, thresholds
+from dahl_ident.diagnostics.units import shown_unit
+from dahl_ident.fitting import Optimum
+
+IDENTIFIED_BELOW = 0.25
+NOT_IDENTIFIED_ABOVE = 1.0
+_SIZE_THAT_MATTERS = 0.1  # of the response, for parameters that may be zero
+_VECTOR_PART = 0.05  # component of the undetermined direction worth naming
+
+
+class Verdict(Enum):
+    """How well a parameter is determined."""
+
+    IDENTIFIED = "identified"
+    WEAK = "weakly identified"
+    NOT_IDENTIFIED = "not identified"
+
+
+class Fit(Protocol):
+    """What can be judged: an optimum with its intervals."""
+
+    @property
+    def optimum(self) -> Optimum:
+        """The solver's result."""
+
+    def conf_interval(self, method: Any = ...) -> ConfidenceIntervals:
+        """Return confidence intervals."""
+
+
+@dataclass(frozen=True)
+class ParameterVerdict:
+    """What the data say about one parameter.
+
+    Attributes
+    ----------
+    name, unit : str
+        The parameter.
+    verdict : Verdict
+        Identified, weakly or not.
+    fisher_std, profile_std : float
+        Standard deviation of its logarithm, first order and by its profile; infinite where open.
+    interval : Interval
+        The 95.45 % profile interval.
+    text : str
+        All of it in words, with the reason and what to do where it is not identified.
+    """
+
+    name: str
+    unit: str
+    verdict: Verdict
+    fisher_std: float
+    profile_std: float
+    interval: Interval
+    text: str
+
+
+@dataclass(frozen=True)
+class DeterminedCombination:
+    """A combination that is determined although its parts are not."""
+
+    expression: str
+    unit: str
+    value: float
+    stderr: float
+
+    def __str__(self) -> str:
+        return f"{self.expression} = {with_unit(self.value, self.stderr, self.unit)}"
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """Which parameters and combinations the data determine.
+
+    Attributes
+    ----------
+    parameters : mapping of str to ParameterVerdict
+        By name.
+    combinations : tuple of DeterminedCombination
+        Determined combinations of parameters that are not.
+    rank : int
+        Directions that the data determine at all, to first order.
+    direction : mapping of str to float
+        Where no combination is known: the least determined direction in the parameters'
+        logarithms (in sizes that matter for those that have none).
+    information_shares : mapping of str to ndarray, shape (n,)
+        What part of the information on each parameter each row of data carries.
+    """
+
+    parameters: Mapping[str, ParameterVerdict]
+    combinations: tuple[DeterminedCombination, ...]
+    rank: int
+    direction: Mapping[str, float]
+    information_shares: Mapping[str, FloatArray]
+
+    def named(self, verdict: Verdict) -> list[str]:
+        """Return the names of the parameters with this verdict."""
+        return [name for name, p in self.parameters.items() if p.verdict is verdict]
+
+    @property
+    def complete(self) -> bool:
+        """Whether every parameter is identified, weakly or well."""
+        return not self.named(Verdict.NOT_IDENTIFIED)
+
+    @property
+    def determined(self) -> tuple[str, ...]:
+        """Names of what the data determine: identified parameters, then combinations."""
+        return (
+            *self.named(Verdict.IDENTIFIED),
+            *(combination.expression for combination in self.combinations),
+        )
+
+    @property
+    def headline(self) -> str:
+        """The verdict in one sentence."""
+        lost, weak = self.named(Verdict.NOT_IDENTIFIED), self.named(Verdict.WEAK)
+        if not lost and not weak:
+            return "Every parameter is identified."
+        if not lost:
+            return f"Every parameter is determined, but {listed(weak)} only weakly."
+        known = self.determined
+        only = f"Only {listed(known)} {'is' if len(known) == 1 else 'are'} determined"
+        return f"{only if known else 'Nothing is determined'}; not {listed(lost)}."
+
+    def __str__(self) -> str:
+        lines = [self.headline, *(f"- {p.text}" for p in self.parameters.values())]
+        lines += [f"- determined: {combination}" for combination in self.combinations]
+        if self.direction:
+            vector = ", ".join(f"{name} {value:+.2f}" for name, value in self.direction.items())
+            lines.append(f"- undetermined direction, in logarithms: {vector}")
+        return "\n".join(lines)
+
+
+def identifiability(fit: Fit) -> Identifiability:
+    """Say which parameters, or which combinations of them, the data determine.
+
+    Parameters
+    ----------
+    fit : FitResult
+        From :func:`dahl_ident.fit`, made with ``throw=False`` where no optimum was found.
+
+    Returns
+    -------
+    Identifiability
+        A verdict on each parameter with its reason; printed, it is a report in words.
+
+    Notes
+    -----
+    "Identified" means a standard deviation of the logarithm below 0.25, "not identified" above 1,
+    by Fisher information and profile together.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import dahl_ident as di
+    >>> rng = np.random.default_rng(1)
+    >>> A = np.geomspace(1e-4, 1e-2, 20)
+    >>> N = di.Dahl(f_max=0.1, sigma=30.0).describing_function(A)
+    >>> noise = np.exp(0.01 * rng.standard_normal((2, 20)).T @ [1.0, 1.0j])
+    >>> result = di.fit(di.FrequencyResponse(np.ones(20), N * noise, A), di.Dahl())
+    >>> print(identifiability(result).headline)
+    Every parameter is identified.
+    """
+    return judged(fit.optimum, fit.conf_interval("profile"))
+
+
+def judged(optimum: Optimum, intervals: ConfidenceIntervals) -> Identifiability:
+    """Return the verdicts on an optimum, given its profile intervals at the three LEVELS."""
+    information, problem = Information(optimum), optimum.problem
+    natural = natural_sizes(optimum)
+    fisher = np.sqrt(np.diagonal(optimum.covariance)) / natural
+    profile = _profile_std(optimum, intervals, natural)
+    verdicts = {
+        name: _verdict(float(f), float(p), intervals[name][-1])
+        for name, f, p in zip(problem.names, fisher, profile, strict=True)
+    }
+    lost = frozenset(n for n, v in verdicts.items() if v is Verdict.NOT_IDENTIFIED)
+    found = _determined(optimum, information, lost)
+    motion = problem.data.motion
+    parameters = {}
+    for i, (name, parameter) in enumerate(zip(problem.names, problem.parameters, strict=True)):
+        unit = shown_unit(parameter.unit, motion)
+        narrow, wide = intervals[name][1:]
+        limits = narrow if _is_closed(wide) else wide if _is_closed(narrow) else narrow
+        text = _text(optimum, name, unit, verdicts[name], limits, lost)
+        parameters[name] = ParameterVerdict(
+            name, unit, verdicts[name], float(fisher[i]), float(profile[i]), limits, text
+        )
+    direction = {}
+    if lost and not found:
+        vector = information.weakest(natural)
+        parts = zip(problem.names, vector.tolist(), strict=True)
+        direction = {n: v for n, v in parts if abs(v) > _VECTOR_PART}
+        direction = direction if len(direction) > 1 else {}
+    rows = dict(zip(problem.names, shares(optimum), strict=True))
+    return Identifiability(parameters, found, information.rank, direction, rows)
+
+
+def natural_sizes(optimum: Optimum) -> FloatArray:
+    """Return the size in theta that a standard deviation is compared with: 1 for logarithms."""
+    problem = optimum.problem
+    slope = np.abs(problem.prediction_jacobian(optimum.theta))
+    response = np.abs(problem.predict(optimum.theta))[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        whole = 1.0 / np.nanmax(slope / response, axis=0)
+    size = np.maximum(np.abs(optimum.theta), _SIZE_THAT_MATTERS * whole)
+    positive = np.array([p.transform == "log" for p in problem.parameters])
+    return np.where(positive | ~np.isfinite(size) | (size == 0.0), 1.0, size)
+
+
+def _profile_std(
+    optimum: Optimum, intervals: ConfidenceIntervals, natural: FloatArray
+) -> FloatArray:
+    """Return half the width of the 95.45 % interval over its threshold, in natural sizes."""
+    (q,) = thresholds(optimum, np.array([LEVELS[1]]))
+    positive = np.array([p.transform == "log" for p in optimum.problem.parameters])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = [
+            np.where(positive, np.log(np.where(positive, values, 1.0)), values)
+            for values in (intervals.lower[1], intervals.upper[1])
+        ]
+        std = (ends[1] - ends[0]) / (2.0 * q * natural)
+    return np.where(np.isnan(std), np.inf, std)
+
+
+def _verdict(fisher: float, profile: float, widest: Interval) -> Verdict:
+    spread = max(fisher, profile)
+    if not _is_closed(widest) or not spread <= NOT_IDENTIFIED_ABOVE:
+        return Verdict.NOT_IDENTIFIED
+    return Verdict.IDENTIFIED if spread < IDENTIFIED_BELOW else Verdict.WEAK
+
+
+def _is_closed(interval: Interval) -> bool:
+    return bool(np.isfinite(interval.upper) and np.isfinite(interval.lower))
+
+
+def _determined(
+    optimum: Optimum, information: Information, lost: frozenset[str]
+) -> tuple[DeterminedCombination, ...]:
+    """Return the combinations of parameters that are not identified, but are together."""
+    if optimum.combinations:
+        known = [c for c in optimum.combinations if c.expression not in optimum.names]
+        units = {c.expression: c.unit for c in candidates(optimum)}
+        return tuple(
+            DeterminedCombination(c.expression, units.get(c.expression, ""), c.value, c.stderr)
+            for c in known
+            if c.stderr < IDENTIFIED_BELOW * abs(c.value)
+        )
+    found = []
+    for candidate in candidates(optimum):
+        enough = candidate.members <= lost if candidate.is_sum else candidate.members & lost
+        if not enough:
+            continue
+        std = float(information.std(candidate.direction))
+        if candidate.is_sum and std > float(information.std(_parts_of(candidate)).min()):
+            continue  # one of its parts alone is known better
+        if std < IDENTIFIED_BELOW:
+            size = abs(candidate.value) * std
+            found.append(
+                DeterminedCombination(candidate.expression, candidate.unit, candidate.value, size)
+            )
+    return tuple(found)
+
+
+def _parts_of(candidate: Candidate) -> FloatArray:
+    """Return the direction of each member of a sum, one a row."""
+    members = np.flatnonzero(candidate.direction)
+    return np.diag(candidate.direction)[members]
+
+
+def _text(
+    optimum: Optimum,
+    name: str,
+    unit: str,
+    verdict: Verdict,
+    limits: Interval,
+    lost: frozenset[str],
+) -> str:
+    lower = -np.inf if limits.lower == 0.0 else limits.lower
+    within = f"{interval_text(lower, limits.upper, unit)} ({percent(limits.level)})"
+    if verdict is Verdict.IDENTIFIED:
+        return f"{name}: {within}, identified"
+    if verdict is Verdict.WEAK:
+        return f"{name}: {within}, weakly identified"
+    return f"{name}: {within}, not determined, {advice(optimum, name, limits, lost)}"

@@ -1,0 +1,344 @@
+"""The posterior of a model's parameters, as users hold it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import ComplexArray, FloatArray, whole_number
+from dahl_ident.bayes.chain import Chain, Settings
+from dahl_ident.bayes.convergence import Convergence
+from dahl_ident.bayes.density import Density
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.errors import SamplingError, ValidationError
+from dahl_ident.fitting import Optimum
+from dahl_ident.problem import Problem
+from dahl_ident.results.prior_rule import PriorRule, prior_rules
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+QUANTILES = {"2.5%": 0.025, "16%": 0.16, "median": 0.5, "84%": 0.84, "97.5%": 0.975}
+
+
+@dataclass(frozen=True)
+class PredictionBand:
+    """What the posterior predicts for each row of the data.
+
+    Attributes
+    ----------
+    gain, phase_deg : ndarray, shape (5, n)
+        Quantiles 2.5, 16, 50, 84 and 97.5 % of the model's response, noise not included.
+    """
+
+    gain: FloatArray
+    phase_deg: FloatArray
+
+
+class Posterior:
+    """Draws from the posterior, with the verdict on whether they can be trusted.
+
+    Made by :func:`dahl_ident.sample`. Names follow emcee where both have the same thing. The
+    unknown scale of the noise is a parameter of its own, ``noise_scale``.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The parameters, those of the model first; they order the last axis of every chain.
+    units : tuple of str
+        Their SI units.
+    problem : Problem
+        Data, model, noise and sensors.
+    priors : mapping of str to str
+        Every prior in words.
+    converged : bool
+        Whether the chain is long enough to be used.
+    message : str
+        The same in words; what is missing.
+    convergence : Convergence
+        tau, ESS and R-hat as numbers.
+    seed : int
+        With which the same chain comes out again.
+    """
+
+    def __init__(
+        self,
+        density: Density,
+        chain: Chain,
+        convergence: Convergence,
+        settings: Settings,
+        optimum: Optimum | None = None,
+    ) -> None:
+        self._density, self._chain = density, chain
+        self.convergence = convergence
+        self._settings, self._optimum = settings, optimum
+
+    @property
+    def problem(self) -> Problem:
+        """Data, model, noise and sensors."""
+        return self._density.problem
+
+    @property
+    def data(self) -> FrequencyResponse:
+        """The data."""
+        return self.problem.data
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters sampled."""
+        return self._density.names
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """SI units of the parameters."""
+        own = [p.unit for p in self.problem.parameters]
+        return (*own, *([""] * (len(self.names) - len(own))))
+
+    @property
+    def likelihood(self) -> str:
+        """How rows count: "gaussian", "student_t" or "none"."""
+        return self._density.likelihood
+
+    @property
+    def seed(self) -> int:
+        """With which the same chain comes out again."""
+        return self._settings.seed
+
+    @property
+    def optimum(self) -> Optimum | None:
+        """The least-squares optimum around which the walkers started."""
+        return self._optimum
+
+    @cached_property
+    def priors(self) -> Mapping[str, str]:
+        """Every prior in words."""
+        texts = {part.parameter.name: str(part) for part in self._density.prior.parts}
+        if self._density.has_scale:
+            texts[self.names[-1]] = "1/s"
+        return texts
+
+    # The chain
+
+    @property
+    def steps(self) -> int:
+        """Total number of steps, warm-up included."""
+        return self._chain.steps
+
+    @property
+    def warm_up(self) -> int:
+        """Steps that `summary`, draws and pictures leave out."""
+        return self.convergence.discard
+
+    @property
+    def converged(self) -> bool:
+        """Whether the chain is long enough to be used."""
+        return self.convergence.reached
+
+    @property
+    def message(self) -> str:
+        """Whether the chain has converged, and what is missing if not."""
+        kept = f"{self.steps - self.warm_up} steps of {self._settings.walkers} walkers"
+        if self.converged:
+            return f"Converged: {kept} after {self.warm_up} of warm-up."
+        return (
+            f"NOT CONVERGED after {self.steps} steps: {'; '.join(self.convergence.lacks)}. The "
+            "numbers are provisional: run more steps, or give narrower priors."
+        )
+
+    def get_chain(self, discard: int = 0, thin: int = 1, flat: bool = False) -> FloatArray:
+        """Return parameter values along the chain, in SI units.
+
+        Parameters
+        ----------
+        discard : int, default 0
+            Steps to leave out at the beginning; `warm_up` is the number that `summary` takes.
+        thin : int, default 1
+            Keep every thin-th step.
+        flat : bool, default False
+            Join steps and walkers.
+
+        Returns
+        -------
+        ndarray, shape (steps, walkers, D) or (steps * walkers, D)
+            Walkers are ordered by ensemble.
+        """
+        return self._density.to_values(self._thinned(self._chain.points, discard, thin, flat))
+
+    def get_log_prob(self, discard: int = 0, thin: int = 1, flat: bool = False) -> FloatArray:
+        """Return the log-posterior, per unit of search coordinate, along the chain."""
+        return self._thinned(self._chain.log_density, discard, thin, flat)
+
+    @staticmethod
+    def _thinned(array: FloatArray, discard: int, thin: int, flat: bool) -> FloatArray:
+        discard = whole_number(discard, "discard", 0)
+        kept = array[discard :: whole_number(thin, "thin", 1)]
+        return kept.reshape(-1, *kept.shape[2:]) if flat else kept
+
+    def get_autocorr_time(self) -> FloatArray:
+        """Return the integrated autocorrelation time of each parameter, in steps."""
+        return self.convergence.tau
+
+    @cached_property
+    def _points(self) -> FloatArray:
+        """All coordinates after warm-up, flat."""
+        return self._thinned(self._chain.points, self.warm_up, 1, True)
+
+    def draws(self, size: int, seed: int = 0) -> FloatArray:
+        """Return values drawn from the chain after warm-up, shape (size, D)."""
+        return self._density.to_values(self._draws(size, seed))
+
+    def _draws(self, size: int, seed: int) -> FloatArray:
+        size = whole_number(size, "size", 1)
+        random = np.random.default_rng(seed)
+        return self._points[random.integers(len(self._points), size=size)]
+
+    # What it says
+
+    @cached_property
+    def values(self) -> FloatArray:
+        """All values after warm-up, flat, shape (draws, D)."""
+        return self._density.to_values(self._points)
+
+    def summary(self) -> pd.DataFrame:
+        """Return one row a parameter: median, intervals, Monte Carlo errors.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``mean, std, 2.5%, 16%, median, 84%, 97.5%``; ``mcse``, the Monte Carlo
+            standard error of the mean; ``ess``, the effective number of draws; ``r_hat``;
+            ``unit``. ``ess`` and ``mcse`` are NaN where the chain has not converged.
+        """
+        import pandas as pd
+
+        values = self.values
+        columns: dict[str, Any] = {"mean": values.mean(axis=0), "std": values.std(axis=0, ddof=1)}
+        quantiles = np.quantile(values, list(QUANTILES.values()), axis=0)
+        columns |= dict(zip(QUANTILES, quantiles, strict=True))
+        ess = self.convergence.ess if self.converged else np.full(len(self.names), np.nan)
+        columns |= {
+            "mcse": columns["std"] / np.sqrt(ess),
+            "ess": ess,
+            "r_hat": self.convergence.r_hat,
+            "unit": list(self.units),
+        }
+        return pd.DataFrame(columns, index=pd.Index(self.names, name="parameter"))
+
+    def derived(self, function: Callable[..., Any], name: str = "derived") -> Mapping[str, float]:
+        """Return mean, std and quantiles of a function of the parameters.
+
+        Parameters
+        ----------
+        function : callable
+            Takes arrays of values by parameter name, such as
+            ``lambda f_max, sigma, **_: f_max / sigma``.
+        name : str, default "derived"
+            For messages.
+
+        Returns
+        -------
+        dict of str to float
+            ``mean, std, 2.5%, 16%, median, 84%, 97.5%``.
+        """
+        by_name = dict(zip(self.names, self.values.T, strict=True))
+        found = np.asarray(function(**by_name))
+        if found.shape != self.values.shape[:1]:
+            raise ValidationError(
+                f"{name} has shape {found.shape}; expected one number a draw, "
+                f"{self.values.shape[:1]}"
+            )
+        quantiles = np.quantile(found, list(QUANTILES.values())).tolist()
+        moments = {"mean": float(found.mean()), "std": float(found.std(ddof=1))}
+        return moments | dict(zip(QUANTILES, quantiles, strict=True))
+
+    @cached_property
+    def prior_rules(self) -> tuple[PriorRule, ...]:
+        """The parameters that the prior determines rather than the data."""
+        if self.likelihood == "none":
+            return ()
+        return prior_rules(self._density.prior, self._points)
+
+    def report(self) -> str:
+        """Return the posterior as text; the first line says whether to trust it."""
+        table = self.summary().to_string(float_format=lambda v: f"{v:.5g}")
+        rules = [str(rule) for rule in self.prior_rules]
+        priors = [f"  {name}: {text}" for name, text in self.priors.items()]
+        return "\n".join([self.message, "", table, *rules, "", "Priors:", *priors])
+
+    def __str__(self) -> str:
+        return self.report()
+
+    def __repr__(self) -> str:
+        verdict = "converged" if self.converged else "NOT CONVERGED"
+        return f"<Posterior: {', '.join(self.names)}; {verdict}, {self.steps} steps>"
+
+    # Predictions
+
+    def predictions(self, size: int = 400, seed: int = 0) -> ComplexArray:
+        """Return the model's response at draws from the posterior, shape (size, n)."""
+        theta, _ = self._density.split(self._draws(size, seed))
+        return self.problem.predict(theta)
+
+    def prediction_band(self, size: int = 400, seed: int = 0) -> PredictionBand:
+        """Return quantiles of the model's gain and phase for each row of the data."""
+        predicted = self.predictions(size, seed)
+        middle = np.angle(predicted.mean(axis=0))
+        phase = middle + np.angle(predicted * np.exp(-1j * middle))
+        levels = list(QUANTILES.values())
+        return PredictionBand(
+            np.quantile(np.abs(predicted), levels, axis=0),
+            np.rad2deg(np.quantile(phase, levels, axis=0)),
+        )
+
+    # Pictures and other formats
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return every draw after warm-up, one column a parameter, one row a draw."""
+        import pandas as pd
+
+        return pd.DataFrame(self.values, columns=list(self.names))
+
+    def plot_corner(self, **options: Any) -> NDArray[Any]:
+        """Draw marginals and pairs; options as :func:`dahl_ident.plots.plot_corner`."""
+        from dahl_ident.plots import plot_corner
+
+        return plot_corner(self._labels, self.values, log=self._density.logarithmic, **options)
+
+    def plot_trace(self, **options: Any) -> NDArray[Any]:
+        """Draw the walkers' paths; options as :func:`dahl_ident.plots.plot_trace`."""
+        from dahl_ident.plots import plot_trace
+
+        return plot_trace(
+            self._labels,
+            self.get_chain(),
+            discard=self.warm_up,
+            log=self._density.logarithmic,
+            **options,
+        )
+
+    @property
+    def _labels(self) -> list[str]:
+        pairs = zip(self.names, self.units, strict=True)
+        return [f"{name} ({unit})" if unit else name for name, unit in pairs]
+
+
+def refuse_unusable(posterior: Posterior) -> Posterior:
+    """Return the posterior, or raise where tau is unusable; the error carries the chain."""
+    if posterior.convergence.usable:
+        return posterior
+    stuck = [
+        name
+        for name, tau in zip(posterior.names, posterior.convergence.tau, strict=True)
+        if not np.isfinite(tau)
+    ]
+    raise SamplingError(
+        f"some walkers never moved in {', '.join(stuck)} over {posterior.steps} steps, so that "
+        "nothing is known about the chain; it is in this error's `posterior`. Run more steps, or "
+        "look for a prior or data that leave next to no room",
+        posterior,
+    )

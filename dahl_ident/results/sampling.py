@@ -1,0 +1,171 @@
+"""The Bayesian doors: posteriors by Markov chain, and exact ones for few parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from dahl_ident.arrays import whole_number
+from dahl_ident.bayes.chain import Chain, Pool, Settings, run
+from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.priors import PriorLike, joint_prior
+from dahl_ident.bayes.start import optimum_of, starting_points
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.elements import Element
+from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.fitting import Optimum
+from dahl_ident.problem import Problem
+from dahl_ident.results.fit_result import FitResult
+from dahl_ident.results.posterior import Posterior, refuse_unusable
+from dahl_ident.sensors import Sensors
+
+_LEAST_STEPS = 20
+
+
+def sample(
+    data: FrequencyResponse | FitResult,
+    model: Element | None = None,
+    *,
+    priors: Mapping[str, PriorLike] | None = None,
+    free: Iterable[str] = (),
+    fixed: Mapping[str, float] | None = None,
+    noise: str | None = None,
+    sensors: Sensors | None = None,
+    likelihood: str = "gaussian",
+    seed: int | None = None,
+    steps: int | None = None,
+    max_steps: int = 20000,
+    ess: float = 2000.0,
+    walkers: int | None = None,
+    ensembles: int = 4,
+    pool: Pool | None = None,
+) -> Posterior:
+    """Sample the posterior of a model's parameters with emcee.
+
+    Parameters
+    ----------
+    data : FrequencyResponse or FitResult
+        What was measured; or a fit, whose data, model, noise and sensors are taken over.
+    model : Element, optional
+        One element or a sum, such as ``Dahl() + Mass(0.3)``; left out with a FitResult.
+    priors : mapping of str to distribution or (low, high), optional
+        By parameter: a frozen distribution of scipy.stats over the value, or bounds, between
+        which positive parameters are log-uniform and the others uniform. Parameters left out
+        get wide bounds from the size of the data, which the report states.
+    free, fixed, noise, sensors
+        As for :func:`dahl_ident.fit`. Sensors may have any prior here.
+    likelihood : {"gaussian", "student_t", "none"}, default "gaussian"
+        "student_t" makes outliers count less (4 degrees of freedom); "none" samples the prior.
+    seed : int, optional
+        The same seed gives the same chain. Left out, one is drawn, and reported.
+    steps : int, optional
+        Total number of steps, warm-up included. Left out, the chain runs until it has
+        converged: 50 autocorrelation times after warm-up, R-hat below 1.01, and `ess`.
+    max_steps : int, default 20000
+        Where to stop a chain that does not converge.
+    ess : float, default 2000
+        Effective number of draws wanted for every parameter.
+    walkers : int, optional
+        In all ensembles together. Default: 32 an ensemble, or more for many parameters.
+    ensembles : int, default 4
+        Groups of walkers that know nothing of each other.
+    pool : object with map, optional
+        Spreads the likelihood over processes. Left out, one process computes all walkers at
+        once, which is faster unless a single likelihood takes milliseconds.
+
+    Returns
+    -------
+    Posterior
+        Marked in its first line where the chain has not converged.
+
+    Raises
+    ------
+    SamplingError
+        If no place of finite density is found, the scale of the noise cannot be estimated, or
+        the chain never moved.
+    ModelError
+        If nothing is free, or a name is unknown.
+    DataError
+        If the rows lack what their model or noise needs.
+    ValidationError
+        If an option or a prior is not as described.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dahl_ident import Dahl, FrequencyResponse
+    >>> A = np.geomspace(1e-3, 1e-2, 9)
+    >>> N = Dahl(f_max=0.1, sigma=30.0).describing_function(A)
+    >>> noise = np.random.default_rng(1).normal(scale=0.02, size=(2, 9))
+    >>> data = FrequencyResponse(np.ones(9), N * np.exp(noise[0] + 1j * noise[1]), A)
+    >>> posterior = sample(data, Dahl(), seed=1)
+    >>> posterior.converged, posterior.names
+    (True, ('f_max', 'sigma', 'noise_scale'))
+    """
+    problem, optimum = _problem(data, model, noise, sensors, free, fixed)
+    density = Density(problem, joint_prior(problem, priors, _theta(optimum)), likelihood)
+    settings = _settings(density, seed, steps, max_steps, ess, walkers, ensembles)
+    random = np.random.default_rng(settings.seed)
+    start = starting_points(density, optimum, settings.walkers, random)
+    chain, verdict = run(density, Chain.at(start, settings.seed), settings, pool=pool)
+    return refuse_unusable(Posterior(density, chain, verdict, settings, optimum))
+
+
+def _problem(
+    data: FrequencyResponse | FitResult,
+    model: Element | None,
+    noise: str | None,
+    sensors: Sensors | None,
+    free: Iterable[str],
+    fixed: Mapping[str, float] | None,
+) -> tuple[Problem, Optimum | None]:
+    if isinstance(data, FitResult):
+        given = {"model": model, "noise": noise, "sensors": sensors, "fixed": fixed}
+        extra = [name for name, value in given.items() if value is not None]
+        if extra or tuple(free):
+            raise ValidationError(
+                f"{', '.join([*extra, *(['free'] if tuple(free) else [])])} is given beside a "
+                "FitResult, which has its own; pass the data instead"
+            )
+        return data.problem, data.optimum
+    if model is None:
+        raise ModelError("there is no model; give one, such as Dahl(), or pass a FitResult")
+    problem = Problem(data, model, noise=noise, sensors=sensors, free=free, fixed=fixed)
+    return problem, optimum_of(problem)
+
+
+def _theta(optimum: Optimum | None) -> np.ndarray | None:
+    return None if optimum is None else optimum.theta
+
+
+def _settings(
+    density: Density,
+    seed: int | None,
+    steps: int | None,
+    max_steps: int,
+    ess: float,
+    walkers: int | None,
+    ensembles: int,
+) -> Settings:
+    dims = len(density.names)
+    ensembles = whole_number(ensembles, "ensembles", 2)
+    if walkers is None:
+        walkers = ensembles * max(32, 6 * dims)
+    least = ensembles * max(8, 4 * dims)
+    whole_number(walkers, "walkers", least)
+    if walkers % (2 * ensembles):
+        raise ValidationError(
+            f"walkers is {walkers}; expected a multiple of {2 * ensembles}, because each of "
+            f"{ensembles} ensembles moves in halves"
+        )
+    if seed is None:
+        seed = int(np.random.SeedSequence().generate_state(1)[0])
+    return Settings(
+        walkers,
+        ensembles,
+        whole_number(seed, "seed", 0),
+        None if steps is None else whole_number(steps, "steps", _LEAST_STEPS),
+        whole_number(max_steps, "max_steps", _LEAST_STEPS),
+        ess,
+    )
