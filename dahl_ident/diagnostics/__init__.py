@@ -1,7 +1,7 @@
 """Judging an estimate: how far to trust its numbers, and what the data cannot say."""
 
-from dahl_ident.diagnostics.verdicts import Identifiability, Verdict, identifiability
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval, IntervalComparison
+from dahl_ident.diagnostics.verdicts import Identifiability, Verdict, identifiability
 
 __all__ = [
     "ConfidenceIntervals",

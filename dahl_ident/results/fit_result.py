@@ -13,7 +13,6 @@ import numpy as np
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.formatting import with_unit
-from dahl_ident.diagnostics.verdicts import Identifiability, judged
 from dahl_ident.diagnostics.intervals import (
     ConfidenceIntervals,
     IntervalComparison,
@@ -22,6 +21,7 @@ from dahl_ident.diagnostics.intervals import (
     intervals,
 )
 from dahl_ident.diagnostics.levels import LEVELS
+from dahl_ident.diagnostics.verdicts import Identifiability, judged
 from dahl_ident.elements import Model, Parameter
 from dahl_ident.fitting.optimum import Combination, Optimum
 from dahl_ident.fitting.status import Status
