@@ -15,6 +15,7 @@ from dahl_ident.cli.extract import extract
 from dahl_ident.cli.fit import fit
 from dahl_ident.cli.inspect import inspect
 from dahl_ident.cli.report import report
+from dahl_ident.cli.sample import sample
 from dahl_ident.cli.simulate import simulate
 from dahl_ident.errors import DahlIdentError
 
@@ -26,7 +27,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (demo, inspect, extract, fit, report, simulate, datasets):
+for command in (demo, inspect, extract, fit, sample, report, simulate, datasets):
     app.command()(command)
 
 

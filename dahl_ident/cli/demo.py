@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -31,6 +32,7 @@ def demo(
     from dahl_ident.extraction import extract as extract_record
     from dahl_ident.reporting import report
     from dahl_ident.results import fit
+    from dahl_ident.results.sampling import sample
     from dahl_ident.synthetic.shipped import datasets_directory, load_dataset
 
     output.mkdir(parents=True, exist_ok=True)
@@ -47,20 +49,33 @@ def demo(
     telling.heading("3. fit: friction, mass, damper and spring, nothing known beforehand")
     result = fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
     show(result, json=False)
-    truth = facts["truth"]
-    telling.say("the truth: " + ", ".join(f"{k} = {v:g}" for k, v in truth.items()))
+    _compare(result, facts["truth"])
     telling.heading("4. identifiability: what the data determine")
     _tell_identifiability(result)
+    telling.heading("5. posterior: emcee, from the same likelihood")
+    posterior = sample(result, seed=1)
+    telling.say(posterior.report())
     telling.heading("6. report")
     with progress_bar() as bar:
         bar.add_task("drawing", total=None)
-        page = report(result, output / "report.html")
+        page = report([result, posterior], output / "report.html")
     telling.say(f"table: {table}\nreport: {page.resolve()}")
     telling.finish(result.success, result.message)
 
 
+def _compare(result: FitResult, truth: Mapping[str, float]) -> None:
+    """Print the true values beside the estimates, and how far off they are."""
+    rows = []
+    for name, estimate in result.params.items():
+        off = (estimate.value - truth[name]) / estimate.stderr if estimate.stderr else 0.0
+        error = f"{estimate.stderr:.2g}" if estimate.stderr else "fixed"
+        rows.append((name, f"{estimate.value:.5g}", error, f"{truth[name]:g}", f"{off:+.1f}"))
+    header = ("parameter", "estimate", "standard error", "truth", "off by standard errors")
+    telling.table("Beside the truth", header, rows)
+
+
 def _tell_identifiability(result: FitResult) -> None:
-    from dahl_ident.diagnostics.identifiability import judged
     from dahl_ident.diagnostics.intervals import profile_intervals
+    from dahl_ident.diagnostics.verdicts import judged
 
     telling.say(str(judged(result.optimum, profile_intervals(result.optimum))))

@@ -19,6 +19,7 @@ def plot_frequency_response(
     *,
     fitted: Sequence[tuple[ArrayLike, ArrayLike]] = (),
     gain_label: str = "gain [m/N]",
+    x_label: str = "frequency [Hz]",
     marker: str = "",
     ax: Sequence[Axes] | None = None,
 ) -> tuple[Axes, Axes]:
@@ -32,6 +33,8 @@ def plot_frequency_response(
         The model's curves, drawn as lines; the levels are then drawn as points.
     gain_label : str
         Axis label with unit.
+    x_label : str
+        The same for the abscissa, which may be an amplitude as well.
     marker : str, default no marker
         A matplotlib marker for the levels.
     ax : sequence of two Axes, optional
@@ -70,7 +73,7 @@ def plot_frequency_response(
     for axis in (top, bottom):
         axis.set_xscale("log" if wide else "linear")
     top.set(yscale="log", ylabel=gain_label)
-    bottom.set(xlabel="frequency [Hz]", ylabel="phase [degrees]")
+    bottom.set(xlabel=x_label, ylabel="phase [degrees]")
     if any(label for label, _, _ in levels):
         top.legend(ncols=2)
     return top, bottom

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
-from dahl_ident.diagnostics.identifiability import judged
+from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.intervals import profile_intervals, wald_intervals
-from dahl_ident.reporting import provenance, tables
+from dahl_ident.diagnostics.verdicts import judged
+from dahl_ident.reporting import posteriors, provenance, tables
 from dahl_ident.reporting.document import (
     Block,
     Bullets,
@@ -20,6 +22,9 @@ from dahl_ident.reporting.document import (
 )
 from dahl_ident.reporting.figures import pictures_of_fit
 from dahl_ident.results import FitResult
+from dahl_ident.results.posterior import Posterior
+
+Result = FitResult | Posterior
 
 NOISE = {
     "measured": "The covariance of every point is known from the measurement; residuals are in "
@@ -32,27 +37,55 @@ NOISE = {
 
 
 def document(
-    results: Sequence[FitResult], *, title: str | None = None, command: str | None = None
+    results: Sequence[Result], *, title: str | None = None, command: str | None = None
 ) -> Document:
-    """Return the report on fits of one or several models."""
-    first = results[0]
-    sections = [section for fit in results for section in _sections(fit, len(results) > 1)]
+    """Return the report on fits and posteriors of the same data."""
+    fits = [result for result in results if isinstance(result, FitResult)]
+    drawn = [result for result in results if isinstance(result, Posterior)]
+    data = results[0].data
+    told = command or _command(results)
+    sections = [section for fit in fits for section in _sections(fit, drawn, len(fits) > 1)]
+    sections += [section for posterior in drawn for section in posteriors.sections(posterior)]
     return Document(
-        title=title or _title(first),
-        trusted=all(fit.success for fit in results),
-        verdict=tuple(line for fit in results for line in _verdict(fit)),
+        title=title or _title(data),
+        trusted=all(trusted(result) for result in results),
+        verdict=(
+            *(line for fit in fits for line in _verdict(fit)),
+            *(line for posterior in drawn for line in posteriors.verdict(posterior)),
+        ),
         sections=(
             *sections,
-            Section("Data", tuple(_data(first))),
-            Section("Origin", tuple(_origin(first, command))),
+            Section("Data", tuple(_data(data))),
+            Section("Origin", tuple(_origin(data, told))),
         ),
-        facts=_facts(results, command),
+        facts={
+            "fits": [_fit_facts(fit) for fit in fits],
+            "posteriors": [posteriors.facts(posterior) for posterior in drawn],
+            "files": dict(provenance.sources(data)),
+            "versions": provenance.versions(),
+            "date": provenance.today(),
+            "command": told,
+        },
     )
 
 
-def _title(fit: FitResult) -> str:
-    files = [name for name, _ in provenance.sources(fit.data)]
-    return f"Friction identified from {files[0]}" if len(files) == 1 else "Friction identified"
+def trusted(result: Result) -> bool:
+    """Return whether a result can be used as it is."""
+    return result.success if isinstance(result, FitResult) else result.converged
+
+
+def _command(results: Sequence[Result]) -> str:
+    fits = [result for result in results if isinstance(result, FitResult)]
+    return provenance.fit_command(fits[0]) if fits else "dahl-ident sample DATA.csv"
+
+
+def _title(data: FrequencyResponse) -> str:
+    files = [name for name, _ in provenance.sources(data)]
+    return (
+        f"Friction identified from {Path(files[0]).name}"
+        if len(files) == 1
+        else "Friction identified"
+    )
 
 
 def _verdict(fit: FitResult) -> list[str]:
@@ -60,11 +93,11 @@ def _verdict(fit: FitResult) -> list[str]:
     return [fit.message, determined.headline]
 
 
-def _sections(fit: FitResult, several: bool) -> Iterator[Section]:
+def _sections(fit: FitResult, drawn: Sequence[Posterior], several: bool) -> Iterator[Section]:
     of = f": {fit.problem.model!r}" if several else ""
     intervals = [wald_intervals(fit.optimum), profile_intervals(fit.optimum)]
     notes = tuple(f"{one.method} intervals: {one.note}" for one in intervals)
-    yield Section(f"Parameters{of}", (tables.parameters(fit, intervals), Bullets(notes)))
+    yield Section(f"Parameters{of}", (tables.parameters(fit, intervals, drawn), Bullets(notes)))
     yield Section(f"Pictures{of}", tuple(pictures_of_fit(fit)))
     determined = judged(fit.optimum, intervals[1])
     yield Section(
@@ -83,35 +116,25 @@ def _sections(fit: FitResult, several: bool) -> Iterator[Section]:
         yield Section(f"Equivalent stiffness and damping{of}", (equivalent,))
 
 
-def _data(fit: FitResult) -> Iterator[Block]:
-    assumed = provenance.notes(fit.data)
+def _data(data: FrequencyResponse) -> Iterator[Block]:
+    assumed = provenance.notes(data)
     if assumed:
         yield Bullets(tuple(assumed))
-    yield tables.measured(fit.data)
+    yield tables.measured(data)
 
 
-def _origin(fit: FitResult, command: str | None) -> Iterator[Block]:
-    files = list(provenance.sources(fit.data))
+def _origin(data: FrequencyResponse, command: str) -> Iterator[Block]:
+    files = list(provenance.sources(data))
     if files:
         rows = tuple(words(name, digest) for name, digest in files)
         yield Table("Files", ("file", "SHA-256"), rows)
-    made = provenance.options(fit.data)
+    made = provenance.options(data)
     if made:
         yield Table("Options", ("option", "value"), tuple(words(*pair) for pair in made))
     used = tuple(words(name, version) for name, version in provenance.versions().items())
     yield Table("Versions", ("package", "version"), used)
     yield Paragraph(f"Made on {provenance.today()}. This command repeats it:")
-    yield Listing(command or provenance.fit_command(fit))
-
-
-def _facts(results: Sequence[FitResult], command: str | None) -> dict[str, Any]:
-    return {
-        "fits": [_fit_facts(fit) for fit in results],
-        "files": dict(provenance.sources(results[0].data)),
-        "versions": provenance.versions(),
-        "date": provenance.today(),
-        "command": command or provenance.fit_command(results[0]),
-    }
+    yield Listing(command)
 
 
 def _fit_facts(fit: FitResult) -> dict[str, Any]:

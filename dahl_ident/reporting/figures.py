@@ -64,14 +64,15 @@ def _response(fit: FitResult) -> Picture:
         f"{phase.min():.1f} to {phase.max():.1f} degrees; the farthest point lies {worst:.1f} "
         "standard deviations from the fit."
     )
-    band = f"The band is the {percent(BAND_LEVEL)} confidence band of the fit."
-    if _over_frequency(data):
-        return Picture(
-            "response", "Data (points) and fit (lines) over frequency, by level.", alt,
-            partial(_draw_levels, fit),
-        )  # fmt: skip
-    caption = f"Data with error bars and fit over amplitude. {band}"
-    return Picture("response", caption, alt, partial(_draw_amplitudes, fit))
+    if len(_groups(data)) == 1 and not _over_frequency(data):
+        caption = (
+            "Data with error bars and fit over amplitude. The band is the "
+            f"{percent(BAND_LEVEL)} confidence band of the fit."
+        )
+        return Picture("response", caption, alt, partial(_draw_amplitudes, fit))
+    over = "frequency, by level" if _over_frequency(data) else "amplitude, by frequency"
+    caption = f"Data (points) and fit (lines) over {over}."
+    return Picture("response", caption, alt, partial(_draw_groups, fit))
 
 
 def _draw_amplitudes(fit: FitResult) -> Figure:
@@ -81,29 +82,41 @@ def _draw_amplitudes(fit: FitResult) -> Figure:
         gain_std, phase_std = polar_std(data.response, data.covariance)
     elif fit.noise == "relative":
         gain_std, phase_std = fit.scale * data.gain, np.full(data.n, fit.scale)
-    fine = over_amplitude(fit)
+    fine = over_amplitude(fit, data)
     top, _ = plots.plot_amplitude_response(
-        held_amplitude(data), data.response, gain_std=gain_std, phase_std=phase_std,
+        held_amplitude(data),
+        data.response,
+        gain_std=gain_std,
+        phase_std=phase_std,
         curve=Curve(fine.x, fine.response, fine.gain_band, fine.phase_band),
-        amplitude_label=_held_label(data), gain_label=_gain_label(data),
-    )  # fmt: skip
-    return _figure(top)
-
-
-def _draw_levels(fit: FitResult) -> Figure:
-    data = fit.data.select(harmonic=1)
-    labels = data.levels or [None]
-    parts = [data if label is None else data.select(level=label) for label in labels]
-    fine = [over_frequency(fit, label) for label in labels]
-    top, _ = plots.plot_frequency_response(
-        [
-            (_level(label, data), part.frequency_hz, part.response)
-            for label, part in zip(labels, parts, strict=True)
-        ],
-        fitted=[(curve.x, curve.response) for curve in fine],
+        amplitude_label=_held_label(data),
         gain_label=_gain_label(data),
-    )  # fmt: skip
+    )
     return _figure(top)
+
+
+def _draw_groups(fit: FitResult) -> Figure:
+    """Draw one curve a level over frequency, or one a frequency over amplitude."""
+    data = fit.data.select(harmonic=1)
+    groups = _groups(data)
+    fine = over_frequency if _over_frequency(data) else over_amplitude
+    curves = [fine(fit, part) for _, part in groups if part.n > 1]
+    top, _ = plots.plot_frequency_response(
+        [(label, _abscissa(part, data)[0], part.response) for label, part in groups],
+        fitted=[(curve.x, curve.response) for curve in curves],
+        gain_label=_gain_label(data),
+        x_label=_abscissa(data, data)[1],
+    )
+    return _figure(top)
+
+
+def _groups(data: FrequencyResponse) -> list[tuple[str, FrequencyResponse]]:
+    """Return the parts of the data that make one curve each, with their labels."""
+    if _over_frequency(data):
+        parts = [(_level(label, data), data.select(level=label)) for label in data.levels]
+        return parts or [("", data)]
+    nominal = np.array([float(f"{f:.2g}") for f in data.frequency_hz])
+    return [(f"{f:g} Hz", data.select(rows=nominal == f)) for f in np.unique(nominal)]
 
 
 def _residuals(fit: FitResult) -> Picture:
@@ -116,7 +129,7 @@ def _residuals(fit: FitResult) -> Picture:
     names = ("ln gain", "phase") if fit.noise == "relative" else ("real part", "imaginary part")
 
     def draw() -> Figure:
-        x, label = _abscissa(fit.data)
+        x, label = _abscissa(fit.data, fit.data)
         return _figure(
             plots.plot_residuals(x, pairs[:, 0], pairs[:, 1], names=names, x_label=label)
         )
@@ -232,7 +245,7 @@ def _correlation(fit: FitResult) -> Picture:
 
 def _information(fit: FitResult) -> Picture:
     share = shares(fit.optimum)
-    x, label = _abscissa(fit.data)
+    x, label = _abscissa(fit.data, fit.data)
     places = [
         f"{name} is told most by the point at {x[int(np.argmax(row))]:.3g}"
         for name, row in zip(fit.var_names, share, strict=True)
@@ -254,17 +267,17 @@ def _whitened_pairs(fit: FitResult) -> FloatArray:
     return fit.residual[: fit.ndata].reshape(-1, 2) / scale
 
 
-def _abscissa(data: FrequencyResponse) -> tuple[FloatArray, str]:
+def _abscissa(part: FrequencyResponse, data: FrequencyResponse) -> tuple[FloatArray, str]:
+    """Return the numbers of some rows on the axis that suits the whole table."""
     if _over_frequency(data):
-        return data.frequency_hz, "frequency [Hz]"
-    return held_amplitude(data), _held_label(data)
+        return part.frequency_hz, "frequency [Hz]"
+    return held_amplitude(part), _held_label(part)
 
 
 def _over_frequency(data: FrequencyResponse) -> bool:
-    """Return whether a level was measured at several frequencies."""
+    """Return whether a curve over frequency suits the data better than one over amplitude."""
     parts = [data.select(level=label) for label in data.levels] or [data]
-    several = [np.unique(part.frequency_hz).size > 1 for part in parts]
-    return bool(np.mean(several) > 0.5)
+    return all(2 * np.unique(part.frequency_hz).size > part.n > 1 for part in parts)
 
 
 def _is_linear_dahl_alone(fit: FitResult) -> bool:

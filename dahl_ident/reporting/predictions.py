@@ -8,7 +8,6 @@ the covariance of theta exactly as for real models.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -32,23 +31,21 @@ class Prediction:
     phase_band: tuple[FloatArray, FloatArray]
 
 
-def over_amplitude(fit: FitResult) -> Prediction:
-    """Return the prediction over the amplitude that was held, at the middle frequency."""
-    data = fit.data.select(harmonic=1)
-    held = held_amplitude(data)
+def over_amplitude(fit: FitResult, part: FrequencyResponse) -> Prediction:
+    """Return the prediction over the amplitude held in some rows, at their middle frequency."""
+    held = held_amplitude(part)
     grid = np.geomspace(held.min(), held.max(), _POINTS)
-    return _prediction(fit, _like(data, np.full(_POINTS, np.median(data.frequency_hz)), grid), grid)
+    f = np.full(_POINTS, np.median(part.frequency_hz))
+    return _prediction(fit, _like(part, f, grid), grid)
 
 
-def over_frequency(fit: FitResult, level: Any) -> Prediction:
-    """Return the prediction over frequency at one level."""
-    data = fit.data.select(harmonic=1)
-    part = data if level is None else data.select(level=level)
+def over_frequency(fit: FitResult, part: FrequencyResponse) -> Prediction:
+    """Return the prediction over frequency through some rows, at their amplitudes."""
     f = part.frequency_hz
     grid = np.geomspace(f.min(), f.max(), _POINTS)
     order = np.argsort(f)
     held = np.interp(grid, f[order], held_amplitude(part)[order])
-    return _prediction(fit, _like(data, grid, held), grid)
+    return _prediction(fit, _like(part, grid, held), grid)
 
 
 def is_force_controlled(data: FrequencyResponse) -> bool:

@@ -10,18 +10,17 @@ from typing import Any
 
 from dahl_ident.data.storage import write_whole
 from dahl_ident.errors import ValidationError
-from dahl_ident.reporting.contents import document
+from dahl_ident.reporting.contents import Result, document
 from dahl_ident.reporting.document import Document, Picture
 from dahl_ident.reporting.html import html
 from dahl_ident.reporting.markdown import markdown
-from dahl_ident.results import FitResult
 
 SCHEMA = 1
 FORMATS = (".html", ".pdf", ".md", ".json")
 
 
 def report(
-    results: FitResult | Sequence[FitResult],
+    results: Result | Sequence[Result],
     path: str | Path,
     *,
     title: str | None = None,
@@ -31,7 +30,7 @@ def report(
 
     Parameters
     ----------
-    results : FitResult, or sequence of them
+    results : FitResult, Posterior, or sequence of them
         What to report on; all on the same data.
     path : path
         Ending in ``.html`` (one file, no network), ``.pdf``, ``.md`` (pictures in a folder
@@ -63,7 +62,7 @@ def report(
     'report.json'
     """
     place = Path(path)
-    told = [results] if isinstance(results, FitResult) else list(results)
+    told = list(results) if isinstance(results, Sequence) else [results]
     if not told:
         raise ValidationError("there is no result to report on; expected at least one")
     kind = place.suffix.lower()

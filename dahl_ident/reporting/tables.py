@@ -10,6 +10,7 @@ import numpy as np
 from dahl_ident.diagnostics.formatting import interval, rounded
 from dahl_ident.elements import Dahl
 from dahl_ident.reporting.document import Cell, Table, number, words
+from dahl_ident.reporting.posteriors import interval_text
 from dahl_ident.reporting.predictions import held_amplitude
 from dahl_ident.units import si_unit
 
@@ -17,12 +18,15 @@ if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
     from dahl_ident.diagnostics import ConfidenceIntervals
     from dahl_ident.results import FitResult
+    from dahl_ident.results.posterior import Posterior
 
 _EQUIVALENT_ROWS = 9
 _LEVEL = 0.9545
 
 
-def parameters(fit: FitResult, intervals: Sequence[ConfidenceIntervals]) -> Table:
+def parameters(
+    fit: FitResult, intervals: Sequence[ConfidenceIntervals], drawn: Sequence[Posterior]
+) -> Table:
     """Return every parameter with its intervals, one column a method."""
     at = [one.at(_LEVEL) for one in intervals]
     rows = []
@@ -37,8 +41,12 @@ def parameters(fit: FitResult, intervals: Sequence[ConfidenceIntervals]) -> Tabl
         for found in at:
             limits = found.get(name)
             row.append(Cell(interval(limits.lower, limits.upper, "") if limits else "-"))
+        for posterior in drawn:
+            median, limits_text = interval_text(posterior, name)
+            row += [median, Cell(limits_text)]
         rows.append((*row, Cell(estimate.description)))
     methods = [f"95.45 % {one.method} interval" for one in intervals]
+    methods += ["posterior median", "95 % posterior interval"] * len(drawn)
     header = ("parameter", "estimate", "standard error", "unit", *methods, "what it is")
     return Table("Parameters", header, tuple(rows))
 

@@ -1,0 +1,112 @@
+"""``dahl-ident sample``: the posterior of the parameters, with a verdict on its convergence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from dahl_ident.cli import telling
+from dahl_ident.cli.groups import grouped
+from dahl_ident.cli.options import Files, General, ModelOptions, Reading, Seed
+from dahl_ident.errors import ValidationError
+
+if TYPE_CHECKING:
+    from dahl_ident.results.posterior import Posterior
+
+_SAMPLING = "Sampling"
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How the chain is run; the words of ``sample``."""
+
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Bounds of a parameter, such as f_max=0.01:1; once for each.",
+            rich_help_panel=_SAMPLING,
+        ),
+    ] = None
+    noise: Annotated[
+        str | None,
+        typer.Option(help="measured, relative or absolute.", rich_help_panel=_SAMPLING),
+    ] = None
+    likelihood: Annotated[
+        str,
+        typer.Option(help="gaussian, student_t or none.", rich_help_panel=_SAMPLING),
+    ] = "gaussian"
+    seed: Seed = 1
+    steps: Annotated[
+        int | None,
+        typer.Option(help="Total steps; by default until converged.", rich_help_panel=_SAMPLING),
+    ] = None
+    max_steps: Annotated[
+        int, typer.Option(help="Where to stop all the same.", rich_help_panel=_SAMPLING)
+    ] = 20000
+    ess: Annotated[
+        float, typer.Option(help="Effective draws wanted.", rich_help_panel=_SAMPLING)
+    ] = 2000.0
+    walkers: Annotated[
+        int | None,
+        typer.Option(help="In all ensembles together.", rich_help_panel=_SAMPLING),
+    ] = None
+    ensembles: Annotated[
+        int, typer.Option(help="Independent groups of walkers.", rich_help_panel=_SAMPLING)
+    ] = 4
+
+    def keywords(self) -> dict[str, Any]:
+        """Return the arguments of ``sample``."""
+        given = dict(vars(self))
+        bounds = dict(_bounds(text) for text in given.pop("prior") or [])
+        return {**given, "priors": bounds or None}
+
+
+@grouped
+def sample(
+    files: Files,
+    general: General,
+    reading: Reading,
+    model: ModelOptions,
+    sampling: Sampling,
+    report: Annotated[
+        str | None, typer.Option(help="Report to write: .html, .pdf, .md or .json.")
+    ] = None,
+) -> None:
+    """Sample the posterior of the parameters.
+
+    Example: dahl-ident datasets noisy -o - | dahl-ident sample - --prior f_max=0.01:1
+    """
+    from dahl_ident.results.sampling import sample as sample_data
+
+    elements, free = model.build()
+    posterior = sample_data(reading.read(files), elements, free=free, **sampling.keywords())
+    if general.json:
+        from dahl_ident.reporting.posteriors import facts
+
+        telling.say_json(facts(posterior))
+    else:
+        telling.say(posterior.report())
+    if report is not None:
+        from dahl_ident.reporting import report as write_report
+
+        telling.doubt(f"report: {write_report(posterior, report)}")
+    finish(posterior)
+
+
+def finish(posterior: Posterior) -> None:
+    """End with status 3 where the chain has not converged."""
+    telling.finish(posterior.converged, posterior.message)
+
+
+def _bounds(text: str) -> tuple[str, tuple[float, float]]:
+    """Return name and bounds of ``f_max=0.01:1``."""
+    name, _, numbers = text.partition("=")
+    try:
+        low, high = (float(part) for part in numbers.split(":"))
+    except ValueError as exc:
+        raise ValidationError(
+            f"prior is {text!r}; expected a name and two bounds, such as f_max=0.01:1"
+        ) from exc
+    return name, (low, high)

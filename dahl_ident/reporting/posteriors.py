@@ -1,0 +1,109 @@
+"""What a report says about a posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from dahl_ident.reporting.document import (
+    Block,
+    Bullets,
+    Cell,
+    Paragraph,
+    Picture,
+    Section,
+    Table,
+    number,
+)
+from dahl_ident.results.posterior import QUANTILES, Posterior
+
+
+def sections(posterior: Posterior) -> Iterator[Section]:
+    """Yield numbers and pictures of a posterior."""
+    yield Section("Posterior", tuple(_numbers(posterior)))
+    yield Section("Pictures of the posterior", (_corner(posterior), _trace(posterior)))
+
+
+def verdict(posterior: Posterior) -> list[str]:
+    """Return whether to use it, and what the prior decides."""
+    return [
+        f"Posterior: {posterior.message}",
+        *(str(rule) for rule in posterior.prior_rules),
+    ]
+
+
+def facts(posterior: Posterior) -> dict[str, Any]:
+    """Return a posterior for machines."""
+    return {
+        "converged": posterior.converged,
+        "message": posterior.message,
+        "seed": posterior.seed,
+        "steps": posterior.steps,
+        "warm_up": posterior.warm_up,
+        "likelihood": posterior.likelihood,
+        "priors": dict(posterior.priors),
+        "set_by_prior": [rule.name for rule in posterior.prior_rules],
+        "summary": posterior.summary().to_dict(orient="index"),
+    }
+
+
+def interval_text(posterior: Posterior, name: str) -> tuple[Cell, str]:
+    """Return the median, and the 95 % interval as text."""
+    row = dict(zip(posterior.names, posterior.values.T, strict=True)).get(name)
+    if row is None:
+        return Cell("-"), "-"
+    low, median, high = np.quantile(row, [0.025, 0.5, 0.975])
+    return number(float(median), 5), f"{low:.5g} to {high:.5g}"
+
+
+def _numbers(posterior: Posterior) -> Iterator[Block]:
+    yield Paragraph(posterior.message)
+    table = posterior.summary()
+    columns = ["mean", "std", *QUANTILES, "mcse", "ess", "r_hat"]
+    rows = tuple(
+        (Cell(str(name)), Cell(str(row["unit"]) or "-"), *(_cell(row[c]) for c in columns))
+        for name, row in table.iterrows()
+    )
+    yield Table("Posterior of each parameter", ("parameter", "unit", *columns), rows)
+    yield Paragraph(
+        "mcse is the Monte Carlo standard error of the mean, ess the effective number of draws, "
+        "r_hat compares independent ensembles and is 1 where they agree."
+    )
+    yield Paragraph(f"Priors (likelihood: {posterior.likelihood.replace('_', ' ')}):")
+    yield Bullets(tuple(f"{name}: {text}" for name, text in posterior.priors.items()))
+    if posterior.prior_rules:
+        yield Bullets(tuple(str(rule) for rule in posterior.prior_rules))
+    yield Paragraph(f"Seed {posterior.seed}; the same seed gives the same chain.")
+
+
+def _cell(value: float) -> Cell:
+    return number(value, 5) if np.isfinite(value) else Cell("-")
+
+
+def _corner(posterior: Posterior) -> Picture:
+    correlation = np.corrcoef(posterior.values.T).reshape(len(posterior.names), -1)
+    i, j = np.unravel_index(np.argmax(np.abs(np.triu(correlation, 1))), correlation.shape)
+    finding = (
+        f"The strongest correlation is {correlation[i, j]:.2f}, between {posterior.names[i]} and "
+        f"{posterior.names[j]}."
+        if len(posterior.names) > 1
+        else f"One parameter, {posterior.names[0]}."
+    )
+    return Picture(
+        "corner",
+        "Posterior density of each parameter (dashed: 16, 50 and 84 %) and of each pair.",
+        finding,
+        lambda: posterior.plot_corner()[0, 0].figure,
+    )
+
+
+def _trace(posterior: Posterior) -> Picture:
+    return Picture(
+        "trace",
+        "Paths of the walkers; the shaded warm-up is left out of every number.",
+        f"{posterior.steps} steps, of which the first {posterior.warm_up} are warm-up. "
+        f"{'The chain has converged' if posterior.converged else 'The chain has NOT converged'}.",
+        lambda: posterior.plot_trace()[0].figure,
+    )
