@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import ComplexArray, FloatArray, finite_array
+from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.element import Element, StiffnessGradient, motion, prefixed
 from dahl_ident.elements.parameter import Parameter
 
@@ -54,6 +54,45 @@ class _Lumped(Element):
         unit = np.broadcast_to(self._unit_stiffness(omega, harmonic), value.shape)
         return StiffnessGradient(value, np.zeros_like(value), (unit,))
 
+    def force(
+        self,
+        displacement: ArrayLike,
+        *,
+        velocity: ArrayLike | None = None,
+        acceleration: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Return p times the displacement, velocity or acceleration that the element answers.
+
+        Parameters
+        ----------
+        displacement, velocity, acceleration : array_like, shape (n,)
+            m, m/s and m/s^2; a spring needs the first, a damper the second, a mass the third.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            N.
+
+        Raises
+        ------
+        ModelError
+            If the parameter has no value.
+        ValidationError
+            If the needed history is missing, or a value is NaN, infinite or complex.
+
+        Examples
+        --------
+        >>> Mass(2.0).force([0.0], acceleration=[3.0])
+        array([6.])
+        """
+        histories = (
+            ("displacement", displacement),
+            ("velocity", velocity),
+            ("acceleration", acceleration),
+        )
+        name, history = histories[self._order]
+        return np.asarray(self.known_values()[0] * motion(history, name, self))
+
 
 class Mass(_Lumped):
     """Inertia: Z = -m omega^2 (Eqn. 53).
@@ -80,22 +119,6 @@ class Mass(_Lumped):
 
     def __init__(self, mass: float | None = None, *, name: str | None = None) -> None:
         self._set_up(mass, name)
-
-    def force(
-        self,
-        displacement: ArrayLike,
-        *,
-        velocity: ArrayLike | None = None,
-        acceleration: ArrayLike | None = None,
-    ) -> FloatArray:
-        """Return m times `acceleration` (m/s^2), N.
-
-        Examples
-        --------
-        >>> Mass(2.0).force([0.0], acceleration=[3.0])
-        array([6.])
-        """
-        return np.asarray(self.known_values()[0] * motion(acceleration, "acceleration", self))
 
 
 class Damper(_Lumped):
@@ -124,22 +147,6 @@ class Damper(_Lumped):
     def __init__(self, damping: float | None = None, *, name: str | None = None) -> None:
         self._set_up(damping, name)
 
-    def force(
-        self,
-        displacement: ArrayLike,
-        *,
-        velocity: ArrayLike | None = None,
-        acceleration: ArrayLike | None = None,
-    ) -> FloatArray:
-        """Return c times `velocity` (m/s), N.
-
-        Examples
-        --------
-        >>> Damper(2.0).force([0.0], velocity=[3.0])
-        array([6.])
-        """
-        return np.asarray(self.known_values()[0] * motion(velocity, "velocity", self))
-
 
 class Spring(_Lumped):
     """Linear spring: Z = k (Eqn. 53).
@@ -166,19 +173,3 @@ class Spring(_Lumped):
 
     def __init__(self, stiffness: float | None = None, *, name: str | None = None) -> None:
         self._set_up(stiffness, name)
-
-    def force(
-        self,
-        displacement: ArrayLike,
-        *,
-        velocity: ArrayLike | None = None,
-        acceleration: ArrayLike | None = None,
-    ) -> FloatArray:
-        """Return k times `displacement` (m), N.
-
-        Examples
-        --------
-        >>> Spring(2.0).force([3.0])
-        array([6.])
-        """
-        return np.asarray(self.known_values()[0] * finite_array(displacement, "displacement"))
