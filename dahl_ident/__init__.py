@@ -10,19 +10,19 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dahl_ident.control_interop import DahlNonlinearity
+    from dahl_ident.control_interop import DahlNonlinearity, limit_cycles
     from dahl_ident.data import FrequencyResponse, Record, read_frequency_response, read_record
     from dahl_ident.diagnostics import identifiability
     from dahl_ident.elements import Dahl, Damper, LinearSystem, Mass, Model, Spring
     from dahl_ident.problem import Problem
-    from dahl_ident.results import FitResult, fit
+    from dahl_ident.results import FitResult, Posterior, fit, posterior_grid, sample
     from dahl_ident.sensors import Sensors
     from dahl_ident.steady_state import response
 
 __version__ = "0.1.0"
 
 _ROOMS = {
-    "dahl_ident.control_interop": ("DahlNonlinearity",),
+    "dahl_ident.control_interop": ("DahlNonlinearity", "limit_cycles"),
     "dahl_ident.data": (
         "FrequencyResponse",
         "Record",
@@ -32,7 +32,7 @@ _ROOMS = {
     "dahl_ident.diagnostics": ("identifiability",),
     "dahl_ident.elements": ("Dahl", "Damper", "LinearSystem", "Mass", "Model", "Spring"),
     "dahl_ident.problem": ("Problem",),
-    "dahl_ident.results": ("FitResult", "fit"),
+    "dahl_ident.results": ("FitResult", "Posterior", "fit", "posterior_grid", "sample"),
     "dahl_ident.sensors": ("Sensors",),
     "dahl_ident.steady_state": ("response",),
 }
@@ -47,15 +47,19 @@ __all__ = [
     "LinearSystem",
     "Mass",
     "Model",
+    "Posterior",
     "Problem",
     "Record",
     "Sensors",
     "Spring",
     "fit",
     "identifiability",
+    "limit_cycles",
+    "posterior_grid",
     "read_frequency_response",
     "read_record",
     "response",
+    "sample",
 ]
 
 

@@ -68,7 +68,19 @@ class FitError(DahlIdentError, RuntimeError):
 
 
 class SamplingError(DahlIdentError, RuntimeError):
-    """A Markov chain cannot be run, resumed or used."""
+    """A Markov chain cannot be run, resumed or used.
+
+    Parameters
+    ----------
+    message : str
+        What happened, and what to do.
+    posterior : Posterior, optional
+        The chain all the same, where there is one.
+    """
+
+    def __init__(self, message: str, posterior: Any = None) -> None:
+        super().__init__(message)
+        self.posterior = posterior
 
 
 class MissingDependencyError(DahlIdentError, ImportError):

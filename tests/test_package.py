@@ -22,15 +22,19 @@ PUBLIC_NAMES = [
     "LinearSystem",
     "Mass",
     "Model",
+    "Posterior",
     "Problem",
     "Record",
     "Sensors",
     "Spring",
     "fit",
     "identifiability",
+    "limit_cycles",
+    "posterior_grid",
     "read_frequency_response",
     "read_record",
     "response",
+    "sample",
 ]
 
 

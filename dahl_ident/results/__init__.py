@@ -2,5 +2,16 @@
 
 from dahl_ident.results.estimate import fit
 from dahl_ident.results.fit_result import Estimate, FitResult
+from dahl_ident.results.grid_posterior import GridPosterior
+from dahl_ident.results.posterior import Posterior
+from dahl_ident.results.sampling import posterior_grid, sample
 
-__all__ = ["Estimate", "FitResult", "fit"]
+__all__ = [
+    "Estimate",
+    "FitResult",
+    "GridPosterior",
+    "Posterior",
+    "fit",
+    "posterior_grid",
+    "sample",
+]

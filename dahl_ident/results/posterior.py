@@ -114,13 +114,10 @@ class Posterior:
         """The least-squares optimum around which the walkers started."""
         return self._optimum
 
-    @cached_property
+    @property
     def priors(self) -> Mapping[str, str]:
         """Every prior in words."""
-        texts = {part.parameter.name: str(part) for part in self._density.prior.parts}
-        if self._density.has_scale:
-            texts[self.names[-1]] = "1/s"
-        return texts
+        return self._density.priors
 
     # The chain
 

@@ -6,21 +6,24 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from dahl_ident.arrays import whole_number
+from dahl_ident.arrays import FloatArray, positive_number, whole_number
 from dahl_ident.bayes.chain import Chain, Pool, Settings, run
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import PriorLike, joint_prior
-from dahl_ident.bayes.start import optimum_of, starting_points
+from dahl_ident.bayes.quadrature import integrate
+from dahl_ident.bayes.start import centre_and_covariance, optimum_of, starting_points
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.elements import Element
-from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.errors import ModelError, SamplingError, ValidationError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
 from dahl_ident.results.fit_result import FitResult
+from dahl_ident.results.grid_posterior import GridPosterior
 from dahl_ident.results.posterior import Posterior, refuse_unusable
 from dahl_ident.sensors import Sensors
 
 _LEAST_STEPS = 20
+_MOST_AXES = 3
 
 
 def sample(
@@ -112,6 +115,69 @@ def sample(
     return refuse_unusable(Posterior(density, chain, verdict, settings, optimum))
 
 
+def posterior_grid(
+    data: FrequencyResponse | FitResult,
+    model: Element | None = None,
+    *,
+    priors: Mapping[str, PriorLike] | None = None,
+    free: Iterable[str] = (),
+    fixed: Mapping[str, float] | None = None,
+    noise: str | None = None,
+    sensors: Sensors | None = None,
+    likelihood: str = "gaussian",
+    tolerance: float = 1e-4,
+) -> GridPosterior:
+    """Integrate the posterior of up to three parameters; no chain, no Monte Carlo error.
+
+    Parameters
+    ----------
+    data, model, priors, free, fixed, noise, sensors
+        As for :func:`sample`. An unknown noise scale is integrated analytically and does not
+        count among the three.
+    likelihood : {"gaussian", "student_t", "none"}, default "gaussian"
+        "student_t" needs noise of known scale here.
+    tolerance : float, default 1e-4
+        Error of the total probability to be reached.
+
+    Returns
+    -------
+    GridPosterior
+        Moments, quantiles and evidence, with their error.
+
+    Raises
+    ------
+    SamplingError
+        If more than three parameters are free, or the scale of the noise cannot be estimated.
+    ModelError, DataError, ValidationError
+        As for :func:`sample`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dahl_ident import Dahl, FrequencyResponse
+    >>> A = np.geomspace(1e-3, 1e-2, 9)
+    >>> N = Dahl(f_max=0.1, sigma=30.0).describing_function(A)
+    >>> noise = np.random.default_rng(1).normal(scale=0.02, size=(2, 9))
+    >>> data = FrequencyResponse(np.ones(9), N * np.exp(noise[0] + 1j * noise[1]), A)
+    >>> grid = posterior_grid(data, Dahl())
+    >>> grid.converged, round(float(grid.quantile("f_max", 0.5)), 2)
+    (True, 0.1)
+    """
+    problem, optimum = _problem(data, model, noise, sensors, free, fixed)
+    if len(problem.names) > _MOST_AXES:
+        raise SamplingError(
+            f"{len(problem.names)} parameters are free ({', '.join(problem.names)}); quadrature "
+            f"takes up to {_MOST_AXES}: fix some, or use dahl_ident.sample"
+        )
+    tolerance = positive_number(tolerance, "tolerance")
+    density = Density(problem, joint_prior(problem, priors, _theta(optimum)), likelihood)
+    centre, covariance = centre_and_covariance(density, optimum, np.random.default_rng(0))
+    grid = integrate(
+        density.marginal, density.prior.limits, centre, covariance, tolerance=tolerance
+    )
+    return GridPosterior(density, grid, tolerance)
+
+
 def _problem(
     data: FrequencyResponse | FitResult,
     model: Element | None,
@@ -135,7 +201,7 @@ def _problem(
     return problem, optimum_of(problem)
 
 
-def _theta(optimum: Optimum | None) -> np.ndarray | None:
+def _theta(optimum: Optimum | None) -> FloatArray | None:
     return None if optimum is None else optimum.theta
 
 

@@ -1,0 +1,182 @@
+"""Markov chains with emcee: run until they have converged, stopped and resumed at will.
+
+The chain depends on the density, the seed and the settings alone. Walkers and the state of the
+random numbers are carried from step to step, so it does not matter in how many pieces it is run;
+whether it has converged is looked at after fixed numbers of steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.bayes.convergence import Convergence, judge
+from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.moves import moves_for
+
+_FIRST_CHECK = 200
+_GROWTH = 1.25
+_ROUND = 50
+_PIECE = 50  # steps between two calls of the listener, at least
+_PIECES = 20  # part of the chain that one piece may add
+
+RandomState = tuple[Any, ...]
+"""As numpy.random.RandomState.get_state returns it."""
+
+
+class Pool(Protocol):
+    """Anything with map: multiprocessing, concurrent.futures, mpi4py."""
+
+    def map(self, function: Callable[..., Any], items: Any) -> Any:
+        """Return the function's value for each of the items, in order."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a chain is run.
+
+    Attributes
+    ----------
+    walkers : int
+        Walkers in all ensembles together.
+    ensembles : int
+        Independent ensembles.
+    seed : int
+        Of the start and of every step.
+    steps : int or None
+        Total number of steps; None runs until convergence.
+    most_steps : int
+        Where to stop without convergence.
+    wanted : float
+        Effective draws of every parameter at which a chain is long enough.
+    """
+
+    walkers: int
+    ensembles: int
+    seed: int
+    steps: int | None
+    most_steps: int
+    wanted: float
+
+
+@dataclass(frozen=True)
+class Chain:
+    """All steps so far, and what is needed to go on.
+
+    Attributes
+    ----------
+    points : ndarray, shape (steps, walkers, D)
+        Coordinates after each step, walkers ordered by ensemble.
+    log_density : ndarray, shape (steps, walkers)
+        Log-posterior there.
+    start : ndarray, shape (walkers, D)
+        Where the walkers were before the first step.
+    random_state : tuple
+        State of the random numbers after the last step.
+    """
+
+    points: FloatArray
+    log_density: FloatArray
+    start: FloatArray
+    random_state: RandomState
+
+    @classmethod
+    def at(cls, start: FloatArray, seed: int) -> Chain:
+        """Return the chain of no steps."""
+        walkers, dims = start.shape
+        bits = np.random.MT19937(np.random.SeedSequence(seed))
+        state = np.random.RandomState(bits).get_state()
+        return cls(np.empty((0, walkers, dims)), np.empty((0, walkers)), start, tuple(state))
+
+    @property
+    def steps(self) -> int:
+        """The number of steps so far."""
+        return len(self.points)
+
+
+Listener = Callable[[Chain, Convergence | None], None]
+"""Called after each piece, with the last verdict."""
+
+
+def run(
+    density: Density,
+    chain: Chain,
+    settings: Settings,
+    *,
+    pool: Pool | None = None,
+    listener: Listener | None = None,
+) -> tuple[Chain, Convergence]:
+    """Return the chain, continued until its total length is enough, and the verdict on it."""
+    verdict: Convergence | None = None
+    sampler = _sampler(density, settings, pool)
+    end = settings.most_steps if settings.steps is None else settings.steps
+    while True:
+        check = next_check(chain.steps, end) if settings.steps is None else end
+        while chain.steps < check:
+            chain = _continued(sampler, chain, min(_piece(chain), check - chain.steps))
+            if listener is not None:
+                listener(chain, verdict)
+        verdict = judge(chain.points, settings.ensembles, settings.wanted)
+        if chain.steps >= end or verdict.reached:
+            return chain, verdict
+        # the next check lies beyond this one
+        chain = _continued(sampler, chain, min(_PIECE, end - chain.steps))
+
+
+def _piece(chain: Chain) -> int:
+    return max(_PIECE, chain.steps // _PIECES)
+
+
+def next_check(steps: int, end: int) -> int:
+    """Return the first number of steps, at least `steps`, after which convergence is judged."""
+    check = _FIRST_CHECK
+    while check < steps:
+        check = int(np.ceil(_GROWTH * check / _ROUND)) * _ROUND
+    return min(check, end)
+
+
+def _sampler(density: Density, settings: Settings, pool: Pool | None) -> Any:
+    import emcee
+
+    return emcee.EnsembleSampler(
+        settings.walkers,
+        len(density.names),
+        density if pool is None else _Mapped(density, pool),
+        moves=moves_for(settings.ensembles),
+        vectorize=True,
+    )
+
+
+def _continued(sampler: Any, chain: Chain, steps: int) -> Chain:
+    import emcee
+
+    sampler.reset()
+    first = chain.steps == 0
+    state = emcee.State(
+        chain.start if first else chain.points[-1],
+        log_prob=None if first else chain.log_density[-1],
+        random_state=chain.random_state,
+    )
+    last = sampler.run_mcmc(state, steps, skip_initial_state_check=True)
+    return Chain(
+        np.concatenate([chain.points, sampler.get_chain()]),
+        np.concatenate([chain.log_density, sampler.get_log_prob()]),
+        chain.start,
+        last.random_state,
+    )
+
+
+@dataclass(frozen=True)
+class _Mapped:
+    """A density whose points are spread over a pool."""
+
+    density: Density
+    pool: Pool
+    parts: int = 8
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        return np.concatenate(list(self.pool.map(self.density, np.array_split(x, self.parts))))

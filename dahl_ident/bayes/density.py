@@ -1,0 +1,175 @@
+r"""The posterior density of one problem, for many points at once.
+
+A point x holds the search coordinates theta and, where the noise's scale s is unknown, ln s. With
+S(theta) the sum of squared residuals of n rows, two residuals each,
+
+    ln p(x) = ln p(theta) - n ln(2 pi s^2) - S(theta)/(2 s^2) + constants,
+
+the prior 1/s of the scale being flat in ln s. Integrated over s, the same is
+
+    ln p(theta) + ln Gamma(n) - n ln(pi S(theta)) - ln 2 + constants.
+
+For outliers a row may count as Student's t in two dimensions with nu = 4 instead, of density
+(1 + |y|^2/(nu s^2))^-(nu/2 + 1) / (2 pi s^2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import gammaln
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.bayes.priors import JointPrior
+from dahl_ident.errors import SamplingError, ValidationError
+from dahl_ident.problem import Problem
+
+LIKELIHOODS = ("gaussian", "student_t", "none")
+SCALE = "noise_scale"
+TAIL_DOF = 4.0
+
+
+@dataclass(frozen=True)
+class Density:
+    """Log-posterior of a problem; call it with points of shape (S, D).
+
+    Attributes
+    ----------
+    problem : Problem
+        Data, model and noise.
+    prior : JointPrior
+        Of theta.
+    likelihood : {"gaussian", "student_t", "none"}
+        What the noise model says (Gaussian, or Student's t where covariances were estimated),
+        tails for outliers, or the prior alone.
+    """
+
+    problem: Problem
+    prior: JointPrior
+    likelihood: str = "gaussian"
+
+    def __post_init__(self) -> None:
+        problem = self.problem
+        if self.likelihood not in LIKELIHOODS:
+            raise ValidationError(
+                f"likelihood is {self.likelihood!r}; expected one of {', '.join(LIKELIHOODS)}"
+            )
+        if self.likelihood == "student_t" and not problem.gaussian:
+            raise ValidationError(
+                "likelihood='student_t' is for Gaussian noise with outliers, but the covariance of "
+                "these data has few degrees of freedom, which gives Student's t by itself; leave "
+                "likelihood out"
+            )
+        if self.has_scale and problem.n_residuals <= len(problem.names):
+            raise SamplingError(
+                f"{problem.n_residuals} residuals cannot tell {len(problem.names)} parameters and "
+                "the scale of the noise; give the data a covariance, or fix parameters"
+            )
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether ln s is the last coordinate."""
+        return not self.problem.scale_known and self.likelihood != "none"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coordinates' values, D of them."""
+        return (*self.problem.names, *((SCALE,) if self.has_scale else ()))
+
+    @property
+    def logarithmic(self) -> tuple[bool, ...]:
+        """Which coordinates are logarithms."""
+        own = tuple(p.transform == "log" for p in self.problem.parameters)
+        return (*own, *((True,) if self.has_scale else ()))
+
+    @property
+    def priors(self) -> dict[str, str]:
+        """Every prior in words."""
+        texts = {part.parameter.name: str(part) for part in self.prior.parts}
+        return texts | ({SCALE: "1/s"} if self.has_scale else {})
+
+    def to_values(self, x: FloatArray) -> FloatArray:
+        """Return values at points of shape (..., D)."""
+        return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, x, 0.0)), x)
+
+    def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return theta, (S, P), and s, (S,), which is 1 where it is known."""
+        P = len(self.problem.names)
+        return x[:, :P], np.exp(x[:, P]) if self.has_scale else np.ones(len(x))
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        """Return the log-density, (S, D) -> (S,); -inf outside the prior's support."""
+        theta, scale = self.split(x)
+        log_prior = self.log_prior(theta)
+        if self.likelihood == "none":
+            return log_prior
+        inside = log_prior > -np.inf
+        if inside.all():
+            return log_prior + self.log_likelihood(theta, scale)
+        if inside.any():
+            log_prior[inside] += self.log_likelihood(theta[inside], scale[inside])
+        return log_prior
+
+    def marginal(self, theta: FloatArray) -> FloatArray:
+        """Return the log-density of theta, (S, P), an unknown scale integrated out."""
+        if self.likelihood == "student_t" and self.has_scale:
+            raise ValidationError(
+                "likelihood='student_t' with an unknown noise scale has no closed integral over "
+                "the scale; give the data a covariance, or use sampling"
+            )
+        if self.likelihood == "student_t":
+            return self(theta)
+        # for an unknown scale the integral over s is a constant times the highest over s
+        return self.highest(theta) + self._integral_constant
+
+    def highest(self, theta: FloatArray) -> FloatArray:
+        """Return the Gaussian log-posterior of theta, (S, P), at the likeliest scale."""
+        result = self.log_prior(theta)
+        inside = result > -np.inf
+        if self.likelihood != "none" and inside.any():
+            result[inside] += self.problem.log_likelihood(theta[inside])
+        return result
+
+    def log_prior(self, theta: FloatArray) -> FloatArray:
+        """Return the log-prior; interchangeable Dahl elements have support in order of x_c."""
+        result = self.prior.log_density(theta)
+        ordered = self.problem.in_order(theta)
+        if ordered is not theta:
+            result = np.where((ordered == theta).all(axis=-1), result, -np.inf)
+        return result
+
+    def log_likelihood(self, theta: FloatArray, scale: FloatArray) -> FloatArray:
+        """Return ln of the data's density at theta, (S, P), and s, (S,)."""
+        if self.likelihood != "student_t":
+            return self.problem.log_likelihood(theta, scale if self.has_scale else None)
+        z = self.squares(theta)
+        n = z.shape[-1]
+        tails = np.log1p(z / (TAIL_DOF * scale[:, None] ** 2)).sum(axis=-1)
+        result = self._constant - 2.0 * n * np.log(scale) - (0.5 * TAIL_DOF + 1.0) * tails
+        return np.where(np.isnan(result), -np.inf, result)
+
+    def squares(self, theta: FloatArray) -> FloatArray:
+        """Return |y|^2 of every row, (S, n), the scale taken as 1."""
+        y, _ = self.problem.whitened(theta, derivatives=False)
+        return np.asarray(y.real**2 + y.imag**2)
+
+    @cached_property
+    def _integral_constant(self) -> float:
+        """Log of the integral over ln s less ln of the highest: both go as S^-n."""
+        if not self.has_scale:
+            return 0.0
+        n = self.problem.n_residuals / 2.0
+        return float(gammaln(n) - np.log(2.0) - n * np.log(n) + n)
+
+    @cached_property
+    def _constant(self) -> float:
+        """The Gaussian log-likelihood at s = 1 less its exponent; the same at every theta."""
+        theta = self.prior.draw(np.random.default_rng(0), 64)
+        ones = np.ones(len(theta)) if self.has_scale else None
+        squares = self.squares(theta).sum(axis=-1)
+        constant = self.problem.log_likelihood(theta, ones) + 0.5 * squares
+        if not np.isfinite(constant).any():
+            raise SamplingError("the model predicts nothing anywhere in the prior; check both")
+        return float(constant[np.nanargmin(np.where(np.isfinite(constant), squares, np.nan))])

@@ -1,0 +1,320 @@
+"""What is believed before the data: one distribution for each free parameter.
+
+A prior is a frozen distribution of scipy.stats over the parameter's value, such as
+``scipy.stats.norm(1.0, 0.005)`` for a gain from a calibration sheet, or a pair of bounds. Bounds
+mean a log-uniform prior for a positive parameter (every decade is as likely as the next) and a
+uniform one for the others. Where the user says nothing, bounds come from the size of the data,
+wide enough to say little and proper all the same:
+
+- f_max and sigma: from a thousandth of the smallest force or dynamic stiffness in the data to a
+  thousand times the largest; alpha: from 0.1 to 10;
+- stiffness, damping, mass: up to ten times the largest dynamic stiffness, or the least-squares
+  estimate if that is larger, either sign;
+- gains: from 0.1 to 10; delay: half a period of the highest frequency either way.
+
+They are part of the result, and reports print them. The unknown scale s of the noise has the
+prior 1/s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray, finite_array
+from dahl_ident.elements import Dahl, Damper, Mass, Parameter, Spring
+from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.problem import Problem
+
+_DECADES = 1e3
+_WIDER = 10.0
+_TAIL = 1e-10  # of a distribution of unbounded support that lies beyond its `limits`
+
+
+class Distribution(Protocol):
+    """What a prior needs of a frozen distribution of scipy.stats."""
+
+    def logpdf(self, x: Any) -> Any:
+        """Return the logarithm of the density at x."""
+
+    def cdf(self, x: Any) -> Any:
+        """Return the probability below x."""
+
+    def ppf(self, q: Any) -> Any:
+        """Return the quantile q."""
+
+
+PriorLike = Distribution | tuple[float, float]
+
+
+@dataclass(frozen=True)
+class ParameterPrior:
+    """The prior of one parameter.
+
+    Attributes
+    ----------
+    parameter : Parameter
+        Whose prior it is.
+    given : Distribution or tuple of float
+        A distribution of the value, or the ends of a log-uniform or uniform one.
+    source : {"given", "sensors", "default"}
+        Where it comes from; a default follows the size of the data.
+    """
+
+    parameter: Parameter
+    given: PriorLike
+    source: str = "given"
+
+    @property
+    def logarithmic(self) -> bool:
+        """Whether the search coordinate theta is the logarithm of the value."""
+        return self.parameter.transform == "log"
+
+    @cached_property
+    def distribution(self) -> Distribution | None:
+        """The distribution of the value; None where there are bounds."""
+        return None if isinstance(self.given, tuple) else self.given
+
+    @cached_property
+    def limits(self) -> tuple[float, float]:
+        """Ends of theta, beyond which there is no, or next to no, probability."""
+        if isinstance(self.given, tuple):
+            low, high = self.given
+        else:
+            low, high = (float(self.given.ppf(q)) for q in (_TAIL, 1.0 - _TAIL))
+        low, high = max(low, self.parameter.lower), min(high, self.parameter.upper)
+        if self.logarithmic:
+            return float(np.log(max(low, 1e-300))), float(np.log(high))
+        return low, high
+
+    @cached_property
+    def width(self) -> float:
+        """Distance in theta between the quantiles 16 % and 84 %."""
+        low, high = self.quantile(np.array([0.16, 0.84]))
+        return float(high - low)
+
+    def log_density(self, theta: FloatArray) -> FloatArray:
+        """Return the log-density over theta; -inf outside its support."""
+        low, high = self.limits
+        if self.distribution is None:
+            inside = (theta >= low) & (theta <= high)
+            return np.where(inside, -np.log(high - low), -np.inf)
+        value = np.exp(theta) if self.logarithmic else theta
+        allowed = (value >= self.parameter.lower) & (value <= self.parameter.upper)
+        density = np.where(allowed, _log_density(self.distribution, value), -np.inf)
+        return density + theta if self.logarithmic else density
+
+    def probability(self, theta: FloatArray) -> FloatArray:
+        """Return the prior probability below theta."""
+        if self.distribution is None:
+            low, high = self.limits
+            return np.clip((theta - low) / (high - low), 0.0, 1.0)
+        return np.asarray(self.distribution.cdf(np.exp(theta) if self.logarithmic else theta))
+
+    def quantile(self, q: FloatArray) -> FloatArray:
+        """Return quantiles of theta."""
+        low, high = self.limits
+        if self.distribution is None:
+            return np.asarray(low + (high - low) * q)
+        value = np.asarray(self.distribution.ppf(q))
+        if not self.logarithmic:
+            return value
+        return np.asarray(np.log(np.maximum(value, np.exp(low))))
+
+    def __str__(self) -> str:
+        unit = f" {self.parameter.unit}" if self.parameter.unit else ""
+        if isinstance(self.given, tuple):
+            kind = "log-uniform" if self.logarithmic else "uniform"
+            text = f"{kind} from {self.given[0]:.4g} to {self.given[1]:.4g}{unit}"
+        else:
+            text = _described(self.given) + unit
+        return f"{text} (from the size of the data)" if self.source == "default" else text
+
+
+@dataclass(frozen=True)
+class JointPrior:
+    """Independent priors of all free parameters, in the order of the problem's names."""
+
+    parts: tuple[ParameterPrior, ...]
+
+    @cached_property
+    def limits(self) -> tuple[FloatArray, FloatArray]:
+        """Ends of every theta, each of shape (P,)."""
+        low, high = np.array([part.limits for part in self.parts]).T
+        return low, high
+
+    @cached_property
+    def widths(self) -> FloatArray:
+        """Distance in theta between the quantiles 16 % and 84 %, shape (P,)."""
+        return np.array([part.width for part in self.parts])
+
+    def log_density(self, theta: FloatArray) -> FloatArray:
+        """Return the joint log-density over theta, (S, P) -> (S,)."""
+        total = self._bounded(theta)
+        for index, part in enumerate(self.parts):
+            if part.distribution is not None:
+                total = total + part.log_density(theta[:, index])
+        return total
+
+    def _bounded(self, theta: FloatArray) -> FloatArray:
+        low, high, constant = self._box
+        inside = ((theta >= low) & (theta <= high)).all(axis=-1)
+        return np.where(inside, constant, -np.inf)
+
+    @cached_property
+    def _box(self) -> tuple[FloatArray, FloatArray, float]:
+        bounded = np.array([part.distribution is None for part in self.parts])
+        low, high = self.limits
+        constant = -float(np.log((high - low)[bounded]).sum())
+        return np.where(bounded, low, -np.inf), np.where(bounded, high, np.inf), constant
+
+    def draw(self, random: np.random.Generator, size: int) -> FloatArray:
+        """Return independent draws of theta, shape (size, P)."""
+        q = random.uniform(size=(size, len(self.parts)))
+        return np.stack([p.quantile(q[:, i]) for i, p in enumerate(self.parts)], axis=-1)
+
+    def __str__(self) -> str:
+        return "\n".join(f"{part.parameter.name}: {part}" for part in self.parts)
+
+
+def joint_prior(
+    problem: Problem,
+    priors: Mapping[str, PriorLike] | None = None,
+    estimate: FloatArray | None = None,
+) -> JointPrior:
+    """Return the prior of every free parameter of a problem.
+
+    Parameters
+    ----------
+    problem : Problem
+        Priors of its sensors are taken over.
+    priors : mapping of str to distribution or (low, high), optional
+        By parameter name; the rest gets the default.
+    estimate : ndarray, shape (P,), optional
+        Least-squares theta, which defaults of plant parameters include.
+
+    Raises
+    ------
+    ModelError
+        If a name is not that of a free parameter.
+    ValidationError
+        If a prior is neither a distribution nor two bounds in order, or a parameter has no
+        default.
+    """
+    given = dict(priors or {})
+    unknown = [name for name in given if name not in problem.names]
+    if unknown:
+        raise ModelError(
+            f"there is a prior for {', '.join(unknown)}, but free are {', '.join(problem.names)}"
+        )
+    estimates = np.full(len(problem.names), np.nan) if estimate is None else estimate
+    parts = []
+    for parameter, at in zip(problem.parameters, estimates, strict=True):
+        name = parameter.name
+        if name in given:
+            parts.append(ParameterPrior(parameter, _checked(parameter, given[name])))
+        elif name in problem.priors:
+            prior = _checked(parameter, problem.priors[name])
+            parts.append(ParameterPrior(parameter, prior, "sensors"))
+        else:
+            bounds = _default(problem, parameter, float(at))
+            parts.append(ParameterPrior(parameter, bounds, "default"))
+    return JointPrior(tuple(parts))
+
+
+def _checked(parameter: Parameter, given: Any) -> PriorLike:
+    if hasattr(given, "logpdf") and hasattr(given, "ppf") and hasattr(given, "cdf"):
+        _check_support(parameter, given)
+        prior: Distribution = given
+        return prior
+    if not isinstance(given, Sequence) or len(given) != 2:
+        raise ValidationError(
+            f"the prior of {parameter.name} is {given!r}; expected a frozen distribution of "
+            "scipy.stats, or a pair (low, high)"
+        )
+    low, high = finite_array(given, f"prior of {parameter.name}").tolist()
+    if not low < high or (parameter.transform == "log" and low <= 0.0):
+        positive = "0 < " if parameter.transform == "log" else ""
+        raise ValidationError(
+            f"the prior of {parameter.name} has the bounds {low:g} and {high:g}; expected "
+            f"{positive}low < high"
+        )
+    if low < parameter.lower or high > parameter.upper:
+        raise ValidationError(
+            f"the prior of {parameter.name} reaches from {low:g} to {high:g}; the parameter's own "
+            f"bounds are {parameter.lower:g} and {parameter.upper:g}"
+        )
+    return low, high
+
+
+def _check_support(parameter: Parameter, given: Distribution) -> None:
+    """Refuse a distribution with noticeable probability where the parameter cannot be."""
+    outside = float(given.cdf(parameter.lower)) + 1.0 - float(given.cdf(parameter.upper))
+    if not outside <= 1e-3:
+        raise ValidationError(
+            f"the prior of {parameter.name}, {_described(given)}, has {outside:.2g} of its "
+            f"probability outside {parameter.lower:g} to {parameter.upper:g}; take one that lives "
+            "inside, such as scipy.stats.lognorm for a positive parameter"
+        )
+
+
+def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[float, float]:
+    """Return default bounds of the value; `estimate` is theta, NaN where unknown."""
+    name = parameter.name
+    view = problem.stiffness_data
+    for element in problem.model.elements:
+        own = [p.name for p in element.parameters]
+        if name not in own:
+            continue
+        stiffness = np.abs(view.stiffness)
+        if isinstance(element, Dahl):
+            sizes = (stiffness * view.amplitude, stiffness, None)
+            return _decades_around(sizes[own.index(name)])
+        for kind, order in ((Spring, 0.0), (Damper, 1.0), (Mass, 2.0)):
+            if not isinstance(element, kind):
+                continue
+            largest = float((stiffness / view.omega**order).max())
+            reach = _WIDER * max(largest, abs(estimate) if np.isfinite(estimate) else 0.0)
+            return -reach, reach
+    if name in ("force_gain", "displacement_gain"):
+        return 1.0 / _WIDER, _WIDER
+    if name == "delay":
+        half = float(np.pi / view.omega.max())
+        return -half, half
+    raise ValidationError(
+        f"{name} has no default prior, because the data do not tell its size; give priors="
+        f'{{"{name}": (low, high)}}, or a frozen distribution of scipy.stats'
+    )
+
+
+def _decades_around(size: FloatArray | None) -> tuple[float, float]:
+    if size is None:
+        return 1.0 / _WIDER, _WIDER
+    seen = size[size > 0.0]
+    return float(seen.min()) / _DECADES, float(seen.max()) * _DECADES
+
+
+def _log_density(distribution: Distribution, value: FloatArray) -> FloatArray:
+    """Return logpdf; a normal one directly, because scipy takes fifty times as long."""
+    if _name(distribution) == "norm":
+        mean, std = _moments(distribution)
+        z = (value - mean) / std
+        return np.asarray(-0.5 * z**2 - np.log(std * np.sqrt(2.0 * np.pi)))
+    return np.asarray(distribution.logpdf(value))
+
+
+def _name(distribution: Any) -> str:
+    return str(getattr(getattr(distribution, "dist", None), "name", type(distribution).__name__))
+
+
+def _moments(distribution: Any) -> tuple[float, float]:
+    return float(distribution.mean()), float(distribution.std())
+
+
+def _described(distribution: Distribution) -> str:
+    mean, std = _moments(distribution)
+    return f"{_name(distribution)}, mean {mean:.6g}, std {std:.4g}"

@@ -1,0 +1,132 @@
+"""Where the walkers start: around the least-squares optimum, wider than the posterior.
+
+The optimum is moved inside the prior's support. Its covariance is the inverse of the Fisher
+information plus the prior's own precision, so that directions that the data leave undetermined
+start as wide as the prior, and walkers draw from Student's t with twice that spread.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.bayes.density import Density
+from dahl_ident.errors import FitError, SamplingError
+from dahl_ident.fitting import Optimum, solve
+from dahl_ident.problem import Problem
+from dahl_ident.sensors import Sensors
+
+_WIDER = 2.0
+_TRIES = 60
+_INSIDE = 1e-3  # of the prior's width, kept from its ends
+_PRIOR_DRAWS = 4096
+_EXACT = 1e-13  # relative noise below which a fit is exact to rounding
+
+
+def optimum_of(problem: Problem) -> Optimum | None:
+    """Return the least-squares optimum, None where there are too few data for one."""
+    try:
+        return solve(_with_normal_priors(problem))
+    except FitError:
+        return None
+
+
+def _with_normal_priors(problem: Problem) -> Problem:
+    """Return the problem with priors of the sensors replaced by normal ones, for least squares."""
+    given = {p.name: getattr(problem.sensors, p.name) for p in problem.sensors.parameters}
+    normal = {n: stats.norm(p.mean(), p.std()) for n, p in problem.priors.items()}
+    if not normal:
+        return problem
+    sensors = Sensors(**{**given, **normal})
+    return Problem(problem.data, problem.model, noise=problem.noise, sensors=sensors)
+
+
+def starting_points(
+    density: Density, optimum: Optimum | None, walkers: int, random: np.random.Generator
+) -> FloatArray:
+    """Return `walkers` points of finite density, (walkers, D)."""
+    theta, covariance = centre_and_covariance(density, optimum, random)
+    centre, root = _with_scale(density, theta, covariance)
+    spread = np.full(walkers, _WIDER)
+    points = np.empty((walkers, len(centre)))
+    missing = np.arange(walkers)
+    for _ in range(_TRIES):
+        shape = (missing.size, len(centre))
+        draws = random.standard_normal(shape) @ root.T
+        points[missing] = _in_order(density, centre + spread[missing, None] * draws)
+        missing = missing[~np.isfinite(density(points[missing]))]
+        if not missing.size:
+            return points
+        spread[missing] *= 0.8
+    raise SamplingError(
+        f"{missing.size} of {walkers} walkers found no place of finite density around "
+        f"{dict(zip(density.names, density.to_values(centre).tolist(), strict=True))}; check that "
+        "the priors leave room there"
+    )
+
+
+def _in_order(density: Density, points: FloatArray) -> FloatArray:
+    P = len(density.problem.names)
+    return np.concatenate([density.problem.in_order(points[:, :P]), points[:, P:]], axis=1)
+
+
+def centre_and_covariance(
+    density: Density, optimum: Optimum | None, random: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return theta near the posterior's centre, and about its covariance."""
+    problem, prior = density.problem, density.prior
+    theta = _inside(density, optimum, random)
+    precision = np.diag((2.0 / prior.widths) ** 2)
+    if density.likelihood != "none":
+        scale = _scale(density, theta)
+        precision = precision + _with_normal_priors(problem).information(theta, scale)
+    size = 1.0 / np.sqrt(np.diagonal(precision))
+    return theta, np.linalg.inv(precision * np.outer(size, size)) * np.outer(size, size)
+
+
+def _with_scale(
+    density: Density, theta: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the centre and a root of the covariance, ln s included where it is sampled."""
+    P = len(theta)
+    std = np.sqrt(np.diagonal(covariance))
+    root = std[:, None] * np.linalg.cholesky(covariance / np.outer(std, std))
+    if not density.has_scale:
+        return theta, root
+    wider = np.zeros((P + 1, P + 1))
+    wider[:P, :P] = root
+    wider[P, P] = 1.0 / np.sqrt(2.0 * (density.problem.n_residuals - P))
+    return np.append(theta, np.log(_scale(density, theta))), wider
+
+
+def _inside(density: Density, optimum: Optimum | None, random: np.random.Generator) -> FloatArray:
+    """Return the optimum moved inside the prior's support, or else the best of many prior draws."""
+    low, high = density.prior.limits
+    if optimum is not None and density.likelihood != "none":
+        margin = _INSIDE * (high - low)
+        nearest = np.clip(optimum.theta, low + margin, high - margin)
+        if np.isfinite(density.highest(nearest[None])).all():
+            return nearest
+    candidates = density.problem.in_order(density.prior.draw(random, _PRIOR_DRAWS))
+    values = density.highest(candidates)
+    if not np.isfinite(values).any():
+        raise SamplingError(
+            f"none of {_PRIOR_DRAWS} draws from the prior gives the data a finite likelihood; "
+            "check the priors and the model"
+        )
+    return np.asarray(candidates[np.argmax(values)])
+
+
+def _scale(density: Density, theta: FloatArray) -> float:
+    """Return the likeliest noise scale at theta; 1 where it is known."""
+    if not density.has_scale:
+        return 1.0
+    squares = density.squares(theta[None]).sum()
+    scale = float(np.sqrt(squares / density.problem.n_residuals))
+    if not scale > _EXACT:
+        raise SamplingError(
+            f"the model fits the data to {scale:.1e} of their size, which leaves no noise whose "
+            "scale could be estimated; data without noise need a covariance for sampling"
+        )
+    return scale

@@ -1,0 +1,210 @@
+"""The exact posterior of up to three parameters, as users hold it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray, whole_number
+from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.noise_scale import ScalePosterior
+from dahl_ident.bayes.quadrature import Grid
+from dahl_ident.errors import ModelError
+from dahl_ident.problem import Problem
+from dahl_ident.results.posterior import QUANTILES
+from dahl_ident.results.prior_rule import PriorRule, prior_rules
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_RULE_DRAWS = 4000
+
+
+class GridPosterior:
+    """The posterior by quadrature: the same answer at every call, with its error.
+
+    Made by :func:`dahl_ident.posterior_grid`. An unknown scale of the noise is integrated out
+    and shown as ``noise_scale`` all the same.
+
+    Attributes
+    ----------
+    names, units : tuple of str
+        The parameters and their SI units.
+    problem : Problem
+        Data, model, noise and sensors.
+    priors : mapping of str to str
+        Every prior in words.
+    log_evidence : float
+        ln of the data's density under model and prior. Differences between models of the same
+        data are logarithms of Bayes factors; the scale's prior 1/s cancels there.
+    error : float
+        Estimated relative error of the evidence, and of any probability.
+    converged : bool
+        Whether `error` is as small as was asked for.
+    evaluations : int
+        Points at which the likelihood was computed.
+    """
+
+    def __init__(self, density: Density, grid: Grid, tolerance: float) -> None:
+        self._density, self._grid, self._tolerance = density, grid, tolerance
+
+    @property
+    def problem(self) -> Problem:
+        """Data, model, noise and sensors."""
+        return self._density.problem
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, an unknown noise scale last."""
+        return self._density.names
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """SI units of the parameters."""
+        own = [p.unit for p in self.problem.parameters]
+        return (*own, *([""] * (len(self.names) - len(own))))
+
+    @property
+    def priors(self) -> Mapping[str, str]:
+        """Every prior in words."""
+        return self._density.priors
+
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of the data's density under model and prior."""
+        return self._grid.log_evidence
+
+    @property
+    def error(self) -> float:
+        """Estimated relative error of the evidence, and of any probability."""
+        return self._grid.error
+
+    @property
+    def evaluations(self) -> int:
+        """Points at which the likelihood was computed."""
+        return self._grid.evaluations
+
+    @property
+    def converged(self) -> bool:
+        """Whether `error` is as small as was asked for."""
+        return self.error <= self._tolerance
+
+    @property
+    def message(self) -> str:
+        """The error of the quadrature, and whether it is small enough."""
+        text = f"error {self.error:.1g} of the probability, {self.evaluations} points"
+        if self.converged:
+            return f"Converged: {text}."
+        return f"NOT CONVERGED: {text}, expected {self._tolerance:.1g}; use sampling, or check it."
+
+    def quantile(self, name: str, probabilities: float | FloatArray) -> FloatArray:
+        """Return quantiles of one parameter.
+
+        Parameters
+        ----------
+        name : str
+            One of `names`.
+        probabilities : float or array_like, shape (Q,)
+            Between 0 and 1.
+
+        Returns
+        -------
+        ndarray, shape () or (Q,)
+            In SI units.
+        """
+        if name not in self.names:
+            raise ModelError(f"there is no {name!r}; expected one of {', '.join(self.names)}")
+        q = np.atleast_1d(np.asarray(probabilities, dtype=float))
+        axis = self.names.index(name)
+        if axis == self._grid.dims:
+            found = self._scale.quantiles(q)
+        else:
+            found = self._grid.quantiles(axis, q)
+            found = np.exp(found) if self._density.logarithmic[axis] else found
+        return found.reshape(np.shape(probabilities))
+
+    @cached_property
+    def _values(self) -> FloatArray:
+        """Values of the points, (N, P), the scale not included."""
+        theta = self._grid.theta
+        return self.problem.to_values(theta)
+
+    @cached_property
+    def _scale(self) -> ScalePosterior:
+        theta = self._grid.theta
+        likely = self._grid.weights > 0.0
+        squares = self._density.squares(theta[likely]).sum(axis=-1)
+        return ScalePosterior(squares, self._grid.weights[likely], self.problem.n_residuals // 2)
+
+    def mean(self) -> FloatArray:
+        """Return the means of the parameters, in the order of `names`."""
+        own = self._grid.weights @ self._values
+        return np.append(own, self._scale.mean()) if self._density.has_scale else own
+
+    def std(self) -> FloatArray:
+        """Return the standard deviations of the parameters, in the order of `names`."""
+        centred = self._values - self._grid.weights @ self._values
+        own = np.sqrt(self._grid.weights @ centred**2)
+        return np.append(own, self._scale.std()) if self._density.has_scale else own
+
+    def expectation(self, function: Callable[..., Any]) -> float:
+        """Return the posterior mean of a function of the parameters.
+
+        Parameters
+        ----------
+        function : callable
+            Takes arrays of values by parameter name, the noise scale excepted, such as
+            ``lambda f_max, sigma: f_max / sigma``.
+
+        Returns
+        -------
+        float
+            The mean.
+        """
+        by_name = dict(zip(self.problem.names, self._values.T, strict=True))
+        return float(self._grid.weights @ np.asarray(function(**by_name)))
+
+    def summary(self) -> pd.DataFrame:
+        """Return one row a parameter: ``mean, std, 2.5%, 16%, median, 84%, 97.5%, unit``."""
+        import pandas as pd
+
+        levels = np.array(list(QUANTILES.values()))
+        quantiles = np.stack([self.quantile(name, levels) for name in self.names])
+        columns: dict[str, Any] = {"mean": self.mean(), "std": self.std()}
+        columns |= dict(zip(QUANTILES, quantiles.T, strict=True))
+        columns["unit"] = list(self.units)
+        return pd.DataFrame(columns, index=pd.Index(self.names, name="parameter"))
+
+    def draws(self, size: int, seed: int = 0) -> FloatArray:
+        """Return values at points drawn by their probability, shape (size, P)."""
+        return self.problem.to_values(self._draws(size, seed))
+
+    def _draws(self, size: int, seed: int) -> FloatArray:
+        random = np.random.default_rng(seed)
+        size = whole_number(size, "size", 1)
+        chosen = random.choice(len(self._grid.theta), size=size, p=self._grid.weights)
+        return self._grid.theta[chosen]
+
+    @cached_property
+    def prior_rules(self) -> tuple[PriorRule, ...]:
+        """The parameters that the prior determines rather than the data."""
+        if self._density.likelihood == "none":
+            return ()
+        return prior_rules(self._density.prior, self._draws(_RULE_DRAWS, 0))
+
+    def report(self) -> str:
+        """Return the posterior as text; the first line says whether to trust it."""
+        table = self.summary().to_string(float_format=lambda v: f"{v:.5g}")
+        rules = [str(rule) for rule in self.prior_rules]
+        priors = [f"  {name}: {text}" for name, text in self.priors.items()]
+        evidence = f"ln evidence: {self.log_evidence:.4f}"
+        return "\n".join([self.message, "", table, *rules, evidence, "", "Priors:", *priors])
+
+    def __str__(self) -> str:
+        return self.report()
+
+    def __repr__(self) -> str:
+        return f"<GridPosterior: {', '.join(self.names)}; error {self.error:.1g}>"
