@@ -44,6 +44,7 @@ _SHORTEST = 2.0**-30
 _ROOM_TO_GROW = 2.0**-11  # the last coefficients go as the 11th power of the length
 _NEWTON_STEPS = 12
 _NOISE = 1e-13
+_BEYOND_BOUNDS = 1e100
 
 
 class DahlValues(NamedTuple):
@@ -224,9 +225,9 @@ class _Run:
                 break
         else:
             return None
-        if not np.isfinite(force).all():
-            return None
         peak = max(self._peak, float(np.max(np.abs(x))))
+        if not (np.isfinite(force).all() and peak < _BEYOND_BOUNDS):
+            return None
         softness = float(np.max(np.sum(np.abs(driven), axis=1))) * refinement
         tail = _tail(x) + softness * _tail(force)
         return _Interval(x, u - force, tail / (_TOLERANCE * peak) if tail > 0.0 else 0.0)

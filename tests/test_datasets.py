@@ -1,0 +1,253 @@
+"""The shipped data sets: values, checksums, sizes, and what each can determine."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dahl_ident import FrequencyResponse, Record, response
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import Model
+from dahl_ident.elements.description import model_from_description
+from dahl_ident.errors import DataError
+from dahl_ident.synthetic import Experiment, load_dataset, shipped
+from dahl_ident.synthetic.catalogue import DATA_SETS
+from dahl_ident.synthetic.regenerate import main, make, readme
+
+FOLDER = Path(__file__).parents[1] / "datasets" / "synthetic"
+TABLES = [name for name, one in DATA_SETS.items() if one.kind == "frequency_response"]
+RECORDS = [name for name, one in DATA_SETS.items() if one.kind == "record"]
+COLUMNS = (
+    "frequency_hz", "response", "amplitude", "drive", "covariance", "dof", "amplitude_std",
+    "amplitude_covariance", "level", "harmonic", "time", "displacement", "force",
+)  # fmt: skip
+
+
+def loaded_table(name: str) -> FrequencyResponse:
+    data = load_dataset(name)
+    assert isinstance(data, FrequencyResponse)
+    return data
+
+
+@pytest.mark.parametrize("name", DATA_SETS)
+def test_experiment_and_seed_give_the_shipped_values(name: str) -> None:
+    data, made = load_dataset(name), make(DATA_SETS[name])
+    assert type(data) is type(made)
+    for column in COLUMNS:
+        ours, theirs = getattr(data, column, None), getattr(made, column, None)
+        assert (ours is None) == (theirs is None), column
+        if ours is not None and theirs is not None:
+            scale = np.max(np.abs(theirs[np.isfinite(theirs)]), initial=0.0)
+            np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-12 * scale, err_msg=column)
+
+
+@pytest.mark.parametrize("name", DATA_SETS)
+def test_files_are_the_ones_described(name: str) -> None:
+    sidecar = json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
+    content = (FOLDER / sidecar["file"]).read_bytes()
+    assert hashlib.sha256(content).hexdigest() == sidecar["sha256"]
+    one = DATA_SETS[name]
+    assert Experiment.from_dict(sidecar["experiment"]) == one.experiment
+    assert sidecar["seed"] == one.seed
+    assert sidecar["truth"] == one.experiment.truth
+    assert sidecar["identifiable"] == list(one.identifiable)
+    assert sidecar["not_identifiable"] == list(one.not_identifiable)
+    assert sidecar["caution"] == one.caution
+
+
+def test_nothing_else_lies_there_and_all_is_small() -> None:
+    files = {file.name for file in FOLDER.iterdir()}
+    expected = {one.file for one in DATA_SETS.values()} | {f"{name}.json" for name in DATA_SETS}
+    assert files == expected | {"README.md"}
+    assert sum(file.stat().st_size for file in FOLDER.iterdir()) < 5e6
+
+
+def test_the_readme_is_the_catalogues() -> None:
+    assert (FOLDER / "README.md").read_text(encoding="utf-8") == readme()
+
+
+def test_names_in_the_documentation_are_all_names() -> None:
+    documented = load_dataset.__doc__ or ""
+    assert all(f'"{name}"' in documented for name in DATA_SETS)
+
+
+def test_regenerating_writes_the_same_files(tmp_path: Path) -> None:
+    assert main(["noisy", "unsettled", "--directory", str(tmp_path)]) == 0
+    written = sorted(file.name for file in tmp_path.iterdir())
+    assert written == [
+        "README.md", "noisy.csv", "noisy.json", "unsettled.csv.gz", "unsettled.json",
+    ]  # fmt: skip
+    again = [(tmp_path / name).read_bytes() for name in written]
+    main(["noisy", "unsettled", "--directory", str(tmp_path)])
+    assert [(tmp_path / name).read_bytes() for name in written] == again
+
+
+def test_the_command_refuses_an_unknown_name(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "dahl_ident.synthetic.regenerate", "nosiy"]
+    run = subprocess.run(
+        [*command, "--directory", str(tmp_path)], capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 2
+    assert "invalid choice: 'nosiy'" in run.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unknown_name_lists_those_there_are() -> None:
+    with pytest.raises(DataError, match=r"no data set 'nosiy'; there are alpha_2, clean, delayed"):
+        load_dataset("nosiy")
+
+
+def test_a_changed_or_missing_file_is_not_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("noisy.json", "noisy.csv"):
+        (tmp_path / name).write_bytes((FOLDER / name).read_bytes())
+    monkeypatch.setattr(shipped, "_PLACES", (tmp_path / "nowhere", tmp_path, FOLDER))
+    assert loaded_table("noisy").n == 30  # the first place that is there
+    with (tmp_path / "noisy.csv").open("a") as file:
+        file.write("\n")
+    with pytest.raises(DataError, match=r"noisy\.csv is not the file that was shipped"):
+        load_dataset("noisy")
+    (tmp_path / "noisy.csv").unlink()
+    with pytest.raises(DataError, match=r"noisy\.csv is not the file that was shipped"):
+        load_dataset("noisy")
+
+
+def test_sets_that_are_nowhere_are_missed_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shipped, "_PLACES", (tmp_path / "a", tmp_path / "b"))
+    with pytest.raises(DataError, match="the synthetic data sets are in none of"):
+        load_dataset("noisy")
+
+
+# --- what a set can determine: Fisher information of its own covariance, at the truth
+
+
+def predicted(data: FrequencyResponse, plant: Model, sensors: dict[str, float]) -> ComplexArray:
+    """Return the fundamental that the sensors would show."""
+    gain, delay = sensors.get("force_gain", 1.0), sensors.get("delay", 0.0)
+    if data.quantity == "receptance":
+        return np.asarray(response(plant, data.frequency_hz, np.asarray(data.drive)).receptance)
+    Z = plant.dynamic_stiffness(np.asarray(data.amplitude), data.omega)
+    return np.asarray(gain * np.exp(1j * data.omega * delay) * Z)
+
+
+def log_deviations(name: str, free: list[str]) -> dict[str, float]:
+    """Return the standard deviation of each free parameter's logarithm."""
+    data = loaded_table(name)
+    assert data.provenance is not None
+    assert data.covariance is not None
+    truth: dict[str, float] = data.provenance["truth"]
+    plant = model_from_description(data.provenance["experiment"]["plant"])
+    own = [p.name for p in plant.parameters]
+
+    def at(values: dict[str, float]) -> FloatArray:
+        moved = plant.with_values({k: v for k, v in values.items() if k in own})
+        R = predicted(data, moved, {k: v for k, v in values.items() if k not in own})
+        return np.stack([R.real, R.imag], axis=-1)
+
+    h = 1e-4
+    slopes = np.stack(
+        [
+            (at(truth | {k: truth[k] * (1 + h)}) - at(truth | {k: truth[k] * (1 - h)})) / (2 * h)
+            for k in free
+        ]
+    )
+    weight = np.linalg.inv(data.covariance)
+    information = np.einsum("pni,nij,qnj->pq", slopes, weight, slopes)
+    scale = np.sqrt(np.diag(information))
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T
+    return dict(zip(free, np.sqrt(np.diag(inverse)) / scale, strict=True))
+
+
+@pytest.mark.parametrize("name", [n for n in TABLES if n not in ("clean", "outliers")])
+def test_a_table_determines_what_its_description_says(name: str) -> None:
+    one = DATA_SETS[name]
+    deviation = log_deviations(name, [*one.identifiable, *one.not_identifiable])
+    for parameter in one.identifiable:
+        assert deviation[parameter] < 0.25, parameter
+    for parameter in one.not_identifiable:
+        assert deviation[parameter] > 1.0, parameter
+
+
+@pytest.mark.parametrize(("name", "number"), [("outliers", 3), ("noisy", 0)])
+def test_outliers_are_where_the_description_says(name: str, number: int) -> None:
+    data = loaded_table(name)
+    assert data.provenance is not None
+    plant = model_from_description(data.provenance["experiment"]["plant"])
+    error = np.abs(data.response / predicted(data, plant, {}) - 1.0)
+    assert np.flatnonzero(error > 0.1).tolist() == data.provenance["outlier_rows"]
+    assert len(data.provenance["outlier_rows"]) == number
+
+
+# --- what is wrong with the flawed sets is there
+
+
+def test_delayed_turns_with_frequency() -> None:
+    data = loaded_table("delayed")
+    plant = model_from_description(data.provenance["experiment"]["plant"])  # type: ignore[index]
+    ratio = data.response / predicted(data, plant, {})
+    for f in (1.0, 5.0, 20.0):
+        mean = np.mean(ratio[data.frequency_hz == f])
+        assert np.angle(mean) == pytest.approx(2.0 * np.pi * f * 2e-3, abs=0.01)
+        assert abs(mean) == pytest.approx(1.2, rel=0.02)
+
+
+def per_step(name: str) -> list[tuple[float, FloatArray, FloatArray, FloatArray]]:
+    """Return level, time, displacement and force of every measured window."""
+    data = load_dataset(name)
+    assert isinstance(data, Record)
+    assert data.provenance is not None
+    steps = []
+    for level, _, start, stop in data.provenance["windows"]:
+        inside = (data.time >= start - 1e-9) & (data.time < stop - 1e-9)
+        steps.append(
+            (level, data.time[inside], data.motion_samples[inside], data.force_samples[inside])
+        )
+    return steps
+
+
+def test_unsettled_small_levels_drift() -> None:
+    steps = per_step("unsettled")
+    levels = [level for level, *_ in steps]
+    assert levels[:4] == sorted(levels[:4], reverse=True)
+    drift = []
+    for _, _, _, force in steps[:4]:
+        periods = force.reshape(5, -1)
+        drift.append(abs(np.mean(periods[0]) - np.mean(periods[-1])) / np.ptp(force))
+    assert drift[0] < 1e-3
+    assert drift[-1] > 0.05
+
+
+def test_quantised_has_steps_that_small_levels_feel() -> None:
+    steps = per_step("quantised")
+    step = 1e-4
+    for _, _, x, _ in steps:
+        assert x / step == pytest.approx(np.round(x / step), abs=1e-6)
+    assert np.unique(np.round(steps[0][2] / step)).size <= 5
+    assert np.unique(np.round(steps[-1][2] / step)).size > 40
+
+
+def test_the_recording_holds_all_steps_of_the_plant() -> None:
+    data = load_dataset("plant_recording")
+    assert data.provenance is not None
+    plant = model_from_description(data.provenance["experiment"]["plant"])
+    windows = data.provenance["windows"]
+    assert len(windows) == 15
+    for (level, time, x, force), (_, f, _, _) in zip(
+        per_step("plant_recording"), windows, strict=True
+    ):
+        turn = 2.0 * np.pi * f * time
+        columns = np.column_stack([np.cos(turn), np.sin(turn), np.ones_like(turn)])
+        (a, b), (c, d) = (np.linalg.lstsq(columns, y)[0][:2] for y in (x, force))
+        receptance = (a - 1j * b) / (c - 1j * d)
+        # noise of a few thousandths at the smallest level, harmonics and filter below that
+        assert receptance == pytest.approx(complex(response(plant, f, level).receptance), rel=0.02)

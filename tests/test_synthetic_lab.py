@@ -1,0 +1,468 @@
+"""Experiments: their description, their sensors, their tables, and that a seed fixes them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import FrozenInstanceError, replace
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dahl_ident import Dahl, Damper, FrequencyResponse, LinearSystem, Mass, Record, Spring, response
+from dahl_ident.arrays import FloatArray
+from dahl_ident.errors import DataError, ModelError, ValidationError
+from dahl_ident.sensors import Sensors
+from dahl_ident.synthetic import (
+    Acquisition,
+    AmplitudeRamp,
+    Channel,
+    Experiment,
+    FrequencySweep,
+    SteppedSine,
+    Table,
+    simulate,
+)
+from dahl_ident.synthetic.excitation import Excitation
+
+FRICTION = Dahl(0.1, 30.0)
+PLANT = FRICTION + Mass(0.3) + Damper(0.24) + Spring(0.3)
+STEPS = SteppedSine((1e-3, 1e-2), (2.0,), settling_periods=2, num_periods=2)
+
+
+def record(experiment: Experiment, seed: int = 1) -> Record:
+    data = simulate(experiment, seed=seed)
+    assert isinstance(data, Record)
+    return data
+
+
+def table(experiment: Experiment, seed: int = 1) -> FrequencyResponse:
+    data = simulate(experiment, seed=seed)
+    assert isinstance(data, FrequencyResponse)
+    return data
+
+
+def displacement(channel: Channel, rate: float = 1000.0, seed: int = 1) -> FloatArray:
+    """Return what one displacement channel adds to or takes from the true motion."""
+    run = Experiment(FRICTION, STEPS, Acquisition(rate, displacement=channel))
+    measured = record(run, seed)
+    assert measured.displacement is not None
+    return measured.displacement - STEPS.waveform(0).value(measured.time)
+
+
+# --- the description
+
+
+EXPERIMENTS = [
+    Experiment(FRICTION, STEPS),
+    Experiment(FRICTION, replace(STEPS, order="random"), table=Table(0.01, 0.02, (1, 3))),
+    Experiment(
+        PLANT,
+        FrequencySweep(0.1, 1.0, 10.0, 20.0),
+        Acquisition(200.0, Channel(antialias_hz=50.0, limit=2.0), Channel(gain=1.1), 1e-4, 0.01),
+        motion="rotation",
+    ),
+    Experiment(
+        Dahl(0.1, 30.0, 2.0, name="a") + Dahl(0.2, 3.0, name="b") + Spring(0.3),
+        AmplitudeRamp(1e-3, 1e-1, 1.0, 20.0),
+    ),
+    Experiment(
+        FRICTION + LinearSystem(control.tf([1.0], [0.3, 0.24, 0.3]), quantity="receptance"),
+        replace(STEPS, controlled="force"),
+    ),
+]
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS, ids=range(len(EXPERIMENTS)))
+def test_a_description_survives_json_toml_and_files(experiment: Experiment, tmp_path: Path) -> None:
+    assert Experiment.from_dict(experiment.to_dict()) == experiment
+    assert Experiment.from_json(experiment.to_json()) == experiment
+    assert Experiment.from_toml(str(experiment)) == experiment
+    assert hash(Experiment.from_toml(str(experiment))) == hash(experiment)
+    for name, text in (("a.json", experiment.to_json()), ("a.toml", experiment.to_toml())):
+        (tmp_path / name).write_text(text)
+        assert Experiment.read(tmp_path / name) == experiment
+
+
+def test_experiments_differ_where_a_number_does() -> None:
+    assert len(set(EXPERIMENTS)) == len(EXPERIMENTS)
+    assert Experiment(Dahl(0.1, 30.0), STEPS) != Experiment(Dahl(0.1, 30.000001), STEPS)
+    assert Experiment(FRICTION, STEPS) != "an experiment"
+
+
+def test_a_description_is_frozen() -> None:
+    with pytest.raises(FrozenInstanceError):
+        EXPERIMENTS[0].motion = "rotation"  # type: ignore[misc]
+
+
+def test_what_a_file_leaves_out_has_its_default() -> None:
+    text = """
+    [[plant]]
+    kind = "dahl"
+    f_max = 0.1
+    sigma = 30.0
+
+    [excitation]
+    kind = "stepped_sine"
+    levels = [1e-3, 1e-2]
+    frequencies_hz = [2.0]
+    settling_periods = 2
+    num_periods = 2
+    """
+    assert Experiment.from_toml(text) == EXPERIMENTS[0]
+
+
+def description(**changes: object) -> dict[str, object]:
+    return EXPERIMENTS[0].to_dict() | changes
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({"plant": []}, "the experiment has no excitation; expected plant, excitation"),
+        (description(sensor=1), "the experiment has the unknown sensor; expected plant"),
+        (description(excitation={"levels": [1.0]}), "the excitation has the kind None"),
+        (
+            description(excitation={"kind": "stepped_sine", "level": 1.0}),
+            "excitation has the unknown level and no levels; expected levels, freq",
+        ),
+        (description(acquisition={"force": {"noise": 1.0}}), "acquisition.force has the unknown"),
+        (description(acquisition=3), "acquisition is 3; expected a table of named values"),
+        (description(table={"std": 0.1}), "table has the unknown std; expected displacement_std"),
+    ],
+)
+def test_a_bad_description_names_the_key(data: dict[str, object], message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        Experiment.from_dict(data)
+
+
+def test_unreadable_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"none\.toml: cannot be read: No such file"):
+        Experiment.read(tmp_path / "none.toml")
+    with pytest.raises(DataError, match=r"run\.yaml: expected an experiment in \.toml or \.json"):
+        Experiment.read(tmp_path / "run.yaml")
+    (tmp_path / "a.toml").write_text("plant = [")
+    with pytest.raises(DataError, match=r"a\.toml: the experiment is no TOML"):
+        Experiment.read(tmp_path / "a.toml")
+    (tmp_path / "a.json").write_text("{")
+    with pytest.raises(DataError, match=r"a\.json: the experiment is no JSON"):
+        Experiment.read(tmp_path / "a.json")
+    (tmp_path / "b.json").write_text(json.dumps(description(plant=[{"kind": "gear"}])))
+    with pytest.raises(DataError, match=r"b\.json: .*kind 'gear'"):
+        Experiment.read(tmp_path / "b.json")
+
+
+def test_impossible_experiments_are_refused() -> None:
+    with pytest.raises(ModelError, match="no value for sigma"):
+        Experiment(Dahl(0.1), STEPS)
+    with pytest.raises(ValidationError, match="a table was asked of a FrequencySweep"):
+        Experiment(PLANT, FrequencySweep(1.0, 1.0, 2.0, 10.0), table=Table())
+    with pytest.raises(ValidationError, match=r"harmonics is \(1, 3\) where force is controlled"):
+        Experiment(PLANT, replace(STEPS, controlled="force"), table=Table(harmonics=(1, 3)))
+    faults = Acquisition(force=Channel(noise_std=1.0, offset=1.0), jitter_std=1e-3)
+    with pytest.raises(ValidationError, match="force noise_std, force offset, jitter_std have no"):
+        Experiment(PLANT, STEPS, faults, Table())
+    with pytest.raises(ValidationError, match="motion is 'sideways'"):
+        Experiment(PLANT, STEPS, motion="sideways")  # type: ignore[arg-type]
+    with pytest.raises(ValidationError, match="sample_rate_hz is 4; expected more than 4"):
+        simulate(Experiment(FRICTION, STEPS, Acquisition(4.0)), seed=1)
+    with pytest.raises(ValidationError, match="seed is -1; expected a whole number >= 0"):
+        simulate(EXPERIMENTS[0], seed=-1)
+    with pytest.raises(ValidationError, match="experiment is a str; expected a dahl_ident"):
+        simulate("run.toml", seed=1)  # type: ignore[arg-type]
+    stuck = Experiment(FRICTION, SteppedSine((1.0,), controlled="force"), table=Table())
+    with pytest.raises(ModelError, match=r"."):
+        simulate(stuck, seed=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("gain", 0.0), ("noise_std", -1.0), ("resolution", -1.0), ("antialias_hz", 0.0),
+     ("limit", -1.0), ("delay", np.inf), ("hum_amplitude", np.nan)],
+)  # fmt: skip
+def test_bad_channels_are_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ValidationError, match=f"{name} is"):
+        Channel(**{name: value})
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [{"force_std": -1.0}, {"harmonics": ()}, {"harmonics": (0,)}, {"outlier_fraction": 1.5}],
+)
+def test_bad_tables_are_refused_by_name(arguments: dict[str, object]) -> None:
+    with pytest.raises(ValidationError, match=next(iter(arguments))):
+        Table(**arguments)  # type: ignore[arg-type]
+
+
+def test_bad_recorders_are_refused_by_name() -> None:
+    with pytest.raises(ValidationError, match=r"dropped_fraction is 0\.95"):
+        Acquisition(dropped_fraction=0.95)
+    with pytest.raises(ValidationError, match="sample_rate_hz is 0"):
+        Acquisition(sample_rate_hz=0.0)
+
+
+# --- seeds
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS, ids=range(len(EXPERIMENTS)))
+def test_a_seed_fixes_the_data(experiment: Experiment) -> None:
+    first, second = (simulate(experiment, seed=3) for _ in range(2))
+    for name in ("time", "displacement", "force", "response", "amplitude"):
+        if hasattr(first, name):
+            assert np.array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_another_seed_gives_other_noise_and_nothing_else() -> None:
+    run = Experiment(FRICTION, STEPS, Acquisition(100.0, force=Channel(noise_std=1e-3)))
+    a, b = record(run, 1), record(run, 2)
+    assert np.array_equal(a.motion_samples, b.motion_samples)
+    assert not np.array_equal(a.force_samples, b.force_samples)
+
+
+def test_adding_one_fault_leaves_the_others_as_they_were() -> None:
+    noise = displacement(Channel(noise_std=1e-3))
+    both = displacement(Channel(noise_std=1e-3, hum_amplitude=1e-4))
+    assert both - noise == pytest.approx(displacement(Channel(hum_amplitude=1e-4)), abs=1e-15)
+
+
+def test_provenance_tells_how_it_was_made() -> None:
+    run = Experiment(
+        PLANT, replace(STEPS, controlled="force"), Acquisition(force=Channel(gain=1.1, delay=1e-3))
+    )
+    made = record(run, 5).provenance
+    assert made is not None
+    assert Experiment.from_dict(made["experiment"]) == run
+    assert made["seed"] == 5
+    assert made["truth"] == {
+        "f_max": 0.1, "sigma": 30.0, "alpha": 1.0, "mass": 0.3, "damping": 0.24,
+        "stiffness": 0.3, "force_gain": 1.1, "delay": -1e-3,
+    }  # fmt: skip
+    assert [window[0] for window in made["windows"]] == [1e-3, 1e-2]
+
+
+# --- sensors
+
+
+def test_an_ideal_sensor_shows_the_motion_itself() -> None:
+    assert np.array_equal(displacement(Channel()), np.zeros(6_001))
+
+
+def test_white_noise() -> None:
+    noise = displacement(Channel(noise_std=1e-3))
+    assert np.std(noise) == pytest.approx(1e-3, rel=0.03)
+    neighbours = np.mean(noise[1:] * noise[:-1]) / 1e-6
+    assert neighbours == pytest.approx(0.0, abs=0.04)
+
+
+def test_flicker_noise_is_slow() -> None:
+    noise = displacement(Channel(flicker_std=1e-3))
+    assert np.mean(noise[1:] * noise[:-1]) / np.mean(noise**2) > 0.5
+    assert np.std(noise) == pytest.approx(1e-3, rel=0.3)
+
+
+def test_offset_drift_and_gain() -> None:
+    time = np.arange(6_001) / 1000.0
+    added = displacement(Channel(offset=1e-3, drift=2e-3))
+    assert added == pytest.approx(1e-3 + 2e-3 * time, abs=1e-15)
+    true = STEPS.waveform(0).value(time)
+    assert displacement(Channel(gain=1.25)) == pytest.approx(0.25 * true, abs=1e-15)
+
+
+def test_hum_is_a_sine_at_the_mains_frequency() -> None:
+    hum = displacement(Channel(hum_amplitude=1e-3, hum_hz=60.0))[:-1]
+    spectrum = 2.0 * np.abs(np.fft.rfft(hum)) / hum.size
+    assert spectrum[360] == pytest.approx(1e-3, rel=1e-9)
+    assert np.sum(np.delete(spectrum, 360)) < 1e-12
+
+
+def test_a_delay_shows_what_was() -> None:
+    time = np.arange(6_001) / 1000.0
+    true = STEPS.waveform(0)
+    late = displacement(Channel(delay=0.0123)) + true.value(time)
+    assert late == pytest.approx(true.value(time - 0.0123), abs=1e-15)
+
+
+def test_quantisation_rounds_to_steps() -> None:
+    error = displacement(Channel(resolution=5e-4))
+    shown = (error + STEPS.waveform(0).value(np.arange(6_001) / 1000.0)) / 5e-4
+    assert shown == pytest.approx(np.round(shown), abs=1e-9)
+    assert np.max(np.abs(error)) <= 2.5e-4 * (1.0 + 1e-9)
+    assert np.max(np.abs(error)) > 2.4e-4
+
+
+def test_clipping_holds_the_limit() -> None:
+    time = np.arange(6_001) / 1000.0
+    true = STEPS.waveform(0).value(time)
+    shown = displacement(Channel(limit=4e-3)) + true
+    assert shown == pytest.approx(np.clip(true, -4e-3, 4e-3), abs=1e-15)
+    assert np.mean(np.abs(shown) == 4e-3) > 0.1
+
+
+def test_the_anti_alias_filter_is_of_first_order() -> None:
+    steps = SteppedSine((1.0,), (2.0,), settling_periods=20)
+    run = Experiment(Spring(1.0), steps, Acquisition(256.0, Channel(antialias_hz=3.0)))
+    measured = record(run)
+    assert measured.provenance is not None
+    _, f, start, stop = measured.provenance["windows"][0]
+    inside = (measured.time >= start) & (measured.time < stop)
+    turn = np.exp(-2j * np.pi * f * measured.time[inside])
+    shown = np.mean(measured.motion_samples[inside] * turn)
+    ratio = shown / np.mean(measured.force_samples[inside] * turn)
+    assert ratio == pytest.approx(1.0 / (1.0 + 2.0j / 3.0), rel=1e-5)
+
+
+def test_the_filter_starts_at_rest_with_its_signal() -> None:
+    shown = displacement(Channel(antialias_hz=3.0))
+    assert shown[0] == pytest.approx(0.0, abs=1e-18)
+
+
+def test_jitter_moves_both_channels_alike() -> None:
+    steps = SteppedSine((1.0,), (2.0,))
+    run = Experiment(Spring(3.0), steps, Acquisition(1000.0, jitter_std=1e-4))
+    measured = record(run)
+    true = steps.waveform(0)
+    assert measured.force_samples == pytest.approx(3.0 * measured.motion_samples)
+    moved = measured.motion_samples - true.value(measured.time)
+    assert np.std(moved) == pytest.approx(
+        1e-4 * np.std(true.motion(measured.time).velocity), rel=0.05
+    )
+    assert np.diff(measured.time) == pytest.approx(1e-3)
+
+
+def test_dropped_samples_leave_gaps() -> None:
+    whole = record(Experiment(FRICTION, STEPS, Acquisition(1000.0)))
+    holed = record(Experiment(FRICTION, STEPS, Acquisition(1000.0, dropped_fraction=0.1)))
+    assert holed.n / whole.n == pytest.approx(0.9, abs=0.01)
+    assert len(holed.gaps) > 400
+    kept = np.searchsorted(whole.time, holed.time)
+    assert np.array_equal(whole.force_samples[kept], holed.force_samples)
+
+
+def test_a_forced_record_holds_the_drive_and_the_motion() -> None:
+    run = Experiment(
+        PLANT,
+        SteppedSine((0.2,), (2.0,), controlled="force", settling_periods=30),
+        motion="rotation",
+    )
+    measured = record(run)
+    assert measured.motion == "rotation"
+    assert measured.sample_rate == pytest.approx(128.0)
+    assert measured.provenance is not None
+    _, f, start, stop = measured.provenance["windows"][0]
+    inside = (measured.time > start - 1e-9) & (measured.time < stop - 1e-9)
+    turn = np.exp(-2j * np.pi * f * measured.time[inside])
+    x = np.mean(measured.motion_samples[inside] * turn)
+    u = np.mean(measured.force_samples[inside] * turn)
+    assert x / u == pytest.approx(complex(response(PLANT, f, 0.2).receptance), rel=3e-3)
+
+
+# --- tables
+
+
+def test_a_table_without_errors_is_the_describing_function() -> None:
+    steps = SteppedSine((1e-3, 1e-2), (1.0, 5.0))
+    data = table(Experiment(PLANT, steps, table=Table(harmonics=(1, 3))))
+    assert data.n == 8
+    assert data.covariance is None
+    assert data.harmonic.tolist() == [1, 3] * 4
+    for row in range(8):
+        k = int(data.harmonic[row])
+        expected = PLANT.dynamic_stiffness(data.amplitude[row], data.omega[row], harmonic=k)  # type: ignore[index]
+        assert data.response[row] == pytest.approx(complex(expected), rel=1e-14)
+
+
+def test_a_forced_table_is_the_steady_response() -> None:
+    steps = SteppedSine((0.05, 0.5), (1.0, 5.0), controlled="force")
+    data = table(Experiment(PLANT, steps, table=Table(), motion="rotation"))
+    assert data.quantity == "receptance"
+    assert data.motion == "rotation"
+    assert data.controlled.tolist() == ["force"] * 4
+    expected = response(PLANT, data.frequency_hz, np.array([0.05, 0.5, 0.05, 0.5]))
+    assert data.response == pytest.approx(np.asarray(expected.receptance), rel=1e-14)
+    assert data.amplitude == pytest.approx(expected.amplitude)
+    assert data.drive == pytest.approx([0.05, 0.5, 0.05, 0.5])
+
+
+def test_a_tables_sensors_are_those_of_the_problem() -> None:
+    acquisition = Acquisition(
+        displacement=Channel(gain=0.9, delay=3e-3), force=Channel(gain=1.2, delay=1e-3)
+    )
+    steps = SteppedSine((1e-3, 1e-2), (1.0, 5.0))
+    plain = table(Experiment(FRICTION, steps, table=Table(harmonics=(1, 3))))
+    seen = table(Experiment(FRICTION, steps, acquisition, Table(harmonics=(1, 3))))
+    assert seen.amplitude == pytest.approx(0.9 * np.asarray(plain.amplitude))
+    turned = np.exp(1j * plain.harmonic * plain.omega * 2e-3) * 1.2 / 0.9
+    assert seen.response == pytest.approx(turned * plain.response, rel=1e-13)
+    assert seen.provenance is not None
+    truth = seen.provenance["truth"]
+    assert Sensors(
+        force_gain=truth["force_gain"],
+        displacement_gain=truth["displacement_gain"],
+        delay=truth["delay"],
+    ) == Sensors(force_gain=1.2, displacement_gain=0.9, delay=2e-3)
+
+
+def test_a_table_sees_the_anti_alias_filter() -> None:
+    acquisition = Acquisition(displacement=Channel(antialias_hz=5.0))
+    steps = SteppedSine((1e-3,), (5.0,))
+    plain = table(Experiment(FRICTION, steps, table=Table())).response
+    seen = table(Experiment(FRICTION, steps, acquisition, Table()))
+    assert seen.response == pytest.approx(plain * (1.0 + 1.0j), rel=1e-13)
+    assert seen.amplitude == pytest.approx([1e-3 / np.sqrt(2.0)])
+
+
+@pytest.mark.parametrize(("controlled", "harmonics"), [("displacement", (1, 3)), ("force", (1,))])
+def test_covariances_are_those_of_repeated_tables(
+    controlled: str, harmonics: tuple[int, ...]
+) -> None:
+    level = 5e-3 if controlled == "displacement" else 0.1
+    steps = SteppedSine((level,) * 5000, (1.0,), controlled=controlled)  # type: ignore[arg-type]
+    data = table(Experiment(PLANT, steps, table=Table(0.004, 0.006, harmonics)))
+    assert data.amplitude is not None
+    assert data.covariance is not None
+    assert data.amplitude_std is not None
+    assert data.amplitude_covariance is not None
+    assert data.dof is not None
+    for k in harmonics:
+        rows = data.harmonic == k
+        R = data.response[rows]
+        found = np.cov(np.array([data.amplitude[rows], R.real, R.imag]))
+        stated = np.zeros((3, 3))
+        stated[0, 0] = np.mean(data.amplitude_std[rows] ** 2)
+        stated[0, 1:] = stated[1:, 0] = np.mean(data.amplitude_covariance[rows], axis=0)
+        stated[1:, 1:] = np.mean(data.covariance[rows], axis=0)
+        scale = np.sqrt(np.diag(stated))
+        difference = (found - stated) / np.outer(scale, scale)
+        assert difference == pytest.approx(np.zeros((3, 3)), abs=0.06)
+        assert np.all(np.isinf(data.dof[rows]))
+
+
+def test_outliers_are_few_large_and_known() -> None:
+    steps = SteppedSine(tuple(np.geomspace(1e-4, 1e-1, 40)))
+    plain = table(Experiment(FRICTION, steps, table=Table(force_std=0.01)))
+    spoiled = table(Experiment(FRICTION, steps, table=Table(force_std=0.01, outlier_fraction=0.1)))
+    moved = np.abs(spoiled.response / plain.response - 1.0)
+    assert spoiled.provenance is not None
+    assert spoiled.provenance["outlier_rows"] == np.flatnonzero(moved > 1e-12).tolist()
+    assert np.count_nonzero(moved > 1e-12) == 4
+    assert moved[moved > 1e-12] == pytest.approx(0.5)
+
+
+@given(seed=st.integers(0, 2**64), f_max=st.floats(1e-6, 1e6), x_c=st.floats(1e-9, 1e3))
+def test_tables_scale_with_their_units(seed: int, f_max: float, x_c: float) -> None:
+    def made(f: float, x: float) -> FrequencyResponse:
+        steps = SteppedSine((0.1 * x, 3.0 * x), order="random")
+        return table(Experiment(Dahl(f, f / x), steps, table=Table(0.01, 0.01)), seed)
+
+    unit, scaled = made(1.0, 1.0), made(f_max, x_c)
+    assert scaled.response == pytest.approx(unit.response * f_max / x_c, rel=1e-10)
+    assert scaled.amplitude == pytest.approx(np.asarray(unit.amplitude) * x_c, rel=1e-10)
+
+
+@pytest.mark.parametrize("excitation", [AmplitudeRamp(1e-3, 1e-2, 2.0, 3.0), STEPS])
+def test_a_record_lasts_as_long_as_its_excitation(excitation: Excitation) -> None:
+    measured = record(Experiment(FRICTION, excitation, Acquisition(100.0)))
+    assert measured.time[-1] == pytest.approx(excitation.waveform(0).duration, abs=0.01)

@@ -1,0 +1,320 @@
+"""Plants in the time domain: against an ODE solver, each other, and the describing function."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring, response
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import Element
+from dahl_ident.elements.model import as_model
+from dahl_ident.errors import ModelError
+from dahl_ident.synthetic import AmplitudeRamp, FrequencySweep, SteppedSine
+from dahl_ident.synthetic.mechanism import Mechanism, Signal
+from dahl_ident.synthetic.waveform import Waveform
+
+FRICTION = (0.1, 30.0)
+LINEAR = Mass(0.3) + Damper(0.24) + Spring(0.3)
+PLANT = Dahl(*FRICTION) + LINEAR
+
+
+def by_ode_solver(
+    mass: float, damping: float, stiffness: float, friction: Sequence[Dahl], force: Waveform
+) -> list[tuple[float, float, Signal]]:
+    """Eqn. 53 with Eqn. 2 as further states: DOP853, restarted at every reversal it finds."""
+    parameters = [[float(v) for v in dahl.known_values()] for dahl in friction]
+    state = np.zeros(2 + len(parameters))
+    direction = 1.0
+    pieces: list[tuple[float, float, Signal]] = []
+    for segment in force.segments:
+        t = segment.start
+        while t < segment.stop - 1e-12:
+            s = direction
+
+            def slope(
+                time: float, y: FloatArray, s: float = s, segment: object = segment
+            ) -> FloatArray:
+                u = float(force.value(np.array([time]))[0])
+                x, v, *forces = y
+                rates = []
+                for (f_max, sigma, alpha), F in zip(parameters, forces, strict=True):
+                    margin = 1.0 - s * F / f_max
+                    rates.append(sigma * abs(margin) ** alpha * np.sign(margin) * v)
+                a = (u - damping * v - stiffness * x - sum(forces)) / mass
+                return np.array([v, a, *rates])
+
+            def reversal(time: float, y: FloatArray) -> float:
+                return float(y[1])
+
+            reversal.terminal = True  # type: ignore[attr-defined]
+            reversal.direction = -s  # type: ignore[attr-defined]
+            run = solve_ivp(
+                slope, (t, segment.stop), state, method="DOP853", rtol=1e-11, atol=1e-18,
+                events=reversal, dense_output=True,
+            )  # fmt: skip
+            pieces.append((t, float(run.t[-1]), partial(_first_state, run.sol)))
+            t, state = float(run.t[-1]), run.y[:, -1].copy()
+            if run.status == 1:
+                state[1], direction = 0.0, -direction
+    return pieces
+
+
+def _first_state(solution: Any, time: FloatArray) -> FloatArray:
+    return np.asarray(solution(time)[0])
+
+
+def phasor(signal: Signal, frequency_hz: float, start: float, periods: int, k: int = 1) -> complex:
+    """Return the k-th harmonic over whole periods, from 512 points in each."""
+    time = start + np.arange(512 * periods) / (512.0 * frequency_hz)
+    return complex(2.0 * np.mean(signal(time) * np.exp(-2j * np.pi * k * frequency_hz * time)))
+
+
+@pytest.mark.parametrize(
+    ("friction", "levels"),
+    [
+        ([Dahl(0.1, 30.0)], (0.02, 0.2)),
+        ([Dahl(0.1, 30.0)], (5.0, 0.05)),
+        ([Dahl(0.1, 30.0, 2.0)], (0.2, 0.02)),
+        ([Dahl(0.1, 30.0, 0.5)], (0.01, 0.05)),
+        ([Dahl(0.1, 30.0), Dahl(0.03, 90.0, 1.5, name="b")], (0.05, 0.3)),
+    ],
+    ids=["microslip up", "gross slip down", "alpha 2", "alpha 1/2", "two elements"],
+)
+def test_motion_agrees_with_an_ode_solver(friction: list[Dahl], levels: tuple[float, ...]) -> None:
+    steps = SteppedSine(levels, (0.7,), controlled="force", settling_periods=1, num_periods=1)
+    force = steps.waveform(seed=0)
+    motion = Mechanism.of(sum(friction[1:], start=friction[0] + LINEAR)).displacement_under(force)
+    worst = largest = 0.0
+    for start, stop, reference in by_ode_solver(0.3, 0.24, 0.3, friction, force):
+        time = np.linspace(start, stop, 15)
+        worst = max(worst, float(np.max(np.abs(motion(time) - reference(time)))))
+        largest = max(largest, float(np.max(np.abs(reference(time)))))
+    assert worst < 5e-10 * largest
+
+
+@pytest.mark.parametrize(
+    "plant",
+    [
+        Dahl(*FRICTION) + Damper(0.5),
+        Dahl(*FRICTION) + Spring(3.0),
+        Dahl(*FRICTION) + Spring(3.0) + Damper(0.1),
+        Dahl(*FRICTION) + Mass(0.3),
+        Dahl(*FRICTION, 0.25) + LINEAR,
+        Dahl(*FRICTION, 3.0) + LINEAR,
+    ],
+    ids=["damper", "spring", "spring and damper", "mass", "alpha 1/4", "alpha 3"],
+)
+@pytest.mark.parametrize("level", [0.05, 0.5])
+def test_forces_balance_at_every_instant(plant: Element, level: float) -> None:
+    force = AmplitudeRamp(0.3 * level, level, 1.0, 3.0, controlled="force").waveform(seed=0)
+    motion = Mechanism.of(plant).displacement_under(force)
+    time = np.linspace(0.0, force.duration, 20_001)
+    x = motion(time)
+    v = np.gradient(x, time, edge_order=2)
+    a = np.gradient(v, time, edge_order=2)
+    total = as_model(plant).force(x, velocity=v, acceleration=a)
+    # second differences jump where friction's stiffness does, at reversals
+    misfit = np.abs(total - force.value(time))[2:-2]
+    assert np.quantile(misfit, 0.99) < 2e-4 * level
+    assert np.max(misfit) < 5e-3 * level
+
+
+def test_without_friction_the_motion_is_the_linear_one() -> None:
+    force = SteppedSine((2.0,), (0.7,), controlled="force", settling_periods=3).waveform(seed=0)
+    motion = Mechanism.of(LINEAR).displacement_under(force)
+    system = control.ss(control.tf([1.0], [0.3, 0.24, 0.3]))
+    time = np.linspace(0.0, force.duration, 40_001)
+    expected = np.asarray(control.forced_response(system, time, force.value(time)).outputs)
+    assert motion(time) == pytest.approx(expected, abs=1e-6 * np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize("controlled", ["force", "displacement"])
+@pytest.mark.parametrize(
+    ("system", "quantity"),
+    [
+        (control.tf([1.0], [0.3, 0.24, 0.3]), "receptance"),
+        (control.ss(control.tf([1.0], [0.3, 0.24, 0.3])), "receptance"),
+        (control.tf([1.0, 0.0], [0.3, 0.24, 0.3]), "mobility"),
+        (control.tf([1.0, 0.0, 0.0], [0.3, 0.24, 0.3]), "accelerance"),
+        (control.tf([0.3, 0.24, 0.3], [1.0]), "dynamic_stiffness"),
+        (control.tf([0.3, 0.24, 0.3], [1.0, 0.0]), "mechanical_impedance"),
+        (control.tf([0.3, 0.24, 0.3], [1.0, 0.0, 0.0]), "apparent_mass"),
+    ],
+)
+def test_a_linear_system_moves_as_its_elements_do(
+    system: object, quantity: str, controlled: str
+) -> None:
+    steps = SteppedSine((0.05,), controlled=controlled, settling_periods=1, num_periods=1)  # type: ignore[arg-type]
+    wave = steps.waveform(seed=0)
+    time = np.linspace(0.0, wave.duration, 500)
+    plants = [PLANT, Dahl(*FRICTION) + LinearSystem(system, quantity=quantity)]  # type: ignore[arg-type]
+    elements, lumped = (
+        (m.displacement_under if controlled == "force" else m.force_under)(wave)(time)
+        for m in map(Mechanism.of, plants)
+    )
+    assert lumped == pytest.approx(elements, abs=1e-10 * np.max(np.abs(elements)))
+
+
+def test_a_linear_system_with_poles_of_its_own_is_followed_under_either_control() -> None:
+    # a tuned absorber beside the plant: Z has a pole pair that no lumped element has
+    absorber = LinearSystem(
+        control.tf([0.05 * 1.0, 0.05 * 25.0, 0.0, 0.0], [1.0, 1.0, 25.0]),
+        quantity="dynamic_stiffness",
+    )
+    plant = PLANT + absorber
+    mechanism = Mechanism.of(plant)
+    f = 0.9
+    held = SteppedSine((0.01,), (f,), settling_periods=20).waveform(seed=0)
+    start = held.windows[0].start
+    stiffness = phasor(mechanism.force_under(held), f, start, 5) / phasor(held.value, f, start, 5)
+    # 512 samples a period alias friction's corners a little
+    assert stiffness == pytest.approx(plant.dynamic_stiffness(0.01, 2.0 * np.pi * f), rel=1e-6)
+    driven = SteppedSine((0.02,), (4.0,), controlled="force", settling_periods=60).waveform(seed=0)
+    start = driven.windows[0].start
+    x = mechanism.displacement_under(driven)
+    receptance = phasor(x, 4.0, start, 5) / phasor(driven.value, 4.0, start, 5)
+    assert receptance == pytest.approx(complex(response(plant, 4.0, 0.02).receptance), rel=1e-3)
+
+
+@pytest.mark.parametrize("alpha", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("amplitude", [1e-4, 1e-2, 1.0])
+def test_friction_under_a_held_displacement_is_the_exact_force(
+    alpha: float, amplitude: float
+) -> None:
+    friction = Dahl(*FRICTION, alpha)
+    wave = SteppedSine(
+        (amplitude, 0.4 * amplitude), (2.0,), settling_periods=1, num_periods=2, rest=0.3
+    ).waveform(seed=0)
+    rng = np.random.Generator(np.random.PCG64(1))
+    time = np.sort(rng.uniform(0.0, wave.duration, 300))
+    force = Mechanism.of(friction).force_under(wave)(time)
+    dense = np.unique(np.concatenate([time, wave.turning_times()]))
+    expected = friction.force(wave.value(dense))[np.searchsorted(dense, time)]
+    assert force == pytest.approx(expected, abs=1e-13 * 0.1)
+
+
+def test_a_held_displacement_has_exactly_the_describing_function() -> None:
+    wave = SteppedSine((0.01,), (2.0,), settling_periods=12, num_periods=1).waveform(seed=0)
+    force = Mechanism.of(PLANT).force_under(wave)
+    start = wave.windows[0].start
+    time = start + np.arange(2**14) / 2.0**14 / 2.0
+    k = np.exp(-4j * np.pi * time)
+    stiffness = np.mean(force(time) * k) / np.mean(wave.value(time) * k)
+    assert stiffness == pytest.approx(PLANT.dynamic_stiffness(0.01, 4.0 * np.pi), rel=1e-8)
+
+
+def steady(level: float, f: float) -> tuple[ComplexArray, Signal, float]:
+    """Return harmonics 0 to 7 of the displacement, the motion, and the start of a period."""
+    wave = SteppedSine((level,), (f,), controlled="force", settling_periods=60).waveform(seed=0)
+    motion = Mechanism.of(PLANT).displacement_under(wave)
+    start = wave.windows[0].start
+    return np.array([phasor(motion, f, start, 4, k) for k in range(8)]), motion, start
+
+
+@pytest.mark.parametrize(("f", "level"), [(0.8, 0.02), (1.0, 0.12), (1.3, 0.06), (2.0, 0.12)])
+def test_the_describing_function_errs_as_the_third_harmonic_says(f: float, level: float) -> None:
+    harmonics, _, start = steady(level, f)
+    drive = level * np.exp(2j * np.pi * f * -start) / 1j  # a sine from the window's start
+    error = abs(harmonics[1] / drive / response(PLANT, f, level).receptance - 1.0)
+    third = abs(harmonics[3] / harmonics[1])
+    assert 1e-4 < error < 4.0 * third
+
+    omega = 2.0 * np.pi * f
+    theta = np.linspace(0.0, 40.0 * np.pi, 40 * 2048 + 1)
+    last = slice(-2048, None)
+
+    def left_over(*kept: int) -> float:
+        """Return the imbalance of the fundamental, friction moved by some harmonics alone."""
+        x = sum(np.real(harmonics[k] * np.exp(1j * k * (theta + omega * start))) for k in kept)
+        force = Dahl(*FRICTION).force(np.asarray(x))[last]
+        turned = np.exp(-1j * (theta[last] + omega * start))
+        friction = 2.0 * np.mean(force * turned)
+        return float(abs(LINEAR.dynamic_stiffness(0.0, omega) * harmonics[1] + friction - drive))
+
+    # with its third harmonic the motion balances the drive, as a pure sine does not
+    assert left_over(1, 3) < 0.25 * left_over(1)
+    assert left_over(1, 3, 5, 7) < 0.05 * left_over(1)
+
+
+def test_small_motion_is_linear_with_the_contact_stiffness() -> None:
+    harmonics, _, start = steady(1e-6, 0.5)
+    stiffness = 1e-6 * np.exp(-1j * np.pi * start) / 1j / harmonics[1]
+    linear = LINEAR.dynamic_stiffness(0.0, np.pi) + 30.0
+    assert stiffness == pytest.approx(linear, rel=1e-4)
+
+
+def test_large_motion_loses_the_loop_area_of_dry_friction() -> None:
+    wave = SteppedSine((20.0,), (0.5,), controlled="force", settling_periods=20).waveform(seed=0)
+    motion = Mechanism.of(PLANT).displacement_under(wave)
+    time = wave.windows[0].start + np.linspace(0.0, 2.0, 200_001)
+    x, u = motion(time), wave.value(time)
+    work = np.sum(0.5 * (u[1:] + u[:-1]) * np.diff(x))
+    A = 0.5 * np.ptp(x)
+    viscous = np.pi * 0.24 * np.pi * A**2
+    assert work - viscous == pytest.approx(4.0 * 0.1 * A, rel=0.02)
+
+
+def test_time_can_be_scaled() -> None:
+    slow, fast = (
+        Mechanism.of(Dahl(*FRICTION) + Mass(0.3 * s**2) + Damper(0.24 * s) + Spring(0.3))
+        for s in (1.0, 1e-4)
+    )
+    time = np.linspace(0.0, 8.0, 301)
+    runs = [FrequencySweep(0.08, 0.5 / s, 1.0 / s, 4.0 * s).waveform(seed=0) for s in (1.0, 1e-4)]
+    x = slow.displacement_under(runs[0])(time)
+    y = fast.displacement_under(runs[1])(time * 1e-4)
+    assert y == pytest.approx(x, abs=1e-9 * np.max(np.abs(x)))
+
+
+def test_progress_rises_to_one() -> None:
+    seen: list[float] = []
+    wave = SteppedSine((0.1, 0.2), controlled="force", settling_periods=1).waveform(seed=0)
+    Mechanism.of(PLANT).displacement_under(wave, seen.append)
+    assert seen == sorted(seen)
+    assert seen[-1] == 1.0
+    assert len(seen) == len(wave.segments)
+
+
+@pytest.mark.parametrize(
+    ("plant", "message"),
+    [
+        (Dahl(*FRICTION), "friction alone slides without bound"),
+        (Dahl(0.1) + Mass(0.3), "no value for sigma"),
+        (
+            Dahl(*FRICTION) + LinearSystem(
+                control.FRD([1.0, 0.5], [1.0, 2.0]), quantity="receptance"
+            ),
+            "no equation of motion in continuous time",
+        ),
+        (
+            Dahl(*FRICTION) + LinearSystem(control.tf([1.0], [1.0, 1.0, 1.0, 1.0, 1.0]),
+            quantity="dynamic_stiffness"),
+            "has no state-space form; give the plant a mass",
+        ),
+    ],
+    ids=["no linear part", "no value", "frequency response data", "improper"],
+)  # fmt: skip
+def test_a_plant_without_motion_says_why(plant: Element, message: str) -> None:
+    wave = SteppedSine((0.1,), controlled="force").waveform(seed=0)
+    with pytest.raises(ModelError, match=message):
+        Mechanism.of(plant).displacement_under(wave)
+
+
+def test_an_unstable_plant_says_so() -> None:
+    wave = SteppedSine((0.1,), controlled="force", settling_periods=2000).waveform(seed=0)
+    with pytest.raises(ModelError, match="the motion grows beyond all bounds"):
+        Mechanism.of(Dahl(*FRICTION) + Mass(0.3) + Damper(-5.0)).displacement_under(wave)
+
+
+def test_a_stiffness_beyond_a_mass_has_no_force_under_a_held_displacement() -> None:
+    jerk = LinearSystem(control.tf([1.0], [1.0, 0.0, 0.0, 0.0]), quantity="receptance")
+    wave = SteppedSine((0.1,)).waveform(seed=0)
+    with pytest.raises(ModelError, match=r"grows as s\^3; under a prescribed displacement"):
+        Mechanism.of(jerk).force_under(wave)
