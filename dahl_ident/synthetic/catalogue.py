@@ -211,9 +211,9 @@ DATA_SETS: dict[str, DataSet] = {
                 ),
                 Acquisition(
                     sample_rate_hz=200.0,
-                    displacement=Channel(noise_std=1e-5, offset=1e-3, antialias_hz=1000.0),
+                    displacement=Channel(noise_std=3e-5, offset=1e-3, antialias_hz=1000.0),
                     force=Channel(
-                        noise_std=3e-3, flicker_std=1e-3, hum_amplitude=5e-3, antialias_hz=1000.0
+                        noise_std=1e-2, flicker_std=1e-3, hum_amplitude=5e-3, antialias_hz=1000.0
                     ),
                 ),
             ),
