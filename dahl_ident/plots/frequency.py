@@ -72,8 +72,9 @@ def plot_frequency_response(
     wide = frequencies.max() > 3.0 * frequencies.min()
     for axis in (top, bottom):
         axis.set_xscale("log" if wide else "linear")
+        style.readable_log_ticks(axis)
     top.set(yscale="log", ylabel=gain_label)
     bottom.set(xlabel=x_label, ylabel="phase [degrees]")
     if any(label for label, _, _ in levels):
-        top.legend(ncols=2)
+        top.legend(ncols=4, loc="lower left", bbox_to_anchor=(0.0, 1.0), columnspacing=1.0)
     return top, bottom

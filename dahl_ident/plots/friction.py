@@ -97,6 +97,8 @@ def plot_amplitude_response(
     bottom.errorbar(A, degrees, yerr=phase_error, **marks)
     top.set(xscale="log", yscale="log", ylabel=gain_label)
     bottom.set(xscale="log", xlabel=amplitude_label, ylabel="phase [degrees]")
+    style.readable_log_ticks(top)
+    style.readable_log_ticks(bottom)
     top.legend()
     return top, bottom
 
@@ -184,5 +186,5 @@ def plot_loops(
     for (displacement, force, label), colour in zip(loops, colours, strict=True):
         axis.plot(displacement, force, color=colour, label=label)
     axis.set(xlabel=displacement_label, ylabel=force_label)
-    axis.legend()
+    axis.legend(ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0))
     return axis

@@ -21,7 +21,9 @@ def plot_residuals(
     suspicious: ArrayLike = (),
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the two residuals of every point, in standard deviations, joined so that runs show.
+    """Draw the two residuals of every point, in standard deviations.
+
+    Points are joined, so that runs show, where no two share their place.
 
     Parameters
     ----------
@@ -51,12 +53,13 @@ def plot_residuals(
     axis = style.axes(ax)
     order = np.argsort(x)
     where = np.asarray(x)[order]
+    line = "-" if np.unique(where).size == where.size else "none"
     axis.axhspan(-2.0, 2.0, color=style.GREY, alpha=0.12, lw=0)
     axis.axhline(0.0, color=style.GREY, lw=0.8)
     for y, name, colour, marker in zip(
         (first, second), names, style.SERIES, style.MARKERS, strict=False
     ):
-        axis.plot(where, np.asarray(y)[order], marker, ls="-", lw=0.6, color=colour, label=name)
+        axis.plot(where, np.asarray(y)[order], marker, ls=line, lw=0.6, color=colour, label=name)
     for index in np.asarray(suspicious, dtype=int):
         for y in (first, second):
             axis.plot(
@@ -65,6 +68,7 @@ def plot_residuals(
             )  # fmt: skip
     if where.min() > 0.0 and where.max() > 5.0 * where.min():
         axis.set_xscale("log")
+        style.readable_log_ticks(axis)
     axis.set(xlabel=x_label, ylabel="residual [standard deviations]")
     axis.legend(ncols=2)
     return axis
@@ -121,6 +125,9 @@ def plot_profile(
     axis.set(xlabel=label, ylabel="rise of deviance", ylim=(-0.02 * top, top))
     if log:
         axis.set_xscale("log")
+        style.readable_log_ticks(axis)
+    else:
+        axis.locator_params(axis="x", nbins=5)
     return axis
 
 
@@ -203,6 +210,7 @@ def plot_information(
             label=name, lw=1.2,
         )  # fmt: skip
     axis.set(xlabel=x_label, ylabel="share of information [%]", xscale="log")
+    style.readable_log_ticks(axis)
     axis.set_ylim(bottom=0.0)
     axis.legend()
     return axis

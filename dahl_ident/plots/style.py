@@ -13,6 +13,7 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError
@@ -84,6 +85,17 @@ def engineering(value: float, unit: str) -> str:
     if unit not in ("N", "m", "s", "Hz", "J", "rad") or exponent not in prefixes:
         return f"{value:.3g} {unit}".strip()
     return f"{value / 10.0**exponent:.3g} {prefixes[exponent]}{unit}"
+
+
+def readable_log_ticks(axis: Axes) -> None:
+    """Label 1, 2 and 5 on logarithmic axes of less than two decades, without crowding."""
+    for scale, line in ((axis.get_xscale(), axis.xaxis), (axis.get_yscale(), axis.yaxis)):
+        low, high = sorted(line.get_view_interval())
+        if scale != "log" or not 0.0 < low < high < 100.0 * low:
+            continue
+        line.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        line.set_major_formatter(StrMethodFormatter("{x:g}"))
+        line.set_minor_formatter(NullFormatter())
 
 
 def pad_log(values: FloatArray) -> tuple[float, float]:

@@ -79,8 +79,10 @@ class Picture:
         import matplotlib as mpl
         import matplotlib.pyplot as plt
 
+        from dahl_ident.plots import style
+
         buffer = io.BytesIO()
-        with mpl.rc_context({"svg.hashsalt": "dahl_ident", "svg.fonttype": "path"}):
+        with mpl.rc_context(style.RC | {"svg.hashsalt": "dahl_ident", "svg.fonttype": "path"}):
             figure = self.draw()
             metadata = {"Date": None} if kind == "svg" else None
             figure.savefig(buffer, format=kind, dpi=160, metadata=metadata)

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from dahl_ident.results import FitResult
 
 _LOOPS = 3
+_WIDE = 20.0  # of amplitudes beyond which loops are drawn over displacement / amplitude
 _MARKED_BETA = (0.3, 1.0, 2.2, 5.0, 20.0)
 _STRAIGHT = 1.5  # log of a profile's range beyond which its axis is logarithmic
 
@@ -134,7 +135,12 @@ def _residuals(fit: FitResult) -> Picture:
             plots.plot_residuals(x, pairs[:, 0], pairs[:, 1], names=names, x_label=label)
         )
 
-    return Picture("residuals", "Residuals of every point, joined so that runs show.", alt, draw)
+    return Picture(
+        "residuals",
+        "Residuals of every point; the grey band is two standard deviations.",
+        alt,
+        draw,
+    )
 
 
 def _universal(fit: FitResult, friction: Dahl) -> Picture:
@@ -169,15 +175,16 @@ def _loops(fit: FitResult, friction: Dahl) -> Picture:
     unit = si_unit("displacement", fit.data.motion)
     energy = [float(v) for v in friction.dissipated_energy(sizes)]
 
+    normal = sizes[-1] > _WIDE * sizes[0]
+
     def draw() -> Figure:
-        loops = [(*friction.loop(float(A)), style.engineering(float(A), unit)) for A in sizes]
-        return _figure(
-            plots.plot_loops(
-                loops,
-                displacement_label=f"displacement [{unit}]",
-                force_label=f"friction [{si_unit('force', fit.data.motion)}]",
-            )
-        )
+        loops = []
+        for A in sizes.tolist():
+            x, force = friction.loop(A)
+            loops.append((x / A if normal else x, force, style.engineering(A, unit)))
+        label = "displacement over amplitude" if normal else f"displacement [{unit}]"
+        force_label = f"friction [{si_unit('force', fit.data.motion)}]"
+        return _figure(plots.plot_loops(loops, displacement_label=label, force_label=force_label))
 
     return Picture(
         "loops",
