@@ -76,6 +76,10 @@ class Noise(ABC):
     def change(self, predicted: ComplexArray, by: ComplexArray) -> ComplexArray:
         """Return the residual's derivative where the prediction has the derivative `by`."""
 
+    @abstractmethod
+    def replicate(self, predicted: ComplexArray, residual: ComplexArray) -> ComplexArray:
+        """Return the response that has the given residual."""
+
 
 @dataclass(frozen=True)
 class Relative(Noise):
@@ -112,6 +116,14 @@ class Relative(Noise):
         harmonic = self.fundamental > 0.0
         return -by / np.where(harmonic, self.fundamental, predicted)
 
+    def replicate(self, predicted: ComplexArray, residual: ComplexArray) -> ComplexArray:
+        """Return R_model exp(y), or R_model + |R_1| y in rows of harmonics."""
+        fundamental = predicted * np.exp(residual)
+        if self.fundamental is None:
+            return np.asarray(fundamental)
+        harmonic = self.fundamental > 0.0
+        return np.where(harmonic, predicted + self.fundamental * residual, fundamental)
+
 
 @dataclass(frozen=True)
 class Absolute(Noise):
@@ -134,6 +146,10 @@ class Absolute(Noise):
     def change(self, predicted: ComplexArray, by: ComplexArray) -> ComplexArray:
         """Return the derivative of the residual."""
         return -by
+
+    def replicate(self, predicted: ComplexArray, residual: ComplexArray) -> ComplexArray:
+        """Return R_model + y."""
+        return predicted + residual
 
 
 @dataclass(frozen=True)
@@ -161,6 +177,10 @@ class Measured(Noise):
     def change(self, predicted: ComplexArray, by: ComplexArray) -> ComplexArray:
         """Return the derivative of the residual."""
         return -self.whitening(by)
+
+    def replicate(self, predicted: ComplexArray, residual: ComplexArray) -> ComplexArray:
+        """Return R_model + L y."""
+        return predicted + self.whitening.inverse(residual)
 
 
 class Covariance(NamedTuple):
@@ -191,6 +211,11 @@ class Whitening(NamedTuple):
         """Return the whitened real and imaginary parts."""
         x, y = value.real, value.imag
         return np.asarray(self.a * x + 1j * (self.b * x + self.c * y))
+
+    def inverse(self, whitened: ComplexArray) -> ComplexArray:
+        """Return the number of which this is the whitened one."""
+        x = whitened.real / self.a
+        return np.asarray(x + 1j * (whitened.imag - self.b * x) / self.c)
 
     def solve(self, value: ComplexArray) -> ComplexArray:
         """Return V^-1 value, that is L'^-1 L^-1 value."""

@@ -116,3 +116,23 @@ def interval(lower: float, upper: float, unit: str) -> str:
         largest = max(abs(lower), abs(upper))
         digits = max(3, 2 + math.ceil(math.log10(largest / width)))
     return f"{lower:.{digits}g} to {upper:.{digits}g} {unit}".rstrip()
+
+
+def table(rows: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> str:
+    """Return rows of text as aligned columns, those numbered in `left` to the left.
+
+    Examples
+    --------
+    >>> print(table([["", "value"], ["f_max", "0.1"]]))
+           value
+    f_max    0.1
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = (
+            cell.ljust(width) if i in left else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)

@@ -27,6 +27,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.formatting import table
 from dahl_ident.diagnostics.levels import LEVELS, checked_levels, percent, thresholds
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.errors import ValidationError
@@ -97,12 +98,7 @@ class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
         for i, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
             numbers = [*self.lower[::-1, i], self.estimate[i], *self.upper[:, i]]
             rows.append([f"{name} [{unit}]" if unit else name, *(f"{v:.5g}" for v in numbers)])
-        widths = [max(len(row[c]) for row in rows) for c in range(len(head))]
-        lines = [
-            "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])])
-            for row in rows
-        ]
-        return "\n".join([f"{self.method} intervals ({self.note})", *lines])
+        return f"{self.method} intervals ({self.note})\n{table(rows)}"
 
     def to_frame(self) -> Any:
         """Return a pandas table: one row a parameter and level."""

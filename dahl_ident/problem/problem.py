@@ -333,6 +333,66 @@ class Problem:
         by = self._predictor(theta, amplitude_error=error).changes if derivatives else []
         return y, [-whiten(d) for d in by]
 
+    def residual_change(self, theta: FloatArray, change: ComplexArray) -> FloatArray:
+        """Return how the data's residuals change where predictions change, unchecked.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (P,)
+            Search coordinates.
+        change : ndarray of complex, shape (..., n)
+            Small change of the predicted responses.
+
+        Returns
+        -------
+        ndarray, shape (..., 2 n)
+            Derivative of the residuals, a covariance of few degrees of freedom taken as known.
+        """
+        noise = self._noise
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if isinstance(noise, Measured) and noise.amplitude is not None:
+                slope = self._predictor(theta).by_ln_amplitude
+                by = -noise.amplitude.whitening(noise.covariance, slope)(change)
+            else:
+                by = noise.change(self.predict(theta), change)
+        return np.ascontiguousarray(by).view(np.float64)
+
+    def draw(
+        self, theta: ArrayLike, scale: float, size: int, rng: np.random.Generator
+    ) -> ComplexArray:
+        """Return sets of responses drawn from the likelihood at theta: measurements repeated.
+
+        Parameters
+        ----------
+        theta : array_like, shape (P,)
+            Search coordinates.
+        scale : float
+            The noise's scale; 1 where it is known.
+        size : int
+            Number S of sets.
+        rng : numpy.random.Generator
+            Where the noise comes from.
+
+        Returns
+        -------
+        ndarray of complex, shape (S, n)
+            Responses in the data's quantity. An error of the measured amplitudes appears, to
+            first order, in the responses, so that amplitudes stay as they were measured.
+        """
+        theta = self._coordinates.checked(theta)
+        shape, noise = (size, self._rows.n), self._noise
+        pairs = rng.standard_normal((2, *shape))
+        y = np.asarray(scale * (pairs[0] + 1j * pairs[1]), dtype=np.complex128)
+        if not isinstance(noise, Measured):
+            return noise.replicate(self.predict(theta), y)
+        if noise.dof is not None:
+            y = y * np.sqrt(noise.dof / rng.chisquare(noise.dof - 1.0, shape))
+        if noise.amplitude is None:
+            return noise.replicate(self.predict(theta), y)
+        value, _, slope = self._predictor(theta)
+        spread: ComplexArray = noise.amplitude.whitening(noise.covariance, slope).inverse(y)
+        return np.asarray(value + spread)
+
     def _with_priors(
         self, theta: FloatArray, y: ComplexArray, changes: list[ComplexArray], scale: ArrayLike
     ) -> FloatArray:

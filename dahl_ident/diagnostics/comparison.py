@@ -1,0 +1,185 @@
+"""Would another model describe the data better? Akaike's and Schwarz's criteria say.
+
+Both are -2 ln L plus a price on parameters, 2 each for AIC and ln(2n) for BIC; the lower, the
+better. A difference above 10 is plain, below 2 means nothing. They compare models, they do not
+prove one: if none describes the data, the best of them does not either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dahl_ident.diagnostics.formatting import table, with_unit
+from dahl_ident.diagnostics.units import shown_unit
+from dahl_ident.diagnostics.verdicts import Fit
+from dahl_ident.elements import Dahl, Element, Model, Spring
+from dahl_ident.errors import DahlIdentError
+from dahl_ident.fitting import Optimum, solve
+from dahl_ident.problem import Problem
+
+_PLAIN = 10.0
+_MEANS_NOTHING = 2.0
+
+
+@dataclass(frozen=True)
+class ComparedModel:
+    """One model's fit to the data.
+
+    Attributes
+    ----------
+    name : str
+        What distinguishes it.
+    optimum : Optimum
+        Its estimate.
+    aic, bic : float
+        The criteria; an estimated noise scale counts as a parameter, and parameters at infinity
+        do not.
+    """
+
+    name: str
+    optimum: Optimum
+    aic: float
+    bic: float
+
+    @property
+    def estimates(self) -> str:
+        """The free parameters in one line."""
+        o = self.optimum
+        units = [shown_unit(p.unit, o.problem.data.motion) for p in o.problem.parameters]
+        rows = zip(o.names, o.values.tolist(), o.stderr.values(), units, strict=True)
+        return ", ".join(f"{name} = {with_unit(v, e, unit)}" for name, v, e, unit in rows)
+
+
+@dataclass(frozen=True)
+class ModelComparison:
+    """Models side by side; the first is the one that was fitted.
+
+    Attributes
+    ----------
+    models : tuple of ComparedModel
+        Those that could be fitted.
+    failed : mapping of str to str
+        Why the others could not.
+    """
+
+    models: tuple[ComparedModel, ...]
+    failed: Mapping[str, str]
+
+    @property
+    def best(self) -> ComparedModel:
+        """The model of the lowest BIC."""
+        return min(self.models, key=lambda model: model.bic)
+
+    @property
+    def headline(self) -> str:
+        """The verdict in one sentence."""
+        fitted, best = self.models[0], self.best
+        aic, bic = fitted.aic - best.aic, fitted.bic - best.bic
+        if best is fitted or bic < _MEANS_NOTHING:
+            return "No model compared is better than the one fitted."
+        word = "plainly better" if bic > _PLAIN else "perhaps better"
+        return f"{best.name} would be {word} (AIC lower by {aic:.0f}, BIC by {bic:.0f})."
+
+    def __str__(self) -> str:
+        head = ("model", "AIC", "BIC", "estimates")
+        aic, bic = (min(getattr(m, name) for m in self.models) for name in ("aic", "bic"))
+        rows = [
+            (
+                m.name,
+                f"{m.aic - aic:+.1f}",
+                f"{m.bic - bic:+.1f}",
+                m.estimates if m.optimum.success else f"{m.estimates} ({m.optimum.status.name})",
+            )
+            for m in self.models
+        ]
+        lines = [self.headline, table([head, *rows], left=(0, 3))]
+        lines += [f"{name} could not be fitted: {why}" for name, why in self.failed.items()]
+        return "\n".join(lines)
+
+    def to_frame(self) -> Any:
+        """Return a pandas table: one row a model."""
+        import pandas as pd
+
+        return pd.DataFrame(
+            [
+                {
+                    "model": m.name,
+                    "aic": m.aic,
+                    "bic": m.bic,
+                    "status": m.optimum.status.name,
+                    **dict(zip(m.optimum.names, m.optimum.values.tolist(), strict=True)),
+                }
+                for m in self.models
+            ]
+        )
+
+
+def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> ModelComparison:
+    """Fit other models to the same data and compare them by AIC and BIC.
+
+    Parameters
+    ----------
+    fit : FitResult
+        From :func:`dahl_ident.fit`; its data, noise model and sensors are used for all.
+    models : mapping of str to Element, optional
+        Models to compare with, by a name for each. Left out: the exponent free (or 1, where it
+        was free), two Dahl elements in place of one, and a spring added.
+
+    Returns
+    -------
+    ModelComparison
+        Printed, a table; `best` is the model of the lowest BIC.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import dahl_ident as di
+    >>> rng = np.random.default_rng(1)
+    >>> A = np.geomspace(1e-4, 1e-2, 20)
+    >>> N = di.Dahl(f_max=0.1, sigma=30.0, alpha=2.0).describing_function(A)
+    >>> noise = np.exp(0.01 * rng.standard_normal((2, 20)).T @ [1.0, 1.0j])
+    >>> result = di.fit(di.FrequencyResponse(np.ones(20), N * noise, A), di.Dahl())
+    >>> compare_models(result).best.name
+    'exponent free'
+    """
+    problem = fit.optimum.problem
+    fitted = [_compared("as fitted", fit.optimum)]
+    failed = {}
+    for name, model in (_variants(problem.model) if models is None else models).items():
+        try:
+            other = Problem(problem.data, model, noise=problem.noise, sensors=problem.sensors)
+            fitted.append(_compared(name, solve(other)))
+        except DahlIdentError as exc:
+            failed[name] = str(exc)
+    return ModelComparison(tuple(fitted), failed)
+
+
+def _variants(model: Model) -> dict[str, Element]:
+    """Return the usual alternatives to a model."""
+    found: dict[str, Element] = {}
+    elements = [e for e in model.elements if isinstance(e, Dahl)]
+    free = [p.name for p in (e.parameters[2] for e in elements) if p.free]
+    given = [p.name for p in (e.parameters[2] for e in elements) if not p.free]
+    if given:
+        found["exponent free"] = model.with_free(given)
+    if free:
+        found["exponent 1"] = model.with_fixed(dict.fromkeys(free, 1.0))
+    if len(elements) == 1:
+        rest = [e for e in model.elements if e is not elements[0]]
+        found["two Dahl elements"] = Model(Dahl(name="early"), Dahl(name="late"), *rest)
+    if not any(isinstance(e, Spring) for e in model.elements):
+        found["spring added"] = model + Spring()
+    return found
+
+
+def _compared(name: str, optimum: Optimum) -> ComparedModel:
+    problem = optimum.problem
+    determined = problem.n_residuals + len(problem.priors) - optimum.dof
+    count = determined + (not problem.scale_known)
+    deviance = -2.0 * float(problem.log_likelihood(optimum.theta))
+    aic = deviance + 2.0 * count
+    return ComparedModel(name, optimum, aic, deviance + float(np.log(problem.n_residuals)) * count)

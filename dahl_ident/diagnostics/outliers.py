@@ -1,0 +1,124 @@
+"""Points that stand apart: listed for a look, never dropped.
+
+A point is tested by letting it have a response of its own (the mean-shift test): how much of the
+sum of squares goes away with its two residuals, leverage included, against what noise would do.
+The most deviant point is set aside and the others are judged without it, so that one outlier does
+not hide another; up to a tenth of the points are set aside this way. The level is 1 % for the
+whole table, divided by the number of points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.residual_space import ResidualSpace
+from dahl_ident.fitting import Optimum
+
+_LEVEL = 0.01
+_SHARE = 0.1
+_LEAST_DOF = 4
+
+
+@dataclass(frozen=True)
+class SuspiciousPoint:
+    """A point that noise does not explain.
+
+    Attributes
+    ----------
+    row : int
+        Its index in the table.
+    frequency_hz, amplitude : float
+        Where it is.
+    level : object
+        Its label, None where the table has none.
+    deviation : float
+        Its distance from the fit to the others, in standard deviations.
+    p_value : float
+        Probability that the worst of all points deviates as far by noise alone.
+    """
+
+    row: int
+    frequency_hz: float
+    amplitude: float
+    level: Any
+    deviation: float
+    p_value: float
+
+    def __str__(self) -> str:
+        label = "" if self.level is None else f", level {self.level}"
+        return (
+            f"row {self.row} ({self.frequency_hz:.4g} Hz, amplitude {self.amplitude:.3g}{label}) "
+            f"lies {self.deviation:.1f} standard deviations off"
+        )
+
+
+def suspicious_points(optimum: Optimum, space: ResidualSpace) -> tuple[SuspiciousPoint, ...]:
+    """Return the points that stand apart, the most deviant first."""
+    data = optimum.problem.data
+    rows: list[int] = []
+    found: list[tuple[int, float, float]] = []
+    accepted = 0
+    for _ in range(max(1, int(_SHARE * data.n))):
+        step = _most_deviant(optimum, space, rows)
+        if step is None:
+            break
+        row, squares, p = step
+        rows.append(row)
+        found.append((row, float(np.sqrt(squares)), p))
+        if p < _LEVEL:
+            accepted = len(found)
+    amplitude = optimum.problem.stiffness_data.amplitude
+    return tuple(
+        SuspiciousPoint(
+            row,
+            float(data.frequency_hz[row]),
+            float(amplitude[row]),
+            None if data.level is None else data.level[row].item(),
+            deviation,
+            p,
+        )
+        for row, deviation, p in found[:accepted]
+    )
+
+
+def _most_deviant(
+    optimum: Optimum, space: ResidualSpace, without: list[int]
+) -> tuple[int, float, float] | None:
+    """Return row, squared deviation and p-value of the worst point, some rows set aside."""
+    m, n = space.residuals.size, space.residuals.size // 2
+    dof = space.dof - 2 * len(without)
+    if dof < _LEAST_DOF:
+        return None
+    keep = np.ones(m, dtype=np.bool_)
+    for row in without:
+        keep[2 * row : 2 * row + 2] = False
+    Q = np.linalg.qr(space.basis[keep])[0] if without else space.basis
+    r = np.zeros(m)
+    r[keep] = space.residuals[keep] - Q @ (Q.T @ space.residuals[keep])
+    lever = np.zeros((m, Q.shape[1]))
+    lever[keep] = Q
+    squares = _shifts(r, lever)
+    squares[without] = -np.inf
+    row = int(np.argmax(squares))
+    explained, total = float(squares[row]), float(r @ r)
+    p = space.tail_of(explained, 2, total, dof)
+    variance = 1.0 if optimum.scale_known else (total - explained) / (dof - 2)
+    if not variance > 0.0:
+        return None
+    return row, explained / variance, min(1.0, (n - len(without)) * p)
+
+
+def _shifts(r: FloatArray, lever: FloatArray) -> FloatArray:
+    """Return by how much the sum of squares falls without each point: r' (I - H)^-1 r."""
+    pairs = r.reshape(-1, 2)
+    Q = lever.reshape(len(pairs), 2, -1)
+    rest = np.eye(2) - Q @ Q.swapaxes(1, 2)
+    determinant = rest[:, 0, 0] * rest[:, 1, 1] - rest[:, 0, 1] ** 2
+    x, y = pairs.T
+    form = rest[:, 1, 1] * x**2 - 2.0 * rest[:, 0, 1] * x * y + rest[:, 0, 0] * y**2
+    fixed = determinant < 1e-8  # a point that alone determines a parameter
+    return np.where(fixed, 0.0, form / np.where(fixed, 1.0, determinant))

@@ -1,0 +1,144 @@
+"""What no mechanism does: warnings about estimates that fit and yet make no sense."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy import special
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.diagnostics.units import shown_unit
+from dahl_ident.elements import Dahl, Damper, Mass, Spring
+from dahl_ident.fitting import Optimum
+from dahl_ident.fitting.status import Status
+
+_LEVEL = 1e-3
+_HARMONIC_SHARE = 0.1
+
+
+def physical_warnings(optimum: Optimum) -> Iterator[str]:
+    """Yield a sentence for everything in an estimate that physics forbids or that is unsafe."""
+    yield from _negative(optimum)
+    if optimum.status is Status.AT_BOUND:
+        yield optimum.message.removeprefix(Status.AT_BOUND.value).strip()
+    yield from _beyond_friction_limit(optimum)
+    share = third_harmonic_share(optimum)
+    if share.size and share.max() > _HARMONIC_SHARE:
+        row = int(np.argmax(share))
+        yield (
+            f"the displacement's third harmonic is predicted to be {100.0 * share[row]:.2g} % of "
+            f"its fundamental in row {row}: a describing function, which assumes a sine, is crude "
+            "there; control the displacement, or leave such points out"
+        )
+
+
+def _negative(optimum: Optimum) -> Iterator[str]:
+    problem = optimum.problem
+    values = parameter_values(optimum)
+    for element in problem.model.elements:
+        if not isinstance(element, Mass | Damper | Spring):
+            continue
+        (parameter,) = element.parameters
+        value, error = values[parameter.name], optimum.stderr.get(parameter.name, 0.0)
+        if value < 0.0 and np.isfinite(value):
+            unit = shown_unit(parameter.unit, problem.data.motion)
+            within = " (zero is within two standard errors)" if -value < 2.0 * error else ""
+            yield f"{parameter.name} is negative, {with_unit(value, error or None, unit)}{within}"
+
+
+def _beyond_friction_limit(optimum: Optimum) -> Iterator[str]:
+    """Yield where friction's fundamental exceeds what slip can give, 4 f_max/pi."""
+    values = parameter_values(optimum)
+    dahl = [e for e in optimum.problem.model.elements if isinstance(e, Dahl)]
+    limit = sum(values[e.parameters[0].name] for e in dahl) * 4.0 / np.pi
+    if not dahl or not 0.0 < limit < np.inf:
+        return
+    force, error = friction_force(optimum)
+    excess = (force - limit) / error
+    rows = np.flatnonzero(np.isfinite(excess))
+    if not rows.size:
+        return
+    row = int(rows[np.argmax(excess[rows])])
+    dof = 1e9 if optimum.scale_known else max(optimum.dof, 1)
+    if excess[row] > special.stdtrit(dof, 1.0 - _LEVEL / rows.size):
+        unit = shown_unit("N", optimum.problem.data.motion)
+        yield (
+            f"in row {row} friction's fundamental is {with_unit(force[row], error[row], unit)}, "
+            f"more than slip can give (4 f_max/pi = {limit:.3g} {unit}): something besides the "
+            "model carries force"
+        )
+
+
+def friction_force(optimum: Optimum) -> tuple[FloatArray, FloatArray]:
+    """Return the fundamental of the friction force of each row and its standard deviation.
+
+    The modelled linear part is subtracted from the measured dynamic stiffness. NaN in rows of
+    harmonics.
+    """
+    N, scale = friction_stiffness(optimum), optimum.scale
+    view = optimum.problem.stiffness_data
+    error = np.sqrt(2.0) * scale / view.weights * view.amplitude
+    force = np.where(view.harmonic == 1, np.abs(N) * view.amplitude, np.nan)
+    return force, error
+
+
+def friction_stiffness(optimum: Optimum) -> ComplexArray:
+    """Return the measured dynamic stiffness less the modelled linear part, sensors corrected."""
+    problem = optimum.problem
+    view = problem.stiffness_data
+    ratio = _sensed(optimum)
+    linear = np.zeros(len(view.amplitude), dtype=np.complex128)
+    values = parameter_values(optimum)
+    for element in problem.model.elements:
+        if not isinstance(element, Dahl):
+            linear += view.of(element, [np.asarray(values[p.name]) for p in element.parameters])
+    return np.asarray(view.stiffness * ratio - linear)
+
+
+def _sensed(optimum: Optimum) -> ComplexArray:
+    """Return the factor from stiffness at the sensors' starts to that at their estimates."""
+    problem = optimum.problem
+    if problem.sensors.are_exact:
+        return np.ones(1, dtype=np.complex128)
+    values, view = parameter_values(optimum), problem.stiffness_data
+    start = {p.name: p.value or 0.0 for p in problem.sensors.parameters}
+    gain = values["force_gain"] / values["displacement_gain"]
+    gain /= start["force_gain"] / start["displacement_gain"]
+    lag = values["delay"] - start["delay"]
+    return np.asarray(np.exp(-1j * view.harmonic * view.omega * lag) / gain)
+
+
+def third_harmonic_share(optimum: Optimum) -> FloatArray:
+    """Return the predicted third harmonic of the displacement over its fundamental.
+
+    One number for each force-controlled row: F_3/X_1 of friction under a sine, over the dynamic
+    stiffness that the plant has at three times the frequency, the friction's own at that
+    amplitude included. Where the laboratory controls displacement there is none.
+    """
+    problem = optimum.problem
+    forced = problem.data.controlled == "force"
+    if not forced.any() or not np.isfinite(optimum.values).all():
+        return np.zeros(0)
+    view, values = problem.stiffness_data, parameter_values(optimum)
+    A, omega = view.amplitude[forced], view.omega[forced]
+    third = np.zeros(len(A), dtype=np.complex128)
+    reaction = np.zeros(len(A), dtype=np.complex128)
+    for element in problem.model.elements:
+        own = [np.asarray(values[p.name]) for p in element.parameters]
+        reaction += element.stiffness(own, A, 3.0 * omega, 1)
+        if isinstance(element, Dahl):
+            third += element.stiffness(own, A, omega, 3)
+    return np.asarray(np.abs(third / reaction))
+
+
+def parameter_values(optimum: Optimum) -> dict[str, float]:
+    """Return the value of every parameter of model and sensors, by name."""
+    problem = optimum.problem
+    values = {
+        p.name: np.nan if p.value is None else p.value
+        for p in (*problem.model.parameters, *problem.sensors.parameters)
+    }
+    found = problem.to_values(optimum.theta).tolist()
+    return values | dict(zip(problem.names, found, strict=True))

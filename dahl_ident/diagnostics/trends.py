@@ -1,0 +1,183 @@
+"""Do residuals run with amplitude, frequency or drive? If so, the model is not the mechanism's.
+
+For each covariate that varies, the response is allowed a smooth relative departure from the
+model, R exp(u), where u is a polynomial of the covariate's logarithm, complex, so that gain and
+phase each have their own. What the parameters could explain is taken out
+(:mod:`dahl_ident.diagnostics.residual_space`); an F or chi-square test tells whether the rest is
+more than noise. The departure's size comes with it, in percent and degrees, so that a
+significant trend can be told from one that matters. A Wald-Wolfowitz test of the residuals' signs
+looks for runs that no low polynomial follows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import legendre
+from scipy import special
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.diagnostics.physics import parameter_values
+from dahl_ident.diagnostics.residual_space import Coefficient, ResidualSpace
+from dahl_ident.diagnostics.units import shown_unit
+from dahl_ident.elements import Dahl
+from dahl_ident.fitting import Optimum
+
+_DEGREES = {"amplitude": 3, "drive": 3, "frequency": 2}
+_SAME = 0.01  # of the covariate's logarithm: values closer than this are one
+_LEAST_RANGE = np.log(1.05)
+_LEAST_DOF_PER_COLUMN = 3
+_FEWEST_SIGNS = 10
+
+
+@dataclass(frozen=True)
+class Trend:
+    """How the data depart from the fitted model along one covariate.
+
+    Attributes
+    ----------
+    covariate : str
+        "amplitude", "frequency" or "drive".
+    low, high : float
+        Its range, SI units (Hz for frequency).
+    stiffness, loss : Coefficient
+        Change of the data's real and imaginary part of the friction force per displacement,
+        against the model and relative to it, from `low` to `high`; a straight line over the
+        covariate's logarithm. Natural logarithms: -0.36 is a fall by 30 %.
+    largest : float
+        Largest relative departure of the response that the smooth curve finds.
+    p_value : float
+        Probability of as much departure by noise alone.
+    """
+
+    covariate: str
+    low: float
+    high: float
+    unit: str
+    stiffness: Coefficient
+    loss: Coefficient
+    largest: float
+    p_value: float
+
+    def __str__(self) -> str:
+        ends = f"from {self.low:.3g} to {self.high:.3g} {self.unit}"
+        parts = [
+            f"the friction's {name} {_change(part)} {ends} against the model"
+            for name, part in (("stiffness", self.stiffness), ("loss", self.loss))
+            if abs(part.value) > 2.0 * part.stderr
+        ]
+        parts.append(
+            f"departure over {self.covariate} up to {100.0 * self.largest:.2g} % of the response"
+        )
+        return ", ".join(parts)
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Runs of equal sign in the residuals, in the order of one covariate."""
+
+    covariate: str
+    runs: int
+    expected: float
+    p_value: float
+
+
+def trends(optimum: Optimum, space: ResidualSpace) -> list[Trend]:
+    """Return the departures over each covariate that varies enough."""
+    found = []
+    friction = _friction_parts(optimum)
+    for name, values, unit in covariates(optimum):
+        x = np.log(values)
+        distinct = _distinct(x)
+        degree = min(_DEGREES[name], distinct - 1, space.dof // (2 * _LEAST_DOF_PER_COLUMN))
+        if degree < 1:
+            continue
+        unit_range = 2.0 * (x - x.min()) / np.ptp(x) - 1.0
+        shape = legendre.legvander(unit_range, degree)[:, 1:].T
+        changes = np.concatenate([shape, 1j * shape])
+        p = space.p_value(changes)
+        if np.isnan(p):
+            continue
+        stiffness, loss = (space.coefficient(0.5 * unit_range * part) for part in friction)
+        found.append(
+            Trend(
+                name,
+                float(values.min()),
+                float(values.max()),
+                unit,
+                stiffness,
+                loss,
+                float(np.abs(np.expm1(space.fitted(changes))).max()),
+                p,
+            )
+        )
+    return found
+
+
+def runs(optimum: Optimum, space: ResidualSpace) -> list[Runs]:
+    """Return the number of runs of the residuals' signs over each covariate."""
+    found = []
+    for name, values, _ in covariates(optimum):
+        order = np.argsort(values, kind="stable")
+        count, mean, variance, signs = 0, 0.0, 0.0, 0
+        for part in (space.residuals[0::2][order], space.residuals[1::2][order]):
+            positive = part > 0.0
+            n, up = len(part), int(positive.sum())
+            pairs = 2.0 * up * (n - up)
+            count += 1 + int((positive[1:] != positive[:-1]).sum())
+            mean += 1.0 + pairs / n
+            variance += pairs * (pairs - n) / (n**2 * max(n - 1, 1))
+            signs += n
+        if signs >= 2 * _FEWEST_SIGNS and variance > 0.0:
+            z = (count - mean + 0.5) / np.sqrt(variance)
+            found.append(Runs(name, count, mean, float(special.ndtr(z))))
+    return found
+
+
+def covariates(optimum: Optimum) -> Iterator[tuple[str, FloatArray, str]]:
+    """Yield name, values and unit of whatever varies over the rows."""
+    problem = optimum.problem
+    data, motion = problem.data, problem.data.motion
+    yield from (
+        (name, values, unit)
+        for name, values, unit in (
+            ("amplitude", problem.stiffness_data.amplitude, shown_unit("m", motion)),
+            ("frequency", data.frequency_hz, "Hz"),
+            ("drive", data.drive if (data.controlled == "force").all() else None, ""),
+        )
+        if values is not None and np.ptp(np.log(values)) > _LEAST_RANGE
+    )
+
+
+def _friction_parts(optimum: Optimum) -> tuple[ComplexArray, ComplexArray]:
+    """Return the relative change of the response with the friction's real and imaginary part."""
+    problem = optimum.problem
+    values = parameter_values(optimum)
+    view = problem.stiffness_data
+    friction = np.zeros(len(view.amplitude), dtype=np.complex128)
+    total = np.zeros(len(view.amplitude), dtype=np.complex128)
+    for element in problem.model.elements:
+        own = [np.asarray(values[p.name]) for p in element.parameters]
+        part = view.of(element, own)
+        total += part
+        if isinstance(element, Dahl):
+            friction += part
+    inverted = problem.data.quantity in ("receptance", "mobility", "accelerance")
+    sign = -1.0 if inverted else 1.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        parts = sign * friction.real / total, sign * 1j * friction.imag / total
+    return np.nan_to_num(parts[0]), np.nan_to_num(parts[1])
+
+
+def _distinct(x: FloatArray) -> int:
+    return 1 + int((np.diff(np.sort(x)) > _SAME).sum())
+
+
+def _change(part: Coefficient) -> str:
+    """Return "falls by 30 +- 4 %"."""
+    word = "rises" if part.value > 0.0 else "falls"
+    size = 100.0 * abs(np.expm1(part.value))
+    return f"{word} by {with_unit(size, 100.0 * np.exp(part.value) * part.stderr, '%')}"
