@@ -15,6 +15,7 @@ TOPICS = (
     "general_dahl",
     "hysteresis",
     "steady_state",
+    "reading",
     "extraction",
     "fitting",
     "ipopt",

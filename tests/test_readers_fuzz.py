@@ -107,7 +107,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(tables())
 def test_tables_that_are_nearly_right(folder: Path, content: bytes) -> None:
     path = folder / "table.csv"
@@ -115,7 +115,7 @@ def test_tables_that_are_nearly_right(folder: Path, content: bytes) -> None:
     read_every_way(path)
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(st.one_of(st.binary(max_size=400), st.text(max_size=200).map(lambda t: t.encode())))
 def test_any_bytes(folder: Path, content: bytes) -> None:
     path = folder / "file.txt"
@@ -137,7 +137,7 @@ def response_table() -> bytes:
 TABLE = response_table()
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(
     st.integers(0, len(TABLE) - 1), st.integers(0, 255), st.sampled_from(["cut", "swap", "drop"])
 )
@@ -152,7 +152,7 @@ def test_one_damaged_byte(folder: Path, place: int, byte: int, how: str) -> None
     read_every_way(path)
 
 
-@settings(max_examples=100)
+@settings(max_examples=60)
 @given(st.integers(0, 10_000), st.integers(0, 255), st.booleans())
 def test_damaged_matlab_file(folder: Path, place: int, byte: int, cut: bool) -> None:
     buffer = io.BytesIO()

@@ -100,6 +100,14 @@ class TestDialects:
         np.testing.assert_array_equal(record.displacement, numbers[:, 0])
         np.testing.assert_array_equal(record.force, numbers[:, 1])
 
+    def test_a_late_word_in_a_long_table(self, tmp_path: Path) -> None:
+        """Parsers that read in parts guess types anew in each."""
+        lines = [f"{i},{i % 7},{i % 5}" for i in range(150_000)]
+        lines[140_000] = "140000,oops,1"
+        text = "time [s],x [mm],F [N]\n" + "\n".join(lines)
+        with pytest.raises(DataError, match="line 140002, column 'x': 'oops' is not a number"):
+            read_record(written(tmp_path, text))
+
 
 class TestColumns:
     def test_names_units_signs_and_factors(self, tmp_path: Path) -> None:

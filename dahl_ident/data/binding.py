@@ -106,7 +106,7 @@ class Binding:
     def numbers(self, role: str, channel: Channel) -> FloatArray:
         """Return finite numbers with the map's sign and factor, in the file's unit."""
         spec = self.map.roles.get(role, Column())
-        return spec.sign * spec.factor * self.source.numbers(channel)
+        return scaled(self.source.numbers(channel), spec.sign * spec.factor)
 
     def unit(self, role: str, channel: Channel, default: str | None = None) -> Unit:
         """Return the unit: the map's, the header's, the one in the name, or the default's.
@@ -188,6 +188,11 @@ class Binding:
                 f"{self.source.name}: columns differ in length: "
                 + ", ".join(f"{role} {size}" for role, size in sizes.items())
             )
+
+
+def scaled(values: FloatArray, factor: float) -> FloatArray:
+    """Return values times factor; long records are not copied for a factor of 1."""
+    return values if factor == 1.0 else values * factor
 
 
 def by_level(source: Source, columns: ColumnMap) -> dict[str | None, ColumnMap]:

@@ -259,7 +259,7 @@ def _time(value: ArrayLike) -> FloatArray:
     time = finite_array(value, "time")
     if time.ndim != 1 or time.size < 2:
         raise ValidationError(f"time: expected at least two samples, got shape {time.shape}")
-    backwards = np.flatnonzero(np.diff(time) <= 0.0)
+    backwards = np.flatnonzero(time[1:] <= time[:-1])
     if backwards.size:
         i = int(backwards[0])
         raise ValidationError(

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data.binding import Binding
+from dahl_ident.data.binding import Binding, scaled
 from dahl_ident.data.columns import RECORD_NAMES, ColumnMap
 from dahl_ident.data.record import DriveUnit, Record
 from dahl_ident.data.source import Channel, Source
@@ -91,7 +91,7 @@ def _samples(bound: Binding, role: str, channel: Channel) -> FloatArray:
             f"{bound.source.name}: column {channel.name!r} has the unit [{unit.text}]; expected "
             "the samples of a waveform, not amplitudes"
         )
-    return values * factor
+    return scaled(values, factor)
 
 
 def _drive(bound: Binding, channel: Channel) -> dict[str, Any]:
@@ -116,8 +116,7 @@ def _even_time(bound: Binding, n: int) -> FloatArray:
 
 
 def _require_increasing(source: Source, channel: Channel, time: FloatArray) -> None:
-    steps = np.diff(time)
-    back = np.flatnonzero(~(steps > 0.0))
+    back = np.flatnonzero(~(time[1:] > time[:-1]))
     if back.size:
         i = int(back[0]) + 1
         raise DataError(

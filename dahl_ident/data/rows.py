@@ -17,6 +17,7 @@ from dahl_ident.errors import DataError
 _OPTIONAL = (
     "amplitude", "drive", "covariance", "dof", "amplitude_std", "amplitude_covariance",
 )  # fmt: skip
+_DIMENSIONS = {"covariance": 3, "amplitude_covariance": 2}  # of one table's column, else 1
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,27 @@ class Rows:
             response=np.array([table.response for table in tables]),
             **{name: _optional(tables, name) for name in _OPTIONAL},
         )
+
+    def take(self, tables: NDArray[np.intp] | slice) -> Rows:
+        """Return some of the stacked tables; columns that all share stay as they are."""
+        columns = {name: getattr(self, name) for name in ("omega", "response", *_OPTIONAL)}
+        stacked = {
+            name: column[tables]
+            for name, column in columns.items()
+            if column is not None and column.ndim > _DIMENSIONS.get(name, 1)
+        }
+        return replace(self, **stacked)
+
+    def table(self, index: int) -> Rows:
+        """Return one of the stacked tables."""
+        one = self.take(np.array([index]))
+        columns = {name: getattr(one, name) for name in ("omega", "response", *_OPTIONAL)}
+        first = {
+            name: column[0]
+            for name, column in columns.items()
+            if column is not None and column.ndim > _DIMENSIONS.get(name, 1)
+        }
+        return replace(one, **first)
 
     def with_responses(self, responses: ComplexArray) -> Rows:
         """Return these rows with one set of responses for each of many tables."""

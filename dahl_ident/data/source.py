@@ -135,9 +135,10 @@ class Source:
             )
         if values.dtype.kind not in "fiu":
             values = self._from_text(channel)
-        values = np.atleast_1d(values).astype(np.float64)
-        bad = np.flatnonzero(np.isnan(values) if infinite else ~(np.abs(values) < LARGEST))
-        if bad.size:
+        values = np.atleast_1d(values).astype(np.float64, copy=False)
+        limit = np.inf if infinite else LARGEST
+        if values.size and not (values.min() >= -limit and values.max() <= limit):
+            bad = np.flatnonzero(~(np.abs(values) <= limit))
             i = int(bad[0])
             what = "empty or NaN" if np.isnan(values[i]) else f"{values[i]:g}"
             raise DataError(

@@ -12,9 +12,10 @@ import csv
 import io
 import json
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,9 @@ from dahl_ident.data.readers.layout import Header, best_run, header, named_chann
 from dahl_ident.data.source import Source
 from dahl_ident.data.storage import METADATA_MARK
 from dahl_ident.errors import DataError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _COMMENT = re.compile(r"\s*(?:#|%|//|!)")
 _COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|%|//|!)[^\r\n]*", re.MULTILINE)
@@ -59,9 +63,8 @@ def read_text_table(data: bytes, name: str, sha256: str | None = None) -> Source
     lines = _head(data)
     layout = _layout(lines, name)
     metadata = _metadata(lines, name)
-    body = data[layout.offset :]
-    _refuse_cut_end(body, layout, name)
-    columns = _parse(body, layout, metadata, name)
+    _refuse_cut_end(data, layout, name)
+    columns = _parse(data, layout, metadata, name)
     channels = named_channels(columns, layout.header, name)
     return Source(
         name,
@@ -69,7 +72,7 @@ def read_text_table(data: bytes, name: str, sha256: str | None = None) -> Source
         channels,
         sha256,
         headerless=not layout.header.names,
-        row_name=lambda i: f"line {_line_of(body, layout.line, i)}",
+        row_name=lambda i: f"line {_line_of(data[layout.offset :], layout.line, i)}",
         metadata=metadata,
     )
 
@@ -169,9 +172,9 @@ def _metadata(lines: list[tuple[int, str]], name: str) -> Mapping[str, Any]:
     return {}
 
 
-def _refuse_cut_end(body: bytes, layout: _Layout, name: str) -> None:
+def _refuse_cut_end(data: bytes, layout: _Layout, name: str) -> None:
     """Refuse a last line with missing fields."""
-    ends = _LINE_END.split(body[-_HEAD_BYTES:])
+    ends = _LINE_END.split(data[max(layout.offset, len(data) - _HEAD_BYTES) :])
     last = next(t for t in reversed(ends) if _counts(t)).decode("utf-8", "replace")
     fields = len(_split(last, layout.delimiter))
     if fields < layout.width:
@@ -187,22 +190,20 @@ def _counts(line: bytes) -> bool:
 
 
 def _parse(
-    body: bytes, layout: _Layout, metadata: Mapping[str, Any], name: str
+    data: bytes, layout: _Layout, metadata: Mapping[str, Any], name: str
 ) -> list[NDArray[Any]]:
     import pandas as pd
 
     # pandas 3.1 reads to the last digit by default, earlier ones have to be asked
     exact = tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1)
-    options: dict[str, Any] = {} if exact else {"float_precision": "round_trip"}
-    if any(mark in body for mark in (b"#", b"%", b"//", b"!")):
-        body = _COMMENT_LINE.sub(b"", body)
-    names = layout.header.names
+    precision: dict[str, Any] = {} if exact else {"float_precision": "round_trip"}
     keys = [str(i) for i in range(layout.width)]
     known = metadata.get("text", [])
-    texts = {key for key, name in zip(keys, names, strict=False) if name in known}
-    try:
-        frame = pd.read_csv(
-            io.BytesIO(body),
+    texts = {key for key, n in zip(keys, layout.header.names, strict=False) if n in known}
+
+    def read(in_parts: bool) -> pd.DataFrame:
+        frame: pd.DataFrame = pd.read_csv(
+            _numbers(data, layout),
             sep=layout.delimiter or r"\s+",
             decimal=layout.mark,
             header=None,
@@ -211,15 +212,33 @@ def _parse(
             keep_default_na=False,
             na_values={key: [""] if key in texts else _MISSING for key in keys},
             dtype=dict.fromkeys(texts, str),
-            low_memory=False,
+            low_memory=in_parts,
             encoding="utf-8",
-            **options,
+            **precision,
         )
+        return frame
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.DtypeWarning)
+            try:
+                frame = read(in_parts=True)  # twice as fast, but each part guesses its own types
+            except pd.errors.DtypeWarning:
+                frame = read(in_parts=False)
     except pd.errors.ParserError as exc:
         raise DataError(f"{name}: {_where_ragged(str(exc), layout)}") from exc
     except (ValueError, OverflowError) as exc:
         raise DataError(f"{name}: the table cannot be read: {exc}") from exc
     return [_plain(frame[key].to_numpy()) for key in keys]
+
+
+def _numbers(data: bytes, layout: _Layout) -> io.BytesIO:
+    """Return the lines below the header, comments blanked."""
+    if any(data.find(mark, layout.offset) >= 0 for mark in b"#%/!"):
+        return io.BytesIO(_COMMENT_LINE.sub(b"", data[layout.offset :]))
+    stream = io.BytesIO(data)
+    stream.seek(layout.offset)
+    return stream
 
 
 def _where_ragged(message: str, layout: _Layout) -> str:

@@ -105,7 +105,7 @@ def _checked(path: Path | None, name: str, data: bytes) -> File:
                 raise DataError(f"{name}: the compressed file is damaged: {exc}") from exc
             if path and suffix == packed:
                 suffix = path.with_suffix("").suffix.lower()
-    if not data.strip():
+    if not data or data.isspace():
         raise DataError(f"{name}: the file is empty")
     found = _sniff(data)
     if found == "text" and suffix == ".mat":
