@@ -103,11 +103,11 @@ class Relative(Noise):
     def residual(self, predicted: ComplexArray) -> ComplexArray:
         """Return ln(R/R_model), or the scaled difference in rows of harmonics."""
         if self.fundamental is None:
-            return np.log(self.response / predicted)
+            return _logarithm(self.response / predicted)
         harmonic = self.fundamental > 0.0
         ratio = np.where(harmonic, 1.0, self.response / np.where(harmonic, 1.0, predicted))
         size = np.where(harmonic, self.fundamental, 1.0)
-        return np.where(harmonic, (self.response - predicted) / size, np.log(ratio))
+        return np.where(harmonic, (self.response - predicted) / size, _logarithm(ratio))
 
     def change(self, predicted: ComplexArray, by: ComplexArray) -> ComplexArray:
         """Return the derivative of the residual."""
@@ -239,6 +239,14 @@ class AmplitudeError(NamedTuple):
                 covariance.ii + (s2 * d.imag - 2.0 * c.imag) * d.imag,
             )
         )
+
+
+def _logarithm(ratio: ComplexArray) -> ComplexArray:
+    """Return ln(ratio), to absolute rounding; numpy's takes pains, and time, near ratio = 1."""
+    result = np.empty_like(ratio)
+    result.real = 0.5 * np.log(ratio.real**2 + ratio.imag**2)
+    result.imag = np.arctan2(ratio.imag, ratio.real)
+    return result
 
 
 class Corrected(NamedTuple):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import FloatArray
 from dahl_ident.fitting.limits import Limit
 from dahl_ident.fitting.losses import Loss
-from dahl_ident.fitting.optimum import Combination, Optimum, inverse
+from dahl_ident.fitting.optimum import Combination, Optimum, inverse, spread
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem
 
@@ -66,7 +66,7 @@ def optimum(
     covariance, undetermined = inner, lost
     if end.limit is not None and end.phi is not None and chart is not None:
         combinations = _combinations(end.limit, end.phi, inner)
-        covariance, undetermined = _spread(end.limit, chart, inner, lost)
+        covariance, undetermined = spread(end.limit, chart, inner, lost)
         extremes = end.limit.extremes
         values = np.array([extremes.get(n, v) for n, v in zip(problem.names, values, strict=True)])
     covariance = np.where(np.isnan(covariance), np.inf, covariance)
@@ -114,19 +114,6 @@ def _combinations(limit: Limit, phi: FloatArray, covariance: FloatArray) -> tupl
         error = float(np.sqrt(covariance[index, index])) * (value if logarithmic else 1.0)
         found.append(Combination(expression, value, error))
     return tuple(found)
-
-
-def _spread(
-    limit: Limit, chart: FloatArray, inner: FloatArray, lost: NDArray[np.bool_]
-) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return the covariance of theta, and which of it is undetermined, from that of phi."""
-    covariance = chart @ np.where(np.isfinite(inner), inner, 0.0) @ chart.T
-    gone = np.array([name in limit.extremes for name in limit.names])
-    gone |= np.abs(chart) @ lost.astype(np.float64) > 0.0
-    gone |= ~chart.any(axis=1)
-    covariance[gone, :] = covariance[:, gone] = 0.0
-    covariance[gone, gone] = np.inf
-    return covariance, gone
 
 
 def _status(

@@ -35,12 +35,12 @@ from dahl_ident.fitting.start import starts
 from dahl_ident.fitting.trust_region import minimise_within
 from dahl_ident.problem import Problem, Quadratic
 
-_DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm
+DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm
 _RESCALINGS = 100
 _SAME_SCALE = 1e-9
 _PATIENCE = 1000  # steps where friction is so faint that each takes little
-_AT_LIMIT = 1e4  # looseness: so far out, large terms cancel
-_TIE, _NEARLY = 1e-12, 1e-4  # relative differences of cost at which a limit wins
+AT_LIMIT = 1e4  # looseness: so far out, large terms cancel
+TIE, NEARLY = 1e-12, 1e-4  # relative differences of cost at which a limit wins
 
 
 def solve(
@@ -157,7 +157,7 @@ class _Search:
 
     def _search(self, begin: FloatArray, scale: float) -> End:
         end = self._descend(begin, scale)
-        if not end.converged or self._friction_error(end, scale) > _DOUBTFUL:
+        if not end.converged or self._friction_error(end, scale) > DOUBTFUL:
             end = self._look_wider(end, begin, scale)
         if end.limit is None and (self.bounded or not end.converged):
             end = self._trust_region(end, begin, scale)
@@ -189,7 +189,7 @@ class _Search:
             begin,
             self.logarithmic,
             self.m,
-            inside=self.reach,
+            inside=lambda theta, _: self.reach(theta),
             steps=steps,
         )
         best = self._best(minima)
@@ -206,8 +206,8 @@ class _Search:
             chart.phi(begin),
             ~((chart.matrix != 0.0).T @ ~self.logarithmic),
             self.m,
-            inside=None if limit else lambda phi: self.reach(chart.theta(phi)),
-            looseness=1.0 if limit is None else _AT_LIMIT,
+            inside=None if limit else lambda phi, _: self.reach(chart.theta(phi)),
+            looseness=1.0 if limit is None else AT_LIMIT,
         )
         best = self._best(minima)
         phi = minima.theta[best]
@@ -221,7 +221,7 @@ class _Search:
     def _best(self, minima: Minima) -> int:
         self.evaluations += int(minima.evaluations.max())
         lowest = minima.cost.min()
-        good = minima.converged & (minima.cost <= lowest * (1.0 + _NEARLY))
+        good = minima.converged & (minima.cost <= lowest * (1.0 + NEARLY))
         return int(np.argmin(np.where(good, minima.cost, np.inf) if good.any() else minima.cost))
 
     def _look_wider(self, end: End, begin: FloatArray, scale: float) -> End:
@@ -239,7 +239,7 @@ class _Search:
             return end
         lowest = min(ends, key=lambda e: e.cost)
         real = end.converged and np.isfinite(self._friction_error(end, scale))
-        slack = _TIE if real else _NEARLY
+        slack = TIE if real else NEARLY
         return lowest if lowest.cost <= end.cost * (1.0 + slack) else end
 
     def _trust_region(self, end: End, begin: FloatArray, scale: float) -> End:

@@ -5,8 +5,9 @@ Hessian and D = diag H, so it does not depend on the parameters' units. lambda s
 nothing, a Gauss-Newton step; it falls where a step does what H foretold, and rises where the cost
 does not fall. All problems take their steps together; those that have ended drop out.
 
-A problem has converged where its next step would move the residuals by less than 1e-8 of their
-standard deviation, or by no more than what rounding leaves of the data.
+A problem has converged where the step after the next, as the steps shrink, would move the
+residuals by less than 1e-8 of their standard deviation, or by no more than what rounding leaves of
+the data; it ends with the next step, which needs no evaluation of its own.
 """
 
 from __future__ import annotations
@@ -45,6 +46,29 @@ class Minima:
     converged: BoolArray
     evaluations: IntArray
 
+    def take(self, which: IntArray) -> Minima:
+        """Return some of the searches."""
+        return Minima(
+            self.theta[which],
+            self.cost[which],
+            self.hessian[which],
+            self.converged[which],
+            self.evaluations[which],
+        )
+
+    def better(self, other: Minima) -> Minima:
+        """Return, search by search, the other where it is lower or alone has converged."""
+        wins = (other.cost < self.cost) & ~(self.converged & ~other.converged)
+        wins |= other.converged & ~self.converged
+        row = wins[:, None]
+        return Minima(
+            np.where(row, other.theta, self.theta),
+            np.where(wins, other.cost, self.cost),
+            np.where(row[:, :, None], other.hessian, self.hessian),
+            np.where(wins, other.converged, self.converged),
+            self.evaluations + other.evaluations,
+        )
+
 
 def minimise(
     evaluate: Evaluate,
@@ -52,14 +76,15 @@ def minimise(
     logarithmic: BoolArray,
     n_residuals: int,
     *,
-    inside: Callable[[FloatArray], BoolArray] | None = None,
+    inside: Callable[[FloatArray, IntArray | None], BoolArray] | None = None,
     looseness: float = 1.0,
     steps: int = 80,
 ) -> Minima:
     """Return the minima of the costs that searches from `theta`, shape (S, P), find.
 
     `logarithmic` says which coordinates are logarithms: their steps have a longest length.
-    Searches that leave the region `inside` end there, not converged. `looseness` multiplies the
+    Searches that leave the region `inside`, which is called like `evaluate`, end there, not
+    converged. `looseness` multiplies the
     length of the step at which a search has converged.
     """
     with np.errstate(all="ignore"):
@@ -109,7 +134,7 @@ def _minimise(
     theta: FloatArray,
     logarithmic: BoolArray,
     n_residuals: int,
-    inside: Callable[[FloatArray], BoolArray] | None,
+    inside: Callable[[FloatArray, IntArray | None], BoolArray] | None,
     looseness: float,
     steps: int,
 ) -> Minima:
@@ -119,32 +144,38 @@ def _minimise(
     converged, evaluations = np.full(S, P == 0), np.ones(S, dtype=np.intp)
     active = np.arange(S)
     damping, growth = np.full(S, _FIRST_DAMPING), np.full(S, 2.0)
+    last = np.full(S, 1e-300)
     for _ in range(steps if P else 0):
         step, moves, foretold = _step(at, damping, logarithmic)
         shortest = looseness**2 * _tolerance(at, logarithmic, n_residuals)
-        settled = (moves <= shortest) | (foretold <= looseness**2 * _EPS * at.cost)
+        settled = moves * np.minimum(1.0, moves / last) <= shortest
+        settled |= foretold <= looseness**2 * _EPS * at.cost
         settled &= damping < _GAUSS_NEWTON
         lost = ~np.isfinite(at.cost) | (damping > _MOST_DAMPING)
+        which = None if active.size == S else active
         if inside is not None:
-            lost |= ~inside(at.theta)
+            lost |= ~inside(at.theta, which)
         ended = settled | lost
         if ended.any():
-            converged[active] = settled & ~lost
-            ends.put(active, at)
+            settled &= ~lost
+            converged[active] = settled
+            ends.put(active, at.moved(settled, step, foretold))
             keep = ~ended
             active, at = active[keep], at.take(keep)
             if not active.size:
                 break
-            step, foretold = step[keep], foretold[keep]
-            damping, growth = damping[keep], growth[keep]
+            step, moves, foretold = step[keep], moves[keep], foretold[keep]
+            damping, growth, last = damping[keep], growth[keep], last[keep]
         trial = at.theta + step
-        new = _State(trial, *evaluate(trial, None if active.size == S else active))
+        which = None if active.size == S else active
+        new = _State(trial, *evaluate(trial, which))
         evaluations[active] += 1
         better = new.cost < at.cost
         gain = (at.cost - new.cost) / foretold
         calmer = np.maximum(damping * np.maximum(0.05, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
         damping = np.where(better, calmer, np.maximum(damping * growth, 1e-6))
         growth = np.where(better, 2.0, 4.0 * growth)
+        last = np.where(better, moves, 1e-300)
         at = new if better.all() else at.replaced(new, better)
     ends.put(active, at)
     return Minima(ends.theta, ends.cost, ends.hessian, converged, evaluations)
@@ -161,6 +192,15 @@ class _State:
 
     def take(self, keep: BoolArray | IntArray) -> _State:
         return _State(self.theta[keep], self.cost[keep], self.gradient[keep], self.hessian[keep])
+
+    def moved(self, which: BoolArray, step: FloatArray, fall: FloatArray) -> _State:
+        """Return this state with a last short step taken by some."""
+        return _State(
+            self.theta + np.where(which[:, None], step, 0.0),
+            np.where(which, np.maximum(self.cost - fall, 0.0), self.cost),
+            self.gradient,
+            self.hessian,
+        )
 
     def put(self, where: IntArray, other: _State) -> None:
         self.theta[where], self.cost[where] = other.theta, other.cost

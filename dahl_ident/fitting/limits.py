@@ -24,9 +24,8 @@ finite. The chart (kappa, x_c, sigma + stiffness) straightens it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from copy import copy
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +50,7 @@ class Chart:
 
     matrix: FloatArray
     offset: FloatArray
+    """(P,), or (S, P) for the tables of a batch."""
     back: FloatArray
     """Gives a phi near a theta: back theta, after theta[spring] += exp(theta[sigma])."""
     tied: tuple[int, int] | None = None
@@ -72,6 +72,10 @@ class Chart:
             size = np.exp(theta[..., sigma])[..., None]
             derivative[..., spring, :] -= size * self.matrix[sigma]
         return derivative
+
+    def of(self, tables: NDArray[np.intp]) -> Chart:
+        """Return the chart of some tables of a batch."""
+        return self if self.offset.ndim == 1 else replace(self, offset=self.offset[tables])
 
     def phi(self, theta: FloatArray) -> FloatArray:
         """Return a phi near theta, (Q,) or (S, Q)."""
@@ -116,17 +120,19 @@ class Reach:
                     np.log(smallest * _EDGES[0]) - x_c[1], x_c[1] - edge, softest - sigma[1]
                 ]  # fmt: skip
         self._rows = np.array(rows).reshape(-1, len(problem.parameters)).T
-        self._limits = np.moveaxis(np.array(limits), 0, -1)
+        self._limits = np.stack(np.broadcast_arrays(*limits), axis=-1) if limits else np.empty(0)
 
-    def __call__(self, theta: FloatArray) -> NDArray[np.bool_]:
-        """Return whether theta is inside, () for (P,), (S,) for (S, P)."""
-        return np.asarray((theta @ self._rows > self._limits).all(axis=-1))
+    def __call__(
+        self, theta: FloatArray, tables: NDArray[np.intp] | None = None
+    ) -> NDArray[np.bool_]:
+        """Return whether theta is inside, () for (P,), (S,) for (S, P).
 
-    def of(self, tables: NDArray[np.intp]) -> Reach:
-        """Return the reach of some tables of a batch."""
-        part = copy(self)
-        part._limits = self._limits[tables]
-        return part
+        `tables` says which of a batch's tables theta belongs to, all by default.
+        """
+        edges = self._limits
+        if tables is not None and edges.ndim > 1:
+            edges = edges[tables]
+        return np.asarray((theta @ self._rows > edges).all(axis=-1))
 
 
 def _row(problem: Problem, parameter: Parameter) -> tuple[FloatArray, float]:
@@ -153,8 +159,8 @@ def valleys(problem: Problem) -> list[Chart]:
 def limits(problem: Problem) -> list[Limit]:
     """Return the limits of every Dahl element of which f_max or sigma is free."""
     view = problem.stiffness_data
-    low, high = np.log(view.amplitude.min()), np.log(view.amplitude.max())
-    least = np.log(np.median(np.abs(view.stiffness)) * _NO_FRICTION)
+    low, high = np.log(view.amplitude.min(axis=-1)), np.log(view.amplitude.max(axis=-1))
+    least = np.log(np.median(np.abs(view.stiffness), axis=-1) * _NO_FRICTION)
     stuck, slipping = high + np.log(_NO_LOSS), low + np.log(_GROSS_SLIP)  # ln x_c
     found = []
     for element in problem.model.elements:
@@ -162,7 +168,7 @@ def limits(problem: Problem) -> list[Limit]:
             continue
         f, s, alpha = element.parameters
         f_max, sigma = f.name, s.name
-        pins = {alpha.name: 0.0} if alpha.free else {}
+        pins: dict[str, FloatArray | float] = {alpha.name: 0.0} if alpha.free else {}
         alone = len(problem.model.elements) == 1
         if f.free and s.free:
             if not _free_springs(problem):
@@ -193,14 +199,14 @@ def limits(problem: Problem) -> list[Limit]:
 
 
 def _microslip(
-    problem: Problem, ln_x_c: float, f_max: int, sigma: int, alpha: int | None, spring: int
+    problem: Problem, ln_x_c: FloatArray, f_max: int, sigma: int, alpha: int | None, spring: int
 ) -> Limit:
     names = problem.names
     pins = {} if alpha is None else {names[alpha]: 0.0}
     plain = _chart(problem, pins, (names[f_max], names[sigma], ln_x_c))
     offset = plain.offset.copy()
-    offset[sigma] += ln_x_c  # phi holds ln kappa = ln sigma - ln x_c in sigma's place
-    offset[f_max] += ln_x_c
+    offset[..., sigma] += ln_x_c  # phi holds ln kappa = ln sigma - ln x_c in sigma's place
+    offset[..., f_max] += ln_x_c
     back = plain.back.copy()
     place = plain.matrix[sigma].argmax()
     back[place, sigma], back[place, f_max] = 2.0, -1.0
@@ -235,19 +241,18 @@ def _limit(
 
 
 def _chart(
-    problem: Problem, pins: dict[str, float], follow: tuple[str, str, float] | None = None
+    problem: Problem,
+    pins: Mapping[str, FloatArray | float],
+    follow: tuple[str, str, FloatArray] | None = None,
 ) -> Chart:
     """Return theta with some coordinates pinned, and one following another at a distance."""
     names = problem.names
-    offset = np.array([pins.get(name, 0.0) for name in names])
-    follower = None if follow is None else follow[0]
-    free = [i for i, name in enumerate(names) if name not in pins and name != follower]
-    matrix = np.eye(len(names))[:, free]
+    places = dict(pins) if follow is None else {**pins, follow[0]: follow[2]}
+    offset = np.stack(np.broadcast_arrays(*(places.get(name, 0.0) for name in names)), axis=-1)
+    matrix = np.eye(len(names))[:, [i for i, name in enumerate(names) if name not in places]]
     back = matrix.T.copy()
     if follow is not None:
-        row = names.index(follow[0])
-        matrix[row] = matrix[names.index(follow[1])]
-        offset[row] = follow[2]
+        matrix[names.index(follow[0])] = matrix[names.index(follow[1])]
     return Chart(matrix, offset, back)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import FitError
+from dahl_ident.fitting.limits import Limit
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem, ProblemBatch
 
@@ -136,15 +137,21 @@ class OptimumBatch:
     covariance: FloatArray
     scale: FloatArray
     scale_known: bool
-    dof: int
+    dof: NDArray[np.intp]
     cost: FloatArray
-    nfev: FloatArray
+    nfev: NDArray[np.intp]
     status: tuple[Status, ...]
 
     @property
-    def success(self) -> FloatArray:
+    def success(self) -> NDArray[np.bool_]:
         """Whether each problem has a finite optimum that was found."""
         return np.array([status.found_optimum for status in self.status])
+
+    @property
+    def stderr(self) -> FloatArray:
+        """Standard errors of the values, shape (S, P)."""
+        slopes = self.problem.value_slopes(self.theta)
+        return np.sqrt(np.diagonal(propagated(self.covariance, slopes), axis1=1, axis2=2))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -153,21 +160,44 @@ class OptimumBatch:
 
 
 def inverse(information: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return the covariance and which parameters are undetermined.
+    """Return the covariance and which parameters are undetermined, (..., P, P) and (..., P).
 
     Parameters with a part in a null direction of the information have infinite variance and no
     covariance; the others keep what is determined.
     """
-    size = np.sqrt(np.diagonal(information))
-    size = np.where((size > 0.0) & np.isfinite(size), size, 1.0)
-    values, vectors = np.linalg.eigh(information / np.outer(size, size))
-    null = values <= _NULL * max(1.0, values[-1])
-    undetermined = (np.abs(vectors[:, null]) > _PART).any(axis=1)
-    vectors = vectors[:, ~null] / size[:, None]
-    covariance = (vectors / values[~null]) @ vectors.T
-    covariance[undetermined, :] = covariance[:, undetermined] = 0.0
-    covariance[undetermined, undetermined] = np.inf
-    return covariance, undetermined
+    finite = np.isfinite(information).all(axis=(-2, -1))[..., None, None]
+    information = np.where(finite, information, 0.0)
+    size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
+    size = np.where(size > 0.0, size, 1.0)
+    sizes = size[..., :, None] * size[..., None, :]
+    values, vectors = np.linalg.eigh(information / sizes)
+    null = values <= _NULL * np.maximum(1.0, values[..., -1:])
+    parts = np.abs(vectors) * null[..., None, :]
+    undetermined: NDArray[np.bool_] = np.asarray(parts.max(axis=-1) > _PART)
+    inverted = np.where(null, 0.0, 1.0 / np.where(null, 1.0, values))
+    covariance = (vectors * inverted[..., None, :]) @ vectors.swapaxes(-1, -2) / sizes
+    return (_blanked(covariance, undetermined) if undetermined.any() else covariance), undetermined
+
+
+def spread(
+    limit: Limit, chart: FloatArray, inner: FloatArray, lost: NDArray[np.bool_]
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return the covariance of theta, and which of it is undetermined, from that of phi.
+
+    `chart` is dtheta/dphi, (..., P, Q); `inner` and `lost` are the same two of phi.
+    """
+    covariance = chart @ np.where(np.isfinite(inner), inner, 0.0) @ chart.swapaxes(-1, -2)
+    undetermined = np.array([name in limit.extremes for name in limit.names])
+    undetermined = undetermined | ((np.abs(chart) > 0.0) & lost[..., None, :]).any(axis=-1)
+    undetermined |= ~chart.any(axis=-1)
+    return _blanked(covariance, undetermined), undetermined
+
+
+def _blanked(covariance: FloatArray, undetermined: NDArray[np.bool_]) -> FloatArray:
+    """Return `covariance` with infinite variances and no covariances of the undetermined."""
+    either = undetermined[..., :, None] | undetermined[..., None, :]
+    diagonal = either & np.eye(covariance.shape[-1], dtype=np.bool_)
+    return np.where(diagonal, np.inf, np.where(either, 0.0, covariance))
 
 
 def propagated(covariance: FloatArray, slopes: FloatArray) -> FloatArray:

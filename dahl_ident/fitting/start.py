@@ -40,6 +40,7 @@ _DECADE = np.log(10.0) / _STEP
 _ALPHAS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0)
 _MOST_COMBINATIONS = 4000
 _MOST_STARTS = 4
+_AROUND = np.array([-1, 0, 1])
 _LINEAR = (Mass, Damper, Spring)
 
 
@@ -49,11 +50,13 @@ def starts(problem: Problem) -> FloatArray:
     Values that the user gave to free parameters make one more start, the last.
     """
     grid = _grid(problem)
-    cost, theta = grid.solved()
-    order = _local_minima(cost.reshape(grid.shape))[:_MOST_STARTS]
-    best = theta[order]
-    if grid.shape == cost.shape:
-        best[0] = _vertex(cost, theta, order[0])
+    cost, coefficients = grid.solved()
+    places = _local_minima(cost.reshape(grid.shape))[:_MOST_STARTS]
+    best = grid.theta(coefficients, places)
+    first = places[0]
+    if grid.shape == cost.shape and 0 < first < len(cost) - 1:
+        around = first + _AROUND
+        best[0] = _vertex(cost[around], grid.theta(coefficients, around))
     if all(p.value is None for p in problem.parameters):
         return best
     values = problem.to_values(best[0])
@@ -63,24 +66,29 @@ def starts(problem: Problem) -> FloatArray:
     return np.vstack([best, problem.to_search(given)])
 
 
-def _vertex(cost: FloatArray, theta: FloatArray, at: int) -> FloatArray:
-    """Return theta where the parabola through three neighbouring nodes has its vertex."""
-    if not 0 < at < len(cost) - 1:
-        return np.asarray(theta[at])
-    left, middle, right = cost[at - 1 : at + 2]
-    bend = left - 2.0 * middle + right
-    if not 0.0 < bend < np.inf:
-        return np.asarray(theta[at])
-    u = 0.5 * (left - right) / bend
-    weights = np.array([0.5 * u * (u - 1.0), 1.0 - u * u, 0.5 * u * (u + 1.0)])
-    return np.asarray(weights @ theta[at - 1 : at + 2])
-
-
 def best_starts(problem: Problem) -> FloatArray:
     """Return the best start of each table of a batch, shape (S, P)."""
-    cost, theta = _grid(problem).solved()
-    best = np.argmin(cost, axis=-1)[..., None, None]
-    return np.take_along_axis(theta, best, axis=-2)[..., 0, :]
+    grid = _grid(problem)
+    cost, coefficients = grid.solved()
+    best = cost.argmin(axis=-1)[:, None]
+    nodes = cost.shape[-1]
+    if grid.shape != (nodes,) or nodes < 3:
+        return grid.theta(coefficients, best)[:, 0]
+    around = np.clip(best, 1, nodes - 2) + _AROUND
+    theta = grid.theta(coefficients, around)
+    vertex = _vertex(np.take_along_axis(cost, around, axis=-1), theta)
+    vertex = np.where(best == 0, theta[:, 0], vertex)
+    return np.where(best == nodes - 1, theta[:, 2], vertex)
+
+
+def _vertex(cost: FloatArray, theta: FloatArray) -> FloatArray:
+    """Return theta at the vertex of the parabola through three nodes, (..., 3) and (..., 3, P)."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        left, middle, right = cost[..., 0], cost[..., 1], cost[..., 2]
+        u = 0.5 * (left - right) / (left - 2.0 * middle + right)
+    u = np.where(np.abs(u) <= 1.0, u, 0.0)[..., None]
+    left, middle, right = theta[..., 0, :], theta[..., 1, :], theta[..., 2, :]
+    return np.asarray(middle + 0.5 * u * (right - left + u * (right - 2.0 * middle + left)))
 
 
 @dataclass(frozen=True)
@@ -120,36 +128,44 @@ class _Grid:
     columns: dict[str, ComplexArray]  # of linear parameters, weighted, (..., n)
 
     def solved(self) -> tuple[FloatArray, FloatArray]:
-        """Return the sum of squares, (..., C), and the search coordinates, (..., C, P)."""
+        """Return the sum of squares, (..., C), and the linear parameters, (..., C, Q)."""
+        if len(self.friction) == 1 and self.friction[0].is_linear and not self.columns:
+            cost, coefficients = _solve_one(self.target, self.friction[0].curve, self.weights)
+        else:
+            cost, coefficients = _solve_linear(*self._system())
+        friction = coefficients[..., len(self.columns) :]
+        return np.where((friction > 0.0).all(axis=-1), cost, np.inf), coefficients
+
+    def _system(self) -> tuple[ComplexArray, list[ComplexArray]]:
+        """Return what is to be fitted and the columns to fit it with, each (..., C, n)."""
         target = self.target[..., None, :]
         columns = [c[..., None, :] for c in self.columns.values()]
-        fitted = []
         for index, element in enumerate(self.friction):
             chosen = self.nodes[:, index]
             column = element.curve[..., chosen, :] * self.weights[..., None, :]
             if element.is_linear:
-                fitted.append(index)
                 columns.append(column)
             else:
                 target = target - element.known_sigma()[..., chosen, None] * column
-        cost, coefficients = _solve_linear(target, columns)
-        friction = coefficients[..., len(self.columns) :]
-        cost = np.where((friction > 0.0).all(axis=-1), cost, np.inf)
-        sigma = dict(zip(fitted, np.moveaxis(np.abs(friction), -1, 0), strict=True))
-        return cost, self._theta(cost.shape, coefficients, sigma)
+        return target, columns
 
-    def _theta(
-        self, shape: tuple[int, ...], coefficients: FloatArray, sigma: dict[int, FloatArray]
-    ) -> FloatArray:
-        known = {name: coefficients[..., i] for i, name in enumerate(self.columns)}
+    def theta(self, coefficients: FloatArray, places: IntArray) -> FloatArray:
+        """Return the search coordinates at some combinations of nodes, (..., k) -> (..., k, P)."""
+        chosen = np.take_along_axis(coefficients, places[..., None], axis=-2)
+        known = {name: chosen[..., i] for i, name in enumerate(self.columns)}
+        used = len(known)
         for index, element in enumerate(self.friction):
-            chosen = self.nodes[:, index]
-            ln_x_c = element.ln_x_c[..., chosen]
-            size = sigma[index] if element.is_linear else element.known_sigma()[..., chosen]
-            known[element.sigma.name] = np.maximum(size, 1e-300)
-            known[element.f_max.name] = np.maximum(size * np.exp(ln_x_c), 1e-300)
-            known[element.alpha.name] = np.exp(element.ln_alpha[chosen])
-        theta = np.empty((*shape, len(self.problem.parameters)))
+            node = self.nodes[places, index]
+            ln_x_c = _taken(element.ln_x_c, node)
+            if element.is_linear:
+                sigma = np.abs(chosen[..., used])
+                used += 1
+            else:
+                sigma = _taken(element.known_sigma(), node)
+            known[element.sigma.name] = sigma
+            known[element.f_max.name] = sigma * np.exp(ln_x_c)
+            known[element.alpha.name] = np.exp(element.ln_alpha[node])
+        theta = np.empty((*places.shape, len(self.problem.parameters)))
         for index, parameter in enumerate(self.problem.parameters):
             value = known.get(parameter.name, parameter.value)
             if value is None:
@@ -248,20 +264,28 @@ def _table(alpha: float, harmonic: int) -> ComplexArray:
     return Dahl().stiffness((one, one, np.asarray(alpha)), beta, one, harmonic)
 
 
+def _solve_one(
+    target: ComplexArray, curve: ComplexArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return what `_solve_linear` does for the one column curve times weights, (..., K, n)."""
+    parts = curve.view(np.float64)
+    power = curve.real**2 + curve.imag**2
+    pulled = (target * weights).view(np.float64)
+    size = (target.real**2 + target.imag**2).sum(axis=-1)[..., None]
+    overlap = (parts @ pulled[..., None])[..., 0]
+    norm = (power @ (weights**2)[..., None])[..., 0]
+    coefficient = overlap / np.maximum(norm, 1e-300)
+    return size - coefficient * overlap, coefficient[..., None]
+
+
 def _solve_linear(
     target: ComplexArray, columns: list[ComplexArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the least sum of |target - sum of real coefficients times columns|^2, and those."""
     shape = np.broadcast_shapes(target.shape, *(c.shape for c in columns))
-    size = (target.real**2 + target.imag**2).sum(axis=-1)
     if not columns:
+        size = (target.real**2 + target.imag**2).sum(axis=-1)
         return np.broadcast_to(size, shape[:-1]), np.empty((*shape[:-1], 0))
-    if len(columns) == 1:
-        (c,) = columns
-        norm = (c.real**2 + c.imag**2).sum(axis=-1)
-        overlap = (c.real * target.real + c.imag * target.imag).sum(axis=-1)
-        coefficient = overlap / np.maximum(norm, 1e-300)
-        return size - coefficient * overlap, coefficient[..., None]
     X = np.stack([np.broadcast_to(c, shape) for c in columns], axis=-2).view(np.float64)
     t = np.ascontiguousarray(np.broadcast_to(target, shape)).view(np.float64)
     norm = np.sqrt((X * X).sum(axis=-1))
@@ -285,6 +309,11 @@ def _local_minima(cost: FloatArray) -> IntArray:
         mask[:-1] &= rows[:-1] < rows[1:]
     places = np.flatnonzero(lowest)
     return places[cost.ravel()[places].argsort()]
+
+
+def _taken(values: FloatArray, node: IntArray) -> FloatArray:
+    """Return values, (K,) or (S, K), at nodes, (k,) or (S, k)."""
+    return values[node] if values.ndim == 1 else np.take_along_axis(values, node, axis=-1)
 
 
 def _is_free(parameters: tuple[Parameter, ...]) -> bool:

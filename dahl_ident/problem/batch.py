@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
@@ -75,11 +76,15 @@ class ProblemBatch(Problem):
                 f"responses have shape {responses.shape}; expected (replicates, {n}), one number "
                 "for each row of the data"
             )
-        batch = object.__new__(cls)
-        batch.__dict__.update(problem.__dict__)
-        batch.__dict__.pop("stiffness_data", None)  # that of the original responses
-        batch._set_rows(problem._rows.with_responses(responses), problem.noise)
-        return batch
+        return problem._with_rows(cls, problem._rows.with_responses(responses))
+
+    def take(self, tables: NDArray[np.intp] | slice) -> ProblemBatch:
+        """Return the batch of some of the tables."""
+        return self._with_rows(ProblemBatch, self._rows.take(tables))
+
+    def table(self, index: int) -> Problem:
+        """Return the problem of one table."""
+        return self._with_rows(Problem, self._rows.table(index))
 
     @property
     def n_tables(self) -> int:

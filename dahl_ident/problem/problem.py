@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +20,8 @@ from dahl_ident.problem.coordinates import Coordinates, in_order, interchangeabl
 from dahl_ident.problem.prediction import Predictor
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import EXACT, Prior, Sensors
+
+_Kind = TypeVar("_Kind", bound="Problem")
 
 
 class Quadratic(NamedTuple):
@@ -128,6 +130,15 @@ class Problem:
         self._tail: Rho | None = None if dof is None else Student(dof)
         self.gaussian = dof is None
         self.n_residuals = 2 * rows.n
+
+    def _with_rows(self, kind: type[_Kind], rows: Rows) -> _Kind:
+        """Return this problem, or batch, with other rows."""
+        other = object.__new__(kind)
+        other.__dict__.update(self.__dict__)
+        for stale in ("stiffness_data", "data"):
+            other.__dict__.pop(stale, None)
+        other._set_rows(rows, self.noise)
+        return other
 
     def __repr__(self) -> str:
         return (
