@@ -9,8 +9,7 @@ N is the sum of the describing functions of the friction elements, L all the res
 
 - :func:`response` is for users: one plant with known parameters, checked arguments, every
   amplitude on request.
-- :func:`solve` and :func:`receptance_gradient` are for estimation: many parameter vectors at
-  once, and the derivatives of X/u_0 by implicit differentiation.
+- :func:`solve` is for estimation: many parameter vectors at once, unchecked.
 
 Where L is passive (Im L >= 0) A |Z| rises with A, whatever the exponents, so the amplitude is
 unique. Only an active linear part (negative damping) can bring several, or self-sustained
@@ -21,6 +20,6 @@ amplitude at all.
 from __future__ import annotations
 
 from dahl_ident.steady_state.forced import SteadyResponse, response
-from dahl_ident.steady_state.implicit import ReceptanceGradient, receptance_gradient, solve
+from dahl_ident.steady_state.implicit import solve
 
-__all__ = ["ReceptanceGradient", "SteadyResponse", "receptance_gradient", "response", "solve"]
+__all__ = ["SteadyResponse", "response", "solve"]
