@@ -1,0 +1,282 @@
+"""The command line: what it prints, what it writes, how it ends."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dahl_ident as di
+from dahl_ident.cli import main
+from dahl_ident.cli.app import app
+from dahl_ident.synthetic import Experiment
+
+COMMANDS = ("demo", "inspect", "extract", "fit", "sample", "report", "simulate", "datasets")
+PROGRAM = Path(sys.executable).with_name("dahl-ident")
+
+
+@dataclass
+class Outcome:
+    """What a command left behind."""
+
+    status: int
+    out: str
+    err: str
+
+
+class Runner:
+    """Runs the command line in this process, in a directory of its own."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str], patch: pytest.MonkeyPatch) -> None:
+        self._capsys, self._patch = capsys, patch
+
+    def __call__(self, *arguments: str, stdin: str = "") -> Outcome:
+        self._patch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(stdin.encode())))
+        self._capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main(list(arguments))
+        out, err = self._capsys.readouterr()
+        code = ended.value.code
+        return Outcome(code if isinstance(code, int) else 0, out, err)
+
+
+@pytest.fixture
+def run(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Runner:
+    monkeypatch.chdir(tmp_path)
+    return Runner(capsys, monkeypatch)
+
+
+def test_fit_recovers_the_truth_and_ends_with_0(run: Runner) -> None:
+    assert run("simulate", "--f-max", "0.2", "--sigma", "50", "-o", "clean.csv").status == 0
+    outcome = run("fit", "clean.csv", "--json", "--noise", "relative")
+    params = json.loads(outcome.out)["params"]
+    assert outcome.status == 0, outcome.err
+    assert params["f_max"]["value"] == pytest.approx(0.2, rel=1e-9)
+    assert params["sigma"]["value"] == pytest.approx(50.0, rel=1e-9)
+
+
+def test_command_line_and_python_give_the_same_numbers(run: Runner) -> None:
+    table = run("datasets", "noisy", "-o", "-").out
+    told = json.loads(run("fit", "-", "--json", stdin=table).out)["params"]
+    Path("noisy.csv").write_text(table, encoding="utf-8")
+    fit = di.fit(di.read_frequency_response("noisy.csv"), di.Dahl())
+    for name in ("f_max", "sigma"):
+        assert told[name]["value"] == fit.params[name].value
+        assert told[name]["stderr"] == fit.params[name].stderr
+
+
+def test_a_missing_file_is_one_line_and_status_1(run: Runner) -> None:
+    outcome = run("fit", "nothing.csv")
+    assert outcome.status == 1
+    assert outcome.out == ""
+    assert outcome.err == (
+        "error: nothing.csv: the file cannot be read: No such file or directory\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("fit", "-", "--mass", "heavy"), "mass is 'heavy'; expected a number in SI units"),
+        (("simulate", "--f-max", "1", "-o", "x.csv"), "no value for sigma"),
+        (
+            ("simulate", "--f-max", "1", "--sigma", "2", "--levels", "a:b:c"),
+            "levels is 'a:b:c'; expected numbers",
+        ),
+        (("datasets", "nosuch"), "there is no data set 'nosuch'; there are"),
+        (("datasets", "-o", "x.csv"), "--output needs the name of a data set"),
+        (("sample", "-", "--prior", "f_max"), "prior is 'f_max'; expected a name and two bounds"),
+        (("fit", "-", "--config", "absent.toml"), "absent.toml: no TOML file of options"),
+    ],
+)
+def test_bad_input_says_what_was_expected(
+    run: Runner, arguments: tuple[str, ...], message: str
+) -> None:
+    table = run("datasets", "noisy", "-o", "-").out
+    outcome = run(*arguments, stdin=table)
+    assert outcome.status == 1
+    assert outcome.err.startswith("error: ")
+    assert outcome.err.count("\n") == 1
+    assert message in outcome.err
+
+
+@pytest.mark.parametrize("arguments", [("fit",), ("fit", "x.csv", "--nosuch"), ("nosuch",)])
+def test_wrong_use_ends_with_2(run: Runner, arguments: tuple[str, ...]) -> None:
+    assert run(*arguments).status == 2
+
+
+def test_a_fit_that_runs_away_ends_with_3_and_says_why(run: Runner) -> None:
+    amplitude = np.geomspace(1e-6, 1e-5, 8)
+    response = np.full(8, 30.0 + 0.0j) * np.exp(1j * 1e-3 * ((-1.0) ** np.arange(8) - 0.5))
+    di.FrequencyResponse(np.ones(8), response, amplitude).save("stuck.csv")
+    outcome = run("fit", "stuck.csv", "--noise", "relative")
+    assert outcome.status == 3
+    assert "not to be trusted: " in outcome.err
+    assert "f_max" in outcome.out
+
+
+def test_points_that_are_not_good_end_with_3(run: Runner) -> None:
+    record = run("datasets", "unsettled", "-o", "-").out
+    outcome = run("extract", "-", "-o", "levels.csv", stdin=record)
+    assert outcome.status == 3
+    assert re.search(r"not to be trusted: \d+ of \d+ points are not good \(point \d+: not settled",
+                     outcome.err)  # fmt: skip
+    assert di.read_frequency_response("levels.csv").n > 0
+
+
+def test_options_come_from_a_file_and_the_command_line_wins(run: Runner) -> None:
+    Path("noisy.csv").write_text(run("datasets", "noisy", "-o", "-").out, encoding="utf-8")
+    Path("lab.toml").write_text(
+        'sigma = "40"\n[fit]\nnoise = "relative"\njson = true\n[datasets]\nname = "x"\n',
+        encoding="utf-8",
+    )
+    params = json.loads(run("fit", "noisy.csv", "--config", "lab.toml").out)["params"]
+    assert params["sigma"] == params["sigma"] | {"value": 40.0, "vary": False}
+    again = run("fit", "noisy.csv", "--config", "lab.toml", "--sigma", "20").out
+    assert json.loads(again)["params"]["sigma"]["value"] == 20.0
+
+
+def test_an_unknown_option_in_a_file_is_named(run: Runner) -> None:
+    Path("lab.toml").write_text("[fit]\nnosie = 1\n", encoding="utf-8")
+    outcome = run("fit", "x.csv", "--config", "lab.toml")
+    assert outcome.status == 1
+    assert "lab.toml: fit has no option nosie; it has " in outcome.err
+
+
+def test_levels_come_from_file_names(run: Runner) -> None:
+    amplitude = np.geomspace(1e-4, 1e-2, 6)
+    stiffness = di.Dahl(0.1, 30.0).describing_function(amplitude)
+    for level, A, N in zip(("0.1", "0.2", "0.3"), amplitude[::2], stiffness[::2], strict=True):
+        text = f"frequency_hz,gain [N/m],phase_deg\n1,{abs(N)},{np.degrees(np.angle(N))}\n"
+        Path(f"run_{level}mm.csv").write_text(text, encoding="utf-8")
+        assert A > 0.0
+    outcome = run(
+        "fit", "run_0.1mm.csv", "run_0.2mm.csv", "run_0.3mm.csv", "--json",
+        "--level-from-name", "_([0-9.]+)mm", "--amplitude", "{level} mm",
+    )  # fmt: skip
+    assert json.loads(outcome.out)["params"]["f_max"]["value"] > 0.0
+
+
+def test_simulate_prints_an_experiment_that_it_reads(run: Runner) -> None:
+    options = ("simulate", "--f-max", "0.1", "--sigma", "30", "--levels", "1e-3,2e-3")
+    text = run(*options).out
+    assert Experiment.from_toml(text).truth["sigma"] == 30.0
+    Path("run.toml").write_text(text, encoding="utf-8")
+    assert run("simulate", "run.toml", "-o", "a.csv").status == 0
+    assert run(*options, "-o", "b.csv").status == 0
+    assert Path("a.csv").read_bytes() == Path("b.csv").read_bytes()
+    assert tomllib.loads(text)["excitation"]["levels"] == [1e-3, 2e-3]
+
+
+def test_a_record_is_simulated_inspected_and_extracted(run: Runner) -> None:
+    made = run(
+        "simulate", "--f-max", "0.1", "--sigma", "30", "--record", "--levels", "2e-3,8e-3",
+        "--force-std", "1e-4", "--settling-periods", "20", "-o", "run.csv",
+    )  # fmt: skip
+    assert made.status == 0, made.err
+    contents = json.loads(run("inspect", "run.csv", "--json").out)
+    assert [c["name"] for c in contents[0]["channels"]] == ["time", "displacement", "force"]
+    outcome = run(
+        "extract", "run.csv", "-o", "points.csv", "--plot", "points.png", "--harmonics", "1"
+    )
+    assert outcome.status in (0, 3), outcome.err
+    points = di.read_frequency_response("points.csv")
+    assert points.amplitude is not None
+    exact = di.Dahl(0.1, 30.0).describing_function(points.amplitude)
+    np.testing.assert_allclose(points.response, exact, rtol=0.02)
+    assert Path("points.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_sample_tells_the_posterior(run: Runner) -> None:
+    table = run("datasets", "noisy", "-o", "-").out
+    outcome = run("sample", "-", "--prior", "f_max=0.01:1", "--json", stdin=table)
+    told = json.loads(outcome.out)
+    assert outcome.status == 0, outcome.err
+    assert told["priors"]["f_max"].startswith("log-uniform from 0.01 to 1 N")
+    row = told["summary"]["f_max"]
+    assert abs(row["median"] - 0.1) < 4.0 * row["std"]
+
+
+def test_a_chain_that_is_too_short_ends_with_3(run: Runner) -> None:
+    table = run("datasets", "noisy", "-o", "-").out
+    outcome = run("sample", "-", "--steps", "20", stdin=table)
+    assert outcome.status == 3
+    assert outcome.out.startswith("NOT CONVERGED after 20 steps")
+
+
+def test_report_writes_every_format_asked_for(run: Runner) -> None:
+    table = run("datasets", "noisy", "-o", "-").out
+    outcome = run("report", "-", "-o", "a.html", "-o", "a.json", stdin=table)
+    assert outcome.out.split() == ["a.html", "a.json"]
+    assert json.loads(Path("a.json").read_text(encoding="utf-8"))["trusted"] is True
+    assert run("report", "-", "-o", "a.doc", stdin=table).status == 1
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_help_has_an_example_that_runs(run: Runner, command: str) -> None:
+    help_text = " ".join(re.sub("[│╭╮╰╯]", " ", run(command, "--help").out).split())
+    found = re.search(r"Example: (dahl-ident .*?)(?= (?:Arguments|Options|Ends) |─|$)", help_text)
+    assert found, help_text
+    if command == "demo":
+        return  # run by make demo and by the test of the chain
+    stdin = ""
+    for stage in found[1].strip().split(" | "):
+        outcome = run(*stage.split()[1:], stdin=stdin)
+        assert outcome.status in (0, 3), outcome.err
+        stdin = outcome.out
+
+
+def test_help_lists_all_commands(run: Runner) -> None:
+    text = run("--help").out
+    assert [name for name in COMMANDS if name not in text] == []
+    assert sorted(
+        str(c.callback.__name__) for c in app.registered_commands if c.callback
+    ) == sorted(COMMANDS)
+
+
+def test_no_colour_off_a_terminal(run: Runner) -> None:
+    assert "\x1b[" not in run("datasets").out + run("--no-color", "datasets").out
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = (
+        "import sys\nfrom dahl_ident.cli import main\n"
+        "try:\n    main(['fit', '--help'])\nexcept SystemExit:\n    pass\n"
+        "print('loaded', *sys.modules)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    loaded = set(out.stdout[out.stdout.rindex("loaded") :].split())
+    assert not loaded & {"numpy", "scipy", "matplotlib", "pandas", "casadi", "emcee", "pint"}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
+def test_an_interrupt_leaves_the_old_file_whole(tmp_path: Path) -> None:
+    target = tmp_path / "long.csv"
+    target.write_text("as it was", encoding="utf-8")
+    levels = "1e-3:1e-1:400"
+    command = [
+        str(PROGRAM), "simulate", "--f-max", "0.1", "--sigma", "30", "--mass", "0.3", "--damping",
+        "0.2", "--stiffness", "0.3", "--record", "--controlled", "force", "--levels", levels,
+        "--settling-periods", "400", "-o", str(target),
+    ]  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    time.sleep(3.0)
+    assert process.poll() is None, process.communicate()
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert target.read_text(encoding="utf-8") == "as it was"
+    assert [p.name for p in tmp_path.iterdir()] == ["long.csv"]
