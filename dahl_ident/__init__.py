@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from dahl_ident.results import FitResult, Posterior, fit, posterior_grid, sample
     from dahl_ident.sensors import Sensors
     from dahl_ident.steady_state import response
+    from dahl_ident.synthetic import load_dataset, simulate
 
 __version__ = "0.1.0"
 
@@ -35,6 +36,7 @@ _ROOMS = {
     "dahl_ident.results": ("FitResult", "Posterior", "fit", "posterior_grid", "sample"),
     "dahl_ident.sensors": ("Sensors",),
     "dahl_ident.steady_state": ("response",),
+    "dahl_ident.synthetic": ("load_dataset", "simulate"),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 
@@ -55,11 +57,13 @@ __all__ = [
     "fit",
     "identifiability",
     "limit_cycles",
+    "load_dataset",
     "posterior_grid",
     "read_frequency_response",
     "read_record",
     "response",
     "sample",
+    "simulate",
 ]
 
 

@@ -30,11 +30,13 @@ PUBLIC_NAMES = [
     "fit",
     "identifiability",
     "limit_cycles",
+    "load_dataset",
     "posterior_grid",
     "read_frequency_response",
     "read_record",
     "response",
     "sample",
+    "simulate",
 ]
 
 
@@ -81,10 +83,12 @@ def test_wheel_installs_and_runs_elsewhere(tmp_path: Path) -> None:
     )
     code = (
         "import dahl_ident as di; print(di.__file__); "
-        "print(abs(di.Dahl(f_max=1.0, sigma=1.0).describing_function(1.0)).round(5))"
+        "print(abs(di.Dahl(f_max=1.0, sigma=1.0).describing_function(1.0)).round(5)); "
+        "print(di.load_dataset('noisy').n, di.load_dataset('unsettled').n)"
     )
     out = subprocess.run(
         [str(python), "-c", code], cwd=tmp_path, check=True, capture_output=True, text=True
     ).stdout.split()
     assert Path(out[0]).is_relative_to(env)
     assert out[1] == "0.79291"
+    assert out[2:] == ["30", "2305"]

@@ -138,6 +138,7 @@ class _Operator(NamedTuple):
     states_driven: FloatArray  # from w at all nodes, (12, n, 13)
     x_free: FloatArray  # (12, n)
     x_driven: FloatArray  # (12, 13)
+    softness: float  # the most that a force of 1 within the interval moves x
 
 
 class _Interval(NamedTuple):
@@ -228,8 +229,7 @@ class _Run:
         peak = max(self._peak, float(np.max(np.abs(x))))
         if not (np.isfinite(force).all() and peak < _BEYOND_BOUNDS):
             return None
-        softness = float(np.max(np.sum(np.abs(driven), axis=1))) * refinement
-        tail = _tail(x) + softness * _tail(force)
+        tail = _tail(x) + operator.softness * refinement * _tail(force)
         return _Interval(x, u - force, tail / (_TOLERANCE * peak) if tail > 0.0 else 0.0)
 
     def _first_turn(self, x: FloatArray) -> float:
@@ -295,9 +295,9 @@ def _operator(system: StateSpace, length: float) -> _Operator:
     states_driven = solution[:, n:].reshape(later, n, NODES.size)
     x_driven = np.einsum("i,jik->jk", system.C, states_driven)
     x_driven[:, 1:] += system.D * np.eye(later)
-    return _Operator(
-        states_free, states_driven, np.einsum("i,jik->jk", system.C, states_free), x_driven
-    )
+    softness = float(np.max(np.sum(np.abs(x_driven[:, 1:]), axis=1)))
+    x_free = np.einsum("i,jik->jk", system.C, states_free)
+    return _Operator(states_free, states_driven, x_free, x_driven, softness)
 
 
 def _tail(values: FloatArray) -> float:
