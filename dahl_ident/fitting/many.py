@@ -196,7 +196,7 @@ def _finite(batch: ProblemBatch, minima: Minima) -> _Part:
     covariance, undetermined = inverse(hessian)
     dof = np.full(len(theta), batch.n_residuals + len(batch.priors) - theta.shape[1])
     scale = _scale(batch, minima.cost, dof)
-    singular = undetermined.any(axis=1)
+    singular = np.asarray(undetermined.any(axis=1))
     return _Part(
         theta,
         batch.to_values(theta),

@@ -165,7 +165,7 @@ def inverse(information: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     Parameters with a part in a null direction of the information have infinite variance and no
     covariance; the others keep what is determined.
     """
-    finite = np.isfinite(information).all(axis=(-2, -1))[..., None, None]
+    finite = np.asarray(np.isfinite(information).all(axis=(-2, -1)))[..., None, None]
     information = np.where(finite, information, 0.0)
     size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
     size = np.where(size > 0.0, size, 1.0)
@@ -173,7 +173,7 @@ def inverse(information: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     values, vectors = np.linalg.eigh(information / sizes)
     null = values <= _NULL * np.maximum(1.0, values[..., -1:])
     parts = np.abs(vectors) * null[..., None, :]
-    undetermined: NDArray[np.bool_] = np.asarray(parts.max(axis=-1) > _PART)
+    undetermined = np.asarray(parts.max(axis=-1) > _PART, dtype=np.bool_)
     inverted = np.where(null, 0.0, 1.0 / np.where(null, 1.0, values))
     covariance = (vectors * inverted[..., None, :]) @ vectors.swapaxes(-1, -2) / sizes
     return (_blanked(covariance, undetermined) if undetermined.any() else covariance), undetermined
