@@ -80,9 +80,12 @@ this page.
 def main(arguments: list[str] | None = None) -> int:
     """Write all data sets, or those named, into a directory."""
     parser = argparse.ArgumentParser(description="Write the synthetic data sets anew.")
-    parser.add_argument("names", nargs="*", choices=[[], *DATA_SETS], help="all, if none is named")
+    parser.add_argument("names", nargs="*", help="all, if none is named")
     parser.add_argument("--directory", type=Path, default=None, help="where to write them")
     given = parser.parse_args(arguments)
+    unknown = [name for name in given.names if name not in DATA_SETS]
+    if unknown:
+        parser.error(f"there is no data set {', '.join(unknown)}; there are {', '.join(DATA_SETS)}")
     directory = given.directory or datasets_directory()
     for name in given.names or DATA_SETS:
         write(DATA_SETS[name], directory)
