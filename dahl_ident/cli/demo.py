@@ -30,7 +30,7 @@ def demo(
     from dahl_ident.data import inspect, read_record
     from dahl_ident.elements import Dahl, Damper, Mass, Spring
     from dahl_ident.extraction import extract as extract_record
-    from dahl_ident.reporting import report
+    from dahl_ident.reporting import judgement, report
     from dahl_ident.results import fit
     from dahl_ident.results.sampling import sample
     from dahl_ident.synthetic.shipped import datasets_directory, load_dataset
@@ -48,10 +48,12 @@ def demo(
     table = data.save(output / "levels.csv")
     telling.heading("3. fit: friction, mass, damper and spring, nothing known beforehand")
     result = fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
-    show(result, json=False)
+    judged = judgement(result)
+    show(judged)
     _compare(result, facts["truth"])
     telling.heading("4. identifiability: what the data determine")
-    _tell_identifiability(result)
+    telling.say(str(judged.identifiability))
+    telling.say(str(judged.goodness))
     telling.heading("5. posterior: emcee, from the same likelihood")
     posterior = sample(result, seed=1)
     telling.say(posterior.report())
@@ -60,7 +62,7 @@ def demo(
         bar.add_task("drawing", total=None)
         page = report([result, posterior], output / "report.html")
     telling.say(f"table: {table}\nreport: {page.resolve()}")
-    telling.finish(result.success, result.message)
+    telling.finish(judged.trusted and posterior.converged, " ".join(judged.objections))
 
 
 def _compare(result: FitResult, truth: Mapping[str, float]) -> None:
@@ -72,10 +74,3 @@ def _compare(result: FitResult, truth: Mapping[str, float]) -> None:
         rows.append((name, f"{estimate.value:.5g}", error, f"{truth[name]:g}", f"{off:+.1f}"))
     header = ("parameter", "estimate", "standard error", "truth", "off by standard errors")
     telling.table("Beside the truth", header, rows)
-
-
-def _tell_identifiability(result: FitResult) -> None:
-    from dahl_ident.diagnostics.intervals import profile_intervals
-    from dahl_ident.diagnostics.verdicts import judged
-
-    telling.say(str(judged(result.optimum, profile_intervals(result.optimum))))

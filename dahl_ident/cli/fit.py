@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,9 +13,11 @@ from dahl_ident.cli.groups import grouped
 from dahl_ident.cli.options import Files, General, ModelOptions, Reading
 
 if TYPE_CHECKING:
+    from dahl_ident.reporting import Judgement
     from dahl_ident.results import FitResult
 
 _ESTIMATING = "Estimating"
+_LEVEL = 0.9545
 
 
 @dataclass(frozen=True)
@@ -52,13 +55,16 @@ def fit(
 
     Example: dahl-ident datasets noisy -o - | dahl-ident fit -
     """
+    from dahl_ident.reporting import judgement
+
     result = fitted(files, reading, model, estimating)
-    show(result, json=general.json)
+    judged = judgement(result)
+    show(judged, json=general.json)
     if report is not None:
         from dahl_ident.reporting import report as write_report
 
         telling.doubt(f"report: {write_report(result, report)}")
-    finish(result)
+    finish(judged)
 
 
 def fitted(
@@ -71,25 +77,56 @@ def fitted(
     return fit_data(reading.read(files), elements, free=free, throw=False, **vars(estimating))
 
 
-def show(result: FitResult, *, json: bool) -> None:
-    """Print a fit for people or for machines."""
+def show(judged: Judgement, *, json: bool = False) -> None:
+    """Print a fit for people or for machines, the verdict first."""
     if json:
-        telling.say_json(as_json(result))
+        telling.say_json(as_json(judged))
         return
-    telling.say(result.message)
-    for estimate in result.params.values():
-        telling.say(f"  {estimate}")
+    from dahl_ident.diagnostics.formatting import interval, rounded
+    from dahl_ident.diagnostics.levels import percent
+
+    fit, limits = judged.fit, judged.profile.at(_LEVEL)
+    for line in judged.headlines:
+        telling.say(line)
+    rows = []
+    for name, estimate in fit.params.items():
+        value, error = rounded(estimate.value, estimate.stderr)
+        if not math.isfinite(estimate.value):
+            value = "none finite"
+        found = limits.get(name)
+        between = interval(found.lower, found.upper, "") if found else "-"
+        rows.append((name, value, error if estimate.vary else "fixed", between, estimate.unit))
+    header = ("parameter", "estimate", "standard error", f"{percent(_LEVEL)} (profile)", "unit")
+    telling.table(repr(fit.problem.model), header, rows)
+    noise = "known" if fit.scale_known else f"estimated as {fit.scale:.3g}"
+    telling.say(f"noise: {fit.noise}, its scale {noise}; reduced chi-square {fit.redchi:.3g}")
+    for text in (p.text for p in judged.identifiability.parameters.values()):
+        telling.say(f"- {text}")
+    for combination in judged.identifiability.combinations:
+        telling.say(f"- determined: {combination}")
+    for point in judged.goodness.suspicious:
+        telling.say(f"- suspicious: {point}")
 
 
-def as_json(result: FitResult) -> dict[str, Any]:
+def as_json(judged: Judgement) -> dict[str, Any]:
     """Return a fit as plain data."""
+    fit, limits = judged.fit, judged.profile.at(_LEVEL)
     return {
-        "success": result.success,
-        "message": result.message,
-        "params": {name: vars(estimate) for name, estimate in result.params.items()},
+        "trusted": judged.trusted,
+        "objections": list(judged.objections),
+        "success": fit.success,
+        "message": fit.message,
+        "params": {
+            name: {**vars(estimate), "interval": limits[name] if estimate.vary else None}
+            for name, estimate in fit.params.items()
+        },
+        "determined": [str(c) for c in judged.identifiability.combinations],
+        "noise": fit.noise,
+        "scale": fit.scale,
+        "redchi": fit.redchi,
     }
 
 
-def finish(result: FitResult) -> None:
+def finish(judged: Judgement) -> None:
     """End with status 3 where the fit is not to be trusted."""
-    telling.finish(result.success, result.message)
+    telling.finish(judged.trusted, " ".join(judged.objections))

@@ -31,6 +31,7 @@ def report(
 
     Example: dahl-ident datasets noisy -o - | dahl-ident report - -o report.html
     """
+    from dahl_ident.reporting import judgement
     from dahl_ident.reporting import report as write_report
 
     result = fitted(files, reading, model, estimating)
@@ -41,7 +42,7 @@ def report(
         telling.say_json(written)
     else:
         telling.say("\n".join(written))
-    finish(result)
+    finish(judgement(result))
 
 
 def typed_command() -> str:

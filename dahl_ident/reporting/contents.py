@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.diagnostics.intervals import profile_intervals, wald_intervals
-from dahl_ident.diagnostics.verdicts import judged
 from dahl_ident.reporting import posteriors, provenance, tables
 from dahl_ident.reporting.document import (
     Block,
@@ -21,6 +19,7 @@ from dahl_ident.reporting.document import (
     words,
 )
 from dahl_ident.reporting.figures import pictures_of_fit
+from dahl_ident.reporting.judgement import Judgement, judgement
 from dahl_ident.results import FitResult
 from dahl_ident.results.posterior import Posterior
 
@@ -40,17 +39,17 @@ def document(
     results: Sequence[Result], *, title: str | None = None, command: str | None = None
 ) -> Document:
     """Return the report on fits and posteriors of the same data."""
-    fits = [result for result in results if isinstance(result, FitResult)]
+    fits = [judgement(result) for result in results if isinstance(result, FitResult)]
     drawn = [result for result in results if isinstance(result, Posterior)]
     data = results[0].data
     told = command or _command(results)
-    sections = [section for fit in fits for section in _sections(fit, drawn, len(fits) > 1)]
+    sections = [section for one in fits for section in _sections(one, drawn, len(fits) > 1)]
     sections += [section for posterior in drawn for section in posteriors.sections(posterior)]
     return Document(
         title=title or _title(data),
-        trusted=all(trusted(result) for result in results),
+        trusted=all(one.trusted for one in fits) and all(p.converged for p in drawn),
         verdict=(
-            *(line for fit in fits for line in _verdict(fit)),
+            *(line for one in fits for line in one.headlines),
             *(line for posterior in drawn for line in posteriors.verdict(posterior)),
         ),
         sections=(
@@ -59,7 +58,7 @@ def document(
             Section("Origin", tuple(_origin(data, told))),
         ),
         facts={
-            "fits": [_fit_facts(fit) for fit in fits],
+            "fits": [_fit_facts(one) for one in fits],
             "posteriors": [posteriors.facts(posterior) for posterior in drawn],
             "files": dict(provenance.sources(data)),
             "versions": provenance.versions(),
@@ -67,11 +66,6 @@ def document(
             "command": told,
         },
     )
-
-
-def trusted(result: Result) -> bool:
-    """Return whether a result can be used as it is."""
-    return result.success if isinstance(result, FitResult) else result.converged
 
 
 def _command(results: Sequence[Result]) -> str:
@@ -88,28 +82,31 @@ def _title(data: FrequencyResponse) -> str:
     )
 
 
-def _verdict(fit: FitResult) -> list[str]:
-    determined = judged(fit.optimum, profile_intervals(fit.optimum))
-    return [fit.message, determined.headline]
-
-
-def _sections(fit: FitResult, drawn: Sequence[Posterior], several: bool) -> Iterator[Section]:
+def _sections(one: Judgement, drawn: Sequence[Posterior], several: bool) -> Iterator[Section]:
+    fit, left = one.fit, one.goodness
     of = f": {fit.problem.model!r}" if several else ""
-    intervals = [wald_intervals(fit.optimum), profile_intervals(fit.optimum)]
-    notes = tuple(f"{one.method} intervals: {one.note}" for one in intervals)
+    intervals = [one.wald, one.profile]
+    notes = tuple(f"{found.method} intervals: {found.note}" for found in intervals)
     yield Section(f"Parameters{of}", (tables.parameters(fit, intervals, drawn), Bullets(notes)))
     yield Section(f"Pictures{of}", tuple(pictures_of_fit(fit)))
-    determined = judged(fit.optimum, intervals[1])
+    known = one.identifiability
     yield Section(
         f"What the data determine{of}",
         (
-            Paragraph(determined.headline),
-            Bullets(tuple(p.text for p in determined.parameters.values())),
-            Bullets(tuple(f"Determined: {c}" for c in determined.combinations)),
+            Paragraph(known.headline),
+            Bullets(tuple(p.text for p in known.parameters.values())),
+            Bullets(tuple(f"Determined: {c}" for c in known.combinations)),
         ),
     )
     yield Section(
-        f"Noise and goodness of fit{of}", (Paragraph(NOISE[fit.noise]), tables.goodness(fit))
+        f"Noise and goodness of fit{of}",
+        (
+            Paragraph(NOISE[fit.noise]),
+            Paragraph(left.headline),
+            Bullets((*(str(trend) for trend in left.significant_trends), *left.warnings)),
+            Bullets(tuple(f"Suspicious: {point}" for point in left.suspicious)),
+            tables.goodness(fit),
+        ),
     )
     equivalent = tables.equivalents(fit)
     if equivalent is not None:
@@ -137,12 +134,14 @@ def _origin(data: FrequencyResponse, command: str) -> Iterator[Block]:
     yield Listing(command)
 
 
-def _fit_facts(fit: FitResult) -> dict[str, Any]:
-    intervals = profile_intervals(fit.optimum).at(0.9545)
+def _fit_facts(one: Judgement) -> dict[str, Any]:
+    fit, known = one.fit, one.identifiability
+    intervals = one.profile.at(0.9545)
     return {
         "model": repr(fit.problem.model),
         "status": fit.status.name.lower(),
         "message": fit.message,
+        "objections": list(one.objections),
         "noise": fit.noise,
         "parameters": {
             name: {
@@ -151,9 +150,13 @@ def _fit_facts(fit: FitResult) -> dict[str, Any]:
                 "unit": e.unit,
                 "fixed": not e.vary,
                 "interval_95.45": list(intervals[name][1:]) if e.vary else None,
+                "verdict": known.parameters[name].verdict.value if e.vary else None,
             }
             for name, e in fit.params.items()
         },
+        "determined": [str(c) for c in known.combinations],
+        "suspicious": [str(point) for point in one.goodness.suspicious],
+        "rms_misfit": one.goodness.rms_misfit,
         "redchi": fit.redchi,
         "aic": fit.aic,
         "bic": fit.bic,

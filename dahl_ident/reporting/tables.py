@@ -34,8 +34,8 @@ def parameters(
         value, error = rounded(estimate.value, estimate.stderr)
         row = [
             Cell(name),
-            Cell(value, estimate.value),
-            Cell(error if estimate.vary else "fixed", estimate.stderr),
+            Cell(value, estimate.value) if np.isfinite(estimate.value) else Cell("none finite"),
+            Cell(error if estimate.vary else "fixed", _finite(estimate.stderr)),
             Cell(estimate.unit or "-"),
         ]
         for found in at:
@@ -117,6 +117,10 @@ def goodness(fit: FitResult) -> Table:
         (Cell("BIC"), number(fit.bic, 6)),
     ]
     return Table("Goodness of fit", ("measure", "value"), tuple(rows))
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and np.isfinite(value) else None
 
 
 def _label(value: object) -> Cell:

@@ -1,0 +1,256 @@
+"""Reports: what they say, in every format, and how the page behaves in a browser."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dahl_ident as di
+from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.reporting import report
+from dahl_ident.results.posterior import Posterior
+from dahl_ident.results.sampling import sample
+from tests.browser import CHROMIUM, Page, chromium
+
+NASTY = "<img src=x onerror=alert(1)>&\"'|*_`[x](y)#.csv"
+WIDTHS = (400, 1400)
+
+
+@pytest.fixture(scope="module")
+def fit() -> di.FitResult:
+    amplitude = np.geomspace(3e-4, 3e-2, 20)
+    random = np.random.default_rng(1)
+    noise = 0.01 * (random.standard_normal(20) + 1j * random.standard_normal(20))
+    response = di.Dahl(0.1, 30.0).describing_function(amplitude) * np.exp(noise)
+    provenance = {"file": NASTY, "sha256": "ab" * 32, "options": "x", "notes": ["zero to peak"]}
+    data = di.FrequencyResponse(np.ones(20), response, amplitude, provenance=provenance)
+    return di.fit(data, di.Dahl())
+
+
+@pytest.fixture(scope="module")
+def posterior(fit: di.FitResult) -> Posterior:
+    return sample(fit, seed=3)
+
+
+@pytest.fixture(scope="module")
+def page_file(
+    fit: di.FitResult, posterior: Posterior, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    return report([fit, posterior], tmp_path_factory.mktemp("report") / "report.html")
+
+
+class Outline(HTMLParser):
+    """Headings, pictures and links to elsewhere, as a reader program meets them."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.headings: list[int] = []
+        self.alts: list[str] = []
+        self.outside: list[str] = []
+        self.scripts = 0
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        if re.fullmatch("h[1-6]", tag):
+            self.headings.append(int(tag[1]))
+        if tag == "img":
+            self.alts.append(given.get("alt") or "")
+        self.scripts += tag == "script"
+        places = [given.get(name) or "" for name in ("src", "href")]
+        self.outside += [p for p in places if p and not p.startswith(("data:", "#"))]
+
+
+def test_html_is_one_file_with_headings_in_order_and_alt_texts(page_file: Path) -> None:
+    outline = Outline(page_file.read_text(encoding="utf-8"))
+    assert outline.outside == []
+    assert outline.headings[0] == 1
+    assert outline.headings.count(1) == 1
+    assert all(b - a <= 1 for a, b in zip(outline.headings, outline.headings[1:], strict=False))
+    assert len(outline.alts) >= 8
+    assert all(re.search(r"\d", alt) for alt in outline.alts), outline.alts
+    assert [p.name for p in page_file.parent.iterdir()] == ["report.html"]
+
+
+def test_text_from_files_is_escaped(page_file: Path) -> None:
+    text = page_file.read_text(encoding="utf-8")
+    assert "<img src=x" not in text
+    assert "&lt;img src=x onerror=alert(1)&gt;" in text
+    assert Outline(text).scripts == 1
+
+
+def test_html_tells_the_numbers_side_by_side(page_file: Path, fit: di.FitResult) -> None:
+    text = page_file.read_text(encoding="utf-8")
+    for method in ("wald interval", "profile interval", "95 % posterior interval"):
+        assert method in text
+    assert f'data-value="{fit.params["f_max"].value}"' in text
+    for fact in (
+        "ab" * 32,
+        f"<td>{di.__version__}</td>",
+        "Seed 3",
+        "dahl-ident fit",
+        "zero to peak",
+    ):
+        assert fact in text
+
+
+def test_the_same_result_gives_the_same_pictures(fit: di.FitResult, tmp_path: Path) -> None:
+    one, two = (report(fit, tmp_path / name) for name in ("a.html", "b.html"))
+    pictures = [re.findall(r'src="data:image[^"]*"', p.read_text()) for p in (one, two)]
+    assert pictures[0] == pictures[1]
+
+
+def test_json_holds_the_numbers(fit: di.FitResult, posterior: Posterior, tmp_path: Path) -> None:
+    told = json.loads(report([fit, posterior], tmp_path / "report.json").read_text())
+    f_max = told["fits"][0]["parameters"]["f_max"]
+    assert f_max["value"] == fit.params["f_max"].value
+    assert f_max["interval_95.45"][0] < 0.1 < f_max["interval_95.45"][1]
+    assert told["posteriors"][0]["seed"] == 3
+    assert told["files"] == {NASTY: "ab" * 32}
+    assert told["versions"]["numpy"] == np.__version__
+
+
+def test_markdown_links_pictures_that_exist(fit: di.FitResult, tmp_path: Path) -> None:
+    place = report(fit, tmp_path / "my report.md")
+    text = place.read_text(encoding="utf-8")
+    links = re.findall(r"!\[[^\n]*\]\(<([^>]*)>\)", text)
+    assert len(links) >= 6
+    for link in links:
+        assert (tmp_path / link).read_bytes().startswith(b"\x89PNG")
+    prose = [line for line in text.splitlines() if not line.startswith("    ")]
+    assert not any("<img src=x" in line.replace(r"\<img", "") for line in prose)
+
+
+def test_pdf_has_text_pictures_and_outline(fit: di.FitResult, tmp_path: Path) -> None:
+    pypdf = pytest.importorskip("pypdf")
+    reader = pypdf.PdfReader(report(fit, tmp_path / "report.pdf"))
+    text = "".join("".join(page.extract_text().split()) for page in reader.pages)
+    for fact in ("Canbetrusted", "f_max", "ab" * 32, "sigma"):
+        assert fact in text
+    assert sum(len(page.images) for page in reader.pages) >= 6
+    assert next(item.title for item in reader.outline) == "Parameters"
+    assert {(round(p.mediabox.width), round(p.mediabox.height)) for p in reader.pages} == {
+        (595, 842)
+    }
+
+
+def test_a_fit_that_ran_away_is_not_trusted(tmp_path: Path) -> None:
+    amplitude = np.geomspace(1e-6, 1e-5, 8)
+    response = 30.0 * np.exp(1j * 1e-3 * ((-1.0) ** np.arange(8) - 0.5))
+    fit = di.fit(di.FrequencyResponse(np.ones(8), response, amplitude), di.Dahl(), throw=False)
+    text = report(fit, tmp_path / "lost.html").read_text(encoding="utf-8")
+    assert "Not to be trusted" in text
+    assert "No finite optimum" in text
+    assert not re.search(r">\s*(nan|inf)\b|data-value=.nan", text)
+
+
+def test_a_plant_over_frequency_is_reported(tmp_path: Path) -> None:
+    frequency, drive = (
+        g.ravel() for g in np.meshgrid(np.geomspace(0.1, 3.0, 9), [0.05, 0.15, 1.0])
+    )
+    plant = di.Dahl(0.1, 30.0) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
+    steady = di.response(plant, frequency, drive)
+    data = di.FrequencyResponse(
+        frequency, steady.displacement / drive, drive=drive, level=drive, controlled="force",
+        quantity="receptance",
+    )  # fmt: skip
+    free = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
+    place = report(di.fit(data, free), tmp_path / "plant.html", title="A plant")
+    text = place.read_text(encoding="utf-8")
+    assert "<h1>A plant</h1>" in text
+    assert "over frequency, by level" in text
+    assert "equivalent damping at" in text
+
+
+def test_what_cannot_be_written_is_refused(fit: di.FitResult, tmp_path: Path) -> None:
+    with pytest.raises(ValidationError, match=r"written as \.html, \.pdf, \.md, \.json"):
+        report(fit, tmp_path / "report.docx")
+    with pytest.raises(ValidationError, match="there is no result to report on"):
+        report([], tmp_path / "report.html")
+    with pytest.raises(DataError, match="cannot be written"):
+        report(fit, tmp_path / "absent" / "report.json")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+def test_the_page_in_chromium(page_file: Path, tmp_path: Path) -> None:
+    with chromium(tmp_path / "profile") as page:
+        for width in WIDTHS:
+            page.open(page_file, width)
+            assert page.value("document.documentElement.scrollWidth") <= width
+            broken = "[...document.images].filter(i => !i.complete || !i.naturalWidth).length"
+            assert page.value(broken) == 0
+            assert page.screenshot().startswith(b"\x89PNG")
+        _check_sorting(page)
+        _check_copying(page)
+        _check_contrast(page)
+        assert page.print_to_pdf().startswith(b"%PDF")
+        assert page.problems == []
+        assert [url for url in page.requests if not url.startswith(("file:", "data:"))] == []
+
+
+def _check_sorting(page: Page) -> None:
+    table = "document.querySelectorAll('table')[document.querySelectorAll('table').length - 2]"
+    page.value("window.data = [...document.querySelectorAll('table')].find(t => "
+               "t.caption.textContent === 'Data'); 1")  # fmt: skip
+    assert page.value(f"{table} !== undefined")
+    gains = "[...data.tBodies[0].rows].map(r => Number(r.cells[2].dataset.value))"
+    for direction in (1, -1):
+        page.value("data.tHead.rows[0].cells[2].querySelector('button').click()")
+        values = page.value(gains)
+        assert values == sorted(values, reverse=direction < 0)
+    assert page.value("data.tHead.rows[0].cells[2].getAttribute('aria-sort')") == "descending"
+
+
+def _check_copying(page: Page) -> None:
+    page.value("navigator.clipboard.writeText = async (t) => { window.copied = t; }; 1")
+    page.value("document.querySelector('.table .copy').click()")
+    rows = page.value("copied").split("\n")
+    assert rows[0].split("\t")[:2] == ["parameter", "estimate"]
+    assert float(rows[1].split("\t")[1]) == pytest.approx(0.1, rel=0.05)
+    assert len(rows[1].split("\t")[1]) > 10, "every digit is copied"
+
+
+def _check_contrast(page: Page) -> None:
+    """All text stands out from its ground by 4.5 to 1 (WCAG 2), in light and dark."""
+    script = """
+    (() => {
+      const rgb = (c) => c.match(/[\\d.]+/g).map(Number);
+      const light = (c) => {
+        const [r, g, b] = c.map((v) => v / 255)
+          .map((v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));
+        return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+      };
+      const ground = (e) => {
+        for (let n = e; n; n = n.parentElement) {
+          const c = rgb(getComputedStyle(n).backgroundColor);
+          if (c.length < 4 || c[3] > 0) return c.slice(0, 3);
+        }
+        return [255, 255, 255];
+      };
+      let worst = 21;
+      const texts = "p, li, a, td, th button, caption, figcaption, pre, h1, h2, .copy";
+      for (const e of document.querySelectorAll(texts)) {
+        const [a, b] = [light(rgb(getComputedStyle(e).color).slice(0, 3)), light(ground(e))];
+        worst = Math.min(worst, (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05));
+      }
+      return worst;
+    })()
+    """
+    for scheme in ("light", "dark"):
+        feature = {"name": "prefers-color-scheme", "value": scheme}
+        page.call("Emulation.setEmulatedMedia", features=[feature])
+        assert page.value(script) >= 4.5, scheme
+
+
+def test_provenance_of_several_files_is_listed(fit: di.FitResult, tmp_path: Path) -> None:
+    parts = [{"file": f"run{i}.csv", "sha256": str(i) * 64} for i in range(2)]
+    data = replace(fit.data, provenance={"parts": parts})
+    told = json.loads(report(di.fit(data, di.Dahl()), tmp_path / "r.json").read_text())
+    assert told["files"] == {"run0.csv": "0" * 64, "run1.csv": "1" * 64}
+    assert "run0.csv run1.csv" in told["command"]
