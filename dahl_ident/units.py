@@ -15,9 +15,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import FloatArray, finite_array
 from dahl_ident.errors import UnitError
 
 if TYPE_CHECKING:
@@ -264,40 +262,6 @@ def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float,
     unit = parse_unit(found[2])
     kind, motion, factor = kind_of(unit, kinds, what)
     return float(found[1]) * factor * unit.to_peak, kind, motion
-
-
-def from_si(values: ArrayLike, unit: str, kind: str, motion: Motion = "translation") -> FloatArray:
-    """Return SI `values` in another unit, for tables and axes.
-
-    Parameters
-    ----------
-    values : array_like
-        In SI.
-    unit : str
-        The unit to show them in.
-    kind : str
-        What they are, a key of `SI_UNITS`.
-    motion : {"translation", "rotation"}
-
-    Returns
-    -------
-    ndarray of float
-
-    Raises
-    ------
-    UnitError
-        If the unit is of another dimension.
-
-    Examples
-    --------
-    >>> from_si([2e-6], "um", "displacement").round(12)
-    array([2.])
-    """
-    target = parse_unit(unit)
-    _, found, factor = kind_of(target, (kind,), kind)
-    if kind in MECHANICAL_KINDS and found != motion:
-        raise UnitError(f"{kind} in {motion} cannot be shown in [{unit}], a unit of {found}")
-    return finite_array(values, kind) / (factor * target.to_peak)
 
 
 def _normalised(text: str, written: str) -> str:

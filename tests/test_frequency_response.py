@@ -497,6 +497,14 @@ class TestTelling:
         for fact in facts:
             assert fact in text, fact
 
+    def test_units(self) -> None:
+        assert full_table(motion="rotation").to("mobility").units == {
+            "frequency_hz": "Hz",
+            "amplitude": "rad",
+            "drive": "N m",
+            "response": "rad/(N m s)",
+        }
+
     def test_html_escapes(self) -> None:
         data = FrequencyResponse([1.0], [1j], [1e-3], level=["<b>"])
         assert "&lt;b&gt;" in data._repr_html_()

@@ -463,6 +463,20 @@ class TestLvm:
         (tmp_path / "run.lvm").write_text(text)
         assert_the_run(read_record(tmp_path / "run.lvm"))
 
+    def test_without_and_with_many_x_columns(self, tmp_path: Path) -> None:
+        values = list(zip(TIME.tolist(), (X * 1e3).tolist(), F.tolist(), strict=True))
+        head = LVM.format(mark=".")
+        none = head.replace("X_Columns\tOne", "X_Columns\tNo")
+        rows = "\n".join(f"\t{x!r}\t{f!r}" for _, x, f in values)
+        (tmp_path / "none.lvm").write_text(none + rows + "\n")
+        assert_the_run(read_record(tmp_path / "none.lvm"))
+        many = head.replace("X_Columns\tOne", "X_Columns\tMulti").replace(
+            "X_Value\tdisplacement\tforce", "X_Value\tdisplacement\tX_Value\tforce"
+        ).replace("Channels\t2", "Channels\t2\t\t")  # fmt: skip
+        rows = "\n".join(f"{t!r}\t{x!r}\t{t!r}\t{f!r}" for t, x, f in values)
+        (tmp_path / "many.lvm").write_text(many.replace("\tmm\tN", "\tmm\tN") + rows + "\n")
+        assert_the_run(read_record(tmp_path / "many.lvm"))
+
     def test_damaged(self, tmp_path: Path) -> None:
         (tmp_path / "run.lvm").write_text(LVM.format(mark=".").split("Channels")[0].rstrip())
         with pytest.raises(DataError, match="the LVM file is damaged"):
@@ -519,6 +533,18 @@ def test_missing_packages_are_named(
     message = rf"{module} is needed .* pip install 'dahl_ident\[{extra}\]'"
     with pytest.raises(MissingDependencyError, match=message):
         inspect(tmp_path / name)
+
+
+def test_errors_name_the_level(tmp_path: Path) -> None:
+    levels = [{"f": FREQUENCY, "u": [1.0, 1.0, v], "H": RECEPTANCE} for v in (1.0, -1.0)]
+    savemat(tmp_path / "a.mat", {"s": np.array(levels, dtype=object)})
+    columns = {
+        "frequency": {"column": "s[*].f", "unit": "Hz"},
+        "drive": {"column": "s[*].u", "unit": "N"},
+        "response": {"column": "s[*].H", "unit": "m/N"},
+    }
+    with pytest.raises(DataError, match=r"a.mat, level s\[1\], index 2, column .*: found -1"):
+        read_frequency_response(tmp_path / "a.mat", columns=columns)
 
 
 def test_doubts_name_indices(tmp_path: Path) -> None:

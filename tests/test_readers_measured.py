@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 from scipy.io import loadmat
 
 from dahl_ident.data import FrequencyResponse, inspect, read_frequency_response, read_record
+from dahl_ident.errors import DataError
 
 MEASURED = os.environ.get("DAHL_IDENT_MEASURED_DATA")
 pytestmark = pytest.mark.skipif(
@@ -54,6 +56,7 @@ class TestBrakeReussBeam:
             f"ResponseControl[{i}]" for i in range(8)
         ]
         assert (beam.quantity, beam.unit) == ("receptance", "m/N")
+        assert "columns not used: FRdata.ForceControl[0].units" in repr(beam)
         for label in beam.levels:
             held = "force" if label.startswith("Force") else "displacement"
             assert set(beam.select(level=label).controlled) == {held}
@@ -115,6 +118,10 @@ class TestFrictionDamper:
         assert record.sample_rate == pytest.approx(1024.0, rel=1e-6)
         assert record.uniform
         assert not len(record.gaps)
+        assert record.provenance is not None
+        assert record.provenance["notes"] == [
+            "columns not used: velocity, actuator force 1, actuator force 2"
+        ]
 
     def test_there_are_ten(self) -> None:
         assert len(list((FOLDER / "brfd").glob("*.csv"))) == 10
@@ -127,11 +134,9 @@ class TestFrictionDamper:
             force="friction force",
         )
         assert record.displacement is not None
-        work = float(np.trapezoid(record.force_samples, record.displacement))
+        work = float(trapezoid(record.force_samples, record.displacement))
         assert 1e3 < work < 1e5
 
     def test_motions_have_to_be_chosen(self) -> None:
-        from dahl_ident.errors import DataError
-
         with pytest.raises(DataError, match="displacement and velocity found; expected one"):
             read_record(FOLDER / "brfd" / "band30lb_2Hz_0.5in.csv", force="friction force")

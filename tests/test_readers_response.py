@@ -403,7 +403,9 @@ class TestManyFiles:
         )
         assert data.levels == [0.2, 0.5, 1.5]
         np.testing.assert_allclose(known(data.drive), np.repeat([0.2, 0.5, 1.5], 3) * math.sqrt(2))
-        assert [p["file"] for p in known_provenance(data)["parts"]] == [str(p) for p in paths]
+        sources = known_provenance(data)["parts"]
+        assert [p["file"] for p in sources] == [str(p) for p in paths]
+        assert sources[1]["options"] == {"controlled": "force", "drive": "0.5 N rms", "level": 0.5}
 
     def test_named_groups(self, tmp_path: Path) -> None:
         path = exported(tmp_path, "runB_5um.csv", 1.0)

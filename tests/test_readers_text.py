@@ -156,6 +156,9 @@ class TestColumns:
             "format": "text table",
             "sha256": hashlib.sha256(PLAIN.encode()).hexdigest(),
         }
+        provenance = read_record(path, displacement="x", columns={"force": "F"}).provenance
+        assert provenance is not None
+        assert provenance["options"] == {"columns": {"force": "F"}, "displacement": "x"}
 
     def test_rotation(self, tmp_path: Path) -> None:
         record = read_record(

@@ -18,7 +18,6 @@ from dahl_ident.units import (
     SI_UNITS,
     Unit,
     factor_to,
-    from_si,
     kind_of,
     parse_quantity,
     parse_unit,
@@ -208,15 +207,3 @@ def test_quantities_in_words() -> None:
     for text in ("N", "0.2", "0,2 N", "a lot"):
         with pytest.raises(UnitError, match="expected a number and its unit, such as"):
             parse_quantity(text, DRIVE_KINDS, "drive")
-
-
-@given(st.floats(1e-9, 1e9), st.sampled_from(["um", "in", "mm rms", "km pp"]))
-def test_there_and_back(value: float, text: str) -> None:
-    unit = parse_unit(text)
-    shown = from_si([value], text, "displacement")
-    np.testing.assert_allclose(shown * unit.factor * unit.to_peak, value, rtol=1e-14)
-
-
-def test_rotation_is_not_shown_in_metres() -> None:
-    with pytest.raises(UnitError, match=r"rotation cannot be shown in \[mm\]"):
-        from_si([1.0], "mm", "displacement", "rotation")

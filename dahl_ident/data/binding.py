@@ -51,6 +51,7 @@ class Binding:
     names: Mapping[str, tuple[str, ...]]
     motions: dict[str, Motion] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    used: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
         if self.source.headerless and not self.map.roles:
@@ -67,6 +68,12 @@ class Binding:
         DataError
             If the map names a column that is not there, or several columns fit the role.
         """
+        channel = self._find(role)
+        if channel is not None:
+            self.used.add(channel.name)
+        return channel
+
+    def _find(self, role: str) -> Channel | None:
         spec = self.map.roles.get(role, Column())
         if spec.column is not None:
             return self.source.find(spec.column)
@@ -165,11 +172,15 @@ class Binding:
 
     def provenance(self) -> dict[str, Any]:
         """Return where the data come from, and the assumptions made on the way."""
+        unused = [c.name for c in self.source.channels if c.name not in self.used]
         notes = list(dict.fromkeys([*self.source.notes, *self.notes]))
+        if unused:
+            notes.append(f"columns not used: {listed(unused, 5)}")
         found = {
             "file": self.source.name,
             "format": self.source.format,
             "sha256": self.source.sha256,
+            "options": dict(self.source.options),
             "notes": notes,
             "origin": self.source.metadata.get("provenance"),
         }

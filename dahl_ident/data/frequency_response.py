@@ -240,6 +240,12 @@ class FrequencyResponse:
         """SI unit of the response."""
         return si_unit(self.quantity, self.motion)
 
+    @property
+    def units(self) -> dict[str, str]:
+        """SI unit of each column that has one."""
+        kinds = {"amplitude": "displacement", "drive": "force", "response": self.quantity}
+        return {"frequency_hz": "Hz"} | {k: si_unit(v, self.motion) for k, v in kinds.items()}
+
     def to(self, quantity: Quantity) -> FrequencyResponse:
         """Return the same points as another standard quantity, their covariance with them.
 

@@ -66,14 +66,18 @@ def response_from(
     DataError, UnitError
         Naming file, row and column.
     """
+    whole = Binding(source, columns, RESPONSE_NAMES)
     parts = []
     for label, one in by_level(source, columns).items():
-        level = options.level if label is None else label
-        parts.append(_Table(source, one, replace(options, level=level)).response())
-    if len(parts) == 1:
-        return parts[0]
-    joined = FrequencyResponse.concatenate(parts)
-    return replace(joined, provenance=parts[0].provenance)
+        if label is not None:
+            options = replace(options, level=label)
+        named = source if label is None else replace(source, name=f"{source.name}, level {label}")
+        table = _Table(named, one, options)
+        parts.append(table.response())
+        whole.used |= table.bound.used
+        whole.notes += table.bound.notes
+    data = parts[0] if len(parts) == 1 else FrequencyResponse.concatenate(parts)
+    return replace(data, provenance=whole.provenance())
 
 
 class _Table:
@@ -117,7 +121,7 @@ class _Table:
         doubt_drive(source.name, data, source.row_name)
         if self.options.passive:
             refuse_created_energy(source.name, data, source.row_name)
-        return replace(data, provenance=self.bound.provenance())
+        return data
 
     def _within_range(self) -> None:
         """Leave out the frequencies that the user does not want, before anything is judged."""
@@ -402,8 +406,9 @@ class _Table:
     def _quality(self) -> dict[str, NDArray[Any]]:
         """Return the verdicts that an earlier save listed, in the types they had."""
         kinds = self.bound.source.metadata.get("quality", {})
-        found = {name: self.bound.source.find(name).values for name in kinds}
-        return {name: _typed(found[name], kind) for name, kind in kinds.items()}
+        found = {name: self.bound.source.find(name) for name in kinds}
+        self.bound.used |= {channel.name for channel in found.values()}
+        return {name: _typed(found[name].values, kind) for name, kind in kinds.items()}
 
 
 def _typed(values: NDArray[Any], kind: str) -> NDArray[Any]:

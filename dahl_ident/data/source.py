@@ -52,7 +52,7 @@ class Source:
     """All channels of one file.
 
     `row_name` turns the index of a value into the words that find it in the file. `metadata`
-    is what an earlier save of this package left in the file.
+    is what an earlier save of this package left in the file, `options` what the user said.
     """
 
     name: str
@@ -63,6 +63,7 @@ class Source:
     row_name: Callable[[int], str] = field(default=lambda i: f"row {i + 1}")
     metadata: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
 
     def rows(self, keep: NDArray[np.bool_]) -> Source:
         """Return the rows to `keep` of every channel that has this length."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +23,7 @@ from dahl_ident.data.record import Record
 from dahl_ident.data.record_table import record_from
 from dahl_ident.data.response_table import ResponseOptions, response_from
 from dahl_ident.data.source import Source
+from dahl_ident.data.table import plain
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.units import Quantity
 
@@ -39,6 +41,7 @@ def read_frequency_response(
     amplitude: str | None = None,
     drive: str | None = None,
     drive_factor: str | None = None,
+    drive_factor_uncertainty: float | None = None,
     level: str | float | None = None,
     level_from_name: str | None = None,
     controlled: str | Mapping[str, str] | None = None,
@@ -64,6 +67,9 @@ def read_frequency_response(
         `level_from_name`.
     drive_factor : str, optional
         Force for one unit of a drive in V or A, such as ``"12.5 N/V"``.
+    drive_factor_uncertainty : float, optional
+        Its relative standard uncertainty; all rows share it, so it is noted and not added to
+        the covariance.
     level : str or float, optional
         Label for all rows.
     level_from_name : str, optional
@@ -111,7 +117,11 @@ def read_frequency_response(
     if not paths:
         raise DataError("no file to read; expected at least one path")
     mapped = column_map(
-        columns, quantity=quantity, drive_factor=drive_factor, controlled=controlled
+        columns,
+        quantity=quantity,
+        drive_factor=drive_factor,
+        drive_factor_uncertainty=drive_factor_uncertainty,
+        controlled=controlled,
     )
     parts = []
     for one in paths:
@@ -123,7 +133,10 @@ def read_frequency_response(
             frequency_hz=frequency_hz,
             passive=passive,
         )
-        parts.append(response_from(open_source(one, sheet), mapped, options))
+        given = _given(columns=columns, quantity=quantity, drive_factor=drive_factor,
+                       drive_factor_uncertainty=drive_factor_uncertainty, controlled=controlled,
+                       sheet=sheet, **vars(options))  # fmt: skip
+        parts.append(response_from(open_source(one, sheet, given), mapped, options))
     if len(parts) == 1:
         return parts[0]
     try:
@@ -193,19 +206,19 @@ def read_record(
     """
     if missing not in ("error", "drop"):
         raise ValidationError(f"missing is {missing!r}; expected 'error' or 'drop'")
-    mapped = column_map(
-        columns,
-        time=time,
-        displacement=displacement,
-        velocity=velocity,
-        acceleration=acceleration,
-        force=force,
-        drive=drive,
-        drive_factor=drive_factor,
-        drive_factor_uncertainty=drive_factor_uncertainty,
-        sample_rate=sample_rate,
-    )
-    return record_from(open_source(path, sheet), mapped, missing)
+    roles = {
+        "time": time,
+        "displacement": displacement,
+        "velocity": velocity,
+        "acceleration": acceleration,
+        "force": force,
+        "drive": drive,
+        "drive_factor": drive_factor,
+        "drive_factor_uncertainty": drive_factor_uncertainty,
+        "sample_rate": sample_rate,
+    }
+    source = open_source(path, sheet, _given(columns=columns, sheet=sheet, **roles))
+    return record_from(source, column_map(columns, **roles), missing)
 
 
 def inspect(path: PathLike, *, sheet: str | None = None) -> FileContents:
@@ -243,12 +256,21 @@ def inspect(path: PathLike, *, sheet: str | None = None) -> FileContents:
     return contents(open_source(path, sheet))
 
 
-def open_source(path: PathLike, sheet: str | None = None) -> Source:
-    """Return the channels of a file of any format."""
+def open_source(
+    path: PathLike, sheet: str | None = None, options: Mapping[str, Any] | None = None
+) -> Source:
+    """Return the channels of a file of any format, and beside them what the user said."""
     file = open_file(path)
     if sheet is not None and file.format != "excel":
         raise DataError(f"{file.name}: sheet={sheet!r} is given, but the file is no workbook")
-    return _parsed(file, sheet)
+    return replace(_parsed(file, sheet), options=options or {})
+
+
+def _given(**options: Any) -> dict[str, Any]:
+    """Return the options that differ from saying nothing, as JSON holds them."""
+    return {
+        k: plain(v) for k, v in options.items() if v is not None and (k, v) != ("passive", True)
+    }
 
 
 def _parsed(file: File, sheet: str | None) -> Source:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -174,7 +174,7 @@ def read_tdms(file: File) -> Source:
 
 
 def _tdms_channels(group: Any) -> Iterator[Channel]:
-    times: list[NDArray[Any]] = []
+    times = []
     for channel in group.channels():
         values = np.asarray(channel[:])
         properties = channel.properties
@@ -184,12 +184,20 @@ def _tdms_channels(group: Any) -> Iterator[Channel]:
         yield Channel(f"{group.name}/{channel.name}", values, unit or None, short=channel.name)
         step = float(properties.get("wf_increment", 0.0))
         if step > 0.0:
-            time = float(properties.get("wf_start_offset", 0.0)) + step * np.arange(values.size)
-            if not any(np.array_equal(time, known) for known in times):
-                times.append(time)
-    for i, time in enumerate(times):
-        name = "time" if len(times) == 1 else f"time {i + 1}"
-        yield Channel(f"{group.name}/{name}", time, "s", "time", name)
+            start = float(properties.get("wf_start_offset", 0.0))
+            times.append(start + step * np.arange(values.size))
+    yield from _times(times, f"{group.name}/")
+
+
+def _times(times: Sequence[NDArray[Any]], prefix: str) -> Iterator[Channel]:
+    """Yield the time axes of a group, equal ones once."""
+    unique: list[NDArray[Any]] = []
+    for time in times:
+        if not any(np.array_equal(time, known) for known in unique):
+            unique.append(time)
+    for i, time in enumerate(unique):
+        name = "time" if len(unique) == 1 else f"time {i + 1}"
+        yield Channel(prefix + name, time, "s", "time", name)
 
 
 def read_lvm(file: File) -> Source:
@@ -209,23 +217,22 @@ def read_lvm(file: File) -> Source:
 
 
 def _lvm_channels(segment: dict[str, Any], prefix: str) -> Iterator[Channel]:
-    """Yield the columns of a segment; its x columns are time where their unit is a time."""
+    """Yield the channels of a segment, and time: its x columns, or counted from their step."""
     data = np.asarray(segment["data"], dtype=float)
-    names = [str(n).strip() for n in segment["Channel names"]]
-    units = [str(u).strip() for u in segment.get("Y_Unit_Label", [])]
-    x_units = [str(u).strip() for u in segment.get("X_Dimension", [])]
-    y = 0
-    for column, name in zip(data.T, names, strict=False):
-        if name == "Comment":
-            continue
-        if name == "X_Value":
-            is_time = not x_units or x_units[0] == "Time"
-            label = "time" if is_time else name
-            yield Channel(prefix + label, column, "s" if is_time else None, short=label)
-        else:
-            unit = units[y] if y < len(units) else ""
-            y += 1
-            yield Channel(prefix + name, column, unit or None, short=name)
+    labels = [str(name).strip() for name in segment["Channel names"]]
+    table = [pair for pair in zip(labels, data.T, strict=False) if pair[0] != "Comment"]
+    channels = [pair for pair in table if pair[0] != "X_Value"]
+    for i, (name, values) in enumerate(channels):
+        units = segment.get("Y_Unit_Label", [])
+        unit = str(units[i]).strip() if i < len(units) else ""
+        yield Channel(prefix + name, values, unit or None, short=name)
+    if set(segment.get("X_Dimension", [])) - {"Time", ""}:
+        return
+    times = [values for name, values in table if name == "X_Value"]
+    if not times:
+        starts, steps = segment.get("X0", []), segment.get("Delta_X", [])
+        times = [a + d * np.arange(len(data)) for a, d in zip(starts, steps, strict=False) if d > 0]
+    yield from _times(times, prefix)
 
 
 def _instrument(
