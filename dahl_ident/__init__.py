@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from dahl_ident.control_interop import DahlNonlinearity, limit_cycles
     from dahl_ident.data import FrequencyResponse, Record, read_frequency_response, read_record
-    from dahl_ident.diagnostics import identifiability
+    from dahl_ident.diagnostics import compare_models, identifiability
     from dahl_ident.elements import Dahl, Damper, LinearSystem, Mass, Model, Spring
     from dahl_ident.problem import Problem
     from dahl_ident.results import FitResult, Posterior, fit, posterior_grid, sample
@@ -30,7 +30,7 @@ _ROOMS = {
         "read_frequency_response",
         "read_record",
     ),
-    "dahl_ident.diagnostics": ("identifiability",),
+    "dahl_ident.diagnostics": ("compare_models", "identifiability"),
     "dahl_ident.elements": ("Dahl", "Damper", "LinearSystem", "Mass", "Model", "Spring"),
     "dahl_ident.problem": ("Problem",),
     "dahl_ident.results": ("FitResult", "Posterior", "fit", "posterior_grid", "sample"),
@@ -54,6 +54,7 @@ __all__ = [
     "Record",
     "Sensors",
     "Spring",
+    "compare_models",
     "fit",
     "identifiability",
     "limit_cycles",

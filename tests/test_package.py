@@ -27,6 +27,7 @@ PUBLIC_NAMES = [
     "Record",
     "Sensors",
     "Spring",
+    "compare_models",
     "fit",
     "identifiability",
     "limit_cycles",

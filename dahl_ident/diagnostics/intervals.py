@@ -21,7 +21,7 @@ Where the noise's scale was estimated, thresholds are those of Student's t and F
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -90,6 +90,11 @@ class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
         """Return the intervals of one level, by name."""
         (row,) = np.flatnonzero(np.isclose(self.levels, level))
         return {name: self[name][row] for name in self.names}
+
+    def only(self, level: float) -> ConfidenceIntervals:
+        """Return these intervals at one of their levels."""
+        row = np.isclose(self.levels, level)
+        return replace(self, levels=self.levels[row], lower=self.lower[row], upper=self.upper[row])
 
     def __str__(self) -> str:
         head = ["", *(f"-{percent(c)}" for c in self.levels[::-1]), "estimate"]

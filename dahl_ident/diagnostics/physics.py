@@ -37,6 +37,7 @@ def physical_warnings(optimum: Optimum) -> Iterator[str]:
 def _negative(optimum: Optimum) -> Iterator[str]:
     problem = optimum.problem
     values = parameter_values(optimum)
+    values |= dict(zip(optimum.names, optimum.values.tolist(), strict=True))
     for element in problem.model.elements:
         if not isinstance(element, Mass | Damper | Spring):
             continue

@@ -82,9 +82,10 @@ class Profiler:
             ends = np.stack([lower, upper])
             side, level, index = (a.ravel() for a in np.indices((2, L, P)))
             search = np.flatnonzero(~self._open[side, index])
-            ends[side[search], level[search], index[search]] = self._ends(
-                index[search], 2.0 * side[search] - 1.0, thresholds[level[search]]
-            )
+            if search.size:
+                ends[side[search], level[search], index[search]] = self._ends(
+                    index[search], 2.0 * side[search] - 1.0, thresholds[level[search]]
+                )
             lower, upper = ends
         return lower, upper
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from matplotlib.axes import Axes
+
 from dahl_ident.plots.frequency import plot_frequency_response
 from dahl_ident.plots.friction import (
+    Curve,
     plot_amplitude_response,
     plot_loops,
     plot_universal_curve,
@@ -18,6 +21,8 @@ from dahl_ident.plots.posterior import plot_corner, plot_trace
 from dahl_ident.plots.quality import plot_cycles
 
 __all__ = [
+    "Axes",
+    "Curve",
     "plot_amplitude_response",
     "plot_corner",
     "plot_correlation",

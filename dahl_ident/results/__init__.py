@@ -1,7 +1,8 @@
 """What users hold: estimates with their judgement, from one call."""
 
 from dahl_ident.results.estimate import fit
-from dahl_ident.results.fit_result import Estimate, FitResult
+from dahl_ident.results.fit_numbers import Estimate
+from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.grid_posterior import GridPosterior
 from dahl_ident.results.posterior import Posterior
 from dahl_ident.results.sampling import posterior_grid, sample

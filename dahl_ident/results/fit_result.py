@@ -1,18 +1,23 @@
-"""The result of a least-squares fit, with the names that lmfit's users know."""
+"""The result of a least-squares fit: its numbers, and how far to trust them."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict
 from functools import cached_property
-from types import MappingProxyType
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.data import FrequencyResponse
-from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.diagnostics.bands import (
+    DerivedQuantity,
+    ResponseBand,
+    derived,
+    describing_function_band,
+    response_band,
+)
+from dahl_ident.diagnostics.goodness import Goodness, goodness
 from dahl_ident.diagnostics.intervals import (
     ConfidenceIntervals,
     IntervalComparison,
@@ -22,49 +27,16 @@ from dahl_ident.diagnostics.intervals import (
 )
 from dahl_ident.diagnostics.levels import LEVELS
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
-from dahl_ident.elements import Model, Parameter
-from dahl_ident.fitting.optimum import Combination, Optimum
-from dahl_ident.fitting.status import Status
-from dahl_ident.problem import Problem
+from dahl_ident.fitting.optimum import Optimum
+from dahl_ident.results import report, storage
+from dahl_ident.results.fit_numbers import FitNumbers
+from dahl_ident.units import Quantity
+
+if TYPE_CHECKING:
+    from dahl_ident.plots import Axes
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """One parameter of a fit.
-
-    Attributes
-    ----------
-    name, unit, description : str
-        As declared beside the element.
-    value : float
-        The estimate, or the fixed value.
-    stderr : float or None
-        Standard error, first order (Wald); infinite where undetermined, None where fixed.
-    init_value : float or None
-        The start that the user gave.
-    min, max : float
-        Bounds.
-    vary : bool
-        Whether it was estimated.
-    """
-
-    name: str
-    unit: str
-    description: str
-    value: float
-    stderr: float | None
-    init_value: float | None
-    min: float
-    max: float
-    vary: bool
-
-    def __str__(self) -> str:
-        if not self.vary:
-            return f"{self.name} = {self.value:g} {self.unit}".rstrip() + " (fixed)"
-        return f"{self.name} = {with_unit(self.value, self.stderr, self.unit)}"
-
-
-class FitResult:
+class FitResult(FitNumbers):
     """What a fit found: estimates, their errors, and whether to trust them.
 
     Made by :func:`dahl_ident.fit`. Names follow lmfit's ``ModelResult`` where both have the
@@ -99,163 +71,8 @@ class FitResult:
     """
 
     def __init__(self, optimum: Optimum) -> None:
-        self._optimum = optimum
+        super().__init__(optimum)
         self._intervals: dict[tuple[str, tuple[float, ...]], ConfidenceIntervals] = {}
-
-    @property
-    def optimum(self) -> Optimum:
-        """The solver's plain result."""
-        return self._optimum
-
-    @property
-    def problem(self) -> Problem:
-        """Data, model, noise and sensors as they were fitted."""
-        return self._optimum.problem
-
-    @property
-    def data(self) -> FrequencyResponse:
-        """The data that were fitted."""
-        return self.problem.data
-
-    @property
-    def method(self) -> str:
-        """The solver."""
-        return self._optimum.method
-
-    @property
-    def noise(self) -> str:
-        """The noise model."""
-        return self.problem.noise
-
-    @property
-    def status(self) -> Status:
-        """How the search ended."""
-        return self._optimum.status
-
-    @property
-    def success(self) -> bool:
-        """Whether a finite optimum was found."""
-        return self._optimum.success
-
-    @property
-    def message(self) -> str:
-        """How the search ended, in words."""
-        return self._optimum.message
-
-    @property
-    def combinations(self) -> tuple[Combination, ...]:
-        """Combinations that the data determine where single parameters run away."""
-        return self._optimum.combinations
-
-    @cached_property
-    def params(self) -> Mapping[str, Estimate]:
-        """Every parameter of model and sensors, by name."""
-        values = dict(zip(self.var_names, self._optimum.values.tolist(), strict=True))
-        stderr = self._optimum.stderr
-        own = self.problem.model.parameters
-        sensed = self.problem.sensors.parameters
-        shown = own if self.problem.sensors.are_exact else (*own, *sensed)
-        return MappingProxyType({p.name: _estimate(p, values, stderr) for p in shown})
-
-    @property
-    def var_names(self) -> list[str]:
-        """Names of the free parameters."""
-        return list(self.problem.names)
-
-    @cached_property
-    def covar(self) -> FloatArray:
-        """Covariance of the free values, first order."""
-        return self._optimum.values_covariance
-
-    @cached_property
-    def correl(self) -> Mapping[str, Mapping[str, float]]:
-        """Correlation of each pair of free parameters, by both names."""
-        std = np.sqrt(np.diagonal(self._optimum.covariance))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            matrix = self._optimum.covariance / np.outer(std, std)
-        names = self.var_names
-        return {
-            a: {b: float(matrix[i, j]) for j, b in enumerate(names) if j != i}
-            for i, a in enumerate(names)
-        }
-
-    @property
-    def residual(self) -> FloatArray:
-        """Whitened residuals."""
-        return self._optimum.residuals
-
-    @property
-    def chisqr(self) -> float:
-        """Sum of squared residuals."""
-        return float(self.residual @ self.residual)
-
-    @property
-    def redchi(self) -> float:
-        """`chisqr` over `nfree`; the squared scale where that was estimated."""
-        return self.chisqr / self.nfree if self.nfree > 0 else math.nan
-
-    @property
-    def scale(self) -> float:
-        """Standard deviation of the residuals: 1 where known beforehand."""
-        return self._optimum.scale
-
-    @property
-    def scale_known(self) -> bool:
-        """Whether the noise's scale was known beforehand."""
-        return self._optimum.scale_known
-
-    @property
-    def ndata(self) -> int:
-        """Real numbers measured: two for each row."""
-        return self.problem.n_residuals
-
-    @property
-    def nvarys(self) -> int:
-        """Number of free parameters."""
-        return len(self.problem.names)
-
-    @property
-    def nfree(self) -> int:
-        """Degrees of freedom."""
-        return self._optimum.dof
-
-    @property
-    def nfev(self) -> int:
-        """Evaluations of the residuals."""
-        return self._optimum.nfev
-
-    @cached_property
-    def log_likelihood(self) -> float:
-        """Log-density of the data at the estimate, at the likeliest scale where unknown."""
-        return float(self.problem.log_likelihood(self._optimum.theta))
-
-    @property
-    def aic(self) -> float:
-        """Akaike's criterion, -2 ln L + 2 k; k counts an estimated noise scale."""
-        return -2.0 * self.log_likelihood + 2.0 * self._counted_parameters
-
-    @property
-    def bic(self) -> float:
-        """Schwarz's criterion, -2 ln L + k ln(ndata); k counts an estimated noise scale."""
-        return -2.0 * self.log_likelihood + math.log(self.ndata) * self._counted_parameters
-
-    @property
-    def _counted_parameters(self) -> int:
-        return self.nvarys + (not self.scale_known)
-
-    @cached_property
-    def best_fit(self) -> ComplexArray:
-        """Predicted response at the estimate, shape (n,)."""
-        return self.problem.predict(self._optimum.theta)
-
-    @cached_property
-    def model(self) -> Model:
-        """The model with the estimates put in; parameters stay free or fixed as they were."""
-        model = self.problem.model
-        own = {p.name for p in model.parameters}
-        values = self.problem.to_values(self._optimum.theta).tolist()
-        found = dict(zip(self.var_names, values, strict=True))
-        return model.with_values({name: v for name, v in found.items() if name in own})
 
     # Judging
 
@@ -316,24 +133,202 @@ class FitResult:
         """Which parameters, or which combinations of them, the data determine."""
         return judged(self._optimum, self.conf_interval())
 
+    @cached_property
+    def goodness(self) -> Goodness:
+        """Whether what is left is noise, and what was fitted is physics."""
+        return goodness(self._optimum)
+
+    @property
+    def trusted(self) -> bool:
+        """Whether there is an optimum, every parameter is identified, and the residuals noise."""
+        return bool(
+            self.success
+            and self.nfree > 0
+            and self.identifiability.complete
+            and self.goodness.acceptable
+        )
+
+    @property
+    def verdict(self) -> str:
+        """Whether to trust the numbers, in words, with what speaks against it."""
+        return report.verdict(self)
+
+    # What follows from the estimate
+
+    def predict(
+        self,
+        frequency_hz: ArrayLike,
+        *,
+        amplitude: ArrayLike | None = None,
+        drive: ArrayLike | None = None,
+        quantity: Quantity | None = None,
+    ) -> ResponseBand:
+        """Return the response that the estimate predicts, with its bands.
+
+        Parameters
+        ----------
+        frequency_hz : array_like, shape (n,)
+            Hz.
+        amplitude : array_like, shape (n,), optional
+            Displacement amplitude, m or rad, where that is controlled.
+        drive : array_like, shape (n,), optional
+            Force amplitude, N or N m, where that is controlled. Give one of the two.
+        quantity : str, optional
+            One of the six standard quantities; left out, that of the data.
+
+        Returns
+        -------
+        ResponseBand
+            Sensors included: what would be measured.
+
+        Raises
+        ------
+        ValidationError
+            If both or neither of amplitude and drive are given, or a value is not above zero.
+        """
+        return response_band(self._optimum, frequency_hz, amplitude, drive, quantity)
+
+    def describing_function(self, amplitude: ArrayLike) -> ResponseBand:
+        """Return N(A) of the friction alone, with its bands.
+
+        Parameters
+        ----------
+        amplitude : array_like
+            Displacement amplitude, m or rad.
+
+        Returns
+        -------
+        ResponseBand
+
+        Raises
+        ------
+        ModelError
+            If the model has no Dahl element.
+        """
+        return describing_function_band(self._optimum, amplitude)
+
+    def derived(
+        self, amplitudes: Sequence[float] = (), frequency_hz: float | None = None
+    ) -> tuple[DerivedQuantity, ...]:
+        """Return x_c, energy per cycle, equivalent stiffness and damping, with their errors.
+
+        Parameters
+        ----------
+        amplitudes : sequence of float, optional
+            Where energy, stiffness and damping are wanted, m or rad.
+        frequency_hz : float, optional
+            For the equivalent damping; left out, there is none.
+
+        Returns
+        -------
+        tuple of DerivedQuantity
+        """
+        return tuple(derived(self._optimum, amplitudes, frequency_hz))
+
+    # Telling
+
+    def fit_report(self, method: Method = "profile", level: float = 0.9545) -> str:
+        """Return the whole report as text, the verdict first.
+
+        Parameters
+        ----------
+        method : {"profile", "wald", "bootstrap"}, default "profile"
+            How the intervals are made.
+        level : float, default 0.9545
+            Their confidence level.
+
+        Returns
+        -------
+        str
+        """
+        return report.fit_report(self, self._reported(method, level))
+
+    def _reported(self, method: Method, level: float) -> ConfidenceIntervals:
+        if level in LEVELS:
+            return self.conf_interval(method).only(level)
+        return self.conf_interval(method, (level,))
+
+    def __str__(self) -> str:
+        return self.fit_report()
+
+    def _repr_html_(self) -> str:
+        return report.as_html(self, self._reported("profile", LEVELS[1]))
+
+    def to_frame(self) -> Any:
+        """Return a pandas table: one row a parameter, with its 95.45 % profile interval."""
+        import pandas as pd
+
+        limits = self.conf_interval().at(LEVELS[1])
+        rows = []
+        for name, p in self.params.items():
+            known = {"lower": limits[name].lower, "upper": limits[name].upper} if p.vary else {}
+            rows.append({**asdict(p), **known})
+        return pd.DataFrame(rows).set_index("name")
+
+    def plot_fit(self, ax: Sequence[Axes] | None = None) -> tuple[Axes, Axes]:
+        """Draw data and fit, gain above phase, over amplitude or frequency.
+
+        Parameters
+        ----------
+        ax : sequence of two matplotlib Axes, optional
+            New ones where left out.
+
+        Returns
+        -------
+        tuple of Axes
+        """
+        from dahl_ident.results.drawing import draw_fit
+
+        return draw_fit(self, ax)
+
+    def plot_residuals(self, ax: Axes | None = None) -> Axes:
+        """Draw the residuals of every row, suspicious points ringed.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            New where left out.
+
+        Returns
+        -------
+        Axes
+        """
+        from dahl_ident.results.drawing import draw_residuals
+
+        return draw_residuals(self, ax)
+
+    # Storage
+
+    def to_json(self) -> str:
+        """Return the fit as JSON: data, model, noise, sensors and optimum."""
+        return storage.to_json(self._optimum)
+
+    @classmethod
+    def from_json(cls, text: str) -> FitResult:
+        """Return the fit that :meth:`to_json` wrote, also by an earlier version.
+
+        Raises
+        ------
+        DataError
+            If the text holds no fit, or one of a later version's schema.
+        """
+        return cls(storage.from_json(text))
+
+    def save(self, path: str | Path) -> None:
+        """Write the fit to a JSON file."""
+        Path(path).write_text(self.to_json(), encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: str | Path) -> FitResult:
+        """Return the fit that :meth:`save` wrote, also by an earlier version.
+
+        Raises
+        ------
+        DataError
+            If the file holds no fit, or one of a later version's schema.
+        """
+        return cls(storage.load(path))
+
     def __repr__(self) -> str:
         estimates = ", ".join(str(self.params[name]) for name in self.var_names)
         return f"<FitResult: {estimates}; {self.status.name.lower()}>"
-
-
-def _estimate(
-    parameter: Parameter, values: Mapping[str, float], stderr: Mapping[str, float]
-) -> Estimate:
-    vary = parameter.name in values
-    value = values[parameter.name] if vary else parameter.value
-    return Estimate(
-        name=parameter.name,
-        unit=parameter.unit,
-        description=parameter.description,
-        value=math.nan if value is None else value,
-        stderr=stderr.get(parameter.name),
-        init_value=parameter.value if vary else None,
-        min=parameter.lower,
-        max=parameter.upper,
-        vary=vary,
-    )

@@ -1,0 +1,235 @@
+"""The numbers of a least-squares fit, with the names that lmfit's users know."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+
+import numpy as np
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.elements import Model, Parameter
+from dahl_ident.fitting.optimum import Combination, Optimum
+from dahl_ident.fitting.status import Status
+from dahl_ident.problem import Problem
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter of a fit.
+
+    Attributes
+    ----------
+    name, unit, description : str
+        As declared beside the element.
+    value : float
+        The estimate, or the fixed value.
+    stderr : float or None
+        Standard error, first order (Wald); infinite where undetermined, None where fixed.
+    init_value : float or None
+        The start that the user gave.
+    min, max : float
+        Bounds.
+    vary : bool
+        Whether it was estimated.
+    """
+
+    name: str
+    unit: str
+    description: str
+    value: float
+    stderr: float | None
+    init_value: float | None
+    min: float
+    max: float
+    vary: bool
+
+    def __str__(self) -> str:
+        if not self.vary:
+            return f"{self.name} = {self.value:g} {self.unit}".rstrip() + " (fixed)"
+        return f"{self.name} = {with_unit(self.value, self.stderr, self.unit)}"
+
+
+class FitNumbers:
+    """An optimum under lmfit's names; see :class:`dahl_ident.FitResult`."""
+
+    def __init__(self, optimum: Optimum) -> None:
+        self._optimum = optimum
+
+    @property
+    def optimum(self) -> Optimum:
+        """The solver's plain result."""
+        return self._optimum
+
+    @property
+    def problem(self) -> Problem:
+        """Data, model, noise and sensors as they were fitted."""
+        return self._optimum.problem
+
+    @property
+    def data(self) -> FrequencyResponse:
+        """The data that were fitted."""
+        return self.problem.data
+
+    @property
+    def method(self) -> str:
+        """The solver."""
+        return self._optimum.method
+
+    @property
+    def noise(self) -> str:
+        """The noise model."""
+        return self.problem.noise
+
+    @property
+    def status(self) -> Status:
+        """How the search ended."""
+        return self._optimum.status
+
+    @property
+    def success(self) -> bool:
+        """Whether a finite optimum was found."""
+        return self._optimum.success
+
+    @property
+    def message(self) -> str:
+        """How the search ended, in words."""
+        return self._optimum.message
+
+    @property
+    def combinations(self) -> tuple[Combination, ...]:
+        """Combinations that the data determine where single parameters run away."""
+        return self._optimum.combinations
+
+    @cached_property
+    def params(self) -> Mapping[str, Estimate]:
+        """Every parameter of model and sensors, by name."""
+        values = dict(zip(self.var_names, self._optimum.values.tolist(), strict=True))
+        stderr = self._optimum.stderr
+        own = self.problem.model.parameters
+        sensed = self.problem.sensors.parameters
+        shown = own if self.problem.sensors.are_exact else (*own, *sensed)
+        return MappingProxyType({p.name: _estimate(p, values, stderr) for p in shown})
+
+    @property
+    def var_names(self) -> list[str]:
+        """Names of the free parameters."""
+        return list(self.problem.names)
+
+    @cached_property
+    def covar(self) -> FloatArray:
+        """Covariance of the free values, first order."""
+        return self._optimum.values_covariance
+
+    @cached_property
+    def correl(self) -> Mapping[str, Mapping[str, float]]:
+        """Correlation of each pair of free parameters, by both names."""
+        std = np.sqrt(np.diagonal(self._optimum.covariance))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            matrix = self._optimum.covariance / np.outer(std, std)
+        names = self.var_names
+        return {
+            a: {b: float(matrix[i, j]) for j, b in enumerate(names) if j != i}
+            for i, a in enumerate(names)
+        }
+
+    @property
+    def residual(self) -> FloatArray:
+        """Whitened residuals."""
+        return self._optimum.residuals
+
+    @property
+    def chisqr(self) -> float:
+        """Sum of squared residuals."""
+        return float(self.residual @ self.residual)
+
+    @property
+    def redchi(self) -> float:
+        """`chisqr` over `nfree`; the squared scale where that was estimated."""
+        return self.chisqr / self.nfree if self.nfree > 0 else math.nan
+
+    @property
+    def scale(self) -> float:
+        """Standard deviation of the residuals: 1 where known beforehand."""
+        return self._optimum.scale
+
+    @property
+    def scale_known(self) -> bool:
+        """Whether the noise's scale was known beforehand."""
+        return self._optimum.scale_known
+
+    @property
+    def ndata(self) -> int:
+        """Real numbers measured: two for each row."""
+        return self.problem.n_residuals
+
+    @property
+    def nvarys(self) -> int:
+        """Number of free parameters."""
+        return len(self.problem.names)
+
+    @property
+    def nfree(self) -> int:
+        """Degrees of freedom."""
+        return self._optimum.dof
+
+    @property
+    def nfev(self) -> int:
+        """Evaluations of the residuals."""
+        return self._optimum.nfev
+
+    @cached_property
+    def log_likelihood(self) -> float:
+        """Log-density of the data at the estimate, at the likeliest scale where unknown."""
+        return float(self.problem.log_likelihood(self._optimum.theta))
+
+    @property
+    def aic(self) -> float:
+        """Akaike's criterion, -2 ln L + 2 k; k counts an estimated noise scale."""
+        return -2.0 * self.log_likelihood + 2.0 * self._counted_parameters
+
+    @property
+    def bic(self) -> float:
+        """Schwarz's criterion, -2 ln L + k ln(ndata); k counts an estimated noise scale."""
+        return -2.0 * self.log_likelihood + math.log(self.ndata) * self._counted_parameters
+
+    @property
+    def _counted_parameters(self) -> int:
+        return self.nvarys + (not self.scale_known)
+
+    @cached_property
+    def best_fit(self) -> ComplexArray:
+        """Predicted response at the estimate, shape (n,)."""
+        return self.problem.predict(self._optimum.theta)
+
+    @cached_property
+    def model(self) -> Model:
+        """The model with the estimates put in; parameters stay free or fixed as they were."""
+        model = self.problem.model
+        own = {p.name for p in model.parameters}
+        values = self.problem.to_values(self._optimum.theta).tolist()
+        found = dict(zip(self.var_names, values, strict=True))
+        return model.with_values({name: v for name, v in found.items() if name in own})
+
+
+def _estimate(
+    parameter: Parameter, values: Mapping[str, float], stderr: Mapping[str, float]
+) -> Estimate:
+    vary = parameter.name in values
+    value = values[parameter.name] if vary else parameter.value
+    return Estimate(
+        name=parameter.name,
+        unit=parameter.unit,
+        description=parameter.description,
+        value=math.nan if value is None else value,
+        stderr=stderr.get(parameter.name),
+        init_value=parameter.value if vary else None,
+        min=parameter.lower,
+        max=parameter.upper,
+        vary=vary,
+    )

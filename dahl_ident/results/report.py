@@ -1,0 +1,148 @@
+"""A fit in words: the verdict first, then every number with its error and where that is from."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from dahl_ident.diagnostics.comparison import compare_models
+from dahl_ident.diagnostics.formatting import interval, rounded, table, with_unit
+from dahl_ident.diagnostics.intervals import ConfidenceIntervals
+from dahl_ident.diagnostics.levels import percent
+from dahl_ident.diagnostics.units import shown_unit
+from dahl_ident.diagnostics.verdicts import Verdict
+
+if TYPE_CHECKING:
+    from dahl_ident.results.fit_result import FitResult
+
+_CORRELATED = 0.1
+_NOISE = {
+    "measured": "measured: the data's covariance, scale known",
+    "relative": "relative: constant variance of (ln gain, phase)",
+    "absolute": "absolute: constant variance of (real, imaginary part)",
+}
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading with its lines."""
+
+    title: str
+    lines: list[str]
+
+
+def verdict(fit: FitResult) -> str:
+    """Return whether to trust a fit, and what speaks against it."""
+    misfit = f"{100.0 * fit.goodness.rms_misfit:.2g} % rms misfit"
+    if fit.trusted:
+        text = "To be trusted: there is an optimum, every parameter is identified, and the "
+        text += f"residuals look like noise ({misfit})."
+        weak = fit.identifiability.named(Verdict.WEAK)
+        return f"{text} {fit.identifiability.headline}" if weak else text
+    parts = ["NOT to be trusted."]
+    if not fit.success:
+        parts.append(fit.message)
+    if fit.nfree <= 0:
+        parts.append("There are no degrees of freedom left to judge the noise by.")
+    if not fit.identifiability.complete:
+        lost = fit.identifiability.named(Verdict.NOT_IDENTIFIED)
+        parts.append(fit.identifiability.headline)
+        parts += [f"{fit.identifiability.parameters[name].text}." for name in lost]
+    if not fit.goodness.acceptable:
+        parts.append(fit.goodness.headline)
+    return " ".join(parts)
+
+
+def fit_report(fit: FitResult, intervals: ConfidenceIntervals) -> str:
+    """Return the whole report as text."""
+    blocks = [
+        f"{s.title}\n" + "\n".join(f"    {line}" for line in s.lines) for s in _all(fit, intervals)
+    ]
+    return "\n".join(blocks)
+
+
+def as_html(fit: FitResult, intervals: ConfidenceIntervals) -> str:
+    """Return the whole report as HTML."""
+    parts = []
+    for section in _all(fit, intervals):
+        body = html.escape("\n".join(section.lines))
+        parts.append(f"<h4>{html.escape(section.title)}</h4><pre>{body}</pre>")
+    return f"<div>{''.join(parts)}</div>"
+
+
+def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[Section]:
+    yield Section("Verdict", [verdict(fit)])
+    yield Section("Parameters", _parameters(fit, intervals))
+    combined = [str(c) for c in fit.identifiability.combinations]
+    if combined:
+        yield Section("Determined combinations", combined)
+    derived = [str(q) for q in fit.derived()]
+    if derived:
+        yield Section("Derived", derived)
+    correlations = _correlations(fit)
+    if correlations:
+        yield Section("Correlations", correlations)
+    yield Section("Noise", _noise(fit))
+    yield Section("Goodness of fit", str(fit.goodness).splitlines())
+    if not fit.goodness.acceptable:
+        yield Section(
+            "Other models, compared and not claimed", str(compare_models(fit)).splitlines()
+        )
+    yield Section("Solver", _solver(fit))
+
+
+def _parameters(fit: FitResult, intervals: ConfidenceIntervals) -> list[str]:
+    level = float(intervals.levels[-1])
+    rows = [["", "value", "stderr", "unit", f"{percent(level)} ({intervals.method})", ""]]
+    motion = fit.data.motion
+    for name, p in fit.params.items():
+        unit = shown_unit(p.unit, motion)
+        if not p.vary:
+            rows.append([name, f"{p.value:g}", "", unit, "", "fixed"])
+            continue
+        value, error = rounded(p.value, p.stderr)
+        limits = intervals[name][-1]
+        positive = p.min == 0.0
+        lower = -math.inf if positive and limits.lower == 0.0 else limits.lower
+        within = interval(lower, limits.upper, "")
+        word = fit.identifiability.parameters[name].verdict.value
+        rows.append([name, value, error, unit, within, word])
+    return [*table(rows, left=(0, 3, 4, 5)).splitlines(), f"({intervals.note})"]
+
+
+def _correlations(fit: FitResult) -> list[str]:
+    pairs = [
+        (a, b, c)
+        for i, a in enumerate(fit.var_names)
+        for b, c in fit.correl[a].items()
+        if b in fit.var_names[i + 1 :] and abs(c) >= _CORRELATED
+    ]
+    pairs.sort(key=lambda pair: -abs(pair[2]))
+    return [f"{a}, {b}: {c:+.3f}" for a, b, c in pairs]
+
+
+def _noise(fit: FitResult) -> list[str]:
+    lines = [_NOISE[fit.noise]]
+    if not fit.scale_known:
+        error = fit.scale / math.sqrt(2.0 * fit.nfree) if fit.nfree > 0 else None
+        unit = fit.data.unit if fit.noise == "absolute" else ""
+        size = with_unit(fit.scale, error, unit)
+        lines.append(f"scale {size}, estimated with {fit.nfree} degrees of freedom")
+    loss = fit.optimum.loss
+    if loss != "linear":
+        lines.append(f"robust loss: {loss}")
+    for name, prior in fit.problem.priors.items():
+        lines.append(f"prior of {name}: {float(prior.mean()):g} +- {float(prior.std()):g}")
+    return lines
+
+
+def _solver(fit: FitResult) -> list[str]:
+    return [
+        f"{fit.method}, {fit.nfev} evaluations; {fit.ndata} numbers, {fit.nvarys} parameters",
+        fit.message,
+        f"AIC {fit.aic:.2f}, BIC {fit.bic:.2f}, chi-square {fit.chisqr:.5g}, "
+        f"reduced {fit.redchi:.5g}",
+    ]

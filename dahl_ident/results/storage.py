@@ -1,0 +1,219 @@
+"""Fits as JSON: data, model, noise, sensors and optimum, so that all of it can be judged again.
+
+The file says its schema and version. What is stored are facts that do not change with the
+package: the table, the model as plain data, the estimate with its covariance. Residuals,
+intervals and verdicts are computed when asked for, by whatever version loads the file.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.elements.description import describe_model, model_from_description
+from dahl_ident.errors import DataError
+from dahl_ident.fitting.optimum import Combination, Optimum
+from dahl_ident.fitting.status import Status
+from dahl_ident.problem import Problem
+from dahl_ident.sensors import EXACT, Sensors
+
+SCHEMA = "dahl_ident.fit_result"
+VERSION = 1
+
+_COLUMNS = (
+    "frequency_hz", "amplitude", "drive", "covariance", "dof", "amplitude_std",
+    "amplitude_covariance", "level", "controlled", "harmonic",
+)  # fmt: skip
+_SENSORS = ("force_gain", "displacement_gain", "delay")
+
+
+def to_dict(optimum: Optimum) -> dict[str, Any]:
+    """Return a fit as plain data."""
+    problem = optimum.problem
+    return {
+        "schema": SCHEMA,
+        "schema_version": VERSION,
+        "dahl_ident_version": version("dahl_ident"),
+        "data": _describe_data(problem.data),
+        "model": describe_model(problem.model),
+        "noise": problem.noise,
+        "sensors": {name: _describe_channel(getattr(problem.sensors, name)) for name in _SENSORS},
+        "optimum": {
+            "names": list(problem.names),
+            "theta": _plain(optimum.theta),
+            "values": _plain(optimum.values),
+            "covariance": _plain(optimum.covariance),
+            "scale": _plain(optimum.scale),
+            "dof": optimum.dof,
+            "cost": _plain(optimum.cost),
+            "nfev": optimum.nfev,
+            "status": optimum.status.name,
+            "message": optimum.message,
+            "method": optimum.method,
+            "loss": optimum.loss,
+            "combinations": [
+                {"expression": c.expression, "value": _plain(c.value), "stderr": _plain(c.stderr)}
+                for c in optimum.combinations
+            ],
+        },
+    }
+
+
+def from_dict(content: Mapping[str, Any], source: str = "the content") -> Optimum:
+    """Return the fit that :func:`to_dict` described."""
+    _check_schema(content, source)
+    try:
+        return _optimum(content)
+    except (KeyError, TypeError) as exc:
+        raise DataError(
+            f"{source} says {SCHEMA}, version {content['schema_version']}, but lacks or garbles "
+            f"{exc}; it may have been edited or cut short"
+        ) from exc
+
+
+def to_json(optimum: Optimum) -> str:
+    """Return a fit as JSON text; numbers that JSON does not know are text, such as "inf"."""
+    return json.dumps(to_dict(optimum), allow_nan=False, indent=1)
+
+
+def from_json(text: str, source: str = "the text") -> Optimum:
+    """Return the fit that JSON text holds."""
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError as exc:
+        raise DataError(f"{source} is no JSON: {exc}; expected a saved fit") from exc
+    return from_dict(content, source)
+
+
+def load(path: str | Path) -> Optimum:
+    """Return the fit that a file holds."""
+    return from_json(Path(path).read_text(encoding="utf-8"), str(path))
+
+
+def _check_schema(content: Any, source: str) -> None:
+    schema = content.get("schema") if isinstance(content, Mapping) else None
+    if schema != SCHEMA:
+        raise DataError(f"{source} has the schema {schema!r}; expected {SCHEMA!r}, a saved fit")
+    found = content.get("schema_version")
+    if not isinstance(found, int) or not 1 <= found <= VERSION:
+        raise DataError(
+            f"{source} has schema version {found!r}; this version of dahl_ident reads 1 to "
+            f"{VERSION}: upgrade dahl_ident"
+        )
+
+
+def _optimum(content: Mapping[str, Any]) -> Optimum:
+    sensors = {name: _channel(content["sensors"][name]) for name in _SENSORS}
+    known = Sensors(**sensors)
+    problem = Problem(
+        _data(content["data"]),
+        model_from_description(content["model"]),
+        noise=content["noise"],
+        sensors=EXACT if known.are_exact else known,
+    )
+    stored = content["optimum"]
+    if list(problem.names) != stored["names"]:
+        raise KeyError(f"the free parameters {stored['names']}, found {list(problem.names)}")
+    return Optimum(
+        problem=problem,
+        theta=_floats(stored["theta"]),
+        values=_floats(stored["values"]),
+        covariance=_floats(stored["covariance"]),
+        scale=float(stored["scale"]),
+        scale_known=problem.scale_known,
+        dof=stored["dof"],
+        cost=float(stored["cost"]),
+        nfev=stored["nfev"],
+        status=Status[stored["status"]],
+        message=stored["message"],
+        method=stored["method"],
+        loss=stored["loss"],
+        combinations=tuple(
+            Combination(c["expression"], float(c["value"]), float(c["stderr"]))
+            for c in stored["combinations"]
+        ),
+    )
+
+
+def _describe_data(data: FrequencyResponse) -> dict[str, Any]:
+    columns = {name: getattr(data, name) for name in _COLUMNS}
+    provenance = None if data.provenance is None else json.loads(_text(dict(data.provenance)))
+    return {
+        "quantity": data.quantity,
+        "motion": data.motion,
+        "real": _plain(data.response.real),
+        "imag": _plain(data.response.imag),
+        **{name: _plain(column) for name, column in columns.items() if column is not None},
+        "quality": {name: _plain(column) for name, column in data.quality.items()},
+        "provenance": provenance,
+    }
+
+
+def _data(content: Mapping[str, Any]) -> FrequencyResponse:
+    columns = {name: content[name] for name in _COLUMNS if name in content}
+    for name in ("covariance", "dof", "amplitude_std", "amplitude_covariance"):
+        if name in columns:
+            columns[name] = _floats(columns[name])
+    return FrequencyResponse(
+        columns.pop("frequency_hz"),
+        _floats(content["real"]) + 1j * _floats(content["imag"]),
+        quantity=content["quantity"],
+        motion=content["motion"],
+        quality=content["quality"],
+        provenance=content["provenance"],
+        **columns,
+    )
+
+
+def _describe_channel(given: Any) -> Any:
+    if given is None or isinstance(given, float):
+        return given
+    kind = getattr(getattr(given, "dist", None), "name", type(given).__name__)
+    if kind != "norm":
+        raise DataError(f"a prior of kind {kind} cannot be written to a file; only norm can")
+    return {"norm": [float(given.mean()), float(given.std())]}
+
+
+def _channel(content: Any) -> Any:
+    if not isinstance(content, Mapping):
+        return content
+    from scipy import stats
+
+    mean, std = content["norm"]
+    return stats.norm(mean, std)
+
+
+def _plain(value: Any) -> Any:
+    """Return numbers as JSON knows them: lists, and text where they are not finite."""
+    if isinstance(value, np.ndarray):
+        return [_plain(item) for item in value.tolist()]
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return str(value)
+    return value
+
+
+def _floats(values: Any) -> FloatArray:
+    return np.array(values, dtype=np.float64) if values else np.zeros(0)
+
+
+def _text(value: Any) -> str:
+    return json.dumps(_plain_tree(value), default=str, allow_nan=False)
+
+
+def _plain_tree(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain_tree(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain_tree(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return _plain(value)
