@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from dahl_ident.diagnostics import compare_models, identifiability
     from dahl_ident.elements import Dahl, Damper, LinearSystem, Mass, Model, Spring
     from dahl_ident.problem import Problem
+    from dahl_ident.reporting import report
     from dahl_ident.results import FitResult, Posterior, fit, posterior_grid, sample
     from dahl_ident.sensors import Sensors
     from dahl_ident.steady_state import response
@@ -33,6 +34,7 @@ _ROOMS = {
     "dahl_ident.diagnostics": ("compare_models", "identifiability"),
     "dahl_ident.elements": ("Dahl", "Damper", "LinearSystem", "Mass", "Model", "Spring"),
     "dahl_ident.problem": ("Problem",),
+    "dahl_ident.reporting": ("report",),
     "dahl_ident.results": ("FitResult", "Posterior", "fit", "posterior_grid", "sample"),
     "dahl_ident.sensors": ("Sensors",),
     "dahl_ident.steady_state": ("response",),
@@ -62,6 +64,7 @@ __all__ = [
     "posterior_grid",
     "read_frequency_response",
     "read_record",
+    "report",
     "response",
     "sample",
     "simulate",

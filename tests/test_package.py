@@ -35,6 +35,7 @@ PUBLIC_NAMES = [
     "posterior_grid",
     "read_frequency_response",
     "read_record",
+    "report",
     "response",
     "sample",
     "simulate",

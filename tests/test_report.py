@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
+from dahl_ident import report
 from dahl_ident.errors import DataError, ValidationError
-from dahl_ident.reporting import report
 from dahl_ident.results.posterior import Posterior
 from dahl_ident.results.sampling import sample
 from tests.browser import CHROMIUM, Page, chromium
@@ -165,7 +165,7 @@ def test_a_plant_over_frequency_is_reported(tmp_path: Path) -> None:
     text = place.read_text(encoding="utf-8")
     assert "<h1>A plant</h1>" in text
     assert "over frequency, by level" in text
-    assert "equivalent damping at" in text
+    assert "equivalent damping [N s/m]" in text
 
 
 def test_what_cannot_be_written_is_refused(fit: di.FitResult, tmp_path: Path) -> None:

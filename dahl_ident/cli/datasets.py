@@ -28,8 +28,8 @@ def datasets(
 
     Example: dahl-ident datasets noisy -o noisy.csv
     """
+    from dahl_ident.synthetic import load_dataset
     from dahl_ident.synthetic.catalogue import DATA_SETS
-    from dahl_ident.synthetic.shipped import load_dataset
 
     if output is not None and name is None:
         raise ValidationError("--output needs the name of a data set; leave it out to list them")

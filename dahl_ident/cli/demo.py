@@ -10,7 +10,6 @@ import typer
 
 from dahl_ident.cli import extract, telling
 from dahl_ident.cli.files import progress_bar
-from dahl_ident.cli.fit import show
 
 if TYPE_CHECKING:
     from dahl_ident.results import FitResult
@@ -30,7 +29,7 @@ def demo(
     from dahl_ident.data import inspect, read_record
     from dahl_ident.elements import Dahl, Damper, Mass, Spring
     from dahl_ident.extraction import extract as extract_record
-    from dahl_ident.reporting import judgement, report
+    from dahl_ident.reporting import report
     from dahl_ident.results import fit
     from dahl_ident.results.sampling import sample
     from dahl_ident.synthetic.shipped import datasets_directory, load_dataset
@@ -48,12 +47,10 @@ def demo(
     table = data.save(output / "levels.csv")
     telling.heading("3. fit: friction, mass, damper and spring, nothing known beforehand")
     result = fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
-    judged = judgement(result)
-    show(judged)
+    telling.say(result.fit_report())
     _compare(result, facts["truth"])
     telling.heading("4. identifiability: what the data determine")
-    telling.say(str(judged.identifiability))
-    telling.say(str(judged.goodness))
+    telling.say(str(result.identifiability))
     telling.heading("5. posterior: emcee, from the same likelihood")
     posterior = sample(result, seed=1)
     telling.say(posterior.report())
@@ -62,7 +59,7 @@ def demo(
         bar.add_task("drawing", total=None)
         page = report([result, posterior], output / "report.html")
     telling.say(f"table: {table}\nreport: {page.resolve()}")
-    telling.finish(judged.trusted and posterior.converged, " ".join(judged.objections))
+    telling.finish(result.trusted and posterior.converged, result.verdict)
 
 
 def _compare(result: FitResult, truth: Mapping[str, float]) -> None:

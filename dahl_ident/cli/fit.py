@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import math
+import shlex
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dahl_ident.cli import telling
+from dahl_ident.cli.files import write_text
 from dahl_ident.cli.groups import grouped
 from dahl_ident.cli.options import Files, General, ModelOptions, Reading
 
 if TYPE_CHECKING:
-    from dahl_ident.reporting import Judgement
     from dahl_ident.results import FitResult
 
 _ESTIMATING = "Estimating"
@@ -50,21 +52,26 @@ def fit(
     report: Annotated[
         str | None, typer.Option(help="Report to write: .html, .pdf, .md or .json.")
     ] = None,
+    save: Annotated[
+        Path | None, typer.Option(help="Fit to write, as JSON that report and Python load.")
+    ] = None,
 ) -> None:
     """Estimate f_max and sigma, and say whether the data determine them.
 
     Example: dahl-ident datasets noisy -o - | dahl-ident fit -
     """
-    from dahl_ident.reporting import judgement
-
     result = fitted(files, reading, model, estimating)
-    judged = judgement(result)
-    show(judged, json=general.json)
+    if save is not None:
+        write_text(result.to_json(), str(save))
     if report is not None:
         from dahl_ident.reporting import report as write_report
 
-        telling.doubt(f"report: {write_report(result, report)}")
-    finish(judged)
+        telling.doubt(f"report: {write_report(result, report, command=typed_command())}")
+    if general.json:
+        telling.say_json(as_json(result))
+    else:
+        telling.say(result.fit_report())
+    finish(result)
 
 
 def fitted(
@@ -77,56 +84,32 @@ def fitted(
     return fit_data(reading.read(files), elements, free=free, throw=False, **vars(estimating))
 
 
-def show(judged: Judgement, *, json: bool = False) -> None:
-    """Print a fit for people or for machines, the verdict first."""
-    if json:
-        telling.say_json(as_json(judged))
-        return
-    from dahl_ident.diagnostics.formatting import interval, rounded
-    from dahl_ident.diagnostics.levels import percent
-
-    fit, limits = judged.fit, judged.profile.at(_LEVEL)
-    for line in judged.headlines:
-        telling.say(line)
-    rows = []
-    for name, estimate in fit.params.items():
-        value, error = rounded(estimate.value, estimate.stderr)
-        if not math.isfinite(estimate.value):
-            value = "none finite"
-        found = limits.get(name)
-        between = interval(found.lower, found.upper, "") if found else "-"
-        rows.append((name, value, error if estimate.vary else "fixed", between, estimate.unit))
-    header = ("parameter", "estimate", "standard error", f"{percent(_LEVEL)} (profile)", "unit")
-    telling.table(repr(fit.problem.model), header, rows)
-    noise = "known" if fit.scale_known else f"estimated as {fit.scale:.3g}"
-    telling.say(f"noise: {fit.noise}, its scale {noise}; reduced chi-square {fit.redchi:.3g}")
-    for text in (p.text for p in judged.identifiability.parameters.values()):
-        telling.say(f"- {text}")
-    for combination in judged.identifiability.combinations:
-        telling.say(f"- determined: {combination}")
-    for point in judged.goodness.suspicious:
-        telling.say(f"- suspicious: {point}")
-
-
-def as_json(judged: Judgement) -> dict[str, Any]:
+def as_json(result: FitResult) -> dict[str, Any]:
     """Return a fit as plain data."""
-    fit, limits = judged.fit, judged.profile.at(_LEVEL)
+    limits = result.conf_interval().at(_LEVEL)
     return {
-        "trusted": judged.trusted,
-        "objections": list(judged.objections),
-        "success": fit.success,
-        "message": fit.message,
+        "trusted": result.trusted,
+        "verdict": result.verdict,
+        "success": result.success,
+        "message": result.message,
         "params": {
             name: {**vars(estimate), "interval": limits[name] if estimate.vary else None}
-            for name, estimate in fit.params.items()
+            for name, estimate in result.params.items()
         },
-        "determined": [str(c) for c in judged.identifiability.combinations],
-        "noise": fit.noise,
-        "scale": fit.scale,
-        "redchi": fit.redchi,
+        "determined": [str(c) for c in result.identifiability.combinations],
+        "warnings": list(result.goodness.warnings),
+        "suspicious": [str(point) for point in result.goodness.suspicious],
+        "noise": result.noise,
+        "scale": result.scale,
+        "redchi": result.redchi,
     }
 
 
-def finish(judged: Judgement) -> None:
+def finish(result: FitResult) -> None:
     """End with status 3 where the fit is not to be trusted."""
-    telling.finish(judged.trusted, " ".join(judged.objections))
+    telling.finish(result.trusted, result.verdict.removeprefix("NOT to be trusted. "))
+
+
+def typed_command() -> str:
+    """Return the command line of this process, as it would be typed again."""
+    return shlex.join(["dahl-ident", *sys.argv[1:]])

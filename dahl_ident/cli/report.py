@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from typing import Annotated
 
 import typer
 
 from dahl_ident.cli import telling
-from dahl_ident.cli.fit import Estimating, finish, fitted
+from dahl_ident.cli.fit import Estimating, finish, fitted, typed_command
 from dahl_ident.cli.groups import grouped
 from dahl_ident.cli.options import Files, General, ModelOptions, Reading
 
@@ -27,14 +25,15 @@ def report(
     ] = ["report.html"],  # noqa: B006 - typer takes lists as lists
     title: Annotated[str | None, typer.Option(help="First line of the report.")] = None,
 ) -> None:
-    """Fit, judge and write a report.
+    """Fit, judge and write a report; or report on a fit that fit --save has written.
 
     Example: dahl-ident datasets noisy -o - | dahl-ident report - -o report.html
     """
-    from dahl_ident.reporting import judgement
     from dahl_ident.reporting import report as write_report
+    from dahl_ident.results import FitResult
 
-    result = fitted(files, reading, model, estimating)
+    saved = len(files) == 1 and files[0].endswith(".json")
+    result = FitResult.load(files[0]) if saved else fitted(files, reading, model, estimating)
     written = [
         str(write_report(result, place, title=title, command=typed_command())) for place in output
     ]
@@ -42,9 +41,4 @@ def report(
         telling.say_json(written)
     else:
         telling.say("\n".join(written))
-    finish(judgement(result))
-
-
-def typed_command() -> str:
-    """Return the command line of this process, as it would be typed again."""
-    return shlex.join(["dahl-ident", *sys.argv[1:]])
+    finish(result)

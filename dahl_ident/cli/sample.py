@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dahl_ident.cli import telling
+from dahl_ident.cli.fit import typed_command
 from dahl_ident.cli.groups import grouped
 from dahl_ident.cli.options import Files, General, ModelOptions, Reading, Seed
 from dahl_ident.errors import ValidationError
@@ -56,11 +59,19 @@ class Sampling:
         int, typer.Option(help="Independent groups of walkers.", rich_help_panel=_SAMPLING)
     ] = 4
 
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            help="HDF5 file that keeps the chain; a run that was stopped goes on from it.",
+            rich_help_panel=_SAMPLING,
+        ),
+    ] = None
+
     def keywords(self) -> dict[str, Any]:
         """Return the arguments of ``sample``."""
         given = dict(vars(self))
         bounds = dict(_bounds(text) for text in given.pop("prior") or [])
-        return {**given, "priors": bounds or None}
+        return {**given, "priors": bounds or None, "progress": sys.stderr.isatty()}
 
 
 @grouped
@@ -78,7 +89,7 @@ def sample(
 
     Example: dahl-ident datasets noisy -o - | dahl-ident sample - --prior f_max=0.01:1
     """
-    from dahl_ident.results.sampling import sample as sample_data
+    from dahl_ident.results import sample as sample_data
 
     elements, free = model.build()
     posterior = sample_data(reading.read(files), elements, free=free, **sampling.keywords())
@@ -91,7 +102,7 @@ def sample(
     if report is not None:
         from dahl_ident.reporting import report as write_report
 
-        telling.doubt(f"report: {write_report(posterior, report)}")
+        telling.doubt(f"report: {write_report(posterior, report, command=typed_command())}")
     finish(posterior)
 
 

@@ -1,6 +1,5 @@
 """Reports to hand on: HTML, PDF, Markdown and JSON from the same content."""
 
-from dahl_ident.reporting.judgement import Judgement, judgement
 from dahl_ident.reporting.publish import report
 
-__all__ = ["Judgement", "judgement", "report"]
+__all__ = ["report"]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.comparison import compare_models
 from dahl_ident.reporting import posteriors, provenance, tables
 from dahl_ident.reporting.document import (
     Block,
@@ -19,7 +20,6 @@ from dahl_ident.reporting.document import (
     words,
 )
 from dahl_ident.reporting.figures import pictures_of_fit
-from dahl_ident.reporting.judgement import Judgement, judgement
 from dahl_ident.results import FitResult
 from dahl_ident.results.posterior import Posterior
 
@@ -39,17 +39,17 @@ def document(
     results: Sequence[Result], *, title: str | None = None, command: str | None = None
 ) -> Document:
     """Return the report on fits and posteriors of the same data."""
-    fits = [judgement(result) for result in results if isinstance(result, FitResult)]
+    fits = [result for result in results if isinstance(result, FitResult)]
     drawn = [result for result in results if isinstance(result, Posterior)]
     data = results[0].data
     told = command or _command(results)
-    sections = [section for one in fits for section in _sections(one, drawn, len(fits) > 1)]
+    sections = [section for fit in fits for section in _sections(fit, drawn, len(fits) > 1)]
     sections += [section for posterior in drawn for section in posteriors.sections(posterior)]
     return Document(
         title=title or _title(data),
-        trusted=all(one.trusted for one in fits) and all(p.converged for p in drawn),
+        trusted=all(fit.trusted for fit in fits) and all(p.converged for p in drawn),
         verdict=(
-            *(line for one in fits for line in one.headlines),
+            *(line for fit in fits for line in _verdict(fit)),
             *(line for posterior in drawn for line in posteriors.verdict(posterior)),
         ),
         sections=(
@@ -58,7 +58,7 @@ def document(
             Section("Origin", tuple(_origin(data, told))),
         ),
         facts={
-            "fits": [_fit_facts(one) for one in fits],
+            "fits": [_fit_facts(fit) for fit in fits],
             "posteriors": [posteriors.facts(posterior) for posterior in drawn],
             "files": dict(provenance.sources(data)),
             "versions": provenance.versions(),
@@ -82,14 +82,16 @@ def _title(data: FrequencyResponse) -> str:
     )
 
 
-def _sections(one: Judgement, drawn: Sequence[Posterior], several: bool) -> Iterator[Section]:
-    fit, left = one.fit, one.goodness
+def _verdict(fit: FitResult) -> list[str]:
+    warnings = [f"Warning: {text}" for text in fit.goodness.warnings]
+    return [fit.verdict, *warnings]
+
+
+def _sections(fit: FitResult, drawn: Sequence[Posterior], several: bool) -> Iterator[Section]:
     of = f": {fit.problem.model!r}" if several else ""
-    intervals = [one.wald, one.profile]
-    notes = tuple(f"{found.method} intervals: {found.note}" for found in intervals)
-    yield Section(f"Parameters{of}", (tables.parameters(fit, intervals, drawn), Bullets(notes)))
+    yield Section(f"Parameters{of}", tuple(_parameters(fit, drawn)))
     yield Section(f"Pictures{of}", tuple(pictures_of_fit(fit)))
-    known = one.identifiability
+    known = fit.identifiability
     yield Section(
         f"What the data determine{of}",
         (
@@ -98,19 +100,30 @@ def _sections(one: Judgement, drawn: Sequence[Posterior], several: bool) -> Iter
             Bullets(tuple(f"Determined: {c}" for c in known.combinations)),
         ),
     )
-    yield Section(
-        f"Noise and goodness of fit{of}",
-        (
-            Paragraph(NOISE[fit.noise]),
-            Paragraph(left.headline),
-            Bullets((*(str(trend) for trend in left.significant_trends), *left.warnings)),
-            Bullets(tuple(f"Suspicious: {point}" for point in left.suspicious)),
-            tables.goodness(fit),
-        ),
-    )
+    yield Section(f"Noise and goodness of fit{of}", tuple(_goodness(fit)))
     equivalent = tables.equivalents(fit)
     if equivalent is not None:
         yield Section(f"Equivalent stiffness and damping{of}", (equivalent,))
+
+
+def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
+    intervals = [fit.conf_interval(method) for method in ("wald", "profile")]
+    yield tables.parameters(fit, intervals, drawn)
+    notes = [f"{found.method} intervals: {found.note}" for found in intervals]
+    yield Bullets((*notes, *(f"Derived: {quantity}" for quantity in fit.derived())))
+
+
+def _goodness(fit: FitResult) -> Iterator[Block]:
+    left = fit.goodness
+    yield Paragraph(NOISE[fit.noise])
+    yield Paragraph(left.headline)
+    yield Bullets(tuple(f"Warning: {text}" for text in left.warnings))
+    yield Bullets(tuple(f"Suspicious: {point}" for point in left.suspicious))
+    yield tables.goodness(fit)
+    if not left.acceptable:
+        compared = compare_models(fit)
+        yield Paragraph(f"Other models, compared and not claimed. {compared.headline}")
+        yield tables.comparison(compared)
 
 
 def _data(data: FrequencyResponse) -> Iterator[Block]:
@@ -134,15 +147,17 @@ def _origin(data: FrequencyResponse, command: str) -> Iterator[Block]:
     yield Listing(command)
 
 
-def _fit_facts(one: Judgement) -> dict[str, Any]:
-    fit, known = one.fit, one.identifiability
-    intervals = one.profile.at(0.9545)
+def _fit_facts(fit: FitResult) -> dict[str, Any]:
+    known, left = fit.identifiability, fit.goodness
+    intervals = fit.conf_interval().at(0.9545)
     return {
         "model": repr(fit.problem.model),
+        "trusted": fit.trusted,
+        "verdict": fit.verdict,
         "status": fit.status.name.lower(),
-        "message": fit.message,
-        "objections": list(one.objections),
         "noise": fit.noise,
+        "scale": fit.scale,
+        "scale_known": fit.scale_known,
         "parameters": {
             name: {
                 "value": e.value,
@@ -155,8 +170,9 @@ def _fit_facts(one: Judgement) -> dict[str, Any]:
             for name, e in fit.params.items()
         },
         "determined": [str(c) for c in known.combinations],
-        "suspicious": [str(point) for point in one.goodness.suspicious],
-        "rms_misfit": one.goodness.rms_misfit,
+        "suspicious": [str(point) for point in left.suspicious],
+        "warnings": list(left.warnings),
+        "rms_misfit": left.rms_misfit,
         "redchi": fit.redchi,
         "aic": fit.aic,
         "bic": fit.bic,

@@ -17,10 +17,9 @@ from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.elements import Dahl
 from dahl_ident.elements.linear_dahl import describing_function
 from dahl_ident.plots import style
-from dahl_ident.plots.friction import Curve
 from dahl_ident.reporting.document import Picture
 from dahl_ident.reporting.predictions import (
-    BAND_LEVEL,
+    displacement_amplitude,
     held_amplitude,
     is_force_controlled,
     over_amplitude,
@@ -68,7 +67,7 @@ def _response(fit: FitResult) -> Picture:
     if len(_groups(data)) == 1 and not _over_frequency(data):
         caption = (
             "Data with error bars and fit over amplitude. The band is the "
-            f"{percent(BAND_LEVEL)} confidence band of the fit."
+            f"{percent(LEVELS[1])} confidence band of the fit."
         )
         return Picture("response", caption, alt, partial(_draw_amplitudes, fit))
     over = "frequency, by level" if _over_frequency(data) else "amplitude, by frequency"
@@ -83,13 +82,12 @@ def _draw_amplitudes(fit: FitResult) -> Figure:
         gain_std, phase_std = polar_std(data.response, data.covariance)
     elif fit.noise == "relative":
         gain_std, phase_std = fit.scale * data.gain, np.full(data.n, fit.scale)
-    fine = over_amplitude(fit, data)
     top, _ = plots.plot_amplitude_response(
         held_amplitude(data),
         data.response,
         gain_std=gain_std,
         phase_std=phase_std,
-        curve=Curve(fine.x, fine.response, fine.gain_band, fine.phase_band),
+        curve=over_amplitude(fit, data),
         amplitude_label=_held_label(data),
         gain_label=_gain_label(data),
     )
@@ -104,7 +102,7 @@ def _draw_groups(fit: FitResult) -> Figure:
     curves = [fine(fit, part) for _, part in groups if part.n > 1]
     top, _ = plots.plot_frequency_response(
         [(label, _abscissa(part, data)[0], part.response) for label, part in groups],
-        fitted=[(curve.x, curve.response) for curve in curves],
+        fitted=[(curve.amplitude, curve.response) for curve in curves],
         gain_label=_gain_label(data),
         x_label=_abscissa(data, data)[1],
     )
@@ -125,22 +123,13 @@ def _residuals(fit: FitResult) -> Picture:
     beyond = int(np.sum(np.abs(pairs) > 3.0))
     alt = (
         f"{pairs.size} residuals with a standard deviation of {pairs.std():.2f}; {beyond} of them "
-        "beyond three standard deviations."
+        f"beyond three standard deviations. {fit.goodness.headline}"
     )
-    names = ("ln gain", "phase") if fit.noise == "relative" else ("real part", "imaginary part")
-
-    def draw() -> Figure:
-        x, label = _abscissa(fit.data, fit.data)
-        return _figure(
-            plots.plot_residuals(x, pairs[:, 0], pairs[:, 1], names=names, x_label=label)
-        )
-
-    return Picture(
-        "residuals",
-        "Residuals of every point; the grey band is two standard deviations.",
-        alt,
-        draw,
+    caption = (
+        "Residuals of every point; the grey band is two standard deviations, suspicious points "
+        "are ringed."
     )
+    return Picture("residuals", caption, alt, lambda: _figure(fit.plot_residuals()))
 
 
 def _universal(fit: FitResult, friction: Dahl) -> Picture:
@@ -167,10 +156,7 @@ def _universal(fit: FitResult, friction: Dahl) -> Picture:
 
 
 def _loops(fit: FitResult, friction: Dahl) -> Picture:
-    amplitude = fit.data.amplitude
-    if amplitude is None:
-        fine = np.abs(fit.best_fit) * held_amplitude(fit.data)
-        amplitude = fine if fit.data.quantity == "receptance" else held_amplitude(fit.data)
+    amplitude = displacement_amplitude(fit.data.select(harmonic=1))
     sizes = np.geomspace(amplitude.min(), amplitude.max(), _LOOPS)
     unit = si_unit("displacement", fit.data.motion)
     energy = [float(v) for v in friction.dissipated_energy(sizes)]

@@ -56,7 +56,7 @@ def report(
     --------
     >>> from tempfile import mkdtemp
     >>> import dahl_ident as di
-    >>> from dahl_ident.synthetic.shipped import load_dataset
+    >>> from dahl_ident.synthetic import load_dataset
     >>> fit = di.fit(load_dataset("noisy"), di.Dahl())
     >>> report(fit, Path(mkdtemp()) / "report.json").name
     'report.json'

@@ -11,12 +11,13 @@ from dahl_ident.diagnostics.formatting import interval, rounded
 from dahl_ident.elements import Dahl
 from dahl_ident.reporting.document import Cell, Table, number, words
 from dahl_ident.reporting.posteriors import interval_text
-from dahl_ident.reporting.predictions import held_amplitude
+from dahl_ident.reporting.predictions import displacement_amplitude
 from dahl_ident.units import si_unit
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
     from dahl_ident.diagnostics import ConfidenceIntervals
+    from dahl_ident.diagnostics.comparison import ModelComparison
     from dahl_ident.results import FitResult
     from dahl_ident.results.posterior import Posterior
 
@@ -53,31 +54,39 @@ def parameters(
 
 def equivalents(fit: FitResult) -> Table | None:
     """Return equivalent stiffness, damping and loss of the friction over amplitude."""
-    friction = [element for element in fit.model.elements if isinstance(element, Dahl)]
+    friction = any(isinstance(element, Dahl) for element in fit.model.elements)
     if not friction or not all(np.isfinite(e.value) for e in fit.params.values()):
         return None
     data = fit.data.select(harmonic=1)
-    A = data.amplitude
-    if A is None:
-        A = held_amplitude(data) * np.abs(data.to("receptance").response)
+    A = displacement_amplitude(data)
     sizes = np.geomspace(A.min(), A.max(), _EQUIVALENT_ROWS)
     f = float(np.median(data.frequency_hz))
-    stiffness = sum(e.equivalent_stiffness(sizes) for e in friction)
-    damping = sum(e.equivalent_damping(sizes, 2.0 * np.pi * f) for e in friction)
-    energy = sum(e.dissipated_energy(sizes) for e in friction)
-    motion = data.motion
-    header = (
-        f"amplitude [{si_unit('displacement', motion)}]",
-        f"equivalent stiffness [{si_unit('dynamic_stiffness', motion)}]",
-        f"equivalent damping at {f:.4g} Hz [{si_unit('mechanical_impedance', motion)}]",
-        "energy lost in a cycle [J]",
+    columns: dict[str, list[Cell]] = {
+        f"amplitude [{si_unit('displacement', data.motion)}]": [number(v) for v in sizes]
+    }
+    for found in fit.derived(sizes.tolist(), f):
+        if found.amplitude is not None:
+            value, error = rounded(found.value, found.stderr)
+            cell = Cell(f"{value} \u00b1 {error}", found.value)
+            columns.setdefault(f"{found.name} [{found.unit}]", []).append(cell)
+    rows = tuple(zip(*columns.values(), strict=True))
+    caption = f"Friction as an equivalent spring and damper (damping at {f:.4g} Hz)"
+    return Table(caption, tuple(columns), rows)
+
+
+def comparison(compared: ModelComparison) -> Table:
+    """Return models side by side."""
+    rows = tuple(
+        (
+            Cell(model.name),
+            number(model.aic, 6),
+            number(model.bic, 6),
+            Cell(model.optimum.status.name.lower().replace("_", " ")),
+            Cell(model.estimates),
+        )
+        for model in compared.models
     )
-    columns = np.array([sizes, stiffness, damping, energy]).T
-    return Table(
-        "Friction as an equivalent spring and damper",
-        header,
-        tuple(tuple(number(v) for v in row) for row in columns),
-    )
+    return Table("Models compared", ("model", "AIC", "BIC", "search", "estimates"), rows)
 
 
 def measured(data: FrequencyResponse) -> Table:
