@@ -185,6 +185,11 @@ class TestColumns:
         assert record.time.tolist() == [0.0, 2.0, 4.0, 5.0]
         assert "2 samples with missing values left out" in record.provenance["notes"]  # type: ignore[index]
 
+    def test_missing_samples_keep_their_place_in_counted_time(self, tmp_path: Path) -> None:
+        path = written(tmp_path, "x [mm],F [N]\n1,1\n,2\n3,3\n4,4\n")
+        record = read_record(path, sample_rate=10.0, missing="drop")
+        np.testing.assert_allclose(record.time, [0.0, 0.2, 0.3])
+
 
 class TestRefusal:
     """Never a number from bad input; the message says where and what to do."""

@@ -30,6 +30,7 @@ def record_from(
     bound = Binding(source, columns, RECORD_NAMES)
     channels = _channels(bound)
     bound.same_length(channels)
+    complete = np.ones(next(iter(channels.values())).values.size, dtype=bool)
     if missing == "drop":
         complete = np.all([np.isfinite(_numeric(c)) for c in channels.values()], axis=0)
         bound.source = source.rows(complete)
@@ -42,7 +43,7 @@ def record_from(
     if "drive" in channels:
         values |= _drive(bound, channels["drive"])
     if "time" not in values:
-        values["time"] = _even_time(bound, next(iter(values.values())).size)
+        values["time"] = _even_time(bound, complete.size)[complete]
     try:
         return Record(**values, motion=bound.motion(), provenance=bound.provenance())
     except ValidationError as exc:

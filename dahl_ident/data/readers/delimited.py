@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _COMMENT = re.compile(r"\s*(?:#|%|//|!)")
 _COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|%|//|!)[^\r\n]*", re.MULTILINE)
 _LINE_END = re.compile(rb"\r\n|\n|\r")
-_HEAD_BYTES = 1 << 16
+_HEAD_BYTES = 1 << 15
 _MISSING = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "n/a", "#N/A", "null", "1.#QNAN"]
 _DIALECTS = (
     ("\t", "."), (";", "."), (",", "."), ("|", "."),
