@@ -29,7 +29,7 @@ from dahl_ident.extraction.sine_fit import SineFit
 CYCLES_FOR_SCATTER = 4  # with fewer, lines beside the harmonic are few and far
 _MOST_LINES = 10  # a side: about 40 degrees of freedom, beyond which a region hardly shrinks
 _INDEPENDENT = 0.05  # of the largest eigenvalue: lines that gaps make alike are left out
-_BLOCK = 8192
+_BLOCK = 16384
 
 
 @dataclass(frozen=True)
@@ -68,14 +68,14 @@ def line_noise(
     side = min(reach, _MOST_LINES)
     content, window = _line_content(fit, harmonics, cycles, side, residual)
     lines = np.concatenate([np.arange(-side, 0), np.arange(1, side + 1)])
-    half, kept = _orthogonal(window, lines)
+    half, free = _orthogonal(window, lines)
     noise = []
     for harmonic, sums in zip(harmonics, content, strict=True):
         frequency = harmonic + lines / cycles
-        weights = frequency / frequency.sum()
+        weights = frequency / (frequency @ free)
         Z = sums @ half.T
         matrix = (weights / _left_by_drift(frequency * cycles, cycles) * Z) @ Z.conj().T
-        noise.append(LineNoise(matrix, 2.0 * kept / (lines.size * float(weights @ weights))))
+        noise.append(LineNoise(matrix, 2.0 / float(weights**2 @ free)))
     return noise
 
 
@@ -113,20 +113,20 @@ def powers(rotor: ComplexArray, highest: int) -> ComplexArray:
     return powers
 
 
-def _orthogonal(window: ComplexArray, lines: FloatArray) -> tuple[ComplexArray, int]:
-    """Return the matrix that gives each line the variance of a sample, and how many are free.
+def _orthogonal(window: ComplexArray, lines: FloatArray) -> tuple[ComplexArray, FloatArray]:
+    """Return the matrix that gives each line the variance of a sample, and how free each is.
 
-    On an even grid the lines are orthogonal. Gaps mix them with one another and with the
-    harmonic between them, which the fit has removed.
+    On an even grid the lines are orthogonal, and the share that is free is 1 for each. Gaps mix
+    them with one another and with the harmonic between them, which the fit has removed.
     """
     apart = lines[:, None] - lines
     gram = np.where(apart >= 0, window[np.abs(apart)], window[np.abs(apart)].conj())
     onto = np.where(lines >= 0, window[np.abs(lines)], window[np.abs(lines)].conj())
     gram -= np.outer(onto, onto.conj()) / window[0]
     values, vectors = np.linalg.eigh(gram)
-    free = values > _INDEPENDENT * values[-1]
-    half = np.where(free, 1.0 / np.sqrt(np.where(free, values, 1.0)), 0.0)
-    return (vectors * half) @ vectors.conj().T, int(free.sum())
+    kept = vectors[:, values > _INDEPENDENT * values[-1]]
+    half = (kept / np.sqrt(values[-kept.shape[1] :])) @ kept.conj().T
+    return half, np.sum(np.abs(kept) ** 2, axis=1)
 
 
 def _left_by_drift(periods: FloatArray, cycles: int) -> FloatArray:

@@ -43,6 +43,8 @@ FEWEST_CYCLES = 2
 _NEGLIGIBLE = 0.2  # bias over standard error to which settling cycles are left out
 _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 _DISTORTED = 0.02  # from which the fundamental alone misses percents of the loss
+_MOVING_MEAN = 0.02  # of the amplitude, over the stretch, where the force is controlled
+_TINY = np.finfo(np.float64).tiny
 _FEW_STEPS = 10.0  # amplitude over sensor step below which the step matters
 
 
@@ -172,8 +174,9 @@ def measure(stretch: Stretch, settings: Settings, *, sweep: bool = False) -> Poi
         )
     whole = last_cycles(stretch, cycles)
     steps = np.array([sensor_step(channel) for channel in whole.channels])
-    rough = sine_fit(thinned(first_cycles(whole, MOST_CYCLES)), trend=sweep)
-    _check_sine(rough, steps, settings)
+    first = first_cycles(whole, MOST_CYCLES)
+    rough = sine_fit(thinned(first), trend=sweep)
+    _check_sine(rough, fundamental_share(rough, first), steps, settings)
     memory = _memory(rough, settings)
     if sweep:
         dropped = 0
@@ -186,11 +189,10 @@ def measure(stretch: Stretch, settings: Settings, *, sweep: bool = False) -> Poi
     return _point(phasors, cycles, dropped, steps)
 
 
-def _check_sine(fit: SineFit, steps: FloatArray, settings: Settings) -> None:
+def _check_sine(fit: SineFit, shares: FloatArray, steps: FloatArray, settings: Settings) -> None:
     """Refuse what moves less than its sensor resolves, or is not one sine."""
     where = f"around t = {fit.stretch.centre:.6g} s, {fit.stretch.omega / (2.0 * np.pi):.6g} Hz"
     amplitudes = np.abs(fit.phasors(1))
-    shares = fundamental_share(fit)
     names = (settings.motion_channel, "force")
     for name, amplitude, step, share in zip(names, amplitudes, steps, shares, strict=True):
         if amplitude <= step or amplitude == 0.0:
@@ -243,6 +245,20 @@ def _lag(phasors: _Phasors) -> ComplexArray:
     fit = phasors.fit
     force = np.array([fit.slopes(k)[1] for k in phasors.harmonics])
     return phasors.changed(complex(fit.slopes(1)[0]), force) / phasors.cycles
+
+
+def _mean_moves(phasors: _Phasors) -> bool:
+    """Return whether the mean of a free displacement is still on its way to its place.
+
+    Where a soft spring alone centres it, it may go much farther than the amplitude, and its
+    approach is no exponential.
+    """
+    fit, channel = phasors.fit, phasors.settings.memory_channel
+    moved = 2.0 * float(fit.coefficients[1, channel])
+    if phasors.memory.significant:
+        first, last = phasors.memory.waveform(fit.stretch)[[0, -1]]
+        moved += float(last - first)
+    return channel == 0 and abs(moved) > _MOVING_MEAN * abs(phasors.phasors(1)[0])
 
 
 def _settling_periods(stretch: Stretch, memory: Memory, cycles: int, settings: Settings) -> int:
@@ -302,11 +318,13 @@ def _point(phasors: _Phasors, cycles: int, dropped: int, steps: FloatArray) -> P
     )
     stretch = phasors.fit.stretch
     memory, bias = phasors.memory, _bias(phasors)
-    lagging = _lag(phasors) if phasors.fit.trend else np.zeros(len(rows))
-    error = np.sqrt(0.5 * np.trace(covariance, axis1=1, axis2=2))
+    lagging = _lag(phasors) if phasors.fit.trending else np.zeros(len(rows))
+    error = np.maximum(np.sqrt(0.5 * np.trace(covariance, axis1=1, axis2=2)), _TINY)
     excess = np.abs(bias) / (_TOLERATED * error)
     forgotten = (excess <= 1.0) | (not memory.significant)
     missing = np.where(forgotten, 0.0, np.ceil(np.log(np.maximum(excess, 1.0)) / memory.rate))
+    if _mean_moves(phasors):
+        forgotten, missing = np.zeros_like(forgotten), np.maximum(missing, cycles)
     quality = {
         "settled": forgotten & (np.abs(lagging) <= _TOLERATED * error),
         "bias_real": (bias + lagging).real,
@@ -337,7 +355,7 @@ def _point(phasors: _Phasors, cycles: int, dropped: int, steps: FloatArray) -> P
 def _channel_quality(phasors: _Phasors, steps: FloatArray) -> dict[str, Any]:
     """Return the columns that judge the two waveforms."""
     fit = phasors.fit
-    shares = fundamental_share(fit)
+    shares = fundamental_share(fit, fit.stretch)
     amplitudes = np.abs(fit.phasors(1))
     noise = np.sqrt(np.diagonal(phasors.noise[0].matrix).real)
     crest = crest_samples(amplitudes[0], steps[0], fit.stretch.sample_phase)

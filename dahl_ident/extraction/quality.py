@@ -9,10 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.extraction.sine_fit import HARMONICS, SineFit
+from dahl_ident.extraction.sine_fit import HARMONICS, SineFit, Stretch
 
 _LOOKED_AT = 5_000  # samples from which the sensor's step is found
 _SAME = 1e-9  # of the range: values nearer than this are equal but for rounding
+_TINY = np.finfo(np.float64).tiny
 _RAIL_RUN = 5  # samples in a row at an extreme value
 
 
@@ -51,10 +52,14 @@ def crest_samples(amplitude: float, step: float, sample_phase: float) -> float:
     return float(2.0 * np.arccos(1.0 - below) / sample_phase) + 1.0
 
 
-def fundamental_share(fit: SineFit) -> FloatArray:
-    """Return the fundamental's share of the power of each channel, offset and drift apart."""
-    powers = np.array([np.abs(fit.phasors(k)) ** 2 / 2.0 for k in range(1, fit.orders + 1)])
-    return np.asarray(powers[0] / (powers.sum(axis=0) + np.mean(fit.residual**2, axis=1)))
+def fundamental_share(fit: SineFit, stretch: Stretch) -> FloatArray:
+    """Return the fundamental's share of the power of each channel, offset and drift apart.
+
+    `fit` may be one of block means; the power is that of the samples themselves.
+    """
+    drift = fit.coefficients[1] ** 2 / 3.0
+    power = np.var(stretch.channels, axis=1) - drift
+    return np.asarray(0.5 * np.abs(fit.phasors(1)) ** 2 / np.maximum(power, _TINY))
 
 
 def distortion(fit: SineFit, integrations: int) -> float:

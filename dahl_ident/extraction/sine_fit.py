@@ -31,8 +31,7 @@ HARMONICS = 9  # fitted at least, where the sampling can tell them apart
 _MOST_HARMONICS = 40  # fitted so that they do not leak where cycles are no whole samples
 _AFFORDABLE = 4e5  # samples times harmonics; leakage falls with the number of samples
 _NYQUIST_MARGIN = 0.45  # highest harmonic over the sampling rate
-_FREQUENCY_HARMONICS = 3  # fitted beside the frequency; the others hardly pull it
-_BLOCK = 8192  # samples whose columns stay in the cache
+_BLOCK = 16384  # samples whose columns stay in the cache
 _BLOCKS_PER_CYCLE = 64  # block means that lose 4e-4 of the fundamental
 _MAX_STEPS = 20
 _TRACKED = 0.1  # phase error that is left to the four-parameter fit, rad
@@ -123,7 +122,7 @@ class SineFit:
 
     stretch: Stretch
     orders: int
-    trend: bool
+    trending: int  # harmonics 1 to this one may change linearly
     coefficients: FloatArray  # (columns, 2)
     inverse: FloatArray  # of the normal matrix
     residual: FloatArray  # (2, n)
@@ -144,7 +143,7 @@ class SineFit:
         """Return phasors 0, 1, ... that the fit would give a waveform; 0 after its last sample."""
         theta, tau = self.stretch.theta[: waveform.size], self.stretch.tau[: waveform.size]
         right = np.zeros(self.inverse.shape[0])
-        for part, block in _column_blocks(theta, tau, self.orders, self.trend):
+        for part, block in _column_blocks(theta, tau, self.orders, self.trending):
             right += block @ waveform[part]
         fitted = (self.inverse @ right)[: 2 * self.orders + 2]
         return np.asarray(fitted[::2] - 1j * fitted[1::2])
@@ -175,14 +174,15 @@ def sine_fit(stretch: Stretch, *, trend: bool = False) -> SineFit:
     With `trend` every harmonic may also change linearly over the stretch, as in a sweep.
     """
     orders = resolvable_orders(stretch)
+    trending = orders if trend else 0
     theta, tau = stretch.theta, stretch.tau
-    normal, right = _normal_equations(theta, tau, stretch.channels, orders, trend)
+    normal, right = _normal_equations(theta, tau, stretch.channels, orders, trending)
     inverse = _inverse(normal, stretch)
     coefficients = inverse @ right
     residual = stretch.channels.copy()
-    for part, block in _column_blocks(theta, tau, orders, trend):
+    for part, block in _column_blocks(theta, tau, orders, trending):
         residual[:, part] -= coefficients.T @ block
-    return SineFit(stretch, orders, trend, coefficients, inverse, residual)
+    return SineFit(stretch, orders, trending, coefficients, inverse, residual)
 
 
 def estimate_frequency(stretch: Stretch) -> Stretch:
@@ -191,15 +191,19 @@ def estimate_frequency(stretch: Stretch) -> Stretch:
     Gauss-Newton on the four-parameter fit; the channels are weighted by their residuals. The
     start has to be within about half a cycle over the whole stretch, see `track_phase`.
     """
+    start, moved = stretch, 0.0
     for _ in range(_MAX_STEPS):
         step = _frequency_step(thinned(stretch))
+        moved += step
+        if abs(moved) > np.pi:
+            break
         stretch = replace(stretch, phase=stretch.phase + Polynomial([0.0, step]))
         if abs(step) < _STEP_TOLERANCE:
             return stretch
     raise ExtractionError(
-        f"the frequency near {stretch.omega / (2.0 * np.pi):.6g} Hz around t = "
-        f"{stretch.centre:.6g} s did not settle in {_MAX_STEPS} steps; expected one steady sine: "
-        "give frequency="
+        f"no steady frequency near {start.omega / (2.0 * np.pi):.6g} Hz around t = "
+        f"{start.centre:.6g} s: the fit wanders off; expected one sine of constant frequency: "
+        "give frequency=, or mode='sweep'"
     )
 
 
@@ -247,31 +251,34 @@ def thinned(stretch: Stretch) -> Stretch:
 
 def _frequency_step(stretch: Stretch) -> float:
     """Return one Gauss-Newton step of the phase at tau = 1, rad."""
-    orders = min(_FREQUENCY_HARMONICS, resolvable_orders(stretch))
+    orders = min(HARMONICS, resolvable_orders(stretch))
     theta, tau, y = stretch.theta, stretch.tau, stretch.channels
-    normal, right = _normal_equations(theta, tau, y, orders, trend=True)
+    normal, right = _normal_equations(theta, tau, y, orders, 1)
     n = 2 * orders + 2
     inverse = _inverse(normal[:n, :n], stretch)
     slope = step = 0.0
     for channel in range(len(y)):
         coefficients = inverse @ right[:n, channel]
+        total = float(y[channel] @ y[channel])
+        if total == 0.0:
+            continue
         cos, sin = coefficients[2:4]
         change = np.zeros(normal.shape[0])  # tau (-cos sin(theta) + sin cos(theta))
         change[n : n + 2] = sin, -cos
         across = normal[:n] @ change
         misfit = change @ right[:, channel] - across @ coefficients
         power = change @ normal @ change - across @ inverse @ across
-        left = float(y[channel] @ y[channel] - right[:n, channel] @ coefficients)
-        weight = 1.0 / max(left, 1e-24 * float(y[channel] @ y[channel]))
+        left = total - float(right[:n, channel] @ coefficients)
+        weight = 1.0 / max(left, 1e-24 * total)
         slope += weight * float(power)
         step += weight * float(misfit)
-    return step / slope
+    return step / slope if slope else 0.0
 
 
-def columns(theta: FloatArray, tau: FloatArray, orders: int, *, trend: bool = False) -> FloatArray:
-    """Return 1, tau, cos theta, sin theta, cos 2 theta, ...; with `trend` these times tau too."""
+def columns(theta: FloatArray, tau: FloatArray, orders: int, trending: int = 0) -> FloatArray:
+    """Return 1, tau, cos theta, sin theta, cos 2 theta, ...; then the first ones times tau."""
     width = 2 * orders + 2
-    out = np.empty((width + 2 * orders * trend, theta.size))
+    out = np.empty((width + 2 * trending, theta.size))
     out[0] = 1.0
     out[1] = tau
     np.cos(theta, out=out[2])
@@ -281,27 +288,26 @@ def columns(theta: FloatArray, tau: FloatArray, orders: int, *, trend: bool = Fa
         np.multiply(twice, out[i - 2], out=out[i])
         if i != 5:
             out[i] -= out[i - 4] if i > 5 else 1.0
-    if trend:
-        np.multiply(out[2:width], tau, out=out[width:])
+    np.multiply(out[2 : 2 + 2 * trending], tau, out=out[width:])
     return out
 
 
 def _column_blocks(
-    theta: FloatArray, tau: FloatArray, orders: int, trend: bool
+    theta: FloatArray, tau: FloatArray, orders: int, trending: int
 ) -> Iterator[tuple[slice, FloatArray]]:
     """Yield slices of the samples with their columns."""
     for start in range(0, theta.size, _BLOCK):
         part = slice(start, start + _BLOCK)
-        yield part, columns(theta[part], tau[part], orders, trend=trend)
+        yield part, columns(theta[part], tau[part], orders, trending)
 
 
 def _normal_equations(
-    theta: FloatArray, tau: FloatArray, channels: FloatArray, orders: int, trend: bool
+    theta: FloatArray, tau: FloatArray, channels: FloatArray, orders: int, trending: int
 ) -> tuple[FloatArray, FloatArray]:
-    width = 2 * orders + 2 + 2 * orders * trend
+    width = 2 * orders + 2 + 2 * trending
     normal = np.zeros((width, width))
     right = np.zeros((width, len(channels)))
-    for part, block in _column_blocks(theta, tau, orders, trend):
+    for part, block in _column_blocks(theta, tau, orders, trending):
         normal += block @ block.T
         right += block @ channels[:, part].T
     return normal, right
