@@ -5,12 +5,13 @@ its spread; outwards they grow sixfold from shell to shell until the box is full
 count as far as the prior reaches. A cell is integrated by a product of Clenshaw and Curtis's
 rules of 9 points. Their 5 inner points are a rule of their own; what changes when they take its
 place along one axis is the error of the cell along that axis. The cells of largest error are
-halved along their worst axes until all errors add up to less than the tolerance. This bounds the
-error generously: that of 9 points is much smaller than the difference to 5.
+halved along their worst axes until all errors add up to less than the tolerance. For the integral
+this is generous, that of 9 points being far better than that of 5; for quantiles, which cut through
+cells, it is about right.
 
-Ridges are straightened first. With the widest direction first, theta = centre + L phi, L unit
-lower triangular from the covariance of the parameters, and only correlations above 0.8 count,
-because L turns the walls of the box oblique.
+Ridges are straightened first: theta = centre + L phi, L unit lower triangular from the covariance
+of the parameters. L turns walls of the box oblique, which matters only where there is probability,
+so parameters that reach a wall come first and keep their axes.
 """
 
 from __future__ import annotations
@@ -29,9 +30,12 @@ from dahl_ident.arrays import FloatArray
 POINTS = 9
 _INNER = 3.0  # standard deviations from the centre to the first wall
 _SHELLS = 6.0
-_STRAIGHTENED = 0.8
+_NEAR = 5.0  # standard deviations within which a wall is near
+_NOTHING = 60.0  # below the peak's logarithm
 _WORST = 0.3  # of the worst axis' error at which another axis is halved as well
 _BISECTIONS = 50
+_STEP = 1e-3  # of the range, for a slope
+_FINE = {2: 64, 3: 20}  # lines along an axis of a cell, by dimension
 
 LogDensity = Callable[[FloatArray], FloatArray]
 
@@ -105,6 +109,8 @@ class Grid:
         Where phi = 0.
     shear : ndarray, shape (D, D)
         theta = centre + shear phi.
+    order : ndarray of int, shape (D,)
+        Which theta each phi moves first, with slope 1.
     log_evidence : float
         ln of the integral.
     error : float
@@ -116,6 +122,7 @@ class Grid:
     cells: Cells
     centre: FloatArray
     shear: FloatArray
+    order: NDArray[np.intp]
     log_evidence: float
     error: float
     evaluations: int
@@ -145,42 +152,53 @@ class Grid:
     def quantiles(self, axis: int, probabilities: FloatArray) -> FloatArray:
         """Return quantiles of one theta."""
         lines = self._lines(axis)
-        low = np.full(len(probabilities), lines.low.min())
-        high = np.full(len(probabilities), lines.high.max())
-        total = lines.below(high[:1])[0]
-        for _ in range(_BISECTIONS):
-            middle = 0.5 * (low + high)
-            under = lines.below(middle) < probabilities * total
-            low, high = np.where(under, middle, low), np.where(under, high, middle)
-        return np.asarray(0.5 * (low + high))
+        found = lines.quantiles(probabilities)
+        if len(lines.low) == len(self.cells.low):
+            return found
+        # oblique lines end one after the other, which takes more of them to count
+        step = _STEP * (self.theta[:, axis].max() - self.theta[:, axis].min())
+        density = (lines.below(found + step) - lines.below(found - step)) / (2.0 * step)
+        excess = self._lines(axis, _FINE[self.dims]).below(found) - probabilities
+        return np.asarray(found - excess / density)
 
-    def _lines(self, axis: int) -> Lines:
-        """Return the density along one theta, cell by cell where its axis is straight."""
+    def _lines(self, axis: int, finer: int = POINTS) -> Lines:
+        """Return the density along one theta, cell by cell where its axis is straight.
+
+        Elsewhere line by line, `finer` of them along each other axis of a cell.
+        """
         cells, D = self.cells, self.dims
-        order = list(self._order)
-        position = order.index(axis)
-        shear = self.shear[axis][order]
-        half = 0.5 * (cells.high - cells.low)
-        density = np.moveaxis(
-            self._density.reshape(cells.log_density.shape), position + 1, -1
-        ).reshape(len(half), -1, POINTS)
+        position = int(np.argmax(self.order == axis))
         others = np.delete(np.arange(D), position)
-        weights = np.prod(half[:, others], axis=1)[:, None] * _product(rule().weights, D - 1)
-        low, high = cells.low[:, position], cells.high[:, position]
-        straight = not np.any(shear[others])
-        if straight:
-            values = np.einsum("cl,cln->cn", weights, density)
-            return Lines(self.centre[axis] + low, self.centre[axis] + high, values)
-        shift = self.centre[axis] + (
-            _nodes(cells.low[:, others], cells.high[:, others]) @ shear[others]
-        ).reshape(len(half), -1)
-        values = (weights[..., None] * density).reshape(-1, POINTS)
-        return Lines((shift + low[:, None]).ravel(), (shift + high[:, None]).ravel(), values)
+        slopes = self.shear[axis, others]
+        density = np.moveaxis(self._density.reshape(cells.log_density.shape), position + 1, -1)
+        half = 0.5 * (cells.high - cells.low)
+        volume = np.prod(half[:, others], axis=1)[:, None]
+        low = self.centre[axis] + cells.low[:, position]
+        high = self.centre[axis] + cells.high[:, position]
+        if not np.any(slopes):
+            weights = volume * _product(rule().weights, D - 1)
+            return Lines(low, high, np.einsum("cl,cln->cn", weights, _flat(density)))
+        nodes, weights_1 = rule().nodes, rule().weights
+        if finer != POINTS:
+            nodes, weights_1 = np.polynomial.legendre.leggauss(finer)
+            for k in range(1, D):
+                density = np.moveaxis(np.moveaxis(density, k, -1) @ _between(nodes).T, -1, k)
+        shift = _nodes(cells.low[:, others], cells.high[:, others], nodes) @ slopes
+        shift = shift.reshape(len(half), -1)
+        values = (volume * _product(weights_1, D - 1))[..., None] * _flat(density)
+        walls = [(shift + wall[:, None]).ravel() for wall in (low, high)]
+        return Lines(walls[0], walls[1], values.reshape(-1, POINTS))
 
-    @property
-    def _order(self) -> NDArray[np.intp]:
-        """Which theta each phi belongs to: where the shear has its ones."""
-        return np.asarray(np.argmax(self.shear == 1.0, axis=0))
+
+def _flat(density: FloatArray) -> FloatArray:
+    """Join all axes but the first and the last."""
+    return density.reshape(len(density), -1, density.shape[-1])
+
+
+def _between(points: FloatArray) -> FloatArray:
+    """Return the matrix from values at the nodes to those at other points of [-1, 1]."""
+    coefficients = np.linalg.inv(chebyshev.chebvander(rule().nodes, POINTS - 1))
+    return np.asarray(chebyshev.chebvander(points, POINTS - 1) @ coefficients)
 
 
 @dataclass(frozen=True)
@@ -194,6 +212,16 @@ class Lines:
     @cached_property
     def _primitive(self) -> FloatArray:
         return 0.5 * (self.high - self.low)[:, None] * (self.values @ rule().primitive.T)
+
+    def quantiles(self, probabilities: FloatArray) -> FloatArray:
+        """Return the points below which there is a given part of the probability."""
+        low = np.full(len(probabilities), self.low.min())
+        high = np.full(len(probabilities), self.high.max())
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            under = self.below(middle) < probabilities
+            low, high = np.where(under, middle, low), np.where(under, high, middle)
+        return np.asarray(0.5 * (low + high))
 
     def below(self, points: FloatArray) -> FloatArray:
         """Return the probability below each of Q points."""
@@ -227,10 +255,10 @@ def integrate(
     most : int
         Evaluations at which refinement ends all the same.
     """
-    shear, spread = _straightened(covariance)
-    low, high = _bounding(box, centre, shear)
+    shear, spread, order = _straightened(covariance, box, centre)
+    low, high = _bounding(box, centre, shear, order)
     at = _Evaluator(log_density, centre, shear)
-    cells = at.cells(*_shells(low, high, spread))
+    cells = at.cells(*at.promising(*_shells(low, high, spread)))
     while True:
         integral, errors, peak = _integrals(cells)
         total, worst = integral.sum(), errors.max(axis=1)
@@ -241,7 +269,7 @@ def integrate(
         cells = cells[~chosen] + at.cells(*_halved(cells[chosen], errors[chosen]))
     kept = integral > 1e-16 * total
     log_evidence = float(peak + np.log(total))
-    return Grid(cells[kept], centre, shear, log_evidence, float(error), at.evaluations)
+    return Grid(cells[kept], centre, shear, order, log_evidence, float(error), at.evaluations)
 
 
 class _Evaluator:
@@ -252,34 +280,50 @@ class _Evaluator:
         self.evaluations = 0
 
     def cells(self, low: FloatArray, high: FloatArray) -> Cells:
-        theta = self._centre + _nodes(low, high) @ self._shear.T
-        self.evaluations += len(theta)
-        values = self._log_density(theta)
+        """Return cells with the density at all their nodes."""
+        values = self._at(_nodes(low, high))
         return Cells(low, high, values.reshape(len(low), *[POINTS] * low.shape[1]))
 
+    def promising(self, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the walls of those cells whose inner nodes find any density at all."""
+        values = self._at(_nodes(low, high, rule().nodes[::2])).reshape(len(low), -1).max(axis=1)
+        some = values > values.max() - _NOTHING
+        return low[some], high[some]
 
-def _straightened(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the shear, and phi's standard deviations; the widest theta comes first."""
+    def _at(self, phi: FloatArray) -> FloatArray:
+        self.evaluations += len(phi)
+        return self._log_density(self._centre + phi @ self._shear.T)
+
+
+def _straightened(
+    covariance: FloatArray, box: tuple[FloatArray, FloatArray], centre: FloatArray
+) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+    """Return the shear, phi's standard deviations, and which theta each phi moves first.
+
+    Axes along which the posterior reaches a wall come first, and are not sheared by each other.
+    """
     std = np.sqrt(np.diagonal(covariance))
-    order = np.argsort(-std)
-    correlation = covariance / np.outer(std, std)
-    correlation = np.where(np.abs(correlation) > _STRAIGHTENED, correlation, 0.0)
-    np.fill_diagonal(correlation, 1.0)
-    if np.linalg.eigvalsh(correlation)[0] < 1e-12:  # dropping entries may leave no covariance
-        correlation = np.eye(len(std))
-    ordered = correlation[np.ix_(order, order)] * np.outer(std[order], std[order])
+    reaches = (centre - _NEAR * std < box[0]) | (centre + _NEAR * std > box[1])
+    order = np.lexsort((-std / (box[1] - box[0]), ~reaches))
+    ordered = covariance[np.ix_(order, order)] / np.outer(std[order], std[order])
     root = np.linalg.cholesky(ordered)
-    spread = np.diagonal(root)
-    shear = np.empty_like(root)
-    shear[order] = root / spread
-    return shear, spread
+    slopes = root / np.diagonal(root)
+    walls = reaches[order]
+    slopes[np.outer(walls, walls) & ~np.eye(len(std), dtype=bool)] = 0.0
+    alone = np.linalg.inv(slopes)
+    spread = np.sqrt(np.diagonal(alone @ ordered @ alone.T)) * std[order]
+    shear = np.empty_like(slopes)
+    shear[order] = slopes * std[order][:, None] / std[order]
+    return shear, spread, order
 
 
 def _bounding(
-    box: tuple[FloatArray, FloatArray], centre: FloatArray, shear: FloatArray
+    box: tuple[FloatArray, FloatArray],
+    centre: FloatArray,
+    shear: FloatArray,
+    order: NDArray[np.intp],
 ) -> tuple[FloatArray, FloatArray]:
     """Return the ranges of phi that hold the box."""
-    order = np.argmax(shear == 1.0, axis=0)
     D = len(centre)
     low, high = np.empty(D), np.empty(D)
     for k, axis in enumerate(order):
@@ -320,10 +364,10 @@ def _corners(dims: int) -> NDArray[np.bool_]:
     return np.array(np.meshgrid(*[[False, True]] * dims)).reshape(dims, -1).T
 
 
-def _nodes(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return the nodes of cells, (C * POINTS^D, D)."""
+def _nodes(low: FloatArray, high: FloatArray, x: FloatArray | None = None) -> FloatArray:
+    """Return points of cells, x along each axis or the rule's nodes, (C * len(x)^D, D)."""
     D = low.shape[1]
-    x = rule().nodes
+    x = rule().nodes if x is None else x
     unit = np.stack(np.meshgrid(*[x] * D, indexing="ij"), axis=-1).reshape(1, -1, D)
     nodes = 0.5 * ((low + high)[:, None] + (high - low)[:, None] * unit)
     return np.asarray(nodes.reshape(-1, D))
@@ -343,11 +387,11 @@ def _integrals(cells: Cells) -> tuple[FloatArray, FloatArray, float]:
     weights, coarse = rule().weights, rule().coarse
     D = cells.low.shape[1]
     fine = _contracted(density, [weights] * D)
-    errors = [
+    by_axis = [
         np.abs(fine - _contracted(density, [coarse if i == axis else weights for i in range(D)]))
         for axis in range(D)
     ]
-    return fine * cells.volume, np.stack(errors, axis=1) * cells.volume[:, None], peak
+    return fine * cells.volume, np.stack(by_axis, axis=1) * cells.volume[:, None], peak
 
 
 def _contracted(density: FloatArray, weights: list[FloatArray]) -> FloatArray:

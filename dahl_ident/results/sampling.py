@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
+from dataclasses import replace
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray, positive_number, whole_number
 from dahl_ident.bayes.chain import Chain, Pool, Settings, run
+from dahl_ident.bayes.checkpoint import Stored, identity, open_chain
+from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import PriorLike, joint_prior
 from dahl_ident.bayes.quadrature import integrate
@@ -20,6 +25,7 @@ from dahl_ident.problem import Problem
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.grid_posterior import GridPosterior
 from dahl_ident.results.posterior import Posterior, refuse_unusable
+from dahl_ident.results.progress import progress_bar
 from dahl_ident.sensors import Sensors
 
 _LEAST_STEPS = 20
@@ -42,7 +48,9 @@ def sample(
     ess: float = 2000.0,
     walkers: int | None = None,
     ensembles: int = 4,
+    resume: str | os.PathLike[str] | None = None,
     pool: Pool | None = None,
+    progress: bool = False,
 ) -> Posterior:
     """Sample the posterior of a model's parameters with emcee.
 
@@ -73,9 +81,15 @@ def sample(
         In all ensembles together. Default: 32 an ensemble, or more for many parameters.
     ensembles : int, default 4
         Groups of walkers that know nothing of each other.
+    resume : path, optional
+        HDF5 file that keeps the chain: begun where there is none, continued to the *total*
+        number of steps where there is. It is whole at every moment, also after a crash, and the
+        chain that comes out is the same however often it was interrupted.
     pool : object with map, optional
         Spreads the likelihood over processes. Left out, one process computes all walkers at
         once, which is faster unless a single likelihood takes milliseconds.
+    progress : bool, default False
+        Show a bar on the terminal, with the time that is left.
 
     Returns
     -------
@@ -85,8 +99,9 @@ def sample(
     Raises
     ------
     SamplingError
-        If no place of finite density is found, the scale of the noise cannot be estimated, or
-        the chain never moved.
+        If no place of finite density is found, the scale of the noise cannot be estimated, the
+        chain never moved (it is in the error's `posterior`), or `resume` names a file that is
+        damaged, in use, or of another run.
     ModelError
         If nothing is free, or a name is unknown.
     DataError
@@ -109,10 +124,57 @@ def sample(
     problem, optimum = _problem(data, model, noise, sensors, free, fixed)
     density = Density(problem, joint_prior(problem, priors, _theta(optimum)), likelihood)
     settings = _settings(density, seed, steps, max_steps, ess, walkers, ensembles)
-    random = np.random.default_rng(settings.seed)
-    start = starting_points(density, optimum, settings.walkers, random)
-    chain, verdict = run(density, Chain.at(start, settings.seed), settings, pool=pool)
+    chain, verdict, settings = _chain(density, optimum, settings, seed, resume, pool, progress)
     return refuse_unusable(Posterior(density, chain, verdict, settings, optimum))
+
+
+def _chain(
+    density: Density,
+    optimum: Optimum | None,
+    settings: Settings,
+    seed: int | None,
+    resume: str | os.PathLike[str] | None,
+    pool: Pool | None,
+    progress: bool,
+) -> tuple[Chain, Convergence, Settings]:
+    """Run the chain, from its file and into it where there is one."""
+    with ExitStack() as stack:
+        listeners = [stack.enter_context(progress_bar(settings))] if progress else []
+        stored: Stored | None = None
+        if resume is not None:
+            of = identity(density, settings.walkers, settings.ensembles)
+            file = stack.enter_context(open_chain(resume, of))
+            stored = file.load()
+            settings = _with_seed_of(stored, settings, seed, resume)
+            file.begin(settings.seed)
+            listeners.append(file)
+        if stored is None:
+            random = np.random.default_rng(settings.seed)
+            start = starting_points(density, optimum, settings.walkers, random)
+            chain = Chain.at(start, settings.seed)
+        else:
+            chain = stored.chain
+
+        def tell(chain: Chain, verdict: Convergence | None) -> None:
+            for listener in listeners:
+                listener(chain, verdict)
+
+        chain, verdict = run(density, chain, settings, pool=pool, listener=tell)
+    return chain, verdict, settings
+
+
+def _with_seed_of(
+    stored: Stored | None, settings: Settings, seed: int | None, path: str | os.PathLike[str]
+) -> Settings:
+    """Return the settings with the seed of the file; a seed that differs from it is refused."""
+    if stored is None:
+        return settings
+    if seed is not None and seed != stored.seed:
+        raise SamplingError(
+            f"{os.fspath(path)} was begun with seed {stored.seed}, but seed is {seed}; leave it "
+            "out to resume, or give another file"
+        )
+    return replace(settings, seed=stored.seed)
 
 
 def posterior_grid(

@@ -1,0 +1,252 @@
+"""Chains on disk that survive a crash.
+
+One HDF5 file holds all steps and the state of the random numbers. It is written to a neighbour
+first, flushed to the disk and put in place by renaming, so that the file is whole at every
+moment, whatever happens to the process. A run spends at most about a twentieth of its time
+writing. While it lasts, it holds a lock on a second neighbour, ``<file>.lock``; a second run on
+the same file is refused. (On Windows there is no such lock: keep runs apart yourself.)
+
+A file is resumed only if it belongs to the same data, model, priors and settings, and if its
+content is as it was written; any other file is refused and left as it is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dahl_ident.bayes.chain import Chain, RandomState
+from dahl_ident.bayes.convergence import Convergence
+from dahl_ident.bayes.density import Density
+from dahl_ident.data.readers.file import library
+from dahl_ident.elements.description import describe_model
+from dahl_ident.errors import ModelError, SamplingError
+
+FORMAT = "dahl_ident chain"
+VERSION = 1
+_SHARE = 20.0  # times as long sampling as writing
+
+Identity = Mapping[str, str]
+"""What a chain depends on, part by part, as text or digest."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A chain read from a file, with its seed."""
+
+    chain: Chain
+    seed: int
+
+
+def identity(density: Density, walkers: int, ensembles: int) -> Identity:
+    """Return what a chain depends on besides its seed, part by part."""
+    problem = density.problem
+    try:
+        model = json.dumps(describe_model(problem.model), sort_keys=True, default=str)
+    except ModelError:  # a linear system built by a function
+        model = repr(problem.model)
+    data = {
+        name: getattr(problem.data, name)
+        for name in (
+            "quantity", "frequency_hz", "amplitude", "drive", "response", "covariance", "dof",
+            "amplitude_std", "amplitude_covariance", "harmonic", "controlled",
+        )
+    }  # fmt: skip
+    fixed = [(p.name, p.value) for p in problem.sensors.parameters if not p.free]
+    priors = {f"prior of {name}": text for name, text in density.priors.items()}
+    return {
+        "data": _digest(*data.values()),
+        "model": model,
+        "noise": problem.noise,
+        "sensors": repr(fixed),
+        "likelihood": density.likelihood,
+        "parameters": ", ".join(density.names),
+        "walkers": f"{walkers} in {ensembles} ensembles",
+        **priors,
+    }
+
+
+class ChainFile:
+    """The file of one run; made by :func:`open_chain`, which holds the lock.
+
+    As a listener of :func:`dahl_ident.bayes.chain.run` it writes whenever that is cheap.
+    """
+
+    def __init__(self, path: Path, identity: Identity) -> None:
+        self.path, self._identity = path, identity
+        self._seed = 0
+        self._written: Chain | None = None
+        self._latest: Chain | None = None
+        self._due = 0.0
+
+    def load(self) -> Stored | None:
+        """Return the chain in the file, None where there is no file yet.
+
+        Raises
+        ------
+        SamplingError
+            If the file is not a whole chain of this identity.
+        """
+        if not self.path.exists():
+            return None
+        stored, found = _read(self.path)
+        differing = [k for k, v in self._identity.items() if found.get(k) != v]
+        if differing:
+            raise SamplingError(
+                f"{self.path} holds a chain of another run: it differs in "
+                f"{', '.join(differing)}. Resume with what it was begun with, or give another "
+                "file; this one is left as it is"
+            )
+        self._written = self._latest = stored.chain
+        return stored
+
+    def begin(self, seed: int) -> None:
+        """Take over the seed to be written."""
+        self._seed = seed
+
+    def __call__(self, chain: Chain, verdict: Convergence | None) -> None:
+        """Take over the chain, and write it if the last time is long enough ago."""
+        self._latest = chain
+        if time.monotonic() >= self._due:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the latest chain, unless it is in the file already."""
+        if self._latest is None or self._latest is self._written:
+            return
+        began = time.monotonic()
+        _write(self.path, self._latest, self._seed, self._identity)
+        self._written = self._latest
+        ended = time.monotonic()
+        self._due = ended + _SHARE * (ended - began)
+
+
+@contextmanager
+def open_chain(path: str | os.PathLike[str], identity: Identity) -> Iterator[ChainFile]:
+    """Lock a chain's file for the duration of a run; write what is left at its end.
+
+    Raises
+    ------
+    SamplingError
+        If the folder does not exist, or another run holds the lock.
+    """
+    file = Path(path)
+    if not file.parent.is_dir():
+        raise SamplingError(f"{file.parent} is no folder; make it, or give another path")
+    with _locked(file):
+        chain_file = ChainFile(file, identity)
+        try:
+            yield chain_file
+        finally:
+            chain_file.flush()
+
+
+@contextmanager
+def _locked(file: Path) -> Iterator[None]:
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    with file.with_name(file.name + ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise SamplingError(
+                f"another run is writing {file}; wait for its end, or give another file"
+            ) from None
+        yield  # the lock ends with the open file, whichever way the process ends
+
+
+def _write(path: Path, chain: Chain, seed: int, identity: Identity) -> None:
+    h5py = library("h5py")
+
+    text = json.dumps(dict(identity), sort_keys=True)
+    arrays = _arrays(chain)
+    partial = path.with_name(path.name + ".partial")
+    with h5py.File(partial, "w") as file:
+        for name, array in arrays.items():
+            file[name] = array
+        file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
+        file.attrs["identity"], file.attrs["seed"] = text, str(seed)
+        file.attrs["digest"] = _digest(text, str(seed), *arrays.values())
+    with partial.open("rb+") as written:
+        os.fsync(written.fileno())
+    partial.replace(path)
+
+
+def _read(path: Path) -> tuple[Stored, dict[str, str]]:
+    h5py = library("h5py")
+
+    try:
+        with h5py.File(path, "r") as file:
+            attributes = {name: _plain(value) for name, value in file.attrs.items()}
+            _check_format(path, attributes)
+            arrays = {name: file[name][()] for name in _NAMES}
+    except (OSError, KeyError, RuntimeError) as exc:
+        raise SamplingError(
+            f"{path} cannot be read as a chain ({exc}); it is damaged or something else. Give "
+            "another file; this one is left as it is"
+        ) from exc
+    digest = _digest(attributes["identity"], attributes["seed"], *arrays.values())
+    if digest != attributes["digest"]:
+        raise SamplingError(
+            f"{path} is damaged: its content does not match the digest that was written with it. "
+            "Give another file, or a copy that is whole; this one is left as it is"
+        )
+    return _stored(arrays, int(attributes["seed"])), json.loads(attributes["identity"])
+
+
+def _check_format(path: Path, attributes: Mapping[str, Any]) -> None:
+    found = (attributes.get("format"), attributes.get("version"))
+    missing = {"identity", "seed", "digest"} - set(attributes)
+    if found != (FORMAT, VERSION) or missing:
+        raise SamplingError(
+            f"{path} is an HDF5 file, but not a chain that this version can resume: format and "
+            f"version are {found}, expected {(FORMAT, VERSION)}. Give another file; this one is "
+            "left as it is"
+        )
+
+
+_NAMES = ("points", "log_density", "start", "random_key", "random_rest")
+
+
+def _arrays(chain: Chain) -> dict[str, np.ndarray[Any, Any]]:
+    _, key, *rest = chain.random_state
+    values = (chain.points, chain.log_density, chain.start, key, np.array(rest, dtype=float))
+    return dict(zip(_NAMES, values, strict=True))
+
+
+def _stored(arrays: Mapping[str, Any], seed: int) -> Stored:
+    position, has_gauss, cached = arrays["random_rest"].tolist()
+    state: RandomState = (
+        "MT19937", arrays["random_key"], int(position), int(has_gauss), cached,
+    )  # fmt: skip
+    chain = Chain(arrays["points"], arrays["log_density"], arrays["start"], state)
+    return Stored(chain, seed)
+
+
+def _digest(*parts: Any) -> str:
+    total = hashlib.blake2b(digest_size=16)
+    for part in parts:
+        if isinstance(part, np.ndarray) and part.dtype.kind in "fciu":
+            total.update(f"{part.dtype}{part.shape}".encode())
+            total.update(np.ascontiguousarray(part).data)
+        else:
+            plain = part.tolist() if isinstance(part, np.ndarray) else part
+            total.update(repr(plain).encode())
+    return total.hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value

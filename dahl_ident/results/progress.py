@@ -1,0 +1,38 @@
+"""A bar on the terminal while a chain runs, with the time that is left."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from dahl_ident.bayes.chain import Chain, Listener, Settings
+from dahl_ident.bayes.convergence import LENGTH, Convergence
+
+
+def expected_steps(settings: Settings, verdict: Convergence | None) -> int | None:
+    """Return the total number of steps as far as known: None before the first verdict."""
+    if settings.steps is not None:
+        return settings.steps
+    if verdict is None or not verdict.usable:
+        return None
+    kept = verdict.steps - verdict.discard
+    most = max(LENGTH * verdict.tau.max(), kept * settings.wanted / verdict.ess.min())
+    return min(int(verdict.discard + most) + 1, settings.most_steps)
+
+
+@contextmanager
+def progress_bar(settings: Settings) -> Iterator[Listener]:
+    """Yield a listener that moves a bar."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+    from rich.progress import TimeRemainingColumn as Remaining
+
+    columns = (TextColumn("sampling"), BarColumn(), MofNCompleteColumn(), Remaining())
+    with Progress(*columns) as bar:
+        task = bar.add_task("sampling", total=settings.steps)
+
+        def update(chain: Chain, verdict: Convergence | None) -> None:
+            total = expected_steps(settings, verdict)
+            steps = chain.steps
+            bar.update(task, completed=steps, total=None if total is None else max(total, steps))
+
+        yield update

@@ -1,0 +1,207 @@
+"""Moves, convergence and chains, against emcee, closed forms and themselves."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import emcee
+import numpy as np
+import pytest
+from scipy import stats
+
+import dahl_ident as di
+from dahl_ident.arrays import FloatArray
+from dahl_ident.bayes.chain import next_check
+from dahl_ident.bayes.convergence import autocorrelation_time, judge, r_hat
+from dahl_ident.bayes.moves import (
+    EnsembleMove,
+    Proposal,
+    differential_evolution,
+    independent,
+    snooker,
+)
+from dahl_ident.errors import ModelError, SamplingError, ValidationError
+from tests.bayes_cases import FRICTION, friction_table, with_covariance
+
+
+def autoregression(steps: int, walkers: int, rho: float, seed: int = 3) -> FloatArray:
+    """Return paths whose autocorrelation time is (1 + rho)/(1 - rho)."""
+    random = np.random.default_rng(seed)
+    chain = np.empty((steps, walkers, 1))
+    chain[0] = random.normal(size=(walkers, 1))
+    for step in range(1, steps):
+        kick = random.normal(size=(walkers, 1))
+        chain[step] = rho * chain[step - 1] + np.sqrt(1.0 - rho**2) * kick
+    return chain
+
+
+def test_autocorrelation_time_is_that_of_emcee_and_of_the_closed_form() -> None:
+    chain = autoregression(3000, 16, 0.8)
+    tau = autocorrelation_time(chain)
+    assert tau == pytest.approx(emcee.autocorr.integrated_time(chain, quiet=True), rel=1e-10)
+    assert tau[0] == pytest.approx(9.0, rel=0.05)
+
+
+def test_r_hat_sees_ensembles_apart_and_drift() -> None:
+    chain = autoregression(2000, 16, 0.5)
+    assert r_hat(chain, 4)[0] < 1.002
+    apart = chain.copy()
+    apart[:, :4] += 1.0
+    assert r_hat(apart, 4)[0] > 1.05
+    drifting = chain + np.linspace(0.0, 1.0, 2000)[:, None, None]
+    assert r_hat(drifting, 4)[0] > 1.02
+
+
+def test_the_verdict_says_what_is_missing() -> None:
+    verdict = judge(autoregression(200, 16, 0.9), 4, wanted=5000.0)
+    assert not verdict.reached
+    assert "autocorrelation times, expected 50" in verdict.lacks[0]
+    assert "effective draws, expected 5000" in verdict.lacks[-1]
+    stuck = judge(np.ones((100, 8, 1)), 4, wanted=10.0)
+    assert not stuck.usable
+    assert stuck.lacks == ["some walkers never moved"]
+
+
+@pytest.mark.parametrize("proposal", [independent, differential_evolution, snooker])
+def test_every_move_alone_leaves_a_distribution_as_it_is(proposal: Proposal) -> None:
+    # skewed, in two dimensions: x gamma, y normal around x^2
+    target = stats.gamma(3.0)
+
+    def log_density(x: FloatArray) -> FloatArray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            first = np.where(x[:, 0] > 0.0, 2.0 * np.log(x[:, 0]) - x[:, 0], -np.inf)
+        return first - 0.5 * (x[:, 1] - 0.3 * x[:, 0]) ** 2
+
+    random = np.random.default_rng(5)
+    x = target.rvs((4 * 40, 1), random_state=random)
+    start = np.concatenate([x, 0.3 * x + random.normal(size=x.shape)], axis=1)
+    move = EnsembleMove(proposal, 4)
+    sampler = emcee.EnsembleSampler(160, 2, log_density, moves=[(move, 1.0)], vectorize=True)
+    seeded = np.random.RandomState(7).get_state()
+    sampler.run_mcmc(emcee.State(start, random_state=seeded), 2000)
+    chain = sampler.get_chain()
+    thin = int(np.ceil(autocorrelation_time(chain).max()))
+    draws = chain[::thin].reshape(-1, 2)
+    assert stats.kstest(draws[:, 0], target.cdf).pvalue > 0.01
+    assert stats.kstest(draws[:, 1] - 0.3 * draws[:, 0], "norm").pvalue > 0.01
+
+
+def test_checks_come_after_fixed_numbers_of_steps() -> None:
+    checks = [next_check(n, 10**6) for n in range(1, 2000)]
+    assert sorted(set(checks))[:5] == [200, 250, 350, 450, 600]
+    assert all(check >= n for n, check in enumerate(checks, start=1))
+    assert next_check(700, 730) == 730
+
+
+def test_the_same_seed_gives_the_same_chain() -> None:
+    data = friction_table()
+    first = di.sample(data, di.Dahl(), seed=4, steps=60)
+    again = di.sample(data, di.Dahl(), seed=4, steps=60)
+    other = di.sample(data, di.Dahl(), seed=5, steps=60)
+    np.testing.assert_array_equal(first.get_chain(), again.get_chain())
+    assert not np.array_equal(first.get_chain(), other.get_chain())
+    unseeded = di.sample(data, di.Dahl(), steps=60)
+    repeated = di.sample(data, di.Dahl(), steps=60, seed=unseeded.seed)
+    np.testing.assert_array_equal(unseeded.get_chain(), repeated.get_chain())
+
+
+def test_a_pool_gives_the_same_posterior() -> None:
+    data = friction_table()
+    with ThreadPoolExecutor(2) as pool:
+        spread = di.sample(data, di.Dahl(), seed=4, steps=40, pool=pool)
+    alone = di.sample(data, di.Dahl(), seed=4, steps=40)
+    np.testing.assert_allclose(spread.get_chain(), alone.get_chain(), rtol=1e-9)
+
+
+def test_walkers_start_at_finite_density_and_wide() -> None:
+    posterior = di.sample(friction_table(), di.Dahl(), seed=1, steps=300)
+    assert np.isfinite(posterior.get_log_prob()).all()
+    chain = posterior.get_chain()
+    assert chain[0].std(axis=0)[0] > 1.2 * chain[100:].std(axis=(0, 1))[0]
+
+
+def test_priors_alone_are_recovered_without_likelihood() -> None:
+    f_max = stats.lognorm(0.3, scale=0.2)
+    given: dict[str, Any] = {"f_max": f_max, "sigma": (5.0, 50.0)}
+    posterior = di.sample(friction_table(), di.Dahl(), priors=given, likelihood="none", seed=2)
+    assert posterior.names == ("f_max", "sigma")
+    thin = int(np.ceil(posterior.get_autocorr_time().max()))
+    draws = posterior.get_chain(discard=posterior.warm_up, thin=thin, flat=True)
+    assert stats.kstest(draws[:, 0], f_max.cdf).pvalue > 0.01
+    assert stats.kstest(np.log10(draws[:, 1] / 5.0), "uniform").pvalue > 0.01
+
+
+def test_the_posterior_moves_with_its_data() -> None:
+    data = friction_table()
+    assert data.amplitude is not None
+    stronger = di.FrequencyResponse(data.frequency_hz, 2.0 * data.response, data.amplitude)
+    one, two = (np.median(di.sample(d, di.Dahl(), seed=1).values, 0) for d in (data, stronger))
+    assert (two / one)[:2] == pytest.approx(2.0, rel=0.005)
+
+
+def test_student_t_resists_an_outlier() -> None:
+    data = friction_table(rows=20, noise=0.01)
+    response = data.response.copy()
+    response[10] *= 1.8
+    assert data.amplitude is not None
+    dirty = di.FrequencyResponse(data.frequency_hz, response, data.amplitude)
+    plain = di.sample(dirty, di.Dahl(), seed=1).values[:, 0]
+    robust = di.sample(dirty, di.Dahl(), seed=1, likelihood="student_t").values[:, 0]
+    assert robust.std() < 0.4 * plain.std()
+    assert np.median(robust) == pytest.approx(0.1, abs=0.002)
+
+
+def test_interchangeable_elements_keep_their_order() -> None:
+    amplitude = np.geomspace(1e-4, 1e-1, 25)
+    truth = di.Dahl(f_max=0.1, sigma=300.0, name="a") + di.Dahl(f_max=0.5, sigma=30.0, name="b")
+    random = np.random.default_rng(2)
+    noise = 0.01 * (random.normal(size=25) + 1j * random.normal(size=25))
+    exact = di.Problem(
+        di.FrequencyResponse(np.ones(25), np.ones(25) + 0j, amplitude), truth, free=["a_f_max"]
+    ).predict(np.log([0.1]))
+    data = di.FrequencyResponse(np.ones(25), exact * np.exp(noise), amplitude)
+    model = di.Dahl(name="a") + di.Dahl(name="b")
+    posterior = di.sample(data, model, seed=1, max_steps=1500)
+    values = posterior.values
+    assert (values[:, 0] / values[:, 1] < values[:, 2] / values[:, 3]).all()
+    assert np.median(values[:, 0]) == pytest.approx(0.1, rel=0.1)
+
+
+def test_sensor_priors_of_any_kind_are_sampled() -> None:
+    sensors = di.Sensors(force_gain=stats.uniform(0.95, 0.1))
+    posterior = di.sample(friction_table(), di.Dahl(), sensors=sensors, seed=1)
+    gain = posterior.values[:, posterior.names.index("force_gain")]
+    assert 0.95 <= gain.min() < 0.955
+    assert 1.045 < gain.max() <= 1.05
+    (rule,) = [r for r in posterior.prior_rules if r.name == "force_gain"]
+    assert rule.width == pytest.approx(1.0, abs=0.1)
+
+
+def test_known_noise_has_no_scale() -> None:
+    posterior = di.sample(with_covariance(friction_table(), 0.02), di.Dahl(), seed=1, steps=50)
+    assert posterior.names == ("f_max", "sigma")
+
+
+def test_a_fit_is_taken_over() -> None:
+    data = friction_table()
+    fit = di.fit(data, di.Dahl())
+    assert di.sample(fit, seed=1, steps=50).problem is fit.problem
+    with pytest.raises(ValidationError, match="noise, free is given beside a FitResult"):
+        di.sample(fit, noise="absolute", free=["alpha"])
+
+
+def test_refusals() -> None:
+    data = friction_table()
+    with pytest.raises(ModelError, match="there is no model"):
+        di.sample(data)
+    with pytest.raises(ValidationError, match="walkers is 33; expected a whole number >= 48"):
+        di.sample(data, di.Dahl(), walkers=33)
+    with pytest.raises(ValidationError, match="walkers is 100; expected a multiple of 8"):
+        di.sample(data, di.Dahl(), walkers=100)
+    with pytest.raises(ValidationError, match="likelihood is 'cauchy'; expected one of gaussian"):
+        di.sample(data, di.Dahl(), likelihood="cauchy")
+    exact = FRICTION.describing_function(np.array([1e-3, 2e-3, 4e-3]))
+    perfect = di.FrequencyResponse(np.ones(3), exact, np.array([1e-3, 2e-3, 4e-3]))
+    with pytest.raises(SamplingError, match="leaves no noise whose scale could be estimated"):
+        di.sample(perfect, di.Dahl())

@@ -1,0 +1,112 @@
+"""Priors: densities, defaults, refusals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import dahl_ident as di
+from dahl_ident.bayes.priors import joint_prior
+from dahl_ident.errors import ModelError, ValidationError
+from tests.bayes_cases import friction_table
+
+
+def problem(**options: Any) -> di.Problem:
+    return di.Problem(friction_table(), di.Dahl(), **options)
+
+
+def test_bounds_are_log_uniform() -> None:
+    prior = joint_prior(problem(), {"f_max": (0.01, 1.0), "sigma": (3.0, 300.0)})
+    theta = np.log([[0.1, 30.0], [0.001, 30.0], [0.1, 301.0]])
+    density = prior.log_density(theta)
+    assert density[0] == pytest.approx(-2.0 * np.log(np.log(100.0)))
+    assert density[1:].tolist() == [-np.inf, -np.inf]
+    assert prior.parts[0].quantile(np.array([0.5])) == pytest.approx(np.log(0.1))
+
+
+def test_a_distribution_of_the_value_gets_its_jacobian() -> None:
+    given = stats.lognorm(0.5, scale=0.1)
+    part = joint_prior(problem(), {"f_max": given}).parts[0]
+    theta = np.array([-3.0, -2.0])
+    # the logarithm of a lognormal value is normal
+    assert part.log_density(theta) == pytest.approx(stats.norm(np.log(0.1), 0.5).logpdf(theta))
+    assert part.width == pytest.approx(0.5 * np.diff(stats.norm.ppf([0.16, 0.84]))[0])
+
+
+def test_a_normal_prior_equals_that_of_scipy() -> None:
+    sensors = di.Sensors(force_gain=stats.norm(1.0, 0.005), delay=stats.norm(0.0, 2e-5))
+    prior = joint_prior(problem(sensors=sensors))
+    gain, delay = prior.parts[2:]
+    assert (gain.source, delay.source) == ("sensors", "sensors")
+    theta = np.array([-0.01, 0.004])
+    exact = stats.norm(1.0, 0.005).logpdf(np.exp(theta)) + theta
+    assert gain.log_density(theta) == pytest.approx(exact)
+    assert delay.log_density(1e-5 * theta) == pytest.approx(
+        stats.norm(0.0, 2e-5).logpdf(1e-5 * theta)
+    )
+
+
+def test_draws_follow_the_prior() -> None:
+    prior = joint_prior(problem(), {"f_max": stats.gamma(3.0, scale=0.03), "sigma": (1.0, 10.0)})
+    draws = np.exp(prior.draw(np.random.default_rng(1), 4000))
+    assert stats.kstest(draws[:, 0], stats.gamma(3.0, scale=0.03).cdf).pvalue > 0.01
+    assert stats.kstest(np.log10(draws[:, 1]), "uniform").pvalue > 0.01
+
+
+def test_defaults_hold_what_the_data_show() -> None:
+    data = friction_table()
+    prior = joint_prior(problem())
+    stiffness = np.abs(data.response)
+    assert data.amplitude is not None
+    force = stiffness * data.amplitude
+    low, high = np.exp(prior.parts[0].limits)
+    assert (low, high) == pytest.approx((force.min() / 1e3, force.max() * 1e3))
+    low, high = np.exp(prior.parts[1].limits)
+    assert (low, high) == pytest.approx((stiffness.min() / 1e3, stiffness.max() * 1e3))
+    assert "log-uniform from" in str(prior)
+    assert "(from the size of the data)" in str(prior)
+    text = str(joint_prior(problem(), {"f_max": (0.01, 1.0)}).parts[0])
+    assert text == "log-uniform from 0.01 to 1 N"
+
+
+def test_plants_and_sensors_have_defaults() -> None:
+    plant = di.Dahl(alpha=1.0) + di.Spring() + di.Mass() + di.Damper()
+    sensors = di.Sensors(force_gain=None, delay=None)
+    made = di.Problem(friction_table(), plant, sensors=sensors, free=["alpha"])
+    prior = joint_prior(made)
+    limits = dict(zip(made.names, (part.limits for part in prior.parts), strict=True))
+    assert np.exp(limits["alpha"]) == pytest.approx((0.1, 10.0))
+    assert limits["delay"] == pytest.approx((-0.5, 0.5))
+    assert limits["stiffness"][0] == -limits["stiffness"][1]
+    largest = np.abs(friction_table().response).max()
+    assert limits["stiffness"][1] == pytest.approx(10.0 * largest)
+    assert limits["mass"][1] == pytest.approx(10.0 * largest / (2.0 * np.pi) ** 2)
+
+
+def test_defaults_of_plants_hold_a_larger_estimate() -> None:
+    made = di.Problem(friction_table(), di.Dahl() + di.Spring())
+    prior = joint_prior(made, estimate=np.array([-2.0, 3.0, -1e5]))
+    assert prior.parts[2].limits == pytest.approx((-1e6, 1e6))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ((0.0, 1.0), "has the bounds 0 and 1; expected 0 < low < high"),
+        ((2.0, 1.0), "has the bounds 2 and 1; expected 0 < low < high"),
+        (3.0, "prior of f_max is 3.0; expected a frozen distribution"),
+        (stats.norm(0.1, 0.1), "norm, mean 0.1, std 0.1, has 0.16 of its probability outside"),
+        ((0.1, np.nan), r"prior of f_max\[1\] is nan"),
+    ],
+)
+def test_bad_priors_are_refused(given: Any, message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        joint_prior(problem(), {"f_max": given})
+
+
+def test_priors_of_unknown_names_are_refused() -> None:
+    with pytest.raises(ModelError, match="a prior for alpha, but free are f_max, sigma"):
+        joint_prior(problem(), {"alpha": (0.1, 10.0)})

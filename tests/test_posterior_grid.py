@@ -1,0 +1,167 @@
+"""Quadrature against closed forms, scipy's integration, and its own limits."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy import integrate as scipy_integrate
+from scipy import stats
+
+import dahl_ident as di
+from dahl_ident.arrays import FloatArray
+from dahl_ident.bayes.noise_scale import ScalePosterior
+from dahl_ident.bayes.quadrature import Grid, integrate, rule
+from dahl_ident.errors import ModelError, SamplingError, ValidationError
+from tests.bayes_cases import FRICTION, X_C, friction_table, with_covariance
+
+LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
+
+
+def gaussian_grid(mean: FloatArray, covariance: FloatArray, low: float, high: float) -> Grid:
+    density = stats.multivariate_normal(mean, covariance)
+    D = len(mean)
+    box = np.full(D, low), np.full(D, high)
+
+    def log_density(theta: FloatArray) -> FloatArray:
+        inside = ((theta >= low) & (theta <= high)).all(axis=1)
+        return np.where(inside, np.atleast_1d(density.logpdf(theta)), -np.inf)
+
+    return integrate(log_density, box, mean + 0.1, 1.3 * covariance)
+
+
+def test_the_rule_is_exact_for_polynomials() -> None:
+    x = rule().nodes
+    for power in range(9):
+        exact = (1.0 - (-1.0) ** (power + 1)) / (power + 1)
+        assert rule().weights @ x**power == pytest.approx(exact, abs=1e-14)
+        if power < 5:
+            assert rule().coarse @ x**power == pytest.approx(exact, abs=1e-14)
+    assert np.all(rule().weights > 0.0)
+
+
+@pytest.mark.parametrize("dims", [1, 2, 3])
+@pytest.mark.parametrize("correlation", [0.0, 0.97])
+def test_a_gaussian_in_a_wide_box(dims: int, correlation: float) -> None:
+    std = np.array([0.5, 0.002, 0.05])[:dims]
+    matrix = np.full((dims, dims), correlation) + (1.0 - correlation) * np.eye(dims)
+    mean = np.array([1.0, -2.0, 0.3])[:dims]
+    grid = gaussian_grid(mean, matrix * np.outer(std, std), -10.0, 10.0)
+    assert grid.error < 1e-4
+    assert abs(grid.log_evidence) < 1e-4
+    assert grid.weights.sum() == pytest.approx(1.0, abs=1e-12)
+    for axis in range(dims):
+        found = (grid.quantiles(axis, LEVELS) - mean[axis]) / std[axis]
+        assert stats.norm.cdf(found) == pytest.approx(LEVELS, abs=1e-4)
+
+
+def test_a_wall_cuts_the_density() -> None:
+    grid = gaussian_grid(np.array([0.2, 0.0]), np.diag([1.0, 0.01]), 0.0, 10.0)
+    inside = stats.norm.sf(-0.2) * 0.5
+    assert grid.log_evidence == pytest.approx(np.log(inside), abs=1e-4)
+
+
+def test_the_noise_scale_follows_its_closed_form() -> None:
+    # one point: s^2 is inverse gamma
+    scale = ScalePosterior(np.array([0.8]), np.array([1.0]), 6)
+    exact = stats.invgamma(6, scale=0.4)
+    assert scale.quantiles(LEVELS) == pytest.approx(np.sqrt(exact.ppf(LEVELS)), rel=1e-9)
+    mean = exact.expect(np.sqrt)
+    assert scale.mean() == pytest.approx(mean, rel=1e-7)
+    assert scale.std() == pytest.approx(np.sqrt(exact.mean() - mean**2), rel=1e-6)
+
+
+def test_one_parameter_against_scipy() -> None:
+    data = friction_table(rows=5, noise=0.3)
+    prior = (0.01, 1.0)
+    grid = di.posterior_grid(data, di.Dahl(sigma=30.0), priors={"f_max": prior})
+    problem = di.Problem(data, di.Dahl(sigma=30.0))
+
+    def density(theta: float, moment: int = 0) -> float:
+        # the scale integrated out by hand: Gamma(n) / (2 (pi S)^n) / |R|^2 ...
+        y = np.log(data.response / problem.predict(np.array([theta])))
+        S = float(np.sum(np.abs(y) ** 2))
+        constants = 24.0 / 2.0 / np.pi**5 / np.prod(np.abs(data.response) ** 2)
+        return float(constants * S**-5.0 / np.log(100.0) * np.exp(moment * theta))
+
+    ends = float(np.log(prior[0])), float(np.log(prior[1]))
+    moments = [
+        scipy_integrate.quad(partial(density, moment=k), *ends, epsrel=1e-10, limit=400)[0]
+        for k in range(3)
+    ]
+    assert grid.log_evidence == pytest.approx(np.log(moments[0]), abs=1e-4)
+    mean = moments[1] / moments[0]
+    assert grid.mean()[0] == pytest.approx(mean, rel=1e-4)
+    assert grid.std()[0] == pytest.approx(np.sqrt(moments[2] / moments[0] - mean**2), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("rows", "low", "high", "noise"),
+    [(30, 0.3, 3.0, 0.01), (3, 0.3, 3.0, 0.5), (10, 0.003, 0.03, 0.01), (10, 30.0, 300.0, 0.01)],
+)
+def test_the_stated_error_holds(rows: int, low: float, high: float, noise: float) -> None:
+    data = friction_table(rows, low, high, noise)
+    grid = di.posterior_grid(data, di.Dahl())
+    exact = di.posterior_grid(data, di.Dahl(), tolerance=1e-6)
+    assert grid.converged
+    assert grid.error < 1e-4
+    assert abs(grid.log_evidence - exact.log_evidence) < grid.error
+    for name in grid.names:
+        below = exact.quantile(name, LEVELS)
+        assert grid.quantile(name, LEVELS) == pytest.approx(below, rel=3e-3)
+
+
+def test_evidence_of_a_free_exponent_is_lower_where_the_exponent_is_one() -> None:
+    data = friction_table(rows=8, noise=0.05)
+    priors = {"f_max": (0.01, 1.0), "sigma": (3.0, 300.0)}
+    plain = di.posterior_grid(data, di.Dahl(), priors=priors)
+    wider = di.posterior_grid(
+        data, di.Dahl(), priors={**priors, "alpha": (0.3, 3.0)}, free=["alpha"], tolerance=1e-2
+    )
+    assert wider.log_evidence < plain.log_evidence
+
+
+def test_scale_free_and_scale_known_agree_for_many_rows() -> None:
+    table = friction_table(rows=200, noise=0.02)
+    free = di.posterior_grid(table, di.Dahl())
+    known = di.posterior_grid(with_covariance(table, 0.02), di.Dahl())
+    assert known.names == ("f_max", "sigma")
+    # the scale is known to 5 % from 400 residuals
+    assert known.std()[:2] == pytest.approx(free.std()[:2], rel=0.15)
+    assert float(free.quantile("noise_scale", 0.5)) == pytest.approx(0.02, rel=0.12)
+
+
+def test_a_microslip_posterior_names_the_prior() -> None:
+    grid = di.posterior_grid(friction_table(10, 0.0003, 0.003, 0.05), di.Dahl())
+    (rule_,) = grid.prior_rules
+    assert str(rule_).startswith("f_max is set by its prior: posterior width 0.")
+    assert rule_.at_upper_end
+    assert "reaches the prior's upper end" in str(rule_)
+    assert "f_max is set by its prior" in grid.report()
+
+
+def test_expectation_and_draws() -> None:
+    grid = di.posterior_grid(friction_table(), di.Dahl())
+    x_c = grid.expectation(lambda f_max, sigma: f_max / sigma)
+    assert x_c == pytest.approx(X_C, rel=0.05)
+    draws = grid.draws(4000, seed=1)
+    assert (draws[:, 0] / draws[:, 1]).mean() == pytest.approx(x_c, rel=0.01)
+
+
+def test_refusals() -> None:
+    data = friction_table()
+    plant = di.Dahl() + di.Spring() + di.Damper()
+    with pytest.raises(SamplingError, match=r"4 parameters are free \(f_max, sigma, stiffness"):
+        di.posterior_grid(data, plant)
+    with pytest.raises(ModelError, match="there is no 'mass'; expected one of f_max, sigma"):
+        di.posterior_grid(data, di.Dahl()).quantile("mass", 0.5)
+    with pytest.raises(ValidationError, match="unknown noise scale has no closed integral"):
+        di.posterior_grid(data, di.Dahl(), likelihood="student_t")
+    exact = FRICTION.describing_function(np.array([1e-3, 2e-3, 4e-3]))
+    perfect = di.FrequencyResponse(np.ones(3), exact, np.array([1e-3, 2e-3, 4e-3]))
+    with pytest.raises(SamplingError, match="leaves no noise whose scale could be estimated"):
+        di.posterior_grid(perfect, di.Dahl())
+    two = friction_table(rows=1)
+    with pytest.raises(SamplingError, match="2 residuals cannot tell 2 parameters and the scale"):
+        di.posterior_grid(two, di.Dahl())
