@@ -10,13 +10,28 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dahl_ident.control_interop import DahlNonlinearity, limit_cycles
+    from dahl_ident.control_interop import (
+        DahlNonlinearity,
+        equivalent_plant,
+        level_responses,
+        limit_cycles,
+        loop_margins,
+        response_branches,
+    )
     from dahl_ident.data import FrequencyResponse, Record, read_frequency_response, read_record
     from dahl_ident.diagnostics import compare_models, identifiability
     from dahl_ident.elements import Dahl, Damper, LinearSystem, Mass, Model, Spring
     from dahl_ident.problem import Problem
     from dahl_ident.reporting import report
-    from dahl_ident.results import FitResult, Posterior, fit, posterior_grid, sample
+    from dahl_ident.results import (
+        FitBatch,
+        FitResult,
+        Posterior,
+        fit,
+        fit_many,
+        posterior_grid,
+        sample,
+    )
     from dahl_ident.sensors import Sensors
     from dahl_ident.steady_state import response
     from dahl_ident.synthetic import load_dataset, simulate
@@ -24,7 +39,14 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _ROOMS = {
-    "dahl_ident.control_interop": ("DahlNonlinearity", "limit_cycles"),
+    "dahl_ident.control_interop": (
+        "DahlNonlinearity",
+        "equivalent_plant",
+        "level_responses",
+        "limit_cycles",
+        "loop_margins",
+        "response_branches",
+    ),
     "dahl_ident.data": (
         "FrequencyResponse",
         "Record",
@@ -35,7 +57,15 @@ _ROOMS = {
     "dahl_ident.elements": ("Dahl", "Damper", "LinearSystem", "Mass", "Model", "Spring"),
     "dahl_ident.problem": ("Problem",),
     "dahl_ident.reporting": ("report",),
-    "dahl_ident.results": ("FitResult", "Posterior", "fit", "posterior_grid", "sample"),
+    "dahl_ident.results": (
+        "FitBatch",
+        "FitResult",
+        "Posterior",
+        "fit",
+        "fit_many",
+        "posterior_grid",
+        "sample",
+    ),
     "dahl_ident.sensors": ("Sensors",),
     "dahl_ident.steady_state": ("response",),
     "dahl_ident.synthetic": ("load_dataset", "simulate"),
@@ -46,6 +76,7 @@ __all__ = [
     "Dahl",
     "DahlNonlinearity",
     "Damper",
+    "FitBatch",
     "FitResult",
     "FrequencyResponse",
     "LinearSystem",
@@ -57,15 +88,20 @@ __all__ = [
     "Sensors",
     "Spring",
     "compare_models",
+    "equivalent_plant",
     "fit",
+    "fit_many",
     "identifiability",
+    "level_responses",
     "limit_cycles",
     "load_dataset",
+    "loop_margins",
     "posterior_grid",
     "read_frequency_response",
     "read_record",
     "report",
     "response",
+    "response_branches",
     "sample",
     "simulate",
 ]

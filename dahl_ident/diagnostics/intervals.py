@@ -20,9 +20,9 @@ Where the noise's scale was estimated, thresholds are those of Student's t and F
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Optimum
 
 Method = Literal["wald", "profile", "bootstrap"]
+METHODS: tuple[Method, ...] = get_args(Method)
 
 
 class Interval(NamedTuple):
@@ -96,6 +97,10 @@ class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
         row = np.isclose(self.levels, level)
         return replace(self, levels=self.levels[row], lower=self.lower[row], upper=self.upper[row])
 
+    def noted(self, note: str) -> ConfidenceIntervals:
+        """Return these intervals with another note."""
+        return replace(self, note=note)
+
     def __str__(self) -> str:
         head = ["", *(f"-{percent(c)}" for c in self.levels[::-1]), "estimate"]
         head += [percent(c) for c in self.levels]
@@ -115,15 +120,6 @@ class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
             for interval in self[name]
         ]
         return pd.DataFrame(rows)
-
-
-def intervals(
-    optimum: Optimum, method: Method, levels: Sequence[float] = LEVELS
-) -> ConfidenceIntervals:
-    """Return the intervals of one method."""
-    if method not in _METHODS:
-        raise ValidationError(f"method is {method!r}; expected one of {', '.join(_METHODS)}")
-    return _METHODS[method](optimum, levels)
 
 
 def wald_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> ConfidenceIntervals:
@@ -200,12 +196,6 @@ def intervals_from_search(
         problem.to_values(np.minimum(upper, high)),
         note,
     )
-
-
-_METHODS: dict[str, Callable[[Optimum, Sequence[float]], ConfidenceIntervals]] = {
-    "wald": wald_intervals,
-    "profile": profile_intervals,
-}
 
 
 class Disagreement(NamedTuple):

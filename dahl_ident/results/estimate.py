@@ -2,27 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from numpy.typing import ArrayLike
 
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.elements import Element
-from dahl_ident.errors import FitError
-from dahl_ident.fitting import solve
-from dahl_ident.problem import Problem
+from dahl_ident.errors import FitError, ValidationError
+from dahl_ident.fitting import solve, solve_many
+from dahl_ident.problem import Problem, ProblemBatch
+from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.sensors import Sensors
+
+if TYPE_CHECKING:
+    from dahl_ident.fitting.casadi_constraints import Constraints
 
 
 def fit(
     data: FrequencyResponse,
     model: Element,
     *,
+    method: str = "scipy",
     free: Iterable[str] = (),
     fixed: Mapping[str, float] | None = None,
     noise: str | None = None,
     sensors: Sensors | None = None,
     loss: str = "linear",
     start: Mapping[str, float] | None = None,
+    constraints: Constraints | None = None,
+    drive_std: ArrayLike | None = None,
+    drive_covariance: ArrayLike | None = None,
     throw: bool = True,
 ) -> FitResult:
     """Estimate a model's free parameters by least squares; no guess is needed.
@@ -34,6 +45,9 @@ def fit(
         a drive.
     model : Element
         One element or a sum, such as ``Dahl() + Mass(0.3)``. Numbers are fixed, the rest free.
+    method : {"scipy", "ipopt"}, default "scipy"
+        "scipy" is least squares with a global start. "ipopt" goes on from there with exact second
+        derivatives, and alone takes `constraints` and noise in the drive; same optimum, slower.
     free : iterable of str, optional
         Names of given parameters to estimate all the same, from their values.
     fixed : mapping of str to float, optional
@@ -46,6 +60,12 @@ def fit(
         A robust loss makes outliers count less; the noise's scale is estimated robustly then.
     start : mapping of str to float, optional
         One more start for the search: values of some or all free parameters.
+    constraints : callable, optional
+        With "ipopt": takes a mapping of every parameter's name to its casadi symbol and returns
+        comparisons, such as ``lambda p: [p["sigma"] >= 100 * p["f_max"]]``.
+    drive_std, drive_covariance : array_like, shapes (n,) and (n, 2), optional
+        With "ipopt", for force-controlled rows: standard deviation of the measured drive, and its
+        covariance with real and imaginary part of the response.
     throw : bool, default True
         Raise where the data give no finite optimum; otherwise return what was found, with its
         `status`.
@@ -78,7 +98,74 @@ def fit(
     (0.1, True)
     """
     problem = Problem(data, model, noise=noise, sensors=sensors, free=free, fixed=fixed)
-    result = FitResult(solve(problem, loss=loss, start=start))
+    tied = constraints is not None or drive_std is not None
+    if method == "ipopt":
+        from dahl_ident.fitting.ipopt import solve_ipopt
+
+        optimum = solve_ipopt(
+            problem,
+            constraints=constraints,
+            start=start,
+            loss=loss,
+            drive_std=drive_std,
+            drive_covariance=drive_covariance,
+        )
+    elif method != "scipy":
+        raise ValidationError(f"method is {method!r}; expected scipy or ipopt")
+    elif tied:
+        raise ValidationError("constraints and drive_std need method='ipopt'")
+    else:
+        optimum = solve(problem, loss=loss, start=start)
+    result = FitResult(optimum, first_order=tied)
     if throw and not result.success:
         raise FitError(result.message, result)
     return result
+
+
+def fit_many(
+    tables: Sequence[FrequencyResponse],
+    model: Element,
+    *,
+    free: Iterable[str] = (),
+    fixed: Mapping[str, float] | None = None,
+    noise: str | None = None,
+    sensors: Sensors | None = None,
+) -> FitBatch:
+    """Estimate one model's parameters from each of many tables at once.
+
+    Parameters
+    ----------
+    tables : sequence of FrequencyResponse
+        With the same number of rows, quantity, harmonics and controlled variable.
+    model, free, fixed, noise, sensors
+        As for :func:`fit`.
+
+    Returns
+    -------
+    FitBatch
+        Estimates and standard errors of all tables; ``batch[i]`` is the :class:`FitResult` of
+        one of them, with everything that a single fit offers.
+
+    Raises
+    ------
+    DataError
+        If the tables do not agree in shape, or there is none.
+    ModelError
+        If nothing is free, or a name is unknown.
+    FitError
+        If there are fewer numbers than parameters.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dahl_ident import Dahl, FrequencyResponse
+    >>> A = np.geomspace(1e-4, 1e-2, 9)
+    >>> tables = [
+    ...     FrequencyResponse(np.ones(9), Dahl(f_max, 30.0).describing_function(A), A)
+    ...     for f_max in (0.1, 0.2)
+    ... ]
+    >>> fit_many(tables, Dahl()).values.round(6).tolist()
+    [[0.1, 30.0], [0.2, 30.0]]
+    """
+    batch = ProblemBatch(tables, model, noise=noise, sensors=sensors, free=free, fixed=fixed)
+    return FitBatch(tuple(tables), solve_many(batch))

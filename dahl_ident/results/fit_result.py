@@ -17,16 +17,20 @@ from dahl_ident.diagnostics.bands import (
     describing_function_band,
     response_band,
 )
+from dahl_ident.diagnostics.bootstrap import REPLICATES, bootstrap_intervals
 from dahl_ident.diagnostics.goodness import Goodness, goodness
 from dahl_ident.diagnostics.intervals import (
+    METHODS,
     ConfidenceIntervals,
     IntervalComparison,
     Method,
     compare,
-    intervals,
+    profile_intervals,
+    wald_intervals,
 )
 from dahl_ident.diagnostics.levels import LEVELS
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
+from dahl_ident.errors import ValidationError
 from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.results import report, storage
 from dahl_ident.results.fit_numbers import FitNumbers
@@ -70,49 +74,76 @@ class FitResult(FitNumbers):
         The model with the estimates put in.
     """
 
-    def __init__(self, optimum: Optimum) -> None:
+    def __init__(self, optimum: Optimum, *, first_order: bool = False) -> None:
         super().__init__(optimum)
-        self._intervals: dict[tuple[str, tuple[float, ...]], ConfidenceIntervals] = {}
+        self._first_order = first_order
+        self._intervals: dict[tuple[Any, ...], ConfidenceIntervals] = {}
 
     # Judging
 
     def conf_interval(
-        self, method: Method = "profile", levels: Sequence[float] = LEVELS
+        self,
+        method: Method = "profile",
+        levels: Sequence[float] = LEVELS,
+        *,
+        replicates: int = REPLICATES,
+        seed: int = 0,
     ) -> ConfidenceIntervals:
         """Return confidence intervals of every free parameter.
 
         Parameters
         ----------
-        method : {"profile", "wald"}, default "profile"
+        method : {"profile", "wald", "bootstrap"}, default "profile"
             See :mod:`dahl_ident.diagnostics.intervals`, which says what to use when.
         levels : sequence of float, default 0.6827, 0.9545, 0.9973
             Confidence levels.
+        replicates, seed : int
+            Of the bootstrap.
 
         Returns
         -------
         ConfidenceIntervals
             A mapping from the parameter's name to its intervals; a side on which the data set no
-            limit is open. Profiles never raise, however badly a parameter is determined.
+            limit is open. Profiles never raise, however badly a parameter is determined. Where
+            the fit had constraints or noise in the drive, intervals are those of Wald.
 
         Raises
         ------
         ValidationError
-            If `method` is unknown or a level is not between 0 and 1.
+            If `method` is unknown, a level is not between 0 and 1, or repetitions of a fit with
+            a robust loss are wanted.
+        FitError
+            If there is no optimum to repeat.
         """
-        key = (method, tuple(levels))
+        if method not in METHODS:
+            raise ValidationError(f"method is {method!r}; expected one of {', '.join(METHODS)}")
+        key = (method, tuple(levels), replicates, seed)
         if key not in self._intervals:
-            self._intervals[key] = intervals(self._optimum, method, levels)
+            self._intervals[key] = self._new_intervals(method, levels, replicates, seed)
         return self._intervals[key]
 
+    def _new_intervals(
+        self, method: Method, levels: Sequence[float], replicates: int, seed: int
+    ) -> ConfidenceIntervals:
+        if self._first_order:
+            note = "first order: the fit had constraints or noise in the drive"
+            return wald_intervals(self._optimum, levels).noted(note)
+        if method == "bootstrap":
+            return bootstrap_intervals(self._optimum, levels, replicates, seed)
+        quick = wald_intervals if method == "wald" else profile_intervals
+        return quick(self._optimum, levels)
+
     def compare_intervals(
-        self, methods: Sequence[Method] = ("wald", "profile"), levels: Sequence[float] = LEVELS
+        self,
+        methods: Sequence[Method] = ("wald", "bootstrap", "profile"),
+        levels: Sequence[float] = LEVELS,
     ) -> IntervalComparison:
         """Return the intervals of several methods side by side, and where they disagree.
 
         Parameters
         ----------
-        methods : sequence of str, default ("wald", "profile")
-            The last is the most trusted.
+        methods : sequence of str, default ("wald", "bootstrap", "profile")
+            The last is the most trusted; each of the others is compared with it.
         levels : sequence of float, default 0.6827, 0.9545, 0.9973
             Confidence levels.
 
@@ -301,7 +332,7 @@ class FitResult(FitNumbers):
 
     def to_json(self) -> str:
         """Return the fit as JSON: data, model, noise, sensors and optimum."""
-        return storage.to_json(self._optimum)
+        return storage.to_json(self._optimum, self._first_order)
 
     @classmethod
     def from_json(cls, text: str) -> FitResult:
@@ -312,7 +343,8 @@ class FitResult(FitNumbers):
         DataError
             If the text holds no fit, or one of a later version's schema.
         """
-        return cls(storage.from_json(text))
+        optimum, first_order = storage.from_json(text)
+        return cls(optimum, first_order=first_order)
 
     def save(self, path: str | Path) -> None:
         """Write the fit to a JSON file."""
@@ -327,7 +359,8 @@ class FitResult(FitNumbers):
         DataError
             If the file holds no fit, or one of a later version's schema.
         """
-        return cls(storage.load(path))
+        optimum, first_order = storage.load(path)
+        return cls(optimum, first_order=first_order)
 
     def __repr__(self) -> str:
         estimates = ", ".join(str(self.params[name]) for name in self.var_names)

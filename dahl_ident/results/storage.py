@@ -34,7 +34,7 @@ _COLUMNS = (
 _SENSORS = ("force_gain", "displacement_gain", "delay")
 
 
-def to_dict(optimum: Optimum) -> dict[str, Any]:
+def to_dict(optimum: Optimum, first_order: bool) -> dict[str, Any]:
     """Return a fit as plain data."""
     problem = optimum.problem
     return {
@@ -58,6 +58,7 @@ def to_dict(optimum: Optimum) -> dict[str, Any]:
             "message": optimum.message,
             "method": optimum.method,
             "loss": optimum.loss,
+            "first_order": first_order,
             "combinations": [
                 {"expression": c.expression, "value": _plain(c.value), "stderr": _plain(c.stderr)}
                 for c in optimum.combinations
@@ -66,11 +67,11 @@ def to_dict(optimum: Optimum) -> dict[str, Any]:
     }
 
 
-def from_dict(content: Mapping[str, Any], source: str = "the content") -> Optimum:
-    """Return the fit that :func:`to_dict` described."""
+def from_dict(content: Mapping[str, Any], source: str = "the content") -> tuple[Optimum, bool]:
+    """Return the fit that :func:`to_dict` described, and whether only first order holds."""
     _check_schema(content, source)
     try:
-        return _optimum(content)
+        return _optimum(content), content["optimum"]["first_order"]
     except (KeyError, TypeError) as exc:
         raise DataError(
             f"{source} says {SCHEMA}, version {content['schema_version']}, but lacks or garbles "
@@ -78,12 +79,12 @@ def from_dict(content: Mapping[str, Any], source: str = "the content") -> Optimu
         ) from exc
 
 
-def to_json(optimum: Optimum) -> str:
+def to_json(optimum: Optimum, first_order: bool) -> str:
     """Return a fit as JSON text; numbers that JSON does not know are text, such as "inf"."""
-    return json.dumps(to_dict(optimum), allow_nan=False, indent=1)
+    return json.dumps(to_dict(optimum, first_order), allow_nan=False, indent=1)
 
 
-def from_json(text: str, source: str = "the text") -> Optimum:
+def from_json(text: str, source: str = "the text") -> tuple[Optimum, bool]:
     """Return the fit that JSON text holds."""
     try:
         content = json.loads(text)
@@ -92,7 +93,7 @@ def from_json(text: str, source: str = "the text") -> Optimum:
     return from_dict(content, source)
 
 
-def load(path: str | Path) -> Optimum:
+def load(path: str | Path) -> tuple[Optimum, bool]:
     """Return the fit that a file holds."""
     return from_json(Path(path).read_text(encoding="utf-8"), str(path))
 

@@ -1,0 +1,103 @@
+"""Fits of many tables at once: estimates side by side, each table's full result on request."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.fitting import OptimumBatch, Status, solve
+from dahl_ident.problem import Problem
+from dahl_ident.results.fit_result import FitResult
+
+
+@dataclass(frozen=True)
+class FitBatch(Sequence[FitResult]):
+    """One model fitted to each of S tables; made by :func:`dahl_ident.fit_many`.
+
+    A sequence: ``batch[i]`` fits table i by itself, from the estimate found here.
+
+    Attributes
+    ----------
+    tables : tuple of FrequencyResponse
+        What was fitted.
+    optima : OptimumBatch
+        The solver's plain result.
+    """
+
+    tables: tuple[FrequencyResponse, ...]
+    optima: OptimumBatch
+
+    def __len__(self) -> int:
+        return len(self.tables)
+
+    @overload
+    def __getitem__(self, index: int) -> FitResult: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[FitResult]: ...
+
+    def __getitem__(self, index: int | slice) -> FitResult | list[FitResult]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        own, first = self.optima.problem, self.optima.theta[index]
+        problem = Problem(self.tables[index], own.model, noise=own.noise, sensors=own.sensors)
+        found = np.isfinite(self.optima.values[index]).all()
+        start = dict(zip(problem.names, problem.to_values(first).tolist(), strict=True))
+        return FitResult(solve(problem, start=start if found else None))
+
+    def __iter__(self) -> Iterator[FitResult]:
+        return (self[i] for i in range(len(self)))
+
+    @property
+    def var_names(self) -> list[str]:
+        """Names of the P free parameters."""
+        return list(self.optima.names)
+
+    @property
+    def values(self) -> FloatArray:
+        """Estimates, shape (S, P); infinite or zero where an optimum lies there."""
+        return self.optima.values
+
+    @property
+    def stderr(self) -> FloatArray:
+        """Standard errors, first order, shape (S, P)."""
+        return self.optima.stderr
+
+    @property
+    def scale(self) -> FloatArray:
+        """Standard deviation of the residuals, shape (S,)."""
+        return self.optima.scale
+
+    @property
+    def status(self) -> tuple[Status, ...]:
+        """How each search ended."""
+        return self.optima.status
+
+    @property
+    def success(self) -> NDArray[np.bool_]:
+        """Whether each table has a finite optimum, shape (S,)."""
+        return self.optima.success
+
+    def to_frame(self) -> Any:
+        """Return a pandas table: one row a table, value and error of each parameter."""
+        import pandas as pd
+
+        columns: dict[str, Any] = {}
+        for i, name in enumerate(self.var_names):
+            columns[name] = self.values[:, i]
+            columns[f"{name}_stderr"] = self.stderr[:, i]
+        columns["scale"] = self.scale
+        columns["status"] = [status.name for status in self.status]
+        return pd.DataFrame(columns)
+
+    def __repr__(self) -> str:
+        ends = Counter(status.name.lower() for status in self.status)
+        told = ", ".join(f"{count} {name}" for name, count in ends.items())
+        return f"<FitBatch: {len(self)} tables, free {', '.join(self.var_names)}; {told}>"
