@@ -356,7 +356,7 @@ def _friction(element: Dahl, values: Sequence[ca.SX], amplitude: ca.SX, harmonic
 def _student(dof: ca.SX, squares: ca.SX) -> ca.SX:
     import casadi as ca
 
-    return (dof + 1.0) * ca.log1p(squares / dof)
+    return (dof - 2.0) * ca.log1p(squares / dof)
 
 
 def _robust(name: str, squares: ca.SX) -> ca.SX:
