@@ -33,6 +33,7 @@ _MOST_DAMPING = 1e12
 _LONGEST_STEP = 2.0  # of a logarithm
 _NOISE_TOLERANCE = 1e-8
 _REMAINDER = 3e-7
+_LAST_STEP = 1e-6  # of a logarithm: the Hessian is that before the last step
 _ROUNDING_TOLERANCE = 1e-13
 
 
@@ -109,8 +110,12 @@ def gauss_newton(
         lever = size * np.where(logarithmic, 1.0, theta)
         if not 0.0 < size.min() <= size.max() < np.inf:
             return None
-        step = np.linalg.solve(at.hessian / size / size[:, None], at.gradient / size) / -size
-        if not (np.abs(step) * logarithmic).max() < _LONGEST_STEP:
+        try:
+            step = np.linalg.solve(at.hessian / size / size[:, None], at.gradient / size) / -size
+        except np.linalg.LinAlgError:
+            return None
+        longest = (np.abs(step) * logarithmic).max()
+        if not longest < _LONGEST_STEP:
             return None
         moves = -float(step @ at.gradient)
         theta = theta + step
@@ -118,7 +123,7 @@ def gauss_newton(
             2.0 * _REMAINDER**2 * float(at.cost) / dof,
             _ROUNDING_TOLERANCE**2 * float(lever @ lever),
         )
-        if moves * min(1.0, moves / last) <= shortest:
+        if longest < _LAST_STEP and moves * min(1.0, moves / last) <= shortest:
             cost = np.maximum(at.cost - 0.5 * moves, 0.0)
             converged, counts = np.ones(1, dtype=np.bool_), np.array([count])
             return Minima(theta[None], cost[None], at.hessian[None], converged, counts)
@@ -146,11 +151,11 @@ def _minimise(
     damping, growth = np.full(S, _FIRST_DAMPING), np.full(S, 2.0)
     last = np.full(S, 1e-300)
     for _ in range(steps if P else 0):
-        step, moves, foretold = _step(at, damping, logarithmic)
+        step, moves, foretold, longest = _step(at, damping, logarithmic)
         shortest = looseness**2 * _tolerance(at, logarithmic, n_residuals)
         settled = moves * np.minimum(1.0, moves / last) <= shortest
         settled |= foretold <= looseness**2 * _EPS * at.cost
-        settled &= damping < _GAUSS_NEWTON
+        settled &= (damping < _GAUSS_NEWTON) & (longest <= looseness * _LAST_STEP)
         lost = ~np.isfinite(at.cost) | (damping > _MOST_DAMPING)
         which = None if active.size == S else active
         if inside is not None:
@@ -218,8 +223,11 @@ class _State:
 
 def _step(
     at: _State, damping: FloatArray, logarithmic: BoolArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the next step, its squared length among residuals, and the fall of cost foretold."""
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the next step, its squared length, the fall of cost foretold, the longest log step.
+
+    The length is among residuals.
+    """
     P = at.theta.shape[1]
     size = np.sqrt(at.hessian[:, range(P), range(P)])
     size = np.where((size > 0.0) & np.isfinite(size), size, 1.0)
@@ -235,7 +243,7 @@ def _step(
         delta *= np.minimum(1.0, _LONGEST_STEP / np.maximum(longest, 1e-300))[:, None]
     moves = (delta[:, None, :] @ H @ delta[:, :, None])[:, 0, 0]
     foretold = -(delta * g).sum(axis=1) - 0.5 * moves
-    return delta / size, moves, np.maximum(foretold, 1e-300)
+    return delta / size, moves, np.maximum(foretold, 1e-300), longest
 
 
 def _tolerance(at: _State, logarithmic: BoolArray, n_residuals: int) -> FloatArray:

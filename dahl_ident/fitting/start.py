@@ -286,7 +286,10 @@ def _solve_linear(
     if not columns:
         size = (target.real**2 + target.imag**2).sum(axis=-1)
         return np.broadcast_to(size, shape[:-1]), np.empty((*shape[:-1], 0))
-    X = np.stack([np.broadcast_to(c, shape) for c in columns], axis=-2).view(np.float64)
+    X = np.empty((*shape[:-1], len(columns), shape[-1]), dtype=np.complex128)
+    for index, column in enumerate(columns):
+        X[..., index, :] = column
+    X = X.view(np.float64)
     t = np.ascontiguousarray(np.broadcast_to(target, shape)).view(np.float64)
     norm = np.sqrt((X * X).sum(axis=-1))
     norm[norm == 0.0] = 1.0

@@ -127,7 +127,7 @@ class Problem:
         self.noise = self._noise.name
         self.scale_known = self._noise.scale_known
         dof = self._noise.dof if isinstance(self._noise, Measured) else None
-        self._tail: Rho | None = None if dof is None else Student(dof)
+        self._tail = None if dof is None else Student(dof)
         self.gaussian = dof is None
         self.n_residuals = 2 * rows.n
 
@@ -292,27 +292,29 @@ class Problem:
             products = rows @ rows.swapaxes(-1, -2)
             cost = 0.5 * products[..., 0, 0]
         else:
-            cost, weighted = self._weighted(rows, rho)
-            products = weighted @ rows.swapaxes(-1, -2)
+            m = self.n_residuals
+            z = _squares(rows[..., 0, :m])
+            loss, slope, bend = rho(z)
+            cost = 0.5 * (loss.sum(axis=-1) + (rows[..., 0, m:] ** 2).sum(axis=-1))
+            along = np.maximum(2.0 * bend, -slope / np.maximum(z, 1e-300))
+            products = self._weighted(rows, slope, along) @ rows.swapaxes(-1, -2)
         cost = np.where(cost < np.inf, cost, np.inf)
         return Quadratic(cost, products[..., 0, 1:], products[..., 1:, 1:])
 
-    def _weighted(self, rows: FloatArray, rho: Rho) -> tuple[FloatArray, FloatArray]:
-        """Return the cost where rows of data count as rho, and residuals and Jacobian weighted."""
+    def _weighted(self, rows: FloatArray, size: FloatArray, along: FloatArray) -> FloatArray:
+        """Return residuals times `size`, derivatives d of each pair y as size d + along y (y' d).
+
+        `rows` are residuals and, below them, their derivatives; those of priors stay.
+        """
         m = self.n_residuals
-        r, J = rows[..., 0, :], rows[..., 1:, :]
-        first, second = r[..., 0:m:2], r[..., 1:m:2]
-        z = first**2 + second**2
-        loss, slope, bend = rho(z)
-        cost = 0.5 * loss.sum(axis=-1) + 0.5 * (r[..., m:] ** 2).sum(axis=-1)
+        first, second = rows[..., :1, 0:m:2], rows[..., :1, 1:m:2]
+        by_first, by_second = rows[..., 1:, 0:m:2], rows[..., 1:, 1:m:2]
+        lever = along[..., None, :] * (first * by_first + second * by_second)
         weighted = rows.copy()
-        weighted[..., :m] *= np.repeat(slope, 2, axis=-1)[..., None, :]
-        along = np.maximum(2.0 * bend, -slope / np.maximum(z, 1e-300))[..., None, :] * (
-            first[..., None, :] * J[..., 0:m:2] + second[..., None, :] * J[..., 1:m:2]
-        )
-        weighted[..., 1:, 0:m:2] += first[..., None, :] * along
-        weighted[..., 1:, 1:m:2] += second[..., None, :] * along
-        return cost, weighted
+        weighted[..., :m] *= np.repeat(size, 2, axis=-1)[..., None, :]
+        weighted[..., 1:, 0:m:2] += first * lever
+        weighted[..., 1:, 1:m:2] += second * lever
+        return weighted
 
     def whitened(
         self, theta: FloatArray, *, derivatives: bool = True, tails: bool = True
@@ -446,7 +448,9 @@ class Problem:
         -------
         ndarray, shape () or (S,)
             Priors not included; -inf where the model has no prediction. All noise models give
-            densities of the same numbers, so their likelihoods compare.
+            densities of the same numbers, so their likelihoods compare. Where a covariance has
+            few degrees of freedom it is a likelihood up to a constant: the loss of
+            :mod:`dahl_ident.noise` in place of the sum of squares.
 
         Raises
         ------
@@ -473,20 +477,19 @@ class Problem:
     ) -> FloatArray:
         """Return the Fisher information of theta, shape (P, P) or (S, P, P), priors included.
 
-        J' J of the whitened residuals; a row whose covariance was estimated with nu degrees of
-        freedom counts (nu + 1)(nu - 1)/(nu (nu + 3)), the expectation for Student's t. With
-        `chart` = dtheta/dphi, (P, Q), the information of phi.
+        J' J of the whitened residuals; rows whose covariance was estimated count as
+        :mod:`dahl_ident.noise` says. With `chart` = dtheta/dphi, (P, Q), the information of phi.
         """
         theta = self._coordinates.checked(theta)
-        y, changes = self.whitened(theta, tails=False)
-        dof = self._noise.dof if isinstance(self._noise, Measured) else None
-        if dof is not None:
-            weight = np.sqrt((dof + 1.0) * (dof - 1.0) / (dof * (dof + 3.0)))
-            changes = [weight * d for d in changes]
-        J = self._with_priors(theta, y, changes, scale)[..., 1:, :]
+        rows = self._with_priors(theta, *self.whitened(theta, tails=False), scale)
+        weighted = rows
+        if self._tail is not None:
+            z = _squares(rows[..., 0, : self.n_residuals])
+            weighted = self._weighted(rows, *self._tail.information(z))
+        J, weighted = rows[..., 1:, :], weighted[..., 1:, :]
         if chart is not None:
-            J = chart.T @ J
-        return J @ J.swapaxes(-1, -2)
+            J, weighted = chart.T @ J, chart.T @ weighted
+        return weighted @ J.swapaxes(-1, -2)
 
     def _shape(self, theta: FloatArray) -> tuple[int, ...]:
         """Return the shape of the rows' numbers for `theta`."""
@@ -516,3 +519,8 @@ def _normal(name: str, prior: Prior) -> tuple[float, float]:
             "(scipy.stats.norm), any other needs sampling"
         )
     return float(prior.mean()), float(prior.std())
+
+
+def _squares(residuals: FloatArray) -> FloatArray:
+    """Return the sum of squares of each pair, (..., 2 n) -> (..., n)."""
+    return np.asarray(residuals[..., 0::2] ** 2 + residuals[..., 1::2] ** 2)

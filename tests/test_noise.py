@@ -1,0 +1,195 @@
+"""Noise models: residuals and densities against scipy.stats and brute force."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from dahl_ident import Dahl, FrequencyResponse, Problem
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.fitting import solve_many
+from dahl_ident.noise import Student, bend
+from dahl_ident.problem import ProblemBatch
+
+n = 8
+A = np.geomspace(1e-4, 1e-1, n)
+TRUE = Dahl(0.1, 30.0).describing_function(A)
+RNG = np.random.default_rng(5)
+MEASURED = TRUE * np.exp(0.05 * (RNG.normal(size=n) + 1j * RNG.normal(size=n)))
+COVARIANCE = np.abs(TRUE)[:, None, None] ** 2 * np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
+
+
+def table(response: ComplexArray = MEASURED, **columns: object) -> FrequencyResponse:
+    return FrequencyResponse(np.ones(n), response, A, **columns)  # type: ignore[arg-type]
+
+
+def pairs(z: ComplexArray) -> FloatArray:
+    return np.stack([z.real, z.imag], axis=-1)
+
+
+def test_relative_noise_has_constant_variance_of_ln_gain_and_phase() -> None:
+    problem = Problem(table(), Dahl())
+    assert problem.noise == "relative"
+    theta = problem.to_search([0.12, 25.0])
+    model = Dahl(0.12, 25.0).describing_function(A)
+    expected = np.stack(
+        [np.log(np.abs(MEASURED) / np.abs(model)), np.angle(MEASURED) - np.angle(model)], axis=-1
+    )
+    np.testing.assert_allclose(problem.residuals(theta), expected.ravel(), atol=1e-14)
+    # the density of (Re, Im) is that of (ln gain, phase) over gain^2
+    density = stats.norm(0.0, 0.07).logpdf(expected).sum() - 2.0 * np.log(np.abs(MEASURED)).sum()
+    assert problem.log_likelihood(theta, 0.07) == pytest.approx(density, rel=1e-12)
+
+
+def test_absolute_noise_has_constant_variance_in_the_datas_quantity() -> None:
+    problem = Problem(table(), Dahl(), noise="absolute")
+    theta = problem.to_search([0.12, 25.0])
+    expected = pairs(MEASURED - Dahl(0.12, 25.0).describing_function(A))
+    np.testing.assert_allclose(problem.residuals(theta), expected.ravel(), rtol=1e-12)
+    density = stats.norm(0.0, 0.5).logpdf(expected).sum()
+    assert problem.log_likelihood(theta, 0.5) == pytest.approx(density, rel=1e-12)
+
+
+def test_measured_noise_has_the_datas_covariance() -> None:
+    problem = Problem(table(covariance=COVARIANCE), Dahl())
+    assert problem.noise == "measured"
+    assert problem.scale_known
+    theta = problem.to_search([0.12, 25.0])
+    r = pairs(MEASURED - Dahl(0.12, 25.0).describing_function(A))
+    each = [stats.multivariate_normal(cov=C).logpdf(x) for x, C in zip(r, COVARIANCE, strict=True)]
+    assert problem.log_likelihood(theta) == pytest.approx(np.sum(each), rel=1e-12)
+    squares = np.einsum("ni,nij,nj->", r, np.linalg.inv(COVARIANCE), r)
+    assert np.sum(problem.residuals(theta) ** 2) == pytest.approx(squares, rel=1e-12)
+
+
+def test_few_degrees_of_freedom_count_less_the_farther_a_row_lies() -> None:
+    dof = np.array([3.0, 4.0, 6.0, 9.0, 20.0, 50.0, np.inf, np.inf])
+    problem = Problem(table(covariance=COVARIANCE, dof=dof), Dahl())
+    gaussian = Problem(table(covariance=COVARIANCE), Dahl())
+    theta = problem.to_search([0.12, 25.0])
+    z = np.sum(gaussian.residuals(theta).reshape(n, 2) ** 2, axis=1)
+    loss = np.append((dof[:6] - 2.0) * np.log1p(z[:6] / dof[:6]), z[6:])
+    assert np.sum(problem.residuals(theta) ** 2) == pytest.approx(loss.sum(), rel=1e-9)
+    # least squares on the residuals is maximum likelihood
+    rise = problem.log_likelihood(theta) - gaussian.log_likelihood(theta)
+    assert rise == pytest.approx(0.5 * np.sum(z - loss), rel=1e-9)
+
+
+def test_stated_covariances_with_few_degrees_of_freedom_hold() -> None:
+    """600 experiments whose covariances were estimated from 6 degrees of freedom each."""
+    rng, dof, tables = np.random.default_rng(11), 6, []
+    factor = np.linalg.cholesky(COVARIANCE)
+    for _ in range(600):
+        noise = np.einsum("nij,njk->nki", factor, rng.normal(size=(n, 2, dof + 1)))
+        estimated = np.einsum("nki,nkj->nij", noise[:, 1:], noise[:, 1:]) / dof
+        response = TRUE + noise[:, 0] @ np.array([1.0, 1.0j])
+        tables.append(table(response, covariance=estimated, dof=float(dof)))
+    batch = ProblemBatch(tables, Dahl())
+    found = solve_many(batch)
+    z = (found.theta - np.log([0.1, 30.0])) / np.sqrt(
+        np.diagonal(found.covariance, axis1=1, axis2=2)
+    )
+    assert np.all(np.abs(z.std(axis=0) - 1.0) < 0.12)  # taking them as known gives 1.8
+    # the likelihood ratio at the truth is chi-square of two degrees of freedom
+    truth = np.broadcast_to(np.log([0.1, 30.0]), (600, 2))
+    ratio = 2.0 * (batch.quadratic(truth).cost - found.cost)
+    covered = np.mean(ratio < stats.chi2(2).ppf(0.95))
+    assert abs(covered - 0.95) < 3.0 * np.sqrt(0.95 * 0.05 / 600)
+
+
+def test_amplitude_errors_are_profiled_out() -> None:
+    s = 0.08
+    cross = 0.5 * s * A[:, None] * np.sqrt(np.diagonal(COVARIANCE, axis1=1, axis2=2))
+    data = table(covariance=COVARIANCE, amplitude_std=s * A, amplitude_covariance=cross)
+    problem = Problem(data, Dahl())
+    theta = problem.to_search([0.12, 25.0])
+    total = 0.0
+    for row in range(n):
+        joint = np.empty((3, 3))
+        joint[0, 0], joint[1:, 1:] = s**2, COVARIANCE[row]
+        joint[0, 1:] = joint[1:, 0] = cross[row] / A[row]
+        inverse = np.linalg.inv(joint)
+
+        def chi_square(error: float, row: int = row, inverse: FloatArray = inverse) -> float:
+            N = Dahl(0.12, 25.0).describing_function(A[row] * np.exp(-error))
+            r = MEASURED[row] - N
+            e = np.array([error, r.real, r.imag])
+            return float(e @ inverse @ e)
+
+        total += optimize.minimize_scalar(chi_square, bounds=(-1.0, 1.0), method="bounded").fun
+    assert np.sum(problem.residuals(theta) ** 2) == pytest.approx(total, rel=1e-7)
+    # its gradient is exact although weights and amplitudes move with the parameters
+    step = 1e-5 * np.eye(2)
+    slope = [
+        (np.sum(problem.residuals(theta + h) ** 2) - np.sum(problem.residuals(theta - h) ** 2))
+        / 4e-5
+        for h in step
+    ]
+    r, J = problem.residuals_and_jacobian(theta)
+    np.testing.assert_allclose(J.T @ r, slope, rtol=1e-7)
+
+
+def test_amplitude_errors_do_not_flatten_the_curve() -> None:
+    """Averaged over 400 tables; taking noisy amplitudes as exact misses sigma by 20 deviations."""
+    rng, s = np.random.default_rng(3), 0.3
+    true_A = np.geomspace(1e-3, 1e-2, n)
+    N = Dahl(0.1, 30.0).describing_function(true_A)
+    C = np.abs(N)[:, None, None] ** 2 * 0.01**2 * np.eye(2)
+    noisy = []
+    for _ in range(400):
+        measured = true_A * np.exp(s * rng.normal(size=n))
+        response = N + 0.01 * np.abs(N) * (rng.normal(size=n) + 1j * rng.normal(size=n))
+        noisy.append((measured, response))
+    known = [
+        FrequencyResponse(np.ones(n), R, m, covariance=C, amplitude_std=s * m) for m, R in noisy
+    ]
+    ignored = [FrequencyResponse(np.ones(n), R, m, covariance=C) for m, R in noisy]
+    bias = []
+    for tables in (known, ignored):
+        theta = solve_many(ProblemBatch(tables, Dahl())).theta - np.log([0.1, 30.0])
+        bias.append(np.abs(theta.mean(axis=0)) / (theta.std(axis=0) / np.sqrt(400)))
+    assert np.all(bias[0] < 4.0)
+    assert bias[1][1] > 12.0
+
+
+def test_harmonics_refer_to_the_measured_fundamental() -> None:
+    pivot = Dahl(0.1, 30.0)
+    both = [pivot.dynamic_stiffness(0.01, harmonic=k) for k in (1, 3)]
+    data = FrequencyResponse(np.ones(2), np.multiply(both, 1.1), [0.01, 0.01], harmonic=[1, 3])
+    problem = Problem(data, Dahl())
+    r = problem.residuals(problem.to_search([0.1, 30.0])).view(np.complex128)
+    assert r[0] == pytest.approx(np.log(1.1))
+    assert r[1] == pytest.approx(0.1 * both[1] / (1.1 * np.abs(both[0])))
+
+
+def test_bend_keeps_direction_and_squares_to_the_loss() -> None:
+    y = np.array([0.0, 1e-9, 0.5 + 1j, 30.0 - 40.0j])
+    rho = Student(np.array(5.0))
+    bent, _ = bend(y, [], rho)
+    z = np.abs(y) ** 2
+    np.testing.assert_allclose(np.abs(bent) ** 2, rho(z)[0], rtol=1e-12)
+    np.testing.assert_allclose(np.angle(bent), np.angle(y), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("columns", "noise", "message"),
+    [
+        ({}, "measured", "needs a covariance, and the data have none"),
+        ({"covariance": COVARIANCE * 0.0}, None, r"covariance\[0\] is singular"),
+        ({"covariance": COVARIANCE, "dof": 2.0}, None, r"dof\[0\] is 2; .* more than 2 degrees"),
+        ({"response": TRUE * (A < 0.05)}, None, r"response\[7\] is 0, which has no logarithm"),
+        ({"harmonic": [1] * 7 + [3]}, None, r"row \[7\] holds a harmonic, but no row holds"),
+    ],
+)
+def test_data_that_the_noise_model_cannot_weigh(
+    columns: dict[str, object], noise: str | None, message: str
+) -> None:
+    with pytest.raises(DataError, match=message):
+        Problem(table(**columns), Dahl(), noise=noise)  # type: ignore[arg-type]
+
+
+def test_an_unknown_noise_model_is_named() -> None:
+    with pytest.raises(ValidationError, match="noise is 'white'; expected one of measured"):
+        Problem(table(), Dahl(), noise="white")
