@@ -72,7 +72,7 @@ def test_frd_between_its_points_follows_two_modes_that_a_receptance_spline_misse
     frd = control.frd(two_modes(omega), omega)
     ours = LinearSystem(frd, quantity="receptance").dynamic_stiffness(1e-3, between)
     assert relative_error(1.0 / ours, two_modes(between)) < 0.02
-    interpolating = control.frd(two_modes(omega), omega, smooth=True)
+    interpolating = control.FrequencyResponseData(two_modes(omega), omega, smooth=True)
     theirs = interpolating(1j * between)
     peak = np.abs(between - 2.0) < 0.1
     truth = two_modes(between)

@@ -145,5 +145,5 @@ def named_channels(
 
 def _is_blank(values: NDArray[Any]) -> bool:
     if values.dtype.kind == "U":
-        return not np.char.strip(values).astype(bool).any()
+        return not np.char.str_len(np.char.strip(values)).any()
     return values.dtype.kind == "f" and bool(np.isnan(values).all())
