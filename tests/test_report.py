@@ -87,7 +87,7 @@ def test_text_from_files_is_escaped(page_file: Path) -> None:
 
 def test_html_tells_the_numbers_side_by_side(page_file: Path, fit: di.FitResult) -> None:
     text = page_file.read_text(encoding="utf-8")
-    for method in ("wald interval", "profile interval", "95 % posterior interval"):
+    for method in ("wald 95.45 %", "profile 95.45 %", "posterior 95 %"):
         assert method in text
     assert f'data-value="{fit.params["f_max"].value}"' in text
     for fact in (

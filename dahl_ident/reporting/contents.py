@@ -84,7 +84,8 @@ def _title(data: FrequencyResponse) -> str:
 
 def _verdict(fit: FitResult) -> list[str]:
     warnings = [f"Warning: {text}" for text in fit.goodness.warnings]
-    return [fit.verdict, *warnings]
+    text = fit.verdict.removeprefix("NOT to be trusted. ").removeprefix("To be trusted: ")
+    return [text[0].upper() + text[1:], *warnings]
 
 
 def _sections(fit: FitResult, drawn: Sequence[Posterior], several: bool) -> Iterator[Section]:
@@ -117,8 +118,7 @@ def _goodness(fit: FitResult) -> Iterator[Block]:
     left = fit.goodness
     yield Paragraph(NOISE[fit.noise])
     yield Paragraph(left.headline)
-    yield Bullets(tuple(f"Warning: {text}" for text in left.warnings))
-    yield Bullets(tuple(f"Suspicious: {point}" for point in left.suspicious))
+    yield Bullets(tuple(line.removeprefix("- ") for line in str(left).splitlines()[1:]))
     yield tables.goodness(fit)
     if not left.acceptable:
         compared = compare_models(fit)

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from dahl_ident.results import FitResult
 
 _LOOPS = 3
+_SAME_FREQUENCY = 5e-3  # relative
 _WIDE = 20.0  # of amplitudes beyond which loops are drawn over displacement / amplitude
 _MARKED_BETA = (0.3, 1.0, 2.2, 5.0, 20.0)
 _STRAIGHT = 1.5  # log of a profile's range beyond which its axis is logarithmic
@@ -114,8 +115,8 @@ def _groups(data: FrequencyResponse) -> list[tuple[str, FrequencyResponse]]:
     if _over_frequency(data):
         parts = [(_level(label, data), data.select(level=label)) for label in data.levels]
         return parts or [("", data)]
-    nominal = np.array([float(f"{f:.2g}") for f in data.frequency_hz])
-    return [(f"{f:g} Hz", data.select(rows=nominal == f)) for f in np.unique(nominal)]
+    nominal = _nominal_frequency(data.frequency_hz)
+    return [(f"{f:.4g} Hz", data.select(rows=nominal == f)) for f in np.unique(nominal)]
 
 
 def _residuals(fit: FitResult) -> Picture:
@@ -270,7 +271,21 @@ def _abscissa(part: FrequencyResponse, data: FrequencyResponse) -> tuple[FloatAr
 def _over_frequency(data: FrequencyResponse) -> bool:
     """Return whether a curve over frequency suits the data better than one over amplitude."""
     parts = [data.select(level=label) for label in data.levels] or [data]
-    return all(2 * np.unique(part.frequency_hz).size > part.n > 1 for part in parts)
+    return all(
+        2 * np.unique(_nominal_frequency(part.frequency_hz)).size > part.n > 1 for part in parts
+    )
+
+
+def _nominal_frequency(f: FloatArray) -> FloatArray:
+    """Return frequencies that differ by measurement alone as one; those of a fine grid as given."""
+    order = np.argsort(f)
+    jump = np.diff(f[order], prepend=f[order][0]) > _SAME_FREQUENCY * f[order]
+    group = np.empty(f.size, dtype=int)
+    group[order] = np.cumsum(jump)
+    members = [f[group == g] for g in range(group.max() + 1)]
+    if any(np.ptp(m) > 2.0 * _SAME_FREQUENCY * m.min() for m in members):
+        return f
+    return np.array([np.median(m) for m in members])[group]
 
 
 def _is_linear_dahl_alone(fit: FitResult) -> bool:

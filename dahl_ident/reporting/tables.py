@@ -46,8 +46,8 @@ def parameters(
             median, limits_text = interval_text(posterior, name)
             row += [median, Cell(limits_text)]
         rows.append((*row, Cell(estimate.description)))
-    methods = [f"95.45 % {one.method} interval" for one in intervals]
-    methods += ["posterior median", "95 % posterior interval"] * len(drawn)
+    methods = [f"{one.method} 95.45 %" for one in intervals]
+    methods += ["posterior median", "posterior 95 %"] * len(drawn)
     header = ("parameter", "estimate", "standard error", "unit", *methods, "what it is")
     return Table("Parameters", header, tuple(rows))
 

@@ -1,0 +1,77 @@
+"""The whole chain, from waveforms to a report: on the shipped recording, and on measured data."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from dahl_ident.cli import main
+
+MEASURED = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent")) / "brfd"
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(list(arguments))
+    code = ended.value.code
+    return code if isinstance(code, int) else 0
+
+
+def test_demo_recovers_the_plant(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    status = run("demo")
+    out = capsys.readouterr().out
+    assert status == 0, out
+    steps = [
+        "1. inspect",
+        "2. extract",
+        "3. fit",
+        "4. identifiability",
+        "5. posterior",
+        "6. report",
+    ]
+    places = [out.index(step) for step in steps]
+    assert places == sorted(places)
+    lines = out[out.index("Beside the truth") : out.index("4. identifiability")].splitlines()
+    off = [float(line.split()[-1]) for line in lines if line.strip().startswith(("f_max", "sigma"))]
+    assert len(off) == 2
+    assert all(abs(number) < 4.0 for number in off)
+    page = Path(out.rstrip().rsplit("report: ", 1)[1])
+    assert page == tmp_path / "out" / "report.html"
+    assert "Can be trusted" in page.read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(not MEASURED.is_dir(), reason="DAHL_IDENT_MEASURED_DATA names no brfd folder")
+def test_measured_damper_from_files_to_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    files = sorted(str(p) for p in MEASURED.glob("*.csv"))
+    assert run("inspect", files[0]) == 0
+    contents = capsys.readouterr().out
+    assert "1024 Hz" in contents
+    status = run("extract", *files, "-o", "levels.csv", "--harmonics", "1", *_channels(contents))
+    assert status in (0, 3), capsys.readouterr().err
+    points = capsys.readouterr().out
+    assert "points of dynamic stiffness" in points
+    status = run("fit", "levels.csv", "--json", "--noise", "relative", "--report", "damper.html")
+    told = json.loads(capsys.readouterr().out)
+    assert status == (0 if told["trusted"] else 3)
+    assert told["params"]["f_max"]["value"] == pytest.approx(1.0e4, rel=0.1)
+    assert told["params"]["sigma"]["value"] == pytest.approx(2.4e6, rel=0.15)
+    page = Path("damper.html").read_text(encoding="utf-8")
+    assert "from 0.25 to 2 Hz against the model" in page, "the damper depends on frequency"
+    assert "displacement distorted 11 %" in page
+
+
+def _channels(contents: str) -> list[str]:
+    """Return the options that name displacement and force of these files."""
+    names = [line.split("  ")[1].strip() for line in contents.splitlines() if line.startswith("  ")]
+    displacement = next(name for name in names if "isplacement" in name)
+    force = next(name for name in names if "orce" in name and "ctuator" not in name)
+    return ["--displacement", displacement, "--force", force]
