@@ -11,6 +11,7 @@ warning (:mod:`dahl_ident.diagnostics.physics`).
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,6 +19,7 @@ import numpy as np
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray
+from dahl_ident.diagnostics.flags import flagged_rows
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.outliers import SuspiciousPoint, suspicious_points
 from dahl_ident.diagnostics.physics import physical_warnings
@@ -28,6 +30,7 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
 
 _FALSE_ALARM = 1e-3
+_HINT = 0.05
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,16 @@ class Exponent:
 
 
 @dataclass(frozen=True)
+class Scatter:
+    """Scatter about the fit over that of the data's own covariance, which the fit left unused."""
+
+    ratio: float
+
+    def __str__(self) -> str:
+        return f"the scatter is {self.ratio:.2g} times what the data's covariance says"
+
+
+@dataclass(frozen=True)
 class Goodness:
     """What is left after the fit, and what it means.
 
@@ -90,10 +103,14 @@ class Goodness:
         Where one Dahl element has a fixed exponent.
     third_harmonic : ThirdHarmonic or None
         Where rows hold it.
+    scatter : Scatter or None
+        Where the data have a covariance that the noise model does not use.
     suspicious : tuple of SuspiciousPoint
         Points that stand apart.
     warnings : tuple of str
         What no mechanism does.
+    flagged : tuple of str
+        Rows that the extraction flagged, with the reason.
     level : float
         p-value below which one test counts.
     """
@@ -104,8 +121,10 @@ class Goodness:
     runs: tuple[Runs, ...]
     exponent: Exponent | None
     third_harmonic: ThirdHarmonic | None
+    scatter: Scatter | None
     suspicious: tuple[SuspiciousPoint, ...]
     warnings: tuple[str, ...]
+    flagged: tuple[str, ...]
 
     @cached_property
     def level(self) -> float:
@@ -113,12 +132,6 @@ class Goodness:
         single = (self.chi_square, self.exponent, self.third_harmonic)
         tests = len(self.trends) + len(self.runs) + sum(test is not None for test in single)
         return _FALSE_ALARM / max(tests, 1)
-
-    @cached_property
-    def significant_trends(self) -> list[Trend]:
-        """Trends that noise does not explain, the clearest first."""
-        found = [trend for trend in self.trends if trend.p_value < self.level]
-        return sorted(found, key=lambda trend: trend.p_value)
 
     @property
     def acceptable(self) -> bool:
@@ -128,50 +141,50 @@ class Goodness:
     @cached_property
     def objections(self) -> tuple[str, ...]:
         """What speaks against the model, in words with numbers; empty where nothing does."""
-        found = [str(trend) for trend in self.significant_trends]
-        frequency = any(trend.covariate == "frequency" for trend in self.significant_trends)
-        if frequency:
-            found.append("no rate-independent model has a trend with frequency")
-        tests = (self.exponent, self.third_harmonic, self.chi_square)
-        found += [str(test) for test in tests if test is not None and test.p_value < self.level]
-        found += [
-            f"the residuals keep their sign over {r.covariate}: {r.runs} runs, "
-            f"{r.expected:.0f} expected"
-            for r in self.runs
-            if r.p_value < self.level and r.covariate not in {t.covariate for t in self.trends}
-        ]
-        if not found and any(r.p_value < self.level for r in self.runs):
-            worst = min(self.runs, key=lambda r: r.p_value)
-            found.append(
-                f"the residuals keep their sign over {worst.covariate}: {worst.runs} runs, "
-                f"{worst.expected:.0f} expected"
-            )
-        return tuple(found)
+        return tuple(self._departures(self.level))
+
+    @cached_property
+    def hints(self) -> tuple[str, ...]:
+        """The same at a level that noise alone reaches in one data set of twenty."""
+        return tuple(self._departures(_HINT / _FALSE_ALARM * self.level))
+
+    def _departures(self, level: float) -> Iterator[str]:
+        """Yield every departure whose p-value is below `level`, those over frequency first."""
+        found = [trend for trend in self.trends if trend.p_value < level]
+        rate = [trend for trend in found if trend.covariate == "frequency"]
+        yield from (f"{trend}, which no rate-independent model does" for trend in rate)
+        curve = [test for test in (self.exponent,) if test is not None and test.p_value < level]
+        over = [trend for trend in found if trend not in rate]
+        if self.exponent is not None and self.exponent.fixed == 1.0 and (curve or over):
+            yield "these data are not linear Dahl"
+        yield from map(str, (*over, *curve))
+        for test in (self.third_harmonic, self.chi_square):
+            if test is not None and test.p_value < level:
+                yield str(test)
+        if not found:
+            yield from (f"{r}" for r in self.runs if r.p_value < level)
 
     @property
     def headline(self) -> str:
         """The verdict in one sentence."""
         misfit = f"{100.0 * self.rms_misfit:.2g} % rms misfit"
-        if self.acceptable:
-            return f"The residuals look like noise ({misfit})."
-        return f"The model does not describe these data ({misfit}): {'; '.join(self.objections)}."
+        if not self.acceptable:
+            return f"The model does not describe these data ({misfit}): {_joined(self.objections)}."
+        text = f"The residuals look like noise ({misfit})"
+        return f"{text}, with a hint that {_joined(self.hints)}." if self.hints else f"{text}."
+
+    @property
+    def details(self) -> list[str]:
+        """Every test with its p-value, suspicious points and warnings, a line each."""
+        tests = (self.chi_square, *self.trends, *self.runs, self.exponent, self.third_harmonic)
+        lines = [f"{test} (p = {test.p_value:.2g})" for test in tests if test is not None]
+        if self.scatter is not None:
+            lines.append(str(self.scatter))
+        lines += [f"suspicious: {point}" for point in self.suspicious]
+        return lines + [f"warning: {text}" for text in self.warnings]
 
     def __str__(self) -> str:
-        lines = [self.headline]
-        if self.chi_square is not None:
-            lines.append(f"- {self.chi_square} (p = {self.chi_square.p_value:.2g})")
-        lines += [f"- {trend} (p = {trend.p_value:.2g})" for trend in self.trends]
-        lines += [
-            f"- {r.runs} runs of sign over {r.covariate}, {r.expected:.0f} expected "
-            f"(p = {r.p_value:.2g})"
-            for r in self.runs
-        ]
-        for test in (self.exponent, self.third_harmonic):
-            if test is not None:
-                lines.append(f"- {test} (p = {test.p_value:.2g})")
-        lines += [f"- suspicious: {point}" for point in self.suspicious]
-        lines += [f"- warning: {text}" for text in self.warnings]
-        return "\n".join(lines)
+        return "\n".join([self.headline, *(f"- {line}" for line in self.details)])
 
 
 def goodness(optimum: Optimum) -> Goodness:
@@ -189,8 +202,10 @@ def goodness(optimum: Optimum) -> Goodness:
         tuple(runs(optimum, space)),
         _exponent(optimum, space),
         _third_harmonic(optimum, space),
+        _scatter(optimum),
         suspicious_points(optimum, space),
         tuple(physical_warnings(optimum)),
+        flagged_rows(problem.data),
     )
 
 
@@ -199,6 +214,15 @@ def _chi_square(optimum: Optimum, space: ResidualSpace) -> ChiSquare | None:
         return None
     value = float(space.residuals @ space.residuals)
     return ChiSquare(value, optimum.dof, float(special.chdtrc(optimum.dof, value)))
+
+
+def _scatter(optimum: Optimum) -> Scatter | None:
+    problem = optimum.problem
+    if problem.noise == "measured" or problem.data.covariance is None or optimum.dof <= 0:
+        return None
+    known = Problem(problem.data, problem.model, noise="measured", sensors=problem.sensors)
+    y, _ = known.residuals_and_jacobian(optimum.theta, tails=False)
+    return Scatter(float(np.sqrt(y @ y / optimum.dof)))
 
 
 def _exponent(optimum: Optimum, space: ResidualSpace) -> Exponent | None:
@@ -212,7 +236,7 @@ def _exponent(optimum: Optimum, space: ResidualSpace) -> Exponent | None:
     change = _by_alpha(optimum, alpha.name)
     slope, error = space.coefficient(change)
     p = space.p_value(change[None])
-    if not np.isfinite(error) or np.isnan(p):
+    if not error < 1.0 or np.isnan(p):  # so wide an error says nothing of the exponent
         return None
     wanted = alpha.value * float(np.exp(slope))
     return Exponent(alpha.name, alpha.value, wanted, wanted * error, p)
@@ -237,3 +261,7 @@ def _third_harmonic(optimum: Optimum, space: ResidualSpace) -> ThirdHarmonic | N
     own = rows.astype(np.complex128)
     ratio, error = space.coefficient(own)
     return ThirdHarmonic(1.0 + ratio, error, space.p_value(np.array([own, 1j * own])))
+
+
+def _joined(parts: Sequence[str]) -> str:
+    return "; ".join(parts)

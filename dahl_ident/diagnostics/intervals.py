@@ -183,7 +183,8 @@ def intervals_from_search(
     problem = optimum.problem
     low, high = problem.bounds()
     if optimum.scale_known:
-        note = "noise as given by the data: normal and chi-square"
+        law = "normal and chi-square" if problem.gaussian else "Student's t row by row"
+        note = f"noise as given by the data: {law}"
     else:
         note = f"noise scale estimated: t and F with {optimum.dof} degrees of freedom"
     return ConfidenceIntervals(

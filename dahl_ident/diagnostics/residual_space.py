@@ -5,13 +5,14 @@ those of the Jacobian: a small change u of the predicted responses, R -> R exp(g
 projection on what the parameters cannot explain, its coefficient and error follow from one inner
 product; several columns together make a chi-square or F test. Nothing is fitted again.
 
-Rows whose covariance has few degrees of freedom, and rows under a robust loss, enter by their
-scores, with the weight that the likelihood (or the loss) gives them.
+Rows whose covariance has nu degrees of freedom follow Student's t; their residuals y are taken to
+the normal ones of the same probability, |y|^2 -> (nu - 1) ln(1 + |y|^2/nu). Rows under a robust
+loss enter by their scores.
 """
 
 from __future__ import annotations
 
-from functools import cached_property
+from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import loss_named
 
 _RANK = 1e-9  # singular value of the Jacobian, over the largest, that counts as none
+_GAUSSIAN = 1e12  # degrees of freedom beyond which Student's t is the normal distribution
 _LEFT = 1e-4  # length of a column after projection, over that before, that counts as none
 
 
@@ -32,46 +34,15 @@ class Coefficient(NamedTuple):
     stderr: float
 
 
-class ResidualSpace:
-    """The residuals of an optimum, orthogonal to its Jacobian, in units of the noise."""
+class _Space(ABC):
+    """Residuals orthogonal to the Jacobian's columns, and columns to compare them with."""
 
-    def __init__(self, optimum: Optimum) -> None:
-        self._optimum, self._problem = optimum, optimum.problem
-        self.dof = optimum.dof
-        m = optimum.problem.n_residuals
-        weight, score = self._weights(m)
-        y, J = self._rows
-        self.residuals = score * y[:m]
-        self._column_weight = weight
-        rows = np.vstack([weight[:, None] * J[:m], J[m:]])
-        self.basis = _orthonormal(rows)[:m]
+    residuals: FloatArray
+    basis: FloatArray
 
-    @cached_property
-    def _rows(self) -> tuple[FloatArray, FloatArray]:
-        """Residuals and Jacobian in units of the noise."""
-        scale = self._scale
-        return self._problem.residuals_and_jacobian(self._optimum.theta, scale, tails=False)
-
-    @property
-    def _scale(self) -> float:
-        scale = self._optimum.scale
-        return scale if np.isfinite(scale) and scale > 0.0 else 1.0
-
-    def _weights(self, m: int) -> tuple[FloatArray, FloatArray]:
-        """Return the weight of each row's columns, and that of its residuals."""
-        y = self._rows[0][:m]
-        z = np.repeat(y[0::2] ** 2 + y[1::2] ** 2, 2)
-        loss, dof = loss_named(self._optimum.loss), self._problem.data.dof
-        if loss is not None:
-            inflation = np.sqrt(loss.inflation(z[0::2], max(self.dof, 1)))
-            slope = loss.slope(z)
-            spread = np.sqrt((slope**2 * z).sum() / (2.0 * max(self.dof, 1)))
-            return np.full(m, 1.0 / inflation), slope / (spread if spread > 0.0 else 1.0)
-        if self._problem.gaussian or dof is None:
-            return np.ones(m), np.ones(m)
-        nu = np.minimum(np.repeat(dof, 2), 1e15)
-        weight = np.sqrt((nu + 1.0) * (nu - 1.0) / (nu * (nu + 3.0)))
-        return weight, (nu + 1.0) / (nu + z) / weight
+    @abstractmethod
+    def _raw(self, changes: ComplexArray) -> FloatArray:
+        """Return the columns (k, m) of relative changes (k, n) of the predicted responses."""
 
     def columns(self, changes: ComplexArray) -> FloatArray:
         """Return the columns (k, m) of relative changes (k, n) of the predicted responses.
@@ -79,10 +50,7 @@ class ResidualSpace:
         What the parameters explain is taken out; a column of which nothing is left is zero. The
         sign is that of the data: positive where data exceed the model.
         """
-        theta = self._optimum.theta
-        predicted = self._problem.predict(theta)
-        columns = -self._problem.residual_change(theta, changes * predicted) / self._scale
-        columns = columns * self._column_weight
+        columns = self._raw(changes)
         before = np.linalg.norm(columns, axis=-1, keepdims=True)
         for _ in range(2):
             columns = columns - (columns @ self.basis) @ self.basis.T
@@ -95,13 +63,87 @@ class ResidualSpace:
         square = float(column @ column)
         if square == 0.0:
             return Coefficient(0.0, np.inf)
-        return Coefficient(float(column @ self.residuals) / square, square**-0.5)
+        return Coefficient(float(column @ self.residuals) / square, self.scale / square**0.5)
 
     def fitted(self, changes: ComplexArray) -> ComplexArray:
         """Return the relative departure of the data, shape (n,), that `changes` (k, n) explain."""
         columns = self.columns(changes)
         gamma = np.linalg.lstsq(columns.T, self.residuals, rcond=_RANK)[0]
         return np.asarray(gamma @ changes)
+
+    @property
+    @abstractmethod
+    def scale(self) -> float:
+        """Standard deviation of one residual."""
+
+
+class RelativeSpace(_Space):
+    """ln(R/R_model) of the fundamentals, all rows alike: for the size of a departure.
+
+    Whatever the noise model, the weights here do not depend on it, so that a departure of 30 %
+    reads as one also where the data claim errors of 1 %.
+    """
+
+    def __init__(self, optimum: Optimum) -> None:
+        problem, theta = optimum.problem, optimum.theta
+        predicted = problem.predict(theta)
+        self._rows = problem.data.harmonic == 1
+        with np.errstate(divide="ignore", invalid="ignore"):
+            y = np.log(problem.data.response / predicted)[self._rows]
+            J = (problem.prediction_jacobian(theta) / predicted[:, None])[self._rows]
+        self.basis = _orthonormal(np.concatenate([J.real, J.imag]))
+        r = np.concatenate([y.real, y.imag])
+        self.residuals = r - self.basis @ (self.basis.T @ r)
+
+    def _raw(self, changes: ComplexArray) -> FloatArray:
+        own = changes[:, self._rows]
+        return np.concatenate([own.real, own.imag], axis=-1)
+
+    @property
+    def scale(self) -> float:
+        """Standard deviation of ln gain and phase, as they scatter."""
+        dof = self.residuals.size - self.basis.shape[1]
+        return float(np.sqrt(self.residuals @ self.residuals / max(dof, 1)))
+
+
+class ResidualSpace(_Space):
+    """The residuals of an optimum in units of the noise: for whether a departure is one."""
+
+    scale = 1.0
+
+    def __init__(self, optimum: Optimum) -> None:
+        self._optimum, self._problem = optimum, optimum.problem
+        self.dof = optimum.dof
+        m = optimum.problem.n_residuals
+        scale = optimum.scale
+        self._scale = scale if np.isfinite(scale) and scale > 0.0 else 1.0
+        y, J = self._problem.residuals_and_jacobian(optimum.theta, self._scale, tails=False)
+        self._column_weight, residual_weight = self._weights(y[:m])
+        self.basis = _orthonormal(np.vstack([self._column_weight[:, None] * J[:m], J[m:]]))[:m]
+        r = residual_weight * y[:m]
+        self.residuals = r - self.basis @ (self.basis.T @ r)
+
+    def _weights(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the weight of each row's columns, and that of its residuals."""
+        z = np.repeat(y[0::2] ** 2 + y[1::2] ** 2, 2)
+        loss, dof = loss_named(self._optimum.loss), self._problem.data.dof
+        if loss is not None:
+            inflation = np.sqrt(loss.inflation(z[0::2], max(self.dof, 1)))
+            slope = loss.slope(z)
+            spread = np.sqrt((slope**2 * z).sum() / (2.0 * max(self.dof, 1)))
+            return np.full(y.shape, 1.0 / inflation), slope / (spread if spread > 0.0 else 1.0)
+        if self._problem.gaussian or dof is None:
+            return np.ones(y.shape), np.ones(y.shape)
+        nu = np.minimum(np.repeat(dof, 2), _GAUSSIAN)
+        z = np.maximum(z, 1e-300)
+        weight = np.sqrt((nu + 1.0) * (nu - 1.0) / (nu * (nu + 3.0)))
+        return weight, np.sqrt((nu - 1.0) * np.log1p(z / nu) / z)
+
+    def _raw(self, changes: ComplexArray) -> FloatArray:
+        theta = self._optimum.theta
+        predicted = self._problem.predict(theta)
+        columns = -self._problem.residual_change(theta, changes * predicted) / self._scale
+        return np.asarray(columns * self._column_weight)
 
     def p_value(self, changes: ComplexArray) -> float:
         """Return how likely noise alone gives as much departure along `changes`, (k, n)."""

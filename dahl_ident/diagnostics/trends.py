@@ -21,7 +21,7 @@ from scipy import special
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.physics import parameter_values
-from dahl_ident.diagnostics.residual_space import Coefficient, ResidualSpace
+from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, ResidualSpace
 from dahl_ident.diagnostics.units import shown_unit
 from dahl_ident.elements import Dahl
 from dahl_ident.fitting import Optimum
@@ -63,16 +63,17 @@ class Trend:
     p_value: float
 
     def __str__(self) -> str:
-        ends = f"from {self.low:.3g} to {self.high:.3g} {self.unit}"
+        ends = f"from {self.low:.3g} to {self.high:.3g} {self.unit}".rstrip()
+        text = (
+            f"over {self.covariate}, {ends}, the data depart from the model by up to "
+            f"{100.0 * self.largest:.2g} %"
+        )
         parts = [
-            f"the friction's {name} {_change(part)} {ends} against the model"
+            f"friction's {name} {_change(part)}"
             for name, part in (("stiffness", self.stiffness), ("loss", self.loss))
             if abs(part.value) > 2.0 * part.stderr
         ]
-        parts.append(
-            f"departure over {self.covariate} up to {100.0 * self.largest:.2g} % of the response"
-        )
-        return ", ".join(parts)
+        return f"{text} ({', '.join(parts)} against it)" if parts else text
 
 
 @dataclass(frozen=True)
@@ -84,11 +85,14 @@ class Runs:
     expected: float
     p_value: float
 
+    def __str__(self) -> str:
+        return f"{self.runs} runs of sign over {self.covariate}, {self.expected:.0f} expected"
+
 
 def trends(optimum: Optimum, space: ResidualSpace) -> list[Trend]:
     """Return the departures over each covariate that varies enough."""
     found = []
-    friction = _friction_parts(optimum)
+    friction, relative = _friction_parts(optimum), RelativeSpace(optimum)
     for name, values, unit in covariates(optimum):
         x = np.log(values)
         distinct = _distinct(x)
@@ -101,7 +105,7 @@ def trends(optimum: Optimum, space: ResidualSpace) -> list[Trend]:
         p = space.p_value(changes)
         if np.isnan(p):
             continue
-        stiffness, loss = (space.coefficient(0.5 * unit_range * part) for part in friction)
+        stiffness, loss = (relative.coefficient(0.5 * unit_range * part) for part in friction)
         found.append(
             Trend(
                 name,
@@ -110,7 +114,7 @@ def trends(optimum: Optimum, space: ResidualSpace) -> list[Trend]:
                 unit,
                 stiffness,
                 loss,
-                float(np.abs(np.expm1(space.fitted(changes))).max()),
+                float(np.abs(np.expm1(relative.fitted(changes))).max()),
                 p,
             )
         )
@@ -141,12 +145,13 @@ def covariates(optimum: Optimum) -> Iterator[tuple[str, FloatArray, str]]:
     """Yield name, values and unit of whatever varies over the rows."""
     problem = optimum.problem
     data, motion = problem.data, problem.data.motion
+    driven = data.drive if (data.controlled == "force").all() else None
     yield from (
         (name, values, unit)
         for name, values, unit in (
             ("amplitude", problem.stiffness_data.amplitude, shown_unit("m", motion)),
             ("frequency", data.frequency_hz, "Hz"),
-            ("drive", data.drive if (data.controlled == "force").all() else None, ""),
+            ("drive", driven, shown_unit("N", motion)),
         )
         if values is not None and np.ptp(np.log(values)) > _LEAST_RANGE
     )

@@ -36,12 +36,8 @@ class Section:
 
 def verdict(fit: FitResult) -> str:
     """Return whether to trust a fit, and what speaks against it."""
-    misfit = f"{100.0 * fit.goodness.rms_misfit:.2g} % rms misfit"
     if fit.trusted:
-        text = "To be trusted: there is an optimum, every parameter is identified, and the "
-        text += f"residuals look like noise ({misfit})."
-        weak = fit.identifiability.named(Verdict.WEAK)
-        return f"{text} {fit.identifiability.headline}" if weak else text
+        return f"To be trusted. {fit.identifiability.headline} {fit.goodness.headline}"
     parts = ["NOT to be trusted."]
     if not fit.success:
         parts.append(fit.message)
@@ -86,7 +82,7 @@ def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[Section]:
     if correlations:
         yield Section("Correlations", correlations)
     yield Section("Noise", _noise(fit))
-    yield Section("Goodness of fit", str(fit.goodness).splitlines())
+    yield Section("Goodness of fit", fit.goodness.details)
     if not fit.goodness.acceptable:
         yield Section(
             "Other models, compared and not claimed", str(compare_models(fit)).splitlines()
