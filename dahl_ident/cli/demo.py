@@ -44,6 +44,7 @@ def demo(
     telling.heading("2. extract: waveforms to dynamic stiffness")
     data = extract_record(read_record(file), controlled="force", harmonics=[1])
     extract.show(data)
+    data = extract.good_points(data)
     table = data.save(output / "levels.csv")
     telling.heading("3. fit: friction, mass, damper and spring, nothing known beforehand")
     result = fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)

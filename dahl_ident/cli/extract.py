@@ -126,6 +126,9 @@ def extract(
         str | None,
         typer.Option(help="Regular expression on the file's name; its group is the level."),
     ] = None,
+    good_only: Annotated[
+        bool, typer.Option("--good-only", help="Leave out points with another verdict than good.")
+    ] = False,
 ) -> None:
     """Turn recorded waveforms into dynamic stiffness with covariance and verdicts.
 
@@ -140,6 +143,8 @@ def extract(
         for file in with_progress(files, "extracting")
     ]
     data = parts[0] if len(parts) == 1 else FrequencyResponse.concatenate(parts)
+    if good_only:
+        data = good_points(data)
     if output is not None:
         write_data(data, output)
     if plot is not None:
@@ -149,6 +154,16 @@ def extract(
     elif output != STANDARD:
         show(data)
     judge(data)
+
+
+def good_points(data: FrequencyResponse) -> FrequencyResponse:
+    """Return the points whose verdict is good, and name the others."""
+    good = data.quality["verdict"] == "good"
+    for i in (~good & (data.harmonic == 1)).nonzero()[0]:
+        telling.doubt(
+            f"left out: row {i} at {data.frequency_hz[i]:.5g} Hz: {data.quality['verdict'][i]}"
+        )
+    return data.select(rows=good)
 
 
 def _points(
