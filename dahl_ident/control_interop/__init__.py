@@ -5,11 +5,33 @@ room is the way back.
 
 - :class:`DahlNonlinearity` puts friction into python-control's describing-function tools.
 - :func:`limit_cycles` finds the free oscillations of a loop, and which of them are approached.
+- :func:`level_responses` gives responses over frequency at several levels, as FRD or pictures.
+- :func:`equivalent_plant` and :func:`loop_margins` help to design a controller: the linear plant
+  at one amplitude, and the loop's margins against amplitude.
+- :func:`response_branches` gives every steady response of an active plant, with its stability.
+
+A plant measured under feedback needs nothing new. With F = C (r - x) the closed loop is the plant
+with the controller as one more element in parallel, ``LinearSystem(C,
+quantity="dynamic_stiffness")``, driven by the force C r.
 """
 
 from __future__ import annotations
 
+from dahl_ident.control_interop.branches import Branches, response_branches
+from dahl_ident.control_interop.equivalent import LoopMargins, equivalent_plant, loop_margins
+from dahl_ident.control_interop.levels import LevelResponses, level_responses
 from dahl_ident.control_interop.limit_cycles import LimitCycle, limit_cycles
 from dahl_ident.control_interop.nonlinearity import DahlNonlinearity
 
-__all__ = ["DahlNonlinearity", "LimitCycle", "limit_cycles"]
+__all__ = [
+    "Branches",
+    "DahlNonlinearity",
+    "LevelResponses",
+    "LimitCycle",
+    "LoopMargins",
+    "equivalent_plant",
+    "level_responses",
+    "limit_cycles",
+    "loop_margins",
+    "response_branches",
+]

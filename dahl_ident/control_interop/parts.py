@@ -1,0 +1,35 @@
+"""A model as friction and everything linear."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from dahl_ident.elements.dahl import Dahl
+from dahl_ident.elements.element import Element
+from dahl_ident.elements.model import Model, as_model
+from dahl_ident.errors import ModelError
+
+
+class Parts(NamedTuple):
+    """The Dahl elements of a plant, and its linear elements."""
+
+    friction: Model
+    linear: Model
+
+
+def parts_of(plant: Element) -> Parts:
+    """Return the friction and the linear part of a plant that has both, values included.
+
+    Raises
+    ------
+    ModelError
+        If the plant has no friction or nothing else, or a parameter has no value.
+    """
+    elements = as_model(plant).elements
+    plant.known_values()
+    friction = [element for element in elements if isinstance(element, Dahl)]
+    linear = [element for element in elements if not isinstance(element, Dahl)]
+    for part, name, example in ((friction, "friction", "Dahl"), (linear, "linear part", "Mass")):
+        if not part:
+            raise ModelError(f"{plant!r} has no {name}; add one, such as {example}(...)")
+    return Parts(Model(*friction), Model(*linear))

@@ -1,0 +1,122 @@
+"""Branches of an active plant: up- and down-sweeps in the time domain land where predicted."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+
+from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring, response_branches
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements import Element
+from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.synthetic.mechanism import Mechanism
+from dahl_ident.synthetic.waveform import WaveformBuilder
+
+s = control.tf("s")
+LAGGING = LinearSystem(s * (1.2 - 2.172 / (0.1 * s + 1)), quantity="dynamic_stiffness")
+"""A damper that feeds below 1.4 Hz and takes above, so that the held mass stays calm."""
+ACTIVE = Dahl(0.1, 30.0) + Mass(0.3) + LAGGING + Spring(3.0)
+FREQUENCY = 0.65
+
+
+def staircase(plant: Element, drives: FloatArray, frequency_hz: float, hold: int) -> FloatArray:
+    """Return the displacement amplitude at the end of each step of drive, in the time domain."""
+    builder = WaveformBuilder(frequency_hz)
+    for drive in drives:
+        builder.go_to(drive, frequency_hz, 8.0 / frequency_hz)
+        builder.stay((hold - 4) / frequency_hz)
+        builder.measure(4 / frequency_hz)
+    force = builder.finish()
+    x = Mechanism.of(plant).displacement_under(force)
+    amplitudes = []
+    for window in force.windows:
+        time = window.start + np.arange(2048) / 2048.0 * (window.stop - window.start)
+        turn = np.exp(-2j * np.pi * frequency_hz * time)
+        amplitudes.append(2.0 * abs(np.mean(x(time) * turn)))
+    return np.array(amplitudes)
+
+
+def test_sweeps_up_and_down_land_on_the_two_stable_branches() -> None:
+    """The third harmonic, near the held mass's resonance, shifts the upper branch by a tenth."""
+    up = np.array([0.05, 0.065, 0.0675, 0.0725])
+    seen = staircase(ACTIVE, np.concatenate([up, up[::-1][1:]]), FREQUENCY, 60)
+    rising, falling = seen[: up.size], seen[up.size - 1 :][::-1]
+    branches = response_branches(ACTIVE, FREQUENCY, up)
+    A, stable = branches.steady.amplitude, branches.stable
+    assert stable.tolist() == [
+        [True, False, False], [True, False, True], [True, False, True], [True, False, False],
+    ]  # fmt: skip
+    lowest, highest = A[:, 0], np.nanmax(A, axis=1)
+    assert rising[:3] == pytest.approx(lowest[:3], rel=0.08)
+    assert falling[3] == pytest.approx(highest[3], rel=0.15)
+    assert falling[0] == pytest.approx(rising[0], rel=1e-3)
+    middle = A[1:3, 1]
+    assert np.all(rising[1:3] < 0.6 * middle)
+    assert np.all(falling[1:3] > 1.3 * middle)
+    for amplitude, drive, tolerance in ((rising[:3], up[:3], 0.03), (falling[1:], up[1:], 0.13)):
+        force = amplitude * np.abs(ACTIVE.dynamic_stiffness(amplitude, 2.0 * np.pi * FREQUENCY))
+        assert force == pytest.approx(drive, rel=tolerance)
+
+
+def test_passive_plants_have_one_stable_branch() -> None:
+    plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
+    frequency, drive = np.geomspace(0.05, 5.0, 40)[:, None], np.geomspace(1e-4, 10.0, 40)
+    branches = response_branches(plant, frequency, drive)
+    assert branches.stable.shape == (40, 40, 1)
+    assert branches.stable.all()
+
+
+def test_without_friction_the_rate_is_that_of_the_pole() -> None:
+    mass, damping, stiffness = 0.3, 0.01, 3.0
+    plant = Dahl(1e-9, 1e-9) + Mass(mass) + Damper(damping) + Spring(stiffness)
+    f = np.sqrt(stiffness / mass) / (2.0 * np.pi)
+    rate = response_branches(plant, f, 1.0).growth_rate
+    pole = np.roots([mass, damping, stiffness])[0]
+    assert rate == pytest.approx([pole.real], rel=1e-3)
+
+
+def test_falling_branches_are_unstable() -> None:
+    """Where A |Z| falls with A, at least one disturbance grows."""
+    u = np.geomspace(0.03, 0.2, 60)
+    branches = response_branches(ACTIVE, np.linspace(0.5, 0.9, 15)[:, None], u)
+    A = branches.steady.amplitude[branches.steady.found]
+    omega = 2.0 * np.pi * branches.steady.frequency_hz[branches.steady.found]
+    size = [step * A * np.abs(ACTIVE.dynamic_stiffness(step * A, omega)) for step in (0.999, 1.001)]
+    falls = size[1] < size[0]
+    assert falls.sum() > 20
+    assert not branches.stable[branches.steady.found][falls].any()
+    assert not branches.stable[~branches.steady.found].any()
+
+
+def test_amplitude_dies_at_the_predicted_rate_in_the_time_domain() -> None:
+    """A step of drive far above friction: the envelope nears its new level at the given rate."""
+    plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.05) + Spring(3.0)
+    f = 0.5032
+    (rate,) = response_branches(plant, f, 0.5).growth_rate
+    builder = WaveformBuilder(f)
+    builder.go_to(0.5, f, 8.0 / f)
+    builder.stay(60.0 / f)
+    builder.go_to(0.505, f, 1.0 / f)
+    for _ in range(12):
+        builder.measure(1.0 / f)
+    builder.stay(60.0 / f)
+    builder.measure(4.0 / f)
+    force = builder.finish()
+    x = Mechanism.of(plant).displacement_under(force)
+    phasors, when = [], []
+    for window in force.windows:
+        time = window.start + np.arange(1024) / 1024.0 * (window.stop - window.start)
+        phasors.append(complex(2.0 * np.mean(x(time) * np.exp(-2j * np.pi * f * time))))
+        when.append(0.5 * (window.start + window.stop))
+    left = np.abs(np.array(phasors[:-1]) - phasors[-1])
+    assert np.polyfit(when[:-1], np.log(left), 1)[0] == pytest.approx(rate, rel=0.1)
+
+
+def test_bad_arguments_are_named() -> None:
+    with pytest.raises(ValidationError, match=r"frequency_hz is 0\.0; expected numbers > 0"):
+        response_branches(ACTIVE, 0.0, 1.0)
+    with pytest.raises(ModelError, match="has no friction; add one, such as Dahl"):
+        response_branches(Mass(1.0) + Spring(1.0), 1.0, 1.0)
+    with pytest.raises(ModelError, match="has no linear part; add one, such as Mass"):
+        response_branches(Dahl(1.0, 1.0), 1.0, 1.0)
