@@ -29,6 +29,7 @@ from dahl_ident.problem import Problem
 LIKELIHOODS = ("gaussian", "student_t", "none")
 SCALE = "noise_scale"
 TAIL_DOF = 4.0
+_FARTHEST = 300.0  # of ln s
 
 
 @dataclass(frozen=True)
@@ -101,16 +102,18 @@ class Density:
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """Return the log-density, (S, D) -> (S,); -inf outside the prior's support."""
-        theta, scale = self.split(x)
-        log_prior = self.log_prior(theta)
+        P = len(self.problem.names)
+        result = self.log_prior(x[:, :P])
+        if self.has_scale:  # where the scale would overflow, the likelihood is nil
+            result[np.abs(x[:, P]) > _FARTHEST] = -np.inf
         if self.likelihood == "none":
-            return log_prior
-        inside = log_prior > -np.inf
+            return result
+        inside = result > -np.inf
         if inside.all():
-            return log_prior + self.log_likelihood(theta, scale)
+            return result + self.log_likelihood(*self.split(x))
         if inside.any():
-            log_prior[inside] += self.log_likelihood(theta[inside], scale[inside])
-        return log_prior
+            result[inside] += self.log_likelihood(*self.split(x[inside]))
+        return result
 
     def marginal(self, theta: FloatArray) -> FloatArray:
         """Return the log-density of theta, (S, P), an unknown scale integrated out."""

@@ -9,9 +9,9 @@ many points at once costs least when the halves of all ensembles go into one cal
   Statistics and Computing 16, 2006; Nelson et al., ApJS 210, 2014).
 - `snooker`: along the line to a walker of the other half, by the projected difference of two more
   (ter Braak and Vrugt, Statistics and Computing 18, 2008).
-- `independent`: to a draw from Student's t that has the mean and the covariance of the other
-  half; in few dimensions nearly every second draw is accepted, and old places are forgotten at
-  once.
+- `independent`: to a draw from Student's t around the mean of the other half, shaped by its
+  covariance; in few dimensions many draws are accepted, old places are forgotten at once, and
+  heavy tails are reached from the middle.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Proposal = Callable[[FloatArray, FloatArray, Random], tuple[FloatArray, FloatArr
 
 _JITTER = 1e-5  # relative, of the step: keeps walkers off a lattice
 _JUMP = 0.1  # part of the steps that go all the way
-_TAIL = 5.0  # degrees of freedom of the independent proposals
+_TAIL = 2.0  # degrees of freedom of the independent proposals: few, to reach far tails
 _SNOOKER = 1.7
 
 

@@ -103,7 +103,8 @@ class ParameterPrior:
         if self.distribution is None:
             inside = (theta >= low) & (theta <= high)
             return np.where(inside, -np.log(high - low), -np.inf)
-        value = np.exp(theta) if self.logarithmic else theta
+        with np.errstate(over="ignore"):
+            value = np.exp(theta) if self.logarithmic else theta
         allowed = (value >= self.parameter.lower) & (value <= self.parameter.upper)
         density = np.where(allowed, _log_density(self.distribution, value), -np.inf)
         return density + theta if self.logarithmic else density
@@ -302,8 +303,9 @@ def _log_density(distribution: Distribution, value: FloatArray) -> FloatArray:
     """Return logpdf; a normal one directly, because scipy takes fifty times as long."""
     if _name(distribution) == "norm":
         mean, std = _moments(distribution)
-        z = (value - mean) / std
-        return np.asarray(-0.5 * z**2 - np.log(std * np.sqrt(2.0 * np.pi)))
+        with np.errstate(over="ignore"):
+            z2 = ((value - mean) / std) ** 2
+        return np.asarray(-0.5 * z2 - np.log(std * np.sqrt(2.0 * np.pi)))
     return np.asarray(distribution.logpdf(value))
 
 

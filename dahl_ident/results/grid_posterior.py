@@ -139,6 +139,11 @@ class GridPosterior:
         squares = self._density.squares(theta[likely]).sum(axis=-1)
         return ScalePosterior(squares, self._grid.weights[likely], self.problem.n_residuals // 2)
 
+    @property
+    def points(self) -> tuple[FloatArray, FloatArray]:
+        """Weights, shape (N,), which sum to 1, and search coordinates, (N, P), of all points."""
+        return self._grid.weights, self._grid.theta
+
     def mean(self) -> FloatArray:
         """Return the means of the parameters, in the order of `names`."""
         own = self._grid.weights @ self._values

@@ -18,12 +18,16 @@ from dahl_ident.data import FrequencyResponse
 from dahl_ident.errors import SamplingError, ValidationError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
+from dahl_ident.results.arviz_export import to_arviz
+from dahl_ident.results.predictive import PredictiveCheck, predictive_checks
 from dahl_ident.results.prior_rule import PriorRule, prior_rules
 
 if TYPE_CHECKING:
     import pandas as pd
 
 QUANTILES = {"2.5%": 0.025, "16%": 0.16, "median": 0.5, "84%": 0.84, "97.5%": 0.975}
+
+_CHECK_DRAWS = 1000
 
 
 @dataclass(frozen=True)
@@ -260,10 +264,20 @@ class Posterior:
             return ()
         return prior_rules(self._density.prior, self._points)
 
+    @cached_property
+    def checks(self) -> tuple[PredictiveCheck, ...]:
+        """Posterior predictive checks of the residuals; none where the prior was sampled."""
+        if self.likelihood == "none":
+            return ()
+        return predictive_checks(
+            self._density, self._draws(_CHECK_DRAWS, 0), np.random.default_rng(0)
+        )
+
     def report(self) -> str:
         """Return the posterior as text; the first line says whether to trust it."""
         table = self.summary().to_string(float_format=lambda v: f"{v:.5g}")
         rules = [str(rule) for rule in self.prior_rules]
+        rules += [str(check) for check in self.checks if not check.passed]
         priors = [f"  {name}: {text}" for name, text in self.priors.items()]
         return "\n".join([self.message, "", table, *rules, "", "Priors:", *priors])
 
@@ -299,6 +313,30 @@ class Posterior:
         import pandas as pd
 
         return pd.DataFrame(self.values, columns=list(self.names))
+
+    def to_arviz(self, seed: int = 0) -> Any:
+        """Return the posterior for ArviZ: InferenceData below version 1.0, DataTree from there.
+
+        Groups ``posterior``, ``prior``, ``log_likelihood``, ``observed_data`` and
+        ``posterior_predictive``. Its chains are the ensembles, thinned by the autocorrelation
+        time, because walkers of one ensemble are not independent.
+
+        Parameters
+        ----------
+        seed : int, default 0
+            Of the draws from the prior and of the replicated noise.
+
+        Returns
+        -------
+        arviz.InferenceData or xarray.DataTree
+            Responses are held as whitened residuals, real and imaginary part.
+
+        Raises
+        ------
+        MissingDependencyError
+            If ArviZ is not installed.
+        """
+        return to_arviz(self._density, self._chain.points, self._settings, self.convergence, seed)
 
     def plot_corner(self, **options: Any) -> NDArray[Any]:
         """Draw marginals and pairs; options as :func:`dahl_ident.plots.plot_corner`."""

@@ -13,8 +13,10 @@ class Parameters:
         self, name: str, value: float = ..., vary: bool = ..., min: float = ..., max: float = ...
     ) -> None: ...
     def __getitem__(self, name: str) -> Parameter: ...
+    def valuesdict(self) -> dict[str, float]: ...
 
 class MinimizerResult:
+    chain: NDArray[float64]
     params: Parameters
     covar: NDArray[float64]
     residual: NDArray[float64]
@@ -30,3 +32,16 @@ def minimize(
     args: tuple[Any, ...] = ...,
     **kwargs: Any,
 ) -> MinimizerResult: ...
+
+class Minimizer:
+    def __init__(self, userfcn: Callable[..., NDArray[float64]], params: Parameters) -> None: ...
+    def emcee(
+        self,
+        *,
+        steps: int = ...,
+        burn: int = ...,
+        nwalkers: int = ...,
+        is_weighted: bool = ...,
+        progress: bool = ...,
+        seed: int | None = ...,
+    ) -> MinimizerResult: ...

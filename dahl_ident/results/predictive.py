@@ -1,0 +1,126 @@
+"""Posterior predictive checks: whether the model could have produced data like these.
+
+Statistics of the whitened residuals at draws from the posterior are compared with the same of
+replicated ones, which are noise by construction (posterior predictive checks: Gelman et al.,
+Bayesian Data Analysis, 2013, chapter 6):
+
+- ``size``: the sum of squares; only where the noise's scale is known;
+- ``largest``: the largest squared residual over the mean one: outliers;
+- ``neighbours``: the correlation of residuals of rows next to each other, in order of frequency
+  and amplitude: a model of the wrong shape leaves runs of residuals of one sign.
+
+A share of replicates at least as extreme of 0.01 or less speaks of a misfit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.bayes.density import TAIL_DOF, Density
+from dahl_ident.data import FrequencyResponse
+
+_MISFIT = 0.01
+_MEANING = {
+    "size": "the residuals are larger than the noise that the data state",
+    "largest": "single rows lie farther off than the noise explains",
+    "neighbours": "neighbouring rows err in the same direction, so the model has the wrong shape",
+}
+
+
+@dataclass(frozen=True)
+class PredictiveCheck:
+    """One statistic: its mean in the data and in replicates, and the share as extreme."""
+
+    statistic: str
+    observed: float
+    replicated: float
+    share: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether replicates reach the data's value often enough."""
+        return self.share > _MISFIT
+
+    def __str__(self) -> str:
+        numbers = (
+            f"{self.statistic} {self.observed:.3g}, replicated {self.replicated:.3g}, "
+            f"share at least as extreme {self.share:.3f}"
+        )
+        return numbers if self.passed else f"MISFIT: {_MEANING[self.statistic]} ({numbers})"
+
+
+def predictive_checks(
+    density: Density, points: FloatArray, random: np.random.Generator
+) -> tuple[PredictiveCheck, ...]:
+    """Return the checks at draws from the posterior, (S, D)."""
+    theta, scale = density.split(points)
+    y, _ = density.problem.whitened(theta, derivatives=False)
+    y = np.broadcast_to(y, (len(theta), density.problem.n_residuals // 2)) / scale[:, None]
+    order = _neighbours(density.problem.data)
+    noise = replicated_noise(density, y.shape, random)
+    found = []
+    for name, statistic in _STATISTICS.items():
+        if name == "size" and density.has_scale:
+            continue
+        observed, replicated = statistic(y[:, order]), statistic(noise[:, order])
+        share = float(np.mean(replicated >= observed))
+        found.append(PredictiveCheck(name, float(observed.mean()), float(replicated.mean()), share))
+    return tuple(found)
+
+
+def replicated_noise(
+    density: Density, shape: tuple[int, int], random: np.random.Generator
+) -> ComplexArray:
+    """Return whitened residuals as the likelihood has them, the scale taken as 1."""
+    noise = random.standard_normal(shape) + 1j * random.standard_normal(shape)
+    dof = density.problem.data.dof
+    if not density.problem.gaussian and dof is not None:
+        # Student's t with the loss (dof + 1) ln(1 + z/dof) for its square
+        with np.errstate(invalid="ignore"):
+            factor = np.where(np.isfinite(dof), (dof + 1.0) / (dof - 1.0), 1.0)
+        noise = noise * np.sqrt(factor)
+    if density.likelihood == "student_t":
+        noise = noise / np.sqrt(random.chisquare(TAIL_DOF, shape) / TAIL_DOF)
+    return np.asarray(noise)
+
+
+def pointwise_log_likelihood(density: Density, points: FloatArray) -> FloatArray:
+    """Return ln of each row's density, (S, n), up to a constant that all rows share.
+
+    The rows add up to the log-likelihood of the data.
+    """
+    theta, scale = density.split(points)
+    z = density.squares(theta) / scale[:, None] ** 2
+    if density.likelihood == "student_t":
+        rows = -(0.5 * TAIL_DOF + 1.0) * np.log1p(z / TAIL_DOF)
+    else:
+        rows = -0.5 * z
+    rest = density.log_likelihood(theta, scale) - rows.sum(axis=1)
+    return np.asarray(rows + rest[:, None] / z.shape[1])
+
+
+def _neighbours(data: FrequencyResponse) -> NDArray[np.intp]:
+    """Return the rows in order of harmonic, frequency and amplitude."""
+    amplitude = data.drive if data.amplitude is None else data.amplitude
+    assert amplitude is not None
+    return np.asarray(np.lexsort((amplitude, data.frequency_hz, data.harmonic)))
+
+
+def _size(y: ComplexArray) -> FloatArray:
+    return np.asarray(np.sum(np.abs(y) ** 2, axis=1))
+
+
+def _largest(y: ComplexArray) -> FloatArray:
+    z = np.abs(y) ** 2
+    return np.asarray(z.max(axis=1) / z.mean(axis=1))
+
+
+def _correlation(y: ComplexArray) -> FloatArray:
+    return np.asarray(np.sum((y[:, 1:] * y[:, :-1].conj()).real, axis=1) / _size(y))
+
+
+_STATISTICS = {"size": _size, "largest": _largest, "neighbours": _correlation}

@@ -1,0 +1,228 @@
+"""The posterior that users hold: against quadrature, and in every form it takes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import dahl_ident as di
+from dahl_ident.bayes.convergence import autocorrelation_time
+from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.moves import EnsembleMove
+from dahl_ident.bayes.priors import joint_prior
+from dahl_ident.data.readers.file import library
+from dahl_ident.errors import SamplingError, ValidationError
+from dahl_ident.results.predictive import pointwise_log_likelihood
+from tests.bayes_cases import friction_table, with_covariance
+
+LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
+
+
+@pytest.fixture(scope="module")
+def posterior() -> di.Posterior:
+    return di.sample(friction_table(), di.Dahl(), seed=1)
+
+
+def scenarios() -> dict[str, tuple[di.FrequencyResponse, Any, dict[str, Any]]]:
+    gain = di.Sensors(force_gain=stats.norm(1.0, 0.05))
+    return {
+        "knee": (friction_table(30, noise=0.01), di.Dahl(), {}),
+        "three points": (friction_table(3, noise=0.3), di.Dahl(), {}),
+        "microslip": (friction_table(10, 0.003, 0.03, 0.02), di.Dahl(), {}),
+        "gross slip": (friction_table(10, 30.0, 300.0), di.Dahl(), {}),
+        "known noise": (with_covariance(friction_table(), 0.02), di.Dahl(), {}),
+        "gain from a sheet": (friction_table(8), di.Dahl(), {"sensors": gain}),
+    }
+
+
+@pytest.mark.parametrize("name", scenarios())
+def test_sampling_agrees_with_quadrature(name: str) -> None:
+    data, model, options = scenarios()[name]
+    drawn = di.sample(data, model, seed=3, ess=3000.0, **options)
+    grid = di.posterior_grid(data, model, tolerance=1e-3, **options)
+    assert drawn.converged
+    ess = drawn.convergence.ess
+    D = len(drawn.names)
+    # moments in search coordinates, where tails are light
+    logs = [p.transform == "log" for p in drawn.problem.parameters] + [True] * (
+        D - len(drawn.problem.names)
+    )
+    values = np.where(logs, np.log(drawn.values), drawn.values)
+    for i, parameter in enumerate(drawn.names):
+        for level in LEVELS:
+            exact = float(grid.quantile(parameter, level))
+            exact = np.log(exact) if logs[i] else exact
+            share = np.mean(values[:, i] < exact)
+            error = np.sqrt(level * (1.0 - level) / ess[i])
+            assert abs(share - level) < 4.0 * error, (parameter, level)
+        if i < len(drawn.problem.names):
+            weights, theta = grid.points
+            mean = weights @ theta[:, i]
+            std = np.sqrt(weights @ (theta[:, i] - mean) ** 2)
+            assert abs(values[:, i].mean() - mean) < 4.0 * std / np.sqrt(ess[i])
+            # the variance is a mean as well, with an autocorrelation time of its own
+            squares = (values[:, i] - mean) ** 2
+            paths = squares.reshape(-1, drawn.get_chain().shape[1], 1)
+            error = squares.std() * np.sqrt(autocorrelation_time(paths)[0] / squares.size)
+            assert abs(squares.mean() - std**2) < 4.0 * error
+
+
+def test_the_summary_is_that_of_the_draws(posterior: di.Posterior) -> None:
+    table = posterior.summary()
+    values = posterior.values
+    assert list(table.index) == ["f_max", "sigma", "noise_scale"]
+    assert table["unit"].tolist() == ["N", "N/m", ""]
+    assert table["mean"].to_numpy() == pytest.approx(values.mean(axis=0))
+    assert table["97.5%"].to_numpy() == pytest.approx(np.quantile(values, 0.975, axis=0))
+    std, ess = table["std"].to_numpy(), table["ess"].to_numpy()
+    assert table["mcse"].to_numpy() == pytest.approx(std / np.sqrt(ess))
+    assert values.shape == (len(posterior.to_frame()), 3)
+    assert np.all(table["r_hat"].to_numpy() < 1.01)
+
+
+def test_emcees_names(posterior: di.Posterior) -> None:
+    whole = posterior.get_chain()
+    assert whole.shape == (posterior.steps, 128, 3)
+    some = posterior.get_chain(discard=100, thin=3)
+    np.testing.assert_array_equal(some, whole[100::3])
+    flat = posterior.get_chain(discard=100, thin=3, flat=True)
+    np.testing.assert_array_equal(flat, some.reshape(-1, 3))
+    assert posterior.get_log_prob().shape == whole.shape[:2]
+    assert posterior.get_autocorr_time() == pytest.approx(posterior.convergence.tau)
+    with pytest.raises(ValidationError, match="discard is -1; expected a whole number >= 0"):
+        posterior.get_chain(discard=-1)
+
+
+def test_a_short_chain_is_marked_and_keeps_its_ess_to_itself() -> None:
+    short = di.sample(friction_table(), di.Dahl(), seed=1, steps=60)
+    assert not short.converged
+    assert short.report().startswith("NOT CONVERGED after 60 steps: ")
+    assert "autocorrelation times, expected 50" in short.message
+    assert np.isnan(short.summary()["ess"].to_numpy()).all()
+    assert "NOT CONVERGED" in repr(short)
+
+
+def test_a_chain_that_never_moved_is_refused_with_its_chain(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def stay(half: Any, guide: Any, random: Any) -> Any:
+        return half, np.full(half.shape[:-1], -np.inf)
+
+    def moves(ensembles: int) -> list[tuple[EnsembleMove, float]]:
+        return [(EnsembleMove(stay, ensembles), 1.0)]
+
+    monkeypatch.setattr("dahl_ident.bayes.chain.moves_for", moves)
+    with pytest.raises(SamplingError, match="walkers never moved in f_max, sigma") as caught:
+        di.sample(friction_table(), di.Dahl(), seed=1, steps=40)
+    assert caught.value.posterior.get_chain().shape == (40, 128, 3)
+
+
+def test_the_report_names_priors(posterior: di.Posterior) -> None:
+    text = posterior.report()
+    assert text.startswith("Converged: ")
+    assert "f_max: log-uniform from" in text
+    assert "noise_scale: 1/s" in text
+    assert "MISFIT" not in text
+
+
+def test_a_prior_dominated_parameter_is_named() -> None:
+    data = friction_table(10, 0.0003, 0.003, 0.05)
+    posterior = di.sample(data, di.Dahl(), seed=1)
+    (rule,) = posterior.prior_rules
+    assert rule.name == "f_max"
+    assert "f_max is set by its prior: posterior width 0." in posterior.report()
+
+
+def test_derived_quantities(posterior: di.Posterior) -> None:
+    x_c = posterior.derived(lambda f_max, sigma, **_: f_max / sigma)
+    exact = posterior.values[:, 0] / posterior.values[:, 1]
+    assert x_c["median"] == pytest.approx(np.median(exact))
+    assert x_c["std"] == pytest.approx(exact.std(), rel=1e-3)
+    with pytest.raises(ValidationError, match="expected one number a draw"):
+        posterior.derived(lambda **_: 1.0)
+
+
+def test_prediction_bands_hold_the_best_fit(posterior: di.Posterior) -> None:
+    band = posterior.prediction_band()
+    best = di.fit(posterior.data, di.Dahl()).best_fit
+    assert (band.gain[0] < np.abs(best)).all()
+    assert (np.abs(best) < band.gain[4]).all()
+    assert (band.phase_deg[0] < np.rad2deg(np.angle(best))).all()
+    assert (np.rad2deg(np.angle(best)) < band.phase_deg[4]).all()
+
+
+def test_predictive_checks_pass_the_right_model_and_fail_the_wrong_one() -> None:
+    data = with_covariance(friction_table(30, 0.1, 10.0, 0.02), 0.02)
+    right = di.sample(data, di.Dahl(), seed=1)
+    assert [check.statistic for check in right.checks] == ["size", "largest", "neighbours"]
+    assert all(check.passed for check in right.checks)
+    wrong = di.sample(data, di.Dahl(alpha=2.0), seed=1)
+    failed = {check.statistic for check in wrong.checks if not check.passed}
+    assert {"size", "neighbours"} <= failed
+    assert "MISFIT: neighbouring rows err in the same direction" in wrong.report()
+
+
+def test_checks_of_a_right_model_are_calibrated() -> None:
+    # over many tables, the shares must not be crowded at the end that means a misfit
+    shares = []
+    for seed in range(12):
+        table = friction_table(15, noise=0.05, seed=seed)
+        drawn = di.sample(table, di.Dahl(), seed=1, steps=150)
+        shares += [check.share for check in drawn.checks]
+    assert np.mean(np.array(shares) < 0.05) < 0.2
+
+
+def test_pointwise_likelihood_adds_up() -> None:
+    problem = di.Problem(with_covariance(friction_table(), 0.02), di.Dahl())
+    for likelihood in ("gaussian", "student_t"):
+        density = Density(problem, joint_prior(problem), likelihood)
+        points = np.log([[0.1, 30.0], [0.11, 28.0]])
+        rows = pointwise_log_likelihood(density, points)
+        exact = density.log_likelihood(points, np.ones(2))
+        assert rows.sum(axis=1) == pytest.approx(exact)
+
+
+def test_student_t_is_a_density() -> None:
+    # one row: its density over the measured response integrates to 1
+    amplitude = np.array([2e-3])
+    model = di.Dahl(f_max=0.1, sigma=30.0).describing_function(amplitude)
+    covariance = 0.04 * np.eye(2)[None]
+    offsets = np.linspace(0.0, 40.0, 401)
+    total = 0.0
+    for x in offsets:
+        row = di.FrequencyResponse(np.ones(1), model + x * 0.2, amplitude, covariance=covariance)
+        problem = di.Problem(row, di.Dahl(sigma=30.0))
+        density = Density(problem, joint_prior(problem, {"f_max": (0.01, 1.0)}), "student_t")
+        value = density.log_likelihood(np.log([[0.1]]), np.ones(1))[0]
+        # radial symmetry: integrate over circles
+        total += np.exp(value) * 2.0 * np.pi * x * 0.04 * (offsets[1] - offsets[0])
+    assert total == pytest.approx(1.0, abs=2e-3)
+
+
+def test_arviz_gets_every_group(posterior: di.Posterior) -> None:
+    exported = posterior.to_arviz()
+    groups = set(exported.groups())
+    assert {
+        "posterior", "prior", "log_likelihood", "observed_data", "posterior_predictive",
+    } <= {name.strip("/") for name in groups}  # fmt: skip
+    drawn = exported["posterior"]["f_max"].to_numpy()
+    assert drawn.shape[0] == 4
+    assert np.median(drawn) == pytest.approx(np.median(posterior.values[:, 0]), rel=1e-3)
+    arviz = library("arviz", "arviz")
+    assert float(arviz.rhat(exported)["f_max"]) < 1.02
+    ess = float(arviz.ess(exported)["f_max"])
+    assert ess == pytest.approx(posterior.convergence.ess[0], rel=0.3)
+    replicated = exported["posterior_predictive"]["real"].to_numpy()
+    observed = exported["observed_data"]["real"].to_numpy()
+    assert replicated.shape[2:] == observed.shape == (12,)
+    assert np.abs(observed).max() < 4.0 * replicated.std()
+
+
+def test_pictures(posterior: di.Posterior) -> None:
+    plt = library("matplotlib.pyplot")
+    assert posterior.plot_corner().shape == (3, 3)
+    assert len(posterior.plot_trace()) == 3
+    plt.close("all")
