@@ -22,9 +22,11 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 
 _THRESHOLD = 0.3  # of the amplitude; sine noise may be a tenth of it
-_HIGH = 0.995  # quantile that stands for the amplitude
-_QUIET = 1.5  # lobes beyond the threshold: a longer time within it may hold another level
+_QUANTILES = (0.995, 0.9, 0.7)  # for the amplitude; the next where a part of a lobe misleads
+_QUIET = 1.5  # half cycles: a longer time within the threshold may hold another level
 _FEWEST_SAMPLES = 16
+_ALIKE = 0.1  # relative difference of periods, and cycles off a whole number, of one sine
+_MOST_BRIDGED = 10.0  # cycles
 _DEEPEST = 12
 _SAMPLED = 50_000  # samples that the quantiles are taken from
 _FEWEST_A_CYCLE = 3
@@ -54,7 +56,7 @@ def find_cycles(time: FloatArray, motion: FloatArray) -> list[Cycles]:
     """Cut a record of unknown frequencies into runs of consecutive cycles, in order of time."""
     runs = _crossing_runs(time, motion, 0)
     runs.sort(key=lambda edges: float(edges[0]))
-    return [_without_noise(_measured(time, motion, edges)) for edges in runs]
+    return [_without_noise(_measured(time, motion, edges)) for edges in _joined(runs)]
 
 
 def cut_cycles(time: FloatArray, motion: FloatArray, frequency_hz: float) -> list[Cycles]:
@@ -67,6 +69,23 @@ def cut_cycles(time: FloatArray, motion: FloatArray, frequency_hz: float) -> lis
     return [_measured(time, motion, edges)]
 
 
+def _joined(runs: list[FloatArray]) -> list[FloatArray]:
+    """Join runs that are a few cycles of the same period apart; what lies between is measured."""
+    joined: list[FloatArray] = []
+    for edges in runs:
+        if joined:
+            last = joined[-1]
+            period, other = last[-1] - last[-2], edges[1] - edges[0]
+            apart = (edges[0] - last[-1]) / period
+            alike = abs(other / period - 1.0) < _ALIKE
+            if alike and apart < _MOST_BRIDGED and abs(apart - round(apart)) < _ALIKE:
+                bridge = np.linspace(last[-1], edges[0], round(apart) + 1)[1:-1]
+                joined[-1] = np.concatenate([last, bridge, edges[0 if round(apart) else 1 :]])
+                continue
+        joined.append(edges)
+    return joined
+
+
 def _without_noise(cycles: Cycles) -> Cycles:
     """Return the cycles with infinite noise for those that noise alone may have made."""
     doubtful = cycles.noise > _NOISIEST_CROSSING
@@ -77,19 +96,25 @@ def _crossing_runs(time: FloatArray, motion: FloatArray, depth: int) -> list[Flo
     """Return the rising crossings, split where the motion is quiet, and those found there."""
     if time.size < _FEWEST_SAMPLES or depth > _DEEPEST:
         return []
+    for quantile in _QUANTILES:
+        found = _runs_at(time, motion, quantile, depth)
+        if found:
+            return found
+    return []
+
+
+def _runs_at(time: FloatArray, motion: FloatArray, quantile: float, depth: int) -> list[FloatArray]:
+    """Return the rising crossings of the amplitude that a quantile gives."""
     seen = motion[:: max(1, time.size // _SAMPLED)]
-    low, high = np.quantile(seen, [1.0 - _HIGH, _HIGH])
+    low, high = np.quantile(seen, [1.0 - quantile, quantile])
     middle, threshold = 0.5 * (low + high), 0.5 * _THRESHOLD * (high - low)
     if not threshold > 1e-12 * max(abs(low), abs(high)):
         return []
     moved = motion - middle
     beyond = np.flatnonzero(np.abs(moved) > threshold)
     above = moved[beyond] > 0.0
-    turns = np.flatnonzero(above[1:] != above[:-1])
-    lobe = np.diff(np.concatenate([[0], turns + 1, [beyond.size]]))
-    usual = np.repeat(lobe, lobe)
     pause = np.diff(beyond) - 1
-    quiet = (pause > _QUIET * np.maximum(usual[1:], usual[:-1])) & (pause >= _FEWEST_SAMPLES)
+    quiet = (pause > _QUIET * _lobe_spacing(beyond, above)) & (pause >= _FEWEST_SAMPLES)
     breaks = np.concatenate([[0], np.flatnonzero(quiet) + 1, [beyond.size]])
     found: list[FloatArray] = []
     done = 0
@@ -98,12 +123,35 @@ def _crossing_runs(time: FloatArray, motion: FloatArray, depth: int) -> list[Flo
         if rising.size < 2:
             continue
         found.append(_crossings(time, moved, beyond[rising], beyond[rising + 1]))
-        before = slice(done, int(beyond[first]))
-        found += _crossing_runs(time[before], motion[before], depth + 1)
-        done = int(beyond[last - 1]) + 1
+        start, stop = _with_a_cycle_more(beyond[rising])
+        found += _crossing_runs(time[done:start], motion[done:start], depth + 1)
+        done = stop
     if done:
         found += _crossing_runs(time[done:], motion[done:], depth + 1)
     return found
+
+
+def _with_a_cycle_more(rising: NDArray[np.intp]) -> tuple[int, int]:
+    """Return the samples a cycle before the first and after the last of rising crossings.
+
+    In them the motion may have been on its way to or from the first and last.
+    """
+    start = rising[0] - (rising[1] - rising[0])
+    stop = rising[-1] + (rising[-1] - rising[-2])
+    return max(int(start), 0), int(stop)
+
+
+def _lobe_spacing(beyond: NDArray[np.intp], above: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return, for each pair of samples beyond the threshold, how far lobes near it are apart.
+
+    In samples from the start of one lobe to that of the next, before or after the pair's own.
+    """
+    lobe = np.concatenate([[0], np.cumsum(above[1:] != above[:-1])])
+    starts = beyond[np.flatnonzero(np.diff(lobe, prepend=-1))]
+    far = np.full(1, beyond[-1] + 1)
+    spacing = np.concatenate([far, np.diff(starts), far, far])
+    before, after = spacing[lobe[:-1]], spacing[lobe[:-1] + 2]
+    return np.asarray(np.minimum(before, after))
 
 
 def _crossings(

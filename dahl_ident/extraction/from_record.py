@@ -29,7 +29,8 @@ _PLATEAU_CYCLES = 3  # fewer only where no plateau has so many
 _QUIET_CROSSINGS = 0.01  # noise of a cycle's log amplitude that no crossing suffers from
 _WELL_COVERED = 0.5  # of a record: where crossings find segments so long, they are right
 _SWEEP_DEGREE = 3  # of the phase in a window
-_STEADY_END = 0.005  # of the amplitude, that the ends of a record may stray from the sine
+_STRAYING = 0.005  # of the amplitude, that a further cycle may stray from the sine
+_MOST_CYCLES_MORE = 2  # on either side
 
 
 def extract(
@@ -215,6 +216,8 @@ def _segments(
             segments = max(segments, find_segments(periods, mode, fewest, window), key=_covered)
         if segments:
             return segments
+    if frequency is not None and mode != "sweep" and len(runs):
+        return [Segment(float(time[0]), float(time[-1]), frequency)]
     raise ExtractionError(_no_segments(time, motion, runs, frequency))
 
 
@@ -252,19 +255,21 @@ def _stretch(
         return track_phase(stretch, _SWEEP_DEGREE)
     if frequency is None:
         stretch = estimate_frequency(track_phase(stretch, 1))
-    part = _with_ends(time, channels[0], stretch, slice(first, last))
+    part = _extended(time, channels[0], stretch, slice(first, last))
     if part == slice(first, last):
         return stretch
     stretch = steady_stretch(time[part], channels[:, part], stretch.omega)
     return stretch if frequency is not None else estimate_frequency(stretch)
 
 
-def _with_ends(time: FloatArray, motion: FloatArray, stretch: Stretch, part: slice) -> slice:
-    """Return the slice with the partial cycles at the record's ends, where the sine fits them."""
+def _extended(time: FloatArray, motion: FloatArray, stretch: Stretch, part: slice) -> slice:
+    """Return the slice with the cycles before and after it that its sine fits as well.
+
+    At the ends of the record they may be partial.
+    """
     few = thinned(stretch)
     basis = columns(few.theta, few.tau, 1)
     fitted = np.linalg.solve(basis @ basis.T, basis @ few.channels[0])
-    amplitude = float(np.hypot(*fitted[2:]))
     cycle = 2.0 * np.pi / stretch.omega
 
     def misfit(where: slice) -> float:
@@ -274,12 +279,14 @@ def _with_ends(time: FloatArray, motion: FloatArray, stretch: Stretch, part: sli
 
     start, stop = part.start, part.stop
     inside = slice(start, int(np.searchsorted(time, time[start] + cycle)))
-    allowed = 1.5 * misfit(inside) + _STEADY_END * amplitude
-    if start > 0 and time[start] - time[0] < cycle and misfit(slice(0, start)) <= allowed:
-        start = 0
-    rest = slice(stop, time.size)
-    if stop < time.size and time[-1] - time[stop] < cycle and misfit(rest) <= allowed:
-        stop = time.size
+    allowed = 1.5 * misfit(inside) + _STRAYING * float(np.hypot(*fitted[2:]))
+    for _ in range(_MOST_CYCLES_MORE):
+        earlier = int(np.searchsorted(time, time[start] - cycle))
+        if earlier < start and misfit(slice(earlier, start)) <= allowed:
+            start = earlier
+        later = int(np.searchsorted(time, time[stop - 1] + cycle, side="right"))
+        if later > stop and misfit(slice(stop, later)) <= allowed:
+            stop = later
     return slice(start, stop)
 
 

@@ -161,23 +161,23 @@ def measure(stretch: Stretch, settings: Settings, *, sweep: bool = False) -> Poi
     found = whole_cycles(stretch)
     if found < FEWEST_CYCLES:
         raise ExtractionError(
-            f"{found} whole cycles of {stretch.omega / (2.0 * np.pi):.6g} Hz around t = "
-            f"{stretch.centre:.6g} s; expected at least {FEWEST_CYCLES}: record longer, or check "
-            "frequency="
+            f"{found} whole cycles {_where(stretch)}; expected at least {FEWEST_CYCLES}: record "
+            "longer, or check frequency="
         )
     cycles = min(found, settings.num_periods or found)
     if not sweep and cycles - (settings.settling_periods or 0) < FEWEST_CYCLES:
         raise ExtractionError(
-            f"{cycles} cycles of {stretch.omega / (2.0 * np.pi):.6g} Hz around t = "
-            f"{stretch.centre:.6g} s, {settings.settling_periods} of them for settling; expected "
-            f"{FEWEST_CYCLES} more than for settling: record longer, or lower settling_periods="
+            f"{cycles} cycles {_where(stretch)}, {settings.settling_periods} of them for "
+            f"settling; expected {FEWEST_CYCLES} more than for settling: record longer, or lower "
+            "settling_periods="
         )
     whole = last_cycles(stretch, cycles)
     steps = np.array([sensor_step(channel) for channel in whole.channels])
     first = first_cycles(whole, MOST_CYCLES)
     rough = sine_fit(thinned(first), trend=sweep)
-    _check_sine(rough, fundamental_share(rough, first), steps, settings)
+    _check_motion(rough, steps, settings)
     memory = _memory(rough, settings)
+    _check_share(rough, _without(memory, first, settings), settings)
     if sweep:
         dropped = 0
     elif settings.settling_periods is not None:
@@ -189,24 +189,36 @@ def measure(stretch: Stretch, settings: Settings, *, sweep: bool = False) -> Poi
     return _point(phasors, cycles, dropped, steps)
 
 
-def _check_sine(fit: SineFit, shares: FloatArray, steps: FloatArray, settings: Settings) -> None:
-    """Refuse what moves less than its sensor resolves, or is not one sine."""
-    where = f"around t = {fit.stretch.centre:.6g} s, {fit.stretch.omega / (2.0 * np.pi):.6g} Hz"
+def _check_motion(fit: SineFit, steps: FloatArray, settings: Settings) -> None:
+    """Refuse what moves less than its sensor resolves."""
     amplitudes = np.abs(fit.phasors(1))
-    names = (settings.motion_channel, "force")
-    for name, amplitude, step, share in zip(names, amplitudes, steps, shares, strict=True):
+    for name, amplitude, step in zip(_names(settings), amplitudes, steps, strict=True):
         if amplitude <= step or amplitude == 0.0:
             raise ExtractionError(
-                f"{name} {where}: amplitude {amplitude:.4g} is {amplitude / (step or 1.0):.3g} "
-                f"sensor steps (of {step:.4g}); expected more than one step: use a larger "
-                "amplitude or a finer range"
+                f"{name} {_where(fit.stretch)}: amplitude {amplitude:.4g} is "
+                f"{amplitude / (step or 1.0):.3g} sensor steps (of {step:.4g}); expected more "
+                "than one step: use a larger amplitude or a finer range"
             )
+
+
+def _check_share(fit: SineFit, stretch: Stretch, settings: Settings) -> None:
+    """Refuse what is not one sine."""
+    shares = fundamental_share(fit, stretch)
+    for name, share in zip(_names(settings), shares, strict=True):
         if share < settings.min_share:
             raise ExtractionError(
-                f"{name} {where}: the fundamental has {100.0 * share:.3g} % of the power; "
-                f"expected at least {100.0 * settings.min_share:.3g} %, one dominant sine: "
+                f"{name} {_where(stretch)}: the fundamental has {100.0 * share:.3g} % of the "
+                f"power; expected at least {100.0 * settings.min_share:.3g} %, one dominant sine: "
                 "check the channel and frequency=, or lower min_share= if it is noise"
             )
+
+
+def _names(settings: Settings) -> tuple[str, str]:
+    return settings.motion_channel, "force"
+
+
+def _where(stretch: Stretch) -> str:
+    return f"around t = {stretch.centre:.6g} s, {stretch.omega / (2.0 * np.pi):.6g} Hz"
 
 
 def _memory(fit: SineFit, settings: Settings) -> Memory:
@@ -215,15 +227,20 @@ def _memory(fit: SineFit, settings: Settings) -> Memory:
     return estimate_memory(fit, settings.memory_channel, float(np.angle(X)), response)
 
 
+def _without(memory: Memory, stretch: Stretch, settings: Settings) -> Stretch:
+    """Return the stretch without its memory, where that stands out of the noise."""
+    if not memory.significant:
+        return stretch
+    channels = stretch.channels.copy()
+    channels[settings.memory_channel] -= memory.waveform(stretch)
+    return replace(stretch, channels=channels)
+
+
 def _phasors(
     stretch: Stretch, memory: Memory, cycles: int, settings: Settings, *, sweep: bool
 ) -> _Phasors:
     """Fit a stretch without its memory, which is no noise, and join the phasors' noise."""
-    if memory.significant:
-        channels = stretch.channels.copy()
-        channels[settings.memory_channel] -= memory.waveform(stretch)
-        stretch = replace(stretch, channels=channels)
-    fit = sine_fit(stretch, trend=sweep)
+    fit = sine_fit(_without(memory, stretch, settings), trend=sweep)
     harmonics = [k for k in settings.harmonics if k <= fit.orders]
     noise = line_noise(fit, [1, *harmonics], cycles, fit.residual)
     return _Phasors(fit, cycles, settings, tuple(noise), memory, memory.phasors(fit))

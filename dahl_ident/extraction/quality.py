@@ -13,7 +13,6 @@ from dahl_ident.extraction.sine_fit import HARMONICS, SineFit, Stretch
 
 _LOOKED_AT = 5_000  # samples from which the sensor's step is found
 _SAME = 1e-9  # of the range: values nearer than this are equal but for rounding
-_TINY = np.finfo(np.float64).tiny
 _RAIL_RUN = 5  # samples in a row at an extreme value
 
 
@@ -59,7 +58,8 @@ def fundamental_share(fit: SineFit, stretch: Stretch) -> FloatArray:
     """
     drift = fit.coefficients[1] ** 2 / 3.0
     power = np.var(stretch.channels, axis=1) - drift
-    return np.asarray(0.5 * np.abs(fit.phasors(1)) ** 2 / np.maximum(power, _TINY))
+    power = np.maximum(power, 0.5 * np.abs(fit.phasors(1)) ** 2)
+    return np.asarray(0.5 * np.abs(fit.phasors(1)) ** 2 / power)
 
 
 def distortion(fit: SineFit, integrations: int) -> float:

@@ -23,7 +23,8 @@ Mode = Literal["auto", "steps", "sweep"]
 MODES: tuple[Mode, ...] = ("auto", "steps", "sweep")
 _AMPLITUDE_TOLERANCE = 0.02
 _FREQUENCY_TOLERANCE = 0.01
-_NOISE_FACTOR = 5.0
+_NOISE_FACTOR = 6.0
+_LEAST_NOISE = 1e-12
 _NOISIEST = 0.2  # noise of a cycle's log amplitude above which it is no cycle
 _EDGE_TOLERANCE = 0.005  # of the amplitude: cycles at the ends of a plateau that stray more go
 _MOSTLY_HELD = 0.5  # plateaus over cycles that change smoothly: with less it is a sweep
@@ -133,24 +134,25 @@ def _change(values: FloatArray) -> float:
 def _pieces(cycles: Cycles) -> Iterator[_Piece]:
     """Grow pieces cycle by cycle against the mean of what they have."""
     amplitude, frequency = cycles.log_amplitude.tolist(), cycles.log_frequency.tolist()
-    noise = cycles.noise.tolist()
-    first, a_sum, f_sum = 0, 0.0, 0.0
+    noise = np.clip(cycles.noise, _LEAST_NOISE, 1.0).tolist()
+    first, a_sum, f_sum, inverse = 0, 0.0, 0.0, 0.0
     for j in range(len(cycles)):
-        if j > first:
-            held = j - first
-            a_tolerance, f_tolerance = _tolerances(max(noise[j], noise[first]))
+        held = j - first
+        if held:
+            usual = min(noise[j], held / inverse)  # a transition is noisier than its neighbours
+            a_tolerance, f_tolerance = _tolerances(usual)
             f_mean = f_sum / (held - 1) if held > 1 else frequency[j - 1]
-            fits = (
+            if (
                 max(noise[j], noise[first]) < _NOISIEST
                 and abs(amplitude[j] - a_sum / held) <= a_tolerance
                 and abs(frequency[j - 1] - f_mean) <= f_tolerance
-            )
-            if not fits:
-                yield _Piece(cycles, first, j)
-                first, a_sum, f_sum = j, 0.0, 0.0
-            else:
+            ):
                 f_sum += frequency[j - 1]
+            else:
+                yield _Piece(cycles, first, j)
+                first, a_sum, f_sum, inverse = j, 0.0, 0.0, 0.0
         a_sum += amplitude[j]
+        inverse += 1.0 / noise[j]
     if len(cycles):
         yield _Piece(cycles, first, len(cycles))
 
