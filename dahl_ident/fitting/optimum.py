@@ -173,7 +173,7 @@ def inverse(information: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     values, vectors = np.linalg.eigh(information / sizes)
     null = values <= _NULL * np.maximum(1.0, values[..., -1:])
     parts = np.abs(vectors) * null[..., None, :]
-    undetermined = np.asarray(parts.max(axis=-1) > _PART, dtype=np.bool_)
+    undetermined = np.asarray((parts > _PART).any(axis=-1), dtype=np.bool_)
     inverted = np.where(null, 0.0, 1.0 / np.where(null, 1.0, values))
     covariance = (vectors * inverted[..., None, :]) @ vectors.swapaxes(-1, -2) / sizes
     return (_blanked(covariance, undetermined) if undetermined.any() else covariance), undetermined

@@ -168,11 +168,7 @@ class _Grid:
         theta = np.empty((*places.shape, len(self.problem.parameters)))
         for index, parameter in enumerate(self.problem.parameters):
             value = known.get(parameter.name, parameter.value)
-            if value is None:
-                raise FitError(
-                    f"{parameter.name} has no value to start from, and only parameters of Dahl, "
-                    "Mass, Damper and Spring can be found without one; give it a start"
-                )
+            assert value is not None
             if parameter.transform == "log":
                 value = np.log(np.maximum(np.abs(value), 1e-300))
             theta[..., index] = value
@@ -195,6 +191,7 @@ def _grid(problem: Problem) -> _Grid:
             column = view.of(element, [np.ones(())])
             columns[element.parameters[0].name] = column * view.weights
         else:
+            _require_values(element.parameters)
             rest = rest + view.of(element, _start_values(element.parameters))
     return _Grid(
         problem,
@@ -321,6 +318,15 @@ def _taken(values: FloatArray, node: IntArray) -> FloatArray:
 
 def _is_free(parameters: tuple[Parameter, ...]) -> bool:
     return any(p.free for p in parameters)
+
+
+def _require_values(parameters: tuple[Parameter, ...]) -> None:
+    missing = [p.name for p in parameters if p.value is None]
+    if missing:
+        raise FitError(
+            f"{', '.join(missing)} has no value to start from, and only parameters of Dahl, Mass, "
+            "Damper and Spring can be found without one; give it a value and name it in free="
+        )
 
 
 def _start_values(parameters: tuple[Parameter, ...]) -> list[FloatArray]:

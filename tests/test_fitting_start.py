@@ -1,0 +1,99 @@
+"""No guess is needed: the optimum is that of a dense scan, whatever the units."""
+
+from __future__ import annotations
+
+import importlib
+
+import numpy as np
+import pytest
+
+from dahl_ident import Dahl, Damper, FrequencyResponse, LinearSystem, Mass, Problem, Spring
+from dahl_ident.errors import FitError
+from dahl_ident.fitting import solve
+from dahl_ident.fitting.start import best_starts, starts
+from dahl_ident.problem import ProblemBatch
+from tests.random_problems import friction_alone
+
+A = np.geomspace(1e-4, 1e-1, 20)
+
+
+def test_optimum_equals_that_of_a_dense_scan_in_a_thousand_random_problems() -> None:
+    worst = 0.0
+    for problem, least_cost, at_edge in friction_alone(seed=1, count=1000):
+        found = solve(problem)
+        assert found.success is not at_edge
+        worst = max(worst, found.cost / least_cost - 1.0)
+    assert worst < 1e-9
+
+
+def test_start_of_a_plant_is_close_where_the_data_say_much() -> None:
+    plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
+    f = np.geomspace(0.1, 10.0, 20)
+    Z = plant.dynamic_stiffness(A, 2.0 * np.pi * f)
+    free = Dahl() + Mass() + Damper() + Spring()
+    problem = Problem(FrequencyResponse(f, Z, A), free)
+    start = problem.to_values(starts(problem)[0])
+    np.testing.assert_allclose(start[:3], [0.1, 30.0, 0.3], rtol=0.15)
+    np.testing.assert_allclose(solve(problem).values, [0.1, 30.0, 0.3, 0.24, 0.3], rtol=1e-8)
+
+
+@pytest.mark.parametrize("alpha", [0.5, 2.0])
+def test_alpha_is_searched_for_as_well(alpha: float) -> None:
+    N = Dahl(0.1, 30.0, alpha).describing_function(A)
+    problem = Problem(FrequencyResponse(np.ones(20), N, A), Dahl(alpha=None))
+    np.testing.assert_allclose(solve(problem).values, [0.1, 30.0, alpha], rtol=1e-8)
+
+
+def test_two_elements_are_told_apart_and_ordered() -> None:
+    both = Dahl(0.5, 20.0, name="b") + Dahl(0.01, 30.0, name="a")
+    N = both.dynamic_stiffness(A, 0.0)
+    free = Dahl(name="first") + Dahl(name="second")
+    found = solve(Problem(FrequencyResponse(np.ones(20), N, A), free))
+    assert found.names == ("first_f_max", "first_sigma", "second_f_max", "second_sigma")
+    np.testing.assert_allclose(found.values, [0.01, 30.0, 0.5, 20.0], rtol=1e-6)
+
+
+def test_harmonics_take_part_in_the_start() -> None:
+    pivot = Dahl(0.1, 30.0)
+    Z = [pivot.dynamic_stiffness(a, harmonic=k) for a in A for k in (3, 5)]
+    data = FrequencyResponse(np.ones(40), Z, np.repeat(A, 2), harmonic=np.tile([3, 5], 20))
+    found = solve(Problem(data, Dahl(), noise="absolute"))
+    np.testing.assert_allclose(found.values, [0.1, 30.0], rtol=1e-8)
+
+
+def test_one_friction_parameter_given() -> None:
+    N = Dahl(0.1, 30.0).describing_function(A)
+    data = FrequencyResponse(np.ones(20), N, A)
+    assert solve(Problem(data, Dahl(f_max=0.1))).values == pytest.approx([30.0], rel=1e-9)
+    assert solve(Problem(data, Dahl(sigma=30.0))).values == pytest.approx([0.1], rel=1e-9)
+
+
+def test_a_given_value_is_one_more_start() -> None:
+    N = Dahl(0.1, 30.0, 1.3).describing_function(A)
+    data = FrequencyResponse(np.ones(20), N, A)
+    problem = Problem(data, Dahl(), free=["alpha"])
+    assert starts(problem)[-1][problem.names.index("alpha")] == 0.0  # ln 1, as given
+    assert solve(problem).values == pytest.approx([0.1, 30.0, 1.3], rel=1e-8)
+
+
+def test_a_batch_starts_where_its_tables_do() -> None:
+    tables = [
+        FrequencyResponse(np.ones(20), scale * Dahl(0.1, 30.0).describing_function(A), A * scale)
+        for scale in (1e-5, 1.0, 1e6)
+    ]
+    batch = ProblemBatch(tables, Dahl())
+    each = [starts(Problem(table, Dahl()))[0] for table in tables]
+    np.testing.assert_allclose(best_starts(batch), each, rtol=1e-9)
+
+
+def test_a_parameter_that_cannot_be_started_is_named() -> None:
+    control = importlib.import_module("control")
+
+    def mode(mass: float) -> object:
+        return control.tf([1], [mass, 0.0, 10.0])
+
+    system = LinearSystem(mode, quantity="receptance", parameters={"mass": None})
+    N = Dahl(0.1, 30.0).describing_function(A) + 10.0
+    problem = Problem(FrequencyResponse(np.ones(20), N, A), Dahl() + system)
+    with pytest.raises(FitError, match="mass has no value to start from"):
+        solve(problem)

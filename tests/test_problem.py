@@ -1,0 +1,307 @@
+"""Problem: predictions, residuals and derivatives against mpmath, closed forms and loops."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mpmath import mp
+from scipy import stats
+
+from dahl_ident import (
+    Dahl,
+    Damper,
+    FrequencyResponse,
+    Mass,
+    Problem,
+    Sensors,
+    Spring,
+    response,
+)
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements import Element
+from dahl_ident.errors import DataError, ModelError, ValidationError
+from dahl_ident.problem import ProblemBatch
+
+n = 6
+A = np.geomspace(3e-4, 3e-2, n)
+FREQUENCY = np.geomspace(0.3, 3.0, n)
+OMEGA = 2.0 * np.pi * FREQUENCY
+DRIVE = np.geomspace(0.02, 1.0, n)
+TRUE = (0.1, 30.0, 0.3, 0.24, 0.3)
+FREE = Dahl() + Mass() + Damper() + Spring()
+RNG = np.random.default_rng(2)
+NOISE = np.exp(0.05 * (RNG.normal(size=n) + 1j * RNG.normal(size=n)))
+QUANTITIES = {
+    "receptance": (0, -1),
+    "mobility": (1, -1),
+    "accelerance": (2, -1),
+    "dynamic_stiffness": (0, 1),
+    "mechanical_impedance": (-1, 1),
+    "apparent_mass": (-2, 1),
+}
+
+
+def plant() -> Element:
+    f_max, sigma, mass, damping, stiffness = TRUE
+    return Dahl(f_max, sigma) + Mass(mass) + Damper(damping) + Spring(stiffness)
+
+
+def data(quantity: str = "dynamic_stiffness", controlled: Any = "displacement") -> Any:
+    power, exponent = QUANTITIES[quantity]
+    R = (1j * OMEGA) ** power * plant().dynamic_stiffness(A, OMEGA) ** exponent * NOISE
+    spread = np.abs(R)[:, None, None] ** 2
+    return FrequencyResponse(
+        FREQUENCY,
+        R,
+        A,
+        DRIVE,
+        covariance=spread * np.array([[4e-4, 1e-4], [1e-4, 9e-4]]),
+        controlled=controlled,
+        quantity=quantity,  # type: ignore[arg-type]  # one of the six above
+    )
+
+
+def mp_stiffness(theta: list[Any], amplitude: Any, omega: Any) -> Any:
+    """Return Z of the plant with mpmath, theta = (ln f_max, ln sigma, mass, damping, stiffness)."""
+    f_max, sigma = mp.exp(theta[0]), mp.exp(theta[1])
+    b = sigma * amplitude / f_max
+    real = 2 * mp.besseli(1, b) / (b * mp.cosh(b))
+    imag = 4 / mp.pi * (1 - mp.tanh(b) / b) / b
+    linear = theta[4] - theta[2] * omega**2 + mp.mpc(0, 1) * omega * theta[3]
+    return sigma * (real + mp.mpc(0, 1) * imag) + linear
+
+
+def mp_driven(theta: list[Any], drive: Any, omega: Any, near: float) -> Any:
+    amplitude = mp.findroot(
+        lambda a: a * abs(mp_stiffness(theta, a, omega)) - drive, mp.mpf(near), tol=1e-50
+    )
+    return mp_stiffness(theta, amplitude, omega)
+
+
+@pytest.mark.parametrize("controlled", ["displacement", "force"])
+def test_predictions_and_derivatives_agree_with_mpmath(controlled: str) -> None:
+    problem = Problem(data("receptance", controlled), FREE)
+    values = np.array(TRUE) * [1.1, 0.9, 1.05, 0.95, 1.2]
+    theta = problem.to_search(values)
+    driven = response(
+        Dahl(*values[:2]) + Mass(values[2]) + Damper(values[3]) + Spring(values[4]),
+        FREQUENCY,
+        DRIVE,
+    ).amplitude
+    with mp.workdps(40):
+        for row in (0, 3, 5):
+            omega = mp.mpf(float(OMEGA[row]))
+
+            def receptance(*at: Any, row: int = row, omega: Any = omega) -> Any:
+                if controlled == "force":
+                    drive = mp.mpf(float(DRIVE[row]))
+                    return 1 / mp_driven(list(at), drive, omega, float(driven[row]))
+                return 1 / mp_stiffness(list(at), mp.mpf(float(A[row])), omega)
+
+            at = [mp.mpf(float(t)) for t in theta]
+            expected = complex(receptance(*at))
+            slopes = [
+                complex(mp.diff(receptance, tuple(at), tuple(int(i == p) for i in range(5))))
+                for p in range(5)
+            ]
+            assert problem.predict(theta)[row] == pytest.approx(expected, rel=1e-11)
+            found = problem.prediction_jacobian(theta)[row]
+            np.testing.assert_allclose(found, slopes, rtol=1e-9)
+
+
+@pytest.mark.parametrize("noise", ["measured", "relative", "absolute"])
+@pytest.mark.parametrize("controlled", ["displacement", "force", "mixed"])
+@pytest.mark.parametrize("quantity", QUANTITIES)
+def test_jacobian_is_the_residuals_derivative(quantity: str, controlled: str, noise: str) -> None:
+    words = np.where(np.arange(n) % 2, "force", "displacement")
+    table = data(quantity, words if controlled == "mixed" else controlled)
+    sensors = Sensors(stats.norm(1.0, 0.01), None, stats.norm(0.0, 1e-3))
+    problem = Problem(table, FREE, noise=noise, sensors=sensors)
+    theta = problem.to_search([0.11, 28.0, 0.31, 0.25, 0.32, 1.01, 0.99, 1e-3])
+    r, J = problem.residuals_and_jacobian(theta)
+    assert r.shape == (2 * n + 2,)
+    step = 1e-4
+    for p, direction in enumerate(np.eye(theta.size)):
+        shifts = step * np.array([-2.0, -1.0, 1.0, 2.0])
+        values = problem.residuals(theta + shifts[:, None] * direction)
+        slope = np.array([1.0, -8.0, 8.0, -1.0]) @ values / (12.0 * step)
+        np.testing.assert_allclose(J[:, p], slope, rtol=1e-7, atol=1e-9 * np.abs(J[:, p]).max())
+    quadratic = problem.quadratic(theta)
+    assert float(quadratic.cost) == pytest.approx(0.5 * r @ r, rel=1e-12)
+    assert np.all(np.abs(quadratic.gradient - J.T @ r) <= 1e-12 * np.abs(J.T) @ np.abs(r))
+    np.testing.assert_allclose(quadratic.hessian, J.T @ J, rtol=1e-12)
+    np.testing.assert_allclose(problem.information(theta), J.T @ J, rtol=1e-12)
+
+
+@pytest.mark.parametrize("controlled", ["displacement", "force"])
+def test_many_vectors_at_once_equal_one_at_a_time(controlled: str) -> None:
+    problem = Problem(data("mobility", controlled), FREE)
+    theta = problem.to_search(TRUE) + 0.05 * RNG.normal(size=(4, 5))
+    for method in (
+        problem.predict,
+        problem.prediction_jacobian,
+        problem.residuals,
+        problem.jacobian,
+        problem.log_likelihood,
+        problem.information,
+        problem.to_values,
+    ):
+        call: Callable[[FloatArray], Any] = method
+        np.testing.assert_allclose(call(theta), [call(t) for t in theta], rtol=1e-10)
+
+
+def test_a_batch_equals_its_tables_one_by_one() -> None:
+    tables = [
+        FrequencyResponse(FREQUENCY * s, Dahl(0.1, 30.0).describing_function(A * s) * NOISE, A * s)
+        for s in (1.0, 1.5, 3.0)
+    ]
+    batch = ProblemBatch(tables, Dahl())
+    theta = np.log([[0.1, 30.0], [0.2, 20.0], [0.05, 35.0]])
+    each = [Problem(table, Dahl()) for table in tables]
+    assert batch.n_tables == 3
+    for name in ("predict", "residuals", "jacobian", "log_likelihood", "information"):
+        singles = [getattr(p, name)(t) for p, t in zip(each, theta, strict=True)]
+        np.testing.assert_allclose(getattr(batch, name)(theta), singles, rtol=1e-12)
+        taken = getattr(batch.take(np.array([2, 0])), name)(theta[[2, 0]])
+        np.testing.assert_allclose(taken, np.array(singles)[[2, 0]], rtol=1e-12)
+    np.testing.assert_allclose(batch.table(1).residuals(theta[1]), each[1].residuals(theta[1]))
+
+
+def test_replicates_share_all_but_the_response() -> None:
+    problem = Problem(data(), FREE)
+    responses = data().response * np.array([[1.0], [1.2]])
+    batch = ProblemBatch.replicates(problem, responses)
+    theta = np.tile(problem.to_search(TRUE), (2, 1))
+    np.testing.assert_allclose(batch.residuals(theta)[0], problem.residuals(theta[0]))
+    with pytest.raises(
+        DataError, match=r"responses have shape \(2, 5\); expected \(replicates, 6\)"
+    ):
+        ProblemBatch.replicates(problem, responses[:, :5])
+
+
+@given(force=st.floats(-30.0, 30.0), motion=st.floats(-30.0, 30.0), x=st.floats(-1.0, 1.0))
+def test_residuals_do_not_depend_on_units(force: float, motion: float, x: float) -> None:
+    a, b = 10.0**force, 10.0**motion
+    N = Dahl(0.1, 30.0).describing_function(A) * NOISE
+    theta = np.log([0.1, 30.0]) + x
+    here = Problem(FrequencyResponse(np.ones(n), N, A), Dahl())
+    there = Problem(FrequencyResponse(np.ones(n), N * a / b, A * b), Dahl())
+    moved = theta + np.log([a, a / b])
+    np.testing.assert_allclose(there.residuals(moved), here.residuals(theta), atol=2e-12)
+    np.testing.assert_allclose(there.jacobian(moved), here.jacobian(theta), atol=2e-11)
+
+
+@given(values=st.lists(st.floats(1e-30, 1e30), min_size=2, max_size=2))
+def test_search_coordinates_round_trip(values: list[float]) -> None:
+    problem = Problem(FrequencyResponse(np.ones(n), NOISE, A), Dahl())
+    np.testing.assert_allclose(problem.to_values(problem.to_search(values)), values, rtol=1e-13)
+
+
+def test_profiled_likelihood_is_its_maximum_over_the_scale() -> None:
+    problem = Problem(data(), FREE, noise="relative")
+    theta = problem.to_search(np.array(TRUE) * 1.05)
+    scales = np.geomspace(0.01, 1.0, 2001)
+    over_scale = problem.log_likelihood(np.tile(theta, (2001, 1)), scales)
+    assert problem.log_likelihood(theta) == pytest.approx(over_scale.max(), abs=1e-3)
+    assert problem.log_likelihood(theta) >= over_scale.max()
+
+
+def test_no_steady_state_has_no_likelihood() -> None:
+    resonance = 2.0 * np.pi
+    table = FrequencyResponse(
+        [1.0], [1.0], drive=[1.0], controlled="force", quantity="receptance", amplitude=[1.0]
+    )
+    undamped = Dahl(sigma=30.0) + Mass(1.0) + Spring(resonance**2)
+    problem = Problem(table, undamped)
+    f_max = np.log([[10.0], [0.1]])  # 0.1 N of friction cannot hold 1 N at resonance
+    likelihood = problem.log_likelihood(f_max, 1.0)
+    assert np.isfinite(likelihood[0])
+    assert likelihood[1] == -np.inf
+    assert np.isnan(problem.predict(f_max)[1]).all()
+
+
+def test_like_elements_are_ordered_by_x_c() -> None:
+    two = Dahl(name="a") + Dahl(name="b")
+    problem = Problem(FrequencyResponse(np.ones(n), NOISE, A), two)
+    theta = np.log([[1.0, 2.0, 0.1, 3.0], [0.1, 3.0, 1.0, 2.0]])
+    np.testing.assert_allclose(problem.in_order(theta), theta[[1, 1]])
+    unlike = Problem(FrequencyResponse(np.ones(n), NOISE, A), two, fixed={"b_sigma": 1.0})
+    np.testing.assert_allclose(unlike.in_order(theta[:, :3]), theta[:, :3])
+
+
+def test_free_and_fixed_reach_model_and_sensors() -> None:
+    problem = Problem(
+        data(), plant(), free=["f_max", "delay"], sensors=Sensors(force_gain=None),
+        fixed={"force_gain": 1.1},
+    )  # fmt: skip
+    assert problem.names == ("f_max", "delay")
+    assert problem.sensors.force_gain == 1.1
+
+
+@pytest.mark.parametrize(
+    ("build", "error", "message"),
+    [
+        (lambda: Problem(data(), plant()), ModelError, "has no free parameter; leave one out"),
+        (lambda: Problem(data(), FREE, free=["speed"]), ModelError, "has no parameter speed"),
+        (
+            lambda: Problem(data(), FREE, free=["mass"], fixed={"mass": 1.0}),
+            ModelError,
+            "mass is both in free= and in fixed=",
+        ),
+        (
+            lambda: Problem(FrequencyResponse([1.0], [1.0], drive=[1.0]), FREE),
+            DataError,
+            "row 0 is displacement-controlled, but the data have no amplitude; give it, or say",
+        ),
+        (
+            lambda: Problem(FrequencyResponse([1.0], [1.0], [1.0], controlled="force"), FREE),
+            DataError,
+            "row 0 is force-controlled, but the data have no drive",
+        ),
+        (
+            lambda: Problem(
+                FrequencyResponse([1.0], [1.0], [1.0], [1.0], controlled="force", harmonic=3), FREE
+            ),
+            DataError,
+            "row 0 is force-controlled and holds harmonic 3",
+        ),
+        (
+            lambda: Problem(data(), FREE).log_likelihood(np.zeros(5), 1.0),
+            ValidationError,
+            "scale is given, but measured noise has a known scale",
+        ),
+        (
+            lambda: Problem(data(), FREE).residuals(np.zeros(4)),
+            ValidationError,
+            r"theta has shape \(4,\); expected \(5,\) or \(S, 5\) for f_max, sigma",
+        ),
+        (
+            lambda: Problem(data(), FREE).to_search([-1.0, 1.0, 1.0, 1.0, 1.0]),
+            ValidationError,
+            r"f_max is -1.0; expected numbers > 0",
+        ),
+        (
+            lambda: Problem(data(), FREE, sensors=Sensors(delay=stats.uniform(0.0, 1.0))).residuals(
+                np.zeros(6)
+            ),
+            ValidationError,
+            "the prior of delay is uniform; least squares takes normal priors",
+        ),
+        (lambda: ProblemBatch([], FREE), DataError, "there is no table"),
+        (
+            lambda: ProblemBatch([data(), FrequencyResponse([1.0], [1.0], [1.0])], FREE),
+            DataError,
+            "table 1 has 1 rows of dynamic_stiffness, table 0 has 6 rows",
+        ),
+    ],
+)
+def test_what_cannot_be_estimated_is_refused(
+    build: Callable[[], object], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        build()
