@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from dahl_ident.control_interop import (
         DahlNonlinearity,
+        closed_loop_response,
         equivalent_plant,
         level_responses,
         limit_cycles,
@@ -41,6 +42,7 @@ __version__ = "0.1.0"
 _ROOMS = {
     "dahl_ident.control_interop": (
         "DahlNonlinearity",
+        "closed_loop_response",
         "equivalent_plant",
         "level_responses",
         "limit_cycles",
@@ -87,6 +89,7 @@ __all__ = [
     "Record",
     "Sensors",
     "Spring",
+    "closed_loop_response",
     "compare_models",
     "equivalent_plant",
     "fit",

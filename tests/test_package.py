@@ -28,6 +28,7 @@ PUBLIC_NAMES = [
     "Record",
     "Sensors",
     "Spring",
+    "closed_loop_response",
     "compare_models",
     "equivalent_plant",
     "fit",

@@ -9,16 +9,14 @@ room is the way back.
 - :func:`equivalent_plant` and :func:`loop_margins` help to design a controller: the linear plant
   at one amplitude, and the loop's margins against amplitude.
 - :func:`response_branches` gives every steady response of an active plant, with its stability.
-
-A plant measured under feedback needs nothing new. With F = C (r - x) the closed loop is the plant
-with the controller as one more element in parallel, ``LinearSystem(C,
-quantity="dynamic_stiffness")``, driven by the force C r.
+- :func:`closed_loop_response` takes a plant that was measured under feedback.
 """
 
 from __future__ import annotations
 
 from dahl_ident.control_interop.branches import Branches, response_branches
 from dahl_ident.control_interop.equivalent import LoopMargins, equivalent_plant, loop_margins
+from dahl_ident.control_interop.feedback import closed_loop_response
 from dahl_ident.control_interop.levels import LevelResponses, level_responses
 from dahl_ident.control_interop.limit_cycles import LimitCycle, limit_cycles
 from dahl_ident.control_interop.nonlinearity import DahlNonlinearity
@@ -29,6 +27,7 @@ __all__ = [
     "LevelResponses",
     "LimitCycle",
     "LoopMargins",
+    "closed_loop_response",
     "equivalent_plant",
     "level_responses",
     "limit_cycles",
