@@ -88,9 +88,11 @@ def stiffness_table(phasors: Phasors, table: Table, draws: Draws) -> FrequencyRe
     """Return F_k/X_1, its phase referred to k times the displacement's (displacement held)."""
     k = phasors.harmonic
     X, F = _with_errors(phasors, table, draws)
-    response = F / np.abs(X) * np.exp(-1j * k * np.angle(X))
-    along, across = response, 1j * k * response  # changes with |X| and with its phase
-    force_part = (table.force_std * phasors.force_size / np.abs(X)) ** 2
+    response = _stiffness(F, X, k)
+    # of the true response: a covariance that followed each row's error would bias every fit
+    true = _stiffness(phasors.force, phasors.displacement, k)
+    along, across = true, 1j * k * true  # changes with |X| and with its phase
+    force_part = (table.force_std * phasors.force_size / np.abs(phasors.displacement)) ** 2
     covariance = table.displacement_std**2 * (_outer(along) + _outer(across)) + force_part[
         :, None, None
     ] * np.eye(2)
@@ -98,20 +100,27 @@ def stiffness_table(phasors: Phasors, table: Table, draws: Draws) -> FrequencyRe
         phasors.frequency_hz, response, np.abs(X), harmonic=k, level=phasors.level,
         controlled="displacement",
     )  # fmt: skip
-    return _finished(data, covariance, -response, table, draws)
+    return _finished(data, covariance, -true, np.abs(phasors.displacement), table, draws)
 
 
 def receptance_table(phasors: Phasors, table: Table, draws: Draws) -> FrequencyResponse:
     """Return X/F (force held)."""
     X, F = _with_errors(phasors, table, draws)
     response = X / F
+    true = phasors.displacement / phasors.force
     relative = table.displacement_std**2 + table.force_std**2
-    covariance = relative * np.abs(response)[:, None, None] ** 2 * np.eye(2)
+    covariance = relative * np.abs(true)[:, None, None] ** 2 * np.eye(2)
     data = FrequencyResponse(
         phasors.frequency_hz, response, np.abs(X), np.abs(F), level=phasors.level,
         controlled="force", quantity="receptance",
     )  # fmt: skip
-    return _finished(data, covariance, response, table, draws)
+    return _finished(data, covariance, true, np.abs(phasors.displacement), table, draws)
+
+
+def _stiffness(
+    force: ComplexArray, displacement: ComplexArray, k: NDArray[np.int64]
+) -> ComplexArray:
+    return np.asarray(force / np.abs(displacement) * np.exp(-1j * k * np.angle(displacement)))
 
 
 def _with_errors(phasors: Phasors, table: Table, draws: Draws) -> tuple[ComplexArray, ComplexArray]:
@@ -130,6 +139,7 @@ def _finished(
     data: FrequencyResponse,
     covariance: FloatArray,
     with_amplitude: ComplexArray,
+    amplitude: FloatArray,
     table: Table,
     draws: Draws,
 ) -> FrequencyResponse:
@@ -141,12 +151,12 @@ def _finished(
     data = replace(data, response=response)
     if data.amplitude is None or table.displacement_std == table.force_std == 0.0:
         return data
-    shared = table.displacement_std**2 * data.amplitude * with_amplitude
+    shared = table.displacement_std**2 * amplitude * with_amplitude
     return replace(
         data,
         covariance=covariance,
         dof=np.full(data.n, np.inf),
-        amplitude_std=table.displacement_std * data.amplitude,
+        amplitude_std=table.displacement_std * amplitude,
         amplitude_covariance=np.column_stack([shared.real, shared.imag]),
     )
 
