@@ -135,8 +135,8 @@ class Goodness:
 
     @property
     def acceptable(self) -> bool:
-        """Whether the residuals look like noise."""
-        return not self.objections
+        """Whether the residuals look like noise, and no row was flagged when it was measured."""
+        return not self.objections and not self.flagged
 
     @cached_property
     def objections(self) -> tuple[str, ...]:
@@ -168,8 +168,18 @@ class Goodness:
     def headline(self) -> str:
         """The verdict in one sentence."""
         misfit = f"{100.0 * self.rms_misfit:.2g} % rms misfit"
-        if not self.acceptable:
-            return f"The model does not describe these data ({misfit}): {_joined(self.objections)}."
+        flaws = ""
+        if self.flagged:
+            shown = "; ".join(self.flagged[:3]) + ("; ..." if len(self.flagged) > 3 else "")
+            flaws = (
+                f"The extraction flagged {len(self.flagged)} of the points fitted ({shown}): "
+                "measure them again, or select the good ones. "
+            )
+        if self.objections:
+            objected = _joined(self.objections)
+            return f"{flaws}The model does not describe these data ({misfit}): {objected}."
+        if flaws:
+            return flaws.strip()
         text = f"The residuals look like noise ({misfit})"
         return f"{text}, with a hint that {_joined(self.hints)}." if self.hints else f"{text}."
 
@@ -181,7 +191,8 @@ class Goodness:
         if self.scatter is not None:
             lines.append(str(self.scatter))
         lines += [f"suspicious: {point}" for point in self.suspicious]
-        return lines + [f"warning: {text}" for text in self.warnings]
+        lines += [f"warning: {text}" for text in self.warnings]
+        return lines + [f"flagged in extraction: {text}" for text in self.flagged]
 
     def __str__(self) -> str:
         return "\n".join([self.headline, *(f"- {line}" for line in self.details)])
