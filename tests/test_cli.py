@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import signal
 import subprocess
@@ -280,3 +281,56 @@ def test_an_interrupt_leaves_the_old_file_whole(tmp_path: Path) -> None:
     assert "Traceback" not in err
     assert target.read_text(encoding="utf-8") == "as it was"
     assert [p.name for p in tmp_path.iterdir()] == ["long.csv"]
+
+
+def test_a_saved_fit_is_reported_with_its_posterior(run: Runner) -> None:
+    table = run("datasets", "noisy", "-o", "-").out
+    assert run("fit", "-", "--save", "fit.json", stdin=table).status == 0
+    assert run("report", "fit.json", "--posterior", "-o", "r.json").status == 0
+    told = json.loads(Path("r.json").read_text(encoding="utf-8"))
+    assert told["posteriors"][0]["converged"] is True
+    assert told["posteriors"][0]["seed"] == 1
+    assert told["fits"][0]["parameters"]["f_max"]["value"] == pytest.approx(0.1, rel=0.02)
+
+
+def test_a_chain_goes_on_from_its_file(run: Runner) -> None:
+    Path("noisy.csv").write_text(run("datasets", "noisy", "-o", "-").out, encoding="utf-8")
+    options = ("sample", "noisy.csv", "--json", "--resume", "chain.h5", "--steps")
+    first = json.loads(run(*options, "30").out)
+    second = json.loads(run(*options, "60").out)
+    whole = json.loads(run("sample", "noisy.csv", "--json", "--steps", "60").out)
+    assert (first["steps"], second["steps"]) == (30, 60)
+    assert second["summary"]["sigma"]["mean"] == whole["summary"]["sigma"]["mean"]
+
+
+def test_no_color_is_obeyed_on_a_terminal() -> None:
+    pty = pytest.importorskip("pty", reason="terminals are POSIX")
+    for extra, coloured in (({}, True), ({"NO_COLOR": "1"}, False)):
+        ours, theirs = pty.openpty()
+        process = subprocess.Popen(
+            [str(PROGRAM), "datasets"], stdout=theirs, stderr=theirs,
+            env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "100", **extra},
+        )  # fmt: skip
+        os.close(theirs)
+        out = b""
+        while True:
+            try:
+                part = os.read(ours, 4096)
+            except OSError:  # the way a terminal says that it is closed
+                break
+            if not part:
+                break
+            out += part
+        process.wait(timeout=60)
+        os.close(ours)
+        assert (re.search(rb"\x1b\[[0-9;]*3[0-9]", out) is not None) <= coloured
+        assert b"noisy" in out
+
+
+def test_completion_knows_the_commands() -> None:
+    environment = {
+        **os.environ, "_DAHL_IDENT_COMPLETE": "complete_bash", "COMP_WORDS": "dahl-ident da",
+        "COMP_CWORD": "1",
+    }  # fmt: skip
+    done = subprocess.run([str(PROGRAM)], env=environment, capture_output=True, text=True)
+    assert done.stdout.split() == ["datasets"]

@@ -202,12 +202,13 @@ def plot_information(
     """
     axis = style.axes(ax)
     order = np.argsort(x)
+    line = "-" if np.unique(x).size == order.size else "none"
     for (name, share), colour, marker in zip(
         shares.items(), style.SERIES, style.MARKERS, strict=False
     ):
         axis.plot(
             np.asarray(x)[order], 100.0 * np.asarray(share)[order], marker=marker, color=colour,
-            label=name, lw=1.2,
+            label=name, lw=1.2, ls=line,
         )  # fmt: skip
     axis.set(xlabel=x_label, ylabel="share of information [%]", xscale="log")
     style.readable_log_ticks(axis)

@@ -84,8 +84,8 @@ def _title(data: FrequencyResponse) -> str:
 
 def _verdict(fit: FitResult) -> list[str]:
     warnings = [f"Warning: {text}" for text in fit.goodness.warnings]
-    text = fit.verdict.removeprefix("NOT to be trusted. ").removeprefix("To be trusted: ")
-    return [text[0].upper() + text[1:], *warnings]
+    text = fit.verdict.removeprefix("NOT to be trusted. ").removeprefix("To be trusted. ")
+    return [text, *warnings]
 
 
 def _sections(fit: FitResult, drawn: Sequence[Posterior], several: bool) -> Iterator[Section]:

@@ -239,7 +239,10 @@ def _correlation(fit: FitResult) -> Picture:
 
 def _information(fit: FitResult) -> Picture:
     share = shares(fit.optimum)
-    x, label = _abscissa(fit.data, fit.data)
+    x, label = fit.data.frequency_hz, "frequency [Hz]"
+    if not _over_frequency(fit.data):
+        x = displacement_amplitude(fit.data)
+        label = f"displacement amplitude [{si_unit('displacement', fit.data.motion)}]"
     places = [
         f"{name} is told most by the point at {x[int(np.argmax(row))]:.3g}"
         for name, row in zip(fit.var_names, share, strict=True)

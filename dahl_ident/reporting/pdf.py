@@ -6,6 +6,7 @@ Letters come from the DejaVu fonts that matplotlib brings along, so Greek and ac
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 _FONT = "DejaVu"
 _FACES = {"": "DejaVuSans.ttf", "B": "DejaVuSans-Bold.ttf", "I": "DejaVuSans-Oblique.ttf"}
-_PICTURE_WIDTH = 110.0  # mm
+_PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
 _GOOD, _BAD = (17, 99, 41), (164, 14, 38)
 
 
@@ -49,7 +50,11 @@ def pdf(document: Document) -> bytes:
         page.start_section(section.title)
         page.multi_cell(0, 7, section.title, new_x="LMARGIN", new_y="NEXT")
         for block in section.blocks:
-            _block(page, block)
+            if not isinstance(block, Picture):
+                _block(page, block)
+        pictures = [block for block in section.blocks if isinstance(block, Picture)]
+        for i in range(0, len(pictures), 2):
+            _pictures(page, pictures[i : i + 2])
     return bytes(page.output())
 
 
@@ -78,29 +83,36 @@ def _block(page: FPDF, block: Block) -> None:
                 _text(page, f"\u2022 {item}")
         case Listing(text):
             page.set_fill_color(244, 244, 244)
-            page.multi_cell(0, 5, text, fill=True, new_x="LMARGIN", new_y="NEXT")
-        case Picture():
-            _picture(page, block)
+            page.multi_cell(0, 5, text, align="L", fill=True, new_x="LMARGIN", new_y="NEXT")
         case Table():
             _table(page, block)
 
 
 def _text(page: FPDF, text: str) -> None:
-    page.multi_cell(0, 5, text, new_x="LMARGIN", new_y="NEXT")
+    page.multi_cell(0, 5, text, align="L", new_x="LMARGIN", new_y="NEXT")
     page.ln(1)
 
 
-def _picture(page: FPDF, picture: Picture) -> None:
+def _pictures(page: FPDF, row: Sequence[Picture]) -> None:
+    """Draw up to two pictures side by side, their captions below."""
     from PIL import Image
 
-    content = io.BytesIO(picture.rendered("png"))
-    with Image.open(content) as image:
-        height = _PICTURE_WIDTH * image.height / image.width
-    if page.get_y() + height + 12 > page.h - page.b_margin:
+    contents = [io.BytesIO(picture.rendered("png")) for picture in row]
+    heights = []
+    for content in contents:
+        with Image.open(content) as image:
+            heights.append(_PICTURE_WIDTH * image.height / image.width)
+    if page.get_y() + max(heights) + _CAPTION_HEIGHT > page.h - page.b_margin:
         page.add_page()
-    page.image(content, w=_PICTURE_WIDTH, alt_text=picture.alt)
-    page.set_font(_FONT, "I", 8.5)
-    _text(page, picture.caption)
+    top, ends = page.get_y(), []
+    for i, (picture, content, height) in enumerate(zip(row, contents, heights, strict=True)):
+        x = page.l_margin + i * (_PICTURE_WIDTH + _GAP)
+        page.image(content, x=x, y=top, w=_PICTURE_WIDTH, alt_text=picture.alt)
+        page.set_xy(x, top + height + 1.0)
+        page.set_font(_FONT, "I", 8)
+        page.multi_cell(_PICTURE_WIDTH, 4, picture.caption, align="L", new_y="NEXT")
+        ends.append(page.get_y())
+    page.set_xy(page.l_margin, max(ends) + 3.0)
 
 
 def _table(page: FPDF, table: Table) -> None:
