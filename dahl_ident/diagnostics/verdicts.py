@@ -3,10 +3,10 @@
 A parameter is **identified** where the standard deviation of its logarithm is below 0.25,
 **not identified** above 1, and **weakly identified** between. The standard deviation is the larger
 of two: the first-order one (Fisher information), and that of the profile (width of its 95.45 %
-interval over the widths of the threshold). A profile still open at 99.73 % is not identified
-whatever else is said. Parameters that may be zero or negative have no logarithm; theirs is the
-standard deviation over their size, or over a tenth of the size at which they would make up the
-whole response, if that is more.
+interval over the widths of the threshold). A parameter short of identified whose profile is
+still open at 99.73 % is not identified. Parameters that may be zero or negative have no
+logarithm; theirs is the standard deviation over their size, or over a tenth of the size at which
+they would make up the whole response, if that is more.
 
 Where parameters are not identified, combinations of them may be
 (:mod:`dahl_ident.diagnostics.combinations`); where no known combination fits, the least
@@ -15,7 +15,7 @@ determined direction is given as a vector.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Protocol
@@ -210,8 +210,7 @@ def judged(optimum: Optimum, intervals: ConfidenceIntervals) -> Identifiability:
     parameters = {}
     for i, (name, parameter) in enumerate(zip(problem.names, problem.parameters, strict=True)):
         unit = shown_unit(parameter.unit, motion)
-        narrow, wide = intervals[name][1:]
-        limits = narrow if _is_closed(wide) else wide if _is_closed(narrow) else narrow
+        limits = _shown(intervals[name], verdicts[name])
         text = _text(optimum, name, unit, verdicts[name], limits, lost)
         parameters[name] = ParameterVerdict(
             name, unit, verdicts[name], float(fisher[i]), float(profile[i]), limits, text
@@ -255,13 +254,21 @@ def _profile_std(
 
 def _verdict(fisher: float, profile: float, widest: Interval) -> Verdict:
     spread = max(fisher, profile)
-    if not _is_closed(widest) or not spread <= NOT_IDENTIFIED_ABOVE:
-        return Verdict.NOT_IDENTIFIED
-    return Verdict.IDENTIFIED if spread < IDENTIFIED_BELOW else Verdict.WEAK
+    if spread < IDENTIFIED_BELOW:
+        return Verdict.IDENTIFIED
+    closed = _is_closed(widest) and spread <= NOT_IDENTIFIED_ABOVE
+    return Verdict.WEAK if closed else Verdict.NOT_IDENTIFIED
 
 
 def _is_closed(interval: Interval) -> bool:
     return bool(np.isfinite(interval.upper) and np.isfinite(interval.lower))
+
+
+def _shown(limits: Sequence[Interval], verdict: Verdict) -> Interval:
+    """Return the 95.45 % interval, or the 99.73 % one where only that says why."""
+    _, narrow, wide = limits
+    only = verdict is Verdict.NOT_IDENTIFIED and _is_closed(narrow) and not _is_closed(wide)
+    return wide if only else narrow
 
 
 def _determined(
