@@ -177,7 +177,7 @@ def test_margins_are_those_of_python_control() -> None:
     for i, amplitude in enumerate(A):
         loop = np.ravel(LAGGING_PID(1j * omega)) / SERVO.dynamic_stiffness(amplitude, omega)
         gains, phases, moduli, *_ = control.stability_margins(
-            control.frd(loop, omega, smooth=True), returnall=True
+            control.FRD(loop, omega, smooth=True), returnall=True
         )
         gain = gains[np.argmin(np.abs(np.log(gains)))]
         phase = phases[np.argmin(np.abs(phases))]

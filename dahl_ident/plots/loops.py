@@ -144,5 +144,5 @@ def _styled(
 
 def _with_legend(axis: Axes, levels: Sequence[tuple[str, ArrayLike]]) -> Axes:
     if any(name for name, _ in levels):
-        axis.legend(ncols=2)
+        axis.legend(ncols=4, loc="lower left", bbox_to_anchor=(0.0, 1.0), columnspacing=1.0)
     return axis
