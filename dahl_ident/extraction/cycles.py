@@ -30,6 +30,8 @@ _MOST_BRIDGED = 10.0  # cycles
 _DEEPEST = 12
 _SAMPLED = 50_000  # samples that the quantiles are taken from
 _FEWEST_A_CYCLE = 3
+_NOISIEST_CUT = 0.05  # noise of the log amplitude that a cycle of known frequency may have
+_FEWEST_CUTS = 3
 _NOISIEST_CROSSING = 0.04  # noise of the log amplitude that a cycle between crossings may have
 _HOLE = 1.0 / 3.0  # of a cycle without samples: its amplitude is not known
 
@@ -60,13 +62,25 @@ def find_cycles(time: FloatArray, motion: FloatArray) -> list[Cycles]:
 
 
 def cut_cycles(time: FloatArray, motion: FloatArray, frequency_hz: float) -> list[Cycles]:
-    """Cut a record of known frequency into its periods, from the first sample on."""
+    """Cut a record of known frequency into its periods, from the first sample on.
+
+    Where noise hides the amplitude of a period, so many periods are taken for one cycle that it
+    does not.
+    """
+    cycles = _cut(time, motion, frequency_hz, 1)
+    if len(cycles):
+        noise = float(np.median(cycles.noise))
+        turns = min(int(np.ceil((noise / _NOISIEST_CUT) ** 2)), len(cycles) // _FEWEST_CUTS)
+        if turns > 1:
+            cycles = _cut(time, motion, frequency_hz, turns)
+    return [cycles]
+
+
+def _cut(time: FloatArray, motion: FloatArray, frequency_hz: float, turns: int) -> Cycles:
     interval = float(np.median(np.diff(time)))
-    count = int((time[-1] - time[0] + 1.5 * interval) * frequency_hz)
-    if count < 1:
-        return []
-    edges = time[0] - 0.5 * interval + np.arange(count + 1) / frequency_hz
-    return [_measured(time, motion, edges)]
+    count = int((time[-1] - time[0] + 1.5 * interval) * frequency_hz / turns)
+    edges = time[0] - 0.5 * interval + np.arange(count + 1) * turns / frequency_hz
+    return _measured(time, motion, edges, turns)
 
 
 def _joined(runs: list[FloatArray]) -> list[FloatArray]:
@@ -162,21 +176,21 @@ def _crossings(
     return np.asarray(time[before] + share * (time[after] - time[before]))
 
 
-def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray) -> Cycles:
-    """Return the amplitude of each cycle and the frequency from each to the next."""
+def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray, turns: int = 1) -> Cycles:
+    """Return the amplitude of each cycle, of so many turns, and the frequency to the next."""
     cuts = np.searchsorted(time, edges)
     counts = np.diff(cuts)
     known = np.flatnonzero((counts >= _FEWEST_A_CYCLE) & ~_with_hole(time, edges))
     start, stop, n = edges[known], edges[known + 1], counts[known]
     inside = slice(int(cuts[0]), int(cuts[-1]))
-    turn = np.repeat(2.0 * np.pi / np.diff(edges), counts)
+    turn = np.repeat(2.0 * np.pi * turns / np.diff(edges), counts)
     theta = (time[inside] - np.repeat(edges[:-1], counts)) * turn
     bounds = np.column_stack([cuts[known], cuts[known + 1]]).ravel() - cuts[0]
     phasor, left = _sine_in_each(theta, motion[inside], bounds, n)
     amplitude = np.maximum(np.abs(phasor), np.finfo(np.float64).tiny)
     noise = np.sqrt(2.0 * left / n) / amplitude
     return Cycles(
-        start, stop, np.log(amplitude), noise, _log_frequency(start, stop, np.angle(phasor))
+        start, stop, np.log(amplitude), noise, _log_frequency(start, stop, np.angle(phasor), turns)
     )
 
 
@@ -205,7 +219,9 @@ def _sums(values: NDArray[Any], bounds: NDArray[np.intp]) -> NDArray[Any]:
     return np.add.reduceat(np.append(values, 0.0), bounds)[::2] if bounds.size else values[:0]
 
 
-def _log_frequency(start: FloatArray, stop: FloatArray, phase: FloatArray) -> FloatArray:
+def _log_frequency(
+    start: FloatArray, stop: FloatArray, phase: FloatArray, turns: int
+) -> FloatArray:
     """Return the mean frequency from the middle of each cycle to that of the next.
 
     The phases give the fraction of a turn; the whole turns are those that the cycles make,
@@ -214,9 +230,9 @@ def _log_frequency(start: FloatArray, stop: FloatArray, phase: FloatArray) -> Fl
     middle, period = 0.5 * (start + stop), stop - start
     missing = (start[1:] - stop[:-1]) / (0.5 * (period[1:] + period[:-1]))
     fraction = np.diff(phase) / (2.0 * np.pi)
-    turns = fraction + np.round(1.0 + missing - fraction)
+    whole = np.round(turns * (1.0 + missing) - fraction)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.log(turns / np.diff(middle))
+        return np.asarray(np.log((whole + fraction) / np.diff(middle)))
 
 
 def _with_hole(time: FloatArray, edges: FloatArray) -> NDArray[np.bool_]:

@@ -249,7 +249,7 @@ def _stretch(
 ) -> Stretch:
     """Return the samples of a segment with their phase."""
     first, last = np.searchsorted(time, [segment.start, segment.stop]).tolist()
-    omega = 2.0 * np.pi * segment.frequency_hz
+    omega = 2.0 * np.pi * (segment.frequency_hz if frequency is None else frequency)
     stretch = steady_stretch(time[first:last], channels[:, first:last], omega)
     if segment.sweep:
         return track_phase(stretch, _SWEEP_DEGREE)

@@ -36,11 +36,17 @@ _BLOCK = 16384
 class LineNoise:
     """Noise beside one harmonic, as that of white noise with the same density there.
 
-    `matrix` is ``E[e e^H]`` of a sample's errors (motion, force), 2 x 2 and Hermitian.
+    `lines` is (2, lines): the errors of motion and force on each line, weighted so that their
+    products sum to those of a sample's errors.
     """
 
-    matrix: ComplexArray
+    lines: ComplexArray
     dof: float
+
+    @property
+    def matrix(self) -> ComplexArray:
+        """``E[e e^H]`` of a sample's errors (motion, force), Hermitian."""
+        return self.lines @ self.lines.conj().T
 
 
 def line_noise(
@@ -73,9 +79,8 @@ def line_noise(
     for harmonic, sums in zip(harmonics, content, strict=True):
         frequency = harmonic + lines / cycles
         weights = frequency / (frequency @ free)
-        Z = sums @ half.T
-        matrix = (weights / _left_by_drift(frequency * cycles, cycles) * Z) @ Z.conj().T
-        noise.append(LineNoise(matrix, 2.0 / float(weights**2 @ free)))
+        weighted = np.sqrt(weights / _left_by_drift(frequency * cycles, cycles)) * (sums @ half.T)
+        noise.append(LineNoise(weighted, 2.0 / float(weights**2 @ free)))
     return noise
 
 

@@ -124,10 +124,13 @@ class _Phasors:
 
     @property
     def errors(self) -> ComplexArray:
-        """E[e e^H] of the fundamental phasors of displacement and force."""
-        scale = np.array([self.integrator, 1.0])
-        matrix = self.noise[0].matrix * self.fit.phasor_variance(1)
-        return np.asarray(scale[:, None] * matrix * scale.conj())
+        """Errors of the fundamental phasors of displacement and force; their products sum up."""
+        scale = np.array([[self.integrator], [1.0]])
+        return np.asarray(scale * self.noise[0].lines * np.sqrt(self.fit.phasor_variance(1)))
+
+    @property
+    def amplitude_variance(self) -> float:
+        return 0.5 * float(np.sum(np.abs(self.errors[0]) ** 2))
 
     def referred(self, force: complex, harmonic: int) -> complex:
         """Return a force phasor over the displacement's amplitude, turned by k times its phase."""
@@ -300,10 +303,10 @@ def _settling_periods(stretch: Stretch, memory: Memory, cycles: int, settings: S
 def _fundamental(phasors: _Phasors) -> tuple[complex, FloatArray, FloatArray, float]:
     """Return N, its covariance, the amplitude's covariance with it, and its dof."""
     X, N = phasors.displacement, phasors.response(1)
-    gradient = np.array([-N / X, 1.0 / X])
-    shared = gradient @ phasors.errors
-    variance = float((shared @ gradient.conj()).real)
-    with_amplitude = 0.5 * shared[0] * X / abs(X)
+    e_X, e_F = phasors.errors
+    e_N = (e_F - N * e_X) / X
+    variance = float(np.sum(np.abs(e_N) ** 2))
+    with_amplitude = 0.5 * complex(e_N @ e_X.conj()) * X / abs(X)
     return (
         N,
         0.5 * variance * np.eye(2),
@@ -318,7 +321,7 @@ def _harmonic(phasors: _Phasors, k: int) -> tuple[complex, FloatArray, FloatArra
     A, N = abs(phasors.displacement), phasors.response(k)
     along = np.array([N.real, N.imag])
     across = np.array([-N.imag, N.real])
-    relative = float(phasors.errors[0, 0].real) / (2.0 * A**2)
+    relative = phasors.amplitude_variance / A**2
     force = float(noise.matrix[1, 1].real) * phasors.fit.phasor_variance(k) / A**2
     covariance = 0.5 * force * np.eye(2) + relative * (
         np.outer(along, along) + k**2 * np.outer(across, across)
@@ -358,7 +361,7 @@ def _point(phasors: _Phasors, cycles: int, dropped: int, steps: FloatArray) -> P
     return Point(
         frequency_hz=stretch.omega / (2.0 * np.pi),
         amplitude=abs(phasors.displacement),
-        amplitude_std=float(np.sqrt(0.5 * phasors.errors[0, 0].real)),
+        amplitude_std=float(np.sqrt(phasors.amplitude_variance)),
         drive=float(abs(phasors.phasors(1)[1])),
         harmonic=phasors.harmonics,
         response=response,

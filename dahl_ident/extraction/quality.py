@@ -14,6 +14,8 @@ from dahl_ident.extraction.sine_fit import HARMONICS, SineFit, Stretch
 _LOOKED_AT = 5_000  # samples from which the sensor's step is found
 _SAME = 1e-9  # of the range: values nearer than this are equal but for rounding
 _RAIL_RUN = 5  # samples in a row at an extreme value
+_CORNER = 3  # samples within which a clipped waveform is ...
+_AWAY = 1e-4  # ... this much of its span away from the rail
 
 
 def sensor_step(samples: FloatArray) -> float:
@@ -29,19 +31,26 @@ def sensor_step(samples: FloatArray) -> float:
     return step if np.abs(few - np.round(few)).max() < 0.05 else 0.0
 
 
-def clipped_share(samples: FloatArray, step: float, noise: float, longest: float) -> float:
+def clipped_share(samples: FloatArray, step: float, noise: float, crest: float) -> float:
     """Return the share of samples that stand still at the highest or the lowest value.
 
-    A run of equal extreme values means clipping where the noise would not let the value stand
-    still, or where the run is longer than the waveform's own crest, `longest` samples.
+    They do so in runs that the waveform enters and leaves at a corner; one that saturates does
+    not enter so. Where the noise does not reach the sensor's step, a crest of `crest` samples
+    stands still as well.
     """
-    tolerance = max(0.5 * step, _SAME * float(np.ptp(samples)))
-    allowed = _RAIL_RUN if noise > max(step, tolerance) else max(_RAIL_RUN, 1.5 * longest)
+    span = float(np.ptp(samples))
+    tolerance = max(0.5 * step, _SAME * span)
+    longest = max(_RAIL_RUN, 1.5 * crest) if noise < 0.5 * step else _RAIL_RUN
     stuck = 0
-    for at_rail in (samples > samples.max() - tolerance, samples < samples.min() + tolerance):
+    for rail in (samples.max(), samples.min()):
+        at_rail = np.abs(samples - rail) < tolerance
         edges = np.flatnonzero(np.diff(at_rail, prepend=False, append=False))
-        runs = edges[1::2] - edges[::2]
-        stuck += int(runs[runs > allowed].sum())
+        starts, stops = edges[::2], edges[1::2]
+        before = samples[np.maximum(starts - _CORNER, 0)]
+        after = samples[np.minimum(stops + _CORNER - 1, samples.size - 1)]
+        corner = np.minimum(np.abs(before - rail), np.abs(after - rail)) > _AWAY * span
+        runs = (stops - starts)[corner]
+        stuck += int(runs[runs > longest].sum())
     return stuck / samples.size
 
 

@@ -191,18 +191,19 @@ def estimate_frequency(stretch: Stretch) -> Stretch:
     Gauss-Newton on the four-parameter fit; the channels are weighted by their residuals. The
     start has to be within about half a cycle over the whole stretch, see `track_phase`.
     """
-    start, moved = stretch, 0.0
+    few, moved = thinned(stretch), 0.0
     for _ in range(_MAX_STEPS):
-        step = _frequency_step(thinned(stretch))
+        step = _frequency_step(few)
         moved += step
         if abs(moved) > np.pi:
             break
-        stretch = replace(stretch, phase=stretch.phase + Polynomial([0.0, step]))
+        few = replace(few, phase=few.phase + Polynomial([0.0, step]))
         if abs(step) < _STEP_TOLERANCE:
-            return stretch
+            turned = moved * stretch.half_width / few.half_width
+            return replace(stretch, phase=stretch.phase + Polynomial([0.0, turned]))
     raise ExtractionError(
-        f"no steady frequency near {start.omega / (2.0 * np.pi):.6g} Hz around t = "
-        f"{start.centre:.6g} s: the fit wanders off; expected one sine of constant frequency: "
+        f"no steady frequency near {stretch.omega / (2.0 * np.pi):.6g} Hz around t = "
+        f"{stretch.centre:.6g} s: the fit wanders off; expected one sine of constant frequency: "
         "give frequency=, or mode='sweep'"
     )
 

@@ -1,0 +1,399 @@
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.extraction_validation import accuracy, one_over_f, steady, white
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.elements import Dahl
+from dahl_ident.errors import ExtractionError, ValidationError
+from dahl_ident.extraction import extract
+
+RATE = 200.0
+FRICTION = Dahl(f_max=1.0, sigma=1.0)
+
+
+@dataclass(frozen=True)
+class Waves:
+    """Steady waveforms of one level, with a little noise."""
+
+    time: FloatArray
+    displacement: FloatArray
+    force: FloatArray
+
+    def record(self) -> Record:
+        return Record(self.time, displacement=self.displacement, force=self.force)
+
+
+def waves(
+    beta: float = 2.0, cycles: float = 20.0, noise: float = 1e-4, frequency: float = 1.0
+) -> Waves:
+    rng = np.random.default_rng(6)
+    time = np.arange(round(cycles * RATE / frequency), dtype=np.float64) / RATE
+    x, force = steady(beta, 0.4 + 2.0 * np.pi * frequency * time)
+    return Waves(
+        time,
+        x + beta * noise * rng.standard_normal(time.size),
+        force + noise * rng.standard_normal(time.size),
+    )
+
+
+def assert_near_truth(data: FrequencyResponse, sigmas: float = 4.0) -> None:
+    """Check every row against the exact response at its amplitude."""
+    assert data.amplitude is not None
+    assert data.covariance is not None
+    for row in range(data.n):
+        a, b = FRICTION.fourier_coefficients(data.amplitude[row], int(data.harmonic[row]))
+        error = abs(data.response[row] - complex(a - 1j * b) / data.amplitude[row])
+        assert error < sigmas * np.sqrt(np.trace(data.covariance[row])) + 1e-6
+
+
+@pytest.mark.parametrize("noise", [white, one_over_f])
+@pytest.mark.parametrize("beta", [0.3, 3.0, 30.0])
+def test_unbiased_and_as_accurate_as_stated(noise: object, beta: float) -> None:
+    kind = white if noise is white else one_over_f
+    result = accuracy(beta, kind, 80, seed=20, cycles=8)
+    assert result.bias < 3.5
+    assert result.coverage >= 0.88
+    if noise is white:
+        assert result.efficiency < 1.05 + 2.0 / (2.0 * np.sqrt(80))
+
+
+def test_rows_for_harmonics_amplitude_and_drive() -> None:
+    data = extract(waves().record())
+    assert data.harmonic.tolist() == [1, 3, 5, 7, 9]
+    assert data.quantity == "dynamic_stiffness"
+    assert data.amplitude is not None
+    assert data.drive is not None
+    np.testing.assert_allclose(data.amplitude, 2.0, rtol=1e-4)
+    np.testing.assert_allclose(data.drive, abs(data.response[0]) * data.amplitude, rtol=1e-12)
+    np.testing.assert_allclose(data.frequency_hz, 1.0, rtol=1e-6)
+    assert data.quality["verdict"].tolist() == ["good"] * 5
+    assert_near_truth(data)
+
+
+@given(
+    shift=st.floats(-1e3, 1e3),
+    force_scale=st.floats(1e-6, 1e6),
+    displacement_scale=st.floats(1e-9, 1e3),
+)
+@settings(max_examples=15)
+def test_units_and_the_clock_do_not_matter(
+    shift: float, force_scale: float, displacement_scale: float
+) -> None:
+    w = waves(cycles=6, noise=1e-3)
+    once = extract(w.record(), harmonics=(1, 3))
+    again = extract(
+        Record(
+            w.time + shift,
+            displacement=displacement_scale * w.displacement,
+            force=force_scale * w.force,
+        ),
+        harmonics=(1, 3),
+    )
+    scale = force_scale / displacement_scale
+    np.testing.assert_allclose(again.response / scale, once.response, rtol=1e-6)
+    assert once.covariance is not None
+    assert again.covariance is not None
+    np.testing.assert_allclose(again.covariance / scale**2, once.covariance, rtol=1e-3, atol=1e-14)
+
+
+@pytest.mark.parametrize("channel", ["velocity", "acceleration"])
+def test_velocity_and_acceleration_are_integrated(channel: str) -> None:
+    w = waves(noise=0.0)
+    omega = 2.0 * np.pi
+    theta = 0.4 + omega * w.time
+    rng = np.random.default_rng(1)
+    motion = -2.0 * omega * np.sin(theta) if channel == "velocity" else -w.displacement * omega**2
+    noisy = motion + 1e-3 * rng.standard_normal(theta.size)
+    force = w.force + 1e-4 * rng.standard_normal(theta.size)
+    if channel == "velocity":
+        data = extract(Record(w.time, velocity=noisy, force=force))
+    else:
+        data = extract(Record(w.time, acceleration=noisy, force=force))
+    assert data.amplitude is not None
+    assert data.amplitude[0] == pytest.approx(2.0, rel=1e-4)
+    assert_near_truth(data)
+
+
+def test_shared_error_of_amplitude_and_response() -> None:
+    rng = np.random.default_rng(12)
+    w = waves(noise=0.0, cycles=10)
+    amplitudes, responses, stated, stds = [], [], [], []
+    for _ in range(100):
+        x = w.displacement + 0.05 * rng.standard_normal(w.time.size)
+        force = w.force + 0.001 * rng.standard_normal(w.time.size)
+        data = extract(Record(w.time, displacement=x, force=force), harmonics=(1, 3))
+        assert data.amplitude is not None
+        assert data.amplitude_std is not None
+        assert data.amplitude_covariance is not None
+        amplitudes.append(data.amplitude[0])
+        responses.append(data.response)
+        stds.append(data.amplitude_std[0])
+        stated.append(data.amplitude_covariance)
+    error = np.array(amplitudes) - np.mean(amplitudes)
+    spread = np.std(error)
+    assert spread == pytest.approx(np.mean(stds), rel=0.2)
+    together = np.mean(error[:, None] * np.array(responses), axis=0)
+    found = np.stack([together.real, together.imag], axis=1)
+    np.testing.assert_allclose(found[0], np.mean(stated, axis=0)[0], rtol=0.4)
+    assert np.abs(found[1] - np.mean(stated, axis=0)[1]).max() < 0.5 * np.abs(found[1]).max()
+
+
+def test_an_ideal_spring_without_noise_is_extracted_exactly() -> None:
+    time = np.arange(4000) / RATE
+    x = np.sin(2.0 * np.pi * 1.1 * time)
+    data = extract(Record(time, displacement=x, force=3.0 * x))
+    np.testing.assert_allclose(data.response[0], 3.0, rtol=1e-12)
+    np.testing.assert_allclose(data.response[1:], 0.0, atol=1e-9)
+
+
+def test_jitter_gaps_and_missing_samples_are_taken_as_they_are() -> None:
+    rng = np.random.default_rng(4)
+    n = 4000
+    time = np.arange(n) / RATE + rng.uniform(-0.002, 0.002, n)
+    kept = (rng.random(n) > 0.15) & ((time < 7.2) | (time > 9.9))
+    x, force = steady(2.0, 0.1 + 2.0 * np.pi * 1.03 * time)
+    noisy = force + 1e-3 * rng.standard_normal(n)
+    data = extract(Record(time[kept], displacement=x[kept], force=noisy[kept]))
+    assert data.n == 5
+    assert data.quality["num_periods"][0] == 20
+    assert_near_truth(data)
+
+
+def test_known_frequency_reads_a_sine_buried_in_noise() -> None:
+    w = waves(cycles=200)
+    rng = np.random.default_rng(5)
+    x = w.displacement + 3.0 * rng.standard_normal(w.time.size)
+    record = Record(w.time, displacement=x, force=w.force)
+    with pytest.raises(ExtractionError, match="one dominant sine"):
+        extract(record, frequency=1.0)
+    data = extract(record, frequency=1.0, min_share=0.1, harmonics=(1,))
+    assert data.frequency_hz.tolist() == pytest.approx([1.0], rel=1e-14)
+    assert_near_truth(data)
+
+
+def test_noise_that_hides_the_crossings_leaves_the_strongest_line() -> None:
+    w = waves(cycles=60)
+    rng = np.random.default_rng(5)
+    x = w.displacement + 0.5 * rng.standard_normal(w.time.size)
+    data = extract(Record(w.time, displacement=x, force=w.force), harmonics=(1,))
+    assert data.n == 1
+    assert data.quality["num_periods"][0] >= 55
+    assert_near_truth(data)
+
+
+def test_stepped_levels_and_a_sweep_give_a_series_of_points() -> None:
+    time = np.arange(60_000) / 1000.0
+    frequency = 1.0 + 0.1 * time
+    theta = 2.0 * np.pi * (time + 0.05 * time**2)
+    x, force = steady(2.0, theta)
+    rng = np.random.default_rng(2)
+    noisy = force + 1e-3 * rng.standard_normal(time.size)
+    data = extract(Record(time, displacement=x, force=noisy), harmonics=(1,))
+    assert data.n > 15
+    middle = 0.5 * (data.quality["start_time"] + data.quality["end_time"])
+    np.testing.assert_allclose(data.frequency_hz, np.interp(middle, time, frequency), rtol=2e-3)
+    assert data.quality["settled"].mean() > 0.8
+    assert_near_truth(data, sigmas=5.0)
+
+
+def test_an_amplitude_sweep_that_is_too_fast_says_so() -> None:
+    time = np.arange(16 * 20_000) / 16_000.0
+    x = 3.0 * np.exp(-time / 10.0) * np.sin(2.0 * np.pi * 5.0 * time)
+    force = FRICTION.force(x)
+    rng = np.random.default_rng(2)
+    noisy = force[::16] + 1e-3 * rng.standard_normal(20_000)
+    data = extract(Record(time[::16], displacement=x[::16], force=noisy), harmonics=(1,))
+    assert data.n > 10
+    assert data.amplitude is not None
+    error = np.abs(data.response - FRICTION.describing_function(data.amplitude))
+    assert (error < 0.01 * np.abs(data.response)).all()
+    bias = np.hypot(data.quality["bias_real"], data.quality["bias_imag"])
+    assert (error < bias).mean() > 0.9
+    assert set(data.quality["verdict"]) == {"swept too fast to settle"}
+
+
+def test_num_periods_and_settling_periods() -> None:
+    record = waves(cycles=20).record()
+    data = extract(record, num_periods=12, settling_periods=4, harmonics=(1,))
+    assert data.quality["num_periods"].tolist() == [12]
+    assert data.quality["settling_periods"].tolist() == [4]
+    assert data.quality["end_time"][0] == pytest.approx(20.0 - 1.0 / RATE)
+    assert data.quality["start_time"][0] == pytest.approx(12.0, abs=1.5 / RATE)
+    assert data.quality["covariance_from"].tolist() == ["cycles"]
+    few = extract(record, num_periods=3, harmonics=(1,))
+    assert few.quality["covariance_from"].tolist() == ["spectrum"]
+    with pytest.raises(ExtractionError, match=r"5 cycles .* 4 of them for settling"):
+        extract(record, num_periods=5, settling_periods=4)
+
+
+def test_distortion_is_measured_and_said() -> None:
+    w = waves()
+    bent = w.displacement + 0.1 * np.sin(2.0 * (0.4 + 2.0 * np.pi * w.time))
+    data = extract(Record(w.time, displacement=bent, force=w.force), harmonics=(1,))
+    assert data.quality["displacement_distortion"][0] == pytest.approx(0.05, rel=1e-2)
+    assert data.quality["verdict"].tolist() == ["displacement distorted 5 %"]
+    clean = extract(w.record(), harmonics=(1,))
+    assert clean.quality["displacement_distortion"][0] < 1e-4
+
+
+def test_distortion_of_an_acceleration_is_that_of_the_displacement() -> None:
+    w = waves()
+    omega = 2.0 * np.pi
+    acceleration = -(omega**2) * (w.displacement + 4.0 * 0.1 * np.sin(2.0 * omega * w.time))
+    data = extract(Record(w.time, acceleration=acceleration, force=w.force), harmonics=(1,))
+    assert data.quality["displacement_distortion"][0] == pytest.approx(0.05, rel=1e-2)
+
+
+def test_quantisation_is_told_in_steps_of_the_sensor() -> None:
+    w = waves()
+    x = np.round(w.displacement / 0.3) * 0.3
+    force = np.round(w.force / 0.01) * 0.01
+    data = extract(Record(w.time, displacement=x, force=force), harmonics=(1,))
+    assert data.drive is not None
+    assert data.quality["displacement_steps"][0] == pytest.approx(2.0 / 0.3, rel=0.05)
+    assert data.quality["force_steps"][0] == pytest.approx(data.drive[0] / 0.01, rel=0.05)
+    assert "displacement only 6.7 sensor steps" in data.quality["verdict"][0]
+    assert np.isinf(extract(w.record(), harmonics=(1,)).quality["force_steps"][0])
+
+
+def test_clipping_is_told() -> None:
+    w = waves(noise=1e-3)
+    clipped = Record(
+        w.time, displacement=np.clip(w.displacement, -1.9, 9.0), force=np.clip(w.force, -9.0, 0.6)
+    )
+    quality = extract(clipped, harmonics=(1,)).quality
+    assert quality["displacement_clipped"][0] == pytest.approx(np.arccos(0.95) / np.pi, abs=0.01)
+    assert quality["force_clipped"][0] == pytest.approx(np.mean(w.force > 0.6), abs=0.03)
+    assert "displacement clipped in 10 % of samples" in quality["verdict"][0]
+    clean = extract(w.record(), harmonics=(1,)).quality
+    assert clean["displacement_clipped"][0] == clean["force_clipped"][0] == 0.0
+
+
+def test_a_force_that_saturates_is_not_clipped() -> None:
+    w = waves(beta=50.0, noise=0.0)
+    quality = extract(w.record(), harmonics=(1,)).quality
+    assert quality["force_clipped"][0] == 0.0
+
+
+def test_labels_and_origin_are_kept() -> None:
+    w = waves()
+    record = Record(
+        w.time,
+        displacement=w.displacement,
+        drive=w.force / 2.0,
+        drive_unit="V",
+        drive_factor=2.0,
+        motion="rotation",
+        provenance={"file": "run07.csv"},
+    )
+    data = extract(record, level="2 mm", controlled="force", harmonics=(1,))
+    assert data.motion == "rotation"
+    assert data.level is not None
+    assert data.level.tolist() == ["2 mm"]
+    assert data.controlled.tolist() == ["force"]
+    assert data.provenance is not None
+    assert data.provenance["file"] == "run07.csv"
+    assert data.provenance["extraction"]["harmonics"] == [1]
+    assert_near_truth(data)
+
+
+def test_table_of_points_and_verdicts() -> None:
+    frame = extract(waves().record(), harmonics=(1, 3)).to_frame()
+    assert {"settled", "verdict", "more_periods", "displacement_distortion"} <= set(frame.columns)
+    assert len(frame) == 2
+
+
+def two_tones(n: int = 4000) -> Record:
+    time = np.arange(n) / RATE
+    x = np.sin(2.0 * np.pi * time) + np.sin(2.0 * np.pi * 2.6 * time)
+    return Record(time, displacement=x, force=x)
+
+
+def test_two_tones_are_refused_with_their_share() -> None:
+    with pytest.raises(ExtractionError, match=r"fundamental has \d+(\.\d)? % of the power"):
+        extract(two_tones(), frequency=1.0)
+
+
+def test_a_force_that_is_noise_is_refused() -> None:
+    w = waves()
+    rng = np.random.default_rng(0)
+    record = Record(w.time, displacement=w.displacement, force=rng.standard_normal(w.time.size))
+    with pytest.raises(ExtractionError, match=r"force around t = .* has 0\.\d+ % of the power"):
+        extract(record)
+
+
+def test_less_motion_than_the_sensors_step_is_refused() -> None:
+    time = np.arange(4000) / RATE
+    x = np.round(0.51 * np.sin(2.0 * np.pi * time)) * 1e-6
+    with pytest.raises(ExtractionError, match=r"displacement .* sensor steps \(of 1e-06\)"):
+        extract(Record(time, displacement=x, force=np.sin(2.0 * np.pi * time)))
+
+
+def test_a_dead_force_is_refused() -> None:
+    w = waves()
+    with pytest.raises(ExtractionError, match=r"force around .*: amplitude 0 is 0 sensor steps"):
+        extract(Record(w.time, displacement=w.displacement, force=np.zeros(w.time.size)))
+
+
+@pytest.mark.parametrize(
+    ("motion", "mode", "message"),
+    [
+        (np.zeros(400), "auto", "no stretch of constant amplitude and frequency in 1.995 s: 0"),
+        (np.linspace(0.0, 1.0, 400), "auto", "expected at least 2 cycles alike"),
+        (np.sin(0.02 * np.arange(400)), "auto", "record longer, give frequency="),
+        (np.sin(0.1 * np.arange(400)), "sweep", "no stretch of constant"),
+    ],
+)
+def test_records_without_cycles_are_refused(
+    motion: FloatArray, mode: Literal["auto", "sweep"], message: str
+) -> None:
+    record = Record(np.arange(400) / RATE, displacement=motion, force=motion)
+    with pytest.raises(ExtractionError, match=message):
+        extract(record, mode=mode)
+
+
+def test_one_bad_stretch_is_left_out_with_a_warning() -> None:
+    good = waves(cycles=15)
+    rng = np.random.default_rng(1)
+    x = np.concatenate([good.displacement, np.zeros(300), 0.5 * good.displacement])
+    force = np.concatenate([good.force, np.zeros(300), rng.standard_normal(good.force.size)])
+    record = Record(np.arange(x.size) / RATE, displacement=x, force=force)
+    with pytest.warns(UserWarning, match="left out: force around t = "):
+        data = extract(record, harmonics=(1,))
+    assert data.n == 1
+    assert data.provenance is not None
+    assert len(data.provenance["extraction"]["refused"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mode": "chirp"}, "mode is 'chirp'; expected one of auto, steps, sweep"),
+        ({"frequency": -1.0}, "frequency is -1.0; expected numbers > 0"),
+        ({"num_periods": 1}, "num_periods is 1"),
+        ({"settling_periods": -1}, "settling_periods is -1"),
+        ({"harmonics": (1, 11)}, r"harmonics is \[1, 11\]; expected different numbers from 1 to 9"),
+        ({"harmonics": ()}, r"harmonics is \[\]; expected"),
+        ({"harmonics": (3, 3)}, r"harmonics is \[3, 3\]; expected different"),
+        ({"controlled": "velocity"}, "controlled is 'velocity'; expected"),
+        ({"min_share": 1.0}, "min_share is 1.0; expected a share from 0 to below 1"),
+    ],
+)
+def test_arguments_are_checked(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        extract(waves(cycles=4).record(), **options)  # type: ignore[arg-type]
+
+
+def test_a_drive_without_a_factor_is_no_force() -> None:
+    w = waves(cycles=4)
+    record = Record(w.time, displacement=w.displacement, drive=w.force)
+    with pytest.raises(ValidationError, match="drive_factor"):
+        extract(record)
