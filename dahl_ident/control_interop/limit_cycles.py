@@ -113,9 +113,11 @@ def limit_cycles(
     Describing functions assume that x is nearly a sine about zero: they are good where H falls
     steeply with frequency. They do not see motions with long rests, such as the slow slips of a
     held mass whose integrator winds up, and where such rests set in an unstable cycle can lie at
-    less than half the amplitude given here. Two cycles nearer to each other than the grid, 4 % in amplitude and 0.6 % in
-    frequency, may be missed, and so may any below 1e-6 of the smallest or above 1e8 of the
-    largest characteristic displacement.
+    less than half the amplitude given here.
+
+    Two cycles nearer to each other than the grid, 4 % in amplitude and 0.6 % in frequency, may be
+    missed, and so may any below 1e-6 of the smallest or above 1e8 of the largest characteristic
+    displacement.
 
     The stability is that of the oscillation's own amplitude (Loeb's criterion); an oscillation
     can still be upset by another mode of the loop.
