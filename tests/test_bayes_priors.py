@@ -63,9 +63,9 @@ def test_defaults_hold_what_the_data_show() -> None:
     assert data.amplitude is not None
     force = stiffness * data.amplitude
     low, high = np.exp(prior.parts[0].limits)
-    assert (low, high) == pytest.approx((force.min() / 1e3, force.max() * 1e3))
+    assert (low, high) == pytest.approx((force.min() / 1e5, force.max() * 1e5))
     low, high = np.exp(prior.parts[1].limits)
-    assert (low, high) == pytest.approx((stiffness.min() / 1e3, stiffness.max() * 1e3))
+    assert (low, high) == pytest.approx((stiffness.min() / 1e5, stiffness.max() * 1e5))
     assert "log-uniform from" in str(prior)
     assert "(from the size of the data)" in str(prior)
     text = str(joint_prior(problem(), {"f_max": (0.01, 1.0)}).parts[0])

@@ -6,8 +6,8 @@ mean a log-uniform prior for a positive parameter (every decade is as likely as 
 uniform one for the others. Where the user says nothing, bounds come from the size of the data,
 wide enough to say little and proper all the same:
 
-- f_max and sigma: from a thousandth of the smallest force or dynamic stiffness in the data to a
-  thousand times the largest; alpha: from 0.1 to 10;
+- f_max and sigma: from 1e-5 times the smallest force or dynamic stiffness in the data to 1e5
+  times the largest, since far from the knee either can lie decades away; alpha: from 0.1 to 10;
 - stiffness, damping, mass: up to ten times the largest dynamic stiffness, or the least-squares
   estimate if that is larger, either sign;
 - gains: from 0.1 to 10; delay: half a period of the highest frequency either way.
@@ -30,7 +30,7 @@ from dahl_ident.elements import Dahl, Damper, Mass, Parameter, Spring
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.problem import Problem
 
-_DECADES = 1e3
+_DECADES = 1e5
 _WIDER = 10.0
 _TAIL = 1e-10  # of a distribution of unbounded support that lies beyond its `limits`
 
@@ -196,7 +196,8 @@ def joint_prior(
     priors : mapping of str to distribution or (low, high), optional
         By parameter name; the rest gets the default.
     estimate : ndarray, shape (P,), optional
-        Least-squares theta, which defaults of plant parameters include.
+        Least-squares values, which defaults of plant parameters include; infinite where there
+        is no finite optimum.
 
     Raises
     ------
@@ -264,7 +265,7 @@ def _check_support(parameter: Parameter, given: Distribution) -> None:
 
 
 def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[float, float]:
-    """Return default bounds of the value; `estimate` is theta, NaN where unknown."""
+    """Return default bounds of the value; `estimate` is one, not finite where unknown."""
     name = parameter.name
     view = problem.stiffness_data
     for element in problem.model.elements:
