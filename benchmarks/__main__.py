@@ -20,6 +20,7 @@ TOPICS = (
     "fitting",
     "ipopt",
     "bayes",
+    "command_line",
 )
 PACKAGES = ("numpy", "scipy", "casadi", "emcee", "control", "lmfit")
 
