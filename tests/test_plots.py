@@ -198,6 +198,15 @@ def test_corner_refuses_axes_of_another_shape() -> None:
     plt.close(figure)
 
 
+def test_only_wide_ranges_are_drawn_over_their_logarithm() -> None:
+    draws = np.stack([DRAWS[:, 0], np.exp(20.0 * DRAWS[:, 1])], axis=-1)
+    grid = plots.plot_corner(["narrow", "wide"], draws, log=[True, True])
+    assert (grid[1, 0].get_xscale(), grid[1, 0].get_yscale()) == ("linear", "log")
+    rows = plots.plot_trace(["narrow", "wide"], draws.reshape(100, 30, 2), log=[True, True])
+    assert [axis.get_yscale() for axis in rows] == ["linear", "log"]
+    plt.close("all")
+
+
 def test_every_axis_has_its_unit() -> None:
     top, bottom = _amplitude(None)
     assert (top.get_ylabel(), bottom.get_ylabel()) == ("gain [N/m]", "phase [degrees]")

@@ -11,9 +11,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 
+from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError
 from dahl_ident.plots import style
 
+_WIDE = 3.0
 _QUANTILES = (0.025, 0.16, 0.5, 0.84, 0.975)
 
 
@@ -34,7 +36,7 @@ def plot_corner(
     draws : array_like, shape (n, p)
         Independent or thinned draws.
     log : sequence of bool, shape (p,), optional
-        Which axes are logarithmic.
+        Which axes are logarithmic, where their values span a factor of three at least.
     truth : mapping of str to float, optional
         Values to mark, by label.
     ax : ndarray of Axes, shape (p, p), optional
@@ -53,7 +55,7 @@ def plot_corner(
     """
     values = np.asarray(draws, dtype=float)
     p = values.shape[1]
-    logs = list(log) or [False] * p
+    logs = _logarithmic(values, log)
     if ax is None:
         with mpl.rc_context(style.RC):
             side = 1.2 + 1.5 * p
@@ -110,7 +112,7 @@ def plot_trace(
     discard : int, default 0
         Steps of warm-up, shaded.
     log : sequence of bool, shape (p,), optional
-        Which axes are logarithmic.
+        Which axes are logarithmic, where their values span a factor of three at least.
     ax : sequence of Axes, shape (p,), optional
         New where left out.
 
@@ -127,7 +129,7 @@ def plot_trace(
     """
     values = np.asarray(chain, dtype=float)
     p = values.shape[2]
-    logs = list(log) or [False] * p
+    logs = _logarithmic(values.reshape(-1, p), log)
     if ax is None:
         with mpl.rc_context(style.RC):
             _, rows = plt.subplots(
@@ -146,6 +148,13 @@ def plot_trace(
         axis.set_ylabel(names[i])
     rows[-1].set_xlabel("step")
     return rows
+
+
+def _logarithmic(values: FloatArray, log: Sequence[bool]) -> list[bool]:
+    """Return which axes a logarithm serves: of a narrow range, its ticks are hard to read."""
+    low, high = np.quantile(values, [0.001, 0.999], axis=0)
+    wanted = list(log) or [False] * values.shape[1]
+    return [bool(w and b > _WIDE * a) for w, a, b in zip(wanted, low, high, strict=True)]
 
 
 def _edges(values: Any, log: bool) -> Any:
