@@ -38,6 +38,7 @@ from dahl_ident.problem import Problem, Quadratic
 DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm
 _RESCALINGS = 100
 _SAME_SCALE = 1e-9
+_LONGEST_SECANT = 20.0
 _PATIENCE = 1000  # steps where friction is so faint that each takes little
 AT_LIMIT = 1e4  # looseness: so far out, large terms cancel
 TIE, NEARLY = 1e-12, 1e-4  # relative differences of cost at which a limit wins
@@ -120,11 +121,15 @@ class _Search:
             y, _ = self.problem.whitened(begin[0], derivatives=False)
             scale = float(np.median(np.abs(y))) / np.sqrt(np.log(4.0))
         end = self._search(begin, scale)
+        step, last = 0.0, 0.0
         for _ in range(_RESCALINGS if self.rescales else 0):
-            stretch = self._stretch(end, scale)
-            if abs(stretch - 1.0) < _SAME_SCALE or not 0.0 < scale * stretch < np.inf:
+            excess = self._excess(end, scale)
+            if abs(excess) < _SAME_SCALE or not np.isfinite(excess):
                 break
-            scale *= stretch
+            # the secant's step where it goes the same way, else the plain one
+            factor = step / (last - excess) if last != excess else 1.0
+            step = excess * (factor if 0.0 < factor < _LONGEST_SECANT else 1.0)
+            last, scale = excess, scale * float(np.exp(step))
             end = self._search(end.theta[None], scale)
         return optimum(self.problem, end, scale, self.loss, self.evaluations)
 
@@ -145,13 +150,13 @@ class _Search:
         y, _ = self.problem.whitened(theta, derivatives=False, tails=self.loss is None)
         return (y.real**2 + y.imag**2) / scale**2
 
-    def _stretch(self, end: End, scale: float) -> float:
-        """Return the factor by which the noise's scale has to change."""
+    def _excess(self, end: End, scale: float) -> float:
+        """Return ln of the ratio of the scale that the residuals have to `scale`."""
         z, dof = self._squares(end.theta, scale), self.m - end.determined
         if dof <= 0:
-            return 1.0
+            return 0.0
         ratio = z.sum() / dof if self.loss is None else self.loss.rescaled(z, dof)
-        return float(np.sqrt(ratio))
+        return 0.5 * float(np.log(ratio))
 
     # Searches
 

@@ -9,16 +9,20 @@ a whole, whichever way the coordinates are turned. Near the model rho(z) = z.
 - ``student_t``: 6 ln(1 + z/4), the likelihood of Student's t with 4 degrees of freedom; distant
   points lose their influence altogether.
 
-**Scale.** Where the noise's scale s is unknown it has to be robust as well: Huber's proposal 2,
-Sum psi(z_i)^2 = (2 n - P)/2 E[psi^2], E taken for Gaussian noise, so that s is its standard
-deviation when there are no outliers. **Covariance**: s^2 kappa (J' J)^-1 with
-kappa = mean(psi^2) / mean(psi')^2 (Huber, Robust Statistics, 1981, section 7.6).
+**Scale.** Where the noise's scale s is unknown it has to be robust as well: mean chi(z) = E[chi(z)]
+with E taken for Gaussian noise and z in units of s^2 (2 n - P)/(2 n), so that s^2 is the noise's
+variance when there are no outliers. chi = psi^2 = rho'(z)^2 z is Huber's proposal 2; for student_t,
+whose psi^2 falls again, chi = rho'(z) z, the scale equation of its likelihood.
+
+**Covariance**: s^2 kappa (J' J)^-1 with kappa = mean(psi^2) / mean(psi')^2 (Huber, Robust
+Statistics, 1981, section 7.6).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -37,20 +41,26 @@ class Loss:
     rho: Callable[[FloatArray], FloatArray]
     slope: Callable[[FloatArray], FloatArray]
     bend: Callable[[FloatArray], FloatArray]
+    power: int
+    """Of rho' in chi."""
 
     def __call__(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return rho and its first two derivatives."""
         return self.rho(z), self.slope(z), self.bend(z)
 
-    def gaussian_square(self) -> float:
-        """Return the expectation of psi^2 = rho'(z)^2 z for Gaussian noise: z/2 exponential."""
+    def chi(self, z: FloatArray) -> FloatArray:
+        """Return what the scale is measured by; it rises with z."""
+        return self.slope(z) ** self.power * z
+
+    @cached_property
+    def gaussian_chi(self) -> float:
+        """The expectation of chi for Gaussian noise, where z/2 is exponential."""
         nodes, weights = np.polynomial.laguerre.laggauss(100)
-        return float(weights @ (self.slope(2.0 * nodes) ** 2 * 2.0 * nodes))
+        return float(weights @ self.chi(2.0 * nodes))
 
     def rescaled(self, z: FloatArray, dof: int) -> float:
-        """Return s_new^2/s^2 of proposal 2, for squares `z` in units of s^2."""
-        psi2 = self.slope(z) ** 2 * z
-        return float(psi2.sum() / (0.5 * dof * self.gaussian_square()))
+        """Return s_new^2/s^2, for squares `z` in units of s^2."""
+        return float(np.mean(self.chi(z * (2.0 * z.size / dof))) / self.gaussian_chi)
 
     def inflation(self, z: FloatArray, dof: int) -> float:
         """Return kappa, by which the covariance exceeds that of least squares."""
@@ -71,18 +81,20 @@ def _huber_bend(z: FloatArray) -> FloatArray:
 
 
 LOSSES = {
-    "huber": Loss("huber", _huber, _huber_slope, _huber_bend),
+    "huber": Loss("huber", _huber, _huber_slope, _huber_bend, power=2),
     "soft_l1": Loss(
         "soft_l1",
         lambda z: 2.0 * z / (np.sqrt(1.0 + z) + 1.0),
         lambda z: (1.0 + z) ** -0.5,
         lambda z: -0.5 * (1.0 + z) ** -1.5,
+        power=2,
     ),
     "student_t": Loss(
         "student_t",
         lambda z: (TAIL_DOF + 2.0) * np.log1p(z / TAIL_DOF),
         lambda z: (TAIL_DOF + 2.0) / (TAIL_DOF + z),
         lambda z: -(TAIL_DOF + 2.0) / (TAIL_DOF + z) ** 2,
+        power=1,
     ),
 }
 

@@ -181,7 +181,7 @@ def _grid(problem: Problem) -> _Grid:
     each = _MOST_COMBINATIONS ** (1.0 / max(1, len(searched)))
     friction = [_nodes(element, view, each) for element in searched]
     counts = [element.curve.shape[-2] for element in friction]
-    nodes = np.indices(counts).reshape(len(counts), -1).T
+    nodes = np.indices(counts).reshape(len(counts), int(np.prod(counts))).T
     rest = np.zeros(view.stiffness.shape, dtype=np.complex128)
     columns = {}
     for element in problem.model.elements:

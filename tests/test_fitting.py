@@ -1,0 +1,268 @@
+"""Least squares against lmfit, curve_fit and general optimisers; coverage by simulation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lmfit
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from dahl_ident import (
+    Dahl,
+    Damper,
+    FrequencyResponse,
+    Mass,
+    Problem,
+    Sensors,
+    Spring,
+    response,
+)
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements.model import as_model
+from dahl_ident.errors import FitError, ModelError, ValidationError
+from dahl_ident.fitting import Status, solve, solve_many
+from dahl_ident.fitting.losses import LOSSES
+from dahl_ident.problem import ProblemBatch
+
+n = 20
+A = np.geomspace(1e-4, 1e-1, n)
+TRUE = Dahl(0.1, 30.0).describing_function(A)
+RNG = np.random.default_rng(7)
+ERROR = RNG.normal(size=n) + 1j * RNG.normal(size=n)
+MEASURED = TRUE * np.exp(0.05 * ERROR)
+COVARIANCE = np.abs(TRUE)[:, None, None] ** 2 * np.array([[2e-3, 1e-3], [1e-3, 4e-3]])
+
+
+def table(response: ComplexArray = MEASURED, **columns: object) -> FrequencyResponse:
+    return FrequencyResponse(np.ones(n), response, A, **columns)  # type: ignore[arg-type]
+
+
+def model(f_max: float, sigma: float) -> ComplexArray:
+    return Dahl(f_max, sigma).describing_function(A)
+
+
+@pytest.mark.parametrize("noise", ["measured", "relative", "absolute"])
+def test_lmfit_finds_the_same_optimum_and_covariance(noise: str) -> None:
+    problem = Problem(table(covariance=COVARIANCE), Dahl(), noise=noise)
+    found = solve(problem)
+    whitening = np.linalg.inv(np.linalg.cholesky(COVARIANCE))
+
+    def rows(values: ComplexArray) -> FloatArray:
+        """Return whitened real and imaginary parts of values in the last axis."""
+        parts = np.ascontiguousarray(values).view(np.float64).reshape(*values.shape, 2)
+        if noise == "measured":
+            parts = np.einsum("nij,...nj->...ni", whitening, parts)
+        return np.asarray(parts.reshape(*values.shape[:-1], 2 * n))
+
+    def residual(p: lmfit.Parameters) -> FloatArray:
+        N = model(p["f_max"].value, p["sigma"].value)
+        return rows(np.log(MEASURED / N) if noise == "relative" else MEASURED - N)
+
+    def slopes(p: lmfit.Parameters) -> FloatArray:
+        pivot = Dahl(p["f_max"].value, p["sigma"].value)
+        by = np.array([pivot.gradient(A)[name] for name in ("f_max", "sigma")])
+        return rows(-by / pivot.describing_function(A) if noise == "relative" else -by).T
+
+    start = lmfit.Parameters()
+    start.add("f_max", 0.1)
+    start.add("sigma", 30.0)
+    settings: dict[str, Any] = {
+        "scale_covar": noise != "measured",
+        "ftol": 1e-15,
+        "xtol": 1e-15,
+        "Dfun": slopes,
+    }
+    # once more from the optimum, because MINPACK's covariance is that before the last step
+    peer = lmfit.minimize(residual, lmfit.minimize(residual, start, **settings).params, **settings)
+    values = [peer.params["f_max"].value, peer.params["sigma"].value]
+    assert found.status is Status.CONVERGED
+    np.testing.assert_allclose(found.values, values, rtol=1e-6)
+    spread = np.sqrt(np.diagonal(peer.covar))
+    off = np.abs(found.values_covariance - peer.covar)
+    assert np.all(off < 1e-6 * np.outer(spread, spread))
+    assert 2.0 * found.cost == pytest.approx(peer.chisqr, rel=1e-9)
+    assert found.dof == 2 * n - 2
+    if noise == "measured":
+        assert found.scale == 1.0
+        assert found.scale_known
+    else:
+        assert found.scale**2 == pytest.approx(peer.redchi, rel=1e-9)
+
+
+def test_curve_fit_finds_the_same_optimum_and_covariance() -> None:
+    found = solve(Problem(table(), Dahl(), noise="absolute"))
+
+    def predict(_: FloatArray, f_max: float, sigma: float) -> FloatArray:
+        return model(f_max, sigma).view(np.float64)
+
+    values, covariance = optimize.curve_fit(
+        predict, np.zeros(2 * n), MEASURED.view(np.float64), p0=[0.1, 30.0], xtol=1e-15, ftol=1e-15
+    )
+    np.testing.assert_allclose(found.values, values, rtol=1e-6)
+    np.testing.assert_allclose(found.values_covariance, covariance, rtol=1e-5)
+
+
+def test_a_driven_plant_is_recovered_from_every_quantity() -> None:
+    true = np.array([0.1, 30.0, 0.3, 0.24, 0.3])
+    plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
+    drive = np.repeat(np.geomspace(1e-3, 1.0, 5), 12)
+    f = np.tile(np.geomspace(0.1, 10.0, 12), 5)
+    R = response(plant, f, drive).receptance
+    noise = np.exp(0.01 * (RNG.normal(size=60) + 1j * RNG.normal(size=60)))
+    free = Dahl() + Mass() + Damper() + Spring()
+    expected = None
+    for quantity, factor in (("receptance", 1.0), ("accelerance", (2j * np.pi * f) ** 2)):
+        data = FrequencyResponse(
+            f,
+            R * noise * factor,
+            drive=drive,
+            controlled="force",
+            quantity=quantity,  # type: ignore[arg-type]  # both are among the six
+        )
+        found = solve(Problem(data, free))
+        assert found.success
+        z = (found.values - true) / list(found.stderr.values())
+        assert np.all(np.abs(z) < 4.0)
+        if expected is not None:  # relative noise does not care for the quantity
+            np.testing.assert_allclose(found.values, expected, rtol=1e-7)
+        expected = found.values
+
+
+@pytest.mark.parametrize("exponent", [-30, 30])
+def test_units_do_not_matter(exponent: int) -> None:
+    here = solve(Problem(table(), Dahl()))
+    a = 10.0**exponent
+    there = solve(Problem(FrequencyResponse(np.ones(n), MEASURED / a**2, A * a), Dahl()))
+    np.testing.assert_allclose(there.values, here.values * [1.0 / a, 1.0 / a**2], rtol=1e-9)
+    np.testing.assert_allclose(there.covariance, here.covariance, rtol=1e-6)
+
+
+def test_a_parameter_at_its_bound_is_named() -> None:
+    capped = as_model(Dahl()).with_parameters(
+        {"f_max": as_model(Dahl()).parameters[0].__class__(
+            "f_max", "N", "friction limit", lower=0.0, upper=0.08, transform="log"
+        )}
+    )  # fmt: skip
+    found = solve(Problem(table(), capped))
+    assert found.status is Status.AT_BOUND
+    assert found.success
+    assert found.values[0] == pytest.approx(0.08, rel=1e-7)
+    assert "At its bound: f_max = 0.08." in found.message
+    held = solve(Problem(table(), Dahl(), fixed={"f_max": 0.08}))
+    assert found.values[1] == pytest.approx(held.values[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_robust_losses_stay_with_the_bulk(loss: str) -> None:
+    spoiled = MEASURED.copy()
+    spoiled[[3, 12]] *= [8.0, 0.2j]
+    clean, robust = (
+        solve(Problem(table(), Dahl())),
+        solve(Problem(table(spoiled), Dahl()), loss=loss),
+    )
+    ordinary = solve(Problem(table(spoiled), Dahl()))
+    assert robust.status is Status.CONVERGED
+    assert robust.loss == loss
+    off = np.abs(robust.theta - clean.theta) / np.sqrt(np.diagonal(robust.covariance))
+    assert np.all(off < 2.0)
+    assert (
+        np.abs(ordinary.theta - clean.theta).max() > 3.0 * np.abs(robust.theta - clean.theta).max()
+    )
+    # the cost is at its minimum for the scale found
+    problem = Problem(table(spoiled), Dahl())
+
+    def cost(theta: FloatArray) -> float:
+        y = problem.residuals(theta).view(np.complex128)
+        return 0.5 * float(LOSSES[loss](np.abs(y / robust.scale) ** 2)[0].sum())
+
+    general = optimize.minimize(cost, robust.theta + 0.01, method="Nelder-Mead", tol=1e-10)
+    np.testing.assert_allclose(robust.theta, general.x, atol=2e-5)
+    assert robust.cost == pytest.approx(general.fun * robust.scale**2, rel=1e-8)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_robust_intervals_and_scale_hold_for_gaussian_noise(loss: str) -> None:
+    rng, z, scales = np.random.default_rng(1), [], []
+    for _ in range(80):
+        error = rng.normal(size=n) + 1j * rng.normal(size=n)
+        found = solve(Problem(table(TRUE * np.exp(0.05 * error)), Dahl()), loss=loss)
+        z.append((found.theta - np.log([0.1, 30.0])) / np.sqrt(np.diagonal(found.covariance)))
+        scales.append(found.scale)
+    assert np.abs(np.std(z, axis=0) - 1.0).max() < 0.22
+    assert np.mean(scales) == pytest.approx(0.05, rel=0.03)
+
+
+def test_a_prior_joins_data_of_known_scale() -> None:
+    data = table(covariance=COVARIANCE)
+    exact = solve(Problem(data, Dahl()))
+    prior = stats.norm(1.0, 0.03)
+    found = solve(Problem(data, Dahl(), sensors=Sensors(force_gain=prior)))
+    # a force gain scales f_max and sigma alike, so its variance adds to both logarithms
+    np.testing.assert_allclose(found.theta, [*exact.theta, 0.0], atol=1e-6)
+    expected = exact.covariance + 0.03**2
+    np.testing.assert_allclose(found.covariance[:2, :2], expected, rtol=1e-3)
+    assert found.dof == 2 * n + 1 - 3
+
+
+def test_a_prior_joins_data_of_unknown_scale() -> None:
+    prior = stats.norm(1.0, 0.03)
+    exact = solve(Problem(table(), Dahl()))
+    found = solve(Problem(table(), Dahl(), sensors=Sensors(force_gain=prior)))
+    assert found.scale == pytest.approx(exact.scale, rel=1e-6)
+    np.testing.assert_allclose(found.covariance[:2, :2], exact.covariance + 0.03**2, rtol=1e-3)
+
+
+def test_what_cannot_be_told_apart_is_singular() -> None:
+    found = solve(Problem(table(), Dahl(), sensors=Sensors(force_gain=None)))
+    assert found.status is Status.SINGULAR
+    assert not found.success
+    assert "Involved: f_max, sigma, force_gain." in found.message
+    assert found.stderr["f_max"] == np.inf
+    x_c = np.exp(found.theta[0] - found.theta[1])
+    assert x_c == pytest.approx(
+        np.exp(-np.diff(solve(Problem(table(), Dahl())).theta))[0], rel=1e-6
+    )
+
+
+def test_stated_intervals_cover_with_relative_noise_of_ten_percent() -> None:
+    rng, tables = np.random.default_rng(21), 2000
+    points = np.geomspace(1e-3, 1e-2, 8)
+    N = Dahl(0.1, 30.0).describing_function(points)
+    problem = Problem(FrequencyResponse(np.ones(8), N, points), Dahl())
+    error = rng.normal(size=(tables, 8)) + 1j * rng.normal(size=(tables, 8))
+    found = solve_many(ProblemBatch.replicates(problem, N * np.exp(0.1 * error)))
+    assert found.success.all()
+    off = np.abs(found.theta - np.log([0.1, 30.0]))
+    for level in (0.6827, 0.9545):
+        half = stats.t(14).ppf(0.5 + level / 2.0)
+        spread = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+        covered = np.mean(off < half * spread, axis=0)
+        assert np.all(np.abs(covered - level) < 4.0 * np.sqrt(level * (1.0 - level) / tables))
+
+
+def test_a_start_is_completed_and_checked() -> None:
+    problem = Problem(table(), Dahl())
+    with pytest.raises(ModelError, match="start names mass; the free parameters are f_max, sigma"):
+        solve(problem, start={"mass": 1.0})
+    np.testing.assert_allclose(
+        solve(problem, start={"f_max": 5.0}).values, solve(problem).values, rtol=1e-6
+    )
+
+
+def test_too_little_data_are_refused() -> None:
+    data = FrequencyResponse([1.0], [1.0 + 1.0j], [1.0])
+    with pytest.raises(FitError, match="1 rows give 2 numbers, fewer than the 3 free parameters"):
+        solve(Problem(data, Dahl() + Spring()))
+    with pytest.raises(ValidationError, match="loss is 'cauchy'; expected linear, huber"):
+        solve(Problem(data, Dahl()), loss="cauchy")
+
+
+def test_as_many_numbers_as_parameters_leave_no_scale() -> None:
+    data = FrequencyResponse([1.0], [20.0 + 10.0j], [1e-2])
+    found = solve(Problem(data, Dahl()))
+    assert found.dof == 0
+    assert np.isnan(found.scale)
+    assert np.isinf(np.diagonal(found.covariance)).all()
+    assert np.abs(found.residuals).max() < 1e-9
