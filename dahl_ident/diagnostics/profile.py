@@ -253,7 +253,7 @@ class Profiler:
         """Return the factor that gives a robust loss's deviance the spread of a chi-square."""
         if self._loss is None:
             return 1.0
-        expected = np.diagonal(np.linalg.pinv(self._at_optimum.hessian)) * self._scale**2
+        expected = np.diagonal(np.linalg.pinv(self._at_optimum.hessian))
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = expected / np.diagonal(self._optimum.covariance)
         ratio = ratio[np.isfinite(ratio) & (ratio > 0.0)]

@@ -1,0 +1,47 @@
+"""Synthetic tables of friction that several tests fit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, response
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import Element
+
+F_MAX, SIGMA = 0.1, 30.0
+X_C = F_MAX / SIGMA
+FRICTION = Dahl(F_MAX, SIGMA)
+PLANT = FRICTION + Mass(0.3) + Damper(0.24) + Spring(0.3)
+
+
+def table(
+    model: Element = FRICTION,
+    beta: tuple[float, float] = (0.1, 10.0),
+    n: int = 30,
+    noise: float = 0.01,
+    seed: int = 1,
+) -> FrequencyResponse:
+    """Return dynamic stiffness over amplitude with relative noise."""
+    A = np.geomspace(*beta, n) * X_C
+    Z = model.dynamic_stiffness(A, 2.0 * np.pi)
+    return FrequencyResponse(np.ones(n), Z * relative_noise(n, noise, seed), A)
+
+
+def plant_table(noise: float = 0.01, seed: int = 1) -> FrequencyResponse:
+    """Return the receptance of the plant of Eqn. 53, five drives by twelve frequencies."""
+    f = np.tile(np.geomspace(0.1, 2.0, 12), 5)
+    u = np.repeat(np.geomspace(0.02, 1.0, 5), 12)
+    R = response(PLANT, f, u).receptance * relative_noise(60, noise, seed)
+    return FrequencyResponse(f, R, drive=u, level=u, controlled="force", quantity="receptance")
+
+
+def amplitudes(data: FrequencyResponse) -> FloatArray:
+    """Return the displacement amplitudes of a table that has them."""
+    assert data.amplitude is not None
+    return data.amplitude
+
+
+def relative_noise(n: int, size: float, seed: int) -> ComplexArray:
+    """Return exp of complex Gaussian noise."""
+    pairs = np.random.default_rng(seed).standard_normal((2, n))
+    return np.asarray(np.exp(size * (pairs[0] + 1j * pairs[1])))

@@ -1,0 +1,337 @@
+"""Confidence intervals against closed forms, brute force, other libraries, and each other."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import optimize, special, stats
+
+from dahl_ident import Dahl, FrequencyResponse, Sensors, Spring, fit
+from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.bootstrap import bootstrap_intervals, replicate
+from dahl_ident.diagnostics.intervals import compare, profile_intervals, wald_intervals
+from dahl_ident.diagnostics.levels import LEVELS, thresholds
+from dahl_ident.diagnostics.profile import Profiler
+from dahl_ident.errors import ValidationError
+from dahl_ident.fitting.status import Status
+from dahl_ident.results import FitResult
+from tests.friction_tables import X_C, amplitudes, plant_table, table
+
+
+def spring_table(n: int = 8, seed: int = 3) -> FrequencyResponse:
+    noise = np.random.default_rng(seed).standard_normal((2, n))
+    Z = 5.0 + 0.1 * (noise[0] + 1j * noise[1])
+    return FrequencyResponse(np.ones(n), Z, np.geomspace(1e-3, 1.0, n))
+
+
+class TestClosedForm:
+    """One spring under constant noise is the mean of n numbers: the textbook's t interval."""
+
+    @pytest.mark.parametrize("method", ["wald", "profile"])
+    def test_interval_of_a_mean(self, method: str) -> None:
+        data = spring_table()
+        result = fit(data, Spring(), noise="absolute")
+        n = data.n
+        mean = data.response.real.mean()
+        squares = ((data.response.real - mean) ** 2).sum() + (data.response.imag**2).sum()
+        error = np.sqrt(squares / (2 * n - 1) / n)
+        for level, lower, upper in result.conf_interval(method)["stiffness"]:  # type: ignore[arg-type]  # parametrised
+            t = stats.t.ppf(0.5 + 0.5 * level, 2 * n - 1)
+            assert lower == pytest.approx(mean - t * error, abs=1e-7 * error)
+            assert upper == pytest.approx(mean + t * error, abs=1e-7 * error)
+
+    def test_known_noise_gives_normal_thresholds(self) -> None:
+        data = replace(spring_table(), covariance=np.tile(0.01 * np.eye(2), (8, 1, 1)))
+        (interval,) = fit(data, Spring()).conf_interval(levels=[0.95])["stiffness"]
+        half = 1.959963984540054 * 0.1 / np.sqrt(8.0)
+        assert 0.5 * (interval.upper - interval.lower) == pytest.approx(half, rel=1e-8)
+
+    def test_bootstrap_of_a_mean_is_student_s_t(self) -> None:
+        optimum = fit(spring_table(), Spring(), noise="absolute").optimum
+        t = replicate(optimum, 20000, 0).studentised[:, 0]
+        assert stats.kstest(t, stats.t(optimum.dof).cdf).pvalue > 0.01
+        spread = np.quantile(t, [0.02275, 0.15865, 0.84135, 0.97725])
+        np.testing.assert_allclose(
+            spread, special.stdtrit(15, [0.02275, 0.15865, 0.84135, 0.97725]), rtol=0.05
+        )
+
+
+class TestOtherLibraries:
+    def test_lmfit_has_the_same_optimum_errors_and_profile(self) -> None:
+        lmfit = importlib.import_module("lmfit")
+        data = table(n=8)
+        result, amplitude = fit(data, Dahl()), amplitudes(data)
+
+        def residuals(p: Any) -> FloatArray:
+            N = Dahl(p["f_max"].value, p["sigma"].value).describing_function(amplitude)
+            return np.log(data.response / N).view(np.float64)
+
+        parameters = lmfit.Parameters()
+        parameters.add("f_max", 0.1)
+        parameters.add("sigma", 30.0)
+        mini = lmfit.Minimizer(residuals, parameters)
+        peer = mini.minimize(ftol=1e-14, xtol=1e-14)
+        for i, name in enumerate(("f_max", "sigma")):
+            assert result.params[name].value == pytest.approx(peer.params[name].value, rel=1e-6)
+            assert result.params[name].stderr == pytest.approx(peer.params[name].stderr, rel=1e-4)
+            np.testing.assert_allclose(result.covar[i], peer.covar[i], rtol=2e-4)
+        found = lmfit.conf_interval(mini, peer, sigmas=[1, 2])
+        ours = result.conf_interval(levels=[0.682689492, 0.954499736])
+        for name in ("f_max", "sigma"):
+            limits = [value for _, value in found[name]]
+            (one, two) = ours[name]
+            np.testing.assert_allclose(
+                [two.lower, one.lower, one.upper, two.upper],
+                [limits[0], limits[1], limits[3], limits[4]],
+                rtol=3e-6,
+            )
+
+    def test_curve_fit_has_the_same_covariance(self) -> None:
+        data = table()
+        result, amplitude = fit(data, Dahl()), amplitudes(data)
+
+        def model(_x: FloatArray, /, f_max: float, sigma: float) -> FloatArray:
+            N = Dahl(f_max, sigma).describing_function(amplitude)
+            return np.log(N).view(np.float64)
+
+        target = np.log(data.response).view(np.float64)
+        values, covariance = optimize.curve_fit(
+            model, np.zeros(1), target, p0=[0.1, 30.0], ftol=1e-14, xtol=1e-14, gtol=1e-14
+        )
+        np.testing.assert_allclose(
+            [result.params[n].value for n in result.var_names], values, rtol=1e-6
+        )
+        np.testing.assert_allclose(result.covar, covariance, rtol=1e-4)
+
+
+class TestProfile:
+    def test_limits_lie_where_brute_force_finds_the_threshold(self) -> None:
+        result = fit(table(n=8, noise=0.1), Dahl())
+        optimum = result.optimum
+        q = thresholds(optimum, np.array(LEVELS))
+        lower, upper = Profiler(optimum).limits(q)
+        for index in range(2):
+            for level in range(3):
+                for limit in (lower[level, index], upper[level, index]):
+
+                    def squares(other: float, at: float = limit, held: int = index) -> float:
+                        theta = np.empty(2)
+                        theta[held], theta[1 - held] = at, other
+                        return float(np.sum(optimum.problem.residuals(theta) ** 2))
+
+                    near = optimum.theta[1 - index]
+                    best = optimize.minimize_scalar(
+                        squares, bounds=(near - 1.0, near + 1.0), method="bounded",
+                        options={"xatol": 1e-10},
+                    )  # fmt: skip
+                    rise = (best.fun - 2.0 * optimum.cost) / optimum.scale**2
+                    assert rise == pytest.approx(q[level] ** 2, rel=1e-5)
+
+    def test_curve_rises_through_the_thresholds_at_the_limits(self) -> None:
+        optimum = fit(table(), Dahl(alpha=None)).optimum
+        profiler, q = Profiler(optimum), thresholds(optimum, np.array(LEVELS))
+        lower, upper = profiler.limits(q)
+        for index in range(3):
+            ends = np.concatenate([lower[:, index], upper[:, index]])
+            np.testing.assert_allclose(profiler.curve(index, ends), np.tile(q**2, 2), rtol=1e-4)
+
+    def test_microslip_leaves_f_max_open_above(self) -> None:
+        result = fit(table(beta=(1e-4, 1e-3)), Dahl(), throw=False)
+        for _, lower, upper in result.conf_interval()["f_max"]:
+            assert 0.0 < lower < 0.1
+            assert upper == np.inf
+        assert np.isfinite(result.conf_interval()["sigma"][-1]).all()
+
+    def test_an_optimum_at_infinity_has_a_lower_limit(self) -> None:
+        result = next(
+            r
+            for seed in range(20)
+            if (r := fit(table(beta=(1e-4, 1e-3), seed=seed), Dahl(), throw=False)).status
+            is Status.NO_LOSS
+        )
+        one, two, three = result.conf_interval()["f_max"]
+        assert 0.0 < three.lower < two.lower < one.lower < np.inf
+        assert {one.upper, two.upper, three.upper} == {np.inf}
+        theta = result.optimum.theta.copy()
+        theta[0] = np.log(two.lower)
+        best = optimize.minimize_scalar(
+            lambda s: float(np.sum(result.problem.residuals([theta[0], s]) ** 2)),
+            bounds=(theta[1] - 0.1, theta[1] + 0.1),
+            method="bounded",
+            options={"xatol": 1e-11},
+        )
+        rise = (best.fun - result.chisqr) / result.scale**2
+        assert rise == pytest.approx(special.stdtrit(result.nfree, 0.97725) ** 2, rel=1e-3)
+
+    def test_an_exact_degeneracy_leaves_everything_open(self) -> None:
+        result = fit(table(), Dahl(), sensors=Sensors(force_gain=None), throw=False)
+        for name in ("f_max", "sigma", "force_gain"):
+            for interval in result.conf_interval()[name]:
+                assert (interval.lower, interval.upper) == (0.0, np.inf)
+
+    def test_a_bound_ends_an_interval(self) -> None:
+        model = Dahl() + Spring()
+        (own,) = (p for p in model.parameters if p.name == "f_max")
+        bounded = model.with_parameters({"f_max": replace(own, upper=0.1002)})
+        data = table(model=Dahl(0.1, 30.0) + Spring(0.3))
+        free = fit(data, model).conf_interval()["f_max"][1]
+        tied = fit(data, bounded).conf_interval()["f_max"][1]
+        assert free.upper > 0.1002
+        assert tied.upper == pytest.approx(0.1002)
+        assert tied.lower == pytest.approx(free.lower, rel=1e-3)
+
+    def test_beside_a_hidden_spring_the_limits_are_those_of_a_global_search(self) -> None:
+        """The profile's valley is bent and long; fits with the value fixed find it from scratch."""
+        hidden = table(model=Dahl(0.1, 30.0) + Spring(30.0), beta=(100.0, 1000.0), seed=4)
+        result = fit(hidden, Dahl() + Spring(), throw=False)
+        q2 = thresholds(result.optimum, np.array(LEVELS)) ** 2
+        for name in ("f_max", "sigma", "stiffness"):
+            for interval, target in zip(result.conf_interval()[name], q2, strict=True):
+                for limit in interval[1:]:
+                    if 0.0 < limit < np.inf:
+                        held = fit(result.data, Dahl() + Spring(), fixed={name: limit}, throw=False)
+                        rise = 2.0 * (held.optimum.cost - result.optimum.cost) / result.scale**2
+                        assert rise == pytest.approx(target, rel=0.05)
+
+    def test_robust_fits_have_intervals_like_those_of_their_covariance(self) -> None:
+        result = fit(table(), Dahl(), loss="huber")
+        wald, profile = result.conf_interval("wald"), result.conf_interval("profile")
+        np.testing.assert_allclose(profile.lower[1], wald.lower[1], rtol=2e-3)
+        np.testing.assert_allclose(profile.upper[1], wald.upper[1], rtol=2e-3)
+
+    @settings(max_examples=25)
+    @given(
+        st.floats(-6.0, 6.0),
+        st.floats(0.1, 4.0),
+        st.integers(2, 12),
+        st.sampled_from([1e-4, 0.01, 0.3]),
+        st.integers(0, 10),
+    )
+    def test_never_raises_and_holds_the_estimate(
+        self, low: float, decades: float, n: int, noise: float, seed: int
+    ) -> None:
+        data = table(beta=(10.0**low, 10.0 ** (low + decades)), n=n, noise=noise, seed=seed)
+        result = fit(data, Dahl(), throw=False)
+        found = result.conf_interval()
+        finite = np.isfinite(result.optimum.values) & (result.optimum.values > 0.0)
+        for i in np.flatnonzero(finite):
+            assert (found.lower[:, i] <= result.optimum.values[i]).all()
+            assert (found.upper[:, i] >= result.optimum.values[i]).all()
+            assert (found.lower[1:, i] <= found.lower[:-1, i]).all()
+            assert (found.upper[1:, i] >= found.upper[:-1, i]).all()
+
+    @settings(max_examples=25)
+    @given(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0))
+    def test_follow_the_units(self, force: float, length: float) -> None:
+        data = table(n=6, noise=0.05)
+        assert data.amplitude is not None
+        N, m = 10.0**force, 10.0**length
+        other = FrequencyResponse(data.frequency_hz, data.response * N / m, data.amplitude * m)
+        ours, theirs = (fit(d, Dahl()).conf_interval() for d in (data, other))
+        factor = np.array([N, N / m])
+        np.testing.assert_allclose(theirs.lower, ours.lower * factor, rtol=1e-6)
+        np.testing.assert_allclose(theirs.upper, ours.upper * factor, rtol=1e-6)
+
+
+class TestBootstrap:
+    def test_agrees_with_the_profile_where_all_is_well(self) -> None:
+        result = fit(table(), Dahl())
+        profile, bootstrap = result.conf_interval("profile"), result.conf_interval("bootstrap")
+        width = profile.upper[1] - profile.lower[1]
+        assert (np.abs(bootstrap.lower[1] - profile.lower[1]) < 0.05 * width).all()
+        assert (np.abs(bootstrap.upper[1] - profile.upper[1]) < 0.05 * width).all()
+
+    def test_works_for_driven_plants(self) -> None:
+        result = fit(plant_table(), Dahl() + Spring(), fixed=None, throw=False)
+        found = result.conf_interval("bootstrap", replicates=99)
+        assert set(found) == {"f_max", "sigma", "stiffness"}
+
+    def test_the_seed_decides(self) -> None:
+        optimum = fit(table(n=8), Dahl()).optimum
+        one, same, other = (bootstrap_intervals(optimum, replicates=199, seed=s) for s in (1, 1, 2))
+        np.testing.assert_array_equal(one.lower, same.lower)
+        assert (one.lower != other.lower).all()
+
+    def test_is_open_where_replicates_run_away(self) -> None:
+        result = fit(table(beta=(1e-4, 1e-3)), Dahl(), throw=False)
+        found = result.conf_interval("bootstrap", replicates=499)
+        assert found["f_max"][0].upper == np.inf
+        assert found["sigma"][0].upper < np.inf
+
+    def test_refuses_robust_losses_and_few_replicates(self) -> None:
+        with pytest.raises(ValidationError, match="robust loss huber"):
+            fit(table(), Dahl(), loss="huber").conf_interval("bootstrap")
+        with pytest.raises(ValidationError, match="replicates is 5; expected a whole number >= 99"):
+            fit(table(), Dahl()).conf_interval("bootstrap", replicates=5)
+
+    def test_few_degrees_of_freedom_a_row(self) -> None:
+        data = table()
+        size = (0.01 * np.abs(data.response)) ** 2
+        C = size[:, None, None] * np.eye(2)
+        known, rough = (
+            fit(replace(data, covariance=C, dof=np.full(30, dof)), Dahl()) for dof in (np.inf, 5.0)
+        )
+        ratio = [
+            np.diff(r.conf_interval("bootstrap", replicates=999)["f_max"][1][1:])[0]
+            for r in (rough, known)
+        ]
+        assert 1.0 < ratio[0] / ratio[1] < 2.0
+
+
+class TestTable:
+    def result(self) -> FitResult:
+        return fit(table(n=8), Dahl())
+
+    def test_methods_side_by_side(self) -> None:
+        compared = self.result().compare_intervals()
+        assert not compared.disagreements
+        assert "The methods agree." in str(compared)
+        assert "profile intervals (noise scale estimated: t and F with 14 degrees" in str(compared)
+
+    def test_disagreement_is_flagged(self) -> None:
+        result = fit(table(beta=(1e-3, 1e-2)), Dahl())
+        compared = result.compare_intervals(["wald", "profile"])
+        flagged = {(d.name, d.side) for d in compared.disagreements}
+        assert ("f_max", "upper") in flagged
+        assert "sigma" not in {name for name, _ in flagged}
+        assert "by wald and inf by profile; trust the latter" in str(compared)
+
+    def test_mapping_and_frame(self) -> None:
+        found = self.result().conf_interval()
+        assert list(found) == ["f_max", "sigma"]
+        assert len(found) == 2
+        assert found.at(0.9545)["sigma"] == found["sigma"][1]
+        frame = found.to_frame()
+        assert frame.shape == (6, 6)
+        assert frame["upper"].iloc[-1] == found.upper[-1, 1]
+        with pytest.raises(KeyError, match="mass is no free parameter"):
+            found["mass"]
+
+    @pytest.mark.parametrize("levels", [[0.0], [1.0], [], [2.0], [np.nan]])
+    def test_impossible_levels(self, levels: list[float]) -> None:
+        with pytest.raises(ValidationError, match="levels"):
+            self.result().conf_interval(levels=levels)
+
+    def test_unknown_method(self) -> None:
+        with pytest.raises(ValidationError, match="method is 'bayes'; expected one of wald"):
+            self.result().conf_interval("bayes")  # type: ignore[arg-type]  # the test's point
+
+    def test_comparison_needs_two_of_the_same_levels(self) -> None:
+        optimum = self.result().optimum
+        with pytest.raises(ValidationError, match="two or more"):
+            compare(optimum, [wald_intervals(optimum)])
+        with pytest.raises(ValidationError, match="differ in level"):
+            compare(optimum, [wald_intervals(optimum), profile_intervals(optimum, [0.9])])
+
+    def test_no_degrees_of_freedom_leave_everything_open(self) -> None:
+        data = FrequencyResponse([1.0], [20.0 + 5.0j], amplitude=[X_C])
+        result = fit(data, Dahl(), throw=False)
+        assert result.nfree == 0
+        for interval in result.conf_interval()["sigma"]:
+            assert (interval.lower, interval.upper) == (0.0, np.inf)
