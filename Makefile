@@ -8,7 +8,7 @@ BIN    := $(VENV)/bin
 JOBS   ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint types rooms unit test-lowest bench lock clean
+.PHONY: help install demo test lint types rooms unit test-lowest docs bench lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -45,6 +45,9 @@ test-lowest: install  ## the same tests on the lowest declared versions
 	$(BIN)/uv pip install --quiet --python .venv-lowest/bin/python --resolution lowest-direct \
 		--editable ".[dev]"
 	.venv-lowest/bin/pytest -n $(JOBS) --dist worksteal
+
+docs: install  ## the manual into docs/_build/html; any warning fails
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
 
 bench: install  ## timings side by side with the peers
 	$(BIN)/python -m benchmarks

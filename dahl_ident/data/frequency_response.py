@@ -431,7 +431,7 @@ class FrequencyResponse:
         Parameters
         ----------
         frame : pandas.DataFrame
-            Columns as :func:`~dahl_ident.data.read_frequency_response` expects them in a file,
+            Columns as :func:`~dahl_ident.read_frequency_response` expects them in a file,
             units in brackets in their names.
         columns, amplitude, drive, passive
             As there.
@@ -461,7 +461,7 @@ class FrequencyResponse:
         return data if origin is None else replace(data, provenance=origin)
 
     def save(self, path: str | Path) -> Path:
-        """Write the table to a file that :func:`~dahl_ident.data.read_frequency_response` reads.
+        """Write the table to a file that :func:`~dahl_ident.read_frequency_response` reads.
 
         Parameters
         ----------

@@ -220,7 +220,7 @@ class Record:
         return record_frame(self)
 
     def save(self, path: str | Path) -> Path:
-        """Write the samples to a file that :func:`~dahl_ident.data.read_record` reads.
+        """Write the samples to a file that :func:`~dahl_ident.read_record` reads.
 
         Parameters
         ----------

@@ -33,7 +33,7 @@ from dahl_ident.errors import ValidationError
 
 
 class Dahl(Element):
-    """Dahl friction: dF/dx = sigma |1 - s F/f_max|^alpha sgn(1 - s F/f_max), s = sgn(dx/dt).
+    """Dahl friction: dF/dx = sigma abs(z)^alpha sgn(z), z = 1 - s F/f_max, s = sgn(dx/dt).
 
     Parameters
     ----------

@@ -29,6 +29,16 @@ class FitBatch(Sequence[FitResult]):
         What was fitted.
     optima : OptimumBatch
         The solver's plain result.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import dahl_ident as di
+    >>> A = np.geomspace(1e-4, 1e-2, 9)
+    >>> table = di.FrequencyResponse(np.ones(9), di.Dahl(0.1, 30.0).describing_function(A), A)
+    >>> batch = di.fit_many([table, table], di.Dahl())
+    >>> len(batch), batch.var_names
+    (2, ['f_max', 'sigma'])
     """
 
     tables: tuple[FrequencyResponse, ...]

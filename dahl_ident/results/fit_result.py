@@ -72,6 +72,13 @@ class FitResult(FitNumbers):
         Predicted response at the estimate.
     model : Model
         The model with the estimates put in.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> fit = di.fit(di.load_dataset("noisy"), di.Dahl())
+    >>> fit.trusted, round(fit.params["f_max"].value, 3)
+    (True, 0.1)
     """
 
     def __init__(self, optimum: Optimum, *, first_order: bool = False) -> None:

@@ -68,6 +68,13 @@ class Posterior:
         tau, ESS and R-hat as numbers.
     seed : int
         With which the same chain comes out again.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> chain = di.sample(di.load_dataset("noisy"), di.Dahl(), seed=1, steps=20)
+    >>> chain.names, chain.steps, chain.converged
+    (('f_max', 'sigma'), 20, False)
     """
 
     def __init__(

@@ -77,7 +77,7 @@ class SteadyResponse:
 def response(
     plant: Element, frequency_hz: ArrayLike, drive: ArrayLike, *, all_roots: bool = False
 ) -> SteadyResponse:
-    """Return the steady displacement for a sine force: A |Z(A, omega)| = u_0  (Eqn. 53).
+    """Return the steady displacement for a sine force: A abs(Z(A, omega)) = u_0  (Eqn. 53).
 
     Parameters
     ----------

@@ -1,0 +1,34 @@
+"""Sphinx: how the manual is built. ``make docs`` fails on any warning."""
+
+from __future__ import annotations
+
+import dahl_ident
+
+project = "dahl_ident"
+author = "The dahl_ident developers"
+release = version = dahl_ident.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
+    "numpydoc",
+]
+myst_enable_extensions = ["dollarmath", "amsmath"]
+myst_heading_anchors = 2
+exclude_patterns = ["_build"]
+nitpicky = True
+nitpick_ignore_regex = [
+    ("py:mod", r"dahl_ident\..*"),  # rooms inside, which the reference leaves to their source
+    ("py:class", r"integer -- .*"),  # from the docstrings of tuple itself
+]
+
+html_theme = "pydata_sphinx_theme"
+html_title = "dahl_ident"
+html_show_sourcelink = False
+
+autodoc_typehints = "none"
+autodoc_member_order = "bysource"
+numpydoc_show_class_members = False
+numpydoc_validation_checks: set[str] = set()

@@ -1,0 +1,52 @@
+"""The README: its code prints what it says, its commands and links exist."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```python\n(.*?)```\n\n```output\n(.*?)```", README, re.DOTALL)
+COMMANDS = sorted(set(re.findall(r"^dahl-ident (\w+)(.*?)(?:#|$)", README, re.MULTILINE)))
+
+
+def _run(code: str, names: dict[str, object]) -> str:
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        exec(compile(code, "README.md", "exec"), names)
+    return printed.getvalue()
+
+
+def test_code_prints_what_the_readme_says() -> None:
+    assert len(BLOCKS) == README.count("```python\n") == 3
+    names: dict[str, object] = {}
+    for code, said in BLOCKS:
+        assert _run(code, names).split() == said.split()
+
+
+@pytest.mark.parametrize(("command", "rest"), COMMANDS)
+def test_commands_have_the_options_that_are_shown(command: str, rest: str) -> None:
+    program = Path(sys.executable).with_name("dahl-ident")
+    helped = subprocess.run(
+        [program, command, "--help"], capture_output=True, text=True, check=True
+    ).stdout
+    for option in re.findall(r"(?<=\s)--?[a-z][a-z-]*", rest):
+        assert option in helped
+
+
+def test_make_targets_exist() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert set(re.findall(r"(?:`|^)make ([a-z][a-z-]+)", README, re.MULTILINE)) <= targets
+
+
+def test_links_lead_to_files() -> None:
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
+    assert "docs/images/overview.png" in links
+    assert [link for link in links if not (ROOT / link).exists()] == []
