@@ -131,7 +131,7 @@ def _extremities(sets: FloatArray) -> FloatArray:
     above = stats.binom.sf(possible - 1, N, thresholds / RANKS)
     probability = 2.0 * np.minimum(below, above)
     counts = np.stack([np.sum(sets < k, axis=1) for k in thresholds], axis=1)
-    return probability[counts, thresholds - 1].min(axis=1)
+    return np.asarray(probability[counts, thresholds - 1].min(axis=1))
 
 
 def band(tables: int, gamma: float) -> tuple[FloatArray, FloatArray]:

@@ -8,8 +8,8 @@ wide enough to say little and proper all the same:
 
 - f_max and sigma: from 1e-5 times the smallest force or dynamic stiffness in the data to 1e5
   times the largest, since far from the knee either can lie decades away; alpha: from 0.1 to 10;
-- stiffness, damping, mass: up to ten times the largest dynamic stiffness, or the least-squares
-  estimate if that is larger, either sign;
+- stiffness, damping, mass: up to a thousand times what the largest dynamic stiffness would take
+  (at a resonance they cancel), or ten times the least-squares estimate, of either sign;
 - gains: from 0.1 to 10; delay: half a period of the highest frequency either way.
 
 They are part of the result, and reports print them. The unknown scale s of the noise has the
@@ -32,6 +32,7 @@ from dahl_ident.problem import Problem
 
 _DECADES = 1e5
 _WIDER = 10.0
+_RESONANCE = 1e3  # by which the parts of a plant may exceed what is left of them
 _TAIL = 1e-10  # of a distribution of unbounded support that lies beyond its `limits`
 
 
@@ -280,7 +281,9 @@ def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[f
             if not isinstance(element, kind):
                 continue
             largest = float((stiffness / view.omega**order).max())
-            reach = _WIDER * max(largest, abs(estimate) if np.isfinite(estimate) else 0.0)
+            reach = _RESONANCE * largest
+            if np.isfinite(estimate):
+                reach = max(reach, _WIDER * abs(estimate))
             return -reach, reach
     if name in ("force_gain", "displacement_gain"):
         return 1.0 / _WIDER, _WIDER

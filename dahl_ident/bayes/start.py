@@ -21,6 +21,7 @@ _WIDER = 2.0
 _TRIES = 60
 _INSIDE = 1e-3  # of the prior's width, kept from its ends
 _PRIOR_DRAWS = 4096
+_POSITIONS = 5
 _EXACT = 1e-13  # relative noise below which a fit is exact to rounding
 
 
@@ -102,10 +103,8 @@ def _with_scale(
 
 def _inside(density: Density, optimum: Optimum | None, random: np.random.Generator) -> FloatArray:
     """Return the optimum moved inside the prior's support, or else the best of many prior draws."""
-    low, high = density.prior.limits
     if optimum is not None and density.likelihood != "none":
-        margin = _INSIDE * (high - low)
-        nearest = np.clip(optimum.theta, low + margin, high - margin)
+        nearest = _moved_inside(density, optimum)
         if np.isfinite(density.highest(nearest[None])).all():
             return nearest
     candidates = density.problem.in_order(density.prior.draw(random, _PRIOR_DRAWS))
@@ -116,6 +115,39 @@ def _inside(density: Density, optimum: Optimum | None, random: np.random.Generat
             "check the priors and the model"
         )
     return np.asarray(candidates[np.argmax(values)])
+
+
+def _moved_inside(density: Density, optimum: Optimum) -> FloatArray:
+    """Return the optimum; where it is outside the prior, the best with its first culprit inside.
+
+    In microslip, say, sigma and the spring have to follow an f_max that cannot be infinite.
+    """
+    problem = density.problem
+    low, high = density.prior.limits
+    margin = _INSIDE * (high - low)
+    low, high = low + margin, high - margin
+    nearest = np.clip(optimum.theta, low, high)
+    outside = np.flatnonzero(nearest != optimum.theta)
+    if not outside.size or len(problem.names) == 1:
+        return nearest
+    first = outside[0]
+    candidates = [nearest]
+    for position in np.linspace(nearest[first], 0.5 * (low + high)[first], _POSITIONS):
+        candidate = nearest.copy()
+        candidate[first] = position
+        value = float(problem.to_values(candidate)[first])
+        reduced = optimum_of(_holding(problem, {problem.names[first]: value}))
+        if reduced is not None:
+            candidate[[problem.names.index(name) for name in reduced.names]] = reduced.theta
+            candidates.append(np.clip(candidate, low, high))
+    values = density.highest(np.array(candidates))
+    return candidates[int(np.argmax(values))]
+
+
+def _holding(problem: Problem, held: dict[str, float]) -> Problem:
+    return Problem(
+        problem.data, problem.model, noise=problem.noise, sensors=problem.sensors, fixed=held
+    )
 
 
 def _scale(density: Density, theta: FloatArray) -> float:

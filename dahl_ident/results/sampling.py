@@ -122,7 +122,7 @@ def sample(
     (True, ('f_max', 'sigma', 'noise_scale'))
     """
     problem, optimum = _problem(data, model, noise, sensors, free, fixed)
-    density = Density(problem, joint_prior(problem, priors, _theta(optimum)), likelihood)
+    density = Density(problem, joint_prior(problem, priors, _estimate(optimum)), likelihood)
     settings = _settings(density, seed, steps, max_steps, ess, walkers, ensembles)
     chain, verdict, settings = _chain(density, optimum, settings, seed, resume, pool, progress)
     return refuse_unusable(Posterior(density, chain, verdict, settings, optimum))
@@ -232,7 +232,7 @@ def posterior_grid(
             f"takes up to {_MOST_AXES}: fix some, or use dahl_ident.sample"
         )
     tolerance = positive_number(tolerance, "tolerance")
-    density = Density(problem, joint_prior(problem, priors, _theta(optimum)), likelihood)
+    density = Density(problem, joint_prior(problem, priors, _estimate(optimum)), likelihood)
     centre, covariance = centre_and_covariance(density, optimum, np.random.default_rng(0))
     grid = integrate(
         density.marginal, density.prior.limits, centre, covariance, tolerance=tolerance
@@ -263,8 +263,8 @@ def _problem(
     return problem, optimum_of(problem)
 
 
-def _theta(optimum: Optimum | None) -> FloatArray | None:
-    return None if optimum is None else optimum.theta
+def _estimate(optimum: Optimum | None) -> FloatArray | None:
+    return None if optimum is None else optimum.values
 
 
 def _settings(
