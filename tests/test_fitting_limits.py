@@ -62,6 +62,28 @@ def test_alpha_joins_the_combination() -> None:
     ]
 
 
+def test_alpha_tends_to_zero_where_the_knee_is_sharp() -> None:
+    slips = np.geomspace(3.0, 100.0, n) * 1e-5 / 7.0
+    Z = Dahl(1e-5, 7.0, 1e-9).describing_function(slips) * (1.0 - 0.01j / 3.0)
+    found = solve(Problem(FrequencyResponse(np.ones(n), Z, slips), Dahl(alpha=None)))
+    assert found.status is Status.SHARP_KNEE
+    assert found.values[2] == 0.0
+    assert [c.expression for c in found.combinations] == ["f_max", "sigma"]
+    assert found.combinations[0].value == pytest.approx(1e-5, rel=1e-2)
+
+
+def test_alpha_and_f_max_grow_together_where_nothing_slips_fully() -> None:
+    phi, sigma = 1e-5, 7.0
+    places = np.geomspace(0.3, 3.0, n) * phi / sigma
+    exponential = Dahl(phi * 1e3, sigma, 1e3).describing_function(places)
+    Z = exponential * np.exp(0.02 * np.log(places / places[0]))  # even less slip than that
+    found = solve(Problem(FrequencyResponse(np.ones(n), Z, places), Dahl(alpha=None)))
+    assert found.status is Status.NO_FULL_SLIP
+    assert found.values.tolist()[0::2] == [np.inf, np.inf]
+    assert [c.expression for c in found.combinations] == ["f_max/alpha"]
+    assert found.combinations[0].value == pytest.approx(phi, rel=0.1)
+
+
 def test_stiffness_without_loss_determines_sigma() -> None:
     found = fitted(7.0 - 0.01j + 0.001 * ERROR, Dahl())
     assert found.status is Status.NO_LOSS

@@ -10,13 +10,15 @@ microslip           sigma + j 4 alpha kappa A/3 pi   f_max, sigma and the   kapp
                                                      spring                 sigma + stiffness
 gross slip          j 4 f_max / (pi A)               sigma                  f_max
 no friction         0                                f_max, sigma to 0
+sharp knee          elastic, then f_max              alpha to 0             f_max, sigma
+no full slip        dF/dx = sigma exp(-s F/phi)      f_max, alpha           phi = f_max/alpha, sigma
 ==================  ===============================  =====================  =====================
 
 Each lies on the edge of the model, so the best fit may lie there, and a search would then return
 whatever huge number it stopped at. A limit is searched as a problem of its own, in a **chart**:
-coordinates phi that stay finite, mapped to a theta so far out that the model is its limit to
-nine digits or more. If the sum of squares there is no higher than at any finite optimum, the
-limit is the optimum, and phi gives what is determined, with its covariance.
+coordinates phi that stay finite, mapped to a theta so far out that the model is its limit, to five
+digits or more (three for no full slip). If the sum of squares there is no higher than at any
+finite optimum, the limit is the optimum, and phi gives what is determined, with its covariance.
 
 In microslip beside a free spring the way to the optimum is a long bent valley even where it is
 finite. The chart (kappa, x_c, sigma + stiffness) straightens it.
@@ -40,6 +42,8 @@ _NO_LOSS = 1e9
 _GROSS_SLIP = 1e-16  # x_c over the smallest amplitude
 _NO_FRICTION = 1e-18  # sigma over the median stiffness
 _LEAST_FRICTION = -60.0  # ln of sigma over the median stiffness that a search may reach
+_SHARP, _SOFT = 1e-6, 1e3  # alpha
+_SEARCHED_ALPHA = (1e-3, 1e2)  # that a search may reach
 _EDGES = (1e-14, 1e8)  # x_c over the smallest and largest amplitude that a search may reach
 _TIED_EDGE = 1e4  # the same where microslip has a limit: short of it
 
@@ -119,6 +123,10 @@ class Reach:
                 limits += [
                     np.log(smallest * _EDGES[0]) - x_c[1], x_c[1] - edge, softest - sigma[1]
                 ]  # fmt: skip
+                if element.parameters[2].free:
+                    alpha, _ = _row(problem, element.parameters[2])
+                    rows += [alpha, -alpha]
+                    limits += [np.log(_SEARCHED_ALPHA[0]), -np.log(_SEARCHED_ALPHA[1])]
         self._rows = np.array(rows).reshape(-1, len(problem.parameters)).T
         self._limits = np.stack(np.broadcast_arrays(*limits), axis=-1) if limits else np.empty(0)
 
@@ -188,11 +196,17 @@ def limits(problem: Problem) -> list[Limit]:
             found.append(_limit(problem, Status.GROSS_SLIP, chart, {sigma: np.inf}))
             vanishing = {sigma: least}
         else:
-            continue
-        if not alone:
+            vanishing = {}
+        if vanishing and not alone:
             chart = _chart(problem, {**pins, **vanishing})
             gone = dict.fromkeys(vanishing, 0.0)
             found.append(_limit(problem, Status.NO_FRICTION, chart, gone))
+        if alpha.free:
+            chart = _chart(problem, {alpha.name: np.log(_SHARP)})
+            kept = [(p.name, p.name, True) for p in (f, s) if p.free]
+            found.append(_limit(problem, Status.SHARP_KNEE, chart, {alpha.name: 0.0}, kept))
+        if alpha.free and f.free:
+            found.append(_no_full_slip(problem, f_max, alpha.name))
     return found + [
         _microslip(problem, high + np.log(_MICROSLIP), *tied) for tied in _tied(problem)
     ]
@@ -220,6 +234,18 @@ def _microslip(
     ]
     extremes = {names[f_max]: np.inf, names[sigma]: np.inf, names[spring]: -np.inf}
     return _limit(problem, Status.MICROSLIP, chart, extremes, kept)
+
+
+def _no_full_slip(problem: Problem, f_max: str, alpha: str) -> Limit:
+    plain = _chart(problem, {alpha: np.log(_SOFT)})
+    row, place = problem.names.index(f_max), problem.names.index(alpha)
+    offset, back = plain.offset.copy(), plain.back.copy()
+    offset[..., row] += np.log(_SOFT)  # phi holds ln f_max - ln alpha in f_max's place
+    back[plain.matrix[row].argmax(), place] = -1.0
+    chart = Chart(plain.matrix, offset, back)
+    extremes = {f_max: np.inf, alpha: np.inf}
+    kept = [(f"{f_max}/{alpha}", f_max, True)]
+    return _limit(problem, Status.NO_FULL_SLIP, chart, extremes, kept)
 
 
 def _limit(

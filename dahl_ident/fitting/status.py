@@ -31,6 +31,15 @@ class Status(Enum):
         "No finite optimum: the fit improves as sigma grows without bound at constant f_max. The "
         "data show slip only: drive more softly, or reduce the noise."
     )
+    SHARP_KNEE = (
+        "No finite optimum: the fit improves as alpha tends to zero. Friction turns from stiffness "
+        "to slip more sharply than the data resolve: measure more amplitudes near the knee, or fix "
+        "alpha."
+    )
+    NO_FULL_SLIP = (
+        "No finite optimum: the fit improves as alpha and f_max grow without bound at constant "
+        "f_max/alpha. The data show no limit of the friction force: drive harder, or fix alpha."
+    )
     NO_FRICTION = (
         "No finite optimum: the fit improves as friction vanishes. The other elements explain "
         "the data: drive more softly, or leave the element out."
@@ -51,4 +60,11 @@ class Status(Enum):
         return self in _AT_INFINITY
 
 
-_AT_INFINITY = (Status.MICROSLIP, Status.NO_LOSS, Status.GROSS_SLIP, Status.NO_FRICTION)
+_AT_INFINITY = (
+    Status.MICROSLIP,
+    Status.NO_LOSS,
+    Status.GROSS_SLIP,
+    Status.SHARP_KNEE,
+    Status.NO_FULL_SLIP,
+    Status.NO_FRICTION,
+)
