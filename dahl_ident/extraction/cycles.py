@@ -32,7 +32,7 @@ _SAMPLED = 50_000  # samples that the quantiles are taken from
 _FEWEST_A_CYCLE = 3
 _NOISIEST_CUT = 0.05  # noise of the log amplitude that a cycle of known frequency may have
 _FEWEST_CUTS = 3
-_NOISIEST_CROSSING = 0.04  # noise of the log amplitude that a cycle between crossings may have
+_NOISIEST_CROSSING = 0.1  # noise of the log amplitude that a cycle between crossings may have
 _HOLE = 1.0 / 3.0  # of a cycle without samples: its amplitude is not known
 
 

@@ -12,25 +12,10 @@ from numpy.typing import ArrayLike
 from dahl_ident.arrays import FloatArray, positive_number, whole_number
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.errors import ExtractionError, ValidationError
-from dahl_ident.extraction.cycles import Cycles, cut_cycles, find_cycles
-from dahl_ident.extraction.point import FEWEST_CYCLES, Point, Settings, measure
-from dahl_ident.extraction.segments import MODES, Mode, Segment, find_segments
-from dahl_ident.extraction.sine_fit import (
-    HARMONICS,
-    Stretch,
-    columns,
-    estimate_frequency,
-    steady_stretch,
-    thinned,
-    track_phase,
-)
-
-_PLATEAU_CYCLES = 3  # fewer only where no plateau has so many
-_QUIET_CROSSINGS = 0.01  # noise of a cycle's log amplitude that no crossing suffers from
-_WELL_COVERED = 0.5  # of a record: where crossings find segments so long, they are right
-_SWEEP_DEGREE = 3  # of the phase in a window
-_STRAYING = 0.005  # of the amplitude, that a further cycle may stray from the sine
-_MOST_CYCLES_MORE = 2  # on either side
+from dahl_ident.extraction.point import Point, Settings, measure
+from dahl_ident.extraction.segments import MODES, Mode
+from dahl_ident.extraction.sine_fit import FEWEST_CYCLES, HARMONICS
+from dahl_ident.extraction.stretches import record_segments, stretch_of
 
 
 def extract(
@@ -144,9 +129,9 @@ def extract(
     known = None if frequency is None else positive_number(frequency, "frequency")
     channels = np.stack([record.motion_samples, record.force_samples])
     points, refused = [], []
-    for segment in _segments(record.time, channels[0], known, mode, num_periods):
+    for segment in record_segments(record.time, channels[0], known, mode, num_periods):
         try:
-            stretch = _stretch(record.time, channels, segment, known)
+            stretch = stretch_of(record.time, channels, segment, known)
             points.append(measure(stretch, settings, sweep=segment.sweep))
         except ExtractionError as exc:
             refused.append(str(exc))
@@ -191,103 +176,6 @@ def _settings(
     return Settings(
         orders, num_periods, settling_periods, min_share, record.motion_channel, controlled
     )
-
-
-def _segments(
-    time: FloatArray,
-    motion: FloatArray,
-    frequency: float | None,
-    mode: Mode,
-    window: int | None,
-) -> list[Segment]:
-    """Return the segments of a record, or say that it has none.
-
-    In noise that drowns the crossings, periods of the strongest line are tried as well.
-    """
-    runs = find_cycles(time, motion) if frequency is None else cut_cycles(time, motion, frequency)
-    noisy = [float(np.median(run.noise)) for run in runs if len(run)]
-    for fewest in (_PLATEAU_CYCLES, FEWEST_CYCLES):
-        segments = find_segments(runs, mode, fewest, window)
-        doubtful = max(noisy, default=np.inf) > _QUIET_CROSSINGS or _covered(
-            segments
-        ) < _WELL_COVERED * (time[-1] - time[0])
-        if frequency is None and doubtful:
-            periods = cut_cycles(time, motion, _strongest_line(time, motion))
-            segments = max(segments, find_segments(periods, mode, fewest, window), key=_covered)
-        if segments:
-            return segments
-    if frequency is not None and mode != "sweep" and len(runs):
-        return [Segment(float(time[0]), float(time[-1]), frequency)]
-    raise ExtractionError(_no_segments(time, motion, runs, frequency))
-
-
-def _covered(segments: Sequence[Segment]) -> float:
-    return sum(segment.stop - segment.start for segment in segments)
-
-
-def _strongest_line(time: FloatArray, motion: FloatArray) -> float:
-    """Return the frequency with most power, samples taken as evenly spaced."""
-    spectrum = np.abs(np.fft.rfft(motion - motion.mean()))
-    line = int(np.argmax(spectrum[1:])) + 1
-    return line / float((time[-1] - time[0]) * time.size / (time.size - 1))
-
-
-def _no_segments(
-    time: FloatArray, motion: FloatArray, runs: Sequence[Cycles], frequency: float | None
-) -> str:
-    cycles = sum(len(run) for run in runs)
-    read = "" if frequency is None else f" of {frequency:.6g} Hz"
-    return (
-        f"no stretch of constant amplitude and frequency in {time[-1] - time[0]:.6g} s: "
-        f"{cycles} cycles{read}, motion from {motion.min():.4g} to {motion.max():.4g}; expected "
-        f"at least {FEWEST_CYCLES} cycles alike: record longer, give frequency=, or mode='sweep'"
-    )
-
-
-def _stretch(
-    time: FloatArray, channels: FloatArray, segment: Segment, frequency: float | None
-) -> Stretch:
-    """Return the samples of a segment with their phase."""
-    first, last = np.searchsorted(time, [segment.start, segment.stop]).tolist()
-    omega = 2.0 * np.pi * (segment.frequency_hz if frequency is None else frequency)
-    stretch = steady_stretch(time[first:last], channels[:, first:last], omega)
-    if segment.sweep:
-        return track_phase(stretch, _SWEEP_DEGREE)
-    if frequency is None:
-        stretch = estimate_frequency(track_phase(stretch, 1))
-    part = _extended(time, channels[0], stretch, slice(first, last))
-    if part == slice(first, last):
-        return stretch
-    stretch = steady_stretch(time[part], channels[:, part], stretch.omega)
-    return stretch if frequency is not None else estimate_frequency(stretch)
-
-
-def _extended(time: FloatArray, motion: FloatArray, stretch: Stretch, part: slice) -> slice:
-    """Return the slice with the cycles before and after it that its sine fits as well.
-
-    At the ends of the record they may be partial.
-    """
-    few = thinned(stretch)
-    basis = columns(few.theta, few.tau, 1)
-    fitted = np.linalg.solve(basis @ basis.T, basis @ few.channels[0])
-    cycle = 2.0 * np.pi / stretch.omega
-
-    def misfit(where: slice) -> float:
-        tau = (time[where] - stretch.centre) / stretch.half_width
-        model = fitted @ columns(np.asarray(stretch.phase(tau)), tau, 1)
-        return float(np.sqrt(np.mean((motion[where] - model) ** 2)))
-
-    start, stop = part.start, part.stop
-    inside = slice(start, int(np.searchsorted(time, time[start] + cycle)))
-    allowed = 1.5 * misfit(inside) + _STRAYING * float(np.hypot(*fitted[2:]))
-    for _ in range(_MOST_CYCLES_MORE):
-        earlier = int(np.searchsorted(time, time[start] - cycle))
-        if earlier < start and misfit(slice(earlier, start)) <= allowed:
-            start = earlier
-        later = int(np.searchsorted(time, time[stop - 1] + cycle, side="right"))
-        if later > stop and misfit(slice(stop, later)) <= allowed:
-            stop = later
-    return slice(start, stop)
 
 
 def _summary(refused: Sequence[str]) -> str:

@@ -20,16 +20,23 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.errors import ExtractionError
-from dahl_ident.extraction.memory import MOST_CYCLES, Memory, estimate_memory
+from dahl_ident.extraction.memory import (
+    MOST_CYCLES,
+    SIGNIFICANT,
+    Memory,
+    estimate_memory,
+)
 from dahl_ident.extraction.noise import CYCLES_FOR_SCATTER, LineNoise, line_noise
 from dahl_ident.extraction.quality import (
     clipped_share,
     crest_samples,
     distortion,
     fundamental_share,
+    quantisation_errors,
     sensor_step,
 )
 from dahl_ident.extraction.sine_fit import (
+    FEWEST_CYCLES,
     SineFit,
     Stretch,
     first_cycles,
@@ -39,11 +46,11 @@ from dahl_ident.extraction.sine_fit import (
     whole_cycles,
 )
 
-FEWEST_CYCLES = 2
 _NEGLIGIBLE = 0.2  # bias over standard error to which settling cycles are left out
 _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 _DISTORTED = 0.02  # from which the fundamental alone misses percents of the loss
 _MOVING_MEAN = 0.02  # of the amplitude, over the stretch, where the force is controlled
+_BEYOND_NOISE = 5.0  # standard errors of a drift in white noise
 _TINY = np.finfo(np.float64).tiny
 _FEW_STEPS = 10.0  # amplitude over sensor step below which the step matters
 
@@ -101,6 +108,8 @@ class _Phasors:
     noise: tuple[LineNoise, ...]
     memory: Memory
     remembered: ComplexArray
+    steps: FloatArray
+    """Of the two sensors, 0 where they have none."""
 
     @property
     def harmonics(self) -> list[int]:
@@ -123,10 +132,21 @@ class _Phasors:
         return complex(self.phasors(1)[0] * self.integrator)
 
     @property
+    def rounding(self) -> FloatArray:
+        """Root mean square error of a phasor of the motion channel and the force by rounding."""
+        return quantisation_errors(
+            np.abs(self.fit.phasors(1)),
+            self.steps,
+            np.sqrt(np.mean(self.fit.residual**2, axis=1)),
+            self.fit.stretch.time.size / self.cycles,
+        )
+
+    @property
     def errors(self) -> ComplexArray:
         """Errors of the fundamental phasors of displacement and force; their products sum up."""
         scale = np.array([[self.integrator], [1.0]])
-        return np.asarray(scale * self.noise[0].lines * np.sqrt(self.fit.phasor_variance(1)))
+        noise = self.noise[0].lines * np.sqrt(self.fit.phasor_variance(1))
+        return np.asarray(scale * np.hstack([noise, np.diag(self.rounding)]))
 
     @property
     def amplitude_variance(self) -> float:
@@ -186,9 +206,9 @@ def measure(stretch: Stretch, settings: Settings, *, sweep: bool = False) -> Poi
     elif settings.settling_periods is not None:
         dropped = settings.settling_periods
     else:
-        dropped = _settling_periods(rough.stretch, memory, cycles, settings)
+        dropped = _settling_periods(rough.stretch, memory, cycles, settings, steps)
     used = last_cycles(whole, cycles - dropped)
-    phasors = _phasors(used, memory, cycles - dropped, settings, sweep=sweep)
+    phasors = _phasors(used, memory, cycles - dropped, settings, steps, sweep=sweep)
     return _point(phasors, cycles, dropped, steps)
 
 
@@ -240,13 +260,19 @@ def _without(memory: Memory, stretch: Stretch, settings: Settings) -> Stretch:
 
 
 def _phasors(
-    stretch: Stretch, memory: Memory, cycles: int, settings: Settings, *, sweep: bool
+    stretch: Stretch,
+    memory: Memory,
+    cycles: int,
+    settings: Settings,
+    steps: FloatArray,
+    *,
+    sweep: bool,
 ) -> _Phasors:
     """Fit a stretch without its memory, which is no noise, and join the phasors' noise."""
     fit = sine_fit(_without(memory, stretch, settings), trend=sweep)
     harmonics = [k for k in settings.harmonics if k <= fit.orders]
     noise = line_noise(fit, [1, *harmonics], cycles, fit.residual)
-    return _Phasors(fit, cycles, settings, tuple(noise), memory, memory.phasors(fit))
+    return _Phasors(fit, cycles, settings, tuple(noise), memory, memory.phasors(fit), steps)
 
 
 def _bias(phasors: _Phasors) -> ComplexArray:
@@ -278,10 +304,18 @@ def _mean_moves(phasors: _Phasors) -> bool:
     if phasors.memory.significant:
         first, last = phasors.memory.waveform(fit.stretch)[[0, -1]]
         moved += float(last - first)
-    return channel == 0 and abs(moved) > _MOVING_MEAN * abs(phasors.phasors(1)[0])
+    by_noise = 2.0 * np.sqrt(fit.inverse[1, 1] * np.mean(fit.residual[channel] ** 2))
+    least = max(
+        _MOVING_MEAN * abs(phasors.phasors(1)[0]),
+        _BEYOND_NOISE * float(by_noise),
+        SIGNIFICANT * phasors.memory.departure_std,
+    )
+    return channel == 0 and abs(moved) > least
 
 
-def _settling_periods(stretch: Stretch, memory: Memory, cycles: int, settings: Settings) -> int:
+def _settling_periods(
+    stretch: Stretch, memory: Memory, cycles: int, settings: Settings, steps: FloatArray
+) -> int:
     """Return how many leading cycles to leave out.
 
     As few as bring the bias below a fifth of the standard error; where none do, those with the
@@ -291,7 +325,7 @@ def _settling_periods(stretch: Stretch, memory: Memory, cycles: int, settings: S
         return 0
     looked_at = min(cycles, MOST_CYCLES)
     only_first = replace(settings, harmonics=(1,))
-    phasors = _phasors(stretch, memory, looked_at, only_first, sweep=False)
+    phasors = _phasors(stretch, memory, looked_at, only_first, steps, sweep=False)
     q = np.arange(cycles - FEWEST_CYCLES + 1)
     kept = looked_at / (cycles - q)
     bias = abs(_bias(phasors)[0]) * np.exp(-memory.rate * q) * kept
@@ -322,7 +356,8 @@ def _harmonic(phasors: _Phasors, k: int) -> tuple[complex, FloatArray, FloatArra
     along = np.array([N.real, N.imag])
     across = np.array([-N.imag, N.real])
     relative = phasors.amplitude_variance / A**2
-    force = float(noise.matrix[1, 1].real) * phasors.fit.phasor_variance(k) / A**2
+    force = float(noise.matrix[1, 1].real) * phasors.fit.phasor_variance(k)
+    force = (force + float(phasors.rounding[1]) ** 2) / A**2
     covariance = 0.5 * force * np.eye(2) + relative * (
         np.outer(along, along) + k**2 * np.outer(across, across)
     )

@@ -11,7 +11,12 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.extraction.sine_fit import HARMONICS, SineFit, Stretch
 
-_LOOKED_AT = 5_000  # samples from which the sensor's step is found
+_UNROUNDED = 0.05  # residual, in steps, below which no rounding took place
+_DITHERED = np.sqrt(0.25 + 1.0 / 12.0)  # residual, in steps, of half a step of noise, rounded
+_LOOKED_AT = 20_000  # samples from which the sensor's step is found
+_FAR = 30.5  # steps, up to which a gap can be told to be whole ones ...
+_ON_GRID = 0.1  # ... to within this
+_MOSTLY = 0.9  # of the gaps are not farther: else the step is too fine to matter
 _SAME = 1e-9  # of the range: values nearer than this are equal but for rounding
 _RAIL_RUN = 5  # samples in a row at an extreme value
 _CORNER = 3  # samples within which a clipped waveform is ...
@@ -19,7 +24,10 @@ _AWAY = 1e-4  # ... this much of its span away from the rail
 
 
 def sensor_step(samples: FloatArray) -> float:
-    """Return the sensor's step, 0 where the values are not multiples of any."""
+    """Return the sensor's step, 0 where the values lie on no grid.
+
+    A sine sampled at the same phases in every cycle has few values too, but its gaps differ.
+    """
     stride = max(1, samples.size // _LOOKED_AT)
     values = np.sort(samples[::stride])
     gaps = np.diff(values)
@@ -27,8 +35,27 @@ def sensor_step(samples: FloatArray) -> float:
     if gaps.size == 0:
         return 0.0
     step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
-    few = gaps[gaps < 5.5 * step] / step
-    return step if np.abs(few - np.round(few)).max() < 0.05 else 0.0
+    in_steps = gaps / step
+    near = in_steps < _FAR
+    on_grid = np.abs(in_steps - np.round(in_steps)) < _ON_GRID
+    return step if near.mean() > _MOSTLY and on_grid[near].all() else 0.0
+
+
+def quantisation_errors(
+    amplitude: FloatArray, step: FloatArray, residual: FloatArray, samples_a_cycle: float
+) -> FloatArray:
+    """Return the error that rounding to sensor steps leaves in a phasor, for each channel.
+
+    Root mean square of its absolute value. Noise of more than half a step dithers: rounding then
+    averages out like noise, and shows in the scatter. Without it every cycle may be rounded
+    alike, so that only the samples of one cycle, step/sqrt(12) each, average out; and rounding
+    itself adds up to (2 step/pi) |J_1(2 pi A/step)|, at most about 0.2 step sqrt(step/A). Values
+    that follow a sine far more closely than the step were not rounded to it.
+    """
+    sampled = step**2 / 12.0 * 4.0 / samples_a_cycle
+    own = 0.04 * step**2 * step / np.maximum(np.maximum(amplitude, step), np.finfo(np.float64).tiny)
+    rounded = (residual > _UNROUNDED * step) & (residual <= _DITHERED * step)
+    return np.asarray(np.where(rounded, np.sqrt(sampled + own), 0.0))
 
 
 def clipped_share(samples: FloatArray, step: float, noise: float, crest: float) -> float:

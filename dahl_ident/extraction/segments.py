@@ -24,6 +24,7 @@ MODES: tuple[Mode, ...] = ("auto", "steps", "sweep")
 _AMPLITUDE_TOLERANCE = 0.02
 _FREQUENCY_TOLERANCE = 0.01
 _NOISE_FACTOR = 6.0
+_WIDEST = 0.3  # tolerance that noise makes
 _LEAST_NOISE = 1e-12
 _NOISIEST = 0.2  # noise of a cycle's log amplitude above which it is no cycle
 _EDGE_TOLERANCE = 0.005  # of the amplitude: cycles at the ends of a plateau that stray more go
@@ -36,12 +37,17 @@ _SWEEP_CYCLES = (4, 20)  # in a window
 
 @dataclass(frozen=True)
 class Segment:
-    """Start and stop in s, and the frequency in the middle, Hz."""
+    """Start and stop in s, and the frequency in the middle, Hz.
+
+    `earliest` and `latest` are where the segments beside it end and begin.
+    """
 
     start: float
     stop: float
     frequency_hz: float
     sweep: bool = False
+    earliest: float = -np.inf
+    latest: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -117,10 +123,8 @@ def find_segments(
 
 def _tolerances(noise: float) -> tuple[float, float]:
     """Return how much log amplitude and log frequency may vary within a plateau."""
-    return (
-        max(_AMPLITUDE_TOLERANCE, _NOISE_FACTOR * noise),
-        max(_FREQUENCY_TOLERANCE, _NOISE_FACTOR * noise / np.pi),
-    )
+    widened = min(_NOISE_FACTOR * noise, _WIDEST)
+    return max(_AMPLITUDE_TOLERANCE, widened), max(_FREQUENCY_TOLERANCE, widened / np.pi)
 
 
 def _change(values: FloatArray) -> float:
