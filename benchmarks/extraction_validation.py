@@ -7,6 +7,7 @@ extracted as a user would, frequency unknown. Run ``python -m benchmarks.extract
 
 from __future__ import annotations
 
+import math
 import sys
 import warnings
 from collections.abc import Callable
@@ -63,7 +64,7 @@ class Accuracy:
     @property
     def efficient(self) -> bool:
         """At most 1.05 times the bound, with two standard errors for the number of records."""
-        return self.efficiency <= 1.05 * (1.0 + self.records**-0.5)
+        return self.efficiency <= 1.05 * (1.0 + 1.0 / math.sqrt(self.records))
 
 
 def accuracy(
