@@ -1,0 +1,164 @@
+"""Every shipped data set through the whole chain: truth inside the intervals, or said why not.
+
+Raw or table -> extract -> fit -> posterior. Flawed data must be caught by name: nothing may be
+silently wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+import dahl_ident as di
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.extraction import extract
+
+PLANT = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
+INSIDE = 0.9973
+
+
+def table(name: str) -> FrequencyResponse:
+    data = di.load_dataset(name)
+    assert isinstance(data, FrequencyResponse)
+    return data
+
+
+def points(name: str, **options: object) -> FrequencyResponse:
+    """Return the fundamentals that the extraction finds in a shipped recording."""
+    record = di.load_dataset(name)
+    assert isinstance(record, di.Record)
+    return extract(record, **options).select(harmonic=1)  # type: ignore[arg-type]  # passed on
+
+
+def truth(name: str) -> Mapping[str, float]:
+    provenance = di.load_dataset(name).provenance
+    assert provenance is not None
+    return dict(provenance["truth"])
+
+
+def assert_recovered(fit: di.FitResult, true: Mapping[str, float], *names: str) -> None:
+    """Check that the profile intervals of `names` hold the truth."""
+    intervals = fit.conf_interval("profile").at(INSIDE)
+    for name in names:
+        low, high = intervals[name].lower, intervals[name].upper
+        assert low <= true[name] <= high, f"{name}: {true[name]} outside {low} to {high}"
+
+
+def assert_posterior_holds(fit: di.FitResult, true: Mapping[str, float], *names: str) -> None:
+    """Check that the posterior's central 99.73 % holds the truth."""
+    posterior = di.posterior_grid(fit)
+    for name in names:
+        low, high = posterior.quantile(name, np.array([0.00135, 0.99865]))
+        assert low <= true[name] <= high, f"{name}: {true[name]} outside {low} to {high}"
+
+
+@pytest.mark.parametrize("name", ["noisy", "alpha_2"])
+def test_tables_that_determine_everything(name: str) -> None:
+    free = ["alpha"] if name == "alpha_2" else []
+    fit = di.fit(table(name), di.Dahl(), free=free)
+    assert fit.trusted, fit.verdict
+    assert_recovered(fit, truth(name), *fit.var_names)
+    assert_posterior_holds(fit, truth(name), *fit.var_names)
+
+
+def test_clean() -> None:
+    fit = di.fit(table("clean"), di.Dahl())
+    assert fit.trusted, fit.verdict
+    for name, value in truth("clean").items():
+        assert fit.params[name].value == pytest.approx(value, rel=1e-9)
+
+
+def test_microslip_says_that_f_max_is_only_bounded_below() -> None:
+    fit = di.fit(table("microslip"), di.Dahl())
+    assert not fit.trusted
+    assert "Only sigma is determined; not f_max" in fit.verdict
+    assert "no amplitude up to 6.7e-06 m reaches slip: drive above that" in fit.verdict
+    assert_recovered(fit, truth("microslip"), "f_max", "sigma")
+    assert_posterior_holds(fit, truth("microslip"), "f_max", "sigma")
+
+
+def test_gross_slip_says_that_sigma_is_only_bounded_below() -> None:
+    fit = di.fit(table("gross_slip"), di.Dahl())
+    assert not fit.trusted
+    assert "Only f_max is determined; not sigma" in fit.verdict
+    assert_recovered(fit, truth("gross_slip"), "f_max", "sigma")
+    assert_posterior_holds(fit, truth("gross_slip"), "f_max", "sigma")
+
+
+def test_an_exponent_of_2_is_not_taken_for_linear_dahl() -> None:
+    fit = di.fit(table("alpha_2"), di.Dahl())
+    assert not fit.trusted
+    assert "The model does not describe these data" in fit.verdict
+    assert "the data ask for alpha near 2.0" in str(fit.goodness)
+
+
+def test_plant_of_figure_7() -> None:
+    fit = di.fit(table("fig_7_plant"), PLANT)
+    assert fit.trusted, fit.verdict
+    assert_recovered(fit, truth("fig_7_plant"), *fit.var_names)
+
+
+def test_plant_recording() -> None:
+    data = points("plant_recording", controlled="force")
+    good = data.select(rows=data.quality["verdict"] == "good")
+    fit = di.fit(good, PLANT)
+    assert fit.trusted, fit.verdict
+    assert_recovered(fit, truth("plant_recording"), *fit.var_names)
+    posterior = di.sample(fit, seed=1)
+    assert posterior.converged
+    draws = posterior.get_chain(flat=True)
+    for name, column in zip(posterior.names, draws.T, strict=False):
+        low, high = np.quantile(column, [0.00135, 0.99865])
+        assert low <= truth("plant_recording")[name] <= high, name
+
+
+def test_levels_without_time_to_settle_are_caught() -> None:
+    data = points("unsettled")
+    assert "not settled" in " ".join(data.quality["verdict"])
+    fit = di.fit(data, di.Dahl())
+    assert not fit.trusted
+    assert "The extraction flagged" in fit.verdict
+    assert "not settled" in fit.verdict
+
+
+def test_coarse_sensor_steps_are_caught_and_the_other_points_recover_the_truth() -> None:
+    data = points("quantised")
+    flagged = data.quality["verdict"] != "good"
+    assert any("sensor steps" in verdict for verdict in data.quality["verdict"][flagged])
+    everything = di.fit(data, di.Dahl())
+    assert not everything.trusted
+    assert "sensor steps" in everything.verdict
+    fit = di.fit(data.select(rows=~flagged), di.Dahl())
+    assert_recovered(fit, truth("quantised"), "f_max", "sigma")
+
+
+def test_outliers_are_named_and_the_other_rows_recover_the_truth() -> None:
+    data = table("outliers")
+    assert data.provenance is not None
+    rows = list(data.provenance["outlier_rows"])
+    fit = di.fit(data, di.Dahl())
+    assert not fit.trusted
+    assert sorted(point.row for point in fit.goodness.suspicious) == rows
+    rest = di.fit(data.select(rows=~np.isin(np.arange(data.n), rows)), di.Dahl())
+    assert rest.trusted, rest.verdict
+    assert_recovered(rest, truth("outliers"), "f_max", "sigma")
+    robust = di.fit(data, di.Dahl(), loss="student_t")
+    for name in ("f_max", "sigma"):
+        estimate = robust.params[name]
+        assert estimate.stderr is not None
+        assert abs(estimate.value - truth("outliers")[name]) < 3.0 * estimate.stderr
+
+
+def test_a_delayed_and_mis_scaled_sensor_is_caught() -> None:
+    data, true = table("delayed"), truth("delayed")
+    fit = di.fit(data, di.Dahl())
+    assert not fit.trusted
+    assert "which no rate-independent model does" in fit.verdict
+    known_gain = di.Sensors(force_gain=true["force_gain"], delay=None)
+    corrected = di.fit(data, di.Dahl(), sensors=known_gain)
+    assert corrected.trusted, corrected.verdict
+    assert_recovered(corrected, true, "f_max", "sigma", "delay")
+    unknown = di.fit(data, di.Dahl(), sensors=di.Sensors(force_gain=None, delay=None), throw=False)
+    assert not unknown.trusted
