@@ -9,6 +9,8 @@ from scipy import special
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.diagnostics.parameters import parameter_values
+from dahl_ident.diagnostics.third_harmonic import third_harmonic_share
 from dahl_ident.diagnostics.units import shown_unit
 from dahl_ident.elements import Dahl, Damper, Mass, Spring
 from dahl_ident.fitting import Optimum
@@ -109,37 +111,3 @@ def _sensed(optimum: Optimum) -> ComplexArray:
     gain /= start["force_gain"] / start["displacement_gain"]
     lag = values["delay"] - start["delay"]
     return np.asarray(np.exp(-1j * view.harmonic * view.omega * lag) / gain)
-
-
-def third_harmonic_share(optimum: Optimum) -> FloatArray:
-    """Return the predicted third harmonic of the displacement over its fundamental.
-
-    One number for each force-controlled row: F_3/X_1 of friction under a sine, over the dynamic
-    stiffness that the plant has at three times the frequency, the friction's own at that
-    amplitude included. Where the laboratory controls displacement there is none.
-    """
-    problem = optimum.problem
-    forced = problem.data.controlled == "force"
-    if not forced.any() or not np.isfinite(optimum.values).all():
-        return np.zeros(0)
-    view, values = problem.stiffness_data, parameter_values(optimum)
-    A, omega = view.amplitude[forced], view.omega[forced]
-    third = np.zeros(len(A), dtype=np.complex128)
-    reaction = np.zeros(len(A), dtype=np.complex128)
-    for element in problem.model.elements:
-        own = [np.asarray(values[p.name]) for p in element.parameters]
-        reaction += element.stiffness(own, A, 3.0 * omega, 1)
-        if isinstance(element, Dahl):
-            third += element.stiffness(own, A, omega, 3)
-    return np.asarray(np.abs(third / reaction))
-
-
-def parameter_values(optimum: Optimum) -> dict[str, float]:
-    """Return the value of every parameter of model and sensors, by name."""
-    problem = optimum.problem
-    values = {
-        p.name: np.nan if p.value is None else p.value
-        for p in (*problem.model.parameters, *problem.sensors.parameters)
-    }
-    found = problem.to_values(optimum.theta).tolist()
-    return values | dict(zip(problem.names, found, strict=True))

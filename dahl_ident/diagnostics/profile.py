@@ -46,7 +46,7 @@ _NARROW = 1e-4  # width of a bracket over its distance
 _FARTHEST = 1e6  # conditional standard errors of a parameter that is no logarithm
 _LEAST_X_C = 1e-14  # over the smallest amplitude
 _MOST_X_C, _MOST_X_C_BESIDE = 1e8, 1e5  # over the largest, alone and beside a spring
-_SOFTEST = 1e-12  # sigma over the median stiffness
+_SOFTEST, _STIFFEST = 1e-12, 1e6  # sigma over the median stiffness
 _FARTHEST_LOG = 80.0
 _FARTHEST_RATIO = 4.0  # of the logarithm of a pure number: an exponent or a gain
 
@@ -308,8 +308,10 @@ class Profiler:
             own = np.isin(np.array(self._problem.names)[index], (f_max.name, sigma.name))
             ln_f_max, ln_sigma = (columns.get(p.name, _ln(p)) for p in (f_max, sigma))
             ln_x_c = ln_f_max - ln_sigma
-            seen = (ln_x_c > self._reach.least) & (ln_x_c < self._reach.most)
-            near &= ~own | (seen & (ln_sigma > self._reach.softest))
+            reach = self._reach
+            seen = (ln_x_c > reach.least) & (ln_x_c < reach.most) & (ln_sigma > reach.softest)
+            cancels = (ln_sigma > reach.stiffest) & (ln_x_c > reach.smallest)
+            near &= ~own | (seen & ~cancels)
         return near
 
     @cached_property
@@ -321,11 +323,14 @@ class Profiler:
     @cached_property
     def _reach(self) -> _Reach:
         view, springs = self._problem.stiffness_data, (Spring, LinearSystem)
+        stiffness = np.median(np.abs(view.stiffness))
         beside = any(isinstance(e, springs) for e in self._problem.model.elements)
         return _Reach(
             float(np.log(view.amplitude.min() * _LEAST_X_C)),
             float(np.log(view.amplitude.max() * (_MOST_X_C_BESIDE if beside else _MOST_X_C))),
-            float(np.log(np.median(np.abs(view.stiffness)) * _SOFTEST)),
+            float(np.log(view.amplitude.min())),
+            float(np.log(stiffness * _SOFTEST)),
+            float(np.log(stiffness * _STIFFEST)),
         )
 
     @cached_property
@@ -338,11 +343,17 @@ class Profiler:
 
 
 class _Reach(NamedTuple):
-    """Range of ln x_c, and least ln sigma, outside of which friction is its own limit."""
+    """Range of ln x_c and ln sigma outside of which friction is its own limit.
+
+    Stiffer than `stiffest` with an x_c beyond the `smallest` amplitude, it is all but cancelled
+    by a spring.
+    """
 
     least: float
     most: float
+    smallest: float
     softest: float
+    stiffest: float
 
 
 @dataclass(frozen=True)

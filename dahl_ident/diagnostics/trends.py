@@ -20,7 +20,7 @@ from scipy import special
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.formatting import with_unit
-from dahl_ident.diagnostics.physics import parameter_values
+from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, ResidualSpace
 from dahl_ident.diagnostics.units import shown_unit
 from dahl_ident.elements import Dahl

@@ -275,16 +275,16 @@ def _determined(
     optimum: Optimum, information: Information, lost: frozenset[str]
 ) -> tuple[DeterminedCombination, ...]:
     """Return the combinations of parameters that are not identified, but are together."""
-    if optimum.combinations:
-        known = [c for c in optimum.combinations if c.expression not in optimum.names]
-        units = {c.expression: c.unit for c in candidates(optimum)}
-        return tuple(
-            DeterminedCombination(c.expression, units.get(c.expression, ""), c.value, c.stderr)
-            for c in known
-            if c.stderr < IDENTIFIED_BELOW * abs(c.value)
-        )
-    found = []
+    units = {c.expression: c.unit for c in candidates(optimum)}
+    found = [
+        DeterminedCombination(c.expression, units.get(c.expression, ""), c.value, c.stderr)
+        for c in optimum.combinations
+        if c.expression not in optimum.names and c.stderr < IDENTIFIED_BELOW * abs(c.value)
+    ]
+    told = {c.expression for c in optimum.combinations}
     for candidate in candidates(optimum):
+        if candidate.expression in told:
+            continue
         enough = candidate.members <= lost if candidate.is_sum else candidate.members & lost
         if not enough:
             continue

@@ -1,0 +1,322 @@
+"""Tests of tests: they stay silent over noise, and speak of what was put into the data."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, compare_models, fit
+from dahl_ident.diagnostics.goodness import Goodness, goodness
+from dahl_ident.diagnostics.outliers import suspicious_points
+from dahl_ident.diagnostics.residual_space import RelativeSpace, ResidualSpace
+from dahl_ident.diagnostics.third_harmonic import third_harmonic_share
+from tests.friction_tables import (
+    FRICTION,
+    PLANT,
+    X_C,
+    amplitudes,
+    plant_table,
+    relative_noise,
+    table,
+)
+
+
+def judge(data: FrequencyResponse, **options: object) -> Goodness:
+    return goodness(fit(data, Dahl(), throw=False, **options).optimum)  # type: ignore[arg-type]  # passed on
+
+
+def swept_table(fall: float, noise: float = 0.01, seed: int = 1) -> FrequencyResponse:
+    """Return friction whose stiffness falls by a share from 0.25 to 2 Hz."""
+    f = np.repeat([0.25, 0.5, 1.0, 2.0], 8)
+    A = np.tile(np.geomspace(0.1, 10.0, 8) * X_C, 4)
+    N = FRICTION.describing_function(A)
+    slope = np.log(1.0 - fall) / np.log(8.0)
+    N = N.real * (f / 0.25) ** slope + 1j * N.imag
+    return FrequencyResponse(f, N * relative_noise(32, noise, seed), A)
+
+
+class TestSilence:
+    def test_p_values_are_uniform_and_alarms_are_rare(self) -> None:
+        found = [judge(table(seed=seed, n=8 + 22 * (seed % 2))) for seed in range(300)]
+        assert sum(not g.acceptable for g in found) <= 3
+        assert 4 <= sum(bool(g.hints) for g in found) <= 32
+        for p in (
+            [g.trends[0].p_value for g in found],
+            [g.exponent.p_value for g in found if g.exponent],
+        ):
+            assert stats.kstest(p, "uniform").pvalue > 1e-3
+        runs = [g.runs[0].p_value for g in found if g.runs]
+        assert np.mean(np.array(runs) < 0.05) < 0.09
+        assert sum(bool(g.suspicious) for g in found) <= 12
+
+    def test_known_noise(self) -> None:
+        data = table(seed=2)
+        C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
+        found = judge(replace(data, covariance=C))
+        assert found.chi_square is not None
+        expected = stats.chi2(58).sf(found.chi_square.value)
+        assert found.chi_square.p_value == pytest.approx(expected)
+        assert found.acceptable
+
+    @pytest.mark.parametrize("dof", [4.0, 12.0])
+    def test_noise_known_with_few_degrees_of_freedom(self, dof: float) -> None:
+        """Covariances as rough as a few cycles give: chi-square keeps its distribution."""
+        rng = np.random.default_rng(5)
+        values = []
+        for seed in range(150):
+            data = table(seed=seed, noise=0.01)
+            s2 = (0.01 * np.abs(data.response)) ** 2
+            factors = rng.standard_normal((30, int(dof), 2))
+            C = np.einsum("nki,nkj->nij", factors, factors) / dof * s2[:, None, None]
+            found = judge(replace(data, covariance=C, dof=np.full(30, dof)))
+            assert found.chi_square is not None
+            values.append(found.chi_square.p_value)
+        assert np.mean(np.array(values) < 0.05) < 0.12
+        assert np.mean(values) == pytest.approx(0.5, abs=0.1)
+
+    def test_a_driven_plant(self) -> None:
+        result = fit(plant_table(), Dahl() + Mass() + Damper() + Spring())
+        assert result.goodness.acceptable
+        assert {t.covariate for t in result.goodness.trends} == {"amplitude", "frequency", "drive"}
+
+
+class TestDepartures:
+    def test_a_trend_with_frequency_has_its_size(self) -> None:
+        found = judge(swept_table(0.28))
+        (trend,) = (t for t in found.trends if t.covariate == "frequency")
+        assert trend.p_value < 1e-6
+        assert np.expm1(trend.stiffness.value) == pytest.approx(-0.28, abs=0.08)
+        assert not found.acceptable
+        assert "which no rate-independent model does" in found.headline
+        assert "friction's stiffness falls by" in found.headline
+
+    def test_the_size_does_not_depend_on_the_claimed_noise(self) -> None:
+        data = swept_table(0.28)
+        C = (1e-3 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
+        for claimed in (
+            replace(data, covariance=C),
+            replace(data, covariance=C, dof=np.full(32, 5.0)),
+        ):
+            (trend,) = (t for t in judge(claimed).trends if t.covariate == "frequency")
+            assert np.expm1(trend.stiffness.value) == pytest.approx(-0.28, abs=0.08)
+            assert trend.p_value < 1e-10
+
+    def test_another_exponent(self) -> None:
+        found = judge(table(model=Dahl(0.1, 30.0, alpha=1.5)))
+        assert found.exponent is not None
+        assert found.exponent.wanted == pytest.approx(1.5, rel=0.15)
+        assert "these data are not linear Dahl" in found.headline
+        free = goodness(fit(table(model=Dahl(0.1, 30.0, alpha=1.5)), Dahl(alpha=None)).optimum)
+        assert free.acceptable
+        assert free.exponent is None
+
+    def test_the_exponent_s_score_is_close_to_its_estimate(self) -> None:
+        data = table(model=Dahl(0.1, 30.0, alpha=1.05))
+        found, estimate = judge(data), fit(data, Dahl(alpha=None)).params["alpha"]
+        assert found.exponent is not None
+        assert found.exponent.wanted == pytest.approx(estimate.value, abs=0.005)
+        assert found.exponent.stderr == pytest.approx(estimate.stderr, rel=0.2)
+
+    def test_a_missing_spring(self) -> None:
+        found = judge(table(model=FRICTION + Spring(1.0)))
+        assert not found.acceptable
+        assert "over amplitude, from 0.000333 to 0.0333 m" in found.headline
+
+    def test_noise_larger_than_the_covariance_says(self) -> None:
+        data = table(noise=0.03)
+        C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
+        known = replace(data, covariance=C)
+        found = judge(known)
+        assert not found.acceptable
+        assert "chi-square" in found.headline
+        unused = judge(known, noise="relative")
+        assert unused.scatter is not None
+        assert unused.scatter.ratio == pytest.approx(3.0, rel=0.3)
+        assert unused.acceptable
+
+    def test_a_third_harmonic_of_another_size(self) -> None:
+        A = np.repeat(np.geomspace(0.5, 20.0, 12), 2) * X_C
+        k = np.tile([1, 3], 12)
+        F = np.where(
+            k == 1, FRICTION.describing_function(A), FRICTION.dynamic_stiffness(A, harmonic=3)
+        )
+        noise = np.random.default_rng(1).standard_normal((2, 24))
+        F1 = np.abs(FRICTION.describing_function(A))
+        for factor in (1.0, 1.3):
+            R = F * np.where(k == 3, factor, 1.0) + 0.002 * F1 * (noise[0] + 1j * noise[1])
+            found = judge(FrequencyResponse(np.ones(24), R, A, harmonic=k))
+            assert found.third_harmonic is not None
+            assert found.third_harmonic.ratio == pytest.approx(factor, abs=0.02)
+            assert found.acceptable == (factor == 1.0)
+
+    def test_misfit_is_its_root_mean_square(self) -> None:
+        result = fit(table(), Dahl())
+        expected = np.sqrt(
+            np.mean(np.abs(result.data.response - result.best_fit) ** 2 / result.data.gain**2)
+        )
+        assert result.goodness.rms_misfit == pytest.approx(expected)
+
+
+class TestOutliers:
+    def test_are_listed_with_their_place(self) -> None:
+        data = table()
+        R = data.response.copy()
+        R[7] *= 1.1
+        R[20] *= np.exp(0.08j)
+        named = replace(data, response=R, level=np.array([f"run {i}" for i in range(30)]))
+        found = judge(named).suspicious
+        assert {point.row for point in found} == {7, 20}
+        (first,) = (point for point in found if point.row == 7)
+        assert first.level == "run 7"
+        assert first.amplitude == amplitudes(data)[7]
+        assert first.deviation > 5.0
+        assert "row 7 (1 Hz, amplitude 0.00101, level run 7) lies" in str(first)
+
+    def test_deviation_is_that_of_the_fit_without_the_point(self) -> None:
+        """The mean-shift test is exact for a linear model: leave the point out and predict it."""
+        noise = np.random.default_rng(0).standard_normal((2, 12))
+        Z = 5.0 + 0.01 * (noise[0] + 1j * noise[1])
+        Z[4] += 0.08
+        data = FrequencyResponse(np.ones(12), Z, np.geomspace(1.0, 2.0, 12))
+        optimum = fit(data, Spring(), noise="absolute").optimum
+        (point,) = suspicious_points(optimum, ResidualSpace(optimum))
+        rest = fit(data.select(rows=np.arange(12) != 4), Spring(), noise="absolute")
+        away = Z[4] - rest.params["stiffness"].value
+        inflated = rest.scale * np.sqrt(1.0 + 1.0 / 11.0)
+        expected = np.hypot(away.real / inflated, away.imag / rest.scale)
+        assert point.row == 4
+        assert point.deviation == pytest.approx(expected, rel=1e-9)
+
+    def test_none_where_too_few_points(self) -> None:
+        assert judge(table(n=3)).suspicious == ()
+
+
+class TestResidualSpace:
+    def test_an_added_column_is_what_a_fit_with_it_finds(self) -> None:
+        """Linear model: the score's coefficient is the estimate of a fit with one more element."""
+        A = np.geomspace(0.5, 2.0, 20)
+        f = np.geomspace(1.0, 4.0, 20)
+        noise = np.random.default_rng(0).standard_normal((2, 20))
+        Z = 5.0 + 0.2j * 2.0 * np.pi * f + 0.05 * (noise[0] + 1j * noise[1])
+        data = FrequencyResponse(f, Z, A)
+        small = fit(data, Spring(), noise="absolute")
+        large = fit(data, Spring() + Damper(), noise="absolute")
+        space = ResidualSpace(small.optimum)
+        change = 2j * np.pi * f / small.best_fit
+        found = space.coefficient(change)
+        assert found.value == pytest.approx(large.params["damping"].value, rel=1e-9)
+        t = large.params["damping"].value / (large.params["damping"].stderr or np.nan)
+        expected = 2.0 * stats.t(large.nfree).sf(abs(t))
+        assert space.p_value(change[None]) == pytest.approx(expected, rel=1e-9)
+
+    def test_what_parameters_explain_is_no_departure(self) -> None:
+        result = fit(table(), Dahl())
+        own = result.problem.prediction_jacobian(result.optimum.theta)[:, 0] / result.best_fit
+        for space in (ResidualSpace(result.optimum), RelativeSpace(result.optimum)):
+            assert not space.columns(own[None]).any()
+        assert np.isinf(ResidualSpace(result.optimum).coefficient(own).stderr)
+
+
+class TestPhysics:
+    def test_a_negative_spring_is_told(self) -> None:
+        result = fit(table(model=FRICTION + Spring(-1.0)), Dahl() + Spring())
+        (text,) = (w for w in result.goodness.warnings if "stiffness" in w)
+        assert text.startswith("stiffness is negative, -")
+        assert "zero is within" not in text
+
+    def test_a_friction_force_beyond_slip(self) -> None:
+        data = table(beta=(10.0, 100.0))
+        R = data.response.copy()
+        R[-1] *= 1.2
+        warnings = judge(replace(data, response=R)).warnings
+        assert any("in row 29 friction's fundamental is" in w for w in warnings)
+        assert not judge(data).warnings
+
+    def test_a_parameter_at_its_bound(self) -> None:
+        model = Dahl() + Spring()
+        (own,) = (p for p in model.parameters if p.name == "f_max")
+        bounded = model.with_parameters({"f_max": replace(own, upper=0.09)})
+        result = fit(table(model=FRICTION + Spring(1.0)), bounded)
+        assert any("At its bound: f_max = 0.09" in w for w in result.goodness.warnings)
+
+    def test_the_third_harmonic_of_the_motion(self) -> None:
+        """Against the motion itself: the plant integrated in time until it is steady."""
+        data = plant_table(noise=0.0)
+        optimum = fit(data, Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24) + Spring()).optimum
+        share = third_harmonic_share(optimum)
+        assert share.shape == (60,)
+        order = np.argsort(share)
+        assert data.level is not None
+        for row, tolerance in ((order[-1], 1.0), (order[50], 0.1), (order[30], 0.1)):
+            f, u = float(data.frequency_hz[row]), float(data.level[row])
+            assert share[row] == pytest.approx(simulated_share(f, u), rel=tolerance)
+
+    def test_controlled_displacement_has_none(self) -> None:
+        assert third_harmonic_share(fit(table(), Dahl()).optimum).size == 0
+
+
+def simulated_share(frequency: float, drive: float, cycles: int = 20, steps: int = 1200) -> float:
+    """Return |X_3/X_1| of the steady motion of PLANT, by classical Runge-Kutta."""
+    m, c, k, f_max, sigma = 0.3, 0.24, 0.3, 0.1, 30.0
+    omega = 2.0 * np.pi * frequency
+    h = 1.0 / frequency / steps
+
+    def slope(
+        t: float, y: np.ndarray[tuple[int], np.dtype[np.float64]]
+    ) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        x, v, F = y
+        rate = sigma * (1.0 - np.sign(v) * F / f_max) * v
+        return np.array([v, (drive * np.cos(omega * t) - c * v - k * x - F) / m, rate])
+
+    y, motion = np.zeros(3), np.empty(steps)
+    for i in range(cycles * steps):
+        t = i * h
+        k1 = slope(t, y)
+        k2 = slope(t + h / 2, y + h / 2 * k1)
+        k3 = slope(t + h / 2, y + h / 2 * k2)
+        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + slope(t + h, y + h * k3))
+        motion[i % steps] = y[0]
+    X = np.fft.rfft(motion)
+    return float(abs(X[3]) / abs(X[1]))
+
+
+class TestComparison:
+    def test_finds_what_the_data_were_made_of(self) -> None:
+        makers = {
+            "as fitted": FRICTION,
+            "exponent free": Dahl(0.1, 30.0, alpha=1.5),
+            "spring added": FRICTION + Spring(1.0),
+            "two Dahl elements": FRICTION + Dahl(0.1, 3.0, name="other"),
+        }
+        for name, maker in makers.items():
+            assert compare_models(fit(table(model=maker), Dahl())).best.name == name
+
+    def test_criteria_are_those_of_the_fits(self) -> None:
+        result = fit(table(), Dahl())
+        found = compare_models(result)
+        assert (found.models[0].aic, found.models[0].bic) == pytest.approx((result.aic, result.bic))
+        (free,) = (m for m in found.models if m.name == "exponent free")
+        alone = fit(table(), Dahl(alpha=None))
+        assert (free.aic, free.bic) == pytest.approx((alone.aic, alone.bic))
+        assert found.headline == "No model compared is better than the one fitted."
+        assert list(found.to_frame()["model"]) == [m.name for m in found.models]
+
+    def test_own_models_and_those_that_fail(self) -> None:
+        data = table(n=3)
+        found = compare_models(
+            fit(data, Dahl()), {"too much": Dahl() + Spring() + Mass() + Damper() + Dahl(name="b")}
+        )
+        assert "fewer than" in found.failed["too much"]
+        assert "too much could not be fitted" in str(found)
+
+    def test_an_exponent_that_is_free_is_also_tried_at_one(self) -> None:
+        names = [m.name for m in compare_models(fit(table(), Dahl(alpha=None))).models]
+        assert "exponent 1" in names
+        assert "exponent free" not in names
+
+
+def test_plant_of_the_helpers_is_that_of_the_paper() -> None:
+    assert [p.value for p in PLANT.parameters] == [0.1, 30.0, 1.0, 0.3, 0.24, 0.3]

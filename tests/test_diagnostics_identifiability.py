@@ -1,0 +1,179 @@
+"""Verdicts on what data can determine, each on data made to deserve it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring, fit, identifiability
+from dahl_ident.diagnostics import Verdict
+from dahl_ident.diagnostics.information import Information, shares
+from dahl_ident.results import FitResult
+from tests.friction_tables import F_MAX, FRICTION, SIGMA, X_C, plant_table, relative_noise, table
+
+IDENTIFIED, WEAK, NOT = Verdict.IDENTIFIED, Verdict.WEAK, Verdict.NOT_IDENTIFIED
+
+
+def verdicts(result: FitResult) -> dict[str, Verdict]:
+    return {name: p.verdict for name, p in identifiability(result).parameters.items()}
+
+
+class TestVerdicts:
+    def test_every_parameter(self) -> None:
+        found = identifiability(fit(table(), Dahl()))
+        assert found.headline == "Every parameter is identified."
+        assert found.complete
+        assert found.rank == 2
+        assert found.determined == ("f_max", "sigma")
+        assert not found.combinations
+        assert not found.direction
+
+    def test_every_parameter_of_a_plant(self) -> None:
+        result = fit(plant_table(), Dahl() + Mass() + Damper() + Spring())
+        assert set(verdicts(result).values()) == {IDENTIFIED}
+
+    def test_sigma_but_not_f_max(self) -> None:
+        found = identifiability(fit(table(beta=(1e-4, 1e-3)), Dahl(), throw=False))
+        assert found.named(NOT) == ["f_max"]
+        assert found.headline == "Only sigma is determined; not f_max."
+        text = found.parameters["f_max"].text
+        assert text.startswith("f_max: at least 0.0")
+        assert "no amplitude up to 3.3e-06 m reaches slip: drive above that" in text
+
+    def test_f_max_but_not_sigma(self) -> None:
+        found = identifiability(fit(table(beta=(1e6, 1e7)), Dahl(), throw=False))
+        assert found.named(IDENTIFIED) == ["f_max"]
+        assert found.named(NOT) == ["sigma"]
+        text = found.parameters["sigma"].text
+        assert "every amplitude from 3.3e+03 m slips" in text
+        assert "drive below that" in text
+
+    def test_weakly_between(self) -> None:
+        found = identifiability(fit(table(beta=(1e4, 1e5)), Dahl()))
+        assert found.named(WEAK) == ["sigma"]
+        assert found.headline == "Every parameter is determined, but sigma only weakly."
+
+    def test_microslip_beside_a_spring(self) -> None:
+        """A spring as stiff as the contact: the loss and the sum of stiffnesses are left."""
+        model = FRICTION + Spring(SIGMA)
+        data = table(model=model, beta=(1e-2, 1e-1), noise=0.004)
+        found = identifiability(fit(data, Dahl() + Spring(), throw=False))
+        assert set(found.named(NOT)) == {"f_max", "sigma", "stiffness"}
+        combined = {c.expression: c for c in found.combinations}
+        assert set(combined) == {"sigma^2/f_max", "sigma + stiffness"}
+        kappa, total = combined["sigma^2/f_max"], combined["sigma + stiffness"]
+        assert abs(kappa.value - SIGMA**2 / F_MAX) < 4.0 * kappa.stderr
+        assert abs(total.value - 2.0 * SIGMA) < 4.0 * total.stderr
+        assert kappa.unit == "N/m^2"
+        assert "free stiffness hides it below 0.00033 m" in found.parameters["f_max"].text
+        assert found.headline.startswith("Only sigma^2/f_max and sigma + stiffness are determined")
+
+    def test_only_the_sum_of_stiffnesses(self) -> None:
+        data = table(model=FRICTION + Spring(SIGMA), beta=(1e-4, 1e-3), noise=0.001, seed=7)
+        found = identifiability(fit(data, Dahl() + Spring(), throw=False))
+        assert found.determined == ("sigma + stiffness",)
+
+    def test_the_exponent_in_microslip(self) -> None:
+        model = FRICTION + Spring(1.0)
+        data = table(model=model, beta=(1e-2, 1e-1), noise=0.004, n=12)
+        found = identifiability(fit(data, Dahl(alpha=None) + Spring(), throw=False))
+        assert "alpha sigma^2/f_max" in found.determined
+        assert "alpha" in found.named(NOT)
+
+    def test_an_unknown_force_gain_leaves_x_c(self) -> None:
+        result = fit(table(), Dahl(), sensors=Sensors(force_gain=None), throw=False)
+        found = identifiability(result)
+        (x_c,) = found.combinations
+        assert x_c.expression == "f_max/sigma"
+        assert x_c.value == pytest.approx(X_C, rel=0.02)
+        assert found.rank == 2
+        assert "calibrate the force channel, or give force_gain a prior" in str(found)
+
+    def test_an_unknown_displacement_gain_leaves_f_max(self) -> None:
+        result = fit(table(), Dahl(), sensors=Sensors(displacement_gain=None), throw=False)
+        found = identifiability(result)
+        assert found.determined == ("f_max",)
+        assert set(found.direction) == {"sigma", "displacement_gain"}
+        sigma, gain = found.direction["sigma"], found.direction["displacement_gain"]
+        assert abs(sigma) == pytest.approx(abs(gain), rel=1e-3)
+        assert "calibrate the displacement channel" in str(found)
+
+    def test_a_prior_on_the_gain_restores_everything(self) -> None:
+        sensors = Sensors(force_gain=stats.norm(1.0, 0.005))
+        found = identifiability(fit(table(), Dahl(), sensors=sensors))
+        assert found.complete
+
+    def test_two_elements_where_one_suffices(self) -> None:
+        model = Dahl(name="a") + Dahl(name="b")
+        found = identifiability(fit(table(seed=2), model, throw=False))
+        assert not found.complete
+        assert "can take its place: leave one of the two elements out" in str(found)
+
+    def test_a_damper_hidden_by_noise_is_bounded_not_unknown(self) -> None:
+        """Its value is zero within its error, but that error is small against the response."""
+        f = np.repeat([1.0, 10.0], 15)
+        A = np.tile(np.geomspace(0.1, 10.0, 15), 2) * X_C
+        N = FRICTION.describing_function(A) * relative_noise(30, 0.001, 1)
+        found = verdicts(fit(FrequencyResponse(f, N, A), Dahl() + Damper()))
+        assert set(found.values()) == {IDENTIFIED}
+
+    def test_rotation_has_its_units(self) -> None:
+        data = table(beta=(1e-4, 1e-3))
+        assert data.amplitude is not None
+        turned = FrequencyResponse(
+            data.frequency_hz, data.response, data.amplitude, motion="rotation"
+        )
+        found = identifiability(fit(turned, Dahl(), throw=False))
+        assert " N m (95.45 %)" in found.parameters["f_max"].text
+        assert "up to 3.3e-06 rad reaches slip" in found.parameters["f_max"].text
+
+
+class TestTheory:
+    """The table of what data can determine: Cramer-Rao bounds, reached by our Fisher matrix."""
+
+    @pytest.mark.parametrize(
+        ("start", "f_max", "sigma"),
+        [(0.001, 0.91, 0.002), (0.01, 0.09, 0.002), (10.0, 0.002, 0.014), (100.0, 0.002, 0.046)],
+    )
+    def test_friction_alone(self, start: float, f_max: float, sigma: float) -> None:
+        data = table(beta=(start, 10.0 * start), noise=0.0)
+        problem = fit(data, Dahl()).problem
+        information = problem.information(problem.to_search([F_MAX, SIGMA]), 0.01)
+        bound = np.sqrt(np.diagonal(np.linalg.inv(information)))
+        assert bound[0] == pytest.approx(f_max, rel=0.25)
+        assert bound[1] == pytest.approx(sigma, rel=0.25)
+
+    def test_verdict_uses_that_bound(self) -> None:
+        found = identifiability(fit(table(beta=(0.01, 0.1)), Dahl()))
+        assert found.parameters["f_max"].fisher_std == pytest.approx(0.09, rel=0.25)
+        assert found.parameters["f_max"].profile_std == pytest.approx(0.09, rel=0.35)
+
+
+class TestInformation:
+    def test_variance_is_the_covariance_s(self) -> None:
+        optimum = fit(table(), Dahl()).optimum
+        information = Information(optimum)
+        np.testing.assert_allclose(
+            information.variance(np.eye(2)), np.diagonal(optimum.covariance), rtol=1e-12
+        )
+        both = optimum.covariance.sum()
+        assert information.variance(np.ones(2)) == pytest.approx(both, rel=1e-12)
+
+    def test_a_null_direction_is_infinite_and_what_is_orthogonal_is_not(self) -> None:
+        result = fit(table(), Dahl(), sensors=Sensors(force_gain=None), throw=False)
+        information = Information(result.optimum)
+        assert information.rank == 2
+        assert np.isinf(information.variance(np.array([1.0, 0.0, 0.0])))
+        known = fit(table(), Dahl()).optimum.covariance
+        difference = np.array([1.0, -1.0, 0.0])
+        expected = difference[:2] @ known @ difference[:2]
+        assert information.variance(difference) == pytest.approx(expected, rel=0.03)
+
+    def test_shares_sum_to_one_and_lie_where_the_knee_is(self) -> None:
+        result = fit(table(beta=(1e-3, 1e3), n=40), Dahl())
+        share = shares(result.optimum)
+        np.testing.assert_allclose(share.sum(axis=1), 1.0)
+        beta = SIGMA * np.geomspace(1e-3, 1e3, 40) * X_C / F_MAX
+        assert share[0][beta > 1.0].sum() > 0.9
+        assert share[1][beta < 1.0].sum() > 0.7
