@@ -110,7 +110,7 @@ def test_amplitude_errors_are_profiled_out() -> None:
         joint = np.empty((3, 3))
         joint[0, 0], joint[1:, 1:] = s**2, COVARIANCE[row]
         joint[0, 1:] = joint[1:, 0] = cross[row] / A[row]
-        inverse = np.linalg.inv(joint)
+        inverse: FloatArray = np.asarray(np.linalg.inv(joint), dtype=np.float64)
 
         def chi_square(error: float, row: int = row, inverse: FloatArray = inverse) -> float:
             N = Dahl(0.12, 25.0).describing_function(A[row] * np.exp(-error))

@@ -1,9 +1,8 @@
 from collections.abc import Sequence
 from typing import Any
 
-from numpy.typing import NDArray
-
 from emcee import autocorr as autocorr
+from numpy.typing import NDArray
 
 class State:
     coords: NDArray[Any]
