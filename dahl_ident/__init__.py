@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse, Record, read_frequency_response, read_record
     from dahl_ident.diagnostics import compare_models, identifiability
     from dahl_ident.elements import Dahl, Damper, LinearSystem, Mass, Model, Spring
+    from dahl_ident.extraction import extract
     from dahl_ident.problem import Problem
     from dahl_ident.reporting import report
     from dahl_ident.results import (
@@ -57,6 +58,7 @@ _ROOMS = {
     ),
     "dahl_ident.diagnostics": ("compare_models", "identifiability"),
     "dahl_ident.elements": ("Dahl", "Damper", "LinearSystem", "Mass", "Model", "Spring"),
+    "dahl_ident.extraction": ("extract",),
     "dahl_ident.problem": ("Problem",),
     "dahl_ident.reporting": ("report",),
     "dahl_ident.results": (
@@ -92,6 +94,7 @@ __all__ = [
     "closed_loop_response",
     "compare_models",
     "equivalent_plant",
+    "extract",
     "fit",
     "fit_many",
     "identifiability",

@@ -31,6 +31,7 @@ PUBLIC_NAMES = [
     "closed_loop_response",
     "compare_models",
     "equivalent_plant",
+    "extract",
     "fit",
     "fit_many",
     "identifiability",
