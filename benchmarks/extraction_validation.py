@@ -1,18 +1,20 @@
 """Whether extraction is unbiased, efficient, honest about its errors, and right about settling.
 
 Records are made from a Dahl element's exact force, with noise added to both channels, and
-extracted as a user would, frequency unknown. Run ``python -m benchmarks.extraction_validation
-[records]``: it prints a table for each study, and ends with an error if a criterion is missed.
+extracted as a user would, frequency unknown. Run ``python -m benchmarks.extraction_validation``:
+it prints a table for each study, and ends with an error if a criterion is missed.
 """
 
 from __future__ import annotations
 
+import argparse
 import math
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from scipy import stats
@@ -40,6 +42,18 @@ def one_over_f(rng: np.random.Generator, n: int) -> FloatArray:
     noise = np.fft.irfft(spectrum * np.sqrt(whole / 100.0 / line), whole)
     start = rng.integers(whole - n)
     return np.asarray(noise[start : start + n])
+
+
+NOISES = {"white": white, "1/f": one_over_f}
+PAGE = """# Extraction of records whose truth is known
+
+Made by `python -m benchmarks.extraction_validation`. `bias/se` is the mean error in its own
+standard errors, `rms/bound` the error over the Cramer-Rao bound for white noise of the same
+density at 1 Hz (harmonics under 1/f noise may lie below it), `coverage` how often the stated
+95 % region holds the truth. Levels run in descending order with 4 to 15 cycles each; `caught`
+are those whose true bias exceeds 3 standard errors, `flagged` those below 1.
+
+"""
 
 
 @dataclass(frozen=True)
@@ -219,38 +233,15 @@ def _span(data: FrequencyResponse, row: int, margin: float) -> list[float]:
     return [start - margin, end + margin]
 
 
-def main(records: int) -> bool:
-    """Print every study as a Markdown table and return whether all criteria are met."""
-    fine = True
-    print("| noise | beta | harmonic | cycles | records | bias/se | rms/bound | coverage | met |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    for name, noise in (("white", white), ("1/f", one_over_f)):
-        for i, (beta, harmonic, cycles) in enumerate(CASES):
-            a = accuracy(beta, noise, records, seed=i, harmonic=harmonic, cycles=cycles)
-            met = a.honest and (a.efficient or noise is one_over_f)
-            print(
-                f"| {name} | {beta:g} | {harmonic} | {cycles} | {a.records} | {a.bias:.2f} "
-                f"| {a.efficiency:.3f} | {100.0 * a.coverage:.1f} % | {'yes' if met else 'NO'} |",
-                flush=True,
-            )
-            fine &= met
-    print(
-        "\n| noise | settling periods | found | biased > 3 se | caught | settled | flagged | met |"
-    )
-    print("|---|---|---|---|---|---|---|---|")
-    for name, noise in (("white", white), ("1/f", one_over_f)):
-        for fixed in (True, False):
-            s = settling(records // 10, seed=2, noise=noise, fixed=fixed)
-            print(
-                f"| {name} | {'one' if fixed else 'as judged'} | {100.0 * s.found:.1f} % "
-                f"| {s.biased} | {100.0 * s.caught:.1f} % | {s.settled} "
-                f"| {100.0 * s.flagged:.1f} % | {'yes' if s.right else 'NO'} |",
-                flush=True,
-            )
-            fine &= s.right
-    return fine
-
-
+ACCURACY_HEAD = (
+    "| noise | beta | harmonic | cycles | records | bias/se | rms/bound | coverage | met |",
+    "|---|---|---|---|---|---|---|---|---|",
+)
+SETTLING_HEAD = (
+    "",
+    "| noise | settling periods | found | biased > 3 se | caught | settled | flagged | met |",
+    "|---|---|---|---|---|---|---|---|",
+)
 CASES = [
     *((beta, 1, 12) for beta in (0.3, 3.0, 30.0)),
     *((beta, 3, 12) for beta in (0.3, 3.0, 30.0)),
@@ -258,5 +249,46 @@ CASES = [
     (3.0, 1, 60),
 ]
 
+
+def studies(records: int) -> Iterator[tuple[str, bool]]:
+    """Yield the lines of the tables, each with whether its criteria are met."""
+    yield from ((line, True) for line in ACCURACY_HEAD)
+    for name, noise in NOISES.items():
+        for i, (beta, harmonic, cycles) in enumerate(CASES):
+            a = accuracy(beta, noise, records, seed=i, harmonic=harmonic, cycles=cycles)
+            met = a.honest and (a.efficient or noise is one_over_f)
+            line = (
+                f"| {name} | {beta:g} | {harmonic} | {cycles} | {a.records} | {a.bias:.2f} "
+                f"| {a.efficiency:.3f} | {100.0 * a.coverage:.1f} % | {'yes' if met else 'NO'} |"
+            )
+            yield line, met
+    yield from ((line, True) for line in SETTLING_HEAD)
+    for name, noise in NOISES.items():
+        for fixed in (True, False):
+            s = settling(records // 10, seed=2, noise=noise, fixed=fixed)
+            line = (
+                f"| {name} | {'one' if fixed else 'as judged'} | {100.0 * s.found:.1f} % "
+                f"| {s.biased} | {100.0 * s.caught:.1f} % | {s.settled} "
+                f"| {100.0 * s.flagged:.1f} % | {'yes' if s.right else 'NO'} |"
+            )
+            yield line, s.right
+
+
+def main() -> None:
+    """Print all tables, write them to a file where asked, and fail where a criterion is missed."""
+    parser = argparse.ArgumentParser(description="validate extraction on records of known truth")
+    parser.add_argument("--records", type=int, default=1500, help="records for each case")
+    parser.add_argument("--write", type=Path, help="write the tables to this Markdown file")
+    arguments = parser.parse_args()
+    lines, fine = [], True
+    for line, met in studies(arguments.records):
+        print(line, flush=True)
+        lines.append(line)
+        fine &= met
+    if arguments.write:
+        arguments.write.write_text(PAGE + "\n".join(lines) + "\n", encoding="utf-8")
+    sys.exit(0 if fine else 1)
+
+
 if __name__ == "__main__":
-    sys.exit(0 if main(int(sys.argv[1]) if len(sys.argv) > 1 else 1500) else 1)
+    main()
