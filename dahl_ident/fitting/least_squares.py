@@ -31,7 +31,7 @@ from dahl_ident.fitting.levenberg_marquardt import (
 from dahl_ident.fitting.limits import Chart, Limit, Reach, limits, valleys
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.optimum import Optimum
-from dahl_ident.fitting.start import starts
+from dahl_ident.fitting.start import edge_starts, starts
 from dahl_ident.fitting.trust_region import minimise_within
 from dahl_ident.problem import Problem, Quadratic
 
@@ -39,9 +39,11 @@ DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm
 _RESCALINGS = 100
 _SAME_SCALE = 1e-9
 _LONGEST_SECANT = 20.0
+_FIRST_LOOK, _HOPELESS = 15, 3.0  # steps at a limit, and how much higher it may then still be
 _PATIENCE = 1000  # steps where friction is so faint that each takes little
 AT_LIMIT = 1e4  # looseness: so far out, large terms cancel
 TIE, NEARLY = 1e-12, 1e-4  # relative differences of cost at which a limit wins
+SAME = 1e-5  # among limits, of which the one with fewest parameters is then taken
 
 
 def solve(
@@ -203,7 +205,12 @@ class _Search:
         return End(theta, float(minima.cost[best]), minima.hessian[best], converged)
 
     def _descend_in(
-        self, chart: Chart, begin: FloatArray, scale: float, limit: Limit | None = None
+        self,
+        chart: Chart,
+        begin: FloatArray,
+        scale: float,
+        limit: Limit | None = None,
+        steps: int = 80,
     ) -> End:
         """Return the best end of searches in a chart: at a limit, or along a valley."""
         minima = minimise(
@@ -213,6 +220,7 @@ class _Search:
             self.m,
             inside=None if limit else lambda phi, _: self.reach(chart.theta(phi)),
             looseness=1.0 if limit is None else AT_LIMIT,
+            steps=steps,
         )
         best = self._best(minima)
         phi = minima.theta[best]
@@ -238,14 +246,22 @@ class _Search:
                 end = other
         if not end.converged and self.reach(end.theta):
             end = self._descend(end.theta[None], scale, steps=_PATIENCE)
-        ends = [self._descend_in(lim.chart, begin, scale, lim) for lim in limits(self.problem)]
-        ends = [e for e in ends if e.converged]
+        edges = np.vstack([end.theta, *edge_starts(self.problem)])
+        ends = []
+        for limit in limits(self.problem):
+            there = self._descend_in(limit.chart, edges, scale, limit, _FIRST_LOOK)
+            if not there.converged and there.cost < _HOPELESS * end.cost:
+                there = self._descend_in(limit.chart, there.theta[None], scale, limit)
+            if there.converged:
+                ends.append(there)
         if not ends:
             return end
-        lowest = min(ends, key=lambda e: e.cost)
+        lowest = min(e.cost for e in ends)
+        ends = [e for e in ends if e.cost <= lowest * (1.0 + SAME)]
+        simplest = min(ends, key=lambda e: (e.determined, e.cost))
         real = end.converged and np.isfinite(self._friction_error(end, scale))
         slack = TIE if real else NEARLY
-        return lowest if lowest.cost <= end.cost * (1.0 + slack) else end
+        return simplest if simplest.cost <= end.cost * (1.0 + slack) else end
 
     def _trust_region(self, end: End, begin: FloatArray, scale: float) -> End:
         """Return the best end of scipy's bounded searches."""

@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Dahl
 from dahl_ident.errors import ValidationError
-from dahl_ident.fitting.least_squares import AT_LIMIT, DOUBTFUL, NEARLY, TIE, solve
+from dahl_ident.fitting.least_squares import AT_LIMIT, DOUBTFUL, NEARLY, SAME, TIE, solve
 from dahl_ident.fitting.levenberg_marquardt import IntArray, Minima, minimise
 from dahl_ident.fitting.limits import Chart, Limit, Reach, limits, valleys
 from dahl_ident.fitting.optimum import Optimum, OptimumBatch, inverse, spread
-from dahl_ident.fitting.start import best_starts
+from dahl_ident.fitting.start import best_starts, edge_starts
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import ProblemBatch, Quadratic
 
@@ -177,14 +177,16 @@ def _look_wider(batch: ProblemBatch, end: Minima) -> _Part:
             end = end.better(Minima(theta, found.cost, hessian, inside, found.evaluations))
     part = _finite(batch, end)
     real = end.converged & np.isfinite(_friction_error(part, batch))
-    lowest = end.cost * (1.0 + np.where(real, TIE, NEARLY))
-    for limit in limits(batch):
-        for begin in begins:
-            found = _descend(batch, begin, limit.chart, AT_LIMIT)
-            wins = np.flatnonzero(found.converged & (found.cost <= lowest))
-            if wins.size:
-                lowest[wins] = found.cost[wins]
-                part.put(wins, _at_limit(batch.take(wins), limit, wins, found.take(wins)))
+    ceiling = end.cost * (1.0 + np.where(real, TIE, NEARLY))
+    edges = [end.theta, *edge_starts(batch)]
+    for limit in sorted(limits(batch), key=lambda lim: lim.chart.matrix.shape[1]):
+        found = _descend(batch, edges[0], limit.chart, AT_LIMIT)
+        for begin in edges[1:]:
+            found = found.better(_descend(batch, begin, limit.chart, AT_LIMIT))
+        wins = np.flatnonzero(found.converged & (found.cost <= ceiling))
+        if wins.size:
+            ceiling[wins] = found.cost[wins] * (1.0 - SAME)  # for limits with more parameters
+            part.put(wins, _at_limit(batch.take(wins), limit, wins, found.take(wins)))
     return part
 
 

@@ -38,6 +38,7 @@ _LOWEST, _NODES = -3200, 6400  # of ln beta in the table, in steps
 _FINE, _COARSE = 58, 230  # steps between nodes of the grid: four a decade, one a decade
 _DECADE = np.log(10.0) / _STEP
 _ALPHAS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0)
+_DEPENDENT = 1e-12  # of a column's length that others leave
 _MOST_COMBINATIONS = 4000
 _MOST_STARTS = 4
 _AROUND = np.array([-1, 0, 1])
@@ -79,6 +80,21 @@ def best_starts(problem: Problem) -> FloatArray:
     vertex = _vertex(np.take_along_axis(cost, around, axis=-1), theta)
     vertex = np.where(best == 0, theta[:, 0], vertex)
     return np.where(best == nodes - 1, theta[:, 2], vertex)
+
+
+def edge_starts(problem: Problem) -> list[FloatArray]:
+    """Return the best nodes at both ends of each Dahl element's grid, each (P,) or (S, P).
+
+    They are where searches for limits start.
+    """
+    grid = _grid(problem)
+    cost, coefficients = grid.solved()
+    found = []
+    for index, count in enumerate(grid.shape):
+        for edge in {0, count - 1}:
+            there = np.where(grid.nodes[:, index] == edge, cost, np.inf)
+            found.append(grid.theta(coefficients, there.argmin(axis=-1)[..., None])[..., 0, :])
+    return found
 
 
 def _vertex(cost: FloatArray, theta: FloatArray) -> FloatArray:
@@ -136,18 +152,20 @@ class _Grid:
         friction = coefficients[..., len(self.columns) :]
         return np.where((friction > 0.0).all(axis=-1), cost, np.inf), coefficients
 
-    def _system(self) -> tuple[ComplexArray, list[ComplexArray]]:
-        """Return what is to be fitted and the columns to fit it with, each (..., C, n)."""
+    def _system(self) -> tuple[FloatArray, list[FloatArray], list[FloatArray]]:
+        """Return what is to be fitted, (..., C, 2 n), columns of every node, and of each."""
         target = self.target[..., None, :]
-        columns = [c[..., None, :] for c in self.columns.values()]
+        columns = []
         for index, element in enumerate(self.friction):
             chosen = self.nodes[:, index]
             column = element.curve[..., chosen, :] * self.weights[..., None, :]
             if element.is_linear:
-                columns.append(column)
+                columns.append(_parts(column))
             else:
                 target = target - element.known_sigma()[..., chosen, None] * column
-        return target, columns
+        shape = np.broadcast_shapes(target.shape, (len(self.nodes), 1))
+        common = [_parts(np.broadcast_to(c, self.target.shape)) for c in self.columns.values()]
+        return _parts(np.broadcast_to(target, shape)), common, columns
 
     def theta(self, coefficients: FloatArray, places: IntArray) -> FloatArray:
         """Return the search coordinates at some combinations of nodes, (..., k) -> (..., k, P)."""
@@ -276,26 +294,55 @@ def _solve_one(
 
 
 def _solve_linear(
-    target: ComplexArray, columns: list[ComplexArray]
+    target: FloatArray, common: list[FloatArray], own: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the least sum of |target - sum of real coefficients times columns|^2, and those."""
-    shape = np.broadcast_shapes(target.shape, *(c.shape for c in columns))
-    if not columns:
-        size = (target.real**2 + target.imag**2).sum(axis=-1)
-        return np.broadcast_to(size, shape[:-1]), np.empty((*shape[:-1], 0))
-    X = np.empty((*shape[:-1], len(columns), shape[-1]), dtype=np.complex128)
-    for index, column in enumerate(columns):
-        X[..., index, :] = column
-    X = X.view(np.float64)
-    t = np.ascontiguousarray(np.broadcast_to(target, shape)).view(np.float64)
-    norm = np.sqrt((X * X).sum(axis=-1))
-    norm[norm == 0.0] = 1.0
-    X = X / norm[..., None]
-    overlap = X @ t[..., None]
-    gram = X @ X.swapaxes(-1, -2) + 1e-13 * np.eye(len(columns))
-    scaled = np.linalg.solve(gram, overlap)
-    rest = t - (scaled.swapaxes(-1, -2) @ X)[..., 0, :]
-    return (rest * rest).sum(axis=-1), scaled[..., 0] / norm
+    """Return the least sum of squares of target - coefficients times columns, and those.
+
+    Columns in `common`, (..., 2 n), are the same at every node; they are projected out first,
+    because those in `own`, (..., C, 2 n), can be hard to tell from them.
+    """
+    Q, R = _factors(common, target)
+    rest = _projected(target, Q)
+    columns = (
+        np.stack(np.broadcast_arrays(*own), axis=-2) if own else rest[..., None, :][..., :0, :]
+    )
+    left = _projected(columns, Q[..., None, :, :])
+    norm = np.sqrt((left * left).sum(axis=-1))
+    left = left / np.where(norm > 0.0, norm, 1.0)[..., None]
+    gram = left @ left.swapaxes(-1, -2) + 1e-13 * np.eye(left.shape[-2])
+    scaled = np.linalg.solve(gram, left @ rest[..., None])
+    rest = rest - (scaled.swapaxes(-1, -2) @ left)[..., 0, :]
+    coefficients = scaled[..., 0] / np.where(norm > 0.0, norm, np.inf)
+    explained = target - (coefficients[..., None, :] @ columns)[..., 0, :]
+    base = np.linalg.solve(R[..., None, :, :], (explained @ Q)[..., None])[..., 0]
+    return (rest * rest).sum(axis=-1), np.concatenate([base, coefficients], axis=-1)
+
+
+def _factors(common: list[FloatArray], target: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return Q, (..., 2 n, L), and R of the common columns; dependent ones get no part."""
+    lead, m = target.shape[:-2], target.shape[-1]
+    X = np.zeros((*lead, m, len(common)))
+    for index, column in enumerate(common):
+        X[..., index] = column
+    size = np.sqrt((X * X).sum(axis=-2))
+    size = np.where(size > 0.0, size, 1.0)
+    Q, R = np.linalg.qr(X / size[..., None, :])
+    diagonal = np.abs(np.diagonal(R, axis1=-2, axis2=-1))
+    dependent = diagonal < _DEPENDENT
+    R = R * size[..., None, :] + np.where(dependent, size, 0.0)[..., None, :] * np.eye(len(common))
+    return np.where(dependent[..., None, :], 0.0, Q), R
+
+
+def _projected(rows: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return rows, (..., C, 2 n), less their part in the span of Q; twice, for the last digits."""
+    for _ in range(2):
+        rows = rows - (rows @ Q) @ Q.swapaxes(-1, -2)
+    return rows
+
+
+def _parts(values: ComplexArray) -> FloatArray:
+    """Return real and imaginary parts side by side in the last axis."""
+    return np.ascontiguousarray(values).view(np.float64)
 
 
 def _local_minima(cost: FloatArray) -> IntArray:

@@ -1,4 +1,7 @@
-"""Search coordinates: the logarithm of positive parameters, the number itself for the others."""
+"""Which parameters are free, and the coordinates in which they are searched for.
+
+The logarithm of positive parameters, the number itself for the others.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import FloatArray, positive_array, real_array
 from dahl_ident.elements import Dahl, Model, Parameter
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.sensors import Sensors
 
 
 class Coordinates:
@@ -84,3 +88,17 @@ def interchangeable_elements(model: Model, names: tuple[str, ...]) -> list[NDArr
         columns = [names.index(p.name) for p in element.parameters if p.free]
         alike.setdefault((None if alpha.free else alpha.value, bounds), []).append(columns)
     return [np.array(columns) for columns in alike.values() if len(columns) > 1]
+
+
+def with_changes(
+    model: Model, sensors: Sensors, free: tuple[str, ...], fixed: dict[str, float]
+) -> tuple[Model, Sensors]:
+    """Free and fix parameters by name, wherever they live."""
+    both = set(free) & set(fixed)
+    if both:
+        raise ModelError(f"{', '.join(sorted(both))} is both in free= and in fixed=; choose one")
+    sensed = {p.name for p in sensors.parameters}
+    model = model.with_free([n for n in free if n not in sensed])
+    model = model.with_fixed({n: v for n, v in fixed.items() if n not in sensed})
+    sensors = sensors.with_free([n for n in free if n in sensed])
+    return model, sensors.with_fixed({n: v for n, v in fixed.items() if n in sensed})

@@ -16,7 +16,12 @@ from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.model import as_model
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.noise import Measured, Rho, Student, bend, correct_amplitude, noise_for
-from dahl_ident.problem.coordinates import Coordinates, in_order, interchangeable_elements
+from dahl_ident.problem.coordinates import (
+    Coordinates,
+    in_order,
+    interchangeable_elements,
+    with_changes,
+)
 from dahl_ident.problem.prediction import Predictor
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import EXACT, Prior, Sensors
@@ -111,7 +116,7 @@ class Problem:
         self, model: Model, sensors: Sensors, free: tuple[str, ...], fixed: dict[str, float]
     ) -> None:
         if free or fixed:
-            model, sensors = _with_changes(model, sensors, free, fixed)
+            model, sensors = with_changes(model, sensors, free, fixed)
         self.model, self.sensors = model, sensors
         parameters = [p for p in (*model.parameters, *sensors.parameters) if p.free]
         if not parameters:
@@ -494,20 +499,6 @@ class Problem:
     def _shape(self, theta: FloatArray) -> tuple[int, ...]:
         """Return the shape of the rows' numbers for `theta`."""
         return (*theta.shape[:-1], self._rows.n)
-
-
-def _with_changes(
-    model: Model, sensors: Sensors, free: tuple[str, ...], fixed: dict[str, float]
-) -> tuple[Model, Sensors]:
-    """Free and fix parameters by name, wherever they live."""
-    both = set(free) & set(fixed)
-    if both:
-        raise ModelError(f"{', '.join(sorted(both))} is both in free= and in fixed=; choose one")
-    sensed = {p.name for p in sensors.parameters}
-    model = model.with_free([n for n in free if n not in sensed])
-    model = model.with_fixed({n: v for n, v in fixed.items() if n not in sensed})
-    sensors = sensors.with_free([n for n in free if n in sensed])
-    return model, sensors.with_fixed({n: v for n, v in fixed.items() if n in sensed})
 
 
 def _normal(name: str, prior: Prior) -> tuple[float, float]:
