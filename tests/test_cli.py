@@ -334,3 +334,13 @@ def test_completion_knows_the_commands() -> None:
     }  # fmt: skip
     done = subprocess.run([str(PROGRAM)], env=environment, capture_output=True, text=True)
     assert done.stdout.split() == ["datasets"]
+
+
+@pytest.mark.parametrize("option", ["--save", "--report"])
+def test_an_input_is_never_written_over(run: Runner, option: str) -> None:
+    assert run("datasets", "noisy", "-o", "noisy.csv").status == 0
+    before = Path("noisy.csv").read_bytes()
+    outcome = run("fit", "noisy.csv", option, "./noisy.csv")
+    assert outcome.status == 1
+    assert "noisy.csv is an input and would be overwritten" in outcome.err
+    assert Path("noisy.csv").read_bytes() == before

@@ -339,3 +339,8 @@ def test_no_warning_where_one_amplitude_exists() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         response(FIG_7, [0.0, 1.0], [[1e-6], [1e6]])
+
+
+def test_what_is_no_plant_is_named() -> None:
+    with pytest.raises(ModelError, match=r"expected a model such as Dahl\(\) .*, got str"):
+        response("plant", 1.0, 1.0)  # type: ignore[arg-type]  # the point of the test

@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import telling
-from dahl_ident.cli.files import STANDARD, with_progress, write_data, write_picture
+from dahl_ident.cli.files import (
+    STANDARD,
+    refuse_inputs,
+    with_progress,
+    write_data,
+    write_picture,
+)
 from dahl_ident.cli.groups import grouped
 from dahl_ident.cli.options import Files, General
 
@@ -20,7 +26,7 @@ _READING = "Reading"
 _EXTRACTING = "Extracting"
 Channel = Annotated[
     str | None,
-    typer.Option(help='Its column, with unit if need be: "x [mm]".', rich_help_panel=_READING),
+    typer.Option(help='Its column, with unit if need be: "x \\[mm]".', rich_help_panel=_READING),
 ]
 
 
@@ -138,6 +144,7 @@ def extract(
     """
     from dahl_ident.data import FrequencyResponse
 
+    refuse_inputs(files, output, plot)
     parts = [
         _points(file, reading, extracting, level_from_name)
         for file in with_progress(files, "extracting")

@@ -24,6 +24,24 @@ class Saved(Protocol):
         ...
 
 
+def refuse_inputs(files: Sequence[str], *outputs: str | Path | None) -> None:
+    """Refuse to write over what is being read.
+
+    Raises
+    ------
+    ValidationError
+        If an output is one of the input files.
+    """
+    from dahl_ident.errors import ValidationError
+
+    inputs = {Path(file).resolve() for file in files if file != STANDARD}
+    for output in outputs:
+        if output is not None and str(output) != STANDARD and Path(output).resolve() in inputs:
+            raise ValidationError(
+                f"{output} is an input and would be overwritten; give the output another name"
+            )
+
+
 def write_data(data: Saved, output: str) -> None:
     """Write a table or a record to a file, or as CSV to standard output."""
     if output != STANDARD:

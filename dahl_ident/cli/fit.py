@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import telling
-from dahl_ident.cli.files import write_text
+from dahl_ident.cli.files import refuse_inputs, write_text
 from dahl_ident.cli.groups import grouped
 from dahl_ident.cli.options import Files, General, ModelOptions, Reading
 
@@ -60,6 +60,7 @@ def fit(
 
     Example: dahl-ident datasets noisy -o - | dahl-ident fit -
     """
+    refuse_inputs(files, save, report)
     result = fitted(files, reading, model, estimating)
     if save is not None:
         write_text(result.to_json(), str(save))

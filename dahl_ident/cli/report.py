@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from dahl_ident.cli import telling
+from dahl_ident.cli.files import refuse_inputs
 from dahl_ident.cli.fit import Estimating, finish, fitted, typed_command
 from dahl_ident.cli.groups import grouped
 from dahl_ident.cli.options import Files, General, ModelOptions, Reading, Seed
@@ -37,6 +38,7 @@ def report(
     from dahl_ident.reporting import report as write_report
     from dahl_ident.results import FitResult, Posterior, sample
 
+    refuse_inputs(files, *output)
     saved = len(files) == 1 and files[0].endswith(".json")
     result = FitResult.load(files[0]) if saved else fitted(files, reading, model, estimating)
     told: list[FitResult | Posterior] = [result]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import telling
+from dahl_ident.cli.files import refuse_inputs
 from dahl_ident.cli.fit import typed_command
 from dahl_ident.cli.groups import grouped
 from dahl_ident.cli.options import Files, General, ModelOptions, Reading, Seed
@@ -91,6 +92,7 @@ def sample(
     """
     from dahl_ident.results import sample as sample_data
 
+    refuse_inputs(files, report)
     elements, free = model.build()
     posterior = sample_data(reading.read(files), elements, free=free, **sampling.keywords())
     if general.json:

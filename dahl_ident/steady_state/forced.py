@@ -17,6 +17,7 @@ from dahl_ident.arrays import (
     positive_array,
 )
 from dahl_ident.elements.element import Element
+from dahl_ident.elements.model import as_model
 from dahl_ident.errors import MultipleSolutionsWarning
 from dahl_ident.steady_state.plant import BoolArray, IntArray, flatten
 from dahl_ident.steady_state.roots import all_roots as find_all
@@ -130,6 +131,7 @@ def response(
     f = non_negative_array(frequency_hz, "frequency_hz")
     u0 = positive_array(drive, "drive")
     shape = broadcast_shape(frequency_hz=f, drive=u0)
+    plant = as_model(plant)
     points, _ = flatten(plant, plant.known_values(), 2.0 * np.pi * f, u0)
     roots = find_all(points)
     count = np.isfinite(roots).sum(axis=1).reshape(shape)
