@@ -14,6 +14,7 @@ or twice.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ from dahl_ident.extraction.quality import (
 )
 from dahl_ident.extraction.sine_fit import (
     FEWEST_CYCLES,
+    HARMONICS,
     SineFit,
     Stretch,
     first_cycles,
@@ -115,7 +117,7 @@ class _Phasors:
     def harmonics(self) -> list[int]:
         return [k for k in self.settings.harmonics if k <= self.fit.orders]
 
-    @property
+    @cached_property
     def integrator(self) -> complex:
         """Displacement over the motion channel at the fundamental."""
         return complex((1j * self.fit.stretch.omega) ** -self.settings.integrations)
@@ -127,11 +129,11 @@ class _Phasors:
             both[self.settings.memory_channel] += self.remembered[harmonic]
         return both
 
-    @property
+    @cached_property
     def displacement(self) -> complex:
         return complex(self.phasors(1)[0] * self.integrator)
 
-    @property
+    @cached_property
     def rounding(self) -> FloatArray:
         """Root mean square error of a phasor of the motion channel and the force by rounding."""
         return quantisation_errors(
@@ -141,7 +143,7 @@ class _Phasors:
             self.fit.stretch.time.size / self.cycles,
         )
 
-    @property
+    @cached_property
     def errors(self) -> ComplexArray:
         """Errors of the fundamental phasors of displacement and force; their products sum up."""
         scale = np.array([[self.integrator], [1.0]])
@@ -197,7 +199,7 @@ def measure(stretch: Stretch, settings: Settings, *, sweep: bool = False) -> Poi
     whole = last_cycles(stretch, cycles)
     steps = np.array([sensor_step(channel) for channel in whole.channels])
     first = first_cycles(whole, MOST_CYCLES)
-    rough = sine_fit(thinned(first), trend=sweep)
+    rough = sine_fit(thinned(first), trend=sweep, most=HARMONICS)
     _check_motion(rough, steps, settings)
     memory = _memory(rough, settings)
     _check_share(rough, _without(memory, first, settings), settings)

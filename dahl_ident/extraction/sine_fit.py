@@ -67,7 +67,7 @@ class Stretch:
         """Phase at every sample, rad."""
         return np.asarray(self.phase(self.tau))
 
-    @property
+    @cached_property
     def omega(self) -> float:
         """Angular frequency in the middle, rad/s."""
         return float(self.phase.deriv()(0.0)) / self.half_width
@@ -169,12 +169,12 @@ def resolvable_orders(stretch: Stretch) -> int:
     return orders
 
 
-def sine_fit(stretch: Stretch, *, trend: bool = False) -> SineFit:
-    """Fit harmonics, offset and drift to both channels, the phase being known.
+def sine_fit(stretch: Stretch, *, trend: bool = False, most: int = _MOST_HARMONICS) -> SineFit:
+    """Fit harmonics, at most so many, offset and drift to both channels, the phase being known.
 
     With `trend` every harmonic may also change linearly over the stretch, as in a sweep.
     """
-    orders = resolvable_orders(stretch)
+    orders = min(resolvable_orders(stretch), most)
     trending = orders if trend else 0
     theta, tau = stretch.theta, stretch.tau
     normal, right = _normal_equations(theta, tau, stretch.channels, orders, trending)
