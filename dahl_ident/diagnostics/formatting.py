@@ -34,16 +34,19 @@ def rounded(value: float, uncertainty: float | None) -> tuple[str, str]:
         return f"{value:.6g}", "?"
     if uncertainty == 0.0:
         return f"{value:.6g}", "0"
-    largest = max(abs(value), uncertainty)
-    power = math.floor(math.log10(largest))
-    exponent = power if power >= 5 or power < -3 else 0
     # rounding 0.0996 to two digits gives 0.10, so the digits follow the rounded uncertainty
     last = math.floor(math.log10(float(f"{uncertainty:.1e}"))) - 1
+    number, error = _alike((value, uncertainty), last)
+    return number, error
+
+
+def _alike(numbers: Sequence[float], last: int) -> list[str]:
+    """Return numbers with one exponent, the last digit standing for 10^last."""
+    power = math.floor(math.log10(max(abs(number) for number in numbers)))
+    exponent = power if power >= 5 or power < -3 else 0
     decimals = max(0, exponent - last)
-    texts = [f"{number / 10.0**exponent:.{decimals}f}" for number in (value, uncertainty)]
-    if exponent:
-        texts = [f"{text}e{exponent:+03d}" for text in texts]
-    return texts[0], texts[1]
+    texts = [f"{number / 10.0**exponent:.{decimals}f}" for number in numbers]
+    return [f"{text}e{exponent:+03d}" for text in texts] if exponent else texts
 
 
 def with_unit(value: float, uncertainty: float | None, unit: str) -> str:
@@ -110,12 +113,10 @@ def interval(lower: float, upper: float, unit: str) -> str:
         return f"at least {lower:.3g} {unit}".rstrip()
     if low_open:
         return f"at most {upper:.3g} {unit}".rstrip()
-    width = upper - lower
-    digits = 4
-    if width > 0.0:
-        largest = max(abs(lower), abs(upper))
-        digits = max(3, 2 + math.ceil(math.log10(largest / width)))
-    return f"{lower:.{digits}g} to {upper:.{digits}g} {unit}".rstrip()
+    if upper <= lower:
+        return f"{lower:.6g} {unit}".rstrip()
+    low, high = _alike((lower, upper), math.floor(math.log10(upper - lower)) - 1)
+    return f"{low} to {high} {unit}".rstrip()
 
 
 def table(rows: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> str:

@@ -1,0 +1,403 @@
+"""What users hold: names, reports, files and pictures of fits."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from scipy import stats
+
+import dahl_ident as di
+from dahl_ident import (
+    Dahl,
+    Damper,
+    FitResult,
+    FrequencyResponse,
+    Mass,
+    Sensors,
+    Spring,
+    fit,
+    fit_many,
+)
+from dahl_ident.arrays import FloatArray
+from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
+from dahl_ident.fitting.status import Status
+from tests.friction_tables import FRICTION, amplitudes, plant_table, table
+
+MEASURED = os.environ.get("DAHL_IDENT_MEASURED_DATA")
+
+
+@pytest.fixture(scope="module")
+def result() -> FitResult:
+    return fit(table(), Dahl())
+
+
+@pytest.fixture(scope="module")
+def plant() -> FitResult:
+    return fit(plant_table(), Dahl() + Mass() + Damper() + Spring())
+
+
+@pytest.fixture(scope="module")
+def microslip() -> FitResult:
+    return fit(table(beta=(1e-4, 1e-3)), Dahl(), throw=False)
+
+
+class TestFit:
+    def test_names_of_lmfit(self, result: FitResult) -> None:
+        f_max = result.params["f_max"]
+        assert (f_max.value, f_max.stderr) == pytest.approx((0.09976, 0.00024), rel=0.05)
+        assert (f_max.min, f_max.max, f_max.vary, f_max.unit) == (0.0, np.inf, True, "N")
+        assert not result.params["alpha"].vary
+        assert result.params["alpha"].stderr is None
+        assert result.var_names == ["f_max", "sigma"]
+        assert (result.ndata, result.nvarys, result.nfree) == (60, 2, 58)
+        assert result.covar[0, 0] == pytest.approx((f_max.stderr or 0.0) ** 2)
+        expected = result.covar[0, 1] / np.sqrt(result.covar[0, 0] * result.covar[1, 1])
+        assert result.correl["f_max"]["sigma"] == pytest.approx(expected)
+        assert result.correl["sigma"]["f_max"] == pytest.approx(expected)
+        assert result.success
+        assert result.message.startswith("Converged")
+        assert result.nfev >= 1
+        assert result.method == "scipy"
+        np.testing.assert_allclose(
+            result.best_fit, result.model.dynamic_stiffness(amplitudes(result.data)), rtol=1e-12
+        )
+
+    def test_residuals_and_their_squares(self, result: FitResult) -> None:
+        y = np.log(result.data.response / result.best_fit)
+        np.testing.assert_allclose(result.residual, y.view(np.float64), atol=1e-14)
+        assert result.chisqr == pytest.approx(np.sum(np.abs(y) ** 2))
+        assert result.redchi == pytest.approx(result.chisqr / 58.0)
+        assert result.scale == pytest.approx(np.sqrt(result.redchi))
+
+    def test_criteria_from_the_density(self, result: FitResult) -> None:
+        """ln gain and phase are normal; a density by Re and Im has the Jacobian 1/|R|^2."""
+        y = np.log(result.data.response / result.best_fit).view(np.float64)
+        s = np.sqrt(np.mean(y**2))
+        density = stats.norm(0.0, s).logpdf(y).sum() - 2.0 * np.log(result.data.gain).sum()
+        assert result.log_likelihood == pytest.approx(density)
+        assert result.aic == pytest.approx(-2.0 * density + 2.0 * 3.0)
+        assert result.bic == pytest.approx(-2.0 * density + 3.0 * np.log(60.0))
+
+    def test_free_fixed_and_start(self) -> None:
+        data = table()
+        freed = fit(data, Dahl(0.1, 30.0), free=["f_max"], fixed={"sigma": 29.0})
+        assert freed.var_names == ["f_max"]
+        assert freed.params["sigma"].value == 29.0
+        assert freed.params["f_max"].init_value == 0.1
+        started = fit(data, Dahl(), start={"f_max": 0.3})
+        assert started.params["f_max"].value == pytest.approx(
+            fit(data, Dahl()).params["f_max"].value
+        )
+
+    def test_no_optimum_is_raised_with_what_was_found(self) -> None:
+        tables = (table(beta=(1e-4, 1e-3), seed=seed) for seed in range(10))
+        data = next(d for d in tables if not fit(d, Dahl(), throw=False).success)
+        with pytest.raises(FitError, match="f_max grows without bound at constant sigma") as caught:
+            fit(data, Dahl())
+        assert caught.value.result.status is Status.NO_LOSS
+        assert caught.value.result.combinations[0].expression == "sigma"
+
+    def test_ipopt_finds_the_same(self, result: FitResult) -> None:
+        other = fit(result.data, Dahl(), method="ipopt")
+        assert other.method == "ipopt"
+        for name in result.var_names:
+            assert other.params[name].value == pytest.approx(result.params[name].value, rel=1e-7)
+
+    def test_constraints_leave_first_order_intervals(self) -> None:
+        def tie(p: Mapping[str, Any]) -> list[Any]:
+            return [p["sigma"] == 290.0 * p["f_max"]]
+
+        tied = fit(table(), Dahl(), method="ipopt", constraints=tie)
+        ratio = tied.params["sigma"].value / tied.params["f_max"].value
+        assert ratio == pytest.approx(290.0, rel=1e-8)
+        found = tied.conf_interval("profile")
+        assert found.method == "wald"
+        assert "constraints" in found.note
+        again = FitResult.from_json(tied.to_json())
+        assert again.conf_interval().note == found.note
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"method": "newton"}, "method is 'newton'; expected scipy or ipopt"),
+            ({"constraints": list}, "constraints and drive_std need method='ipopt'"),
+            ({"loss": "cubic"}, "loss is 'cubic'"),
+            ({"noise": "white"}, "noise is 'white'"),
+        ],
+    )
+    def test_unknown_options(self, options: dict[str, object], message: str) -> None:
+        with pytest.raises(ValidationError, match=message):
+            fit(table(), Dahl(), **options)  # type: ignore[arg-type]  # wrong on purpose
+
+    def test_nothing_free(self) -> None:
+        with pytest.raises(ModelError, match="no free parameter"):
+            fit(table(), FRICTION)
+
+
+class TestMany:
+    def test_is_each_fit(self) -> None:
+        tables = [table(seed=s) for s in range(4)] + [table(beta=(1e-4, 1e-3), seed=5)]
+        many = fit_many(tables, Dahl())
+        assert len(many) == 5
+        for i, one in enumerate(many):
+            alone = fit(tables[i], Dahl(), throw=False)
+            assert one.status is alone.status is many.status[i]
+            np.testing.assert_allclose(one.optimum.values, alone.optimum.values, rtol=1e-6)
+            np.testing.assert_allclose(many.values[i], alone.optimum.values, rtol=1e-6)
+        np.testing.assert_array_equal(many.success, [s.found_optimum for s in many.status])
+        assert many[0].data is tables[0]
+        assert [r.data for r in many[1:3]] == tables[1:3]
+
+    def test_frame_and_text(self) -> None:
+        many = fit_many([table(seed=s) for s in range(3)], Dahl())
+        frame = many.to_frame()
+        assert list(frame) == ["f_max", "f_max_stderr", "sigma", "sigma_stderr", "scale", "status"]
+        np.testing.assert_array_equal(frame["sigma"], many.values[:, 1])
+        np.testing.assert_array_equal(frame["sigma_stderr"], many.stderr[:, 1])
+        assert repr(many) == "<FitBatch: 3 tables, free f_max, sigma; 3 converged>"
+
+    def test_tables_must_agree(self) -> None:
+        with pytest.raises(DataError, match="table 1 has 8 rows"):
+            fit_many([table(), table(n=8)], Dahl())
+
+
+class TestReport:
+    def test_verdict_comes_first(self, result: FitResult) -> None:
+        text = result.fit_report()
+        assert text.splitlines()[0] == "Verdict"
+        assert "To be trusted. Every parameter is identified." in text.splitlines()[1]
+        assert str(result) == text
+        for section in ("Parameters", "Derived", "Noise", "Goodness of fit", "Solver"):
+            assert f"\n{section}\n" in text
+        assert "95.45 % (profile)" in text
+        assert "0.09976  0.00024  N     0.09927 to 0.10026  identified" in text
+        assert "estimated with 58 degrees of freedom" in text
+        assert "constant variance of (ln gain, phase)" in text
+
+    def test_other_intervals(self, result: FitResult) -> None:
+        assert "90 % (wald)" in result.fit_report("wald", 0.9)
+        assert "95.45 % (bootstrap)" in result.fit_report("bootstrap")
+
+    def test_what_is_not_to_be_trusted_says_why(self, microslip: FitResult) -> None:
+        assert not microslip.trusted
+        assert microslip.verdict.startswith("NOT to be trusted.")
+        assert "Only sigma is determined; not f_max." in microslip.verdict
+        assert "drive above that" in microslip.verdict
+        assert "at least" in microslip.fit_report()
+
+    def test_a_wrong_model_is_compared_with_others(self) -> None:
+        wrong = fit(table(model=FRICTION + Spring(1.0)), Dahl())
+        assert not wrong.trusted
+        text = wrong.fit_report()
+        assert "these data are not linear Dahl" in text
+        assert "Other models, compared and not claimed" in text
+        assert "spring added would be plainly better" in text
+
+    def test_correlations_of_a_plant(self, plant: FitResult) -> None:
+        text = plant.fit_report()
+        assert "sigma, mass: +0." in text
+        assert "warning: the displacement's third harmonic" in text
+        assert plant.trusted
+
+    def test_priors_losses_and_units_are_told(self) -> None:
+        sensors = Sensors(force_gain=stats.norm(1.0, 0.005))
+        told = fit(table(), Dahl(), sensors=sensors).fit_report()
+        assert "prior of force_gain: 1 +- 0.005" in told
+        assert "robust loss: huber" in fit(table(), Dahl(), loss="huber").fit_report()
+        absolute = fit(table(), Dahl(), noise="absolute").fit_report()
+        assert "N/m, estimated with" in absolute
+        data = table()
+        turned = FrequencyResponse(
+            data.frequency_hz, data.response, data.amplitude, motion="rotation"
+        )
+        assert "N m/rad" in fit(turned, Dahl()).fit_report()
+
+    def test_html_is_escaped_and_has_the_same_words(self, result: FitResult) -> None:
+        page = result._repr_html_()
+        assert page.startswith("<div><h4>Verdict</h4><pre>To be trusted.")
+        assert page.count("<h4>") == page.count("</h4>") == page.count("<pre>")
+
+    def test_repr_is_one_line(self, result: FitResult) -> None:
+        assert repr(result) == (
+            "<FitResult: f_max = 0.09976 +- 0.00024 N, sigma = 30.023 +- 0.066 N/m; converged>"
+        )
+
+    def test_frame(self, result: FitResult) -> None:
+        frame = result.to_frame()
+        assert list(frame.index) == ["f_max", "sigma", "alpha"]
+        assert frame.loc["sigma", "value"] == result.params["sigma"].value
+        assert frame.loc["sigma", "lower"] == result.conf_interval()["sigma"][1].lower
+        assert np.isnan(frame.loc["alpha", "lower"])
+
+
+class TestStorage:
+    def check_same(self, one: FitResult, other: FitResult) -> None:
+        np.testing.assert_array_equal(one.optimum.theta, other.optimum.theta)
+        np.testing.assert_array_equal(one.optimum.values, other.optimum.values)
+        np.testing.assert_array_equal(one.optimum.covariance, other.optimum.covariance)
+        assert one.status is other.status
+        assert one.combinations == other.combinations
+        assert one.to_json() == other.to_json()
+        assert one.fit_report() == other.fit_report()
+
+    def test_round_trip(self, result: FitResult, plant: FitResult, microslip: FitResult) -> None:
+        for one in (result, plant, microslip):
+            self.check_same(one, FitResult.from_json(one.to_json()))
+
+    def test_everything_a_table_can_hold(self, tmp_path: Path) -> None:
+        data = table(n=9)
+        A = amplitudes(data)
+        C = (0.01 * data.gain)[:, None, None] ** 2 * np.array([[1.0, 0.2], [0.2, 1.0]])
+        full = FrequencyResponse(
+            data.frequency_hz,
+            data.response,
+            A,
+            A * data.gain,
+            covariance=C,
+            dof=[np.inf, *[6.0] * 8],
+            amplitude_std=1e-3 * A,
+            amplitude_covariance=np.zeros((9, 2)),
+            level=["low"] * 9,
+            quality={"settled": np.array([True] * 9)},
+            provenance={"file": "a.csv", "size": np.int64(3), "path": Path("a")},
+        )
+        sensors = Sensors(force_gain=stats.norm(1.0, 0.005), delay=1e-5)
+        one = fit(full, Dahl(alpha=None) + Spring(0.0), sensors=sensors, throw=False)
+        one.save(tmp_path / "fit.json")
+        self.check_same(one, FitResult.load(tmp_path / "fit.json"))
+        back = FitResult.load(tmp_path / "fit.json").data
+        assert back.provenance == {"file": "a.csv", "size": 3, "path": "a"}
+        np.testing.assert_array_equal(back.dof, full.dof)
+        assert back.levels == ["low"]
+
+    def test_is_strict_json_with_a_schema(self, microslip: FitResult) -> None:
+        content = json.loads(microslip.to_json(), parse_constant=lambda name: pytest.fail(name))
+        assert (content["schema"], content["schema_version"]) == ("dahl_ident.fit_result", 1)
+        assert content["model"][0] == {
+            "kind": "dahl",
+            "f_max": "free",
+            "sigma": "free",
+            "alpha": 1.0,
+        }
+
+    def test_a_file_of_the_first_version_loads(self) -> None:
+        """Written by version 0.1.0 and kept: it has to load for ever."""
+        stored = FitResult.load(Path(__file__).parent / "fit_version_1.json")
+        assert stored.params["f_max"].value == pytest.approx(0.10028228058572991, rel=1e-9)
+        assert stored.trusted
+
+    def test_what_is_no_fit(self, result: FitResult, tmp_path: Path) -> None:
+        content = json.loads(result.to_json())
+        with pytest.raises(DataError, match="is no JSON"):
+            FitResult.from_json("{")
+        with pytest.raises(DataError, match="has the schema None"):
+            FitResult.from_json("[]")
+        with pytest.raises(DataError, match="schema version 2; this version of dahl_ident reads 1"):
+            FitResult.from_json(json.dumps({**content, "schema_version": 2}))
+        del content["optimum"]["theta"]
+        (tmp_path / "cut.json").write_text(json.dumps(content))
+        with pytest.raises(DataError, match=r"cut.json says .* lacks or garbles 'theta'"):
+            FitResult.load(tmp_path / "cut.json")
+
+    def test_priors_that_no_file_can_hold(self) -> None:
+        result = fit(table(), Dahl())
+        sensors = Sensors(force_gain=stats.uniform(0.9, 0.2))
+        odd = replace(result.optimum, problem=di.Problem(table(), Dahl(), sensors=sensors))
+        with pytest.raises(DataError, match="prior of kind uniform"):
+            FitResult(odd).to_json()
+
+
+def xy(line: Line2D) -> FloatArray:
+    """Return what a line shows, shape (2, n)."""
+    return np.array([line.get_xdata(), line.get_ydata()], dtype=np.float64)
+
+
+def lines(axis: Axes, points: int) -> list[Line2D]:
+    """Return the lines of so many points."""
+    return [line for line in axis.lines if xy(line).shape[1] == points]
+
+
+class TestPictures:
+    @pytest.fixture(autouse=True)
+    def _close(self) -> Iterator[None]:
+        yield
+        plt.close("all")
+
+    def test_over_amplitude_with_a_band(self, result: FitResult) -> None:
+        top, bottom = result.plot_fit()
+        (line,) = lines(top, 200)
+        band = result.predict(1.0, amplitude=xy(line)[0])
+        np.testing.assert_allclose(xy(line)[1], np.abs(band.response))
+        assert len(top.collections) >= 2  # the band, and the error bars
+        assert bottom.get_ylabel() == "phase [degrees]"
+
+    def test_over_frequency_by_levels(self, plant: FitResult) -> None:
+        top, _ = plant.plot_fit()
+        points = lines(top, 12)
+        curves = lines(top, 200)
+        assert len(points) == len(curves) == 5
+        part = plant.data.select(level=plant.data.levels[2])
+        np.testing.assert_allclose(xy(points[2])[1], part.gain)
+        ends = xy(curves[2])[1][[0, -1]]
+        predicted = np.abs(plant.best_fit[24:36])[[0, -1]]
+        np.testing.assert_allclose(ends, predicted, rtol=1e-9)
+
+    def test_residuals_in_standard_deviations(self, result: FitResult) -> None:
+        axis = result.plot_residuals()
+        (gain,) = (x for x in axis.lines if x.get_label() == "ln gain")
+        np.testing.assert_allclose(xy(gain)[1], result.residual[0::2] / result.scale)
+
+    def test_draw_where_they_are_told(self, result: FitResult) -> None:
+        figure, axes = plt.subplots(3)
+        assert result.plot_fit(axes[:2])[0] is axes[0]
+        drawn = result.plot_residuals(axes[2])
+        assert isinstance(drawn, Axes)
+        assert drawn.figure is figure
+
+    def test_suspicious_points_are_ringed(self) -> None:
+        data = table()
+        R = data.response.copy()
+        R[7] *= 1.2
+        axis = fit(replace(data, response=R), Dahl()).plot_residuals()
+        rings = [x for x in axis.lines if x.get_markerfacecolor() == "none"]
+        assert len(rings) == 2
+
+    def test_measured_errors_become_error_bars(self) -> None:
+        data = table()
+        C = (0.02 * data.gain)[:, None, None] ** 2 * np.eye(2)
+        top, _ = fit(replace(data, covariance=C), Dahl()).plot_fit()
+        segments = top.collections[-1].get_segments()  # type: ignore[attr-defined]  # error bars
+        heights = [np.ptp(s[:, 1]) for s in segments]
+        np.testing.assert_allclose(heights, 0.04 * data.gain, rtol=1e-6)
+
+
+@pytest.mark.skipif(MEASURED is None, reason="the folder of the measured data is not named")
+class TestMeasured:
+    def test_beam_with_a_bolted_joint(self, tmp_path: Path) -> None:
+        """One mode and one joint: microslip, and more in the joint than a Dahl element."""
+        from tests.test_readers_measured import BRAKE_REUSS
+
+        (tmp_path / "columns.toml").write_text(BRAKE_REUSS)
+        path = Path(MEASURED or "") / "brb" / "ForcedFrequencyResponses.mat"
+        data = di.read_frequency_response(path, columns=tmp_path / "columns.toml")
+        driven = data.select(level=[label for label in data.levels if "Force" in label])
+        found = fit(driven, Dahl() + Mass() + Damper() + Spring(), throw=False)
+        assert not found.trusted
+        assert "f_max" in found.identifiability.named(di.diagnostics.Verdict.NOT_IDENTIFIED)
+        (kappa,) = (c for c in found.identifiability.combinations if "^2" in c.expression)
+        assert kappa.expression == "sigma^2/f_max"
+        modal = kappa.value / found.params["mass"].value
+        assert 3.0e7 < kappa.value < 5.0e7
+        assert modal > 0.0
+        assert "sigma^2/f_max" in found.verdict
+        assert "The model does not describe these data" in found.verdict
