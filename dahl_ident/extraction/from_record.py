@@ -75,9 +75,10 @@ def extract(
         ``settled``
             Whether the bias left by friction's memory is within a standard error.
         ``bias_real``, ``bias_imag``
-            That bias as estimated, in the response's unit; it is not subtracted.
+            That bias as estimated, in the response's unit; it is not subtracted. In a sweep
+            with half of what the response changes in a cycle, a bound of how far it lags.
         ``more_periods``
-            Settling periods that are missing.
+            Settling periods that are missing at least; 0 in a sweep that is too fast.
         ``num_periods``, ``settling_periods``
             Periods of the stretch, and how many leading ones were left out.
         ``covariance_from``
@@ -106,9 +107,13 @@ def extract(
 
     Notes
     -----
-    The sine fit is that of IEEE Std 1057 with harmonics. The uncertainty of a record's
-    `drive_factor` is common to all points and not part of their covariance. A hum during rests
-    that is a clean sine in both channels is taken for a level; give `frequency` then.
+    The sine fit is that of IEEE Std 1057 with harmonics. Its covariance is taken from what does
+    not repeat between the harmonics, plus rounding to sensor steps where no noise dithers it;
+    it holds for white and for 1/f noise. The uncertainty of a record's `drive_factor` is common
+    to all points and not part of it. Harmonics above half the sampling rate fold onto lower
+    ones, alike in every cycle, so that no scatter shows it: sample hundreds of times a cycle, or
+    filter before sampling. A hum during rests that is a clean sine in both channels is taken for
+    a level; give `frequency` then.
 
     Examples
     --------
