@@ -36,6 +36,7 @@ IntArray = NDArray[np.intp]
 _STEP = 0.01
 _LOWEST, _NODES = -3200, 6400  # of ln beta in the table, in steps
 _FINE, _COARSE = 58, 230  # steps between nodes of the grid: four a decade, one a decade
+_FINE_ENDS = (6, 4)  # coarse nodes at either end
 _DECADE = np.log(10.0) / _STEP
 _ALPHAS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0)
 _DEPENDENT = 1e-12  # of a column's length that others leave
@@ -53,8 +54,11 @@ def starts(problem: Problem) -> FloatArray:
     grid = _grid(problem)
     cost, coefficients = grid.solved()
     places = _local_minima(cost.reshape(grid.shape))[:_MOST_STARTS]
-    best = grid.theta(coefficients, places)
     first = places[0]
+    if grid.shape == cost.shape and first in (0, len(cost) - 1):
+        nearer = _FINE_ENDS[0] if first == 0 else len(cost) - 1 - _FINE_ENDS[1]
+        places = np.append(places, nearer)  # an optimum far out may be kept from there by bounds
+    best = grid.theta(coefficients, places)
     if grid.shape == cost.shape and 0 < first < len(cost) - 1:
         around = first + _AROUND
         best[0] = _vertex(cost[around], grid.theta(coefficients, around))
