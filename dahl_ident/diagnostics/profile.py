@@ -22,9 +22,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.bracket import BoolArray, Bracket, IntArray
 from dahl_ident.elements import Dahl, LinearSystem, Parameter, Spring
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.levenberg_marquardt import minimise
@@ -33,30 +33,16 @@ from dahl_ident.fitting.losses import loss_named
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Quadratic
 
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
-
-_STEPS = 60
-_SEARCH_STEPS = 40
+_STEPS = 60  # of the searches for limits, all together
+_SEARCH_STEPS = 40  # of a constrained search
 _LOOSENESS = 1e5  # a search this loose still gives the deviance, flat at its minimum, to 1e-6
-_NEAR = 1e-3  # in the root of the deviance; one more Newton step needs no solution
 _LONGEST = 3.0  # step of a logarithm
-_GROWTH, _SHRINKAGE = 3.0, 0.3  # of a step over the last, until the limit is bracketed
-_NARROW = 1e-4  # width of a bracket over its distance
 _FARTHEST = 1e6  # conditional standard errors of a parameter that is no logarithm
 _LEAST_X_C = 1e-14  # over the smallest amplitude
 _MOST_X_C, _MOST_X_C_BESIDE = 1e8, 1e5  # over the largest, alone and beside a spring
 _SOFTEST, _STIFFEST = 1e-12, 1e6  # sigma over the median stiffness
-_FARTHEST_LOG = 80.0
+_FARTHEST_LOG = 80.0  # of a logarithm, from the optimum
 _FARTHEST_RATIO = 4.0  # of the logarithm of a pure number: an exponent or a gain
-
-
-@dataclass(frozen=True)
-class Profile:
-    """The deviance of one parameter over its search coordinate."""
-
-    coordinate: FloatArray
-    deviance: FloatArray
 
 
 class Profiler:
@@ -91,55 +77,33 @@ class Profiler:
 
     def _ends(self, index: IntArray, sign: FloatArray, target: FloatArray) -> FloatArray:
         """Return where the profile of parameter `index` meets `target` on the side of `sign`."""
-        rows, S = np.arange(len(index)), len(index)
-        theta = np.tile(self._optimum.theta, (S, 1))
-        origin = theta[rows, index]
-        step = self._first_step[index] * target
-        tangent = self._tangents[index]
-        inner, outer, end = np.zeros(S), np.full(S, np.inf), np.full(S, np.nan)
-        furthest = np.where(sign > 0.0, self._high[index] - origin, origin - self._low[index])
-        jump = self._jump(index, sign)
-        jumps = np.isfinite(jump)
-        position = np.minimum(np.where(jumps, jump, step), furthest)  # distance from the optimum
-        step = np.where(jumps, np.abs(origin + sign * position), step)
-        active, entered = rows, np.zeros(S, dtype=np.bool_)
+        theta = np.tile(self._optimum.theta, (len(index), 1))
+        tangent, origin = self._tangents[index], self._optimum.theta[index]
+        entered = np.zeros(len(index), dtype=np.bool_)
+        bracket = self._bracket(index, sign, target)
         for _ in range(_STEPS):
-            a = active
-            moved = sign[a] * position[a] + origin[a] - theta[a, index[a]]
+            a = bracket.active
+            moved = sign[a] * bracket.position[a] + origin[a] - theta[a, index[a]]
             at = self._from_best_start(index[a], theta[a], self._along(tangent[a], moved))
             root = np.sqrt(np.maximum(at.deviance, 0.0))
-            below = root < target[a]
-            inner[a[below]] = position[a[below]]
-            outer[a[~below]] = position[a[~below]]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                newton = (target[a] - root) * root / (sign[a] * at.slope)
-            stuck = below & (position[a] >= furthest[a])
-            reached = self._reachable(at.theta, index[a], position[a])
+            reached = self._reachable(at.theta, index[a], bracket.position[a])
             entered[a] |= reached
-            open_ = below & (stuck | (entered[a] & ~reached))
-            near = (np.abs(root - target[a]) < _NEAR) & np.isfinite(newton)
-            with np.errstate(invalid="ignore"):
-                near |= np.isfinite(outer[a]) & (outer[a] - inner[a] <= _NARROW * outer[a])
-            newton = np.where(np.isfinite(newton), newton, np.inf)
-            last = np.where(np.abs(newton) < step[a], position[a] + newton, position[a])
-            end[a[near]] = last[near]
-            end[a[open_ & ~near]] = np.where(stuck, furthest[a], np.inf)[open_ & ~near]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                slope = sign[a] * at.slope / root
+            below = bracket.narrow(root, slope, entered[a] & ~reached)
             theta[a[below]], tangent[a[below]] = at.theta[below], at.tangent[below]
-            keep = ~(near | open_)
-            active = a[keep]
-            if not active.size:
+            if not bracket.active.size:
                 break
-            position[active], step[active] = self._next(
-                position[active],
-                newton[keep],
-                np.where(below[keep], step[active], np.inf),
-                inner[active],
-                outer[active],
-                furthest[active],
-                self._logarithmic[index[active]],
-            )
-        end[active] = outer[active]  # not met exactly: the wider limit
-        return np.asarray(origin + sign * end)
+        return np.asarray(origin + sign * bracket.give_up())
+
+    def _bracket(self, index: IntArray, sign: FloatArray, target: FloatArray) -> Bracket:
+        origin = self._optimum.theta[index]
+        furthest = np.where(sign > 0.0, self._high[index] - origin, origin - self._low[index])
+        step, jump = self._first_step[index] * target, self._jump(index, sign)
+        jumps = np.isfinite(jump)
+        first = np.where(jumps, jump, step)
+        step = np.where(jumps, np.abs(origin + sign * jump), step)
+        return Bracket(target, first, step, furthest, self._logarithmic[index])
 
     def _from_best_start(self, index: IntArray, theta: FloatArray, change: FloatArray) -> _Solution:
         """Return constrained optima near theta + change, also from along microslip's valleys."""
@@ -160,29 +124,6 @@ class Profiler:
         change = moved[:, None] * tangent
         short = np.clip(change, -_LONGEST, _LONGEST)
         return np.where(self._logarithmic & (change != moved[:, None]), short, change)
-
-    @staticmethod
-    def _next(
-        position: FloatArray,
-        newton: FloatArray,
-        step: FloatArray,
-        inner: FloatArray,
-        outer: FloatArray,
-        furthest: FloatArray,
-        logarithmic: BoolArray,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the next distance from the optimum, inside what is known, and the step there."""
-        shortest = np.where(np.isfinite(outer), 0.0, _SHRINKAGE * step)
-        longest = np.where(logarithmic, np.minimum(_LONGEST, _GROWTH * step), _GROWTH * step)
-        new = position + np.clip(np.where(newton > 0.0, newton, np.inf), shortest, longest)
-        backward = position + newton  # where the last step went too far
-        new = np.where(position >= outer, backward, new)
-        bounded = np.isfinite(outer)
-        width = np.where(bounded, outer - inner, 1.0)
-        outside = bounded & ~((new > inner + 0.02 * width) & (new < outer - 0.02 * width))
-        new = np.where(outside, inner + 0.5 * width, new)
-        new = np.minimum(new, furthest)
-        return new, np.maximum(np.abs(new - position), 1e-300)
 
     # Constrained problems
 
