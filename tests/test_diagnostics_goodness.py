@@ -190,6 +190,15 @@ class TestOutliers:
         assert point.row == 4
         assert point.deviation == pytest.approx(expected, rel=1e-9)
 
+    def test_robust_fits_list_them_too(self) -> None:
+        data = table()
+        R = data.response.copy()
+        R[7] *= 1.1
+        found = judge(replace(data, response=R), loss="huber")
+        assert [point.row for point in found.suspicious] == [7]
+        assert "Suspicious rows: 7; look at them" in found.headline
+        assert judge(data, loss="huber").suspicious == ()
+
     def test_none_where_too_few_points(self) -> None:
         assert judge(table(n=3)).suspicious == ()
 

@@ -20,7 +20,7 @@ from scipy import special
 
 from dahl_ident.arrays import ComplexArray
 from dahl_ident.diagnostics.flags import flagged_rows
-from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.outliers import SuspiciousPoint, suspicious_points
 from dahl_ident.diagnostics.physics import physical_warnings
 from dahl_ident.diagnostics.residual_space import ResidualSpace
@@ -31,6 +31,7 @@ from dahl_ident.problem import Problem
 
 _FALSE_ALARM = 1e-3
 _HINT = 0.05
+_MOST_ROWS = 5
 
 
 @dataclass(frozen=True)
@@ -181,7 +182,18 @@ class Goodness:
         if flaws:
             return flaws.strip()
         text = f"The residuals look like noise ({misfit})"
-        return f"{text}, with a hint that {_joined(self.hints)}." if self.hints else f"{text}."
+        hint = f", with a hint that {_joined(self.hints)}" if self.hints else ""
+        return f"{text}{hint}.{self._apart}"
+
+    @property
+    def _apart(self) -> str:
+        """Suspicious points as a sentence."""
+        if not self.suspicious:
+            return ""
+        rows = listed([str(point.row) for point in self.suspicious[:_MOST_ROWS]])
+        more = len(self.suspicious) - _MOST_ROWS
+        rest = f" and {more} more" if more > 0 else ""
+        return f" Suspicious rows: {rows}{rest}; look at them; a robust loss bears such rows."
 
     @property
     def details(self) -> list[str]:

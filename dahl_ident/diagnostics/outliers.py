@@ -3,8 +3,9 @@
 A point is tested by letting it have a response of its own (the mean-shift test): how much of the
 sum of squares goes away with its two residuals, leverage included, against what noise would do.
 The most deviant point is set aside and the others are judged without it, so that one outlier does
-not hide another; up to a tenth of the points are set aside this way. The level is 1 % for the
-whole table, divided by the number of points.
+not hide another; up to a tenth of the points are set aside this way. A robust fit is not bent by
+outliers, so its residuals are judged as they are. The level is 1 % for the whole table, divided
+by the number of points.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import special
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.residual_space import ResidualSpace
@@ -58,20 +60,8 @@ class SuspiciousPoint:
 
 def suspicious_points(optimum: Optimum, space: ResidualSpace) -> tuple[SuspiciousPoint, ...]:
     """Return the points that stand apart, the most deviant first."""
-    data = optimum.problem.data
-    rows: list[int] = []
-    found: list[tuple[int, float, float]] = []
-    accepted = 0
-    for _ in range(max(1, int(_SHARE * data.n))):
-        step = _most_deviant(optimum, space, rows)
-        if step is None:
-            break
-        row, squares, p = step
-        rows.append(row)
-        found.append((row, float(np.sqrt(squares)), p))
-        if p < _LEVEL:
-            accepted = len(found)
-    amplitude = optimum.problem.stiffness_data.amplitude
+    found = _beyond_noise(optimum) if optimum.loss != "linear" else _standing_apart(optimum, space)
+    data, amplitude = optimum.problem.data, optimum.problem.stiffness_data.amplitude
     return tuple(
         SuspiciousPoint(
             row,
@@ -81,8 +71,36 @@ def suspicious_points(optimum: Optimum, space: ResidualSpace) -> tuple[Suspiciou
             deviation,
             p,
         )
-        for row, deviation, p in found[:accepted]
+        for row, deviation, p in found
     )
+
+
+def _standing_apart(optimum: Optimum, space: ResidualSpace) -> list[tuple[int, float, float]]:
+    """Return row, deviation and p-value of points found one after the other."""
+    rows: list[int] = []
+    found: list[tuple[int, float, float]] = []
+    accepted = 0
+    for _ in range(max(1, int(_SHARE * optimum.problem.data.n))):
+        step = _most_deviant(optimum, space, rows)
+        if step is None:
+            break
+        row, squares, p = step
+        rows.append(row)
+        found.append((row, float(np.sqrt(squares)), p))
+        if p < _LEVEL:
+            accepted = len(found)
+    return found[:accepted]
+
+
+def _beyond_noise(optimum: Optimum) -> list[tuple[int, float, float]]:
+    """Return the same for a robust fit, which no outlier has bent: whatever noise cannot reach."""
+    m, dof = optimum.problem.n_residuals, max(optimum.dof, 1)
+    y, _ = optimum.problem.residuals_and_jacobian(optimum.theta, optimum.scale, tails=False)
+    squares = y[:m:2] ** 2 + y[1:m:2] ** 2
+    tail = special.chdtrc(2, squares) if optimum.scale_known else special.fdtrc(2, dof, squares / 2)
+    p = np.minimum(1.0, squares.size * tail)
+    order = np.argsort(-squares)
+    return [(int(i), float(np.sqrt(squares[i])), float(p[i])) for i in order if p[i] < _LEVEL]
 
 
 def _most_deviant(
