@@ -20,7 +20,7 @@ from scipy import special
 
 from dahl_ident.arrays import ComplexArray
 from dahl_ident.diagnostics.flags import flagged_rows
-from dahl_ident.diagnostics.formatting import listed, with_unit
+from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.outliers import SuspiciousPoint, suspicious_points
 from dahl_ident.diagnostics.physics import physical_warnings
 from dahl_ident.diagnostics.residual_space import ResidualSpace
@@ -31,7 +31,6 @@ from dahl_ident.problem import Problem
 
 _FALSE_ALARM = 1e-3
 _HINT = 0.05
-_MOST_ROWS = 5
 
 
 @dataclass(frozen=True)
@@ -167,33 +166,32 @@ class Goodness:
 
     @property
     def headline(self) -> str:
-        """The verdict in one sentence."""
+        """The verdict in a few sentences."""
+        return " ".join(filter(None, (self._flaws, self._fit, self._apart)))
+
+    @property
+    def _fit(self) -> str:
         misfit = f"{100.0 * self.rms_misfit:.2g} % rms misfit"
-        flaws = ""
-        if self.flagged:
-            shown = "; ".join(self.flagged[:3]) + ("; ..." if len(self.flagged) > 3 else "")
-            flaws = (
-                f"The extraction flagged {len(self.flagged)} of the points fitted ({shown}): "
-                "measure them again, or select the good ones. "
-            )
         if self.objections:
-            objected = _joined(self.objections)
-            return f"{flaws}The model does not describe these data ({misfit}): {objected}."
-        if flaws:
-            return flaws.strip()
-        text = f"The residuals look like noise ({misfit})"
+            return f"The model does not describe these data ({misfit}): {_joined(self.objections)}."
         hint = f", with a hint that {_joined(self.hints)}" if self.hints else ""
-        return f"{text}{hint}.{self._apart}"
+        return f"The residuals look like noise ({misfit}){hint}."
+
+    @property
+    def _flaws(self) -> str:
+        if not self.flagged:
+            return ""
+        return (
+            f"The extraction flagged {len(self.flagged)} of the points fitted "
+            f"({_joined(self.flagged, 3)}): measure them again, or select the good ones."
+        )
 
     @property
     def _apart(self) -> str:
-        """Suspicious points as a sentence."""
         if not self.suspicious:
             return ""
-        rows = listed([str(point.row) for point in self.suspicious[:_MOST_ROWS]])
-        more = len(self.suspicious) - _MOST_ROWS
-        rest = f" and {more} more" if more > 0 else ""
-        return f" Suspicious rows: {rows}{rest}; look at them; a robust loss bears such rows."
+        rows = _joined([str(point.row) for point in self.suspicious], 5, ", ")
+        return f"Suspicious rows: {rows}; look at them (a robust loss bears such rows)."
 
     @property
     def details(self) -> list[str]:
@@ -286,5 +284,7 @@ def _third_harmonic(optimum: Optimum, space: ResidualSpace) -> ThirdHarmonic | N
     return ThirdHarmonic(1.0 + ratio, error, space.p_value(np.array([own, 1j * own])))
 
 
-def _joined(parts: Sequence[str]) -> str:
-    return "; ".join(parts)
+def _joined(parts: Sequence[str], most: int = 100, separator: str = "; ") -> str:
+    """Return parts as one text, no more than so many of them."""
+    more = ["..."] if len(parts) > most else []
+    return separator.join([*parts[:most], *more])
