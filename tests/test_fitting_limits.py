@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Problem, Spring
+from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Problem, Sensors, Spring
 from dahl_ident.arrays import ComplexArray
 from dahl_ident.elements import Element
 from dahl_ident.errors import FitError
@@ -145,6 +145,16 @@ def test_limits_hold_for_driven_plants(friction: ComplexArray, status: Status) -
     assert found.status is status
     np.testing.assert_allclose(found.values[2:4], [0.3, 0.24], rtol=0.05)
     assert np.isfinite(list(found.stderr.values())[2:4]).all()
+
+
+def test_an_unknown_displacement_gain_is_no_limit() -> None:
+    N = Dahl(0.1, 30.0).describing_function(np.geomspace(1e-4, 1e-1, n)) * np.exp(0.01 * ERROR)
+    data = FrequencyResponse(np.ones(n), N, np.geomspace(1e-4, 1e-1, n))
+    found = solve(Problem(data, Dahl(), sensors=Sensors(displacement_gain=None)))
+    assert found.status is Status.SINGULAR
+    assert found.values[0] == pytest.approx(0.1, rel=0.02)
+    assert np.isfinite(found.stderr["f_max"])
+    assert np.isinf(found.stderr["sigma"])
 
 
 def test_limits_agree_with_dense_scans() -> None:

@@ -165,7 +165,12 @@ def valleys(problem: Problem) -> list[Chart]:
 
 
 def limits(problem: Problem) -> list[Limit]:
-    """Return the limits of every Dahl element of which f_max or sigma is free."""
+    """Return the limits of every Dahl element of which f_max or sigma is free.
+
+    None where an unknown displacement gain could undo any distance from the amplitudes.
+    """
+    if "displacement_gain" in problem.names and "displacement_gain" not in problem.priors:
+        return []
     view = problem.stiffness_data
     low, high = np.log(view.amplitude.min(axis=-1)), np.log(view.amplitude.max(axis=-1))
     least = np.log(np.median(np.abs(view.stiffness), axis=-1) * _NO_FRICTION)

@@ -68,7 +68,8 @@ def starts(problem: Problem) -> FloatArray:
     given = [
         v if p.value is None else p.value for p, v in zip(problem.parameters, values, strict=True)
     ]
-    return np.vstack([best, problem.to_search(given)])
+    extra = problem.to_search(given)
+    return best if np.allclose(extra, best[0], rtol=1e-12) else np.vstack([best, extra])
 
 
 def best_starts(problem: Problem) -> FloatArray:
