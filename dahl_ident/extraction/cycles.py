@@ -171,9 +171,16 @@ def _lobe_spacing(beyond: NDArray[np.intp], above: NDArray[np.bool_]) -> NDArray
 def _crossings(
     time: FloatArray, moved: FloatArray, before: NDArray[np.intp], after: NDArray[np.intp]
 ) -> FloatArray:
-    """Return where the straight lines between samples before and after cross zero."""
-    share = moved[before] / (moved[before] - moved[after])
-    return np.asarray(time[before] + share * (time[after] - time[before]))
+    """Return where zero is crossed between samples before and after.
+
+    Noise may cross it several times: the middle of the first and the last crossing.
+    """
+    upward = np.flatnonzero((moved[:-1] < 0.0) & (moved[1:] >= 0.0))
+    first = upward[np.searchsorted(upward, before)]
+    last = upward[np.searchsorted(upward, after) - 1]
+    at = np.array([first, last])
+    share = moved[at] / (moved[at] - moved[at + 1])
+    return np.asarray(np.mean(time[at] + share * (time[at + 1] - time[at]), axis=0))
 
 
 def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray, turns: int = 1) -> Cycles:
