@@ -83,8 +83,8 @@ def test_every_move_alone_leaves_a_distribution_as_it_is(proposal: Proposal) -> 
     chain = sampler.get_chain()
     thin = int(np.ceil(4.0 * autocorrelation_time(chain).max()))  # the test wants independence
     draws = chain[::thin].reshape(-1, 2)
-    assert stats.kstest(draws[:, 0], target.cdf).pvalue > 0.01
-    assert stats.kstest(draws[:, 1] - 0.3 * draws[:, 0], "norm").pvalue > 0.01
+    assert stats.kstest(draws[:, 0], target.cdf).pvalue > 1e-3
+    assert stats.kstest(draws[:, 1] - 0.3 * draws[:, 0], "norm").pvalue > 1e-3
 
 
 def test_checks_come_after_fixed_numbers_of_steps() -> None:
@@ -128,8 +128,9 @@ def test_priors_alone_are_recovered_without_likelihood() -> None:
     assert posterior.names == ("f_max", "sigma")
     thin = int(np.ceil(4.0 * posterior.get_autocorr_time().max()))
     draws = posterior.get_chain(discard=posterior.warm_up, thin=thin, flat=True)
-    assert stats.kstest(draws[:, 0], f_max.cdf).pvalue > 0.01
-    assert stats.kstest(np.log10(draws[:, 1] / 5.0), "uniform").pvalue > 0.01
+    # other versions draw other numbers from the seed: a bound that chance rarely crosses
+    assert stats.kstest(draws[:, 0], f_max.cdf).pvalue > 1e-4
+    assert stats.kstest(np.log10(draws[:, 1] / 5.0), "uniform").pvalue > 1e-4
 
 
 def test_the_posterior_moves_with_its_data() -> None:

@@ -20,6 +20,7 @@ pytestmark = pytest.mark.skipif(
     reason="DAHL_IDENT_MEASURED_DATA does not name the folder of the measured data",
 )
 FOLDER = Path(MEASURED or "")
+FILES = sorted((FOLDER / "brfd").glob("*.csv"))
 
 # An acceleration's amplitude with a displacement's phase, as the file's own README says.
 BRAKE_REUSS = """
@@ -105,7 +106,7 @@ class TestBrakeReussBeam:
 
 
 class TestFrictionDamper:
-    @pytest.mark.parametrize("path", sorted((FOLDER / "brfd").glob("*.csv")), ids=lambda p: p.stem)
+    @pytest.mark.parametrize("path", FILES, ids=[file.stem for file in FILES])
     def test_every_file_is_a_record(self, path: Path) -> None:
         record = read_record(path, displacement="displacement", force="friction force")
         raw = np.loadtxt(path, delimiter=",", skiprows=1)
