@@ -7,7 +7,11 @@ as text. After a wanted change:
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -247,3 +251,23 @@ def test_the_house_style_stays_in_its_figures() -> None:
     plots.plot_residuals(A, A, A)
     assert dict(mpl.rcParams) == before
     plt.close("all")
+
+
+def test_a_notebook_stays_interactive_after_the_first_picture(tmp_path: Path) -> None:
+    backend = tmp_path / "notebook_like.py"
+    backend.write_text(
+        "import matplotlib\n"
+        "from matplotlib.backends.backend_agg import *\n"
+        "matplotlib.interactive(True)\n"
+    )
+    code = (
+        "import matplotlib; from dahl_ident.plots import plot_loops, plot_corner;"
+        "import numpy as np;"
+        "{draw}; assert 'notebook_like' in matplotlib.get_backend();"
+        "assert matplotlib.is_interactive()"
+    )
+    environment = os.environ | {
+        "MPLBACKEND": "module://notebook_like", "PYTHONPATH": str(tmp_path)
+    }  # fmt: skip
+    for draw in ("plot_loops([([0, 1], [0, 1], 'a')])", "plot_corner(['a'], np.eye(9)[:, :1])"):
+        subprocess.run([sys.executable, "-c", code.format(draw=draw)], check=True, env=environment)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib as mpl
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
@@ -57,9 +55,8 @@ def plot_corner(
     p = values.shape[1]
     logs = _logarithmic(values, log)
     if ax is None:
-        with mpl.rc_context(style.RC):
-            side = 1.2 + 1.5 * p
-            _, grid = plt.subplots(p, p, figsize=(side, side), squeeze=False, layout="constrained")
+        side = 1.2 + 1.5 * p
+        grid = style.new_axes(p, p, size=(side, side), sharex=False)
     else:
         grid = np.asarray(ax, dtype=object)
         if grid.shape != (p, p):
@@ -131,12 +128,7 @@ def plot_trace(
     p = values.shape[2]
     logs = _logarithmic(values.reshape(-1, p), log)
     if ax is None:
-        with mpl.rc_context(style.RC):
-            _, rows = plt.subplots(
-                p, 1, figsize=(5.4, 1.0 + 1.3 * p), sharex=True, squeeze=False,
-                layout="constrained",
-            )  # fmt: skip
-        rows = rows[:, 0]
+        rows = style.new_axes(p, 1, size=(5.4, 1.0 + 1.3 * p), sharex=True)[:, 0]
     else:
         rows = np.ravel(np.asarray(ax, dtype=object))
     shown = values[:, :: max(1, values.shape[1] // 32)]

@@ -7,13 +7,14 @@ tells them apart. Levels, which have an order, take a sequential map.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError
@@ -45,13 +46,22 @@ RC: dict[Any, Any] = {
 }
 
 
+def new_axes(rows: int, columns: int, *, size: tuple[float, float], sharex: bool) -> NDArray[Any]:
+    """Return the axes, shape (rows, columns), of a new figure in the house style.
+
+    The figure is made outside the style's context: the first figure of a session loads the
+    backend, and what that sets (a notebook shows figures only while interactive) has to stay.
+    """
+    figure = plt.figure(figsize=size, layout="constrained")
+    with mpl.rc_context(RC):
+        return np.asarray(figure.subplots(rows, columns, sharex=sharex, squeeze=False))
+
+
 def axes(ax: Axes | None, *, size: tuple[float, float] = (4.6, 3.4)) -> Axes:
     """Return `ax`, or the one axes of a new figure in the house style."""
     if ax is not None:
         return ax
-    with mpl.rc_context(RC):
-        _, new = plt.subplots(figsize=size, layout="constrained")
-    return new
+    return cast("Axes", new_axes(1, 1, size=size, sharex=False)[0, 0])
 
 
 def axes_pair(
@@ -59,9 +69,8 @@ def axes_pair(
 ) -> tuple[Axes, Axes]:
     """Return the two given axes, or two new ones, one above the other, that share x."""
     if ax is None:
-        with mpl.rc_context(RC):
-            _, new = plt.subplots(2, 1, figsize=size, sharex=True, layout="constrained")
-        return new[0], new[1]
+        top, bottom = new_axes(2, 1, size=size, sharex=True)[:, 0]
+        return top, bottom
     pair = np.ravel(np.asarray(ax, dtype=object))
     if pair.size != 2:
         raise ValidationError(f"ax holds {pair.size} axes; expected two, for gain and phase")
