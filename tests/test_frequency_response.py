@@ -448,9 +448,17 @@ class TestTables:
 
         monkeypatch.setattr(Path, "replace", broken)
         with pytest.raises(KeyboardInterrupt):
-            full_table(5).save(path)
+            full_table(5).save(path, overwrite=True)
         assert path.read_bytes() == before
         assert list(tmp_path.iterdir()) == [path]
+
+    def test_a_file_is_replaced_on_request_only(self, tmp_path: Path) -> None:
+        path = full_table().save(tmp_path / "t.csv")
+        before = path.read_bytes()
+        with pytest.raises(DataError, match=r"there is such a file already.*overwrite=True"):
+            full_table(5).save(path)
+        assert path.read_bytes() == before
+        assert full_table(5).save(path, overwrite=True).read_bytes() != before
 
 
 class TestControl:

@@ -460,13 +460,15 @@ class FrequencyResponse:
         origin = (data.provenance or {}).get("origin")
         return data if origin is None else replace(data, provenance=origin)
 
-    def save(self, path: str | Path) -> Path:
+    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the table to a file that :func:`~dahl_ident.read_frequency_response` reads.
 
         Parameters
         ----------
         path : path
             Ending in ``.csv``, ``.csv.gz``, ``.tsv``, ``.parquet``, ``.h5`` or ``.hdf5``.
+        overwrite : bool, default False
+            Replace a file that is there already.
 
         Returns
         -------
@@ -478,7 +480,7 @@ class FrequencyResponse:
         ValidationError
             If the ending is another one.
         DataError
-            If the place cannot be written to.
+            If a file is there already, or the place cannot be written to.
 
         Examples
         --------
@@ -489,7 +491,7 @@ class FrequencyResponse:
         """
         from dahl_ident.data.storage import save_frame
 
-        return save_frame(self.to_frame(), path)
+        return save_frame(self.to_frame(), path, overwrite=overwrite)
 
     def to_control(self) -> dict[Any, Any]:
         """Return one python-control frequency response for each level.

@@ -219,13 +219,15 @@ class Record:
 
         return record_frame(self)
 
-    def save(self, path: str | Path) -> Path:
+    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the samples to a file that :func:`~dahl_ident.read_record` reads.
 
         Parameters
         ----------
         path : path
             Ending in ``.csv``, ``.csv.gz``, ``.tsv``, ``.parquet``, ``.h5`` or ``.hdf5``.
+        overwrite : bool, default False
+            Replace a file that is there already.
 
         Returns
         -------
@@ -237,7 +239,7 @@ class Record:
         ValidationError
             If the ending is another one.
         DataError
-            If the place cannot be written to.
+            If a file is there already, or the place cannot be written to.
 
         Examples
         --------
@@ -248,7 +250,7 @@ class Record:
         """
         from dahl_ident.data.storage import save_frame
 
-        return save_frame(self.to_frame(), path)
+        return save_frame(self.to_frame(), path, overwrite=overwrite)
 
 
 def _rebuild(arguments: dict[str, Any]) -> Record:

@@ -1,7 +1,7 @@
 """Tables to files and nothing lost: CSV, TSV, Parquet and HDF5.
 
 Files are written beside their place under another name and moved there when complete, so that
-an interrupted run leaves no half table.
+an interrupted run leaves no half table. What was there before is replaced on request only.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 METADATA_MARK = "dahl_ident:"
 
 
-def save_frame(frame: pd.DataFrame, path: str | Path) -> Path:
+def save_frame(frame: pd.DataFrame, path: str | Path, *, overwrite: bool = False) -> Path:
     """Write a table in the format of the path's extension.
 
     Raises
@@ -33,7 +33,7 @@ def save_frame(frame: pd.DataFrame, path: str | Path) -> Path:
     ValidationError
         If the extension is none that is written.
     DataError
-        If the place cannot be written to.
+        If a file is there already and `overwrite` is not set, or the place cannot be written to.
     """
     place = Path(path)
     packed = place.suffix.lower() == ".gz"
@@ -44,18 +44,36 @@ def save_frame(frame: pd.DataFrame, path: str | Path) -> Path:
             f"{place.suffix or 'no extension'!r}"
         )
     content = _WRITERS[suffix](frame)
-    write_whole(place, gzip.compress(content, mtime=0) if packed else content)
+    packing = gzip.compress(content, mtime=0) if packed else content
+    write_whole(place, packing, overwrite=overwrite)
     return place
 
 
-def write_whole(path: Path, content: bytes) -> None:
+def refuse_existing(path: Path) -> None:
+    """Refuse to replace a file.
+
+    Raises
+    ------
+    DataError
+        If there is one.
+    """
+    if path.exists():
+        raise DataError(
+            f"{path}: there is such a file already; give another name, or replace it with "
+            "overwrite=True (on the command line --force)"
+        )
+
+
+def write_whole(path: Path, content: bytes, *, overwrite: bool = False) -> None:
     """Write a file so that it is there whole or not at all.
 
     Raises
     ------
     DataError
-        If the place cannot be written to.
+        If a file is there already and `overwrite` is not set, or the place cannot be written to.
     """
+    if not overwrite:
+        refuse_existing(path)
     # not a file of tempfile, which nobody else may read
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
+from dahl_ident.data.storage import write_whole
 from dahl_ident.diagnostics.bands import (
     DerivedQuantity,
     ResponseBand,
@@ -353,9 +354,33 @@ class FitResult(FitNumbers):
         optimum, first_order = storage.from_json(text)
         return cls(optimum, first_order=first_order)
 
-    def save(self, path: str | Path) -> None:
-        """Write the fit to a JSON file."""
-        Path(path).write_text(self.to_json(), encoding="utf-8")
+    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
+        """Write the fit to a file that :meth:`load` reads.
+
+        Parameters
+        ----------
+        path : path
+            Ending in ``.json``.
+        overwrite : bool, default False
+            Replace a file that is there already.
+
+        Returns
+        -------
+        Path
+            The file, complete; an interrupted run leaves none.
+
+        Raises
+        ------
+        ValidationError
+            If the ending is another one.
+        DataError
+            If a file is there already, or the place cannot be written to.
+        """
+        place = Path(path)
+        if place.suffix.lower() != ".json":
+            raise ValidationError(f"{place}: fits are saved as .json; got {place.suffix!r}")
+        write_whole(place, self.to_json().encode(), overwrite=overwrite)
+        return place
 
     @classmethod
     def load(cls, path: str | Path) -> FitResult:

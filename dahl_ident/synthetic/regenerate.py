@@ -31,7 +31,7 @@ def write(one: DataSet, directory: Path) -> None:
     data = make(one)
     provenance = dict(data.provenance or {})
     bare = replace(data, provenance={"dataset": one.name})
-    file = bare.save(directory / one.file)
+    file = bare.save(directory / one.file, overwrite=True)
     sidecar: dict[str, Any] = {
         "name": one.name,
         "kind": one.kind,
