@@ -10,7 +10,8 @@ from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Problem, Sensors, 
 from dahl_ident.arrays import ComplexArray
 from dahl_ident.elements import Element
 from dahl_ident.errors import FitError
-from dahl_ident.fitting import Optimum, Status, solve
+from dahl_ident.fitting import Optimum, Status, solve, solve_many
+from dahl_ident.problem import ProblemBatch
 from tests.random_problems import friction_and_spring
 
 n = 24
@@ -166,3 +167,20 @@ def test_limits_agree_with_dense_scans() -> None:
         assert found.cost <= least_cost * (1.0 + 1e-4)
         assert found.status.at_infinity == at_edge
     assert named >= {Status.CONVERGED, Status.MICROSLIP, Status.GROSS_SLIP, Status.NO_FRICTION}
+
+
+def test_a_given_f_max_far_beyond_the_data_leaves_sigma_to_be_found_beside_a_spring() -> None:
+    """Only sigma^2/f_max and sigma + stiffness show: a bent valley, as with f_max free."""
+    f, amplitude = np.tile(np.geomspace(0.5, 2.0, 15), 3), np.repeat([1e-6, 3e-6, 1e-5], 15)
+    truth = np.array([1e6, 2.0, 1.0, -9.9e5])
+    plant = Dahl(1e5, truth[0]) + Mass(truth[1]) + Damper(truth[2]) + Spring(truth[3])
+    rng = np.random.default_rng(3)
+    error = 1e-3 * (rng.normal(size=45) + 1j * rng.normal(size=45))
+    Z = plant.dynamic_stiffness(amplitude, 2.0 * np.pi * f) * np.exp(error)
+    data, free = FrequencyResponse(f, Z, amplitude), Dahl(1e5) + Mass() + Damper() + Spring()
+    found = solve(Problem(data, free))
+    assert found.status is Status.CONVERGED
+    off = np.abs(found.values - truth) / np.sqrt(np.diagonal(found.values_covariance))
+    assert (off < 3.0).all()
+    together = solve_many(ProblemBatch([data, data], free))
+    np.testing.assert_allclose(together.cost, found.cost, rtol=1e-9)

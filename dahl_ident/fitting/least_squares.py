@@ -28,7 +28,7 @@ from dahl_ident.fitting.levenberg_marquardt import (
     gauss_newton,
     minimise,
 )
-from dahl_ident.fitting.limits import Chart, Limit, Reach, limits, valleys
+from dahl_ident.fitting.limits import Chart, Limit, Reach, limits, stiffness_valleys, valleys
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.fitting.start import edge_starts, starts
@@ -240,7 +240,7 @@ class _Search:
     def _look_wider(self, end: End, begin: FloatArray, scale: float) -> End:
         """Return the best of `end`, the ends of microslip's valleys, and the limits."""
         begin = np.vstack([end.theta, begin])
-        for chart in valleys(self.problem):
+        for chart in (*valleys(self.problem), *stiffness_valleys(self.problem)):
             other = self._descend_in(chart, begin, scale)
             if other.cost < end.cost or (other.converged and not end.converged):
                 end = other

@@ -21,7 +21,8 @@ digits or more (three for no full slip). If the sum of squares there is no highe
 finite optimum, the limit is the optimum, and phi gives what is determined, with its covariance.
 
 In microslip beside a free spring the way to the optimum is a long bent valley even where it is
-finite. The chart (kappa, x_c, sigma + stiffness) straightens it.
+finite. The chart (kappa, x_c, sigma + stiffness) straightens it; where f_max is given, the chart
+(sigma, sigma + stiffness).
 """
 
 from __future__ import annotations
@@ -159,9 +160,23 @@ def valleys(problem: Problem) -> list[Chart]:
         matrix = np.eye(len(problem.parameters))
         matrix[sigma, f_max] = 1.0  # ln sigma = ln kappa + ln x_c
         matrix[f_max, f_max], matrix[f_max, sigma] = 2.0, 1.0
-        back = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-        charts.append(Chart(matrix, np.zeros(len(matrix)), back, (spring, sigma)))
+        charts.append(_straightened(matrix, spring, sigma))
     return charts
+
+
+def stiffness_valleys(problem: Problem) -> list[Chart]:
+    """Return the same for elements of which sigma alone is free: ln sigma, sigma + stiffness."""
+    return [
+        _straightened(np.eye(len(problem.parameters)), *map(problem.names.index, (spring, s.name)))
+        for f, s, _ in (e.parameters for e in problem.model.elements if isinstance(e, Dahl))
+        if s.free and not f.free
+        for spring in _free_springs(problem)
+    ]
+
+
+def _straightened(matrix: FloatArray, spring: int, sigma: int) -> Chart:
+    back = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    return Chart(matrix, np.zeros(len(matrix)), back, (spring, sigma))
 
 
 def limits(problem: Problem) -> list[Limit]:

@@ -18,7 +18,7 @@ from dahl_ident.elements import Dahl
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting.least_squares import AT_LIMIT, DOUBTFUL, NEARLY, SAME, TIE, solve
 from dahl_ident.fitting.levenberg_marquardt import IntArray, Minima, minimise
-from dahl_ident.fitting.limits import Chart, Limit, Reach, limits, valleys
+from dahl_ident.fitting.limits import Chart, Limit, Reach, limits, stiffness_valleys, valleys
 from dahl_ident.fitting.optimum import Optimum, OptimumBatch, inverse, spread
 from dahl_ident.fitting.start import best_starts, edge_starts
 from dahl_ident.fitting.status import Status
@@ -168,7 +168,7 @@ def _look_wider(batch: ProblemBatch, end: Minima) -> _Part:
     """Return the best of the ends found, of the valleys' and of the limits."""
     begins = [end.theta, best_starts(batch)]
     end = end.better(_descend(batch, begins[1]))
-    for chart in valleys(batch):
+    for chart in (*valleys(batch), *stiffness_valleys(batch)):
         for begin in begins:
             found = _descend(batch, begin, chart)
             theta = chart.theta(found.theta)
