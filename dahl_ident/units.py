@@ -82,6 +82,8 @@ _SPELLINGS = {
     "Nmm": "N*mm",
     "Ns": "N*s",
     "Nms": "N*m*s",
+    "mil": "thou",
+    "mils": "thou",
 }
 _TOKEN = re.compile(r"[A-Za-zµμ°%Ω_]\w*|\b1\b|(?<![\d(])\^-?\d(?!\d)|[*/() ]")
 _LONGEST = 60

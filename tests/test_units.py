@@ -35,6 +35,8 @@ POUND_FORCE = 0.45359237 * 9.80665  # international avoirdupois pound, standard 
         ("µm", 1e-6),
         ("μm", 1e-6),
         ("in", 0.0254),
+        ("mil", 25.4e-6),
+        ("mils", 25.4e-6),
         ("in/s", 0.0254),
         ("lbf", POUND_FORCE),
         ("kip", 1000 * POUND_FORCE),
@@ -145,6 +147,10 @@ def test_any_text_is_a_unit_or_a_unit_error(text: str) -> None:
 def test_any_combination_of_symbols_ends(parts: list[str]) -> None:
     with contextlib.suppress(UnitError):
         assert isinstance(parse_unit("".join(parts)), Unit)
+
+
+def test_a_mil_is_a_length_and_no_angle() -> None:
+    assert kind_of(parse_unit("mils pp"), ("displacement",), "x")[1] == "translation"
 
 
 @pytest.mark.parametrize("kind", SI_UNITS)
