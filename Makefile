@@ -8,7 +8,7 @@ BIN    := $(VENV)/bin
 JOBS   ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint types rooms unit test-lowest docs bench lock clean
+.PHONY: help install demo test lint types rooms unit test-lowest docs bench validation lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -51,6 +51,10 @@ docs: install  ## the manual into docs/_build/html; any warning fails
 
 bench: install  ## timings side by side with the peers
 	$(BIN)/python -m benchmarks
+
+# Stated errors against records and tables whose truth is known; each page says what was met.
+validation: install  ## long statistical checks, written into docs/validation
+	$(BIN)/python -m benchmarks.extraction_validation --write docs/validation/extraction.md
 
 lock: install  ## renew the pinned environment from pyproject.toml
 	$(BIN)/uv pip compile --quiet --no-emit-index-url --no-emit-find-links --upgrade \

@@ -224,7 +224,7 @@ def fundamental(time: FloatArray, samples: FloatArray, frequency: float) -> comp
     basis = np.vstack(
         [np.ones_like(theta), time - time.mean(), np.cos(k * theta), np.sin(k * theta)]
     )
-    fitted = np.linalg.lstsq(basis.T, samples, rcond=None)[0]
+    fitted = np.linalg.solve(basis @ basis.T, basis @ samples)
     return complex(fitted[2] - 1j * fitted[42])
 
 

@@ -102,7 +102,8 @@ def estimate_memory(
     drifting = fit.residual[channel] + fit.coefficients[1, channel] * fit.stretch.tau
     few = thinned(replace(fit.stretch, channels=drifting[None]))
     basis = columns(few.theta, few.tau, _orders(few))
-    steady = np.linalg.qr(np.delete(basis, 1, axis=0).T)[0]
+    steady = np.delete(basis, 1, axis=0)
+    steady = np.linalg.solve(np.linalg.cholesky(steady @ steady.T), steady)  # orthonormal
     path = _path(few.theta + displacement_phase)
     start = float(_path(fit.stretch.theta[:1] + displacement_phase)[0])
 
@@ -111,13 +112,13 @@ def estimate_memory(
     centre = np.log(_friction_rate(response))
     for _ in range(_REFINEMENTS):
         decays = np.exp(-0.25 * rates[:, None] * (path - start))
-        decays -= (decays @ steady) @ steady.T
+        decays -= decays @ steady.T @ steady
         power = np.einsum("ij,ij->i", decays, decays)
         sizes = decays @ few.channels[0] / power
         gain = sizes**2 * power
         best = int(np.argmax(gain))
         left = few.channels[0] - sizes[best] * decays[best]
-        variance = slow.variance(left - steady @ (steady.T @ left), decays[best])
+        variance = slow.variance(left - steady.T @ (steady @ left), decays[best])
         i = int(np.argmin(((np.log(rates) - centre) / _RATE_SPREAD) ** 2 - gain / variance))
         departure, std, rate = sizes[i], np.sqrt(variance / power[i]), rates[i]
         rates = np.geomspace(rates[max(i - 1, 0)], rates[min(i + 1, rates.size - 1)], 11)
