@@ -23,7 +23,7 @@ $(VENV)/.installed: pyproject.toml requirements/dev.txt
 install: $(VENV)/.installed  ## the pinned environment in .venv
 
 demo: install  ## the whole chain on shipped data
-	$(BIN)/dahl-ident demo
+	$(BIN)/dahl-ident demo --overwrite
 
 test: lint types rooms unit  ## every check that a change must pass
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import dahl_ident as di
 from dahl_ident.cli import main
@@ -270,7 +271,7 @@ def test_an_interrupt_leaves_the_old_file_whole(tmp_path: Path) -> None:
     command = [
         str(PROGRAM), "simulate", "--f-max", "0.1", "--sigma", "30", "--mass", "0.3", "--damping",
         "0.2", "--stiffness", "0.3", "--record", "--controlled", "force", "--levels", levels,
-        "--settling-periods", "400", "-o", str(target),
+        "--settling-periods", "400", "-o", str(target), "--overwrite",
     ]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     time.sleep(3.0)
@@ -336,6 +337,41 @@ def test_completion_knows_the_commands() -> None:
     assert done.stdout.split() == ["datasets"]
 
 
+WRITING = {
+    "datasets": ("noisy", "-o", "there.csv"),
+    "simulate": ("--f-max", "0.1", "--sigma", "30", "-o", "there.csv"),
+    "extract": ("-", "--plot", "there.png"),
+    "fit": ("-", "--save", "there.json"),
+    "report": ("-", "-o", "new.json", "-o", "there.html"),
+    "sample": ("-", "--steps", "20", "--report", "there.json"),
+    "demo": ("-o", "."),
+}
+
+
+@pytest.mark.parametrize("command", WRITING)
+def test_what_is_there_is_replaced_on_request_only(run: Runner, command: str) -> None:
+    there = {"demo": "levels.csv"}.get(command) or next(
+        word for word in WRITING[command] if word.startswith("there")
+    )
+    Path(there).write_text("mine", encoding="utf-8")
+    outcome = run(command, *WRITING[command])
+    assert (outcome.status, outcome.out) == (1, "")
+    assert f"error: {there}: there is such a file already" in outcome.err
+    assert "--overwrite" in outcome.err
+    assert [p.name for p in Path().iterdir()] == [there]
+    assert Path(there).read_text(encoding="utf-8") == "mine"
+
+
+def test_overwrite_replaces(run: Runner) -> None:
+    Path("noisy.csv").write_text("mine", encoding="utf-8")
+    assert run("datasets", "noisy", "-o", "noisy.csv", "--overwrite").status == 0
+    assert di.read_frequency_response("noisy.csv").n > 10
+    for _ in range(2):
+        ended = run("fit", "noisy.csv", "--save", "f.json", "--report", "r.md", "--overwrite")
+        assert ended.status == 0, ended.err
+    assert di.FitResult.load("f.json").trusted
+
+
 @pytest.mark.parametrize("option", ["--save", "--report"])
 def test_an_input_is_never_written_over(run: Runner, option: str) -> None:
     assert run("datasets", "noisy", "-o", "noisy.csv").status == 0
@@ -344,3 +380,82 @@ def test_an_input_is_never_written_over(run: Runner, option: str) -> None:
     assert outcome.status == 1
     assert "noisy.csv is an input and would be overwritten" in outcome.err
     assert Path("noisy.csv").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("fit", "-", "--save", "fit.txt"), "fit.txt: a fit is written as .json; got '.txt'"),
+        (("fit", "-", "--report", "r.docx"), "r.docx: a report is written as .html, .pdf"),
+        (("sample", "-", "--report", "r"), "r: a report is written as"),
+        (("report", "-", "-o", "-", "--json"), "more than one thing wants standard output"),
+        (("report", "-", "-o", "-", "-o", "-"), "more than one thing wants standard output"),
+        (("fit", "-", "--start", "f_max=much"), "start of f_max is 'much'; expected a number"),
+        (("fit", "-", "--delay", "soon"), "delay is 'soon'; expected a number"),
+        (("fit", "-", "--force-gain", "nrm(1,2)"), "expected a distribution of scipy.stats"),
+        (("fit", "-", "--force-gain", "norm(1,a)"), "which are no arguments of norm"),
+        (("fit", "-", "--force-gain", "norm(1,0)"), "has no finite mean or no width"),
+        (("fit", "-", "--method", "simplex"), "method is 'simplex'; expected scipy or ipopt"),
+    ],
+)
+def test_bad_options_are_refused_before_anything_is_written(
+    run: Runner, arguments: tuple[str, ...], message: str
+) -> None:
+    outcome = run(*arguments, stdin=run("datasets", "noisy", "-o", "-").out)
+    assert (outcome.status, outcome.out) == (1, "")
+    assert message in outcome.err
+    assert list(Path().iterdir()) == []
+
+
+def test_a_report_goes_to_standard_output(run: Runner) -> None:
+    table = run("datasets", "noisy", "-o", "-").out
+    for arguments in (("report", "-", "-o", "-"), ("fit", "-", "--report", "-")):
+        out = run(*arguments, stdin=table).out
+        assert out.startswith("<!doctype html>")
+        assert out.rstrip().endswith("</html>")
+    assert list(Path().iterdir()) == []
+
+
+def test_both_solvers_find_the_same_optimum(run: Runner) -> None:
+    table = run("datasets", "noisy", "-o", "-").out
+    one, two = (
+        json.loads(run("fit", "-", "--json", *extra, stdin=table).out)["params"]
+        for extra in ((), ("--method", "ipopt", "--start", "f_max=0.2"))
+    )
+    for name in ("f_max", "sigma"):
+        assert two[name]["value"] == pytest.approx(one[name]["value"], rel=1e-7)
+
+
+def test_sensors_are_fixed_free_or_have_a_prior(run: Runner) -> None:
+    Path("noisy.csv").write_text(run("datasets", "noisy", "-o", "-").out, encoding="utf-8")
+    Path("lab.toml").write_text('force_gain = "norm(1, 0.05)"\ndelay = 1e-4\n', encoding="utf-8")
+    params = json.loads(run("fit", "noisy.csv", "--json", "--config", "lab.toml").out)["params"]
+    sensors = di.Sensors(force_gain=stats.norm(1, 0.05), delay=1e-4)
+    fit = di.fit(di.read_frequency_response("noisy.csv"), di.Dahl(), sensors=sensors)
+    for name in ("f_max", "sigma", "force_gain", "delay"):
+        assert params[name]["value"] == fit.params[name].value
+        assert params[name]["stderr"] == fit.params[name].stderr
+    assert params["force_gain"]["vary"]
+    outcome = run("fit", "noisy.csv", "--force-gain", "free")
+    assert outcome.status == 3
+    assert "give force_gain a prior" in outcome.out
+
+
+def test_priors_come_from_a_calibration_sheet(run: Runner) -> None:
+    table = run("datasets", "noisy", "-o", "-").out
+    Path("lab.toml").write_text(
+        "[sample]\nsteps = 30\n[sample.prior]\nf_max = [0.01, 1]\n"
+        'sigma = "lognorm(s=0.1, scale=30)"\n',
+        encoding="utf-8",
+    )
+    told = json.loads(run("sample", "-", "--json", "--config", "lab.toml", stdin=table).out)
+    assert told["priors"]["f_max"].startswith("log-uniform from 0.01 to 1 N")
+    assert told["priors"]["sigma"].startswith("lognorm, mean 30.15")
+
+
+def test_a_saved_fit_takes_no_other_model(run: Runner) -> None:
+    table = run("datasets", "noisy", "-o", "-").out
+    assert run("fit", "-", "--save", "fit.json", stdin=table).status == 0
+    outcome = run("report", "fit.json", "--mass", "free", "-o", "r.html")
+    assert outcome.status == 1
+    assert "a saved fit is reported as it is" in outcome.err

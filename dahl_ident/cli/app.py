@@ -61,9 +61,10 @@ def main(arguments: list[str] | None = None) -> None:
     arguments : list of str, optional
         As typed after ``dahl-ident``; by default those of the process.
     """
-    telling.warnings_in_one_line()
+    typed = sys.argv[1:] if arguments is None else arguments
+    telling.begin(typed)
     try:
-        app(args=arguments)
+        app(args=typed)
     except DahlIdentError as exc:
         telling.doubt(f"error: {' '.join(str(exc).split())}")
         sys.exit(telling.BAD_INPUT)

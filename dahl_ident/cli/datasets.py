@@ -9,13 +9,14 @@ import typer
 from dahl_ident.cli import telling
 from dahl_ident.cli.files import write_data
 from dahl_ident.cli.groups import grouped
-from dahl_ident.cli.options import General
+from dahl_ident.cli.options import General, Writing
 from dahl_ident.errors import ValidationError
 
 
 @grouped
 def datasets(
     general: General,
+    writing: Writing,
     name: Annotated[
         str | None, typer.Argument(help="The one to describe or copy; all if left out.")
     ] = None,
@@ -33,10 +34,11 @@ def datasets(
 
     if output is not None and name is None:
         raise ValidationError("--output needs the name of a data set; leave it out to list them")
+    writing.check([output], json=general.json)
     if name is not None:
         data = load_dataset(name)
         if output is not None:
-            write_data(data, output)
+            write_data(data, output, overwrite=writing.overwrite)
         elif general.json:
             telling.say_json(data.provenance)
         else:

@@ -10,6 +10,8 @@ import typer
 
 from dahl_ident.cli import extract, telling
 from dahl_ident.cli.files import progress_bar
+from dahl_ident.cli.groups import grouped
+from dahl_ident.cli.options import Writing
 
 if TYPE_CHECKING:
     from dahl_ident.results import FitResult
@@ -17,7 +19,9 @@ if TYPE_CHECKING:
 _DATASET = "plant_recording"
 
 
+@grouped
 def demo(
+    writing: Writing,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for the table and the report.")
     ] = Path("out"),
@@ -34,6 +38,8 @@ def demo(
     from dahl_ident.results.sampling import sample
     from dahl_ident.synthetic.shipped import datasets_directory, load_dataset
 
+    table, page = output / "levels.csv", output / "report.html"
+    writing.check([table, page])
     output.mkdir(parents=True, exist_ok=True)
     recording = load_dataset(_DATASET)
     facts = recording.provenance or {}
@@ -45,7 +51,7 @@ def demo(
     data = extract_record(read_record(file), controlled="force", harmonics=[1])
     extract.show(data)
     data = extract.good_points(data)
-    table = data.save(output / "levels.csv")
+    data.save(table, overwrite=writing.overwrite)
     telling.heading("3. fit: friction, mass, damper and spring, nothing known beforehand")
     result = fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
     telling.say(result.fit_report())
@@ -58,7 +64,8 @@ def demo(
     telling.heading("6. report")
     with progress_bar() as bar:
         bar.add_task("drawing", total=None)
-        page = report([result, posterior], output / "report.html")
+        told = telling.typed_command()
+        report([result, posterior], page, command=told, overwrite=writing.overwrite)
     telling.say(f"table: {table}\nreport: {page.resolve()}")
     telling.finish(result.trusted and posterior.converged, result.verdict)
 

@@ -9,15 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import telling
-from dahl_ident.cli.files import (
-    STANDARD,
-    refuse_inputs,
-    with_progress,
-    write_data,
-    write_picture,
-)
+from dahl_ident.cli.files import with_progress, write_data, write_picture
 from dahl_ident.cli.groups import grouped
-from dahl_ident.cli.options import Files, General
+from dahl_ident.cli.options import STANDARD, Files, General, Writing
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
@@ -123,6 +117,7 @@ def extract(
     general: General,
     reading: RecordReading,
     extracting: Extracting,
+    writing: Writing,
     output: Annotated[
         str | None,
         typer.Option("--output", "-o", help="Table to write; - is standard output, as CSV."),
@@ -144,7 +139,7 @@ def extract(
     """
     from dahl_ident.data import FrequencyResponse
 
-    refuse_inputs(files, output, plot)
+    writing.check([output, plot], files, json=general.json)
     parts = [
         _points(file, reading, extracting, level_from_name)
         for file in with_progress(files, "extracting")
@@ -153,9 +148,9 @@ def extract(
     if good_only:
         data = good_points(data)
     if output is not None:
-        write_data(data, output)
+        write_data(data, output, overwrite=writing.overwrite)
     if plot is not None:
-        write_picture(data.plot(), plot)
+        write_picture(data.plot(), plot, overwrite=writing.overwrite)
     if general.json:
         telling.say_json(_rows(data))
     elif output != STANDARD:

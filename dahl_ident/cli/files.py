@@ -5,63 +5,41 @@ from __future__ import annotations
 import io
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+from dahl_ident.cli.options import STANDARD
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-STANDARD = "-"
 _T = TypeVar("_T")
 
 
 class Saved(Protocol):
     """Data that write themselves to a file."""
 
-    def save(self, path: str | Path) -> Path:
+    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write, and return the place."""
         ...
 
 
-def refuse_inputs(files: Sequence[str], *outputs: str | Path | None) -> None:
-    """Refuse to write over what is being read.
-
-    Raises
-    ------
-    ValidationError
-        If an output is one of the input files.
-    """
-    from dahl_ident.errors import ValidationError
-
-    inputs = {Path(file).resolve() for file in files if file != STANDARD}
-    for output in outputs:
-        if output is not None and str(output) != STANDARD and Path(output).resolve() in inputs:
-            raise ValidationError(
-                f"{output} is an input and would be overwritten; give the output another name"
-            )
-
-
-def write_data(data: Saved, output: str) -> None:
+def write_data(data: Saved, output: str, *, overwrite: bool) -> None:
     """Write a table or a record to a file, or as CSV to standard output."""
+    written(lambda place: data.save(place, overwrite=overwrite), output, ".csv")
+
+
+def written(write: Callable[[str | Path], Path], output: str, ending: str) -> str:
+    """Let `write` make a file; what is meant for standard output, with this ending."""
     if output != STANDARD:
-        data.save(output)
-        return
+        return str(write(output))
     with tempfile.TemporaryDirectory() as directory:
-        sys.stdout.write(data.save(Path(directory) / "table.csv").read_text(encoding="utf-8"))
+        sys.stdout.write(write(Path(directory) / f"output{ending}").read_text(encoding="utf-8"))
+    return output
 
 
-def write_text(text: str, output: str) -> None:
-    """Write a text to a file, or to standard output."""
-    from dahl_ident.data.storage import write_whole
-
-    if output == STANDARD:
-        sys.stdout.write(text)
-    else:
-        write_whole(Path(output), text.encode())
-
-
-def write_picture(axes: Any, path: str) -> None:
+def write_picture(axes: Any, path: str, *, overwrite: bool) -> None:
     """Write the figure of some axes in the format of the file's name."""
     import numpy as np
 
@@ -74,7 +52,7 @@ def write_picture(axes: Any, path: str) -> None:
         figure.savefig(buffer, format=Path(path).suffix.lstrip(".") or "png", dpi=150)
     except ValueError as exc:
         raise DataError(f"{path}: no picture of this kind: {exc}") from exc
-    write_whole(Path(path), buffer.getvalue())
+    write_whole(Path(path), buffer.getvalue(), overwrite=overwrite)
 
 
 def with_progress(items: Sequence[_T], what: str) -> Iterator[_T]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,21 +10,33 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import telling
-from dahl_ident.cli.files import refuse_inputs, write_text
+from dahl_ident.cli.distributions import values
+from dahl_ident.cli.files import written
 from dahl_ident.cli.groups import grouped
-from dahl_ident.cli.options import Files, General, ModelOptions, Reading
+from dahl_ident.cli.model import ModelOptions
+from dahl_ident.cli.options import STANDARD, Files, General, Reading, Writing
 
 if TYPE_CHECKING:
-    from dahl_ident.results import FitResult
+    from dahl_ident.results import FitResult, Posterior
 
 _ESTIMATING = "Estimating"
 _LEVEL = 0.9545
+ReportPlace = Annotated[
+    str | None,
+    typer.Option(help="Report to write: .html, .pdf, .md or .json; - is HTML on standard output."),
+]
 
 
 @dataclass(frozen=True)
 class Estimating:
     """How the estimate is made; the words of ``fit``."""
 
+    method: Annotated[
+        str,
+        typer.Option(
+            help="scipy, or ipopt with exact second derivatives.", rich_help_panel=_ESTIMATING
+        ),
+    ] = "scipy"
     noise: Annotated[
         str | None,
         typer.Option(
@@ -40,6 +51,18 @@ class Estimating:
             rich_help_panel=_ESTIMATING,
         ),
     ] = "linear"
+    start: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="One more start for the search, f_max=0.1; once for each parameter.",
+            rich_help_panel=_ESTIMATING,
+        ),
+    ] = None
+
+    def keywords(self) -> dict[str, Any]:
+        """Return the arguments of ``fit``."""
+        start = values("start", self.start) if self.start else None
+        return {**vars(self), "start": start}
 
 
 @grouped
@@ -49,9 +72,8 @@ def fit(
     reading: Reading,
     model: ModelOptions,
     estimating: Estimating,
-    report: Annotated[
-        str | None, typer.Option(help="Report to write: .html, .pdf, .md or .json.")
-    ] = None,
+    writing: Writing,
+    report: ReportPlace = None,
     save: Annotated[
         Path | None, typer.Option(help="Fit to write, as JSON that report and Python load.")
     ] = None,
@@ -60,18 +82,22 @@ def fit(
 
     Example: dahl-ident datasets noisy -o - | dahl-ident fit -
     """
-    refuse_inputs(files, save, report)
+    from dahl_ident.data.storage import place_of
+    from dahl_ident.results.storage import FORMATS
+
+    writing.check([report, save], files, json=general.json)
+    check_reports(report)
+    if save is not None:
+        place_of(save, "a fit", FORMATS)
     result = fitted(files, reading, model, estimating)
     if save is not None:
-        write_text(result.to_json(), str(save))
-    if report is not None:
-        from dahl_ident.reporting import report as write_report
-
-        telling.doubt(f"report: {write_report(result, report, command=typed_command())}")
+        result.save(save, overwrite=writing.overwrite)
     if general.json:
         telling.say_json(as_json(result))
-    else:
+    elif report != STANDARD:
         telling.say(result.fit_report())
+    if report is not None:
+        tell_report([result], report, writing)
     finish(result)
 
 
@@ -81,8 +107,43 @@ def fitted(
     """Return the fit of the model to the files."""
     from dahl_ident.results import fit as fit_data
 
-    elements, free = model.build()
-    return fit_data(reading.read(files), elements, free=free, throw=False, **vars(estimating))
+    how = {**model.keywords(), **estimating.keywords()}
+    return fit_data(reading.read(files), throw=False, **how)
+
+
+def check_reports(*places: str | None) -> None:
+    """Refuse reports of an unknown kind before any work is done."""
+    from dahl_ident.data.storage import place_of
+    from dahl_ident.reporting.publish import FORMATS
+
+    for place in places:
+        if place is not None and place != STANDARD:
+            place_of(place, "a report", FORMATS)
+
+
+def write_report(
+    results: Sequence[FitResult | Posterior],
+    place: str,
+    writing: Writing,
+    title: str | None = None,
+) -> str:
+    """Write a report, as HTML where that is standard output, and return where it is."""
+    from functools import partial
+
+    from dahl_ident.reporting import report
+
+    write = partial(
+        report, list(results), title=title, command=telling.typed_command(),
+        overwrite=writing.overwrite,
+    )  # fmt: skip
+    return written(write, place, ".html")
+
+
+def tell_report(results: Sequence[FitResult | Posterior], place: str, writing: Writing) -> None:
+    """Write a report beside other output, and say where it is."""
+    told = write_report(results, place, writing)
+    if told != STANDARD:
+        telling.doubt(f"report: {told}")
 
 
 def as_json(result: FitResult) -> dict[str, Any]:
@@ -109,8 +170,3 @@ def as_json(result: FitResult) -> dict[str, Any]:
 def finish(result: FitResult) -> None:
     """End with status 3 where the fit is not to be trusted."""
     telling.finish(result.trusted, result.verdict.removeprefix("NOT to be trusted. "))
-
-
-def typed_command() -> str:
-    """Return the command line of this process, as it would be typed again."""
-    return shlex.join(["dahl-ident", *sys.argv[1:]])

@@ -8,10 +8,11 @@ from typing import Annotated
 import typer
 
 from dahl_ident.cli import telling
-from dahl_ident.cli.files import refuse_inputs
-from dahl_ident.cli.fit import Estimating, finish, fitted, typed_command
+from dahl_ident.cli.fit import Estimating, check_reports, finish, fitted, write_report
 from dahl_ident.cli.groups import grouped
-from dahl_ident.cli.options import Files, General, ModelOptions, Reading, Seed
+from dahl_ident.cli.model import ModelOptions
+from dahl_ident.cli.options import STANDARD, Files, General, Reading, Seed, Writing
+from dahl_ident.errors import ValidationError
 
 
 @grouped
@@ -21,11 +22,19 @@ def report(
     reading: Reading,
     model: ModelOptions,
     estimating: Estimating,
+    writing: Writing,
     output: Annotated[
         list[str],
-        typer.Option("--output", "-o", help="Report: .html, .pdf, .md, .json; or several."),
+        typer.Option(
+            "--output",
+            "-o",
+            help="Report: .html, .pdf, .md, .json; or several. - is HTML on standard output.",
+        ),
     ] = ["report.html"],  # noqa: B006 - typer takes lists as lists
     title: Annotated[str | None, typer.Option(help="First line of the report.")] = None,
+    bootstrap: Annotated[
+        bool, typer.Option("--bootstrap", help="Bootstrap intervals as well, beside the others.")
+    ] = False,
     posterior: Annotated[
         bool, typer.Option("--posterior", help="Sample the posterior as well, beside the fit.")
     ] = False,
@@ -35,20 +44,28 @@ def report(
 
     Example: dahl-ident datasets noisy -o - | dahl-ident report - -o report.html
     """
-    from dahl_ident.reporting import report as write_report
     from dahl_ident.results import FitResult, Posterior, sample
 
-    refuse_inputs(files, *output)
-    saved = len(files) == 1 and files[0].endswith(".json")
-    result = FitResult.load(files[0]) if saved else fitted(files, reading, model, estimating)
+    writing.check(output, files, json=general.json)
+    check_reports(*output)
+    if any(file.endswith(".json") for file in files):
+        chosen = (reading, model, estimating) != (Reading(), ModelOptions(), Estimating())
+        if len(files) > 1 or chosen:
+            raise ValidationError(
+                "a saved fit is reported as it is: give one file, and no options of reading, "
+                "model or estimate beside it"
+            )
+        result = FitResult.load(files[0])
+    else:
+        result = fitted(files, reading, model, estimating)
+    if bootstrap:
+        result.conf_interval("bootstrap", seed=seed)
     told: list[FitResult | Posterior] = [result]
     if posterior:
         told.append(sample(result, seed=seed, progress=sys.stderr.isatty()))
-    written = [
-        str(write_report(told, place, title=title, command=typed_command())) for place in output
-    ]
+    places = [write_report(told, place, writing, title) for place in output]
     if general.json:
-        telling.say_json(written)
-    else:
-        telling.say("\n".join(written))
+        telling.say_json(places)
+    elif STANDARD not in places:
+        telling.say("\n".join(places))
     finish(result)

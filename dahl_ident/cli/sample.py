@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import telling
-from dahl_ident.cli.files import refuse_inputs
-from dahl_ident.cli.fit import typed_command
+from dahl_ident.cli.distributions import prior
+from dahl_ident.cli.fit import ReportPlace, check_reports, tell_report
 from dahl_ident.cli.groups import grouped
-from dahl_ident.cli.options import Files, General, ModelOptions, Reading, Seed
-from dahl_ident.errors import ValidationError
+from dahl_ident.cli.model import ModelOptions
+from dahl_ident.cli.options import STANDARD, Files, General, Reading, Seed, Writing
 
 if TYPE_CHECKING:
     from dahl_ident.results.posterior import Posterior
@@ -29,7 +29,8 @@ class Sampling:
     prior: Annotated[
         list[str] | None,
         typer.Option(
-            help="Bounds of a parameter, such as f_max=0.01:1; once for each.",
+            help="Bounds of a parameter, f_max=0.01:1, or a distribution of scipy.stats, "
+            "'mass=norm(0.3, 0.001)'; once for each.",
             rich_help_panel=_SAMPLING,
         ),
     ] = None
@@ -59,7 +60,6 @@ class Sampling:
     ensembles: Annotated[
         int, typer.Option(help="Independent groups of walkers.", rich_help_panel=_SAMPLING)
     ] = 4
-
     resume: Annotated[
         Path | None,
         typer.Option(
@@ -71,8 +71,8 @@ class Sampling:
     def keywords(self) -> dict[str, Any]:
         """Return the arguments of ``sample``."""
         given = dict(vars(self))
-        bounds = dict(_bounds(text) for text in given.pop("prior") or [])
-        return {**given, "priors": bounds or None, "progress": sys.stderr.isatty()}
+        priors = dict(prior(text) for text in given.pop("prior") or [])
+        return {**given, "priors": priors, "progress": sys.stderr.isatty()}
 
 
 @grouped
@@ -82,9 +82,8 @@ def sample(
     reading: Reading,
     model: ModelOptions,
     sampling: Sampling,
-    report: Annotated[
-        str | None, typer.Option(help="Report to write: .html, .pdf, .md or .json.")
-    ] = None,
+    writing: Writing,
+    report: ReportPlace = None,
 ) -> None:
     """Sample the posterior of the parameters.
 
@@ -92,34 +91,21 @@ def sample(
     """
     from dahl_ident.results import sample as sample_data
 
-    refuse_inputs(files, report)
-    elements, free = model.build()
-    posterior = sample_data(reading.read(files), elements, free=free, **sampling.keywords())
+    writing.check([report], files, json=general.json)
+    check_reports(report)
+    how = {**model.keywords(), **sampling.keywords()}
+    posterior = sample_data(reading.read(files), **how)
     if general.json:
         from dahl_ident.reporting.posteriors import facts
 
         telling.say_json(facts(posterior))
-    else:
+    elif report != STANDARD:
         telling.say(posterior.report())
     if report is not None:
-        from dahl_ident.reporting import report as write_report
-
-        telling.doubt(f"report: {write_report(posterior, report, command=typed_command())}")
+        tell_report([posterior], report, writing)
     finish(posterior)
 
 
 def finish(posterior: Posterior) -> None:
     """End with status 3 where the chain has not converged."""
     telling.finish(posterior.converged, posterior.message)
-
-
-def _bounds(text: str) -> tuple[str, tuple[float, float]]:
-    """Return name and bounds of ``f_max=0.01:1``."""
-    name, _, numbers = text.partition("=")
-    try:
-        low, high = (float(part) for part in numbers.split(":"))
-    except ValueError as exc:
-        raise ValidationError(
-            f"prior is {text!r}; expected a name and two bounds, such as f_max=0.01:1"
-        ) from exc
-    return name, (low, high)

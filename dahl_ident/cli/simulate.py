@@ -10,7 +10,8 @@ import typer
 from dahl_ident.cli import telling
 from dahl_ident.cli.files import progress_bar, write_data
 from dahl_ident.cli.groups import grouped
-from dahl_ident.cli.options import General, ModelOptions, Seed
+from dahl_ident.cli.model import OTHERS, in_parallel, part
+from dahl_ident.cli.options import General, Seed, Writing
 from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:
@@ -21,6 +22,31 @@ _EXCITATION = "Excitation"
 _ERRORS = "Errors"
 _SPAN = (0.1, 10.0)  # of the characteristic displacement, where no levels are given
 _COUNT = 30
+
+
+@dataclass(frozen=True)
+class Plant:
+    """The truth: friction, and what is beside it."""
+
+    f_max: Annotated[float | None, part("Coulomb friction, N; needed.")] = None
+    sigma: Annotated[float | None, part("Rest stiffness, N/m; needed.")] = None
+    alpha: Annotated[float, part("Exponent of the Dahl model.")] = 1.0
+    mass: Annotated[float | None, part("Add a mass, kg.")] = None
+    damping: Annotated[float | None, part("Add a damper, N s/m.")] = None
+    stiffness: Annotated[float | None, part("Add a spring, N/m.")] = None
+
+    def built(self) -> Element:
+        """Return the plant."""
+        from dahl_ident.elements import Dahl
+
+        missing = [name for name in ("f_max", "sigma") if getattr(self, name) is None]
+        if missing:
+            raise ValidationError(
+                f"no value for {' and '.join(missing)}; a simulation needs --f-max and --sigma"
+            )
+        others = {name: getattr(self, name) for name in OTHERS}
+        beside = {name: value for name, value in others.items() if value is not None}
+        return in_parallel(Dahl(self.f_max, self.sigma, self.alpha), beside)
 
 
 @dataclass(frozen=True)
@@ -71,9 +97,10 @@ class Errors:
 @grouped
 def simulate(
     general: General,
-    model: ModelOptions,
+    plant: Plant,
     excitation: Excitation,
     errors: Errors,
+    writing: Writing,
     experiment: Annotated[
         str | None, typer.Argument(help="Experiment file, .toml or .json, instead of options.")
     ] = None,
@@ -90,10 +117,12 @@ def simulate(
     from dahl_ident.synthetic import Experiment
     from dahl_ident.synthetic import simulate as run
 
+    inputs = [] if experiment is None else [experiment]
+    writing.check([output], inputs, json=general.json)
     described = (
-        Experiment.read(experiment)
-        if experiment is not None
-        else _experiment(model.build()[0], excitation, errors)
+        _experiment(plant, excitation, errors)
+        if experiment is None
+        else Experiment.read(experiment)
     )
     if output is None:
         telling.say(described.to_json() if general.json else described.to_toml())
@@ -101,36 +130,32 @@ def simulate(
     with progress_bar() as bar:
         task = bar.add_task("simulating", total=1.0)
         data = run(described, seed=seed, progress=lambda done: bar.update(task, completed=done))
-    write_data(data, output)
+    write_data(data, output, overwrite=writing.overwrite)
 
 
-def _experiment(plant: Element, excitation: Excitation, errors: Errors) -> Experiment:
+def _experiment(plant: Plant, excitation: Excitation, errors: Errors) -> Experiment:
     from dahl_ident.synthetic import Acquisition, Channel, Experiment, SteppedSine, Table
 
+    truth = plant.built()
     given: dict[str, Any] = dict(vars(excitation))
     as_record = given.pop("record")
     given["levels"] = _numbers("levels", excitation.levels or _usual_levels(plant, excitation))
     given["frequencies_hz"] = _numbers("frequencies_hz", excitation.frequencies_hz)
     steps = SteppedSine(**given)
     if not as_record:
-        return Experiment(plant, steps, table=Table(**vars(errors)))
+        return Experiment(truth, steps, table=Table(**vars(errors)))
     sensors = Acquisition(
         displacement=Channel(noise_std=errors.displacement_std),
         force=Channel(noise_std=errors.force_std),
     )
-    return Experiment(plant, steps, sensors)
+    return Experiment(truth, steps, sensors)
 
 
-def _usual_levels(plant: Element, excitation: Excitation) -> str:
+def _usual_levels(plant: Plant, excitation: Excitation) -> str:
     """Return levels about the knee of friction, of displacement or of force."""
-    values = {p.name: p.value for p in plant.parameters}
-    f_max, sigma = values["f_max"], values["sigma"]
-    if f_max is None or sigma is None:
-        missing = [name for name in ("f_max", "sigma") if values[name] is None]
-        raise ValidationError(
-            f"no value for {' and '.join(missing)}; a simulation needs --f-max and --sigma"
-        )
-    knee = f_max if excitation.controlled == "force" else f_max / sigma
+    assert plant.f_max is not None  # the plant has been built
+    assert plant.sigma is not None
+    knee = plant.f_max if excitation.controlled == "force" else plant.f_max / plant.sigma
     return f"{_SPAN[0] * knee}:{_SPAN[1] * knee}:{_COUNT}"
 
 

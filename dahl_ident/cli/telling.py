@@ -3,26 +3,55 @@
 from __future__ import annotations
 
 import json
+import math
+import shlex
 import sys
 import warnings
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from dahl_ident.cli.options import plain
+from dahl_ident.cli.options import STANDARD
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 BAD_INPUT = 1
 NOT_TRUSTED = 3
-_state = {"color": True}
+
+
+@dataclass
+class _Session:
+    color: bool = True
+    typed: Sequence[str] = ()
+
+
+_session = _Session()
+
+
+def begin(typed: Sequence[str]) -> None:
+    """Remember what was typed, and show warnings as lines for people, without file and code."""
+
+    def show(message: Warning | str, *_: Any) -> None:
+        doubt(f"warning: {message}")
+
+    _session.typed = typed
+    # setattr, because the signature here has no use for file and line
+    setattr(warnings, "showwarning", show)  # noqa: B010
+
+
+def typed_command() -> str:
+    """Return the command of this run, as it would be typed again."""
+    command = shlex.join(["dahl-ident", *_session.typed])
+    piped = STANDARD in _session.typed
+    return f"{command}  # its input came through standard input" if piped else command
 
 
 def use_color(color: bool) -> None:
     """Turn colour on or off for all that follows."""
-    _state["color"] = color
+    _session.color = color
 
 
 def console() -> Console:
@@ -31,7 +60,7 @@ def console() -> Console:
 
     terminal = sys.stdout.isatty()
     return Console(
-        no_color=None if _state["color"] else True,
+        no_color=None if _session.color else True,
         highlight=False,
         soft_wrap=True,
         width=None if terminal else 100,
@@ -81,11 +110,16 @@ def finish(trusted: bool, reason: str) -> None:
         raise typer.Exit(NOT_TRUSTED)
 
 
-def warnings_in_one_line() -> None:
-    """Show Python warnings as lines for people, without file and code."""
-
-    def show(message: Warning | str, *_: Any) -> None:
-        doubt(f"warning: {message}")
-
-    # setattr, because the signature here has no use for file and line
-    setattr(warnings, "showwarning", show)  # noqa: B010
+def plain(value: Any) -> Any:
+    """Return nested data that JSON knows: arrays as lists, complex numbers as pairs."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, complex):
+        return [plain(value.real), plain(value.imag)]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

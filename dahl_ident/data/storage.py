@@ -11,7 +11,7 @@ import gzip
 import io
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,6 +49,23 @@ def save_frame(frame: pd.DataFrame, path: str | Path, *, overwrite: bool = False
     return place
 
 
+def place_of(path: str | Path, what: str, endings: Sequence[str]) -> Path:
+    """Return the path, which has to have one of the endings.
+
+    Raises
+    ------
+    ValidationError
+        If it has another.
+    """
+    place = Path(path)
+    if place.suffix.lower() not in endings:
+        raise ValidationError(
+            f"{place}: {what} is written as {', '.join(endings)}; got "
+            f"{place.suffix or 'no ending'!r}"
+        )
+    return place
+
+
 def refuse_existing(path: Path) -> None:
     """Refuse to replace a file.
 
@@ -60,7 +77,7 @@ def refuse_existing(path: Path) -> None:
     if path.exists():
         raise DataError(
             f"{path}: there is such a file already; give another name, or replace it with "
-            "overwrite=True (on the command line --force)"
+            "overwrite=True (on the command line --overwrite)"
         )
 
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from dahl_ident.data.storage import write_whole
-from dahl_ident.errors import ValidationError
+from dahl_ident.data.storage import place_of, refuse_existing, write_whole
+from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.reporting.contents import Result, document
 from dahl_ident.reporting.document import Document, Picture
 from dahl_ident.reporting.html import html
@@ -25,6 +25,7 @@ def report(
     *,
     title: str | None = None,
     command: str | None = None,
+    overwrite: bool = False,
 ) -> Path:
     """Write a report on one or several results.
 
@@ -39,6 +40,8 @@ def report(
         First line; by default the file's name.
     command : str, optional
         The command that repeats it; by default the one that fits the same model.
+    overwrite : bool, default False
+        Replace a report that is there already.
 
     Returns
     -------
@@ -50,7 +53,7 @@ def report(
     ValidationError
         If there is no result, or the ending is another one.
     DataError
-        If the place cannot be written to.
+        If a file is there already and `overwrite` is not set, or the place cannot be written to.
 
     Examples
     --------
@@ -61,32 +64,45 @@ def report(
     >>> report(fit, Path(mkdtemp()) / "report.json").name
     'report.json'
     """
-    place = Path(path)
+    place = place_of(path, "a report", FORMATS)
+    if not overwrite:
+        refuse_existing(place)
     told = list(results) if isinstance(results, Sequence) else [results]
     if not told:
         raise ValidationError("there is no result to report on; expected at least one")
-    kind = place.suffix.lower()
-    if kind not in FORMATS:
-        raise ValidationError(f"{place}: reports are written as {', '.join(FORMATS)}")
     whole = document(told, title=title, command=command)
-    write_whole(place, _content(whole, place, kind))
+    kind = place.suffix.lower()
+    if kind == ".md":
+        folder = place.with_name(f"{place.stem}_pictures")
+        _write_pictures(whole, folder, overwrite)
+        content = markdown(whole, folder.name)
+    else:
+        content = _content(whole, kind)
+    write_whole(place, content, overwrite=overwrite)
     return place
 
 
-def _content(whole: Document, place: Path, kind: str) -> bytes:
+def _content(whole: Document, kind: str) -> bytes:
     if kind == ".html":
         return html(whole)
     if kind == ".pdf":
         from dahl_ident.reporting.pdf import pdf
 
         return pdf(whole)
-    if kind == ".md":
-        folder = place.with_name(f"{place.stem}_pictures")
-        for picture in _pictures(whole):
-            folder.mkdir(parents=True, exist_ok=True)
-            write_whole(folder / f"{picture.name}.png", picture.rendered("png"))
-        return markdown(whole, folder.name)
     return machine_readable(whole)
+
+
+def _write_pictures(whole: Document, folder: Path, overwrite: bool) -> None:
+    places = {folder / f"{picture.name}.png": picture for picture in _pictures(whole)}
+    if not overwrite:
+        for place in places:
+            refuse_existing(place)
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as exc:
+        raise DataError(f"{folder}: cannot be made: {exc.strerror or exc}") from exc
+    for place, picture in places.items():
+        write_whole(place, picture.rendered("png"), overwrite=overwrite)
 
 
 def machine_readable(whole: Document) -> bytes:

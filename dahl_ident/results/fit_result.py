@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
-from dahl_ident.data.storage import write_whole
+from dahl_ident.data.storage import place_of, write_whole
 from dahl_ident.diagnostics.bands import (
     DerivedQuantity,
     ResponseBand,
@@ -376,9 +376,7 @@ class FitResult(FitNumbers):
         DataError
             If a file is there already, or the place cannot be written to.
         """
-        place = Path(path)
-        if place.suffix.lower() != ".json":
-            raise ValidationError(f"{place}: fits are saved as .json; got {place.suffix!r}")
+        place = place_of(path, "a fit", storage.FORMATS)
         write_whole(place, self.to_json().encode(), overwrite=overwrite)
         return place
 

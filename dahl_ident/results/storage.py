@@ -26,6 +26,7 @@ from dahl_ident.sensors import EXACT, Sensors
 
 SCHEMA = "dahl_ident.fit_result"
 VERSION = 1
+FORMATS = (".json",)
 
 _COLUMNS = (
     "frequency_hz", "amplitude", "drive", "covariance", "dof", "amplitude_std",

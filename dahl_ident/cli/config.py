@@ -1,0 +1,57 @@
+"""Options from a TOML file: a laboratory's standard run in one word.
+
+What stands outside of tables is meant for every command that knows it; a table named after a
+command is for that one alone. An option that may be given several times is a list, or, where it
+assigns values to names, a table: ``[sample.prior]`` with ``f_max = [0.01, 1]`` and
+``mass = "norm(0.3, 0.001)"`` is the calibration sheet of a laboratory.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from dahl_ident.errors import DataError
+
+
+def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
+    """Take the options that the command line leaves out from a TOML file."""
+    if path is None:
+        return None
+    try:
+        given = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as exc:
+        raise DataError(f"{path}: no TOML file of options: {exc}") from exc
+    known = {p.name for p in ctx.command.params} - {"config", None}
+    own = _named(given.pop(ctx.info_name or "", {}))
+    unknown = sorted(own.keys() - known)
+    if unknown:
+        raise DataError(
+            f"{path}: {ctx.info_name} has no option {', '.join(unknown)}; it has "
+            f"{', '.join(sorted(map(str, known)))}"
+        )
+    shared = _named({k: v for k, v in given.items() if not isinstance(v, dict)})
+    ctx.default_map = {k: v for k, v in shared.items() if k in known} | own
+    return path
+
+
+def _named(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options by the names of their parameters, values as they would be typed."""
+    return {k.replace("-", "_"): _typed(v) for k, v in options.items()}
+
+
+def _typed(value: Any) -> Any:
+    if isinstance(value, dict):
+        return [f"{name}={_assigned(item)}" for name, item in value.items()]
+    if isinstance(value, list):
+        return [_typed(item) for item in value]
+    return value if isinstance(value, bool) else str(value)
+
+
+def _assigned(value: Any) -> str:
+    """Return bounds as ``low:high``, anything else as it stands."""
+    return ":".join(map(str, value)) if isinstance(value, list) else str(value)
