@@ -60,6 +60,7 @@ Rho = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
 
 NOISE_MODELS = ("measured", "relative", "absolute")
 
+_ROUNDING = 2.0**-46  # of a response, after the arithmetic that leads to a residual
 _GAUSSIAN = 1e15  # degrees of freedom at which the loss is z to rounding
 _AMPLITUDE_STEPS = 40
 _AMPLITUDE_TOLERANCE = 1e-10  # of the amplitude's standard deviation
@@ -77,6 +78,11 @@ class Noise(ABC):
     @abstractmethod
     def weights(self) -> FloatArray:
         """One over the standard deviation of |R - R_model| at the data, up to the scale."""
+
+    @property
+    @abstractmethod
+    def rounding(self) -> FloatArray:
+        """Size of residuals that may be rounding errors alone, shape () or (S,)."""
 
     @abstractmethod
     def residual(self, predicted: ComplexArray) -> ComplexArray:
@@ -109,6 +115,11 @@ class Relative(Noise):
         if self.fundamental is not None:
             size = np.where(self.fundamental > 0.0, self.fundamental, size)
         return 1.0 / size
+
+    @property
+    def rounding(self) -> FloatArray:
+        """That of a logarithm."""
+        return np.asarray(_ROUNDING)
 
     def residual(self, predicted: ComplexArray) -> ComplexArray:
         """Return ln(R/R_model), or the scaled difference in rows of harmonics."""
@@ -149,6 +160,11 @@ class Absolute(Noise):
         """1, in every row."""
         return np.ones(self.response.shape)
 
+    @property
+    def rounding(self) -> FloatArray:
+        """That of the responses' root mean square."""
+        return np.asarray(_ROUNDING * np.sqrt(np.mean(np.abs(self.response) ** 2, axis=-1)))
+
     def residual(self, predicted: ComplexArray) -> ComplexArray:
         """Return R - R_model."""
         return self.response - predicted
@@ -179,6 +195,11 @@ class Measured(Noise):
     def weights(self) -> FloatArray:
         """One over the root mean square of the two parts' standard deviations."""
         return np.sqrt(2.0 / (self.covariance.rr + self.covariance.ii))
+
+    @property
+    def rounding(self) -> FloatArray:
+        """0: the scale is known, whatever the residuals are."""
+        return np.zeros(())
 
     def residual(self, predicted: ComplexArray) -> ComplexArray:
         """Return L^-1 (R - R_model)."""

@@ -17,6 +17,7 @@ from dahl_ident import (
     Problem,
     Sensors,
     Spring,
+    fit,
     response,
 )
 from dahl_ident.arrays import ComplexArray, FloatArray
@@ -266,3 +267,33 @@ def test_as_many_numbers_as_parameters_leave_no_scale() -> None:
     assert np.isnan(found.scale)
     assert np.isinf(np.diagonal(found.covariance)).all()
     assert np.abs(found.residuals).max() < 1e-9
+
+
+@pytest.mark.parametrize("noise", ["relative", "absolute"])
+@pytest.mark.parametrize("loss", ["linear", *LOSSES])
+@pytest.mark.parametrize("copies", [1, 2])
+def test_data_without_noise_are_met_to_rounding(noise: str, loss: str, copies: int) -> None:
+    """Rounding errors are no noise: they repeat, and standard errors cannot be smaller."""
+    amplitude = np.tile(np.geomspace(1e-3, 1e-1, 30), copies)
+    N = Dahl(0.1, 30.0).describing_function(amplitude)
+    found = fit(FrequencyResponse(np.ones(N.size), N, amplitude), Dahl(), noise=noise, loss=loss)
+    assert found.optimum.is_exact
+    size = 1.0 if noise == "relative" else np.sqrt(np.mean(np.abs(N) ** 2))
+    assert found.scale == pytest.approx(2.0**-46 * size, rel=1e-3)
+    for name, truth in (("f_max", 0.1), ("sigma", 30.0)):
+        estimate = found.params[name]
+        assert estimate.stderr is not None
+        assert abs(estimate.value - truth) < 2.0 * estimate.stderr < 1e-13 * truth
+    assert found.trusted, found.verdict
+    assert "what rounding leaves" in found.fit_report()
+
+
+def test_an_outlier_among_exact_data_is_no_rounding() -> None:
+    amplitude = np.geomspace(1e-3, 1e-1, 30)
+    N = Dahl(0.1, 30.0).describing_function(amplitude)
+    N[4] *= 2.0
+    data = FrequencyResponse(np.ones(30), N, amplitude)
+    assert not fit(data, Dahl()).optimum.is_exact
+    robust = fit(data, Dahl(), loss="student_t")
+    assert robust.optimum.is_exact
+    assert [point.row for point in robust.goodness.suspicious] == [4]

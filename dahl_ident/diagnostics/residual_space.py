@@ -7,7 +7,7 @@ product; several columns together make a chi-square or F test. Nothing is fitted
 
 Rows whose covariance has nu degrees of freedom follow Student's t; their residuals y are taken to
 the normal ones of the same probability, |y|^2 -> (nu - 1) ln(1 + |y|^2/nu). Rows under a robust
-loss enter by their scores.
+loss enter by their scores. Residuals that are rounding errors count as none.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class ResidualSpace(_Space):
         y, J = self._problem.residuals_and_jacobian(optimum.theta, self._scale, tails=False)
         self._column_weight, residual_weight = self._weights(y[:m])
         self.basis = _orthonormal(np.vstack([self._column_weight[:, None] * J[:m], J[m:]]))[:m]
-        r = residual_weight * y[:m]
+        r = residual_weight * y[:m] * (not optimum.is_exact)
         self.residuals = r - self.basis @ (self.basis.T @ r)
 
     def _weights(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:

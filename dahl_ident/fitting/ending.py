@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import FloatArray
 from dahl_ident.fitting.limits import Limit
 from dahl_ident.fitting.losses import Loss
-from dahl_ident.fitting.optimum import Combination, Optimum, inverse, spread
+from dahl_ident.fitting.optimum import (
+    Combination,
+    Optimum,
+    estimated_scale,
+    inverse,
+    robust_information,
+    spread,
+)
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem
 
@@ -52,10 +59,10 @@ def optimum(
     dof = problem.n_residuals + len(problem.priors) - end.determined
     final = scale
     if not problem.scale_known and loss is None and not problem.priors:
-        final = float(np.sqrt(2.0 * end.cost / dof)) if dof > 0 else np.nan
+        final = float(estimated_scale(problem, end.cost, dof))
     chart = None if end.limit is None else end.limit.chart.derivative(theta)
     if loss is not None:
-        inner, lost = inverse(_robust_information(problem, theta, scale, loss, dof, chart))
+        inner, lost = inverse(robust_information(problem, theta, scale, loss, dof, chart))
     elif theta is not end.theta or not problem.gaussian:
         inner, lost = inverse(problem.information(theta, scale, chart))
     else:
@@ -87,23 +94,6 @@ def optimum(
         loss="linear" if loss is None else loss.name,
         combinations=combinations,
     )
-
-
-def _robust_information(
-    problem: Problem,
-    theta: FloatArray,
-    scale: float,
-    loss: Loss,
-    dof: int,
-    chart: FloatArray | None,
-) -> FloatArray:
-    """Return the inverse of a robust estimate's covariance."""
-    r, J = problem.residuals_and_jacobian(theta, scale, tails=False)
-    if chart is not None:
-        J = J @ chart
-    m = problem.n_residuals
-    kappa = loss.inflation(r[:m:2] ** 2 + r[1:m:2] ** 2, dof)
-    return np.asarray(J[:m].T @ J[:m] / kappa + J[m:].T @ J[m:])
 
 
 def _combinations(limit: Limit, phi: FloatArray, covariance: FloatArray) -> tuple[Combination, ...]:

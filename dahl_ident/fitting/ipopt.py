@@ -36,7 +36,13 @@ from dahl_ident.fitting.casadi_nlp import RowwiseProblem, SharedTerms
 from dahl_ident.fitting.casadi_rows import Target, check_elements, parameter_values, row_blocks
 from dahl_ident.fitting.ending import End, optimum
 from dahl_ident.fitting.losses import loss_named
-from dahl_ident.fitting.optimum import Optimum, inverse
+from dahl_ident.fitting.optimum import (
+    Optimum,
+    estimated_scale,
+    inverse,
+    robust_information,
+    scale_ratio,
+)
 from dahl_ident.fitting.start import starts
 from dahl_ident.fitting.status import Status
 from dahl_ident.noise import AmplitudeError
@@ -133,11 +139,12 @@ def solve_ipopt(
     adapts = not problem.scale_known and bool(loss != "linear" or problem.priors)
     target = Target(problem, begin.scale if adapts else 1.0, loss, drive_error)
     found = _search(target, begin, relations)
+    dof = problem.n_residuals + len(problem.priors) - len(problem.names) + relations.freedom_lost
     for _ in range(_RESCALINGS if adapts and relations.texts else 0):
-        scale = target.scale * _stretch(target, found.theta, relations.freedom_lost)
-        if abs(scale / target.scale - 1.0) < _SAME_SCALE:
+        ratio = scale_ratio(problem, found.theta, target.scale, loss_named(loss), dof)
+        if abs(ratio - 1.0) < _SAME_SCALE:
             break
-        target = replace(target, scale=scale)
+        target = replace(target, scale=target.scale * ratio)
         found = _descend(target, found.theta, relations, found.evaluations)
     return _ended(target, found, relations, begin.nfev)
 
@@ -280,17 +287,6 @@ def _run(
     return solution, solver.stats()
 
 
-def _stretch(target: Target, theta: FloatArray, freedom_lost: int) -> float:
-    """Return the factor by which the noise's scale has to change."""
-    problem, loss = target.problem, loss_named(target.loss)
-    y, _ = problem.whitened(theta, derivatives=False, tails=loss is None)
-    z = (y.real**2 + y.imag**2) / target.scale**2
-    dof = problem.n_residuals + len(problem.priors) - theta.size + freedom_lost
-    if dof <= 0:
-        return 1.0
-    return float(np.sqrt(z.sum() / dof if loss is None else loss.rescaled(z, dof)))
-
-
 def _counts(problem: Problem) -> FloatArray:
     """Return what each row's information counts, as in `Problem.information`."""
     dof = problem.data.dof
@@ -366,7 +362,7 @@ def _constrained(result: Optimum, target: Target, found: _Found, relations: Rela
     dof = result.dof + relations.freedom_lost
     scale = target.scale
     if not problem.scale_known and loss is None and not problem.priors:
-        scale = float(np.sqrt(2.0 * found.cost / dof)) if dof > 0 else np.nan
+        scale = float(estimated_scale(problem, found.cost, dof))
     covariance, undetermined = _on_constraints(
         _information(target, found, dof), found.slopes[np.array(relations.equal, dtype=np.bool_)]
     )
@@ -400,14 +396,13 @@ def _constrained(result: Optimum, target: Target, found: _Found, relations: Rela
 def _information(target: Target, found: _Found, dof: int) -> FloatArray:
     """Return the information of theta, constraints aside."""
     problem, loss = target.problem, loss_named(target.loss)
-    r, J = problem.residuals_and_jacobian(found.theta, target.scale, tails=False)
-    m = problem.n_residuals
     if found.information is not None:
-        return np.asarray(found.information + J[m:].T @ J[m:])
+        _, J = problem.residuals_and_jacobian(found.theta, target.scale, tails=False)
+        of_priors = J[problem.n_residuals :]
+        return np.asarray(found.information + of_priors.T @ of_priors)
     if loss is None:
         return problem.information(found.theta, target.scale)
-    kappa = loss.inflation(r[:m:2] ** 2 + r[1:m:2] ** 2, dof)
-    return np.asarray(J[:m].T @ J[:m] / kappa + J[m:].T @ J[m:])
+    return robust_information(problem, found.theta, target.scale, loss, dof)
 
 
 def _on_constraints(

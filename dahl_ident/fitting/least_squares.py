@@ -30,7 +30,7 @@ from dahl_ident.fitting.levenberg_marquardt import (
 )
 from dahl_ident.fitting.limits import Chart, Limit, Reach, limits, stiffness_valleys, valleys
 from dahl_ident.fitting.losses import Loss, loss_named
-from dahl_ident.fitting.optimum import Optimum
+from dahl_ident.fitting.optimum import Optimum, scale_ratio
 from dahl_ident.fitting.start import edge_starts, starts
 from dahl_ident.fitting.trust_region import minimise_within
 from dahl_ident.problem import Problem, Quadratic
@@ -121,11 +121,13 @@ class _Search:
         begin, scale = self._starts(start), 1.0
         if self.rescales:
             y, _ = self.problem.whitened(begin[0], derivatives=False)
-            scale = float(np.median(np.abs(y))) / np.sqrt(np.log(4.0))
+            size = float(np.median(np.abs(y))) / np.sqrt(np.log(4.0))
+            scale = max(size, float(self.problem.rounding))
         end = self._search(begin, scale)
         step, last = 0.0, 0.0
         for _ in range(_RESCALINGS if self.rescales else 0):
-            excess = self._excess(end, scale)
+            dof = self.m - end.determined
+            excess = np.log(scale_ratio(self.problem, end.theta, scale, self.loss, dof))
             if abs(excess) < _SAME_SCALE or not np.isfinite(excess):
                 break
             # the secant's step where it goes the same way, else the plain one
@@ -147,18 +149,6 @@ class _Search:
             given = [start.get(n, v) for n, v in zip(names, values, strict=True)]
             begin = np.vstack([self.problem.to_search(given), begin])
         return np.clip(begin, self.low, self.high) if self.bounded else begin
-
-    def _squares(self, theta: FloatArray, scale: float) -> FloatArray:
-        y, _ = self.problem.whitened(theta, derivatives=False, tails=self.loss is None)
-        return (y.real**2 + y.imag**2) / scale**2
-
-    def _excess(self, end: End, scale: float) -> float:
-        """Return ln of the ratio of the scale that the residuals have to `scale`."""
-        z, dof = self._squares(end.theta, scale), self.m - end.determined
-        if dof <= 0:
-            return 0.0
-        ratio = z.sum() / dof if self.loss is None else self.loss.rescaled(z, dof)
-        return 0.5 * float(np.log(ratio))
 
     # Searches
 

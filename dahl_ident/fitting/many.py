@@ -19,7 +19,7 @@ from dahl_ident.errors import ValidationError
 from dahl_ident.fitting.least_squares import AT_LIMIT, DOUBTFUL, NEARLY, SAME, TIE, solve
 from dahl_ident.fitting.levenberg_marquardt import IntArray, Minima, minimise
 from dahl_ident.fitting.limits import Chart, Limit, Reach, limits, stiffness_valleys, valleys
-from dahl_ident.fitting.optimum import Optimum, OptimumBatch, inverse, spread
+from dahl_ident.fitting.optimum import Optimum, OptimumBatch, estimated_scale, inverse, spread
 from dahl_ident.fitting.start import best_starts, edge_starts
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import ProblemBatch, Quadratic
@@ -245,7 +245,7 @@ def _scale(batch: ProblemBatch, cost: FloatArray, dof: IntArray) -> FloatArray:
     """Return the standard deviation of the residuals of each table."""
     if batch.scale_known:
         return np.ones(cost.shape)
-    return np.sqrt(2.0 * cost / np.where(dof > 0, dof, np.nan))
+    return estimated_scale(batch, cost, dof)
 
 
 def _friction_error(part: _Part, batch: ProblemBatch) -> FloatArray:

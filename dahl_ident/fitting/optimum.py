@@ -8,15 +8,17 @@ from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import FitError
 from dahl_ident.fitting.limits import Limit
+from dahl_ident.fitting.losses import Loss
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem, ProblemBatch
 
 _NULL = 1e-13  # eigenvalue of the scaled information below which a direction is undetermined
+_BARELY = 1.001  # of the rounding, below which a scale is that
 _PART = 1e-4  # of a parameter in such a direction that matters
 
 
@@ -46,7 +48,7 @@ class Optimum:
         Of theta: scale^2 times the inverse Fisher information; infinite where undetermined.
     scale : float
         Standard deviation of the residuals: 1 where the noise model knows it, else estimated as
-        (sum of squares / dof)^(1/2).
+        (sum of squares / dof)^(1/2), but no less than rounding makes it.
     scale_known : bool
         Which of the two.
     dof : int
@@ -87,6 +89,11 @@ class Optimum:
     def success(self) -> bool:
         """Whether there is a finite optimum and it was found."""
         return self.status.found_optimum
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the model meets the data to rounding, so that residuals say nothing."""
+        return _is_rounding(self.problem, self.scale)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -157,6 +164,53 @@ class OptimumBatch:
     def names(self) -> tuple[str, ...]:
         """The names of the free parameters."""
         return self.problem.names
+
+
+def estimated_scale(problem: Problem, cost: ArrayLike, dof: int | NDArray[np.intp]) -> FloatArray:
+    """Return the standard deviation of residuals whose half sum of squares is `cost`.
+
+    It is what rounding makes it where the residuals are smaller, and NaN without freedom.
+    """
+    variance = 2.0 * np.asarray(cost) / np.where(np.asarray(dof) > 0, dof, np.nan)
+    return np.maximum(np.sqrt(variance), problem.rounding)
+
+
+def scale_ratio(
+    problem: Problem, theta: FloatArray, scale: float, loss: Loss | None, dof: int
+) -> float:
+    """Return the scale that the residuals at `theta` have, over the `scale` that was assumed.
+
+    It is that of rounding where the residuals are smaller, and `scale` itself without freedom.
+    """
+    if dof <= 0:
+        return 1.0
+    y, _ = problem.whitened(theta, derivatives=False, tails=loss is None)
+    z = (y.real**2 + y.imag**2) / scale**2
+    variance = float(z.sum()) / dof if loss is None else loss.rescaled(z, dof)
+    return max(float(np.sqrt(variance)), float(problem.rounding) / scale)
+
+
+def _is_rounding(problem: Problem, scale: float) -> bool:
+    return not problem.scale_known and bool(scale < _BARELY * problem.rounding)
+
+
+def robust_information(
+    problem: Problem,
+    theta: FloatArray,
+    scale: float,
+    loss: Loss,
+    dof: int,
+    chart: FloatArray | None = None,
+) -> FloatArray:
+    """Return the inverse of a robust estimate's covariance; `chart` is dtheta/dphi, (P, Q)."""
+    r, J = problem.residuals_and_jacobian(theta, scale, tails=False)
+    if chart is not None:
+        J = J @ chart
+    m = problem.n_residuals
+    kappa = 1.0
+    if not _is_rounding(problem, scale):
+        kappa = loss.inflation(r[:m:2] ** 2 + r[1:m:2] ** 2, dof)
+    return np.asarray(J[:m].T @ J[:m] / kappa + J[m:].T @ J[m:])
 
 
 def inverse(information: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:

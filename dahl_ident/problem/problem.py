@@ -233,6 +233,11 @@ class Problem:
         """The data as dynamic stiffness at known amplitudes, sensors at their starts."""
         return self._predictor.as_stiffness(self._noise.weights)
 
+    @property
+    def rounding(self) -> FloatArray:
+        """Size of residuals that may be rounding errors alone; no estimated scale is smaller."""
+        return self._noise.rounding
+
     # Residuals
 
     def residuals(self, theta: ArrayLike, scale: ArrayLike = 1.0) -> FloatArray:

@@ -38,18 +38,26 @@ def verdict(fit: FitResult) -> str:
     """Return whether to trust a fit, and what speaks against it."""
     if fit.trusted:
         return f"To be trusted. {fit.identifiability.headline} {fit.goodness.headline}"
-    parts = ["NOT to be trusted."]
+    return " ".join(["NOT to be trusted.", *_objections(fit)])
+
+
+def _objections(fit: FitResult) -> Iterator[str]:
+    """Yield what speaks against a fit, a sentence or more each."""
     if not fit.success:
-        parts.append(fit.message)
+        yield fit.message
     if fit.nfree <= 0:
-        parts.append("There are no degrees of freedom left to judge the noise by.")
-    if not fit.identifiability.complete:
+        judged = "the model" if fit.scale_known else "noise and model"
+        yield (
+            f"{fit.nvarys} parameters leave nothing of {fit.ndata} numbers to judge {judged} by: "
+            "measure more points."
+        )
+    known = fit.scale_known or fit.nfree > 0
+    if known and not fit.identifiability.complete:
         lost = fit.identifiability.named(Verdict.NOT_IDENTIFIED)
-        parts.append(fit.identifiability.headline)
-        parts += [f"{fit.identifiability.parameters[name].text}." for name in lost]
+        yield fit.identifiability.headline
+        yield from (f"{fit.identifiability.parameters[name].text}." for name in lost)
     if not fit.goodness.acceptable:
-        parts.append(fit.goodness.headline)
-    return " ".join(parts)
+        yield fit.goodness.headline
 
 
 def fit_report(fit: FitResult, intervals: ConfidenceIntervals) -> str:
@@ -82,7 +90,7 @@ def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[Section]:
     if correlations:
         yield Section("Correlations", correlations)
     yield Section("Noise", _noise(fit))
-    yield Section("Goodness of fit", fit.goodness.details)
+    yield Section("Goodness of fit", fit.goodness.details or ["no test applies"])
     if not fit.goodness.acceptable:
         yield Section(
             "Other models, compared and not claimed", str(compare_models(fit)).splitlines()
@@ -126,7 +134,10 @@ def _noise(fit: FitResult) -> list[str]:
         error = fit.scale / math.sqrt(2.0 * fit.nfree) if fit.nfree > 0 else None
         unit = fit.data.unit if fit.noise == "absolute" else ""
         size = with_unit(fit.scale, error, unit)
-        lines.append(f"scale {size}, estimated with {fit.nfree} degrees of freedom")
+        made = "what rounding leaves; the residuals are smaller"
+        if not fit.optimum.is_exact:
+            made = f"estimated with {fit.nfree} degrees of freedom"
+        lines.append(f"scale {size}, {made}")
     loss = fit.optimum.loss
     if loss != "linear":
         lines.append(f"robust loss: {loss}")
