@@ -111,7 +111,7 @@ def test_a_chain_that_never_moved_is_refused_with_its_chain(
     def stay(half: Any, guide: Any, random: Any) -> Any:
         return half, np.full(half.shape[:-1], -np.inf)
 
-    def moves(ensembles: int) -> list[tuple[EnsembleMove, float]]:
+    def moves(ensembles: int, shear: Any) -> list[tuple[EnsembleMove, float]]:
         return [(EnsembleMove(stay, ensembles), 1.0)]
 
     monkeypatch.setattr("dahl_ident.bayes.chain.moves_for", moves)

@@ -17,6 +17,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.convergence import Convergence, judge
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.moves import moves_for
+from dahl_ident.bayes.shear import shear_of
 
 _FIRST_CHECK = 200
 _GROWTH = 1.25
@@ -146,7 +147,7 @@ def _sampler(density: Density, settings: Settings, pool: Pool | None) -> Any:
         settings.walkers,
         len(density.names),
         density if pool is None else _Mapped(density, pool),
-        moves=moves_for(settings.ensembles),
+        moves=moves_for(settings.ensembles, shear_of(density.problem)),
         vectorize=True,
     )
 

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.bayes.shear import Shear
 
 Random = np.random.RandomState  # emcee's
 Proposal = Callable[[FloatArray, FloatArray, Random], tuple[FloatArray, FloatArray]]
@@ -36,10 +37,14 @@ _SNOOKER = 1.7
 
 @dataclass(frozen=True)
 class EnsembleMove:
-    """One kind of proposal, applied to every ensemble by itself; a move of emcee's sampler."""
+    """One kind of proposal, applied to every ensemble by itself; a move of emcee's sampler.
+
+    With a shear, places are proposed where ridges are straight.
+    """
 
     proposal: Proposal
     ensembles: int
+    shear: Shear | None = None
 
     def propose(self, model: Any, state: Any) -> tuple[Any, Any]:
         """Return the state after every walker was asked to move once, and who accepted."""
@@ -49,26 +54,29 @@ class EnsembleMove:
         order = random.uniform(size=(self.ensembles, each)).argsort(axis=1)
         order += each * np.arange(self.ensembles)[:, None]
         accepted = np.zeros(walkers, dtype=bool)
+        straight = state.coords if self.shear is None else self.shear.straight(state.coords)
         halves = (order[:, : each // 2], order[:, each // 2 :])
         for half, guide in (halves, halves[::-1]):
-            places, factor = self.proposal(state.coords[half], state.coords[guide], random)
-            who = half.ravel()
-            log_density, _ = model.compute_log_prob_fn(places.reshape(-1, dims))
+            proposed, factor = self.proposal(straight[half], straight[guide], random)
+            who, proposed = half.ravel(), proposed.reshape(-1, dims)
+            places = proposed if self.shear is None else self.shear.bent(proposed)
+            log_density, _ = model.compute_log_prob_fn(places)
             gain = factor.ravel() + log_density - state.log_prob[who]
             moves = gain > np.log(random.uniform(size=who.size))
             who = who[moves]
-            state.coords[who] = places.reshape(-1, dims)[moves]
+            straight[who] = proposed[moves]
+            state.coords[who] = places[moves]
             state.log_prob[who] = log_density[moves]
             accepted[who] = True
         return state, accepted
 
 
-def moves_for(ensembles: int) -> list[tuple[EnsembleMove, float]]:
+def moves_for(ensembles: int, shear: Shear | None) -> list[tuple[EnsembleMove, float]]:
     """Return the moves and how often each is taken."""
     return [
-        (EnsembleMove(independent, ensembles), 0.5),
-        (EnsembleMove(differential_evolution, ensembles), 0.4),
-        (EnsembleMove(snooker, ensembles), 0.1),
+        (EnsembleMove(independent, ensembles, shear), 0.5),
+        (EnsembleMove(differential_evolution, ensembles, shear), 0.4),
+        (EnsembleMove(snooker, ensembles, shear), 0.1),
     ]
 
 

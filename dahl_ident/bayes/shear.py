@@ -1,0 +1,98 @@
+r"""Coordinates in which the ridges of plants are straight.
+
+A spring beside friction is known by their sum: where the data leave f_max and sigma open, the
+stiffness follows them along a curve, and straight steps leave it. Weighted least squares of
+friction's describing function N(f_max, sigma, alpha) by the columns of spring, damper and mass,
+at the amplitudes and with the weights of the data, say how far their parameters l follow:
+
+    phi = l + W N(f_max, sigma, alpha),    W = (G' w^2 G)^-1 G' w^2.
+
+phi is what the data see of l. For given friction it is a shift, so that volumes stay as they are
+and a density over phi is the density over l.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import Dahl, Damper, Mass, Spring
+from dahl_ident.problem import Problem
+
+_FARTHEST = 1e300  # stands for a shift that is no number; no prior reaches it
+
+
+@dataclass(frozen=True)
+class Shear:
+    """The shift of the linear parameters; made by :func:`shear_of`.
+
+    Attributes
+    ----------
+    problem : Problem
+        Whose search coordinates theta, (S, P), come first in the points moved, (S, D).
+    friction : tuple of Dahl
+        The elements with free parameters.
+    linear : ndarray of int, shape (L,)
+        Which coordinates are those of springs, dampers and masses.
+    projection : ndarray, shape (2 n, L)
+        From real and imaginary parts of N at every row to the shift.
+    """
+
+    problem: Problem
+    friction: tuple[Dahl, ...]
+    linear: NDArray[np.intp]
+    projection: FloatArray
+
+    def straight(self, x: FloatArray) -> FloatArray:
+        """Return points with phi in the place of l."""
+        return self._moved(x, 1.0)
+
+    def bent(self, x: FloatArray) -> FloatArray:
+        """Return points with l in the place of phi."""
+        return self._moved(x, -1.0)
+
+    def _moved(self, x: FloatArray, sign: float) -> FloatArray:
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore"):
+            shift = _parts(self._describing_function(x)) @ self.projection
+        moved = x.copy()
+        moved[:, self.linear] += sign * np.where(np.isfinite(shift), shift, _FARTHEST)
+        return moved
+
+    def _describing_function(self, x: FloatArray) -> ComplexArray:
+        names, view = self.problem.names, self.problem.stiffness_data
+        values = self.problem.to_values(x[:, : len(names)])
+        by_name = dict(zip(names, values.T[..., None], strict=True))
+        return np.asarray(
+            sum(
+                view.of(e, [by_name.get(p.name, np.asarray(p.value)) for p in e.parameters])
+                for e in self.friction
+            )
+        )
+
+
+def shear_of(problem: Problem) -> Shear | None:
+    """Return the shear of a problem; None where friction or a linear element is not free."""
+    view = problem.stiffness_data
+    elements = problem.model.elements
+    friction = tuple(e for e in elements if isinstance(e, Dahl) and _is_free(problem, e))
+    linear = [e for e in elements if isinstance(e, Spring | Damper | Mass) and _is_free(problem, e)]
+    if not friction or not linear:
+        return None
+    weights = np.repeat(view.weights, 2)
+    columns = np.stack([_parts(view.of(e, [np.ones(())])) for e in linear], axis=-1)
+    weighted = columns * weights[:, None]
+    size = np.sqrt((weighted**2).sum(axis=0))
+    projection = np.linalg.pinv(weighted / size) * weights / size[:, None]
+    at = [problem.names.index(e.parameters[0].name) for e in linear]
+    return Shear(problem, friction, np.array(at), projection.T)
+
+
+def _is_free(problem: Problem, element: Dahl | Spring | Damper | Mass) -> bool:
+    return any(p.name in problem.names for p in element.parameters)
+
+
+def _parts(values: ComplexArray) -> FloatArray:
+    return np.ascontiguousarray(values).view(np.float64)

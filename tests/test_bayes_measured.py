@@ -1,0 +1,56 @@
+"""Posteriors from measurements made by others; what the model cannot say has to show."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dahl_ident as di
+from tests.test_extraction_measured import FILES, measured
+from tests.test_readers_measured import BRAKE_REUSS
+
+MEASURED = os.environ.get("DAHL_IDENT_MEASURED_DATA")
+pytestmark = pytest.mark.skipif(
+    MEASURED is None,
+    reason="DAHL_IDENT_MEASURED_DATA does not name the folder of the measured data",
+)
+
+
+def test_the_damper_shows_its_misfit() -> None:
+    data = di.FrequencyResponse.concatenate(
+        [di.extract(measured(name), harmonics=(1,)) for name in FILES]
+    )
+    posterior = di.sample(data, di.Dahl(), seed=1)
+    assert posterior.converged
+    size = next(check for check in posterior.checks if check.statistic == "size")
+    assert not size.passed
+    assert size.observed > 3.0 * size.replicated
+    assert "MISFIT: the residuals are larger than the noise that the data state" in str(posterior)
+    grid = di.posterior_grid(data, di.Dahl())
+    for i, name in enumerate(("f_max", "sigma")):
+        middle = float(grid.quantile(name, 0.5))
+        assert np.median(posterior.values[:, i]) == pytest.approx(middle, abs=0.1 * grid.std()[i])
+
+
+def test_the_bolted_joint_leaves_f_max_to_its_prior(tmp_path: Path) -> None:
+    columns = tmp_path / "columns.toml"
+    columns.write_text(BRAKE_REUSS)
+    path = Path(MEASURED or "") / "brb" / "ForcedFrequencyResponses.mat"
+    beam = di.read_frequency_response(path, columns=columns)
+    held = beam.select(level=[label for label in beam.levels if "Response" in str(label)])
+    data = held.select(rows=np.arange(held.n) % 8 == 0)
+    model = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
+    posterior = di.sample(data, model, seed=1, ess=1000.0)
+    assert posterior.converged, posterior.message
+    f_max = next(rule for rule in posterior.prior_rules if rule.name == "f_max")
+    assert f_max.at_upper_end
+    assert "f_max is set by its prior: posterior width 0." in posterior.report()
+    # all the same, the microslip loss and the small-amplitude stiffness are well known
+    loss = posterior.derived(lambda f_max, sigma, **_: sigma**2 / f_max)
+    assert loss["84%"] < 1.4 * loss["16%"]
+    assert 3.0e7 < loss["median"] < 5.0e7
+    total = posterior.derived(lambda sigma, stiffness, **_: sigma + stiffness)
+    assert total["84%"] < 1.1 * total["16%"]
