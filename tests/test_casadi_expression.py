@@ -13,6 +13,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import general_dahl
 from dahl_ident.fitting import chebyshev
 from dahl_ident.fitting.casadi_expression import (
+    Expansion,
     Phasor,
     general_describing_function,
     linear_describing_function,
@@ -24,12 +25,13 @@ Derivatives = tuple[complex, complex, complex]
 BREAKS = (chebyshev.LOW, chebyshev.HIGH)
 
 
-def jets(h: Phasor, variables: Sequence[ca.SX]) -> ca.Function:
-    """Value, Jacobian and all second derivatives of (Re h, Im h)."""
+def jets(h: Phasor, variables: Sequence[ca.SX], *given: ca.SX) -> ca.Function:
+    """Value, Jacobian and all second derivatives of (Re h, Im h) by `variables`."""
     v = ca.vertcat(*variables)
     parts = ca.vertcat(h.real, h.imag)
     first = ca.jacobian(parts, v)
-    return ca.Function("jets", [v], [parts, ca.vec(first), ca.vec(ca.jacobian(first, v))])
+    second = ca.jacobian(first, v)
+    return ca.Function("jets", [v, *given], [parts, ca.vec(first), ca.vec(second)])
 
 
 @pytest.fixture(scope="module")
@@ -193,6 +195,24 @@ def test_full_slip_has_finite_derivatives(general: ca.Function) -> None:
         betas = onset * (1.0 + np.array([-1e-6, -1e-12, 0.0, 1e-12, 1e-6]))
         parts = general_values(general, betas, alpha)
         assert all(np.isfinite(part).all() for part in parts)
+
+
+@pytest.mark.parametrize("harmonic", [1, 2, 3])
+@pytest.mark.parametrize(("at_x", "at_y"), [(0.02, -0.5), (1.0, 0.4), (30.0, 0.0)])
+def test_an_expansion_has_the_derivatives_of_what_it_stands_for(
+    harmonic: int, at_x: float, at_y: float
+) -> None:
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    beta, alpha = x * ca.exp(y * x / (1.0 + x)), ca.exp(y)
+    at = [at_x, at_y]
+    expected = jets(general_describing_function(beta, alpha, harmonic), [x, y])(at)
+    expansion = Expansion(beta, alpha, harmonic)
+    point = ca.Function("point", [ca.vertcat(x, y)], [expansion.point])(at)
+    known = jets(expansion.value, [x, y], expansion.symbols)
+    for order in range(3):
+        found = known(at, expansion.coefficients(order)(point))
+        for part, exact in list(zip(found, expected, strict=True))[: order + 1]:
+            np.testing.assert_allclose(part, ca.densify(exact), rtol=1e-11, atol=1e-11)
 
 
 def test_phasor_arithmetic() -> None:

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 _LEAST_BETA = 1e-200
 _NEWTON_STEPS = 6
+_COEFFICIENTS = 14  # of an expansion: point, value, two slopes, three second derivatives
 _DEEPEST = 42.0
 """ln(z_0/z) beyond which nothing is left of the margin z to full slip."""
 
@@ -153,6 +154,73 @@ def general_describing_function(beta: ca.SX, alpha: ca.SX | float, harmonic: int
     if harmonic % 2 == 0:
         return Phasor(ca.SX(0.0), ca.SX(0.0))
     return Phasor(*_quadrature(harmonic).call([ca.SX(beta), ca.SX(alpha)]))
+
+
+class Expansion:
+    """h about one beta and alpha: a quadratic polynomial whose coefficients are mere symbols.
+
+    Written into a larger expression, the quadrature would be differentiated by all of that
+    expression's variables. The polynomial about where beta and alpha are has the same value and
+    derivatives there, and takes those of the quadrature by beta and alpha alone.
+
+    Attributes
+    ----------
+    point : casadi.SX, shape (2,)
+        Expressions of beta and alpha.
+    symbols : casadi.SX, shape (14,)
+        What `coefficients` returns at `point`.
+
+    Examples
+    --------
+    >>> import casadi as ca
+    >>> x = ca.SX.sym("x")
+    >>> h = Expansion(x**2, ca.SX(2.0))
+    >>> at_one = h.coefficients(1)([1.0, 2.0])
+    >>> slope = ca.Function("slope", [x, h.symbols], [ca.jacobian(h.value.real, x)])
+    >>> slope(1.0, at_one)
+    DM(-0.769847)
+    """
+
+    def __init__(self, beta: ca.SX, alpha: ca.SX, harmonic: int = 1) -> None:
+        import casadi as ca
+
+        self.point = ca.vertcat(beta, alpha)
+        self.symbols = ca.SX.sym("expansion", _COEFFICIENTS)
+        self._harmonic = harmonic
+
+    @property
+    def value(self) -> Phasor:
+        """h, as an expression of `point` and `symbols`."""
+        import casadi as ca
+
+        at, h, *derivatives = ca.vertsplit(self.symbols, 2)
+        x, y = ca.vertsplit(self.point - at)
+        powers = (x, y, x * x / 2.0, x * y, y * y / 2.0)
+        for factor, derivative in zip(powers, derivatives, strict=True):
+            h = h + factor * derivative
+        return Phasor(h[0], h[1])
+
+    def coefficients(self, order: int) -> ca.Function:
+        """Return beta and alpha -> them, h and its derivatives up to `order`; zeros beyond."""
+        return _expansion(self._harmonic, order)
+
+
+@cache
+def _expansion(harmonic: int, order: int) -> ca.Function:
+    import casadi as ca
+
+    at = ca.SX.sym("at", 2)
+    h = general_describing_function(at[0], at[1], harmonic)
+    value = ca.vertcat(h.real, h.imag)
+    parts = [at, value]
+    if order > 0:
+        by_beta, by_alpha = ca.horzsplit(ca.jacobian(value, at))
+        parts += [by_beta, by_alpha]
+    if order > 1:
+        parts += [ca.jacobian(by_beta, at), ca.jacobian(by_alpha, at[1])]
+    coefficients = ca.vertcat(*map(ca.vec, parts))
+    rest = ca.DM.zeros(_COEFFICIENTS - coefficients.numel())
+    return ca.Function("expansion", [at], [ca.densify(ca.vertcat(coefficients, rest))])
 
 
 @cache

@@ -8,6 +8,9 @@ on its own unknowns alone, so the Hessian has the shape of an arrowhead. casadi 
 one row of each kind; one mapped call evaluates that for all rows, and the results are, in their
 order, the nonzeros of the sparse matrices. Left to itself casadi would colour the whole problem,
 which takes several times as long to build and to evaluate.
+
+What is long-winded in a row, the quadrature of a general exponent, enters as its expansion about
+the row's own numbers (:class:`dahl_ident.fitting.casadi_expression.Expansion`).
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +92,7 @@ class RowwiseProblem:
         cost, constraints = self._of_shared([self._shared.cost, self._shared.constraints])
         balances = []
         for rows in self._rows:
-            f, g = rows.evaluated([rows.cost, rows.block.balance])
+            (f,), (g,) = (rows.evaluated([part], 0) for part in (rows.cost, rows.block.balance))
             cost += ca.sum2(f)
             balances.append(ca.vec(g))
         return self._function("nlp", ["f", "g"], [cost, ca.vertcat(*balances, constraints)])
@@ -102,7 +105,7 @@ class RowwiseProblem:
         cost, by_shared = self._of_shared([shared.cost, ca.gradient(shared.cost, shared.variables)])
         by_own = []
         for rows in self._rows:
-            f, d = rows.evaluated([rows.cost, ca.gradient(rows.cost, rows.variables)])
+            f, d = rows.evaluated([rows.cost, ca.gradient(rows.cost, rows.variables)], 1)
             cost += ca.sum2(f)
             by_shared += ca.sum2(d[: self.n_shared, :])
             by_own.append(ca.vec(d[self.n_shared :, :]))
@@ -118,7 +121,9 @@ class RowwiseProblem:
         c, dc = self._of_shared(
             [shared.constraints, _dense_jacobian(shared.constraints, shared.variables)]
         )
-        parts = [rows.evaluated([rows.block.balance, rows.balance_slopes()]) for rows in self._rows]
+        parts = [
+            rows.evaluated([rows.block.balance, rows.balance_slopes()], 1) for rows in self._rows
+        ]
         columns = []
         for j in range(self.n_shared):
             for rows, (_, d) in zip(self._rows, parts, strict=True):
@@ -230,13 +235,36 @@ class _Rows:
 
     @cached_property
     def _inputs(self) -> list[ca.SX]:
-        return [self._shared, self.block.unknowns, self.block.columns]
-
-    def evaluated(self, expressions: list[ca.SX]) -> list[ca.MX]:
-        """Return expressions of one row for all rows, side by side."""
         import casadi as ca
 
-        return list(ca.Function("row", self._inputs, expressions).map(self.n).call(self.arguments))
+        block = self.block
+        expansions = ca.vertcat(ca.SX(0, 1), *(e.symbols for e in block.expansions))
+        return [self._shared, block.unknowns, block.columns, expansions]
+
+    def _inputs_at(self, arguments: list[Any], order: int) -> list[Any]:
+        """Return arguments and the expansions' coefficients up to derivatives of `order`."""
+        import casadi as ca
+
+        points = [e.point for e in self.block.expansions]
+        if not points:
+            return [*arguments, ca.DM(0, self.n)]
+        at = ca.Function("points", self._inputs[:3], points).map(self.n).call(arguments)
+        coefficients = [
+            e.coefficients(order).map(self.n)(point)
+            for e, point in zip(self.block.expansions, at, strict=True)
+        ]
+        return [*arguments, ca.vertcat(*coefficients)]
+
+    def evaluated(self, expressions: list[ca.SX], order: int) -> list[ca.MX]:
+        """Return expressions of one row, derivatives of `order`, for all rows, side by side."""
+        import casadi as ca
+
+        inputs = self._inputs
+        if not ca.depends_on(ca.vertcat(*map(ca.vec, expressions)), inputs[-1]):
+            row = ca.Function("row", inputs[:-1], expressions)
+            return list(row.map(self.n).call(self.arguments))
+        row = ca.Function("row", inputs, expressions)
+        return list(row.map(self.n).call(self._inputs_at(self.arguments, order)))
 
     def balance_slopes(self) -> ca.SX:
         """Return the Jacobian of the balance, column after column."""
@@ -255,7 +283,8 @@ class _Rows:
         row = ca.Function(
             "row", [*self._inputs, factor, multipliers], [_upper(H[:, :P], 0), _upper(H[:, P:], P)]
         )
-        return list(row.map(self.n).call([*self.arguments, ca.repmat(lam_f, 1, self.n), lam_g]))
+        inputs = self._inputs_at(self.arguments, 2)
+        return list(row.map(self.n).call([*inputs, ca.repmat(lam_f, 1, self.n), lam_g]))
 
     def information(self, xi: FloatArray, own: FloatArray) -> FloatArray:
         """Return each row's information of xi, shape (n, P, P): a Schur complement."""
@@ -265,7 +294,8 @@ class _Rows:
         slopes = ca.Function(
             "slopes", self._inputs, [_dense_jacobian(p, self.variables) for p in parts]
         )
-        numbers = slopes.map(self.n)(np.tile(xi[:, None], self.n), own.T, self.block.numbers)
+        arguments = [ca.DM(a) for a in (np.tile(xi[:, None], self.n), own.T, self.block.numbers)]
+        numbers = slopes.map(self.n).call(self._inputs_at(arguments, 1))
         J, G = (
             np.asarray(d).reshape(part.numel(), self.n, -1).swapaxes(0, 1)
             for d, part in zip(numbers, parts, strict=True)
@@ -277,7 +307,8 @@ class _Rows:
         bordered[:, k:, :k] = G[:, :, P:]
         bordered[:, :k, k:] = G[:, :, P:].swapaxes(1, 2)
         lever = np.concatenate((H[:, P:, :P], G[:, :, :P]), axis=1)
-        return H[:, :P, :P] - lever.swapaxes(1, 2) @ np.linalg.solve(bordered, lever)
+        taken = lever.swapaxes(1, 2) @ np.linalg.solve(bordered, lever)
+        return np.asarray(H[:, :P, :P] - taken)
 
 
 def _dense_jacobian(parts: ca.SX, variables: ca.SX) -> ca.SX:

@@ -39,8 +39,8 @@ from dahl_ident.elements import Dahl, Damper, LinearSystem, Mass, Model, Spring
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import losses
 from dahl_ident.fitting.casadi_expression import (
+    Expansion,
     Phasor,
-    general_describing_function,
     linear_describing_function,
 )
 from dahl_ident.noise import (
@@ -106,6 +106,8 @@ class RowBlock:
         Symbols for the row's numbers.
     numbers : ndarray, shape (m, n)
         Their values in every row.
+    expansions : list of Expansion
+        Describing functions whose coefficients are to be put in for their symbols.
     """
 
     rows: IntArray
@@ -115,6 +117,7 @@ class RowBlock:
     unknowns: ca.SX
     columns: ca.SX
     numbers: FloatArray
+    expansions: list[Expansion]
 
 
 def parameter_values(problem: Problem, theta: ca.SX) -> dict[str, ca.SX]:
@@ -177,12 +180,13 @@ def row_blocks(target: Target, theta: ca.SX, start: FloatArray) -> list[RowBlock
 
 
 class _Columns:
-    """Numbers that differ from row to row, each with a symbol to stand for it."""
+    """What differs from row to row, with symbols to stand for it: numbers and expansions."""
 
     def __init__(self, rows: IntArray) -> None:
         self._rows = rows
         self._symbols: list[ca.SX] = []
         self._numbers: list[FloatArray] = []
+        self.expansions: list[Expansion] = []
 
     def real(self, values: FloatArray) -> ca.SX:
         """Return the symbol of a column, or its number if that is the same in all rows.
@@ -201,6 +205,18 @@ class _Columns:
     def phasor(self, values: ComplexArray) -> Phasor:
         """Return the symbols of a complex column."""
         return Phasor(self.real(values.real), self.real(values.imag))
+
+    def friction(
+        self, element: Dahl, values: Sequence[ca.SX], amplitude: ca.SX, harmonic: int
+    ) -> Phasor:
+        """Return F_k/X_1 of a Dahl element."""
+        f_max, sigma, alpha = values
+        beta = sigma * amplitude / f_max
+        exponent = element.parameters[2]
+        if harmonic == 1 and not exponent.free and exponent.value == 1.0:
+            return linear_describing_function(beta).scaled(sigma)
+        self.expansions.append(Expansion(beta, alpha, harmonic))
+        return self.expansions[-1].value.scaled(sigma)
 
     def collected(self) -> tuple[ca.SX, FloatArray]:
         """Return all symbols and their numbers."""
@@ -248,7 +264,9 @@ class _Table:
         loss = self._loss(columns, ca.sumsqr(residuals))
         symbols, numbers = columns.collected()
         unknowns = ca.vertcat(phasor, error)
-        return RowBlock(rows, residuals, loss, balance, unknowns, symbols, numbers)
+        return RowBlock(
+            rows, residuals, loss, balance, unknowns, symbols, numbers, columns.expansions
+        )
 
     def _driven(self, columns: _Columns, phasor: ca.SX, stretch: ca.SX) -> tuple[Phasor, ca.SX]:
         """Return F/X = u_0/X and the balance Z X/u_0 - 1 for the unknown phasor X."""
@@ -272,7 +290,7 @@ class _Table:
         for element in self.problem.model.elements:
             values = [self.values[p.name] for p in element.parameters]
             if isinstance(element, Dahl):
-                total = total + _friction(element, values, amplitude, harmonic)
+                total = total + columns.friction(element, values, amplitude, harmonic)
             elif isinstance(element, Mass | Damper | Spring):
                 unit = element.stiffness([np.ones(())], np.ones(()), self.rows.omega, harmonic)
                 total = total + columns.phasor(unit).scaled(values[0])
@@ -342,15 +360,6 @@ class _Table:
         seen = predicted / self.operator if self.is_stiffness else self.operator / predicted
         stiffness = seen / measured_stiffness_factor(sensed, self.rows.omega, 1)
         return np.where(forced, self.rows.drive / sensed[0] / stiffness, 1.0)
-
-
-def _friction(element: Dahl, values: Sequence[ca.SX], amplitude: ca.SX, harmonic: int) -> Phasor:
-    f_max, sigma, alpha = values
-    beta = sigma * amplitude / f_max
-    exponent = element.parameters[2]
-    if harmonic == 1 and not exponent.free and exponent.value == 1.0:
-        return linear_describing_function(beta).scaled(sigma)
-    return general_describing_function(beta, alpha, harmonic).scaled(sigma)
 
 
 def _student(dof: ca.SX, squares: ca.SX) -> ca.SX:

@@ -55,7 +55,7 @@ def optimum(
 
     `scale` is 1 where the optimum does not depend on it; it is estimated here then.
     """
-    theta = problem.in_order(end.theta)
+    theta = end.theta if end.limit else problem.in_order(end.theta)  # a limit has names
     dof = problem.n_residuals + len(problem.priors) - end.determined
     final = scale
     if not problem.scale_known and loss is None and not problem.priors:
