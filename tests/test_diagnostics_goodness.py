@@ -11,8 +11,10 @@ from scipy import stats
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, compare_models, fit
 from dahl_ident.diagnostics.goodness import Goodness, goodness
 from dahl_ident.diagnostics.outliers import suspicious_points
-from dahl_ident.diagnostics.residual_space import RelativeSpace, ResidualSpace
+from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, ResidualSpace
 from dahl_ident.diagnostics.third_harmonic import third_harmonic_share
+from dahl_ident.diagnostics.trends import Trend
+from dahl_ident.fitting import Status
 from tests.friction_tables import (
     FRICTION,
     PLANT,
@@ -41,7 +43,7 @@ def swept_table(fall: float, noise: float = 0.01, seed: int = 1) -> FrequencyRes
 class TestSilence:
     def test_p_values_are_uniform_and_alarms_are_rare(self) -> None:
         found = [judge(table(seed=seed, n=8 + 22 * (seed % 2))) for seed in range(300)]
-        assert sum(not g.acceptable for g in found) <= 3
+        assert sum(not g.acceptable for g in found) <= 8
         assert 4 <= sum(bool(g.hints) for g in found) <= 32
         for p in (
             [g.trends[0].p_value for g in found],
@@ -92,6 +94,25 @@ class TestDepartures:
         assert not found.acceptable
         assert "which no rate-independent model does" in found.headline
         assert "friction's stiffness falls by" in found.headline
+
+    def test_ten_scattered_points_show_a_fall_of_stiffness_by_30_percent(self) -> None:
+        """As the points of a damper do: most such tables are not to be trusted."""
+        f = np.array([0.25] * 3 + [0.5] * 3 + [1.0] * 3 + [2.0])
+        A = np.array([1.0, 2.0, 3.0] * 3 + [1.0]) * 3.0 * X_C
+        N = FRICTION.describing_function(A)
+        N = N.real * (f / 0.25) ** (np.log(0.7) / np.log(8.0)) + 1j * N.imag
+        found = [
+            judge(FrequencyResponse(f, N * relative_noise(10, 0.02, seed), A)) for seed in range(20)
+        ]
+        alarmed = [g.headline for g in found if not g.acceptable]
+        assert len(alarmed) >= 12
+        assert all("over frequency, from 0.25 to 2 Hz" in text for text in alarmed)
+
+    def test_a_slope_too_steep_to_be_a_size_has_a_direction_only(self) -> None:
+        steep = Trend(
+            "amplitude", 1e-3, 1.0, "m", Coefficient(-9.0, 1.0), Coefficient(1e4, 10.0), 0.3, 1e-9
+        )
+        assert "(friction's stiffness falls more than tenfold, friction's loss rises" in str(steep)
 
     def test_the_size_does_not_depend_on_the_claimed_noise(self) -> None:
         data = swept_table(0.28)
@@ -312,6 +333,18 @@ class TestComparison:
         assert (free.aic, free.bic) == pytest.approx((alone.aic, alone.bic))
         assert found.headline == "No model compared is better than the one fitted."
         assert list(found.to_frame()["model"]) == [m.name for m in found.models]
+
+    def test_an_element_that_vanishes_leaves_the_other_its_numbers(self) -> None:
+        for seed in range(12, 20):
+            data = table(seed=seed)
+            one = fit(data, Dahl())
+            two = fit(data, Dahl(name="early") + Dahl(name="late"), throw=False)
+            if two.status is not Status.NO_FRICTION:
+                continue
+            kept = "late" if two.params["early_f_max"].value == 0.0 else "early"
+            assert two.params[f"{kept}_f_max"].value == pytest.approx(one.params["f_max"].value)
+            return
+        pytest.fail("no data set makes an element vanish")
 
     def test_own_models_and_those_that_fail(self) -> None:
         data = table(n=3)

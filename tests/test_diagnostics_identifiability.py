@@ -69,6 +69,22 @@ class TestVerdicts:
         assert "free stiffness hides it below 0.00033 m" in found.parameters["f_max"].text
         assert found.headline.startswith("Only sigma^2/f_max and sigma + stiffness are determined")
 
+    def test_what_runs_away_determines_only_what_its_limit_says(self) -> None:
+        """At f_max = infinity the length f_max/sigma has no value, however the search stands."""
+        tables = (
+            table(model=FRICTION + Spring(SIGMA), beta=(1e-2, 1e-1), noise=0.01, seed=seed)
+            for seed in range(9)
+        )
+        fits = (fit(data, Dahl() + Spring(), throw=False) for data in tables)
+        found = identifiability(next(f for f in fits if np.isinf(f.params["f_max"].value)))
+        assert found.determined == ("sigma^2/f_max", "sigma + stiffness")
+
+    def test_a_stiffness_hidden_by_a_spring_is_no_slip(self) -> None:
+        """f_max and sigma fade together: the reason is the spring, not amplitudes too large."""
+        data = table(model=FRICTION + Spring(SIGMA), beta=(1e-2, 1e-1), noise=0.004)
+        text = identifiability(fit(data, Dahl() + Spring(), throw=False)).parameters["sigma"].text
+        assert "the free stiffness can take its place: drive far into slip" in text
+
     def test_only_the_sum_of_stiffnesses(self) -> None:
         data = table(model=FRICTION + Spring(SIGMA), beta=(1e-4, 1e-3), noise=0.001, seed=7)
         found = identifiability(fit(data, Dahl() + Spring(), throw=False))
@@ -117,6 +133,13 @@ class TestVerdicts:
         N = FRICTION.describing_function(A) * relative_noise(30, 0.001, 1)
         found = verdicts(fit(FrequencyResponse(f, N, A), Dahl() + Damper()))
         assert set(found.values()) == {IDENTIFIED}
+
+    def test_one_point_without_covariance_leaves_the_noise_unknown(self) -> None:
+        found = identifiability(fit(table(n=1, beta=(1.0, 1.0)), Dahl()))
+        assert found.named(NOT) == ["f_max", "sigma"]
+        for parameter in found.parameters.values():
+            assert "because no number is left to estimate the noise by" in parameter.text
+            assert "slip" not in parameter.text
 
     def test_rotation_has_its_units(self) -> None:
         data = table(beta=(1e-4, 1e-3))
@@ -169,6 +192,11 @@ class TestInformation:
         difference = np.array([1.0, -1.0, 0.0])
         expected = difference[:2] @ known @ difference[:2]
         assert information.variance(difference) == pytest.approx(expected, rel=0.03)
+
+    def test_without_a_noise_scale_there_is_no_variance(self) -> None:
+        information = Information(fit(table(n=1, beta=(1.0, 1.0)), Dahl()).optimum)
+        assert np.isnan(information.std(np.eye(2))).all()
+        assert information.rank == 2
 
     def test_shares_sum_to_one_and_lie_where_the_knee_is(self) -> None:
         result = fit(table(beta=(1e-3, 1e3), n=40), Dahl())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dahl_ident.diagnostics.intervals import Interval
+from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.units import shown_unit
 from dahl_ident.elements import Dahl, Element, Spring
 from dahl_ident.fitting import Optimum
@@ -17,6 +18,11 @@ def advice(optimum: Optimum, name: str, limits: Interval, lost: frozenset[str]) 
 
     `limits` is its interval, `lost` the names of all such parameters.
     """
+    if not optimum.scale_known and optimum.dof <= 0:
+        return (
+            "because no number is left to estimate the noise by: measure more points, or repeat "
+            "them so that their covariance is known"
+        )
     gain = _confounding_gain(optimum, name, lost)
     if gain:
         return gain
@@ -70,7 +76,7 @@ def _of_friction(
                 f"the spring and fix {spring}"
             )
         return f"because no amplitude up to {most} reaches slip: drive above that"
-    if kind == "sigma" and spring in lost:
+    if kind == "sigma" and (spring in lost or (spring and _sticks(optimum, element))):
         return (
             f"because the free {spring} can take its place: drive far into slip, or measure the "
             f"spring and fix {spring}"
@@ -91,6 +97,13 @@ def _of_friction(
         f"because friction's share of the response from {least} to {most} is within the noise: "
         "cover amplitudes where it is larger, or reduce the noise"
     )
+
+
+def _sticks(optimum: Optimum, element: Dahl) -> bool:
+    """Return whether no amplitude reaches x_c, where an element begins to slip."""
+    values = parameter_values(optimum)
+    f_max, sigma = (values[p.name] for p in element.parameters[:2])
+    return bool(optimum.problem.stiffness_data.amplitude.max() < f_max / sigma)
 
 
 def _rival(optimum: Optimum, element: Dahl, kind: str, lost: frozenset[str]) -> str:

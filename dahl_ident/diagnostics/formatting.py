@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+_DIGITS = 12  # of a number that is known more exactly than anyone reads
+
 
 def rounded(value: float, uncertainty: float | None) -> tuple[str, str]:
     """Return value and uncertainty as text, the uncertainty with two significant digits.
@@ -19,7 +21,8 @@ def rounded(value: float, uncertainty: float | None) -> tuple[str, str]:
     Returns
     -------
     tuple of str
-        The value, to six digits where the uncertainty is unknown; the uncertainty or ``"?"``.
+        The value, to six digits where the uncertainty is unknown and to no more than twelve; the
+        uncertainty or ``"?"``.
 
     Examples
     --------
@@ -29,11 +32,19 @@ def rounded(value: float, uncertainty: float | None) -> tuple[str, str]:
     ('2.400e+06', '0.031e+06')
     >>> rounded(1.5, None)
     ('1.5', '?')
+    >>> rounded(0.1, 3e-16)
+    ('0.1', '3e-16')
+    >>> rounded(31.4, 8.2e5)
+    ('31', '8.2e+05')
     """
     if uncertainty is None or not math.isfinite(uncertainty) or not math.isfinite(value):
         return f"{value:.6g}", "?"
     if uncertainty == 0.0:
         return f"{value:.6g}", "0"
+    if uncertainty < 10.0**-_DIGITS * abs(value):
+        return f"{value:.{_DIGITS}g}", f"{uncertainty:.1g}"
+    if abs(value) < 0.1 * uncertainty:  # its digits would all be rounded away
+        return f"{value:.2g}", f"{uncertainty:.2g}"
     # rounding 0.0996 to two digits gives 0.10, so the digits follow the rounded uncertainty
     last = math.floor(math.log10(float(f"{uncertainty:.1e}"))) - 1
     number, error = _alike((value, uncertainty), last)
@@ -105,6 +116,8 @@ def interval(lower: float, upper: float, unit: str) -> str:
     '0.0981 to 0.1019 N'
     >>> interval(0.31, math.inf, "N")
     'at least 0.31 N'
+    >>> interval(0.1, 0.1 + 1e-15, "N")
+    '0.1 N'
     """
     low_open, high_open = not math.isfinite(lower), not math.isfinite(upper)
     if low_open and high_open:
@@ -113,8 +126,8 @@ def interval(lower: float, upper: float, unit: str) -> str:
         return f"at least {lower:.3g} {unit}".rstrip()
     if low_open:
         return f"at most {upper:.3g} {unit}".rstrip()
-    if upper <= lower:
-        return f"{lower:.6g} {unit}".rstrip()
+    if upper - lower <= 10.0**-_DIGITS * max(abs(lower), abs(upper)):
+        return f"{lower:.{_DIGITS}g} {unit}".rstrip()
     low, high = _alike((lower, upper), math.floor(math.log10(upper - lower)) - 1)
     return f"{low} to {high} {unit}".rstrip()
 

@@ -3,7 +3,7 @@
 Every test that applies is made: chi-square where the noise is known, trends and runs of the
 residuals over amplitude, frequency and drive, the exponent's score (departure from the universal
 curve h(beta)), the third harmonic against the model's. Together they may cry wolf once in a
-thousand data sets, so each has a thousandth over their number as its level.
+hundred data sets, so each has a hundredth over their number as its level.
 
 A fit can be statistically perfect and physically absurd; what no mechanism does is said as a
 warning (:mod:`dahl_ident.diagnostics.physics`).
@@ -29,7 +29,7 @@ from dahl_ident.elements import Dahl
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
 
-_FALSE_ALARM = 1e-3
+_FALSE_ALARM = 0.01
 _HINT = 0.05
 
 

@@ -15,13 +15,15 @@ class Information:
     """First-order variances of anything that depends on the parameters.
 
     Where the covariance is finite it is the optimum's own. Where data leave a direction open,
-    what does not depend on that direction still has a finite variance here.
+    what does not depend on that direction still has a finite variance here; NaN where nothing
+    is left to estimate the noise's scale by.
     """
 
     def __init__(self, optimum: Optimum) -> None:
         self._covariance = optimum.covariance
         self.regular = bool(np.isfinite(optimum.covariance).all())
-        scale = optimum.scale if np.isfinite(optimum.scale) and optimum.scale > 0.0 else 1.0
+        self._scaled = bool(np.isfinite(optimum.scale) and optimum.scale > 0.0)
+        scale = optimum.scale if self._scaled else 1.0
         information = optimum.problem.information(optimum.theta, scale)
         size = np.sqrt(np.diagonal(information))
         self._size = np.where((size > 0.0) & np.isfinite(size), size, 1.0)
@@ -36,6 +38,8 @@ class Information:
 
     def variance(self, directions: FloatArray) -> FloatArray:
         """Return the variance of directions . theta, shape (...), for directions (..., P)."""
+        if not self._scaled:
+            return np.full(np.shape(directions)[:-1], np.nan)
         if self.regular:
             C = self._covariance
             return np.asarray(np.einsum("...i,ij,...j->...", directions, C, directions))

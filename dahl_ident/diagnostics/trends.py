@@ -23,7 +23,7 @@ from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, ResidualSpace
 from dahl_ident.diagnostics.units import shown_unit
-from dahl_ident.elements import Dahl
+from dahl_ident.elements import Dahl, Element, Spring
 from dahl_ident.fitting import Optimum
 
 _DEGREES = {"amplitude": 3, "drive": 3, "frequency": 2}
@@ -31,6 +31,7 @@ _SAME = 0.01  # of the covariate's logarithm: values closer than this are one
 _LEAST_RANGE = np.log(1.05)
 _LEAST_DOF_PER_COLUMN = 3
 _FEWEST_SIGNS = 10
+_STEEPEST = np.log(10.0)
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,8 @@ class Trend:
     stiffness, loss : Coefficient
         Change of the data's real and imaginary part of the friction force per displacement,
         against the model and relative to it, from `low` to `high`; a straight line over the
-        covariate's logarithm. Natural logarithms: -0.36 is a fall by 30 %.
+        covariate's logarithm. Natural logarithms: -0.36 is a fall by 30 %. The stiffness is that
+        of friction and springs together where the data know only their sum.
     largest : float
         Largest relative departure of the response that the smooth curve finds.
     p_value : float
@@ -158,22 +160,27 @@ def covariates(optimum: Optimum) -> Iterator[tuple[str, FloatArray, str]]:
 
 
 def _friction_parts(optimum: Optimum) -> tuple[ComplexArray, ComplexArray]:
-    """Return the relative change of the response with the friction's real and imaginary part."""
+    """Return the relative change of the response with the friction's real and imaginary part.
+
+    Where friction's stiffness and a spring's are known in sum only, the real part is that sum's.
+    """
     problem = optimum.problem
     values = parameter_values(optimum)
     view = problem.stiffness_data
-    friction = np.zeros(len(view.amplitude), dtype=np.complex128)
-    total = np.zeros(len(view.amplitude), dtype=np.complex128)
+    stiff: tuple[type[Element], ...] = (Dahl, Spring) if optimum.status.at_infinity else (Dahl,)
+    total, stiffness, loss = np.zeros((3, len(view.amplitude)), dtype=np.complex128)
     for element in problem.model.elements:
         own = [np.asarray(values[p.name]) for p in element.parameters]
         part = view.of(element, own)
         total += part
+        if isinstance(element, stiff):
+            stiffness += part.real
         if isinstance(element, Dahl):
-            friction += part
+            loss += 1j * part.imag
     inverted = problem.data.quantity in ("receptance", "mobility", "accelerance")
     sign = -1.0 if inverted else 1.0
     with np.errstate(divide="ignore", invalid="ignore"):
-        parts = sign * friction.real / total, sign * 1j * friction.imag / total
+        parts = sign * stiffness / total, sign * loss / total
     return np.nan_to_num(parts[0]), np.nan_to_num(parts[1])
 
 
@@ -182,7 +189,9 @@ def _distinct(x: FloatArray) -> int:
 
 
 def _change(part: Coefficient) -> str:
-    """Return "falls by 30 +- 4 %"."""
+    """Return "falls by 30 +- 4 %"; a line that steep is no size, only a direction."""
     word = "rises" if part.value > 0.0 else "falls"
+    if abs(part.value) > _STEEPEST:
+        return f"{word} more than tenfold"
     size = 100.0 * abs(np.expm1(part.value))
     return f"{word} by {with_unit(size, 100.0 * np.exp(part.value) * part.stderr, '%')}"

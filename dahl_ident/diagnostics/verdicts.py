@@ -282,8 +282,9 @@ def _determined(
         if c.expression not in optimum.names and c.stderr < IDENTIFIED_BELOW * abs(c.value)
     ]
     told = {c.expression for c in optimum.combinations}
+    gone = _run_away(optimum)  # the optimum itself says which combinations of these are left
     for candidate in candidates(optimum):
-        if candidate.expression in told:
+        if candidate.expression in told or candidate.members & gone:
             continue
         enough = candidate.members <= lost if candidate.is_sum else candidate.members & lost
         if not enough:
@@ -297,6 +298,13 @@ def _determined(
                 DeterminedCombination(candidate.expression, candidate.unit, candidate.value, size)
             )
     return tuple(found)
+
+
+def _run_away(optimum: Optimum) -> frozenset[str]:
+    """Return the names of the parameters whose optimum lies at infinity, or at a positive zero."""
+    positive = np.array([p.transform == "log" for p in optimum.problem.parameters])
+    gone = ~np.isfinite(optimum.values) | (positive & (optimum.values == 0.0))
+    return frozenset(np.array(optimum.names)[gone].tolist())
 
 
 def _parts_of(candidate: Candidate) -> FloatArray:

@@ -1,0 +1,108 @@
+"""Two measured joints that no Dahl model describes: what the verdicts say of them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dahl_ident import (
+    Dahl,
+    Damper,
+    FitResult,
+    FrequencyResponse,
+    Mass,
+    Spring,
+    compare_models,
+    extract,
+    fit,
+    read_frequency_response,
+    read_record,
+)
+from dahl_ident.diagnostics import Verdict
+from tests.test_readers_measured import BRAKE_REUSS
+
+FOLDER = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent"))
+pytestmark = pytest.mark.skipif(
+    not FOLDER.is_dir(), reason="DAHL_IDENT_MEASURED_DATA names no folder of measured data"
+)
+
+
+@pytest.fixture(scope="module")
+def damper() -> FrequencyResponse:
+    """Ten steady levels of the banded rotary friction damper at 30 lbf."""
+    files = sorted((FOLDER / "brfd").glob("band30lb_*.csv"))
+    records = [read_record(f, displacement="displacement", force="friction force") for f in files]
+    return FrequencyResponse.concatenate([extract(r, harmonics=[1]) for r in records])
+
+
+@pytest.fixture(scope="module")
+def beam(tmp_path_factory: pytest.TempPathFactory) -> FrequencyResponse:
+    """The Brake-Reuss beam near its first mode."""
+    columns = tmp_path_factory.mktemp("lab") / "columns.toml"
+    columns.write_text(BRAKE_REUSS)
+    return read_frequency_response(FOLDER / "brb/ForcedFrequencyResponses.mat", columns=columns)
+
+
+class TestDamper:
+    def test_numbers_of_the_hand_fit(self, damper: FrequencyResponse) -> None:
+        found = fit(damper, Dahl(), noise="relative")
+        assert found.params["f_max"].value == pytest.approx(9.7e3, rel=0.02)
+        assert found.params["sigma"].value == pytest.approx(2.5e6, rel=0.05)
+        assert found.goodness.rms_misfit == pytest.approx(0.09, abs=0.005)
+        slow = fit(damper.select(rows=damper.frequency_hz < 0.6), Dahl(), noise="relative")
+        assert slow.params["f_max"].value == pytest.approx(1.02e4, rel=0.02)
+        assert slow.goodness.rms_misfit == pytest.approx(0.035, abs=0.002)
+
+    @pytest.mark.parametrize("kept", ["covariance and verdicts", "covariance", "neither"])
+    def test_the_verdict_is_rate_dependence(self, damper: FrequencyResponse, kept: str) -> None:
+        """However bare the table, the fall of stiffness with frequency is said with its size."""
+        data = damper
+        if kept == "covariance":
+            data = damper.select(rows=damper.quality["verdict"] == "good")
+        if kept == "neither":
+            data = FrequencyResponse(damper.frequency_hz, damper.response, damper.amplitude)
+        found = fit(data, Dahl())
+        assert not found.trusted
+        assert "over frequency, from 0.25 to 2 Hz" in found.verdict
+        assert "which no rate-independent model does" in found.verdict
+        (trend,) = (t for t in found.goodness.trends if t.covariate == "frequency")
+        assert np.expm1(trend.stiffness.value) == pytest.approx(-0.26, abs=0.04)
+
+    def test_other_models_are_compared_beside_it(self, damper: FrequencyResponse) -> None:
+        found = fit(damper, Dahl())
+        report = found.fit_report()
+        assert "Other models, compared and not claimed" in report
+        names = [model.name for model in compare_models(found).models]
+        assert names[:3] == ["as fitted", "exponent free", "two Dahl elements"]
+        assert all(name in report for name in names)
+
+
+class TestBeam:
+    """One mode and one joint: microslip, and more in the joint than a Dahl element."""
+
+    @staticmethod
+    def fitted(beam: FrequencyResponse, controlled: str) -> FitResult:
+        data = beam.select(level=[label for label in beam.levels if controlled in label])
+        return fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
+
+    @pytest.mark.parametrize("controlled", ["Force", "Response"])
+    def test_only_the_loss_is_determined(self, beam: FrequencyResponse, controlled: str) -> None:
+        found = self.fitted(beam, controlled)
+        assert not found.trusted
+        assert {"f_max", "sigma"} <= set(found.identifiability.named(Verdict.NOT_IDENTIFIED))
+        (kappa,) = (c for c in found.identifiability.combinations if "^2" in c.expression)
+        assert kappa.expression == "sigma^2/f_max"
+        assert 3.8e7 < kappa.value < 4.7e7
+        assert "f_max/sigma" not in found.identifiability.determined
+        assert "f_max: at least" in found.verdict
+        assert "hides it below" in found.verdict
+        assert "The model does not describe these data" in found.verdict
+
+    def test_controlled_response_has_its_optimum_at_infinity(self, beam: FrequencyResponse) -> None:
+        found = self.fitted(beam, "Response")
+        assert found.params["f_max"].value == np.inf
+        assert "f_max grows without bound at constant sigma^2/f_max" in found.verdict
+        assert "sigma + stiffness" in found.identifiability.determined
