@@ -8,7 +8,7 @@ BIN    := $(VENV)/bin
 JOBS   ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint types rooms unit test-lowest docs bench validation lock clean
+.PHONY: help install demo test lint types rooms unit test-lowest examples docs bench validation lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -46,8 +46,11 @@ test-lowest: install  ## the same tests on the lowest declared versions
 		--editable ".[dev]"
 	.venv-lowest/bin/pytest -n $(JOBS) --dist worksteal
 
+examples: install  ## renew the outputs printed in README and manual
+	$(BIN)/python -m tests.examples
+
 docs: install  ## the manual into docs/_build/html; any warning fails
-	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
+	$(BIN)/python -m sphinx -q -W --keep-going -b html -j $(JOBS) docs docs/_build/html
 
 bench: install  ## timings side by side with the peers
 	$(BIN)/python -m benchmarks

@@ -22,6 +22,19 @@ if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse, Record, read_frequency_response, read_record
     from dahl_ident.diagnostics import compare_models, identifiability
     from dahl_ident.elements import Dahl, Damper, LinearSystem, Mass, Model, Spring
+    from dahl_ident.errors import (
+        DahlIdentError,
+        DataError,
+        DataWarning,
+        ExtractionError,
+        FitError,
+        MissingDependencyError,
+        ModelError,
+        MultipleSolutionsWarning,
+        SamplingError,
+        UnitError,
+        ValidationError,
+    )
     from dahl_ident.extraction import extract
     from dahl_ident.problem import Problem
     from dahl_ident.reporting import report
@@ -58,6 +71,19 @@ _ROOMS = {
     ),
     "dahl_ident.diagnostics": ("compare_models", "identifiability"),
     "dahl_ident.elements": ("Dahl", "Damper", "LinearSystem", "Mass", "Model", "Spring"),
+    "dahl_ident.errors": (
+        "DahlIdentError",
+        "DataError",
+        "DataWarning",
+        "ExtractionError",
+        "FitError",
+        "MissingDependencyError",
+        "ModelError",
+        "MultipleSolutionsWarning",
+        "SamplingError",
+        "UnitError",
+        "ValidationError",
+    ),
     "dahl_ident.extraction": ("extract",),
     "dahl_ident.problem": ("Problem",),
     "dahl_ident.reporting": ("report",),
@@ -78,19 +104,30 @@ _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = [
     "Dahl",
+    "DahlIdentError",
     "DahlNonlinearity",
     "Damper",
+    "DataError",
+    "DataWarning",
+    "ExtractionError",
     "FitBatch",
+    "FitError",
     "FitResult",
     "FrequencyResponse",
     "LinearSystem",
     "Mass",
+    "MissingDependencyError",
     "Model",
+    "ModelError",
+    "MultipleSolutionsWarning",
     "Posterior",
     "Problem",
     "Record",
+    "SamplingError",
     "Sensors",
     "Spring",
+    "UnitError",
+    "ValidationError",
     "closed_loop_response",
     "compare_models",
     "equivalent_plant",

@@ -24,31 +24,108 @@ __all__ = [
 
 
 class DahlIdentError(Exception):
-    """Base of every error that this package raises on purpose."""
+    """Base of every error that this package raises on purpose.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> try:
+    ...     di.fit(di.load_dataset("microslip"), di.Dahl() + di.Spring())
+    ... except di.DahlIdentError as error:
+    ...     print(type(error).__name__)
+    FitError
+    """
 
 
 class ValidationError(DahlIdentError, ValueError):
-    """An argument has a value, type or shape that gives no meaningful number."""
+    """An argument has a value, type or shape that gives no meaningful number.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> di.FrequencyResponse(frequency_hz=[1.0], response=[30.0], amplitude=[-1e-3])
+    Traceback (most recent call last):
+    ...
+    dahl_ident.errors.ValidationError: ...
+    """
 
 
 class ModelError(DahlIdentError, ValueError):
-    """A model cannot be built or evaluated: clashing names, or a parameter without a value."""
+    """A model cannot be built or evaluated: clashing names, or a parameter without a value.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> di.Dahl(f_max=0.1).gain(1e-3)
+    Traceback (most recent call last):
+    ...
+    dahl_ident.errors.ModelError: ... has no value for sigma; ...
+    """
 
 
 class UnitError(DahlIdentError, ValueError):
-    """A unit is missing, unknown, or of the wrong dimension."""
+    """A unit is missing, unknown, or of the wrong dimension.
+
+    Examples
+    --------
+    >>> from dahl_ident.units import parse_unit
+    >>> parse_unit("newtonne")
+    Traceback (most recent call last):
+    ...
+    dahl_ident.errors.UnitError: [newtonne] is not a known unit: ...
+    """
 
 
 class DataError(DahlIdentError, ValueError):
-    """A file or table cannot be used; the message names file, row and column."""
+    """A file or table cannot be used; the message names file, row and column.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> di.read_frequency_response("nowhere.csv")
+    Traceback (most recent call last):
+    ...
+    dahl_ident.errors.DataError: nowhere.csv: the file cannot be read: ...
+    """
 
 
 class DataWarning(UserWarning):
-    """Data that can be used but look wrong; the message lists the rows."""
+    r"""Data that can be used but look wrong; the message lists the rows.
+
+    Examples
+    --------
+    Turned into an error, it stops a pipeline:
+
+    >>> import warnings
+    >>> from pathlib import Path
+    >>> from tempfile import mkdtemp
+    >>> import dahl_ident as di
+    >>> table = Path(mkdtemp()) / "pivot.csv"
+    >>> _ = table.write_text(
+    ...     "frequency_hz,amplitude [um],gain [N/m],phase_deg\n1,5,30,0.5\n1,50,29,1.2\n"
+    ... )
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", di.DataWarning)
+    ...     di.read_frequency_response(table)
+    Traceback (most recent call last):
+    ...
+    dahl_ident.errors.DataWarning: ... is in degrees, yet no phase is above 2 pi; ...
+    """
 
 
 class ExtractionError(DahlIdentError, ValueError):
-    """A record holds no usable sine response; the message says what it holds instead."""
+    """A record holds no usable sine response; the message says what it holds instead.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import dahl_ident as di
+    >>> time, rest = np.arange(100) / 10.0, np.zeros(100)
+    >>> di.extract(di.Record(time, displacement=rest, force=rest))
+    Traceback (most recent call last):
+    ...
+    dahl_ident.errors.ExtractionError: no stretch of constant amplitude and frequency ...
+    """
 
 
 class FitError(DahlIdentError, RuntimeError):
@@ -60,6 +137,15 @@ class FitError(DahlIdentError, RuntimeError):
         What happened, and what to do.
     result : FitResult, optional
         What was found all the same: status, and the combinations that are determined.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> try:
+    ...     di.fit(di.load_dataset("microslip"), di.Dahl() + di.Spring())
+    ... except di.FitError as error:
+    ...     print(error.result.success)
+    False
     """
 
     def __init__(self, message: str, result: Any = None) -> None:
@@ -76,6 +162,14 @@ class SamplingError(DahlIdentError, RuntimeError):
         What happened, and what to do.
     posterior : Posterior, optional
         The chain all the same, where there is one.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> di.posterior_grid(di.load_dataset("noisy"), di.Dahl(alpha=None) + di.Mass())
+    Traceback (most recent call last):
+    ...
+    dahl_ident.errors.SamplingError: 4 parameters are free ...
     """
 
     def __init__(self, message: str, posterior: Any = None) -> None:
@@ -84,8 +178,26 @@ class SamplingError(DahlIdentError, RuntimeError):
 
 
 class MissingDependencyError(DahlIdentError, ImportError):
-    """An optional package is needed; the message gives the command that installs it."""
+    """An optional package is needed; the message gives the command that installs it.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> issubclass(di.MissingDependencyError, ImportError)
+    True
+    """
 
 
 class MultipleSolutionsWarning(UserWarning):
-    """A plant with negative damping has several steady amplitudes, and one was chosen."""
+    """A plant with negative damping has several steady amplitudes, and one was chosen.
+
+    Examples
+    --------
+    Ask for all of them, and there is no choice to warn of:
+
+    >>> import dahl_ident as di
+    >>> plant = di.Dahl(0.1, 30.0) + di.Mass(0.3) + di.Damper(-0.05) + di.Spring(0.3)
+    >>> found = di.response(plant, 0.16, 0.02, all_roots=True)
+    >>> int((found.amplitude > 0.0).sum())
+    3
+    """

@@ -1,4 +1,7 @@
-"""Sphinx: how the manual is built. ``make docs`` fails on any warning."""
+"""Sphinx: how the manual is built. ``make docs`` fails on any warning.
+
+The notebooks, which `docs/notebooks` links to, are stored without outputs and run at each build.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +12,27 @@ author = "The dahl_ident developers"
 release = version = dahl_ident.__version__
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
     "numpydoc",
 ]
-myst_enable_extensions = ["dollarmath", "amsmath"]
-myst_heading_anchors = 2
 exclude_patterns = ["_build"]
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:mod", r"dahl_ident\..*"),  # rooms inside, which the reference leaves to their source
     ("py:class", r"integer -- .*"),  # from the docstrings of tuple itself
 ]
+
+myst_enable_extensions = ["dollarmath", "amsmath"]
+myst_heading_anchors = 2
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_in_temp = True
+nb_execution_timeout = 120
+nb_output_stderr = "error"
+nb_merge_streams = True
 
 html_theme = "pydata_sphinx_theme"
 html_title = "dahl_ident"

@@ -10,24 +10,36 @@ from pathlib import Path
 import pytest
 
 import dahl_ident as di
+from dahl_ident import errors
 
 ROOT = Path(__file__).parents[1]
 
 PUBLIC_NAMES = [
     "Dahl",
+    "DahlIdentError",
     "DahlNonlinearity",
     "Damper",
+    "DataError",
+    "DataWarning",
+    "ExtractionError",
     "FitBatch",
+    "FitError",
     "FitResult",
     "FrequencyResponse",
     "LinearSystem",
     "Mass",
+    "MissingDependencyError",
     "Model",
+    "ModelError",
+    "MultipleSolutionsWarning",
     "Posterior",
     "Problem",
     "Record",
+    "SamplingError",
     "Sensors",
     "Spring",
+    "UnitError",
+    "ValidationError",
     "closed_loop_response",
     "compare_models",
     "equivalent_plant",
@@ -52,6 +64,10 @@ PUBLIC_NAMES = [
 
 def test_public_names_are_frozen() -> None:
     assert sorted(di.__all__) == PUBLIC_NAMES
+
+
+def test_every_error_is_public() -> None:
+    assert set(errors.__all__) <= set(di.__all__)
 
 
 @pytest.mark.parametrize("name", PUBLIC_NAMES)
