@@ -65,15 +65,20 @@ _TO_PEAK: dict[Marker, float] = {"zero to peak": 1.0, "rms": np.sqrt(2.0), "peak
 _MARKERS: tuple[tuple[Marker, str], ...] = (
     ("rms", r"r\.?m\.?s\.?|eff"),
     ("peak to peak", r"pk-pk|pkpk|p-p|pp|peak[- ]to[- ]peak|peak[- ]peak"),
-    ("zero to peak", r"zero[- ]to[- ]peak|zero[- ]peak|0-pk?|0-peak|zp|pk|peak"),
+    ("zero to peak", r"zero[- ]to[- ]peak|zero[- ]peak|0-?pk?|0-peak|zp|pk|peak"),
 )
 _MARKER = re.compile(
-    "(?:^|[\\s_,]|(?<=\\w))(?:" + "|".join(f"({p})" for _, p in _MARKERS) + r")\s*$", re.I
+    "(?:^|[\\s_,(]|(?<=\\w))(?:" + "|".join(f"({p})" for _, p in _MARKERS) + r")\)?\s*$", re.I
 )
-_DECIBEL = re.compile(r"^\s*dB\b(?:\s*re\.?\s*(?:1\b)?)?\s*", re.I)
+_DECIBEL = re.compile(r"^\s*dB\b(?:\s*re\.?\s*(?:1(?![\d./]))?)?\s*", re.I)
 # What laboratories write and pint does not know, or takes for something else.
 _SPELLINGS = {
     "sec": "s",
+    "Sec": "s",
+    "Deg": "deg",
+    "DEG": "deg",
+    "Rad": "rad",
+    "RAD": "rad",
     "HZ": "Hz",
     "hz": "Hz",
     "Nm": "N*m",
@@ -269,10 +274,12 @@ def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float,
 def _normalised(text: str, written: str) -> str:
     """Bring what laboratories write to what pint reads, and nothing dangerous."""
     superscripts = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+    text = text.replace("º", "°")
     out = re.sub(r"[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+", lambda m: "^" + m[0].translate(superscripts), text.strip())
     out = re.sub(r"[·⋅×]", "*", out).replace("**", "^")
     out = re.sub(r"(?<=[A-Za-z°])[-.](?=[A-Za-z])", "*", out)
     out = re.sub(r"(?<=[A-Za-z])(-?\d)", r"^\1", out)
+    out = re.sub(r"[A-Z][a-z]{3,}", lambda m: m[0].lower(), out)  # Newtons, Volts
     out = re.sub(r"[A-Za-z]+", lambda m: _SPELLINGS.get(m[0], m[0]), out)
     if not out or len(out) > _LONGEST or _TOKEN.sub("", out):
         raise UnitError(

@@ -265,13 +265,14 @@ class TestMatlab:
             read_record(matlab)
 
     def test_no_matlab_file(self, tmp_path: Path) -> None:
-        (tmp_path / "a.mat").write_bytes(b"\x07\x08\x09" * 99)
+        (tmp_path / "a.mat").write_bytes(b"\x07\x08\x00" * 99)
         with pytest.raises(DataError, match="the file is damaged or no MATLAB file"):
             read_record(tmp_path / "a.mat")
 
-    def test_nothing_but_text(self, tmp_path: Path) -> None:
+    def test_nothing_but_a_cube(self, tmp_path: Path) -> None:
         savemat(tmp_path / "a.mat", {"cube": np.zeros((3, 4, 5))})
-        with pytest.raises(DataError, match="holds no array of numbers"):
+        message = r"no vector or matrix of numbers; cube \(\(3, 4, 5\), float64\) is not used"
+        with pytest.raises(DataError, match=message):
             read_record(tmp_path / "a.mat")
 
 
@@ -389,6 +390,24 @@ class TestUniversalFile:
         )
         assert_the_run(read_record(path), rtol=1e-10)
 
+    def test_units_outside_ascii(self, tmp_path: Path) -> None:
+        label = {"ordinate_axis_units_lab": "m/s2", "orddenom_axis_units_lab": "N"}
+        path = write_uff(tmp_path / "a.uff", uff_function(RECEPTANCE, FREQUENCY, 4, 12, **label))
+        path.write_bytes(path.read_bytes().replace(b"m/s2", "m/s²".encode("cp1252")))
+        data = read_frequency_response(path, drive="1 N", passive=False)
+        assert data.quantity == "accelerance"
+
+    def test_other_data_sets_are_passed_without_a_word(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        path = write_uff(tmp_path / "a.uff", uff_function(RECEPTANCE, FREQUENCY, 4, 8))
+        group: list[list[Any]] = [[1, 0, 0, 0, 0, 0, 0, 1], ["left side"], [8, 110, 0, 0]]
+        lines = ["".join(f"{cell:>10}" for cell in row) for row in group]
+        with path.open("a") as file:
+            file.write("\n".join(["    -1", "  2467", *lines, "    -1", ""]))
+        inspect(path)
+        assert not capsys.readouterr().out
+
     def test_refusal(self, tmp_path: Path) -> None:
         function = uff_function(RECEPTANCE, FREQUENCY, 4, 8)
         with pytest.raises(UnitError, match=r"column 'FRF 1:\+Z/2:\+Z' has no unit"):
@@ -419,6 +438,17 @@ class TestTdms:
 
     def test_waveforms(self, tmp_path: Path) -> None:
         assert_the_run(read_record(self.write(tmp_path / "run.tdms")))
+
+    def test_units_in_the_channels_names(self, tmp_path: Path) -> None:
+        nptdms: Any = importlib.import_module("nptdms")
+        wave = {"wf_increment": 1 / 128.0}
+        with nptdms.TdmsWriter(str(tmp_path / "run.tdms")) as writer:
+            writer.write_segment([
+                nptdms.ChannelObject("rig", "Displacement (mm)", X * 1e3, wave),
+                nptdms.ChannelObject("rig", "Force [N]", F, wave),
+            ])  # fmt: skip
+        assert_the_run(read_record(tmp_path / "run.tdms"))
+        assert_the_run(read_record(tmp_path / "run.tdms", displacement="rig/Displacement (mm)"))
 
     def test_without_timing(self, tmp_path: Path) -> None:
         path = self.write(tmp_path / "run.tdms", wf_increment=0.0)
@@ -463,6 +493,14 @@ class TestLvm:
         (tmp_path / "run.lvm").write_text(text)
         assert_the_run(read_record(tmp_path / "run.lvm"))
 
+    def test_labels_outside_utf_8_with_units_in_them(self, tmp_path: Path) -> None:
+        rows = (f"{t!r}\t{x * 1e6!r}\t{f!r}" for t, x, f in zip(
+            TIME.tolist(), X.tolist(), F.tolist(), strict=True))  # fmt: skip
+        head = LVM.format(mark=".").replace("Y_Unit_Label\tmm\tN\n", "")
+        head = head.replace("displacement\tforce", "Verlängerung (µm)\tforce (Newtons)")
+        (tmp_path / "run.lvm").write_text(head + "\n".join(rows) + "\n", encoding="cp1252")
+        assert_the_run(read_record(tmp_path / "run.lvm", displacement="Verlängerung"), 1e-12)
+
     def test_without_and_with_many_x_columns(self, tmp_path: Path) -> None:
         values = list(zip(TIME.tolist(), (X * 1e3).tolist(), F.tolist(), strict=True))
         head = LVM.format(mark=".")
@@ -490,6 +528,7 @@ class TestWrongExtension:
             ("a.csv", b"\x89HDF\r\n\x1a\n123", "extension .csv says a text table, .* is HDF5"),
             ("a.xlsx", b"t,x\n1,2\n", "extension .xlsx says an Excel workbook, .* a text table"),
             ("a.h5", b"PAR1xxx", "extension .h5 says HDF5 .*, the content is Parquet"),
+            ("a.mat", b"t,x\n1,2\n", "extension .mat says MATLAB .*, the content is a text table"),
             ("a.mat", b"TDSm....", "extension .mat says MATLAB .*, the content is NI TDMS"),
             ("a.tdms", b"    -1\n    58\n", "the content is a universal file"),
             ("a.uff", b"LabVIEW Measurement\n", "the content is LabVIEW LVM"),

@@ -53,6 +53,7 @@ class TestForms:
                 "phase [deg]": np.angle(STIFFNESS, deg=True),
             },
             {"response [N/m]": STIFFNESS},
+            {"frf [N/m]": [f"{z.real:.17g} {z.imag:+.17g}i" for z in STIFFNESS]},
         ],
     )
     def test_all_forms_agree(self, columns: dict[str, Any]) -> None:

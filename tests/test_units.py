@@ -65,6 +65,10 @@ POUND_FORCE = 0.45359237 * 9.80665  # international avoirdupois pound, standard 
         ("sec", 1.0),
         ("ms", 1e-3),
         ("HZ", 1.0),
+        ("Newtons", 1.0),
+        ("Volts", 1.0),
+        ("Deg", math.pi / 180),
+        ("º", math.pi / 180),
         ("kHz", 1e3),
         ("mV", 1e-3),
         ("1", 1.0),
@@ -90,6 +94,9 @@ def test_factors(text: str, factor: float) -> None:
         ("mm p-p", "peak to peak", 0.5),
         ("mm pk-pk", "peak to peak", 0.5),
         ("mm peak-to-peak", "peak to peak", 0.5),
+        ("mm (p-p)", "peak to peak", 0.5),
+        ("um (rms)", "rms", math.sqrt(2)),
+        ("mm 0p", "zero to peak", 1.0),
     ],
 )
 def test_amplitude_markers(text: str, marker: str | None, to_peak: float) -> None:
@@ -97,7 +104,9 @@ def test_amplitude_markers(text: str, marker: str | None, to_peak: float) -> Non
     assert (unit.marker, unit.to_peak) == (marker, to_peak)
 
 
-@pytest.mark.parametrize("text", ["dB re 1 N/m", "dB re N/m", "dB N/m", "db re. 1 N/m"])
+@pytest.mark.parametrize(
+    "text", ["dB re 1 N/m", "dB re N/m", "dB N/m", "db re. 1 N/m", "dB re 1N/m"]
+)
 def test_decibels_keep_their_reference(text: str) -> None:
     unit = parse_unit(text)
     assert unit.decibel

@@ -23,7 +23,7 @@ from dahl_ident.data.binding import Binding, by_level, per_frequency
 from dahl_ident.data.columns import RESPONSE_NAMES, ColumnMap
 from dahl_ident.data.fields import CONTROLLED
 from dahl_ident.data.frequency_response import FrequencyResponse
-from dahl_ident.data.source import LARGEST, SMALLEST, Source
+from dahl_ident.data.source import SMALLEST, Source
 from dahl_ident.data.suspicion import doubt_drive, doubt_phase_unit, refuse_created_energy
 from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import (
@@ -275,14 +275,7 @@ class _Table:
     def _complex(self) -> tuple[Quantity, ComplexArray]:
         channel = self.bound.required("response")
         quantity, factor, _ = self._factor("response")
-        values = np.atleast_1d(channel.values)
-        if values.dtype.kind != "c":
-            raise DataError(
-                f"{self.bound.source.name}: column {channel.name!r} holds no complex numbers; "
-                "name the columns of real and imag, or of gain and phase"
-            )
-        self.bound.source.require(np.abs(values) < LARGEST, channel, "finite numbers")
-        return quantity, factor * values.astype(np.complex128)
+        return quantity, factor * self.bound.source.complex_numbers(channel)
 
     def _phase(self) -> FloatArray:
         channel = self.bound.required("phase")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.summary import listed
 from dahl_ident.errors import DataError, UnitError
 from dahl_ident.units import parse_unit
@@ -148,6 +148,34 @@ class Source:
             )
         return values
 
+    def complex_numbers(self, channel: Channel) -> ComplexArray:
+        """Return a channel's complex numbers, also those written as text, such as ``5+1i``.
+
+        Raises
+        ------
+        DataError
+            If a cell holds something else.
+        """
+        values = np.atleast_1d(channel.values)
+        if values.dtype.kind == "U":
+            values = np.array([self._complex_cell(channel, i) for i in range(values.size)])
+        if values.dtype.kind != "c":
+            raise DataError(
+                f"{self.name}: column {channel.name!r} holds no complex numbers; name the columns "
+                "of real and imag, or of gain and phase"
+            )
+        self.require(np.abs(values) < LARGEST, channel, "finite numbers")
+        return values.astype(np.complex128)
+
+    def _complex_cell(self, channel: Channel, index: int) -> complex:
+        text = str(np.atleast_1d(channel.values)[index])
+        try:
+            return complex(text.replace(" ", "").replace("i", "j"))
+        except ValueError:
+            raise DataError(
+                f"{self.where(channel, index)}: {text[:40]!r} is not a complex number"
+            ) from None
+
     def require(self, good: NDArray[np.bool_], channel: Channel, expected: str) -> None:
         """Raise a DataError that names the first cell that is not `good`."""
         bad = np.flatnonzero(~good)
@@ -186,6 +214,8 @@ def split_header(text: str) -> tuple[str, str | None]:
             return square[1], unit
     curved = re.fullmatch(r"\s*(.*?)\s*\((.*)\)\s*", text)
     if curved and curved[1]:
+        if curved[2].strip() == "dB":
+            return curved[1], "dB"  # of what, whoever needs the gain will ask
         try:
             return curved[1], parse_unit(curved[2]).text
         except UnitError:

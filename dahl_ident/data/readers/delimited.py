@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dahl_ident.data.readers.file import utf8
 from dahl_ident.data.readers.layout import Header, best_run, header, named_channels
 from dahl_ident.data.source import Source
 from dahl_ident.data.storage import METADATA_MARK
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 _COMMENT = re.compile(r"\s*(?:#|%|//|!)")
 _COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|%|//|!)[^\r\n]*", re.MULTILINE)
 _LINE_END = re.compile(rb"\r\n|\n|\r")
+_BEFORE_BRACKET = re.compile(r"(?<=[^\s\])])[ \t]+(?=[\[(])")  # "time [s]" is one field
+_BLANK_SEPARATED = re.compile(r"(?:\[[^\]]*\]|\([^)]*\)|\S)+")
 _HEAD_BYTES = 1 << 15
 _MISSING = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "n/a", "#N/A", "null", "1.#QNAN"]
 _DIALECTS = (
@@ -59,7 +62,11 @@ def read_text_table(data: bytes, name: str, sha256: str | None = None) -> Source
     DataError
         If the bytes are no text, or no table of numbers is found, or lines differ in width.
     """
-    data = _as_utf8(data, name)
+    data = utf8(data)
+    if b"\0" in data:
+        raise DataError(
+            f"{name}: the file is binary (byte {data.index(0)} is 0); expected a text table"
+        )
     lines = _head(data)
     layout = _layout(lines, name)
     metadata = _metadata(lines, name)
@@ -77,25 +84,6 @@ def read_text_table(data: bytes, name: str, sha256: str | None = None) -> Source
     )
 
 
-def _as_utf8(data: bytes, name: str) -> bytes:
-    """Return the text in UTF-8 without a byte-order mark; instruments also write cp1252."""
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        text = data.decode("utf-16", errors="replace")
-        data = text.encode("utf-8")
-    data = data.removeprefix(b"\xef\xbb\xbf")
-    if b"\0" in data:
-        raise DataError(
-            f"{name}: the file is binary (byte {data.index(0)} is 0); expected a text table"
-        )
-    if data.isascii():
-        return data
-    try:
-        data.decode("utf-8")
-    except UnicodeDecodeError:
-        return data.decode("cp1252", errors="replace").encode("utf-8")
-    return data
-
-
 def _head(data: bytes) -> list[tuple[int, str]]:
     """Return offset and text of the first lines."""
     lines: list[tuple[int, str]] = []
@@ -111,7 +99,7 @@ def _head(data: bytes) -> list[tuple[int, str]]:
 
 def _split(line: str, delimiter: str | None) -> list[str]:
     if delimiter is None:
-        return line.split()
+        return _BLANK_SEPARATED.findall(_BEFORE_BRACKET.sub("", line))
     if '"' not in line:
         return line.split(delimiter)
     try:

@@ -108,7 +108,7 @@ def _checked(path: Path | None, name: str, data: bytes) -> File:
     if not data or data.isspace():
         raise DataError(f"{name}: the file is empty")
     found = _sniff(data)
-    if found == "text" and suffix == ".mat":
+    if found == "text" and suffix == ".mat" and b"\0" in data[:4]:
         found = "matlab"  # version 4 has no signature
     allowed = _EXTENSIONS.get(suffix, (found,))
     if found not in allowed:
@@ -129,6 +129,18 @@ def _sniff(data: bytes) -> str:
     if lines[0].strip() == b"-1" and len(lines) > 1 and lines[1].strip()[:1].isdigit():
         return "uff"
     return "text"
+
+
+def utf8(data: bytes) -> bytes:
+    """Return a text in UTF-8 without a byte-order mark; instruments also write cp1252."""
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        data = data.decode("utf-16", errors="replace").encode("utf-8")
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", errors="replace").encode("utf-8")
+    return data
 
 
 def library(module: str, extra: str | None = None) -> Any:

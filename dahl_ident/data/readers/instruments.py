@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -11,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.readers.file import File, library
-from dahl_ident.data.source import Channel, Source
+from dahl_ident.data.readers.file import File, library, utf8
+from dahl_ident.data.source import Channel, Source, split_header
 from dahl_ident.errors import DataError
 from dahl_ident.units import parse_unit
 
@@ -66,9 +67,11 @@ def _uff_sets(file: File, pyuff: Any) -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         # pyuff reads by name only, and standard input has none
         path = Path(folder) / "data.uff"
-        path.write_bytes(file.data)
+        # binary data sets count bytes, so that only pure text can be brought to UTF-8
+        path.write_bytes(file.data if b"58b" in file.data else utf8(file.data))
         try:
-            sets = pyuff.UFF(str(path)).read_sets()
+            with contextlib.redirect_stdout(io.StringIO()):  # pyuff prints groups
+                sets = pyuff.UFF(str(path)).read_sets()
         except Exception as exc:  # pyuff raises bare Exception
             raise DataError(f"{file.name}: the universal file is damaged: {exc}") from exc
     return sets if isinstance(sets, list) else [sets]
@@ -181,12 +184,18 @@ def _tdms_channels(group: Any) -> Iterator[Channel]:
         unit = properties.get("unit_string") or properties.get("NI_UnitDescription")
         if values.dtype.kind not in "fiubc":
             values = values.astype(np.str_)
-        yield Channel(f"{group.name}/{channel.name}", values, unit or None, short=channel.name)
+        yield _named(f"{group.name}/", channel.name, values, unit)
         step = float(properties.get("wf_increment", 0.0))
         if step > 0.0:
             start = float(properties.get("wf_start_offset", 0.0))
             times.append(start + step * np.arange(values.size))
     yield from _times(times, f"{group.name}/")
+
+
+def _named(prefix: str, label: str, values: NDArray[Any], unit: str | None) -> Channel:
+    """Return a channel; many loggers write its unit into the label, as in ``Force (N)``."""
+    name, in_label = (label, unit) if unit else split_header(label)
+    return Channel(prefix + name, values, in_label, short=name)
 
 
 def _times(times: Sequence[NDArray[Any]], prefix: str) -> Iterator[Channel]:
@@ -204,7 +213,7 @@ def read_lvm(file: File) -> Source:
     """Return the channels of all segments of a LabVIEW measurement file."""
     lvm_read = library("lvm_read", "lvm")
     try:
-        content = lvm_read.read_str(file.data.decode("utf-8", errors="replace"))
+        content = lvm_read.read_str(utf8(file.data).decode("utf-8"))
         segments = [content[i] for i in range(content["Segments"])]
         channels = [
             c
@@ -225,7 +234,7 @@ def _lvm_channels(segment: dict[str, Any], prefix: str) -> Iterator[Channel]:
     for i, (name, values) in enumerate(channels):
         units = segment.get("Y_Unit_Label", [])
         unit = str(units[i]).strip() if i < len(units) else ""
-        yield Channel(prefix + name, values, unit or None, short=name)
+        yield _named(prefix, name, values, unit)
     if set(segment.get("X_Dimension", [])) - {"Time", ""}:
         return
     times = [values for name, values in table if name == "X_Value"]

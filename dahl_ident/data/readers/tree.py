@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.data.readers.file import File, library
 from dahl_ident.data.source import Channel, Source
+from dahl_ident.data.summary import listed
 from dahl_ident.errors import DataError
 
 _WIDEST = 64
@@ -64,7 +65,8 @@ def _source(
         if not found:
             notes.append(f"{path} ({np.shape(value)}, {np.asarray(value).dtype}) is not used")
     if not channels:
-        raise DataError(f"{file.name}: the file holds no array of numbers")
+        others = f"; {listed(notes, 3)}" if notes else ""
+        raise DataError(f"{file.name}: the file holds no vector or matrix of numbers{others}")
     return Source(
         file.name,
         kind,
