@@ -9,6 +9,7 @@ response is. A missing or misfitting unit is an error, never a guess.
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from functools import cache
@@ -239,6 +240,25 @@ def si_unit(kind: str, motion: Motion = "translation") -> str:
     'N m/rad'
     """
     return SI_UNITS[kind][motion == "rotation"]
+
+
+def engineering(value: float, unit: str) -> str:
+    """Return a number with an SI prefix, such as ``3.33 mm``.
+
+    Units that are not one symbol, such as N/m, take a power of ten instead of a prefix.
+
+    Examples
+    --------
+    >>> engineering(3.33e-3, "m")
+    '3.33 mm'
+    """
+    if value == 0.0 or not math.isfinite(value):
+        return f"{value:g} {unit}".strip()
+    prefixes = {-9: "n", -6: "\u00b5", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+    exponent = 3 * math.floor(math.log10(abs(value)) / 3.0)
+    if unit not in ("N", "m", "s", "Hz", "J", "rad") or exponent not in prefixes:
+        return f"{value:.3g} {unit}".strip()
+    return f"{value / 10.0**exponent:.3g} {prefixes[exponent]}{unit}"
 
 
 def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float, str, Motion]:

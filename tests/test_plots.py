@@ -25,8 +25,8 @@ import dahl_ident as di
 from dahl_ident import plots
 from dahl_ident.elements.linear_dahl import describing_function
 from dahl_ident.errors import ValidationError
-from dahl_ident.plots import style
-from dahl_ident.plots.friction import Curve
+from dahl_ident.plots import Curve, style
+from dahl_ident.units import engineering
 
 FRICTION = di.Dahl(0.1, 30.0)
 A = np.geomspace(3e-4, 3e-2, 12)
@@ -61,6 +61,7 @@ def the_figure(axes: Any) -> Figure:
     figure: Figure = np.ravel(np.asarray(axes, dtype=object))[0].figure
     for ax in figure.axes:
         ax.set(xlabel="", ylabel="")
+        ax.set_title("", loc="left")
         for artist in (*ax.texts, ax.get_legend()):
             if artist is not None:
                 artist.remove()
@@ -90,9 +91,10 @@ def test_universal_curve() -> Figure:
 
 @same_picture
 def test_loops() -> Figure:
-    loops = [(*FRICTION.loop(amplitude), f"{amplitude:g} m") for amplitude in (1e-3, 3e-3, 1e-2)]
-    x, force = FRICTION.loop(5e-3, points=60)
-    return the_figure(plots.plot_loops(loops, measured=[(x, 1.05 * force)]))
+    sizes = (1e-3, 3e-3, 1e-2)
+    loops = [(*FRICTION.loop(size), f"{size:g} m") for size in sizes]
+    measured = [(x, 1.05 * force) for x, force in (FRICTION.loop(size, 60) for size in sizes)]
+    return the_figure(plots.plot_loops(loops, measured=measured))
 
 
 @same_picture
@@ -175,6 +177,25 @@ SINGLES: dict[str, Callable[[Axes], Axes]] = {
 }
 
 
+def test_residuals_are_joined_along_each_curve_only() -> None:
+    axis = plots.plot_residuals([1, 2, 1, 2], [1, 2, 3, 4], [0, 0, 0, 0], group=[0, 0, 1, 1])
+    joined = [list(np.asarray(x.get_ydata())) for x in axis.lines if x.get_linestyle() == "-"]
+    assert [1, 2] in joined
+    assert [3, 4] in joined
+    assert [1, 2, 3, 4] not in joined
+    plt.close("all")
+
+
+def test_a_fitted_phase_lies_on_the_turn_of_its_points() -> None:
+    x = np.array([1.0, 2.0, 3.0])
+    measured = np.exp(1j * np.radians([179.0, 181.0, 183.0]))
+    fitted = plots.Curve(x, np.exp(1j * np.radians([-181.5, -179.5, -177.5])))
+    _, bottom = plots.plot_frequency_response([("a", x, measured)], fitted=[fitted])
+    (curve,) = (line for line in bottom.lines if line.get_linestyle() == "-")
+    np.testing.assert_allclose(np.asarray(curve.get_ydata()), [178.5, 180.5, 182.5])
+    plt.close("all")
+
+
 @pytest.mark.parametrize("draw", SINGLES.values(), ids=SINGLES.keys())
 def test_single_plots_draw_on_the_axes_given(draw: Callable[[Axes], Axes]) -> None:
     figure, ax = plt.subplots()
@@ -221,7 +242,9 @@ def test_every_axis_has_its_unit() -> None:
     assert (loops.get_xlabel(), loops.get_ylabel()) == ("displacement [m]", "force [N]")
     residuals = plots.plot_residuals(A, A, A)
     assert residuals.get_ylabel() == "residual [standard deviations]"
-    assert plots.plot_information(A, {"a": A}).get_ylabel() == "share of information [%]"
+    information = plots.plot_information(A, {"a": A / A.sum()})
+    assert information.get_xlabel() == "displacement amplitude [m]"
+    assert information.get_title(loc="left") == "share of the information, by area"
     plt.close("all")
 
 
@@ -243,7 +266,7 @@ def test_series_differ_for_every_reader() -> None:
     ],
 )  # fmt: skip
 def test_engineering_notation(value: float, unit: str, text: str) -> None:
-    assert style.engineering(value, unit) == text
+    assert engineering(value, unit) == text
 
 
 def test_the_house_style_stays_in_its_figures() -> None:

@@ -7,12 +7,9 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from dahl_ident.cli.options import STANDARD
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _T = TypeVar("_T")
 
@@ -41,15 +38,13 @@ def written(write: Callable[[str | Path], Path], output: str, ending: str) -> st
 
 def write_picture(axes: Any, path: str, *, overwrite: bool) -> None:
     """Write the figure of some axes in the format of the file's name."""
-    import numpy as np
-
     from dahl_ident.data.storage import write_whole
     from dahl_ident.errors import DataError
+    from dahl_ident.reporting.document import figure_of
 
-    figure: Figure = np.ravel(np.asarray(axes, dtype=object))[0].figure
     buffer = io.BytesIO()
     try:
-        figure.savefig(buffer, format=Path(path).suffix.lstrip(".") or "png", dpi=150)
+        figure_of(axes).savefig(buffer, format=Path(path).suffix.lstrip(".") or "png", dpi=150)
     except ValueError as exc:
         raise DataError(f"{path}: no picture of this kind: {exc}") from exc
     write_whole(Path(path), buffer.getvalue(), overwrite=overwrite)

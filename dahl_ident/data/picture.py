@@ -8,10 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from dahl_ident.data import layout
 from dahl_ident.data.quantities import polar_std
-from dahl_ident.units import si_unit
 
 if TYPE_CHECKING:
     from dahl_ident.data.frequency_response import FrequencyResponse
@@ -22,25 +20,28 @@ def draw_response(data: FrequencyResponse, ax: Any = None) -> tuple[Any, Any]:
     from dahl_ident.plots import plot_amplitude_response, plot_frequency_response
 
     fundamental = data.select(harmonic=1)
-    gain_label = f"{data.quantity.replace('_', ' ')} [{data.unit}]"
-    parts = [(label, fundamental.select(level=label)) for label in fundamental.levels]
-    parts = parts or [("", fundamental)]
-    if any(np.unique(part.frequency_hz).size > 1 for _, part in parts):
-        curves = [(str(label), part.frequency_hz, part.response) for label, part in parts]
-        return plot_frequency_response(curves, gain_label=gain_label, marker=".", ax=ax)
-    gain_std = phase_std = None
-    if fundamental.covariance is not None:
-        gain_std, phase_std = polar_std(fundamental.response, fundamental.covariance)
-    amplitude, axis = fundamental.amplitude, "displacement"
-    if amplitude is None:
-        amplitude, axis = fundamental.drive, "force"
-    assert amplitude is not None  # one of the two is always there
+    over_frequency = layout.is_over_frequency(fundamental)
+    parts = layout.curves(fundamental)
+    if over_frequency or len(parts) > 1:
+        return plot_frequency_response(
+            [(name, layout.abscissa(part, over_frequency), part.response) for name, part in parts],
+            errors=[_stds(part) for _, part in parts],
+            gain_label=layout.gain_label(data),
+            x_label=layout.abscissa_label(fundamental),
+            marker=".",
+            ax=ax,
+        )
+    gain_std, phase_std = _stds(fundamental)
     return plot_amplitude_response(
-        amplitude,
+        layout.held_amplitude(fundamental),
         fundamental.response,
         gain_std=gain_std,
         phase_std=phase_std,
-        amplitude_label=f"{axis} amplitude [{si_unit(axis, data.motion)}]",
-        gain_label=gain_label,
+        amplitude_label=layout.held_label(fundamental),
+        gain_label=layout.gain_label(data),
         ax=ax,
     )
+
+
+def _stds(data: FrequencyResponse) -> tuple[Any, Any]:
+    return (None, None) if data.covariance is None else polar_std(data.response, data.covariance)

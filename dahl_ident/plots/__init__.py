@@ -6,11 +6,11 @@ from matplotlib.axes import Axes
 
 from dahl_ident.plots.frequency import plot_frequency_response
 from dahl_ident.plots.friction import (
-    Curve,
     plot_amplitude_response,
     plot_loops,
     plot_universal_curve,
 )
+from dahl_ident.plots.gain_phase import Curve
 from dahl_ident.plots.judging import (
     plot_correlation,
     plot_information,

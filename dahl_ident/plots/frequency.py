@@ -1,4 +1,4 @@
-"""Response over frequency at several levels: Fig. 7 of the paper and its measured relatives."""
+"""Response of several levels: Fig. 7 of the paper and its measured relatives."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
 from dahl_ident.plots import style
-
-_MOST_LABELS = 8
+from dahl_ident.plots.gain_phase import Curve, Points, draw_curve, draw_points
 
 
 def plot_frequency_response(
     levels: Sequence[tuple[str, ArrayLike, ArrayLike]],
     *,
-    fitted: Sequence[tuple[ArrayLike, ArrayLike]] = (),
+    errors: Sequence[tuple[ArrayLike | None, ArrayLike | None]] = (),
+    fitted: Sequence[Curve] = (),
     gain_label: str = "gain [m/N]",
     x_label: str = "frequency [Hz]",
     marker: str = "",
@@ -29,8 +29,10 @@ def plot_frequency_response(
     ----------
     levels : sequence of (label, frequency in Hz, complex response)
         In the order of the levels; colours run from dark to light.
-    fitted : sequence of (frequency in Hz, complex response), optional
-        The model's curves, drawn as lines; the levels are then drawn as points.
+    errors : sequence of (gain_std, phase_std), optional
+        Standard deviations of each level's points, in the gain's unit and in rad.
+    fitted : sequence of Curve, optional
+        The model's curves, one a level, drawn as lines; the levels are then drawn as points.
     gain_label : str
         Axis label with unit.
     x_label : str
@@ -51,30 +53,25 @@ def plot_frequency_response(
     >>> top.get_xscale()
     'log'
     """
-    top, bottom = style.axes_pair(ax)
+    pair = top, bottom = style.axes_pair(ax)
     colours = style.level_colours(len(levels))
-    labelled = np.unique(np.linspace(0, len(levels) - 1, _MOST_LABELS).round().astype(int))
+    labelled = style.labelled_levels(len(levels))
     drawn: dict[str, Any] = {"marker": marker or None}
     if fitted:
         drawn = {"marker": marker or "o", "linestyle": "none"}
-    for i, ((label, frequency, response), colour) in enumerate(zip(levels, colours, strict=True)):
+    given = [*errors, *[(None, None)] * (len(levels) - len(errors))]
+    points = [Points(x, R, *std) for (_, x, R), std in zip(levels, given, strict=True)]
+    for i, (part, (label, _, _), colour) in enumerate(zip(points, levels, colours, strict=True)):
         name = label if label and i in labelled else None
-        order = np.argsort(frequency)
-        f, R = np.asarray(frequency)[order], np.asarray(response)[order]
-        top.plot(f, np.abs(R), color=colour, label=name, **drawn)
-        bottom.plot(f, np.degrees(np.unwrap(np.angle(R))), color=colour, **drawn)
-    for (frequency, response), colour in zip(fitted, colours, strict=False):
-        order = np.argsort(frequency)
-        f, R = np.asarray(frequency)[order], np.asarray(response)[order]
-        top.plot(f, np.abs(R), color=colour)
-        bottom.plot(f, np.degrees(np.unwrap(np.angle(R))), color=colour)
-    frequencies = np.concatenate([np.ravel(np.asarray(f)) for _, f, _ in levels])
-    wide = frequencies.max() > 3.0 * frequencies.min()
-    for axis in (top, bottom):
-        axis.set_xscale("log" if wide else "linear")
-        style.readable_log_ticks(axis)
-    top.set(yscale="log", ylabel=gain_label)
-    bottom.set(xlabel=x_label, ylabel="phase [degrees]")
+        draw_points(pair, part, color=colour, label=name, **drawn)
+    for curve, part, colour in zip(fitted, points, colours, strict=False):
+        draw_curve(pair, curve, near=part, color=colour)
+    places = np.concatenate([np.ravel(np.asarray(x)) for _, x, _ in levels])
+    wide = places.max() > 3.0 * places.min()
+    top.set(xscale="log" if wide else "linear", yscale="log", ylabel=gain_label)
+    bottom.set(xscale="log" if wide else "linear", xlabel=x_label, ylabel="phase [degrees]")
+    style.readable_log_ticks(top)
+    style.readable_log_ticks(bottom)
     if any(label for label, _, _ in levels):
-        top.legend(ncols=4, loc="lower left", bbox_to_anchor=(0.0, 1.0), columnspacing=1.0)
+        style.legend_above(top, columns=4)
     return top, bottom

@@ -3,38 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.plots import style
-
-
-@dataclass(frozen=True)
-class Curve:
-    """A model's response over amplitude, with its band where known.
-
-    Parameters
-    ----------
-    amplitude : ndarray, shape (m,)
-        m, increasing.
-    response : ndarray of complex, shape (m,)
-        N/m.
-    gain_band, phase_band : tuple of two ndarrays, shape (m,), optional
-        Lower and upper limits, N/m and rad.
-    label : str
-        For the legend.
-    """
-
-    amplitude: FloatArray
-    response: ComplexArray
-    gain_band: tuple[FloatArray, FloatArray] | None = None
-    phase_band: tuple[FloatArray, FloatArray] | None = None
-    label: str = "fit"
+from dahl_ident.plots.gain_phase import Curve, Points, draw_curve, draw_points
 
 
 def plot_amplitude_response(
@@ -74,32 +49,16 @@ def plot_amplitude_response(
     >>> bottom.get_ylabel()
     'phase [degrees]'
     """
-    top, bottom = style.axes_pair(ax)
-    A, R = np.asarray(amplitude), np.asarray(response)
-    degrees = np.degrees(np.angle(R))
+    pair = top, bottom = style.axes_pair(ax)
+    points = Points(amplitude, response, gain_std, phase_std)
     if curve is not None:
-        top.plot(curve.amplitude, np.abs(curve.response), color=style.FIT, label=curve.label)
-        bottom.plot(curve.amplitude, np.degrees(np.angle(curve.response)), color=style.FIT)
-        if curve.gain_band is not None:
-            top.fill_between(curve.amplitude, *curve.gain_band, color=style.FIT, alpha=0.2, lw=0)
-        if curve.phase_band is not None:
-            low, high = (np.degrees(limit) for limit in curve.phase_band)
-            bottom.fill_between(curve.amplitude, low, high, color=style.FIT, alpha=0.2, lw=0)
-    marks: dict[str, Any] = {
-        "fmt": "o",
-        "color": style.BLUE,
-        "capsize": 2,
-        "elinewidth": 1,
-        "zorder": 3,
-    }
-    top.errorbar(A, np.abs(R), yerr=gain_std, label="data", **marks)
-    phase_error = None if phase_std is None else np.degrees(phase_std)
-    bottom.errorbar(A, degrees, yerr=phase_error, **marks)
+        draw_curve(pair, curve, near=points, color=style.FIT, label=curve.label)
+    draw_points(pair, points, fmt="o", color=style.BLUE, label="data")
     top.set(xscale="log", yscale="log", ylabel=gain_label)
     bottom.set(xscale="log", xlabel=amplitude_label, ylabel="phase [degrees]")
     style.readable_log_ticks(top)
     style.readable_log_ticks(bottom)
-    top.legend()
+    style.legend_above(top, columns=2)
     return top, bottom
 
 
@@ -140,12 +99,20 @@ def plot_universal_curve(
     for beta, value in marked_beta:
         axis.plot(value.real, value.imag, "|", color=style.FIT, markersize=9)
         axis.annotate(
-            f"{beta:g}", (value.real, value.imag), (0, -13), textcoords="offset points",
-            ha="center", fontsize=7, color=style.GREY,
+            f"{beta:g}", (value.real, value.imag), _inwards(value), textcoords="offset points",
+            ha="center", va="center", fontsize=7, color=style.GREY,
         )  # fmt: skip
     axis.set(xlabel="Re N / sigma", ylabel="Im N / sigma")
-    axis.legend()
+    axis.margins(y=0.12)
+    style.legend_above(axis, columns=2)
     return axis
+
+
+def _inwards(h: complex) -> tuple[float, float]:
+    """Return the way from a point of the curve to its label, clear of the data on it, in points."""
+    way = 0.5 + 0.1j - h
+    way *= 18.0 / abs(way)
+    return way.real, way.imag
 
 
 def plot_loops(
@@ -163,7 +130,7 @@ def plot_loops(
     loops : sequence of (displacement, force, label)
         The model's loops.
     measured : sequence of (displacement, force), optional
-        Measured samples, drawn as dots behind the loops.
+        Measured points, drawn as dots in the colour of the loop at the same place.
     displacement_label, force_label : str
         Axis labels with units.
     ax : Axes, optional
@@ -180,11 +147,11 @@ def plot_loops(
     'force [N]'
     """
     axis = style.axes(ax)
-    for displacement, force in measured:
-        axis.plot(displacement, force, ".", color=style.GREY, markersize=2, alpha=0.5)
-    colours = style.level_colours(len(loops))
-    for (displacement, force, label), colour in zip(loops, colours, strict=True):
+    colours = style.level_colours(max(len(loops), len(measured)))
+    for (displacement, force), colour in zip(measured, colours, strict=False):
+        axis.plot(displacement, force, ".", color=colour, markersize=4)
+    for (displacement, force, label), colour in zip(loops, colours, strict=False):
         axis.plot(displacement, force, color=colour, label=label)
     axis.set(xlabel=displacement_label, ylabel=force_label)
-    axis.legend(ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0))
+    style.legend_above(axis, columns=3)
     return axis

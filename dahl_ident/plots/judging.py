@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from dahl_ident.arrays import FloatArray
 from dahl_ident.plots import style
+
+_LARGEST_DISC = 250.0  # area, points squared
+_MOST_JOINED = 6  # curves, beyond which lines between points only confuse
 
 
 def plot_residuals(
@@ -18,12 +23,14 @@ def plot_residuals(
     *,
     names: tuple[str, str] = ("real part", "imaginary part"),
     x_label: str = "displacement amplitude [m]",
+    group: ArrayLike | None = None,
     suspicious: ArrayLike = (),
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the two residuals of every point, in standard deviations.
 
-    Points are joined, so that runs show, where no two share their place.
+    Points of a group are joined, so that runs show, where no two of it share their place; of
+    many groups none is.
 
     Parameters
     ----------
@@ -35,6 +42,8 @@ def plot_residuals(
         What the two residuals are.
     x_label : str
         Axis label with unit.
+    group : array_like, shape (n,), optional
+        To which curve each point belongs; one curve where left out.
     suspicious : array_like of int
         Indices to ring.
     ax : Axes, optional
@@ -51,15 +60,15 @@ def plot_residuals(
     'residual [standard deviations]'
     """
     axis = style.axes(ax)
-    order = np.argsort(x)
-    where = np.asarray(x)[order]
-    line = "-" if np.unique(where).size == where.size else "none"
+    where = np.asarray(x)
     axis.axhspan(-2.0, 2.0, color=style.GREY, alpha=0.12, lw=0)
     axis.axhline(0.0, color=style.GREY, lw=0.8)
     for y, name, colour, marker in zip(
         (first, second), names, style.SERIES, style.MARKERS, strict=False
     ):
-        axis.plot(where, np.asarray(y)[order], marker, ls=line, lw=0.6, color=colour, label=name)
+        axis.plot(where, y, marker, color=colour, label=name)
+        for part in _curves(where, group):
+            axis.plot(where[part], np.asarray(y)[part], lw=0.6, color=colour)
     for index in np.asarray(suspicious, dtype=int):
         for y in (first, second):
             axis.plot(
@@ -70,8 +79,18 @@ def plot_residuals(
         axis.set_xscale("log")
         style.readable_log_ticks(axis)
     axis.set(xlabel=x_label, ylabel="residual [standard deviations]")
-    axis.legend(ncols=2)
+    style.legend_above(axis, columns=2)
     return axis
+
+
+def _curves(x: FloatArray, group: ArrayLike | None) -> Iterator[NDArray[np.intp]]:
+    """Yield the rows of each group in order of their place, where no two share one."""
+    of = np.zeros(x.size) if group is None else np.asarray(group)
+    names = np.unique(of)
+    for name in names[: names.size if names.size <= _MOST_JOINED else 0]:
+        rows = np.flatnonzero(of == name)
+        if np.unique(x[rows]).size == rows.size:
+            yield rows[np.argsort(x[rows])]
 
 
 def plot_profile(
@@ -118,16 +137,17 @@ def plot_profile(
     for name, height in limits.items():
         axis.axhline(height, color=style.GREY, lw=0.8, ls="--")
         axis.annotate(
-            name, (0.99, height), xycoords=("axes fraction", "data"), ha="right", va="bottom",
-            fontsize=7, color=style.GREY,
+            name, (1.01, height), xycoords=("axes fraction", "data"), va="center", fontsize=7,
+            color=style.GREY, annotation_clip=False,
         )  # fmt: skip
-    top = 1.6 * max(limits.values())
+    top = 1.2 * max(limits.values())
     axis.set(xlabel=label, ylabel="rise of deviance", ylim=(-0.02 * top, top))
     if log:
         axis.set_xscale("log")
         style.readable_log_ticks(axis)
     else:
         axis.locator_params(axis="x", nbins=5)
+        axis.ticklabel_format(axis="x", useOffset=False)
     return axis
 
 
@@ -184,7 +204,8 @@ def plot_information(
     x : array_like, shape (n,)
         Amplitude of each point.
     shares : mapping of str to array_like, shape (n,)
-        For each parameter, each point's share of the information, summing to 1.
+        For each parameter, each point's share of the information, summing to 1; NaN where
+        there is none.
     x_label : str
         Axis label with unit.
     ax : Axes, optional
@@ -193,25 +214,32 @@ def plot_information(
     Returns
     -------
     Axes
-        Share over amplitude.
+        A line for each parameter; discs' areas go with the shares, the largest one's is written.
 
     Examples
     --------
-    >>> plot_information([1.0, 2.0], {"f_max": [0.2, 0.8]}).get_ylabel()
-    'share of information [%]'
+    >>> axis = plot_information([1.0, 2.0], {"f_max": [0.2, 0.8]})
+    >>> [label.get_text() for label in axis.get_yticklabels()], axis.texts[0].get_text()
+    (['f_max'], '80 %')
     """
-    axis = style.axes(ax)
-    order = np.argsort(x)
-    line = "-" if np.unique(x).size == order.size else "none"
-    for (name, share), colour, marker in zip(
-        shares.items(), style.SERIES, style.MARKERS, strict=False
-    ):
-        axis.plot(
-            np.asarray(x)[order], 100.0 * np.asarray(share)[order], marker=marker, color=colour,
-            label=name, lw=1.2, ls=line,
+    axis = style.axes(ax, size=(4.6, 1.2 + 0.5 * len(shares)))
+    where = np.asarray(x, dtype=float)
+    parts = [np.nan_to_num(np.asarray(share, dtype=float)) for share in shares.values()]
+    area = _LARGEST_DISC / (max(float(part.max()) for part in parts) or 1.0)
+    for line, (part, colour) in enumerate(zip(parts, itertools.cycle(style.SERIES), strict=False)):
+        axis.scatter(
+            where, np.full(where.size, line), s=area * part, color=colour, alpha=0.6,
+            edgecolor=style.BLACK, lw=0.5, zorder=3,
         )  # fmt: skip
-    axis.set(xlabel=x_label, ylabel="share of information [%]", xscale="log")
+        largest = int(np.argmax(part))
+        if part[largest] > 0.0:
+            axis.annotate(
+                f"{100.0 * part[largest]:.0f} %", (where[largest], line), (0, 10),
+                textcoords="offset points", ha="center", fontsize=7,
+            )  # fmt: skip
+    axis.set(xlabel=x_label, xscale="log", ylim=(len(shares) - 0.4, -0.8))
+    axis.set_title("share of the information, by area", fontsize=8, loc="left")
+    axis.set_yticks(range(len(shares)), list(shares))
+    axis.margins(x=0.08)
     style.readable_log_ticks(axis)
-    axis.set_ylim(bottom=0.0)
-    axis.legend()
     return axis

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike
 from dahl_ident.arrays import FloatArray
 from dahl_ident.plots import style
 
-_MOST_LABELS = 8
-
 
 def plot_nyquist(
     levels: Sequence[tuple[str, ArrayLike]], *, label: str = "response", ax: Axes | None = None
@@ -133,7 +131,7 @@ def _styled(
     levels: Sequence[tuple[str, ArrayLike]],
 ) -> list[tuple[tuple[str | None, ArrayLike], object]]:
     """Return each level with its colour; of many levels only some are labelled."""
-    labelled = np.unique(np.linspace(0, len(levels) - 1, _MOST_LABELS).round().astype(int))
+    labelled = style.labelled_levels(len(levels))
     return [
         ((name if name and i in labelled else None, values), colour)
         for i, ((name, values), colour) in enumerate(
@@ -144,5 +142,5 @@ def _styled(
 
 def _with_legend(axis: Axes, levels: Sequence[tuple[str, ArrayLike]]) -> Axes:
     if any(name for name, _ in levels):
-        axis.legend(ncols=4, loc="lower left", bbox_to_anchor=(0.0, 1.0), columnspacing=1.0)
+        style.legend_above(axis, columns=4)
     return axis

@@ -16,7 +16,6 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError
 
 BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE, YELLOW, BLACK = (
@@ -82,18 +81,17 @@ def level_colours(count: int) -> list[Any]:
     return list(mpl.colormaps["viridis"](np.linspace(0.0, 0.88, count)))
 
 
-def engineering(value: float, unit: str) -> str:
-    """Return a number with an SI prefix, such as ``3.33 mm``.
+def labelled_levels(count: int, most: int = 8) -> set[int]:
+    """Return which of many levels stand in the legend: evenly spread, the ends among them."""
+    return set(np.linspace(0, count - 1, most).round().astype(int).tolist())
 
-    Units that are not one symbol, such as N/m, take a power of ten instead of a prefix.
-    """
-    if value == 0.0 or not np.isfinite(value):
-        return f"{value:g} {unit}".strip()
-    prefixes = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
-    exponent = int(3 * np.floor(np.log10(abs(value)) / 3.0))
-    if unit not in ("N", "m", "s", "Hz", "J", "rad") or exponent not in prefixes:
-        return f"{value:.3g} {unit}".strip()
-    return f"{value / 10.0**exponent:.3g} {prefixes[exponent]}{unit}"
+
+def legend_above(axis: Axes, *, columns: int) -> None:
+    """Put the legend above the axes, where it hides no data."""
+    axis.legend(
+        ncols=columns, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2,
+        columnspacing=1.0, handletextpad=0.5,
+    )  # fmt: skip
 
 
 def readable_log_ticks(axis: Axes) -> None:
@@ -105,10 +103,3 @@ def readable_log_ticks(axis: Axes) -> None:
         line.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         line.set_major_formatter(StrMethodFormatter("{x:g}"))
         line.set_minor_formatter(NullFormatter())
-
-
-def pad_log(values: FloatArray) -> tuple[float, float]:
-    """Return limits a little wider than positive `values`, on a logarithmic axis."""
-    low, high = float(np.min(values)), float(np.max(values))
-    margin = max((high / low) ** 0.04, 1.05)
-    return low / margin, high * margin

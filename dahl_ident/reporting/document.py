@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -134,3 +136,9 @@ def words(*texts: str) -> tuple[Cell, ...]:
 def number(value: float, digits: int = 4) -> Cell:
     """Return a number with so many digits; all of them are kept for copying."""
     return Cell(f"{value:.{digits}g}", float(value))
+
+
+def figure_of(axes: Any) -> Figure:
+    """Return the figure that holds some axes."""
+    figure: Figure = np.ravel(np.asarray(axes, dtype=object))[0].figure
+    return figure

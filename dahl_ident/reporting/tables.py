@@ -11,7 +11,6 @@ from dahl_ident.diagnostics.formatting import interval, rounded
 from dahl_ident.elements import Dahl
 from dahl_ident.reporting.document import Cell, Table, number, words
 from dahl_ident.reporting.posteriors import interval_text
-from dahl_ident.reporting.predictions import displacement_amplitude
 from dahl_ident.units import si_unit
 
 if TYPE_CHECKING:
@@ -58,7 +57,7 @@ def equivalents(fit: FitResult) -> Table | None:
     if not friction or not all(np.isfinite(e.value) for e in fit.params.values()):
         return None
     data = fit.data.select(harmonic=1)
-    A = displacement_amplitude(data)
+    A = fit.problem.stiffness_data.amplitude[fit.data.harmonic == 1]
     sizes = np.geomspace(A.min(), A.max(), _EQUIVALENT_ROWS)
     f = float(np.median(data.frequency_hz))
     columns: dict[str, list[Cell]] = {

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.data import FrequencyResponse
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse, layout
+from dahl_ident.data.quantities import polar_std
 from dahl_ident.plots import (
     Axes,
     Curve,
@@ -16,6 +17,7 @@ from dahl_ident.plots import (
     plot_frequency_response,
     plot_residuals,
 )
+from dahl_ident.units import si_unit
 
 if TYPE_CHECKING:
     from dahl_ident.results.fit_result import FitResult
@@ -24,101 +26,78 @@ _POINTS = 200
 
 
 def draw_fit(fit: FitResult, ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:
-    """Draw data and fit: over amplitude with a band, or over frequency by levels."""
+    """Draw data with error bars and fit with its band, over amplitude or over frequency."""
     data = fit.data.select(harmonic=1)
-    amplitude = data.amplitude
-    if amplitude is not None and _is_over_amplitude(data, amplitude):
-        return _over_amplitude(fit, data, amplitude, ax)
-    levels, fitted = [], []
-    for label, part in _levels(data):
-        levels.append((label, part.frequency_hz, part.response))
-        fitted.append(_curve(fit, part))
-    return plot_frequency_response(levels, fitted=fitted, gain_label=f"gain [{data.unit}]", ax=ax)
+    over_frequency = layout.is_over_frequency(data)
+    parts = layout.curves(data)
+    drawn: dict[str, Any] = {"gain_label": layout.gain_label(data), "ax": ax}
+    if over_frequency or len(parts) > 1:
+        return plot_frequency_response(
+            [(name, layout.abscissa(part, over_frequency), part.response) for name, part in parts],
+            errors=[_stds(fit, part) for _, part in parts],
+            fitted=[_curve(fit, part, over_frequency) for _, part in parts],
+            x_label=layout.abscissa_label(data),
+            **drawn,
+        )
+    gain_std, phase_std = _stds(fit, data)
+    return plot_amplitude_response(
+        layout.held_amplitude(data),
+        data.response,
+        gain_std=gain_std,
+        phase_std=phase_std,
+        curve=_curve(fit, data, over_frequency),
+        amplitude_label=layout.held_label(data),
+        **drawn,
+    )
 
 
 def draw_residuals(fit: FitResult, ax: Axes | None) -> Axes:
-    """Draw both residuals of every row over what varies most: amplitude or frequency."""
-    data, m = fit.data, fit.problem.n_residuals
-    amplitude = fit.problem.stiffness_data.amplitude
-    unit = "rad" if data.motion == "rotation" else "m"
-    x, label = amplitude, f"displacement amplitude [{unit}]"
-    if np.ptp(np.log(data.frequency_hz)) > np.ptp(np.log(amplitude)):
+    """Draw both residuals of every row over amplitude or frequency, as suits the table."""
+    data = fit.data
+    if layout.is_over_frequency(data.select(harmonic=1)):
         x, label = data.frequency_hz, "frequency [Hz]"
-    residuals = fit.residual[:m] / (fit.scale if fit.scale > 0.0 else 1.0)
-    names = ("ln gain", "phase") if fit.noise == "relative" else ("real part", "imaginary part")
-    suspicious = [point.row for point in fit.goodness.suspicious]
+    else:
+        x = fit.problem.stiffness_data.amplitude
+        label = f"displacement amplitude [{si_unit('displacement', data.motion)}]"
+    of_curve = np.stack([layout.curve_of_row(data), data.harmonic])
+    residuals = fit.residual[: fit.ndata] / (fit.scale if fit.scale > 0.0 else 1.0)
     return plot_residuals(
         x,
         residuals[0::2],
         residuals[1::2],
-        names=names,
+        names=("ln gain", "phase") if fit.noise == "relative" else ("real part", "imaginary part"),
         x_label=label,
-        suspicious=suspicious,
+        group=np.unique(of_curve, axis=1, return_inverse=True)[1],
+        suspicious=[point.row for point in fit.goodness.suspicious],
         ax=ax,
     )
 
 
-def _is_over_amplitude(data: FrequencyResponse, amplitude: FloatArray) -> bool:
-    """Return whether the table is a curve over amplitude rather than curves over frequency."""
-    return bool(
-        (data.controlled == "displacement").all()
-        and np.ptp(np.log(amplitude)) >= np.ptp(np.log(data.frequency_hz))
-    )
-
-
-def _over_amplitude(
-    fit: FitResult, data: FrequencyResponse, amplitude: FloatArray, ax: Sequence[Axes] | None
-) -> tuple[Axes, Axes]:
-    grid = np.geomspace(amplitude.min(), amplitude.max(), _POINTS)
-    band = fit.predict(float(np.median(data.frequency_hz)), amplitude=grid)
-    gain_std, phase_std = _errors(fit, data)
-    unit = "rad" if data.motion == "rotation" else "m"
-    return plot_amplitude_response(
-        amplitude,
-        data.response,
-        gain_std=gain_std,
-        phase_std=phase_std,
-        curve=Curve(grid, band.response, band.gain(), band.phase()),
-        amplitude_label=f"displacement amplitude [{unit}]",
-        gain_label=f"gain [{data.unit}]",
-        ax=ax,
-    )
-
-
-def _errors(fit: FitResult, data: FrequencyResponse) -> tuple[FloatArray | None, FloatArray | None]:
+def _stds(fit: FitResult, data: FrequencyResponse) -> tuple[FloatArray | None, FloatArray | None]:
     """Return the standard deviations of gain and phase that the noise model has."""
-    R = data.response
+    gain = data.gain
     if fit.noise == "relative":
-        return fit.scale * np.abs(R), np.full(R.shape, fit.scale)
+        return fit.scale * gain, np.full(gain.shape, fit.scale)
     if fit.noise == "absolute":
-        return np.full(R.shape, fit.scale), fit.scale / np.abs(R)
-    if data.covariance is None:
-        return None, None
-    along = np.stack([R.real, R.imag], axis=-1) / np.abs(R)[:, None]
-    across = np.stack([-R.imag, R.real], axis=-1) / np.abs(R)[:, None]
-    gain, phase = (
-        np.sqrt(np.einsum("ni,nij,nj->n", v, data.covariance, v)) for v in (along, across)
+        return np.full(gain.shape, fit.scale), fit.scale / gain
+    return (None, None) if data.covariance is None else polar_std(data.response, data.covariance)
+
+
+def _curve(fit: FitResult, part: FrequencyResponse, over_frequency: bool) -> Curve:
+    """Return the fitted response between some rows, what was held interpolated between them."""
+    x = layout.abscissa(part, over_frequency)
+    order = np.argsort(x)
+    grid = np.geomspace(x[order[0]], x[order[-1]], _POINTS)
+
+    def between(values: FloatArray) -> FloatArray:
+        return np.exp(np.interp(np.log(grid), np.log(x[order]), np.log(values[order])))
+
+    if over_frequency:
+        frequency, held = grid, between(layout.held_amplitude(part))
+    else:
+        frequency, held = between(part.frequency_hz), grid
+    forced = layout.is_force_controlled(part)
+    band = fit.predict(
+        frequency, drive=held if forced else None, amplitude=None if forced else held
     )
-    return gain, phase / np.abs(R)
-
-
-def _levels(data: FrequencyResponse) -> Iterator[tuple[str, FrequencyResponse]]:
-    if data.level is None:
-        yield "data", data
-        return
-    for label in data.levels:
-        yield f"{label:.3g}" if isinstance(label, float) else str(label), data.select(level=label)
-
-
-def _curve(fit: FitResult, part: FrequencyResponse) -> tuple[FloatArray, ComplexArray]:
-    """Return the fitted response over a level's frequencies, what was controlled interpolated."""
-    order = np.argsort(part.frequency_hz)
-    f = part.frequency_hz[order]
-    if f[-1] <= f[0]:
-        return f, fit.best_fit[:0]
-    grid = np.geomspace(f[0], f[-1], _POINTS)
-    forced = bool((part.controlled == "force").all())
-    held: Any = part.drive if forced else part.amplitude
-    level = np.exp(np.interp(np.log(grid), np.log(f), np.log(held[order])))
-    band = fit.predict(grid, drive=level) if forced else fit.predict(grid, amplitude=level)
-    return grid, band.response
+    return Curve(grid, band.response, band.gain(), band.phase())
