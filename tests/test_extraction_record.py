@@ -252,6 +252,20 @@ def test_distortion_of_an_acceleration_is_that_of_the_displacement() -> None:
     assert data.quality["displacement_distortion"][0] == pytest.approx(0.05, rel=1e-2)
 
 
+def test_a_turned_sign_creates_energy() -> None:
+    w = waves(noise=1e-3)
+    turned = extract(Record(w.time, displacement=w.displacement, force=-w.force))
+    assert set(turned.quality["verdict"]) == {"creates energy, a sign is turned"}
+    theta = 2.0 * np.pi * w.time
+    rng = np.random.default_rng(3)
+    verdicts = []
+    for _ in range(40):
+        x, force = np.sin(theta) + 1e-3 * rng.standard_normal((2, theta.size))
+        data = extract(Record(w.time, displacement=x, force=force), harmonics=(1,))
+        verdicts += data.quality["verdict"].tolist()
+    assert verdicts.count("good") >= 39
+
+
 def test_quantisation_is_told_in_steps_of_the_sensor() -> None:
     w = waves()
     x = np.round(w.displacement / 0.3) * 0.3

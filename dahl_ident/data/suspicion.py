@@ -103,8 +103,13 @@ def refuse_created_energy(file: str, data: FrequencyResponse, row_name: RowName)
             "columns hold another quantity?"
         )
     creating = np.zeros(data.n, dtype=bool)
-    creating[fundamental] = loss < -_limit(dof) * std
+    creating[fundamental] = creates_energy(loss, std, dof)
     doubt(file, creating, row_name, "the phase's sign creates energy")
+
+
+def creates_energy(loss: FloatArray, std: FloatArray, dof: FloatArray) -> NDArray[np.bool_]:
+    """Return which losses are below zero by more than their noise."""
+    return np.asarray(loss < -_limit(dof) * std)
 
 
 def _amplitude(part: FrequencyResponse) -> FloatArray:

@@ -95,7 +95,7 @@ def extract(
         ``displacement_clipped``, ``force_clipped``
             Share of samples that stand still at the highest or lowest value.
         ``verdict``
-            "good", or what speaks against the point.
+            "good", or what speaks against the point; a loss below zero among it.
 
     Raises
     ------

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.suspicion import creates_energy
 from dahl_ident.errors import ExtractionError
 from dahl_ident.extraction.memory import (
     MOST_CYCLES,
@@ -54,6 +55,7 @@ _DISTORTED = 0.02  # from which the fundamental alone misses percents of the los
 _MOVING_MEAN = 0.02  # of the amplitude, over the stretch, where the force is controlled
 _BEYOND_NOISE = 5.0  # standard errors of a drift in white noise
 _TINY = np.finfo(np.float64).tiny
+_ROUNDING = 1e-9  # of the response
 _FEW_STEPS = 10.0  # amplitude over sensor step below which the step matters
 
 
@@ -394,7 +396,7 @@ def _point(phasors: _Phasors, cycles: int, dropped: int, steps: FloatArray) -> P
         "end_time": stretch.time[-1],
         **_channel_quality(phasors, steps),
     }
-    quality["verdict"] = _verdicts(quality)
+    quality["verdict"] = _verdicts(quality, creating=_creating(phasors))
     return Point(
         frequency_hz=stretch.omega / (2.0 * np.pi),
         amplitude=abs(phasors.displacement),
@@ -430,9 +432,18 @@ def _channel_quality(phasors: _Phasors, steps: FloatArray) -> dict[str, Any]:
     }
 
 
-def _verdicts(quality: dict[str, Any]) -> list[str]:
+def _creating(phasors: _Phasors) -> bool:
+    """Return whether the fundamental loses less than nothing, beyond noise and rounding."""
+    N, covariance, _, dof = _fundamental(phasors)
+    std = np.hypot(np.sqrt(covariance[1, 1]), _ROUNDING * abs(N))
+    return bool(creates_energy(np.asarray(N.imag), std, np.asarray(dof)))
+
+
+def _verdicts(quality: dict[str, Any], *, creating: bool) -> list[str]:
     """Return, for each row, "good" or what speaks against it."""
     shared = []
+    if creating and all(quality["settled"]):
+        shared.append("creates energy, a sign is turned")
     if quality["displacement_distortion"] > _DISTORTED:
         shared.append(f"displacement distorted {100 * quality['displacement_distortion']:.2g} %")
     for name in ("displacement", "force"):
