@@ -12,6 +12,9 @@ from dahl_ident.errors import ValidationError
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+SMALLEST, LARGEST = 1e-90, 1e90
+"""Sizes that a number may have, so that their squares, products and ratios stay representable."""
+
 
 def real_array(value: ArrayLike, name: str) -> FloatArray:
     """Return `value` as a float array, or say what else it is.
@@ -31,7 +34,7 @@ def real_array(value: ArrayLike, name: str) -> FloatArray:
     Raises
     ------
     ValidationError
-        If the values are complex, text, dates or ragged.
+        If the values are complex, truth values, text, dates or ragged.
     """
     try:
         array = np.asarray(value)
@@ -42,17 +45,20 @@ def real_array(value: ArrayLike, name: str) -> FloatArray:
             f"{name}: expected real numbers, got complex ones (dtype {array.dtype}); "
             "pass an amplitude or a waveform, not a phasor"
         )
-    if array.dtype.kind not in "fiub":
+    if array.dtype.kind not in "fiu":
         raise ValidationError(f"{name}: expected real numbers, got dtype {array.dtype}")
     return array.astype(np.float64, copy=False)
 
 
 def finite_array(value: ArrayLike, name: str) -> FloatArray:
-    """Return `value` as a float array without NaN or infinity, or name the first bad index."""
+    """Return `value` as a float array of at most 1e90 in size, or name the first bad index."""
     array = real_array(value, name)
-    good = np.isfinite(array)
+    good = np.abs(array) <= LARGEST
     if not good.all():
-        _refuse(array, good, name, "finite numbers")
+        finite = np.isfinite(array)
+        if finite.all():
+            _refuse(array, good, name, f"numbers of at most {LARGEST:g} in size; check the unit")
+        _refuse(array, finite, name, "finite numbers")
     return array
 
 
@@ -66,11 +72,14 @@ def non_negative_array(value: ArrayLike, name: str) -> FloatArray:
 
 
 def positive_array(value: ArrayLike, name: str) -> FloatArray:
-    """Return `value` as a finite float array of numbers above zero."""
+    """Return `value` as a float array of numbers above zero, from 1e-90 to 1e90."""
     array = finite_array(value, name)
-    good = array > 0.0
+    good = array >= SMALLEST
     if not good.all():
-        _refuse(array, good, name, "numbers > 0")
+        positive = array > 0.0
+        if positive.all():
+            _refuse(array, good, name, f"numbers of at least {SMALLEST:g}; check the unit")
+        _refuse(array, positive, name, "numbers > 0")
     return array
 
 

@@ -202,6 +202,38 @@ def test_arguments_are_not_changed() -> None:
     np.testing.assert_array_equal(A, kept)
 
 
+@pytest.mark.parametrize("alpha", [1.0, 1e-9, 0.5, 2.0, 1e2])
+@pytest.mark.parametrize("f_max", [1e-90, 1.0, 1e90])
+@pytest.mark.parametrize("sigma", [1e-90, 1.0, 1e90])
+def test_every_call_is_finite_to_the_edges_of_what_is_accepted(
+    f_max: float, sigma: float, alpha: float
+) -> None:
+    friction = Dahl(f_max, sigma, alpha)
+    A = np.array([0.0, 5e-324, 1e-300, 1e-100, 1e-30, 1.0, 1e30, 1e90])
+    N = friction.describing_function(A)
+    assert np.all(
+        (N.real >= 0.0) & (N.imag >= 0.0) & (np.abs(N) <= 4.0 / np.pi * 2.0**alpha * sigma)
+    )
+    assert N[0] == sigma
+    for values in friction.gradient(A).values():
+        assert np.isfinite(values).all()
+    for k in (1, 3, 15):
+        a, b = friction.fourier_coefficients(A, k)
+        assert np.all(np.abs(a + 1j * b) <= 4.0 / np.pi * f_max * (1.0 + 1e-12))
+    x, F = friction.loop(1e90)
+    assert np.all(np.abs(F) <= f_max * (1.0 + 1e-15))
+    assert np.all(np.abs(friction.force([*x, *(1e-5 * x)])) <= f_max * (1.0 + 1e-15))
+
+
+@pytest.mark.parametrize("alpha", [1.0, 2.0])
+def test_slope_at_rest_meets_the_slope_beside_it(alpha: float) -> None:
+    friction = Dahl(2.0, 3.0, alpha)
+    rest, beside, further = friction.gradient([0.0, 1e-99, 1e-20], names=["amplitude"])["amplitude"]
+    assert rest == pytest.approx(1j * 4.0 * alpha * 9.0 / 2.0 / (3.0 * np.pi), rel=1e-15)
+    assert beside == pytest.approx(rest, rel=1e-13)
+    assert further == pytest.approx(rest, rel=1e-13)
+
+
 # what is refused
 
 
@@ -215,6 +247,8 @@ def test_arguments_are_not_changed() -> None:
         (np.inf, r"^amplitude is inf; expected finite numbers$"),
         ([1.0 + 0.0j], r"^amplitude: expected real numbers, got complex ones"),
         (["a"], r"^amplitude: expected real numbers, got dtype <U1$"),
+        ([True], r"^amplitude: expected real numbers, got dtype bool$"),
+        (1e101, r"^amplitude is 1e\+101; expected numbers of at most 1e\+90 in size; check the"),
         ([[1.0], [1.0, 2.0]], r"^amplitude: expected an array of real numbers"),
     ],
 )
@@ -229,13 +263,15 @@ def test_bad_amplitudes_are_named(
 @pytest.mark.parametrize(
     ("value", "text"),
     [
-        (0.0, r" is 0\.0; expected a number > 0"),
-        (-1.0, r" is -1\.0; expected a number > 0"),
+        (0.0, r" is 0\.0; expected numbers > 0"),
+        (-1.0, r" is -1\.0; expected numbers > 0"),
         (np.nan, r" is nan; expected finite"),
         (np.inf, r" is inf; expected finite"),
         (1j, r": expected real numbers, got complex"),
         ([1.0, 2.0], r": expected one number, got an array of shape \(2,\)"),
         ("0.1", r": expected real numbers, got dtype"),
+        (True, r": expected real numbers, got dtype bool"),
+        (1e-200, r" is 1e-200; expected numbers of at least 1e-90; check the unit"),
     ],
 )
 def test_bad_parameters_are_named(parameter: str, value: Any, text: str) -> None:
@@ -275,3 +311,7 @@ def test_other_bad_arguments_are_named() -> None:
         friction.loop(0.0)
     with pytest.raises(ModelError, match=r"has no value for sigma"):
         _ = Dahl(1.0).characteristic_displacement
+    with pytest.raises(
+        ValidationError, match=r"^alpha is 1e-10; expected numbers from 1e-09 to 1000"
+    ):
+        Dahl(1.0, 1.0, 1e-10)

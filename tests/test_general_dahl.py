@@ -47,7 +47,10 @@ def test_agrees_with_independent_computation(beta: float, alpha: float, expected
 
 @pytest.mark.parametrize(
     ("beta", "alpha"),
-    [(2e-6, 3.7), (1.12, 0.25), (1.13, 0.25), (0.9, 1 - 1e-8), (30.0, 1.4), (7e5, 4.0)],
+    [
+        *((2e-6, 3.7), (1.12, 0.25), (1.13, 0.25), (0.9, 1 - 1e-8), (30.0, 1.4), (7e5, 4.0)),
+        *((0.3, 0.01), (40.0, 0.1), (0.3, 10.0), (40.0, 100.0)),
+    ],
 )
 def test_agrees_with_fifty_digit_integration(beta: float, alpha: float) -> None:
     found = errors(beta, alpha, (1, 15))

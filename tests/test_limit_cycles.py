@@ -276,7 +276,7 @@ def test_bad_arguments_are_named() -> None:
         ValidationError, match=r"frequency_range_hz is \(2, 1\); expected two rising"
     ):
         limit_cycles(ACTIVE, GRIP, frequency_range_hz=(2, 1))
-    with pytest.raises(ValidationError, match="system is a float; expected a python-control"):
+    with pytest.raises(ValidationError, match="loop is a float; expected a python-control"):
         limit_cycles(3.0, GRIP)
     with pytest.raises(ModelError, match="has no frequency of its own; give frequency_range_hz"):
         limit_cycles(Spring(-1.0), GRIP)

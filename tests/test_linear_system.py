@@ -159,7 +159,7 @@ def test_what_is_no_system_is_refused(
 
 def test_quantity_has_to_be_said() -> None:
     wrong: Any = "X/F"
-    with pytest.raises(ValidationError, match=r"quantity is 'X/F'; expected one of 'receptance'"):
+    with pytest.raises(ValidationError, match=r"quantity is 'X/F'; expected one of receptance"):
         LinearSystem(transfer_function("receptance"), quantity=wrong)
 
 

@@ -22,14 +22,14 @@ WIDE = np.geomspace(1e-12, 1e12, 97)[:, None]
 
 
 def worst_residual(plant: Model, result: SteadyResponse) -> float:
-    """Return abs(A abs(Z)/u_0 - 1) over its bound max(1, kappa/4), the largest one found."""
+    """Return abs(X Z/u_0 - 1) over its bound max(1, kappa/4), the largest one found."""
     A, omega = result.amplitude, 2.0 * np.pi * result.frequency_hz
     found = np.isfinite(A)
     friction = Model(*(e for e in plant.elements if isinstance(e, Dahl)))
     N = friction.dynamic_stiffness(np.where(found, A, 1.0))
     Z = plant.dynamic_stiffness(np.where(found, A, 1.0), omega)
     kappa = (np.abs(Z - N) + np.abs(N)) / np.abs(Z)
-    residual = np.abs(A * np.abs(Z) / result.drive - 1.0) / np.maximum(1.0, kappa / 4.0)
+    residual = np.abs(result.displacement * Z / result.drive - 1.0) / np.maximum(1.0, kappa / 4.0)
     return float(np.max(residual[found]))
 
 
@@ -76,6 +76,15 @@ def test_several_friction_elements_side_by_side() -> None:
     result = response(plant, [0.0, 0.1, 0.9, 25.0], WIDE)
     assert result.found.all()
     assert worst_residual(plant, result) < 1e-12
+
+
+@pytest.mark.parametrize("levels", [1, 3, 40])
+def test_the_phasor_is_as_accurate_as_the_amplitude_however_few_the_points(levels: int) -> None:
+    rng = np.random.default_rng(4)
+    for plant in some_plants(40, [1.0, 0.5, 2.0]):
+        f_max = float(plant.parameters[0].value or 0.0)
+        drive = f_max * 10.0 ** rng.uniform(-8.0, 8.0, levels)
+        assert worst_residual(plant, response(plant, rng.uniform(0.0, 3.0), drive)) < 1e-12
 
 
 @pytest.mark.parametrize("exponent", [(30, 30), (30, -30), (-30, 30), (-30, -30)])
@@ -207,13 +216,16 @@ def limit_cycle() -> tuple[Model, float, float]:
     return friction + Mass(0.1) + Damper(-N.imag / 10.0) + Spring(10.0 - N.real), 1.0, 10.0
 
 
-def test_a_weakly_driven_limit_cycle_has_two_close_amplitudes_beside_the_small_one() -> None:
+@pytest.mark.parametrize("drive", [1e-9, 1e-14, 1e-17, 1e-20, 1e-30])
+def test_a_weakly_driven_limit_cycle_has_two_close_amplitudes_beside_the_small_one(
+    drive: float,
+) -> None:
     plant, amplitude, omega = limit_cycle()
-    result = response(plant, omega / (2.0 * np.pi), 1e-9, all_roots=True)
-    small, below, above = result.amplitude
-    assert small < 1e-8
-    assert 0.0 < amplitude - below < 1e-8
-    assert 0.0 < above - amplitude < 1e-8
+    result = response(plant, omega / (2.0 * np.pi), drive, all_roots=True)
+    small, *pair = result.amplitude  # that only rounding parts where the drive is less than it
+    assert small < 10.0 * drive
+    assert len(pair) == 2 or drive < 1e-15
+    np.testing.assert_allclose(pair, amplitude, rtol=10.0 * drive + 1e-13)
 
 
 def test_start_chooses_among_several() -> None:
@@ -252,6 +264,12 @@ def test_resonance_that_rounding_hides_has_no_amplitude_either() -> None:
     assert 0.1 - 0.3 * omega**2 != 0.0
     assert not response(plant, omega / (2.0 * np.pi), 2.0).found
     assert response(plant, 1.0000001 * omega / (2.0 * np.pi), 2.0).found
+
+
+def test_a_point_without_amplitude_has_no_stiffness_and_no_warning() -> None:
+    result = response(RESONANT, [0.5 / np.pi, 1.0], 2.0)
+    for part in (result.dynamic_stiffness, result.receptance, result.phase):
+        assert np.isfinite(part).tolist() == [False, True]
 
 
 def test_linear_plant_alone() -> None:
@@ -322,12 +340,50 @@ def test_results_are_read_only() -> None:
         (1.0, [[0.1, 0.0]], r"drive\[0, 1\] is 0\.0; expected numbers > 0"),
         (1.0, np.inf, r"drive is inf; expected finite"),
         (1.0, 1.0 + 1.0j, r"drive: expected real numbers, got complex"),
+        (1.0, 1e300, r"drive is 1e\+300; expected numbers of at most 1e\+90"),
+        (1.0, True, r"drive: expected real numbers, got dtype bool"),
         ([1.0, 2.0], [0.1, 0.2, 0.3], r"frequency_hz \(2,\), drive \(3,\)"),
     ],
 )
 def test_bad_arguments_are_named(frequency: FloatArray, drive: FloatArray, text: str) -> None:
     with pytest.raises(ValidationError, match=text):
         response(FIG_7, frequency, drive)
+
+
+@given(
+    st.lists(st.floats(-89.0, 89.0), min_size=7, max_size=7),
+    st.sampled_from([1.0, 0.5, 2.0]),
+    st.sampled_from([1.0, -1.0, 0.0]),
+)
+def test_whatever_is_accepted_is_right_or_refused(
+    exponents: list[float], alpha: float, sign: float
+) -> None:
+    f_max, sigma, mass, damping, stiffness, frequency, drive = (10.0**e for e in exponents)
+    plant = Dahl(f_max, sigma, alpha) + Mass(mass) + Damper(sign * damping) + Spring(stiffness)
+    try:
+        result = response(plant, frequency, [drive], all_roots=True)
+    except ValidationError:
+        with pytest.raises(ValidationError, match="beyond which numbers end; check the units"):
+            response(plant, frequency, drive)
+        return
+    assert result.found.any() or result.message
+    if sign >= 0.0 and result.found.any() and result.amplitude[0, 0] < 1e90:
+        assert worst_residual(plant, result) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("plant", "frequency", "drive"),
+    [
+        (Mass(1e-90) + Damper(1e-90), 1e-120, 1e90),
+        (Dahl(1e-90, 1e-90) + Mass(1e90), 1e80, 1.0),
+    ],
+)
+def test_what_numbers_cannot_hold_is_refused(
+    plant: Element, frequency: float, drive: float
+) -> None:
+    text = r"^point 0 \(1 such points\) has an amplitude of about .* outside 1e-290 to 1e\+290"
+    with pytest.raises(ValidationError, match=text):
+        response(plant, frequency, drive)
 
 
 def test_a_plant_without_a_value_says_which() -> None:

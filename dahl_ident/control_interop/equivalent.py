@@ -25,10 +25,13 @@ from dahl_ident.arrays import (
     positive_array,
     positive_number,
 )
-from dahl_ident.control_interop.linear_part import coefficients, transfer_stiffness
+from dahl_ident.control_interop.linear_part import (
+    coefficients,
+    controller_response,
+    transfer_stiffness,
+)
 from dahl_ident.control_interop.parts import parts_of
 from dahl_ident.elements.element import Element
-from dahl_ident.elements.linear_system import LinearSystem
 from dahl_ident.elements.model import as_model
 from dahl_ident.errors import ValidationError
 
@@ -209,7 +212,7 @@ def loop_margins(
             "each, frequencies rising"
         )
     omega = 2.0 * np.pi * f
-    C = LinearSystem(controller, quantity="dynamic_stiffness").dynamic_stiffness(0.0, omega)
+    C = controller_response(controller, omega)
     model, values = _with_draws(plant, draws)
     Z = model.stiffness(values, A[:, None], omega)
     shape = np.broadcast_shapes(Z.shape, (A.size, f.size))

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import broadcast_shape, finite_array, positive_array
+from dahl_ident.control_interop.linear_part import controller_response
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.elements.linear_system import LinearSystem
+from dahl_ident.data.quantities import jacobian
 from dahl_ident.errors import ValidationError
 
 
@@ -68,7 +69,7 @@ def closed_loop_response(
     X_over_R = np.asarray(response, dtype=np.complex128)
     broadcast_shape(frequency_hz=f, reference=r, response=X_over_R)
     omega = 2.0 * np.pi * f
-    C = LinearSystem(controller, quantity="dynamic_stiffness").dynamic_stiffness(0.0, omega)
+    C = controller_response(controller, omega)
     if np.any(C == 0.0):
         raise ValidationError(
             f"the controller is 0 at {f[C == 0.0][0]:g} Hz, where nothing drives the plant; "
@@ -76,8 +77,7 @@ def closed_loop_response(
         )
     turned = None
     if covariance is not None:
-        g = 1.0 / C
-        turn = np.stack([np.stack([g.real, -g.imag], -1), np.stack([g.imag, g.real], -1)], -2)
+        turn = jacobian(1.0 / C)
         turned = turn @ finite_array(covariance, "covariance") @ np.swapaxes(turn, -1, -2)
     return FrequencyResponse(
         f,

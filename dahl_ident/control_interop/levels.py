@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
+from dahl_ident.data.fields import CONTROLLED, one_of
 from dahl_ident.data.quantities import converted
 from dahl_ident.elements.element import Element
 from dahl_ident.errors import ValidationError
@@ -141,16 +142,13 @@ def level_responses(
         raise ValidationError(
             f"frequency_hz has shape {f.shape} and levels {held.shape}; expected one dimension each"
         )
-    if quantity not in QUANTITIES:
-        known = ", ".join(repr(q) for q in QUANTITIES)
-        raise ValidationError(f"quantity is {quantity!r}; expected one of {known}")
+    one_of(quantity, "quantity", QUANTITIES)
+    one_of(controlled, "controlled", CONTROLLED)
     omega = 2.0 * np.pi * f
     if controlled == "force":
         R = np.asarray(response(plant, f, held[:, None]).receptance)
-    elif controlled == "displacement":
-        R = 1.0 / np.asarray(plant.dynamic_stiffness(held[:, None], omega))
     else:
-        raise ValidationError(f"controlled is {controlled!r}; expected 'force' or 'displacement'")
+        R = 1.0 / np.asarray(plant.dynamic_stiffness(held[:, None], omega))
     with np.errstate(invalid="ignore"):  # where there is no steady amplitude
         R, _ = converted(R, omega, "receptance", quantity)
     return LevelResponses(f, held, controlled, quantity, R)

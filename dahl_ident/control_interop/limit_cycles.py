@@ -31,7 +31,7 @@ from dahl_ident.control_interop.linear_part import (
 from dahl_ident.control_interop.nonlinearity import dahl_elements, friction_and_slope
 from dahl_ident.elements.dahl import Dahl
 from dahl_ident.elements.element import Element
-from dahl_ident.elements.linear_system import LinearSystem
+from dahl_ident.elements.linear_system import LinearSystem, check_system
 from dahl_ident.elements.model import Model, as_model
 from dahl_ident.errors import ModelError, ValidationError
 
@@ -152,8 +152,10 @@ def limit_cycles(
 
 def as_linear(loop: Any) -> Model:
     """Return a loop, H or elements, as a linear model."""
-    linear = loop if isinstance(loop, Element) else LinearSystem(loop, quantity="receptance")
-    model = as_model(linear)
+    if not isinstance(loop, Element):
+        check_system(loop, "loop")
+        loop = LinearSystem(loop, quantity="receptance")
+    model = as_model(loop)
     dahl = [element for element in model.elements if isinstance(element, Dahl)]
     if dahl:
         raise ModelError(f"loop holds {dahl[0]!r}; expected linear elements: pass it as friction")

@@ -7,33 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.quantities import DEFINITIONS
 from dahl_ident.elements.element import Element
-from dahl_ident.elements.linear import Damper, Mass, Spring
-from dahl_ident.elements.linear_system import LinearSystem
+from dahl_ident.elements.linear import Lumped
+from dahl_ident.elements.linear_system import LinearSystem, check_system
 from dahl_ident.elements.model import as_model
 from dahl_ident.errors import ModelError
-
-_POWER: dict[type[Element], int] = {Spring: 0, Damper: 1, Mass: 2}
-_OF_RESPONSE = {
-    "receptance": (True, 0),
-    "mobility": (True, 1),
-    "accelerance": (True, 2),
-    "dynamic_stiffness": (False, 0),
-    "mechanical_impedance": (False, 1),
-    "apparent_mass": (False, 2),
-}
-"""Whether Z is the inverse of the response, and the power of s that it then takes."""
-
-
-def system_of(element: LinearSystem) -> Any:
-    """Return the python-control system of an element at the values of its parameters."""
-    if not element.parameters:
-        return element.system
-    prefix = f"{element.name}_" if element.name else ""
-    labels = [p.name.removeprefix(prefix) for p in element.parameters]
-    values = [float(v) for v in element.known_values()]
-    return element.system(**dict(zip(labels, values, strict=True)))
 
 
 def transfer_stiffness(model: Element) -> Any:
@@ -49,32 +29,42 @@ def transfer_stiffness(model: Element) -> Any:
     for element in as_model(model).elements:
         if isinstance(element, LinearSystem):
             total = total + _stiffness_of(element)
+        elif isinstance(element, Lumped):
+            (value,) = element.known_values()
+            total = total + float(value) * _s_to_the(element.order)
         else:
-            (value,) = (float(v) for v in element.known_values())
-            total = total + control.tf([value, *[0.0] * _POWER[type(element)]], [1.0])
+            raise ModelError(f"{element!r} has no transfer function; expected a linear element")
     return total
+
+
+def controller_response(controller: Any, omega: FloatArray) -> ComplexArray:
+    """Return C(j omega) of a python-control system: force over displacement error."""
+    check_system(controller, "controller")
+    return LinearSystem(controller, quantity="dynamic_stiffness").dynamic_stiffness(0.0, omega)
 
 
 def has_polynomials(model: Element) -> bool:
     """Return whether every linear system of the model is continuous and no FRD."""
     control = importlib.import_module("control")
-    systems = [system_of(e) for e in as_model(model).elements if isinstance(e, LinearSystem)]
-    return all(not isinstance(s, control.FRD) and s.isctime() for s in systems)
+    return all(not isinstance(s, control.FRD) and s.isctime() for s in _systems(model))
 
 
 def known_range(model: Element) -> tuple[float, float]:
     """Return the angular frequencies between which every linear system is known, rad/s."""
     control = importlib.import_module("control")
     low, high = 0.0, np.inf
-    for element in as_model(model).elements:
-        if not isinstance(element, LinearSystem):
-            continue
-        system = system_of(element)
+    for system in _systems(model):
         if isinstance(system, control.FRD):
             low, high = max(low, np.min(system.omega)), min(high, np.max(system.omega))
         elif system.isdtime(strict=True):
             high = min(high, np.pi / system.dt)
     return float(low), float(high)
+
+
+def _systems(model: Element) -> list[Any]:
+    """Return the python-control systems of a model at the values of their parameters."""
+    elements = [e for e in as_model(model).elements if isinstance(e, LinearSystem)]
+    return [e.system_at([float(v) for v in e.known_values()]) for e in elements]
 
 
 def coefficients(transfer: Any) -> tuple[FloatArray, FloatArray]:
@@ -85,13 +75,11 @@ def coefficients(transfer: Any) -> tuple[FloatArray, FloatArray]:
 
 def _stiffness_of(element: LinearSystem) -> Any:
     control = importlib.import_module("control")
-    system = system_of(element)
-    if isinstance(system, control.FRD) or not system.isctime():
-        raise ModelError(
-            f"{element!r} is no rational function of s; give a continuous TransferFunction or "
-            "StateSpace, or ask for a frequency response instead"
-        )
-    transfer = control.tf(system)
-    inverted, power = _OF_RESPONSE[element.quantity]
-    s_power = control.tf([1.0, *[0.0] * power], [1.0])
-    return s_power / transfer if inverted else s_power * transfer
+    response = control.tf(*element.polynomials())
+    definition = DEFINITIONS[element.quantity]
+    operator = _s_to_the(definition.power_in_stiffness)
+    return operator * response if definition.exponent == 1 else operator / response
+
+
+def _s_to_the(power: int) -> Any:
+    return importlib.import_module("control").tf([1.0, *[0.0] * power], [1.0])

@@ -1,11 +1,14 @@
 """The six standard quantities, and how their errors travel from one to another.
 
 With X the displacement phasor, F the force phasor and s = j omega, the receptance is X/F, the
-mobility s X/F and the accelerance s^2 X/F; their inverses are the dynamic stiffness F/X, the
-mechanical impedance F/(s X) and the apparent mass F/(s^2 X) (ISO 7626-1).
+mobility s X/F and the accelerance s^2 X/F; their inverses are the dynamic stiffness Z = F/X, the
+mechanical impedance F/(s X) and the apparent mass F/(s^2 X) (ISO 7626-1). So every one of them is
+R = s^p Z^q with q = 1 or -1, and Z = s^(-p q) R^q.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,16 +16,33 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.errors import ValidationError
 from dahl_ident.units import Quantity
 
-# power of s on the displacement, and whether the quantity is force over motion
-_DEFINITION: dict[Quantity, tuple[int, bool]] = {
-    "receptance": (0, False),
-    "mobility": (1, False),
-    "accelerance": (2, False),
-    "dynamic_stiffness": (0, True),
-    "mechanical_impedance": (1, True),
-    "apparent_mass": (2, True),
+
+class Definition(NamedTuple):
+    """A quantity R = s^power Z^exponent."""
+
+    power: int
+    exponent: int  # 1 or -1
+
+    @property
+    def power_in_stiffness(self) -> int:
+        """Power of s in Z = s^power_in_stiffness R^exponent."""
+        return -self.power * self.exponent
+
+
+DEFINITIONS: dict[Quantity, Definition] = {
+    "receptance": Definition(0, -1),
+    "mobility": Definition(1, -1),
+    "accelerance": Definition(2, -1),
+    "dynamic_stiffness": Definition(0, 1),
+    "mechanical_impedance": Definition(-1, 1),
+    "apparent_mass": Definition(-2, 1),
 }
 _POWERS_OF_J = (1.0 + 0.0j, 1.0j, -1.0 + 0.0j, -1.0j)  # exact, where (1j)**n rounds
+
+
+def power_of_s(omega: FloatArray, power: int) -> ComplexArray:
+    """Return (j omega)^power, without rounding of the direction."""
+    return np.asarray(_POWERS_OF_J[power % 4] * omega ** float(power))
 
 
 def converted(
@@ -35,12 +55,10 @@ def converted(
     ValidationError
         If a response of zero would have to be inverted.
     """
-    from_power, from_inverted = _DEFINITION[source]
-    to_power, to_inverted = _DEFINITION[target]
-    exponent = from_power - to_power if to_inverted else to_power - from_power
-    powers = _POWERS_OF_J[exponent % 4] * omega ** float(exponent)
-    factor = np.asarray(powers, dtype=np.complex128)
-    if from_inverted == to_inverted:
+    given, wanted = DEFINITIONS[source], DEFINITIONS[target]
+    turn = given.exponent * wanted.exponent
+    factor = power_of_s(omega, wanted.power - turn * given.power)
+    if turn == 1:
         return response * factor, factor
     zero = np.flatnonzero(response == 0.0)
     if zero.size:

@@ -18,12 +18,12 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
 from dahl_ident.data.binding import Binding, by_level, per_frequency
 from dahl_ident.data.columns import RESPONSE_NAMES, ColumnMap
 from dahl_ident.data.fields import CONTROLLED
 from dahl_ident.data.frequency_response import FrequencyResponse
-from dahl_ident.data.source import SMALLEST, Source
+from dahl_ident.data.source import Source
 from dahl_ident.data.suspicion import doubt_drive, doubt_phase_unit, refuse_created_energy
 from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import (
@@ -149,7 +149,7 @@ class _Table:
         channel = self.bound.required("frequency")
         values = self.bound.numbers("frequency", channel)
         self.bound.source.require(
-            values > SMALLEST, channel, "a frequency > 0; frequency_hz=(low, high) leaves rows out"
+            values >= SMALLEST, channel, "a frequency > 0; frequency_hz=(low, high) leaves rows out"
         )
         return self._hertz(values)
 
@@ -158,7 +158,7 @@ class _Table:
         if channel is None:
             return self._constant("amplitude", frequency_hz, MOTION_KINDS)
         values = self.bound.numbers("amplitude", channel)
-        self.bound.source.require(values > SMALLEST, channel, "an amplitude > 0")
+        self.bound.source.require(values >= SMALLEST, channel, "an amplitude > 0")
         unit = self.bound.unit("amplitude", channel)
         kind, factor = self.bound.kind("amplitude", unit, MOTION_KINDS)
         self.bound.note_peak("amplitude", unit)
@@ -169,7 +169,7 @@ class _Table:
         if channel is None:
             return self._constant("drive", frequency_hz, DRIVE_KINDS)
         values = self.bound.numbers("drive", channel)
-        self.bound.source.require(values > SMALLEST, channel, "a drive amplitude > 0")
+        self.bound.source.require(values >= SMALLEST, channel, "a drive amplitude > 0")
         unit = self.bound.unit("drive", channel)
         kind, factor = self.bound.kind("drive", unit, DRIVE_KINDS)
         self.bound.note_peak("drive", unit)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.frequency_response import FrequencyResponse
 from dahl_ident.errors import DataError
+from dahl_ident.units import Quantity
 
 _OPTIONAL = (
     "amplitude", "drive", "covariance", "dof", "amplitude_std", "amplitude_covariance",
@@ -27,7 +28,7 @@ class Rows:
     `harmonic` and `forced` (force-controlled) have shape (n,): stacked tables agree in them.
     """
 
-    quantity: str
+    quantity: Quantity
     harmonic: NDArray[np.int64]
     forced: NDArray[np.bool_]
     omega: FloatArray

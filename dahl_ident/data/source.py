@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import LARGEST, ComplexArray, FloatArray
 from dahl_ident.data.summary import listed
 from dahl_ident.errors import DataError, UnitError
 from dahl_ident.units import parse_unit
 
 _NUMBER = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\s*|[-+]?inf|nan", re.ASCII)
 _SUFFIXES = {"hz": "Hz", "deg": "deg", "rad": "rad", "s": "s"}
-LARGEST, SMALLEST = 1e100, 1e-100  # what can be measured, and squared without overflow
 _INDEX = re.compile(r"[\d:, ]+")
 
 

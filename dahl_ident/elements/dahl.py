@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from dahl_ident.arrays import (
     ComplexArray,
     FloatArray,
+    array_between,
     broadcast_shape,
     finite_array,
     finite_number,
@@ -31,6 +32,10 @@ from dahl_ident.elements.element import Element, StiffnessGradient, prefixed
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ValidationError
 
+_EXPONENTS = (1e-9, 1e3)
+_AT_REST = 1e-100
+"""Smaller beta are rest, to more digits than a number has."""
+
 
 class Dahl(Element):
     """Dahl friction: dF/dx = sigma abs(z)^alpha sgn(z), z = 1 - s F/f_max, s = sgn(dx/dt).
@@ -42,7 +47,7 @@ class Dahl(Element):
     sigma : float, optional
         Contact stiffness at zero force, N/m (N m/rad), > 0. Given: fixed; left out: free.
     alpha : float or None, default 1
-        Exponent, > 0: 1 is the linear Dahl model. None: free.
+        Exponent, from 1e-9 to 1000: 1 is the linear Dahl model. None: free.
     name : str, optional
         Prefix of the parameters' names, such as "pivot" for ``pivot_f_max``; needed where a
         model has several Dahl elements.
@@ -50,7 +55,8 @@ class Dahl(Element):
     Raises
     ------
     ValidationError
-        If a parameter is not a finite number above zero, or `name` is no identifier.
+        If f_max or sigma is not a number from 1e-90 to 1e90, alpha is outside its range, or
+        `name` is no identifier.
 
     Notes
     -----
@@ -81,6 +87,8 @@ class Dahl(Element):
             _positive(prefixed(name, "sigma"), "N/m", "contact stiffness", sigma),
             _positive(prefixed(name, "alpha"), "", "exponent of the Dahl model", alpha),
         )
+        if alpha is not None:
+            array_between(alpha, self._parameters[2].name, *_EXPONENTS)
 
     @property
     def characteristic_displacement(self) -> float:
@@ -110,8 +118,8 @@ class Dahl(Element):
 
         Notes
         -----
-        Eqns. 51 and 52. Within 1e-13 of each part for alpha = 1, within 1e-10 of abs(N) for
-        other exponents between 0.25 and 4.
+        Eqns. 51 and 52. Within 1e-13 of each part for alpha = 1, within 1e-10 of abs(N) for other
+        exponents from 0.01 to 100.
 
         Examples
         --------
@@ -446,29 +454,10 @@ class Dahl(Element):
             by_alpha = general_dahl.describing_function_gradient(beta, alpha)[3]
         elif closed:
             by_alpha = _per(general_dahl.harmonic_gradient(beta, alpha, harmonic)[2], beta)
-        by_amplitude = self._by_amplitude(values, amplitude, harmonic, by_f_max)
+        by_amplitude = _by_amplitude(values, beta, harmonic, by_f_max)
         h *= sigma
         by_f_max *= sigma / f_max
         return StiffnessGradient(h, by_amplitude, (by_f_max, by_sigma, sigma * by_alpha))
-
-    @staticmethod
-    def _by_amplitude(
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        harmonic: int,
-        by_ln_f_max: ComplexArray,
-    ) -> ComplexArray:
-        """Return dN/dA = -(sigma/A) times the derivative of h by ln f_max, also at rest."""
-        sigma = values[1]
-        if np.all(amplitude > 0.0):
-            return np.asarray(by_ln_f_max * (-sigma / amplitude))
-        shape = by_ln_f_max.shape
-        return np.divide(
-            -sigma * by_ln_f_max,
-            amplitude,
-            out=_slope_at_rest(values, harmonic, shape),
-            where=np.broadcast_to(amplitude > 0.0, shape),
-        )
 
 
 def _positive(name: str, unit: str, description: str, value: float | None) -> Parameter:
@@ -482,6 +471,19 @@ def _is_linear(alpha: FloatArray) -> bool:
 def _per(c: ComplexArray, beta: FloatArray) -> ComplexArray:
     """Return c/beta, with the limit 0 at beta = 0 that every harmonic k > 1 has."""
     return np.divide(c, beta, out=np.zeros(np.shape(c), dtype=np.complex128), where=beta > 0.0)
+
+
+def _by_amplitude(
+    values: Sequence[FloatArray], beta: FloatArray, harmonic: int, by_ln_f_max: ComplexArray
+) -> ComplexArray:
+    """Return dN/dA = -(sigma/A) times the derivative of h by ln f_max, also at rest."""
+    f_max, sigma, _ = values
+    slope: ComplexArray = np.asarray(by_ln_f_max * (1.0 / np.maximum(beta, _AT_REST)))
+    slope *= -sigma / f_max * sigma
+    rests = beta < _AT_REST
+    if np.any(rests):
+        slope = np.where(rests, _slope_at_rest(values, harmonic, slope.shape), slope)
+    return slope
 
 
 def _slope_at_rest(

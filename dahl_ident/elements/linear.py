@@ -8,17 +8,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.quantities import power_of_s
 from dahl_ident.elements.element import Element, StiffnessGradient, motion, prefixed
 from dahl_ident.elements.parameter import Parameter
 
 
-class _Lumped(Element):
-    """One parameter p that enters as Z = p (j omega)^n; a fundamental answers no harmonic."""
+class Lumped(Element):
+    """One parameter p that enters as Z = p (j omega)^order; a sine answers no harmonic."""
 
+    order: int
     _label: str
     _unit: str
     _description: str
-    _order: int
 
     def _set_up(self, value: float | None, name: str | None) -> None:
         self._name = name
@@ -30,7 +31,7 @@ class _Lumped(Element):
         if harmonic != 1:
             # a pure sine of displacement moves a linear element at its own frequency alone
             return np.zeros(np.shape(omega), dtype=np.complex128)
-        return np.asarray((1j * omega) ** self._order)
+        return power_of_s(omega, self.order)
 
     def stiffness(
         self,
@@ -90,11 +91,11 @@ class _Lumped(Element):
             ("velocity", velocity),
             ("acceleration", acceleration),
         )
-        name, history = histories[self._order]
+        name, history = histories[self.order]
         return np.asarray(self.known_values()[0] * motion(history, name, self))
 
 
-class Mass(_Lumped):
+class Mass(Lumped):
     """Inertia: Z = -m omega^2 (Eqn. 53).
 
     Parameters
@@ -115,13 +116,14 @@ class Mass(_Lumped):
     (-30+0j)
     """
 
-    _label, _unit, _description, _order = "mass", "kg", "mass", 2
+    order = 2
+    _label, _unit, _description = "mass", "kg", "mass"
 
     def __init__(self, mass: float | None = None, *, name: str | None = None) -> None:
         self._set_up(mass, name)
 
 
-class Damper(_Lumped):
+class Damper(Lumped):
     """Viscous damping: Z = j omega c (Eqn. 53, where c is called b).
 
     Parameters
@@ -142,13 +144,14 @@ class Damper(_Lumped):
     2.4j
     """
 
-    _label, _unit, _description, _order = "damping", "N s/m", "viscous damping", 1
+    order = 1
+    _label, _unit, _description = "damping", "N s/m", "viscous damping"
 
     def __init__(self, damping: float | None = None, *, name: str | None = None) -> None:
         self._set_up(damping, name)
 
 
-class Spring(_Lumped):
+class Spring(Lumped):
     """Linear spring: Z = k (Eqn. 53).
 
     Parameters
@@ -169,7 +172,8 @@ class Spring(_Lumped):
     (0.3+0j)
     """
 
-    _label, _unit, _description, _order = "stiffness", "N/m", "spring stiffness", 0
+    order = 0
+    _label, _unit, _description = "stiffness", "N/m", "spring stiffness"
 
     def __init__(self, stiffness: float | None = None, *, name: str | None = None) -> None:
         self._set_up(stiffness, name)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.fields import one_of
 from dahl_ident.data.quantities import converted
 from dahl_ident.elements.element import Element, StiffnessGradient, prefixed
 from dahl_ident.elements.parameter import Parameter
@@ -82,9 +83,7 @@ class LinearSystem(Element):
         parameters: Mapping[str, float | Parameter | None] | None = None,
         name: str | None = None,
     ) -> None:
-        if quantity not in QUANTITIES:
-            known = ", ".join(repr(q) for q in QUANTITIES)
-            raise ValidationError(f"quantity is {quantity!r}; expected one of {known}")
+        one_of(quantity, "quantity", QUANTITIES)
         given = dict(parameters or {})
         is_function = callable(system) and not _is_system(system)
         if is_function != bool(given):
@@ -99,7 +98,7 @@ class LinearSystem(Element):
         self._parameters = tuple(_parameter(prefixed(name, k), v) for k, v in given.items())
         self._last: tuple[FloatArray, ComplexArray] | None = None
         if not is_function:
-            _check(system)
+            check_system(system, "system")
 
     @property
     def system(self) -> Any:
@@ -169,12 +168,37 @@ class LinearSystem(Element):
             result[:, which == i] = work(tuple(vector), frequencies[which == i])
         return result
 
+    def system_at(self, values: Sequence[float]) -> Any:
+        """Return the python-control system at `values` of the parameters, in their order."""
+        if not self._labels:
+            return self._system
+        system = self._system(**dict(zip(self._labels, values, strict=True)))
+        check_system(system, "system")
+        return system
+
+    def polynomials(self) -> tuple[FloatArray, FloatArray]:
+        """Return numerator and denominator of the response, from the highest power of s down.
+
+        Raises
+        ------
+        ModelError
+            If a parameter has no value, or the system is discrete or an FRD.
+        """
+        control = importlib.import_module("control")
+        system = self.system_at([float(v) for v in self.known_values()])
+        if isinstance(system, control.FRD) or not system.isctime():
+            raise ModelError(
+                f"{self!r} is no rational function of s, and so has no equation of motion in "
+                "continuous time; give a continuous TransferFunction or StateSpace"
+            )
+        transfer = control.tf(system)
+        numerator, denominator = transfer.num[0][0], transfer.den[0][0]
+        return np.asarray(numerator, np.float64), np.asarray(denominator, np.float64)
+
     def _curve(self, vector: tuple[float, ...], omega: FloatArray) -> ComplexArray:
         """Return Z at angular frequencies, shape (n,); a fixed system remembers the last."""
         if self._labels:
-            system = self._system(**dict(zip(self._labels, vector, strict=True)))
-            _check(system)
-            return dynamic_stiffness(system, self._quantity, omega)
+            return dynamic_stiffness(self.system_at(vector), self._quantity, omega)
         if self._last is None or not np.array_equal(self._last[0], omega):
             self._last = omega.copy(), dynamic_stiffness(self._system, self._quantity, omega)
         return self._last[1]
@@ -252,20 +276,20 @@ def _to_stiffness(R: ComplexArray, quantity: Quantity, omega: FloatArray) -> Com
     return np.where(pole, 0.0, Z)
 
 
-def _check(system: Any) -> None:
+def check_system(system: Any, name: str) -> None:
     """Refuse what is no python-control system with one input, one output and a known time."""
     if not _is_system(system):
         raise ValidationError(
-            f"system is a {type(system).__name__}; expected a python-control TransferFunction, "
-            "StateSpace or FRD, or a function that returns one"
+            f"{name} is a {type(system).__name__}; expected a python-control TransferFunction, "
+            "StateSpace or FRD"
         )
     if (system.ninputs, system.noutputs) != (1, 1):
         raise ValidationError(
-            f"system has {system.ninputs} inputs and {system.noutputs} outputs; expected one of "
+            f"{name} has {system.ninputs} inputs and {system.noutputs} outputs; expected one of "
             "each, such as system[0, 0]"
         )
     if system.dt is True:
-        raise ValidationError("system is discrete without a sampling time; set its dt, s")
+        raise ValidationError(f"{name} is discrete without a sampling time; set its dt, s")
 
 
 def _is_system(system: Any) -> bool:

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from dahl_ident.arrays import finite_number
+from dahl_ident.arrays import finite_number, positive_number
 from dahl_ident.errors import ValidationError
 
 
@@ -55,12 +55,13 @@ class Parameter:
 
     def __post_init__(self) -> None:
         if self.value is not None:
-            value = finite_number(self.value, self.name)
-            positive = self.transform == "log"
-            if (positive and value <= 0.0) or not self.lower <= value <= self.upper:
-                low = "> 0" if positive and self.lower <= 0.0 else f">= {self.lower:g}"
+            number = positive_number if self.transform == "log" else finite_number
+            value = number(self.value, self.name)
+            if not self.lower <= value <= self.upper:
                 high = "" if np.isinf(self.upper) else f" and <= {self.upper:g}"
-                raise ValidationError(f"{self.name} is {value!r}; expected a number {low}{high}")
+                raise ValidationError(
+                    f"{self.name} is {value!r}; expected a number >= {self.lower:g}{high}"
+                )
             object.__setattr__(self, "value", value)
         if self.free is None:
             object.__setattr__(self, "free", self.value is None)

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from dahl_ident import steady_state
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.quantities import DEFINITIONS, power_of_s
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Model, Parameter
 from dahl_ident.errors import DataError
@@ -32,14 +33,6 @@ from dahl_ident.problem.coordinates import Coordinates
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import Sensors, measured_stiffness_factor
 
-_POWERS = {
-    "receptance": (0, -1),
-    "mobility": (1, -1),
-    "accelerance": (2, -1),
-    "dynamic_stiffness": (0, 1),
-    "mechanical_impedance": (-1, 1),
-    "apparent_mass": (-2, 1),
-}
 _NONE: ComplexArray = np.zeros((), dtype=np.complex128)
 
 
@@ -79,8 +72,8 @@ class Predictor:
     def _set_rows(self, rows: Rows) -> None:
         self._rows = rows
         _check(rows)
-        power, self._exponent = _POWERS[rows.quantity]
-        self._operator = np.asarray((1j * rows.omega) ** power, dtype=np.complex128)
+        power, self._exponent = DEFINITIONS[rows.quantity]
+        self._operator = power_of_s(rows.omega, power)
         self._guess = _measured_amplitude(rows, self._operator, self._exponent)
         self._groups = [
             _Group(

@@ -18,11 +18,12 @@ from dahl_ident.arrays import (
 )
 from dahl_ident.elements.element import Element
 from dahl_ident.elements.model import as_model
-from dahl_ident.errors import MultipleSolutionsWarning
+from dahl_ident.errors import MultipleSolutionsWarning, ValidationError
 from dahl_ident.steady_state.plant import BoolArray, IntArray, flatten
-from dahl_ident.steady_state.roots import all_roots as find_all
+from dahl_ident.steady_state.roots import find_roots
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
+_REACH = (1e-290, 1e290)
 
 
 @dataclass(frozen=True)
@@ -66,13 +67,14 @@ class SteadyResponse:
 
     @property
     def receptance(self) -> ComplexArray:
-        """X/u_0, m/N."""
+        """X/u_0, m/N; NaN where there is no amplitude."""
         return (self.displacement / self.drive)[()]
 
     @property
     def dynamic_stiffness(self) -> ComplexArray:
-        """u_0/X, N/m."""
-        return (self.drive / self.displacement)[()]
+        """u_0/X, N/m; NaN where there is no amplitude."""
+        with np.errstate(invalid="ignore"):
+            return (self.drive / self.displacement)[()]
 
 
 def response(
@@ -132,9 +134,15 @@ def response(
     u0 = positive_array(drive, "drive")
     shape = broadcast_shape(frequency_hz=f, drive=u0)
     plant = as_model(plant)
-    points, _ = flatten(plant, plant.known_values(), 2.0 * np.pi * f, u0)
-    roots = find_all(points)
-    count = np.isfinite(roots).sum(axis=1).reshape(shape)
+    with np.errstate(over="ignore"):
+        points, _ = flatten(plant, plant.known_values(), 2.0 * np.pi * f, u0)
+        _check_reach(points.bounds()[0])
+        roots, force = find_roots(points)
+        _check_reach(roots)
+        amplitude = roots * points.unit[:, None]
+        _check_reach(amplitude)
+    found = ~np.isnan(amplitude)
+    count = found.sum(axis=1).reshape(shape)
     message = _message(count, np.broadcast_to(f, shape), np.broadcast_to(u0, shape))
     if all_roots:
         f, u0, shape = f[..., None], u0[..., None], (*shape, roots.shape[1])
@@ -142,11 +150,8 @@ def response(
         if np.any(count > 1):
             text = f"{message}; the smallest is returned, all of them with all_roots=True"
             warnings.warn(text, MultipleSolutionsWarning, stacklevel=2)
-        roots = roots[:, :1]
-    found = np.isfinite(roots)
-    force = points.force(np.where(found, roots, 1.0).T).T
-    amplitude = roots * points.unit[:, None]
-    with np.errstate(invalid="ignore"):  # no force at a resonance without friction
+        amplitude, force, found = amplitude[:, :1], force[:, :1], found[:, :1]
+    with np.errstate(invalid="ignore"):  # NaN where there is no amplitude
         displacement = amplitude * (force.conj() / np.abs(force))
     return SteadyResponse(
         frequency_hz=_read_only(np.broadcast_to(f, shape)),
@@ -157,6 +162,19 @@ def response(
         number_of_solutions=_read_only(count),
         message=message,
     )
+
+
+def _check_reach(amplitude: FloatArray) -> None:
+    """Refuse an amplitude, in any unit, of which numbers hold no more than its order."""
+    least, most = _REACH
+    lost = (amplitude < least) | (amplitude > most)
+    if lost.any():
+        row = int(np.argwhere(lost)[0, 0])
+        raise ValidationError(
+            f"point {row} ({lost.sum()} such points) has an amplitude of about "
+            f"{amplitude[lost][0]:g}, outside {least:g} to {most:g}, beyond which numbers end; "
+            "check the units"
+        )
 
 
 def _read_only(array: NDArray[_Scalar]) -> NDArray[_Scalar]:

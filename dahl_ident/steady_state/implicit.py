@@ -9,7 +9,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.element import Element
 from dahl_ident.steady_state.plant import flatten
-from dahl_ident.steady_state.roots import all_roots
+from dahl_ident.steady_state.roots import find_roots
 
 
 def solve(
@@ -26,7 +26,7 @@ def solve(
     several amplitudes the one nearest to `start` in ratio, else the smallest.
     """
     plant, shape = flatten(model, values, omega, drive)
-    roots = all_roots(plant) * plant.unit[:, None]
+    roots = find_roots(plant).amplitude * plant.unit[:, None]
     if start is None or roots.shape[1] == 1:
         return roots[:, 0].reshape(shape)
     near = np.broadcast_to(start, shape).reshape(-1, 1)

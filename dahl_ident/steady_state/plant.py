@@ -118,8 +118,7 @@ class Plant:
         total = rest + force
         size = np.abs(total)
         with np.errstate(divide="ignore", invalid="ignore"):  # Z = 0 at a limit cycle
-            rise = ((rest + slope) * total.conj()).real / size**2
-            return np.log(size / self.drive), rise
+            return np.log(size / self.drive), ((rest + slope) / total).real
 
     def conditioning(self, amplitude: FloatArray, force: ComplexArray) -> FloatArray:
         """Return (|L| + |N|) A/u_0, by which rounding grows near a sharp resonance."""

@@ -14,12 +14,15 @@ each other than the grid's nodes, 1.8 % in amplitude, may be missed.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.steady_state.plant import EPS, BoolArray, Friction, IntArray, Plant
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 
 _NODES_PER_DECADE = (4, 180)
 _SCAN_PER_DECADE = 128
@@ -27,29 +30,47 @@ _SCAN_CELLS = 2**18  # points times nodes of the scan in work at once
 _CHUNK = 8192  # points solved together: their scratch arrays stay in the processor's cache
 
 
-def all_roots(plant: Plant) -> FloatArray:
-    """Return every amplitude of every point in its unit, shape (points, most).
+class Roots(NamedTuple):
+    """Amplitudes A and force phasors A Z(A) in the plant's units, shape (points, most).
 
-    They rise along a row; a row with fewer than the most is filled up with NaN.
+    Amplitudes rise along a row; a row with fewer than the most is filled up with NaN.
     """
+
+    amplitude: FloatArray
+    force: ComplexArray
+
+
+def find_roots(plant: Plant) -> Roots:
+    """Return every amplitude of every point, and the force that it takes."""
     resonant = np.abs(plant.linear) <= plant.rounding
     if not plant.friction.values:
         with np.errstate(divide="ignore", over="ignore"):
-            amplitude = plant.drive / np.abs(plant.linear)
-        return np.where(resonant, np.nan, amplitude)[:, None]
+            amplitude = np.where(resonant, np.nan, plant.drive / np.abs(plant.linear))
+        return Roots(amplitude[:, None], (amplitude * plant.linear)[:, None])
     known = np.isfinite(plant.linear)
     passive = known & (plant.linear.imag >= -plant.rounding)
     single = passive & ~(resonant & (plant.drive >= plant.largest_friction()))
-    roots = np.full(plant.drive.shape, np.nan)
+    amplitude = np.full(plant.drive.shape, np.nan)
+    force = np.full(plant.drive.shape, np.nan, dtype=np.complex128)
     if single.any():
         table = _tabulate(plant.friction, int(single.sum()))
         settled = ~single
         for points in _chunks(single):
-            roots[points], settled[points] = _interpolated_roots(plant.at(points), table)
+            part = _interpolated_roots(plant.at(points), table)
+            amplitude[points], force[points], settled[points] = part
         rest = np.flatnonzero(~settled)
-        roots[rest] = _bracketed_roots(plant.at(rest), table, roots[rest])
+        amplitude[rest] = _bracketed_roots(plant.at(rest), table, amplitude[rest])
+        force[rest] = plant.at(rest).force(amplitude[rest])
     active = np.flatnonzero(known & ~passive)
-    return _insert(roots, *_scan(plant, active)) if active.size else roots[:, None]
+    if not active.size:
+        return Roots(amplitude[:, None], force[:, None])
+    point, found = _scan(plant, active)
+    column = _places(point)
+    most = 1 + int(column.max(initial=0))
+    roots = Roots(_widened(amplitude, most), _widened(force, most))
+    roots.amplitude[point, column] = found
+    roots.force[point, column] = plant.at(point).force(found)
+    return roots
 
 
 def _chunks(chosen: BoolArray) -> Iterator[IntArray | slice]:
@@ -67,6 +88,7 @@ class _Table(NamedTuple):
     amplitude: FloatArray
     force: ComplexArray
     slope: ComplexArray  # by ln A
+    sure_step: float  # steps of ln A, times kappa, after which linear corrections are exact
 
 
 def _tabulate(friction: Friction, points: int) -> _Table:
@@ -82,20 +104,23 @@ def _tabulate(friction: Friction, points: int) -> _Table:
     nodes = 2 ** int(np.ceil(np.log2(least))) - 1
     amplitude = 10.0 ** np.linspace(low, high, nodes, axis=-1).ravel()
     vector = np.repeat(np.arange(low.size), nodes)
-    return _Table(nodes, amplitude, *friction.force_and_slope(amplitude, vector))
+    spacing = decades * np.log(10.0) / nodes
+    force, slope = friction.force_and_slope(amplitude, vector)
+    return _Table(nodes, amplitude, force, slope, min(1e-9, float(1e-13 / spacing**2)))
 
 
-def _interpolated_roots(plant: Plant, table: _Table) -> tuple[FloatArray, BoolArray]:
-    """Return the one amplitude of each passive point, and whether one step has settled it."""
+def _interpolated_roots(plant: Plant, table: _Table) -> tuple[FloatArray, ComplexArray, BoolArray]:
+    """Return amplitude and force of each passive point, and whether one step has settled them."""
     below = _search(plant, table)
-    start, per_misfit = _inverse_cubic(plant, table, *_cell(plant, table, below))
     with np.errstate(all="ignore"):  # beyond the table's ends the result is not used
-        force = plant.friction.force(start, plant.vector)
-        size = np.abs(start * plant.linear + force)
-        step = -np.log(size / plant.drive) * per_misfit
-        settled = np.abs(step) * plant.conditioning(start, force) < 1e-9
+        start, per_misfit, slope = _inverse_cubic(plant, table, *_cell(plant, table, below))
+        friction = plant.friction.force(start, plant.vector)
+        rest = start * plant.linear
+        force = rest + friction
+        step = (plant.drive / np.abs(force) - 1.0) * per_misfit
+        settled = np.abs(step) * plant.conditioning(start, friction) < table.sure_step
         settled &= (below > 0) & (below < table.nodes)
-        return start * np.exp(step), settled
+        return start + start * step, force + (rest + slope) * step, settled
 
 
 def _bracketed_roots(plant: Plant, table: _Table, guess: FloatArray) -> FloatArray:
@@ -123,37 +148,35 @@ def _cell(plant: Plant, table: _Table, below: IntArray) -> tuple[IntArray, IntAr
 
 def _search(plant: Plant, table: _Table) -> IntArray:
     """Return at how many nodes A |Z| lies below the drive, by bisection without branches."""
-    unit = np.max(np.abs(table.force))  # keeps the squares in range
-    linear, force = plant.linear / unit, table.force / unit
-    limit = (plant.drive / unit) ** 2
     offset = plant.vector * table.nodes - 1
-    below = np.zeros(limit.shape, dtype=np.intp)
+    below = np.zeros(plant.drive.shape, dtype=np.intp)
     width = (table.nodes + 1) // 2
     while width:
         node = offset + (below + width)
-        total = table.amplitude.take(node, mode="clip") * linear
-        total += force.take(node, mode="clip")
-        size = total.real**2
-        size += total.imag**2
-        below += width * (size < limit)
+        total = table.amplitude.take(node, mode="clip") * plant.linear
+        total += table.force.take(node, mode="clip")
+        below += width * (np.abs(total) < plant.drive)
         width //= 2
     return below
 
 
 def _inverse_cubic(
     plant: Plant, table: _Table, left: IntArray, right: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return A and dlnA/dg at g = ln(A |Z|/u_0) = 0, from Hermite's cubic of ln A over g."""
+) -> tuple[FloatArray, FloatArray, ComplexArray]:
+    """Return A and dlnA/dg at g = ln(A |Z|/u_0) = 0, from Hermite's cubic of ln A over g.
+
+    And the friction force's derivative by ln A there, between those of the nodes.
+    """
     A0, A1 = table.amplitude[left], table.amplitude[right]
-    g0, s0 = plant.misfit(A0, table.force[left], table.slope[left])
-    g1, s1 = plant.misfit(A1, table.force[right], table.slope[right])
-    with np.errstate(all="ignore"):  # left and right are one node beyond the table's ends
-        width, log_ratio = g1 - g0, np.log(A1 / A0)
-        t = -g0 / width
-        m0, m1 = width / s0, width / s1
-        y = t * ((1 - t) ** 2 * m0 + t * ((3 - 2 * t) * log_ratio + (t - 1) * m1))
-        slope = 6 * t * (1 - t) * log_ratio + (1 - t) * (1 - 3 * t) * m0 + t * (3 * t - 2) * m1
-        return A0 * np.exp(y), slope / width
+    slope0, slope1 = table.slope[left], table.slope[right]
+    g0, s0 = plant.misfit(A0, table.force[left], slope0)
+    g1, s1 = plant.misfit(A1, table.force[right], slope1)
+    width, log_ratio = g1 - g0, np.log(A1 / A0)
+    t = -g0 / width
+    m0, m1 = width / s0, width / s1
+    y = t * ((1 - t) ** 2 * m0 + t * ((3 - 2 * t) * log_ratio + (t - 1) * m1))
+    rise = 6 * t * (1 - t) * log_ratio + (1 - t) * (1 - 3 * t) * m0 + t * (3 * t - 2) * m1
+    return A0 * np.exp(y), rise / width, slope0 + (slope1 - slope0) * (y / log_ratio)
 
 
 def _polish(
@@ -179,8 +202,9 @@ def _polish(
         with np.errstate(all="ignore"):  # a step from a turning point is no number: bisect
             step = -g / s
             newton = A * np.exp(step)
+            excess = np.expm1(g)  # A |Z|/u_0 - 1, of which rounding leaves eps kappa
         inside = (newton >= left) & (newton <= right)
-        settled = (np.abs(g) <= 64.0 * EPS * kappa) | (right <= left * (1.0 + 4.0 * EPS))
+        settled = (np.abs(excess) <= 64.0 * EPS * kappa) | (right <= left * (1.0 + 4.0 * EPS))
         amplitude[active] = np.where(
             inside, newton, np.where(settled, A, np.sqrt(left) * np.sqrt(right))
         )
@@ -192,19 +216,21 @@ def _polish(
 
 
 def _scan(plant: Plant, points: IntArray) -> tuple[IntArray, FloatArray]:
-    """Return every amplitude of the chosen points, as pairs (point, amplitude)."""
+    """Return every amplitude of the chosen points, as pairs (point, amplitude) in rising order."""
     low, high = plant.at(points).bounds()
     least, most = np.min(low), np.max(high)
     nodes = 2 + int(np.ceil(_SCAN_PER_DECADE * (np.log10(most) - np.log10(least))))
     grid = np.geomspace(least, most, nodes)
-    at, amplitudes = [], []
+    points_found, amplitudes_found = [], []
     together = max(1, _SCAN_CELLS // nodes)
     for first in range(0, points.size, together):
         chunk = points[first : first + together]
         which, amplitude = _scan_grid(plant.at(chunk), grid)
-        at.append(chunk[which])
-        amplitudes.append(amplitude)
-    return np.concatenate(at), np.concatenate(amplitudes)
+        points_found.append(chunk[which])
+        amplitudes_found.append(amplitude)
+    at, amplitude = np.concatenate(points_found), np.concatenate(amplitudes_found)
+    order = np.lexsort((amplitude, at))
+    return at[order], amplitude[order]
 
 
 def _scan_grid(plant: Plant, grid: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -251,13 +277,14 @@ def _turning_point(
     return middle, g > 0.0
 
 
-def _insert(roots: FloatArray, point: IntArray, amplitude: FloatArray) -> FloatArray:
-    """Return `roots` with the pairs (point, amplitude) put into their rows in rising order."""
-    order = np.lexsort((amplitude, point))
-    point, amplitude = point[order], amplitude[order]
-    counts = np.bincount(point, minlength=len(roots))
-    place = np.arange(point.size) - np.repeat(np.cumsum(counts) - counts, counts)
-    wide = np.full((len(roots), max(1, counts.max())), np.nan)
-    wide[:, 0] = roots
-    wide[point, place] = amplitude
+def _places(point: IntArray) -> IntArray:
+    """Return which entry of its point each entry is; equal points stand side by side."""
+    _, first, counts = np.unique(point, return_index=True, return_counts=True)
+    return np.arange(point.size) - np.repeat(first, counts)
+
+
+def _widened(column: NDArray[_Scalar], most: int) -> NDArray[_Scalar]:
+    """Return a column with NaN to its right, `most` columns in all."""
+    wide = np.full((column.size, most), np.nan, dtype=column.dtype)
+    wide[:, 0] = column
     return wide

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements import Dahl, Damper, Element, LinearSystem, Mass, Spring
+from dahl_ident.data.quantities import DEFINITIONS
+from dahl_ident.elements import Dahl, Element, LinearSystem
 from dahl_ident.elements.hysteresis import force_history, margin_change
+from dahl_ident.elements.linear import Lumped
 from dahl_ident.elements.model import as_model
 from dahl_ident.errors import ModelError
 from dahl_ident.synthetic.plant_motion import DahlValues, Progress, simulate_plant
@@ -20,15 +20,6 @@ from dahl_ident.synthetic.waveform import Waveform
 
 Signal = Callable[[FloatArray], FloatArray]
 """A channel's true value at any times, shape in and out (n,)."""
-
-_RESPONSE_POWER = {
-    "receptance": (True, 0),
-    "mobility": (True, 1),
-    "accelerance": (True, 2),
-    "dynamic_stiffness": (False, 0),
-    "mechanical_impedance": (False, 1),
-    "apparent_mass": (False, 2),
-}
 
 
 @dataclass(frozen=True)
@@ -55,9 +46,13 @@ class Mechanism:
             if isinstance(element, Dahl):
                 friction.append(DahlValues(*values))
             elif isinstance(element, LinearSystem):
-                linear = linear + _stiffness_of(element, values)
+                linear = linear + _stiffness_of(element)
+            elif isinstance(element, Lumped):
+                linear = linear + Rational(np.array(values), np.ones(1)).times_s(element.order)
             else:
-                linear = linear + Rational(np.array(values), np.ones(1)).times_s(_power(element))
+                raise ModelError(
+                    f"{element!r} has no equation of motion; expected an element of dahl_ident"
+                )
         return cls(tuple(friction), linear)
 
     def displacement_under(self, force: Waveform, progress: Progress | None = None) -> Signal:
@@ -133,27 +128,9 @@ class DahlForce:
         return np.asarray(f_max * (scaled - heading * change))
 
 
-def _power(element: Element) -> int:
-    """Return n of an element with the dynamic stiffness p s^n."""
-    for kind, power in ((Mass, 2), (Damper, 1), (Spring, 0)):
-        if isinstance(element, kind):
-            return power
-    raise ModelError(f"{element!r} has no equation of motion; expected an element of dahl_ident")
-
-
-def _stiffness_of(element: LinearSystem, values: list[float]) -> Rational:
+def _stiffness_of(element: LinearSystem) -> Rational:
     """Return the dynamic stiffness of a linear system as polynomials in s."""
-    control = importlib.import_module("control")
-    system: Any = element.system
-    if element.parameters:
-        labels = [p.name.removeprefix(f"{element.name}_") for p in element.parameters]
-        system = system(**dict(zip(labels, values, strict=True)))
-    if isinstance(system, control.FRD) or not system.isctime():
-        raise ModelError(
-            f"{element!r} has no equation of motion in continuous time; give a continuous "
-            "TransferFunction or StateSpace to simulate a record"
-        )
-    transfer = control.tf(system)
-    response = Rational(np.ravel(transfer.num[0][0]), np.ravel(transfer.den[0][0])).trimmed()
-    inverted, power = _RESPONSE_POWER[element.quantity]
-    return (response.inverse() if inverted else response).times_s(power)
+    response = Rational(*element.polynomials()).trimmed()
+    definition = DEFINITIONS[element.quantity]
+    base = response if definition.exponent == 1 else response.inverse()
+    return base.times_s(definition.power_in_stiffness)
