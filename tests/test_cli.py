@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import re
@@ -11,7 +10,6 @@ import subprocess
 import sys
 import time
 import tomllib
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,37 +17,12 @@ import pytest
 from scipy import stats
 
 import dahl_ident as di
-from dahl_ident.cli import main
 from dahl_ident.cli.app import app
 from dahl_ident.synthetic import Experiment
+from tests.command_line import Runner
 
 COMMANDS = ("demo", "inspect", "extract", "fit", "sample", "report", "simulate", "datasets")
 PROGRAM = Path(sys.executable).with_name("dahl-ident")
-
-
-@dataclass
-class Outcome:
-    """What a command left behind."""
-
-    status: int
-    out: str
-    err: str
-
-
-class Runner:
-    """Runs the command line in this process, in a directory of its own."""
-
-    def __init__(self, capsys: pytest.CaptureFixture[str], patch: pytest.MonkeyPatch) -> None:
-        self._capsys, self._patch = capsys, patch
-
-    def __call__(self, *arguments: str, stdin: str = "") -> Outcome:
-        self._patch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(stdin.encode())))
-        self._capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            main(list(arguments))
-        out, err = self._capsys.readouterr()
-        code = ended.value.code
-        return Outcome(code if isinstance(code, int) else 0, out, err)
 
 
 @pytest.fixture
@@ -233,11 +206,7 @@ def test_every_help_has_an_example_that_runs(run: Runner, command: str) -> None:
     assert found, help_text
     if command == "demo":
         return  # run by make demo and by the test of the chain
-    stdin = ""
-    for stage in found[1].strip().split(" | "):
-        outcome = run(*stage.split()[1:], stdin=stdin)
-        assert outcome.status in (0, 3), outcome.err
-        stdin = outcome.out
+    run.line(found[1].strip())
 
 
 def test_help_lists_all_commands(run: Runner) -> None:

@@ -20,6 +20,7 @@ from dahl_ident.reporting.document import (
     words,
 )
 from dahl_ident.reporting.figures import pictures_of_fit
+from dahl_ident.reporting.repeat import repeating_command
 from dahl_ident.results import FitResult
 from dahl_ident.results.posterior import Posterior
 
@@ -42,7 +43,7 @@ def document(
     fits = [result for result in results if isinstance(result, FitResult)]
     drawn = [result for result in results if isinstance(result, Posterior)]
     data = results[0].data
-    told = command or _command(results)
+    repeated = command or repeating_command(results)
     sections = [section for fit in fits for section in _sections(fit, drawn, len(fits) > 1)]
     sections += [section for posterior in drawn for section in posteriors.sections(posterior)]
     return Document(
@@ -54,8 +55,9 @@ def document(
         ),
         sections=(
             *sections,
+            *_extraction(data),
             Section("Data", tuple(_data(data))),
-            Section("Origin", tuple(_origin(data, told))),
+            Section("Origin", tuple(_origin(data, repeated, typed=command is not None))),
         ),
         facts={
             "fits": [_fit_facts(fit) for fit in fits],
@@ -63,14 +65,9 @@ def document(
             "files": dict(provenance.sources(data)),
             "versions": provenance.versions(),
             "date": provenance.today(),
-            "command": told,
+            "command": repeated,
         },
     )
-
-
-def _command(results: Sequence[Result]) -> str:
-    fits = [result for result in results if isinstance(result, FitResult)]
-    return provenance.fit_command(fits[0]) if fits else "dahl-ident sample DATA.csv"
 
 
 def _title(data: FrequencyResponse) -> str:
@@ -108,7 +105,9 @@ def _sections(fit: FitResult, drawn: Sequence[Posterior], several: bool) -> Iter
 
 
 def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
-    intervals = [fit.conf_interval(method) for method in ("wald", "profile")]
+    for method in ("wald", "profile"):
+        fit.conf_interval(method)
+    intervals = fit.intervals_run(tables.LEVEL)
     yield tables.parameters(fit, intervals, drawn)
     notes = [f"{found.method} intervals: {found.note}" for found in intervals]
     yield Bullets((*notes, *(f"Derived: {quantity}" for quantity in fit.derived())))
@@ -126,6 +125,26 @@ def _goodness(fit: FitResult) -> Iterator[Block]:
         yield tables.comparison(compared)
 
 
+def _extraction(data: FrequencyResponse) -> Iterator[Section]:
+    """Yield how the points were measured, where they come from waveforms."""
+    if "num_periods" not in data.quality:
+        return
+    verdicts = data.select(harmonic=1).quality["verdict"]
+    bad = int((verdicts != "good").sum())
+    says = f"{bad} of them are not good" if bad else "all of them are good"
+    yield Section(
+        "Extraction",
+        (
+            Paragraph(
+                f"{verdicts.size} points were measured from waveforms; {says}. Cycles left out "
+                "are leading ones, in which friction still remembered the step before; the bias "
+                "is what it may remember in the cycles used."
+            ),
+            tables.extraction(data),
+        ),
+    )
+
+
 def _data(data: FrequencyResponse) -> Iterator[Block]:
     assumed = provenance.notes(data)
     if assumed:
@@ -133,7 +152,7 @@ def _data(data: FrequencyResponse) -> Iterator[Block]:
     yield tables.measured(data)
 
 
-def _origin(data: FrequencyResponse, command: str) -> Iterator[Block]:
+def _origin(data: FrequencyResponse, command: str | None, *, typed: bool) -> Iterator[Block]:
     files = list(provenance.sources(data))
     if files:
         rows = tuple(words(name, digest) for name, digest in files)
@@ -143,7 +162,16 @@ def _origin(data: FrequencyResponse, command: str) -> Iterator[Block]:
         yield Table("Options", ("option", "value"), tuple(words(*pair) for pair in made))
     used = tuple(words(name, version) for name, version in provenance.versions().items())
     yield Table("Versions", ("package", "version"), used)
-    yield Paragraph(f"Made on {provenance.today()}. This command repeats it:")
+    when = f"Made on {provenance.today()}"
+    if command is None:
+        yield Paragraph(f"{when}, in Python; no command describes this model and these data.")
+        return
+    how = (
+        ". This command repeats it:"
+        if typed
+        else ", in Python. With all rows of the files, this gives the same on the command line:"
+    )
+    yield Paragraph(when + how)
     yield Listing(command)
 
 

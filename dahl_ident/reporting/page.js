@@ -38,7 +38,7 @@ const copy = async (text) => {
 };
 for (const button of document.querySelectorAll("button.copy")) {
   button.addEventListener("click", async () => {
-    const box = button.parentElement;
+    const box = button.closest(".table, .listing");
     const text =
       button.dataset.copy === "table"
         ? tableText(box.querySelector("table"))

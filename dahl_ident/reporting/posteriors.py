@@ -49,15 +49,6 @@ def facts(posterior: Posterior) -> dict[str, Any]:
     }
 
 
-def interval_text(posterior: Posterior, name: str) -> tuple[Cell, str]:
-    """Return the median, and the 95 % interval as text."""
-    row = dict(zip(posterior.names, posterior.values.T, strict=True)).get(name)
-    if row is None:
-        return Cell("-"), "-"
-    low, median, high = np.quantile(row, [0.025, 0.5, 0.975])
-    return number(float(median), 5), f"{low:.5g} to {high:.5g}"
-
-
 def _numbers(posterior: Posterior) -> Iterator[Block]:
     yield Paragraph(posterior.message)
     table = posterior.summary()

@@ -1,11 +1,10 @@
-"""Where a result comes from: files and their hashes, options, versions, and how to repeat it."""
+"""Where a result comes from: files and their hashes, options, versions."""
 
 from __future__ import annotations
 
 import datetime
 import importlib.metadata
 import platform
-import shlex
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -13,29 +12,27 @@ import dahl_ident
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
-    from dahl_ident.results import FitResult
 
 _PACKAGES = ("numpy", "scipy", "casadi", "emcee", "pandas", "matplotlib", "pint")
-_ELEMENT_OPTIONS = {"mass", "damping", "stiffness"}
 _TOLD_APART = {"parts", "file", "sha256", "notes"}
 
 
 def sources(data: FrequencyResponse) -> Iterator[tuple[str, str]]:
     """Yield name and SHA-256 of every file that the data came from."""
-    for part in _parts(data):
+    for part in parts(data):
         if "file" in part:
             yield str(part["file"]), str(part.get("sha256", ""))
 
 
 def notes(data: FrequencyResponse) -> list[str]:
     """Return what had to be assumed on reading."""
-    return list(dict.fromkeys(str(note) for part in _parts(data) for note in part.get("notes", [])))
+    return list(dict.fromkeys(str(note) for part in parts(data) for note in part.get("notes", [])))
 
 
 def options(data: FrequencyResponse) -> list[tuple[str, str]]:
     """Return how the data were made, key by key, where they say so."""
     found: dict[str, str] = {}
-    for part in _parts(data):
+    for part in parts(data):
         for key, value in part.items():
             if key not in _TOLD_APART and not isinstance(value, Mapping):
                 found.setdefault(str(key), str(value))
@@ -55,20 +52,7 @@ def today() -> str:
     return datetime.datetime.now().astimezone().isoformat(timespec="minutes")
 
 
-def fit_command(fit: FitResult) -> str:
-    """Return the command that fits the same model to the same files."""
-    files = [name for name, _ in sources(fit.data)] or ["DATA.csv"]
-    words = ["dahl-ident", "fit", *files]
-    for name, estimate in fit.params.items():
-        option = f"--{name.replace('_', '-')}"
-        if not estimate.vary and (name, estimate.value) != ("alpha", 1.0):
-            words += [option, f"{estimate.value:.12g}"]
-        elif estimate.vary and name in _ELEMENT_OPTIONS | {"alpha"}:
-            words += [option, "free"]
-    words += ["--noise", fit.noise]
-    return shlex.join(words)
-
-
-def _parts(data: FrequencyResponse) -> list[Mapping[str, Any]]:
+def parts(data: FrequencyResponse) -> list[Mapping[str, Any]]:
+    """Return the provenance of each table that was joined."""
     provenance = data.provenance or {}
     return list(provenance.get("parts", [provenance]))

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dahl_ident.diagnostics.formatting import interval, rounded
+from dahl_ident.diagnostics.levels import percent
 from dahl_ident.elements import Dahl
 from dahl_ident.reporting.document import Cell, Table, number, words
-from dahl_ident.reporting.posteriors import interval_text
 from dahl_ident.units import si_unit
 
 if TYPE_CHECKING:
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from dahl_ident.results.posterior import Posterior
 
 _EQUIVALENT_ROWS = 9
-_LEVEL = 0.9545
+LEVEL = 0.9545
 
 
 def parameters(
     fit: FitResult, intervals: Sequence[ConfidenceIntervals], drawn: Sequence[Posterior]
 ) -> Table:
     """Return every parameter with its intervals, one column a method."""
-    at = [one.at(_LEVEL) for one in intervals]
+    at = [one.at(LEVEL) for one in intervals]
     rows = []
     for name, estimate in fit.params.items():
         value, error = rounded(estimate.value, estimate.stderr)
@@ -41,14 +41,21 @@ def parameters(
         for found in at:
             limits = found.get(name)
             row.append(Cell(interval(limits.lower, limits.upper, "") if limits else "-"))
-        for posterior in drawn:
-            median, limits_text = interval_text(posterior, name)
-            row += [median, Cell(limits_text)]
+        row += [Cell(credible_interval(posterior, name)) for posterior in drawn]
         rows.append((*row, Cell(estimate.description)))
-    methods = [f"{one.method} 95.45 %" for one in intervals]
-    methods += ["posterior median", "posterior 95 %"] * len(drawn)
-    header = ("parameter", "estimate", "standard error", "unit", *methods, "what it is")
-    return Table("Parameters", header, tuple(rows))
+    methods = [*(one.method for one in intervals), *("posterior" for _ in drawn)]
+    told = (f"{method} {percent(LEVEL)}" for method in methods)
+    header = ("parameter", "estimate", "standard error", "unit", *told, "what it is")
+    return Table("Estimates and intervals, one column a method", header, tuple(rows))
+
+
+def credible_interval(posterior: Posterior, name: str) -> str:
+    """Return the central interval of a posterior, rounded as the others are."""
+    if name not in posterior.names:
+        return "-"
+    values = posterior.values[:, posterior.names.index(name)]
+    lower, upper = np.quantile(values, [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL])
+    return interval(float(lower), float(upper), "")
 
 
 def equivalents(fit: FitResult) -> Table | None:
@@ -106,10 +113,40 @@ def measured(data: FrequencyResponse) -> Table:
     ]
     if (data.harmonic > 1).any():
         columns.append(("harmonic", [Cell(str(k), float(k)) for k in data.harmonic]))
-    if "verdict" in data.quality:
-        columns.append(("verdict", [Cell(str(v)) for v in data.quality["verdict"]]))
+    return _of_columns("The points as they were fitted", columns)
+
+
+def extraction(data: FrequencyResponse) -> Table:
+    """Return how each point was measured from its waveforms."""
+    points = data.select(harmonic=1)
+    quality = points.quality
+    assert points.amplitude is not None  # extraction measures it
+    bias = np.hypot(quality["bias_real"], quality["bias_imag"]) / points.gain
+    clipped = np.maximum(quality["displacement_clipped"], quality["force_clipped"])
+    percents = {
+        "bias [%]": bias,
+        "harmonics of displacement [%]": quality["displacement_distortion"],
+        "sine in power of force [%]": quality["force_share"],
+        "clipped samples [%]": clipped,
+    }
+    columns = [
+        ("frequency [Hz]", [number(v, 5) for v in points.frequency_hz]),
+        (
+            f"amplitude [{si_unit('displacement', points.motion)}]",
+            [number(v) for v in points.amplitude],
+        ),
+        ("cycles", [number(v) for v in quality["num_periods"]]),
+        ("left out", [number(v) for v in quality["settling_periods"]]),
+        ("cycles missing", [number(v) for v in quality["more_periods"]]),
+        *((name, [number(100.0 * v, 3) for v in values]) for name, values in percents.items()),
+        ("verdict", [Cell(str(v)) for v in quality["verdict"]]),
+    ]
+    return _of_columns("Quality of each point", columns)
+
+
+def _of_columns(caption: str, columns: Sequence[tuple[str, Sequence[Cell]]]) -> Table:
     rows = tuple(zip(*(cells for _, cells in columns), strict=True))
-    return Table("Data", tuple(name for name, _ in columns), rows)
+    return Table(caption, tuple(name for name, _ in columns), rows)
 
 
 def goodness(fit: FitResult) -> Table:

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.data.storage import place_of, write_whole
@@ -129,6 +130,11 @@ class FitResult(FitNumbers):
         if key not in self._intervals:
             self._intervals[key] = self._new_intervals(method, levels, replicates, seed)
         return self._intervals[key]
+
+    def intervals_run(self, level: float) -> list[ConfidenceIntervals]:
+        """Return the intervals at a level of every method that has been asked for until now."""
+        found = (one for one in self._intervals.values() if np.isclose(one.levels, level).any())
+        return list({one.method: one for one in found}.values())
 
     def _new_intervals(
         self, method: Method, levels: Sequence[float], replicates: int, seed: int

@@ -14,6 +14,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray, whole_number
 from dahl_ident.bayes.chain import Chain, Settings
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.priors import PriorLike
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.errors import SamplingError, ValidationError
 from dahl_ident.fitting import Optimum
@@ -129,6 +130,12 @@ class Posterior:
     def priors(self) -> Mapping[str, str]:
         """Every prior in words."""
         return self._density.priors
+
+    @property
+    def given_priors(self) -> Mapping[str, PriorLike]:
+        """The priors that were given, as they were given; the others follow the data's size."""
+        parts = self._density.prior.parts
+        return {part.parameter.name: part.given for part in parts if part.source == "given"}
 
     # The chain
 
