@@ -22,6 +22,7 @@ import numpy as np
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.suspicion import creates_energy
 from dahl_ident.errors import ExtractionError
+from dahl_ident.extraction.folding import folded_error
 from dahl_ident.extraction.memory import (
     MOST_CYCLES,
     SIGNIFICANT,
@@ -56,6 +57,7 @@ _MOVING_MEAN = 0.02  # of the amplitude, over the stretch, where the force is co
 _BEYOND_NOISE = 5.0  # standard errors of a drift in white noise
 _TINY = np.finfo(np.float64).tiny
 _ROUNDING = 1e-9  # of the response
+_FOLDED = 0.01  # of the fundamental, above which folded harmonics are told
 _FEW_STEPS = 10.0  # amplitude over sensor step below which the step matters
 
 
@@ -145,12 +147,16 @@ class _Phasors:
             self.fit.stretch.time.size / self.cycles,
         )
 
+    def repeating_errors(self, harmonic: int) -> FloatArray:
+        """Return the errors of the phasors of both channels that are alike in every cycle."""
+        return np.hypot(self.rounding, folded_error(self.fit, harmonic, self.cycles))
+
     @cached_property
     def errors(self) -> ComplexArray:
         """Errors of the fundamental phasors of displacement and force; their products sum up."""
         scale = np.array([[self.integrator], [1.0]])
         noise = self.noise[0].lines * np.sqrt(self.fit.phasor_variance(1))
-        return np.asarray(scale * np.hstack([noise, np.diag(self.rounding)]))
+        return np.asarray(scale * np.hstack([noise, np.diag(self.repeating_errors(1))]))
 
     @property
     def amplitude_variance(self) -> float:
@@ -361,7 +367,7 @@ def _harmonic(phasors: _Phasors, k: int) -> tuple[complex, FloatArray, FloatArra
     across = np.array([-N.imag, N.real])
     relative = phasors.amplitude_variance / A**2
     force = float(noise.matrix[1, 1].real) * phasors.fit.phasor_variance(k)
-    force = (force + float(phasors.rounding[1]) ** 2) / A**2
+    force = (force + float(phasors.repeating_errors(k)[1]) ** 2) / A**2
     covariance = 0.5 * force * np.eye(2) + relative * (
         np.outer(along, along) + k**2 * np.outer(across, across)
     )
@@ -396,7 +402,7 @@ def _point(phasors: _Phasors, cycles: int, dropped: int, steps: FloatArray) -> P
         "end_time": stretch.time[-1],
         **_channel_quality(phasors, steps),
     }
-    quality["verdict"] = _verdicts(quality, creating=_creating(phasors))
+    quality["verdict"] = _verdicts(quality, _doubts(phasors, all(quality["settled"])))
     return Point(
         frequency_hz=stretch.omega / (2.0 * np.pi),
         amplitude=abs(phasors.displacement),
@@ -432,18 +438,23 @@ def _channel_quality(phasors: _Phasors, steps: FloatArray) -> dict[str, Any]:
     }
 
 
-def _creating(phasors: _Phasors) -> bool:
-    """Return whether the fundamental loses less than nothing, beyond noise and rounding."""
+def _doubts(phasors: _Phasors, settled: bool) -> list[str]:
+    """Return what speaks against the fundamental itself."""
+    doubts = []
     N, covariance, _, dof = _fundamental(phasors)
     std = np.hypot(np.sqrt(covariance[1, 1]), _ROUNDING * abs(N))
-    return bool(creates_energy(np.asarray(N.imag), std, np.asarray(dof)))
+    if settled and creates_energy(np.asarray(N.imag), std, np.asarray(dof)):
+        doubts.append("creates energy, a sign is turned")
+    fit = phasors.fit
+    if (folded_error(fit, 1, phasors.cycles) > _FOLDED * np.abs(fit.phasors(1))).any():
+        samples = 2.0 * np.pi / fit.stretch.sample_phase
+        doubts.append(f"harmonics fold at {samples:.3g} samples a cycle")
+    return doubts
 
 
-def _verdicts(quality: dict[str, Any], *, creating: bool) -> list[str]:
+def _verdicts(quality: dict[str, Any], doubts: list[str]) -> list[str]:
     """Return, for each row, "good" or what speaks against it."""
-    shared = []
-    if creating and all(quality["settled"]):
-        shared.append("creates energy, a sign is turned")
+    shared = doubts.copy()
     if quality["displacement_distortion"] > _DISTORTED:
         shared.append(f"displacement distorted {100 * quality['displacement_distortion']:.2g} %")
     for name in ("displacement", "force"):
