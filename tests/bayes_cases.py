@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import dahl_ident as di
+from dahl_ident.arrays import FloatArray
 
 FRICTION = di.Dahl(f_max=0.1, sigma=30.0)
 X_C = 0.1 / 30.0
@@ -14,10 +15,23 @@ def friction_table(
     rows: int = 12, low: float = 0.3, high: float = 3.0, noise: float = 0.02, seed: int = 1
 ) -> di.FrequencyResponse:
     """Return describing-function data between two values of beta, noise in ln gain and phase."""
-    amplitude = np.geomspace(low, high, rows) * X_C
+    return _table(0.0, np.geomspace(low, high, rows) * X_C, noise, seed)
+
+
+def spring_table(
+    noise: float, rows: int = 8, low: float = 0.3, high: float = 10.0
+) -> di.FrequencyResponse:
+    """Return the same for friction beside a spring as stiff as it is at small amplitudes."""
+    return _table(30.0, np.geomspace(low, high, rows) * X_C, noise, 1)
+
+
+def _table(
+    stiffness: float, amplitude: FloatArray, noise: float, seed: int
+) -> di.FrequencyResponse:
     random = np.random.default_rng(seed)
+    rows = amplitude.size
     error = noise * (random.normal(size=rows) + 1j * random.normal(size=rows))
-    response = FRICTION.describing_function(amplitude) * np.exp(error)
+    response = (FRICTION.describing_function(amplitude) + stiffness) * np.exp(error)
     return di.FrequencyResponse(np.ones(rows), response, amplitude)
 
 

@@ -8,7 +8,7 @@ import pytest
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.shear import Shear, shear_of
-from tests.bayes_cases import FRICTION, X_C, friction_table
+from tests.bayes_cases import FRICTION, X_C, friction_table, spring_table
 
 PLANT = di.Dahl() + di.Spring() + di.Damper() + di.Mass()
 
@@ -80,11 +80,7 @@ def test_friction_or_a_plant_alone_needs_none() -> None:
 
 def test_a_curved_ridge_is_walked_along() -> None:
     # microslip beside a free spring: f_max is open upwards, stiffness = constant - sigma
-    amplitude = np.geomspace(0.003, 0.03, 20) * X_C
-    random = np.random.default_rng(1)
-    noise = 1e-3 * (random.normal(size=20) + 1j * random.normal(size=20))
-    exact = FRICTION.describing_function(amplitude) + 30.0
-    data = di.FrequencyResponse(np.ones(20), exact * np.exp(noise), amplitude)
+    data = spring_table(1e-3, 20, 0.003, 0.03)
     posterior = di.sample(data, di.Dahl() + di.Spring(), seed=1, max_steps=3000)
     assert posterior.converged, posterior.message
     sigma = posterior.derived(lambda sigma, **_: sigma)

@@ -54,11 +54,15 @@ class Shear:
         """Return points with l in the place of phi."""
         return self._moved(x, -1.0)
 
-    def _moved(self, x: FloatArray, sign: float) -> FloatArray:
+    def shift(self, x: FloatArray) -> FloatArray:
+        """Return phi - l at points, (S, L)."""
         with np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore"):
             shift = _parts(self._describing_function(x)) @ self.projection
+        return np.where(np.isfinite(shift), shift, _FARTHEST)
+
+    def _moved(self, x: FloatArray, sign: float) -> FloatArray:
         moved = x.copy()
-        moved[:, self.linear] += sign * np.where(np.isfinite(shift), shift, _FARTHEST)
+        moved[:, self.linear] += sign * self.shift(x)
         return moved
 
     def _describing_function(self, x: FloatArray) -> ComplexArray:

@@ -16,6 +16,7 @@ from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import PriorLike, joint_prior
 from dahl_ident.bayes.quadrature import integrate
+from dahl_ident.bayes.slices import ProfileSlices
 from dahl_ident.bayes.start import centre_and_covariance, optimum_of, starting_points
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.elements import Element
@@ -234,8 +235,14 @@ def posterior_grid(
     tolerance = positive_number(tolerance, "tolerance")
     density = Density(problem, joint_prior(problem, priors, _estimate(optimum)), likelihood)
     centre, covariance = centre_and_covariance(density, optimum, np.random.default_rng(0))
+    slicers = [ProfileSlices(density, axis, centre) for axis in range(len(centre))]
     grid = integrate(
-        density.marginal, density.prior.limits, centre, covariance, tolerance=tolerance
+        density.marginal,
+        density.prior.limits,
+        slicers,
+        centre,
+        np.sqrt(np.diagonal(covariance)),
+        tolerance=tolerance,
     )
     return GridPosterior(density, grid, tolerance)
 

@@ -1,0 +1,257 @@
+r"""Where a posterior is large at a given value of one parameter: conditional modes and spreads.
+
+Modes are found by damped Gauss-Newton steps for many values at once. Each starts from the nearest
+value already solved, along the slope of the mode there, so that a ridge is walked along from the
+posterior's centre outwards. A mode need not be exact: the lattice that is laid around it counts
+what is there, whatever its middle.
+
+Parameters of springs, dampers and masses follow friction along curves; they are held as phi of
+:mod:`dahl_ident.bayes.shear`, in which the curves are straight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.shear import Shear, shear_of
+from dahl_ident.problem import Problem
+from dahl_ident.sensors import Sensors
+
+_STEPS = 25
+_NEAR = 0.1  # length of a step, in standard deviations, at which the mode is near enough
+_DAMPING = (1e-3, 0.2, 8.0)  # first; factors after a success and after a failure
+_SLOPE = 1e-4  # of ln f_max, ln sigma, ..., for slopes of the shear
+_RIDGE = 1e-13  # keeps what the data leave open solvable
+
+
+@dataclass
+class GaussianSlices:
+    """Slices of a normal density of any covariance, shape (D, D)."""
+
+    outer: int
+    centre: FloatArray
+    covariance: FloatArray
+
+    followers = 0
+
+    @property
+    def inner(self) -> tuple[int, ...]:
+        """The other axes."""
+        return tuple(i for i in range(len(self.centre)) if i != self.outer)
+
+    def charts(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return conditional means, and the conditional spread."""
+        a, b = self.outer, list(self.inner)
+        C = self.covariance
+        offset = values - self.centre[a]
+        modes = np.repeat(self.centre[None], len(values), axis=0)
+        modes[:, a] = values
+        modes[:, b] += offset[:, None] * C[b, a] / C[a, a]
+        rest = C[np.ix_(b, b)] - np.outer(C[b, a], C[b, a]) / C[a, a]
+        return modes, np.repeat(np.linalg.cholesky(rest)[None], len(values), axis=0)
+
+    def follow(self, theta: FloatArray) -> FloatArray:
+        """Return nothing; nothing follows."""
+        return theta[:, :0]
+
+
+class _Fit(NamedTuple):
+    """The quadratic model of S slices at a point: objective, gradient and Hessian by phi."""
+
+    value: FloatArray
+    gradient: FloatArray
+    hessian: FloatArray
+
+
+class ProfileSlices:
+    """Slices of the posterior of a problem.
+
+    Parameters
+    ----------
+    density : Density
+        The posterior.
+    outer : int
+        The axis held.
+    centre : ndarray, shape (P,)
+        A point near the posterior's middle, where walking begins.
+    """
+
+    def __init__(self, density: Density, outer: int, centre: FloatArray) -> None:
+        problem = _without_priors(density.problem)
+        self.outer = outer
+        self._density, self._problem = density, problem
+        self._shear = _without(shear_of(problem), outer)
+        behind = [] if self._shear is None else self._shear.linear.tolist()
+        others = [i for i in range(len(centre)) if i != outer and i not in behind]
+        self._inner = [*others, *behind]
+        self.followers = len(behind)
+        self._prior_mean, self._prior_precision, self._pull = _priors(density)
+        self._box = density.prior.limits
+        _, fit = self._solved(centre[None])
+        self._known = self._straight(centre[None]), self._slopes(fit)
+
+    @property
+    def inner(self) -> tuple[int, ...]:
+        """The other axes, those that follow friction last."""
+        return tuple(self._inner)
+
+    def charts(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return conditional modes and spreads, in phi where axes follow."""
+        modes, fit = self._solved(self._bent(self._starts(values)))
+        phi, slopes = self._known
+        self._known = (
+            np.concatenate([phi, self._straight(modes)]),
+            np.concatenate([slopes, self._slopes(fit)]),
+        )
+        free = np.ix_(range(len(values)), self._inner, self._inner)
+        return modes, _roots_of_inverse(fit.hessian[free])
+
+    def follow(self, theta: FloatArray) -> FloatArray:
+        """Return where the followers are, for given friction."""
+        if self._shear is None:
+            return theta[:, :0]
+        return np.negative(self._shear.shift(theta))
+
+    def _starts(self, values: FloatArray) -> FloatArray:
+        """Return phi on the tangent at the nearest value solved before."""
+        phi, slopes = self._known
+        offset = values[:, None] - phi[:, self.outer]
+        nearest = np.abs(offset).argmin(axis=1)
+        step = offset[np.arange(len(values)), nearest]
+        return np.asarray(phi[nearest] + step[:, None] * slopes[nearest])
+
+    def _solved(self, start: FloatArray) -> tuple[FloatArray, _Fit]:
+        """Return modes near starts with the same outer value, and the model there."""
+        inner = self._inner
+        theta = self._inside(start)
+        best = self._model(theta)
+        damping = np.full(len(theta), _DAMPING[0])
+        for _ in range(_STEPS if inner else 0):
+            step, length = _step(best, inner, damping)
+            if length.max() < _NEAR:
+                break
+            phi = self._straight(theta)
+            phi[:, inner] += step
+            proposed = self._inside(self._bent(phi))
+            fit = self._model(proposed)
+            better = fit.value < best.value
+            theta = np.where(better[:, None], proposed, theta)
+            best = _Fit(*(_chosen(better, a, b) for a, b in zip(fit, best, strict=True)))
+            damping *= np.where(better, _DAMPING[1], _DAMPING[2])
+        return theta, best
+
+    def _model(self, theta: FloatArray) -> _Fit:
+        """Return minus the log-posterior, up to a constant, as least squares see it."""
+        density, problem = self._density, self._problem
+        offset = (theta - self._prior_mean) * self._pull
+        value = 0.5 * (offset**2 * self._prior_precision).sum(axis=1)
+        gradient = offset * self._prior_precision
+        chart = self._chart(theta)
+        hessian = np.broadcast_to(np.diag(self._prior_precision), chart.shape)
+        if density.likelihood == "none":
+            return _Fit(value, gradient, hessian)
+        data = problem.quadratic(theta, chart=chart)
+        cost = np.maximum(data.cost, np.finfo(float).tiny)
+        rows = 0.5 * problem.n_residuals
+        variance = cost / rows if density.has_scale else np.ones(len(theta))
+        value = value + (rows * np.log(cost) if density.has_scale else cost)
+        return _Fit(
+            np.where(np.isfinite(value), value, np.inf),
+            np.nan_to_num(gradient + data.gradient / variance[:, None]),
+            np.nan_to_num(hessian + data.hessian / variance[:, None, None]),
+        )
+
+    def _chart(self, theta: FloatArray) -> FloatArray:
+        """Return dtheta/dphi, (S, P, P)."""
+        P = theta.shape[1]
+        chart = np.repeat(np.eye(P)[None], len(theta), axis=0)
+        if self._shear is not None:
+            for axis in range(P):
+                if axis not in self._shear.linear:
+                    by = np.zeros(P)
+                    by[axis] = _SLOPE
+                    change = self._shear.shift(theta + by) - self._shear.shift(theta - by)
+                    chart[:, self._shear.linear, axis] = -change / (2.0 * _SLOPE)
+        return chart
+
+    def _slopes(self, fit: _Fit) -> FloatArray:
+        """Return dphi/d(outer) of the mode, (S, P)."""
+        inner = self._inner
+        slopes = np.zeros_like(fit.gradient)
+        slopes[:, self.outer] = 1.0
+        if inner:
+            H = fit.hessian[np.ix_(range(len(slopes)), inner, inner)]
+            slopes[:, inner] = -_solve(H, fit.hessian[:, inner, self.outer])
+        return slopes
+
+    def _inside(self, theta: FloatArray) -> FloatArray:
+        return np.clip(theta, *self._box)
+
+    def _straight(self, theta: FloatArray) -> FloatArray:
+        return theta.copy() if self._shear is None else self._shear.straight(theta)
+
+    def _bent(self, phi: FloatArray) -> FloatArray:
+        return phi if self._shear is None else self._shear.bent(phi)
+
+
+def _step(fit: _Fit, inner: list[int], damping: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return damped Newton steps of the inner axes, and their lengths in standard deviations."""
+    free = np.ix_(range(len(damping)), inner, inner)
+    H, g = fit.hessian[free], fit.gradient[:, inner]
+    diagonal = np.einsum("sii->si", H)
+    damped = H + damping[:, None, None] * diagonal[:, None] * np.eye(len(inner))
+    step = -_solve(damped, g)
+    return step, np.sqrt(np.abs((step * g).sum(axis=1)))
+
+
+def _solve(H: FloatArray, g: FloatArray) -> FloatArray:
+    """Return H^-1 g, rows and columns of H brought to one size first."""
+    size = 1.0 / np.sqrt(np.einsum("sii->si", H))
+    scaled = H * size[:, :, None] * size[:, None]
+    solved = np.linalg.solve(scaled + _RIDGE * np.eye(H.shape[-1]), (g * size)[..., None])[..., 0]
+    return np.asarray(size * solved)
+
+
+def _roots_of_inverse(H: FloatArray) -> FloatArray:
+    """Return lower triangular L with L L' = H^-1."""
+    size = 1.0 / np.sqrt(np.einsum("sii->si", H))
+    scaled = H * size[:, :, None] * size[:, None] + _RIDGE * np.eye(H.shape[-1])
+    # with J J' = H of reversed order, (J^-1)' reversed is lower triangular
+    reverse = np.linalg.cholesky(scaled[:, ::-1, ::-1])
+    root = np.linalg.inv(reverse).swapaxes(-1, -2)[:, ::-1, ::-1]
+    return np.asarray(size[:, :, None] * root)
+
+
+def _chosen(better: NDArray[np.bool_], new: FloatArray, old: FloatArray) -> FloatArray:
+    return np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+
+def _without(shear: Shear | None, outer: int) -> Shear | None:
+    """Return the shear of the other axes."""
+    if shear is None or np.array_equal(shear.linear, [outer]):
+        return None
+    others = shear.linear != outer
+    return replace(shear, linear=shear.linear[others], projection=shear.projection[:, others])
+
+
+def _without_priors(problem: Problem) -> Problem:
+    """Return the problem with priors of the sensors left out, which are counted apart."""
+    if not problem.priors:
+        return problem
+    given = {p.name: getattr(problem.sensors, p.name) for p in problem.sensors.parameters}
+    sensors = Sensors(**{**given, **dict.fromkeys(problem.priors)})
+    return Problem(problem.data, problem.model, noise=problem.noise, sensors=sensors)
+
+
+def _priors(density: Density) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return means and precisions of the priors as normal ones, and which pull: bounds do not."""
+    parts = density.prior.parts
+    mean = np.array([float(part.quantile(np.array([0.5]))[0]) for part in parts])
+    pulls = np.array([part.distribution is not None for part in parts])
+    return mean, (2.0 / density.prior.widths) ** 2, pulls.astype(float)
