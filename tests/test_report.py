@@ -14,6 +14,7 @@ import pytest
 import dahl_ident as di
 from dahl_ident import report
 from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.reporting.settling import cycle_by_cycle
 from dahl_ident.results.posterior import Posterior
 from dahl_ident.results.sampling import sample
 from tests.browser import CHROMIUM, Page, chromium
@@ -254,3 +255,51 @@ def test_provenance_of_several_files_is_listed(fit: di.FitResult, tmp_path: Path
     told = json.loads(report(di.fit(data, di.Dahl()), tmp_path / "r.json").read_text())
     assert told["files"] == {"run0.csv": "0" * 64, "run1.csv": "1" * 64}
     assert "run0.csv run1.csv" in told["command"]
+
+
+def test_measured_loops_and_settling_are_shown(tmp_path: Path) -> None:
+    friction = di.Dahl(0.1, 30.0)
+    t = np.arange(6000) / 200.0
+    x = 0.008 * np.sin(2.0 * np.pi * 1.25 * t)
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(t.size)
+    record = di.Record(t, displacement=x, force=friction.force(x) + 0.5 * x + noise)
+    fit = di.fit(di.extract(record), di.Dahl() + di.Spring(0.5), throw=False)
+    place = report(fit, tmp_path / "r.html", record=record)
+    text = place.read_text(encoding="utf-8")
+    told = re.search(r"measured loops lie within ([0-9.]+) % rms", text)
+    assert told is not None
+    assert 0.0 < float(told[1]) < 3.0, "harmonics up to the ninth make the loop"
+    assert "Quality of each point" in text
+    assert "Points measured from waveforms: 1, all good." in text
+    assert "How the point at 1.25 Hz, 0.008 m settled" in text
+    other = di.Record(t, displacement=x, force=x, provenance={"sha256": "00"})
+    with pytest.raises(ValidationError, match="not extracted from this record"):
+        report(fit, tmp_path / "other.html", record=other)
+    with pytest.raises(ValidationError, match="not extracted from this record"):
+        report(di.fit(plain_table(), di.Dahl()), tmp_path / "other.html", record=record)
+
+
+def plain_table() -> di.FrequencyResponse:
+    amplitude = np.geomspace(3e-4, 3e-2, 12)
+    noise = 0.01 * np.random.default_rng(1).standard_normal((2, 12))
+    response = di.Dahl(0.1, 30.0).describing_function(amplitude) * np.exp(noise[0] + 1j * noise[1])
+    return di.FrequencyResponse(np.ones(12), response, amplitude)
+
+
+def test_cycle_by_cycle_sees_what_changes() -> None:
+    t = np.arange(4000) / 400.0 + 7.0
+    stiffness, offset = 2.0 + 0.5 * np.floor(t - 7.0), 0.1 * np.floor(t - 7.0)
+    x = np.cos(2.0 * np.pi * (t - 7.0))
+    record = di.Record(t, velocity=np.gradient(x, t), force=stiffness * x + offset)
+    response, mean = cycle_by_cycle(record, 1.0, 8.0, 11.0)
+    np.testing.assert_allclose(response, [2.5, 3.0, 3.5], rtol=1e-3)
+    np.testing.assert_allclose(mean, [0.1, 0.2, 0.3], atol=1e-9)
+
+
+def test_the_bootstrap_stands_beside_the_others_once_it_was_run(tmp_path: Path) -> None:
+    fit = di.fit(plain_table(), di.Dahl())
+    before = report(fit, tmp_path / "a.md").read_text(encoding="utf-8")
+    assert "bootstrap" not in before
+    fit.conf_interval("bootstrap", replicates=200)
+    after = report(fit, tmp_path / "b.md").read_text(encoding="utf-8")
+    assert "| bootstrap 95.45 % |" in after

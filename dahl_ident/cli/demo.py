@@ -48,7 +48,8 @@ def demo(
     telling.heading(f"1. inspect: {file}")
     telling.say(repr(inspect(file)))
     telling.heading("2. extract: waveforms to dynamic stiffness")
-    data = extract_record(read_record(file), controlled="force", harmonics=[1])
+    record = read_record(file)
+    data = extract_record(record, controlled="force", harmonics=[1])
     extract.show(data)
     data = extract.good_points(data)
     data.save(table, overwrite=writing.overwrite)
@@ -64,8 +65,13 @@ def demo(
     telling.heading("6. report")
     with progress_bar() as bar:
         bar.add_task("drawing", total=None)
-        told = telling.typed_command()
-        report([result, posterior], page, command=told, overwrite=writing.overwrite)
+        report(
+            [result, posterior],
+            page,
+            command=telling.typed_command(),
+            record=record,
+            overwrite=writing.overwrite,
+        )
     telling.say(f"table: {table}\nreport: {page.resolve()}")
     telling.finish(result.trusted and posterior.converged, result.verdict)
 

@@ -160,12 +160,21 @@ def extract(
 
 def good_points(data: FrequencyResponse) -> FrequencyResponse:
     """Return the points whose verdict is good, and name the others."""
+    from dahl_ident.errors import ExtractionError
+
     good = data.quality["verdict"] == "good"
-    for i in (~good & (data.harmonic == 1)).nonzero()[0]:
+    for i in (~good & (data.harmonic == data.harmonic.min())).nonzero()[0]:
         telling.doubt(
             f"left out: row {i} at {data.frequency_hz[i]:.5g} Hz: {data.quality['verdict'][i]}"
         )
+    if not good.any():
+        raise ExtractionError("no point is good; without --good-only the table holds them all")
     return data.select(rows=good)
+
+
+def _one_row_a_point(data: FrequencyResponse) -> FrequencyResponse:
+    """Return the fundamental of every point, or the lowest harmonic that was asked for."""
+    return data.select(harmonic=int(data.harmonic.min()))
 
 
 def _points(
@@ -181,39 +190,36 @@ def _points(
 
 
 def show(data: FrequencyResponse) -> None:
-    """Print the fundamental of every point with its verdict."""
+    """Print one row for each point, with its level where it has one, and its verdict."""
     import numpy as np
 
     from dahl_ident.units import si_unit
 
-    points = data.select(harmonic=1)
-    motion = si_unit("displacement", data.motion)
-    header = (
-        "frequency [Hz]",
-        f"amplitude [{motion}]",
-        "gain",
-        "phase [deg]",
-        "periods",
-        "verdict",
-    )
+    points = _one_row_a_point(data)
     assert points.amplitude is not None  # extraction measures it
     used = points.quality["num_periods"] - points.quality["settling_periods"]
+    columns = {
+        "level": [] if points.level is None else [str(label) for label in points.level],
+        "frequency [Hz]": [f"{f:.5g}" for f in points.frequency_hz],
+        f"amplitude [{si_unit('displacement', data.motion)}]": [
+            f"{A:.4g}" for A in points.amplitude
+        ],
+        "gain": [f"{g:.4g}" for g in points.gain],
+        "phase [deg]": [f"{p:.2f}" for p in np.degrees(points.phase)],
+        "periods": [f"{u:g}" for u in used],
+        "verdict": [str(v) for v in points.quality["verdict"]],
+    }
+    shown = {name: cells for name, cells in columns.items() if cells}
     telling.table(
         f"{points.n} points of {points.quantity.replace('_', ' ')} [{points.unit}]",
-        header,
-        [
-            (f"{f:.5g}", f"{A:.4g}", f"{g:.4g}", f"{p:.2f}", f"{u:g}", str(v))
-            for f, A, g, p, u, v in zip(
-                points.frequency_hz, points.amplitude, points.gain, np.degrees(points.phase),
-                used, points.quality["verdict"], strict=True,
-            )
-        ],
-    )  # fmt: skip
+        list(shown),
+        list(zip(*shown.values(), strict=True)),
+    )
 
 
 def judge(data: FrequencyResponse) -> None:
     """End with status 3 where a point is not good, and say which and why."""
-    verdicts = data.select(harmonic=1).quality["verdict"]
+    verdicts = _one_row_a_point(data).quality["verdict"]
     bad = [(i, str(v)) for i, v in enumerate(verdicts) if v != "good"]
     named = "; ".join(f"point {i}: {verdict}" for i, verdict in bad[:3])
     more = "" if len(bad) <= 3 else "; ..."

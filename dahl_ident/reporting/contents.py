@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from dahl_ident.data import FrequencyResponse
+from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.diagnostics.comparison import compare_models
 from dahl_ident.reporting import posteriors, provenance, tables
 from dahl_ident.reporting.document import (
@@ -21,6 +21,7 @@ from dahl_ident.reporting.document import (
 )
 from dahl_ident.reporting.figures import pictures_of_fit
 from dahl_ident.reporting.repeat import repeating_command
+from dahl_ident.reporting.settling import settling
 from dahl_ident.results import FitResult
 from dahl_ident.results.posterior import Posterior
 
@@ -37,7 +38,11 @@ NOISE = {
 
 
 def document(
-    results: Sequence[Result], *, title: str | None = None, command: str | None = None
+    results: Sequence[Result],
+    *,
+    title: str | None = None,
+    command: str | None = None,
+    record: Record | None = None,
 ) -> Document:
     """Return the report on fits and posteriors of the same data."""
     fits = [result for result in results if isinstance(result, FitResult)]
@@ -55,7 +60,7 @@ def document(
         ),
         sections=(
             *sections,
-            *_extraction(data),
+            *_extraction(data, record),
             Section("Data", tuple(_data(data))),
             Section("Origin", tuple(_origin(data, repeated, typed=command is not None))),
         ),
@@ -125,22 +130,24 @@ def _goodness(fit: FitResult) -> Iterator[Block]:
         yield tables.comparison(compared)
 
 
-def _extraction(data: FrequencyResponse) -> Iterator[Section]:
+def _extraction(data: FrequencyResponse, record: Record | None) -> Iterator[Section]:
     """Yield how the points were measured, where they come from waveforms."""
+    seen = () if record is None else (settling(data, record),)
     if "num_periods" not in data.quality:
         return
     verdicts = data.select(harmonic=1).quality["verdict"]
     bad = int((verdicts != "good").sum())
-    says = f"{bad} of them are not good" if bad else "all of them are good"
+    says = f"{bad} of them not good" if bad else "all good"
     yield Section(
         "Extraction",
         (
             Paragraph(
-                f"{verdicts.size} points were measured from waveforms; {says}. Cycles left out "
+                f"Points measured from waveforms: {verdicts.size}, {says}. Cycles left out "
                 "are leading ones, in which friction still remembered the step before; the bias "
                 "is what it may remember in the cycles used."
             ),
             tables.extraction(data),
+            *seen,
         ),
     )
 

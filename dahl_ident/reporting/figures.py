@@ -17,7 +17,7 @@ from dahl_ident.elements import Dahl
 from dahl_ident.elements.linear_dahl import describing_function
 from dahl_ident.reporting.document import Picture, figure_of
 from dahl_ident.reporting.loops import loops
-from dahl_ident.units import si_unit
+from dahl_ident.units import engineering, si_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from dahl_ident.results import FitResult
 
 _MARKED_BETA = (0.3, 1.0, 2.2, 5.0, 20.0)
+_LEVELS, _POINTS = 5, 160  # of the plant's response over levels
+_APART = 1.2  # of the largest frequency over the smallest
 _STRAIGHT = 1.5  # log of a profile's range beyond which its axis is logarithmic
 
 
@@ -32,6 +34,8 @@ def pictures_of_fit(fit: FitResult) -> Iterator[Picture]:
     """Yield what a fit has to show."""
     yield _response(fit)
     yield _residuals(fit)
+    if fit.success and _is_plant_over_amplitude(fit):
+        yield _over_levels(fit)
     friction = [e for e in fit.model.elements if isinstance(e, Dahl)]
     if _is_linear_dahl_alone(fit) and fit.success:
         yield _universal(fit, friction[0])
@@ -62,6 +66,46 @@ def _response(fit: FitResult) -> Picture:
         f"{percent(LEVELS[1])} confidence bands of the fit."
     )
     return Picture("response", caption, alt, lambda: figure_of(fit.plot_fit()))
+
+
+def _over_levels(fit: FitResult) -> Picture:
+    data = fit.data.select(harmonic=1)
+    drives = np.geomspace(*_ends(layout.held_amplitude(data)), _LEVELS)
+    grid = np.geomspace(*_ends(data.frequency_hz), _POINTS)
+    unit = si_unit("force", data.motion)
+    responses = [
+        fit.predict(grid, drive=np.full(_POINTS, drive), quantity="receptance").response
+        for drive in drives
+    ]
+    peaks = [f"{np.abs(R).max():.3g}" for R in (responses[0], responses[-1])]
+    gain_unit = si_unit("receptance", data.motion)
+
+    def draw() -> Figure:
+        levels = [(engineering(u, unit), grid, R) for u, R in zip(drives, responses, strict=True)]
+        return figure_of(
+            plots.plot_frequency_response(levels, gain_label=f"receptance [{gain_unit}]")
+        )
+
+    return Picture(
+        "levels",
+        "The fitted plant over the frequencies of the data, at five levels of the drive: friction "
+        "makes the response depend on its level.",
+        f"The largest receptance is {peaks[0]} {gain_unit} at the smallest drive and {peaks[1]} "
+        f"{gain_unit} at the largest.",
+        draw,
+    )
+
+
+def _is_plant_over_amplitude(fit: FitResult) -> bool:
+    """Return whether a plant was driven by force at a few frequencies apart from each other."""
+    data = fit.data.select(harmonic=1)
+    low, high = _ends(data.frequency_hz)
+    several = len(fit.model.elements) > 1 and high > _APART * low
+    return several and layout.is_force_controlled(data) and not layout.is_over_frequency(data)
+
+
+def _ends(values: FloatArray) -> tuple[float, float]:
+    return float(values.min()), float(values.max())
 
 
 def _residuals(fit: FitResult) -> Picture:

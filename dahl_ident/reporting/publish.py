@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from dahl_ident.data import Record
 from dahl_ident.data.storage import place_of, refuse_existing, write_whole
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.reporting.contents import Result, document
@@ -25,6 +26,7 @@ def report(
     *,
     title: str | None = None,
     command: str | None = None,
+    record: Record | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Write a report on one or several results.
@@ -40,6 +42,8 @@ def report(
         First line; by default the file's name.
     command : str, optional
         The command that repeats it; by default the one that fits the same model.
+    record : Record, optional
+        The waveforms that the data were extracted from; the report shows how a point settled.
     overwrite : bool, default False
         Replace a report that is there already.
 
@@ -51,7 +55,7 @@ def report(
     Raises
     ------
     ValidationError
-        If there is no result, or the ending is another one.
+        If there is no result, the ending is another one, or the record is of other data.
     DataError
         If a file is there already and `overwrite` is not set, or the place cannot be written to.
 
@@ -70,7 +74,7 @@ def report(
     told = list(results) if isinstance(results, Sequence) else [results]
     if not told:
         raise ValidationError("there is no result to report on; expected at least one")
-    whole = document(told, title=title, command=command)
+    whole = document(told, title=title, command=command, record=record)
     kind = place.suffix.lower()
     if kind == ".md":
         folder = place.with_name(f"{place.stem}_pictures")
