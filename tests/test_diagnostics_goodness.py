@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, compare_models, fit
+from dahl_ident import (
+    Dahl,
+    Damper,
+    FrequencyResponse,
+    Mass,
+    Spring,
+    compare_models,
+    fit,
+    response,
+)
 from dahl_ident.diagnostics.goodness import Goodness, goodness
 from dahl_ident.diagnostics.outliers import suspicious_points
 from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, ResidualSpace
@@ -283,6 +292,34 @@ class TestPhysics:
         for row, tolerance in ((order[-1], 1.0), (order[50], 0.1), (order[30], 0.1)):
             f, u = float(data.frequency_hz[row]), float(data.level[row])
             assert share[row] == pytest.approx(simulated_share(f, u), rel=tolerance)
+
+    def test_the_row_of_a_crude_sine_is_the_table_s(self) -> None:
+        """Also where rows of controlled displacement stand before those of a drive."""
+        driven = plant_table(noise=0.001)
+        assert driven.drive is not None
+        A = np.geomspace(0.1, 10.0, 7) * X_C
+        f = np.concatenate([np.ones(7), driven.frequency_hz])
+        R = np.concatenate([1.0 / PLANT.dynamic_stiffness(A, 2.0 * np.pi), driven.response])
+        mixed = FrequencyResponse(
+            f,
+            R,
+            amplitude=np.concatenate([A, driven.gain * driven.drive]),
+            drive=np.concatenate([A / np.abs(R[:7]), driven.drive]),
+            controlled=["displacement"] * 7 + ["force"] * 60,
+            quantity="receptance",
+        )
+        result = fit(mixed, Dahl() + Mass(0.3) + Damper(0.24) + Spring())
+        row = 7 + int(np.argmax(third_harmonic_share(result.optimum)))
+        (text,) = result.goodness.warnings
+        assert f"of its fundamental in row {row}: a describing function" in text
+
+    def test_a_nearly_linear_plant_moves_in_a_sine(self) -> None:
+        plant = FRICTION + Mass(0.3) + Damper(20.0) + Spring(300.0)
+        f = np.tile(np.geomspace(0.1, 20.0, 12), 3)
+        u = np.repeat([0.05, 0.1, 0.3], 12)
+        R = response(plant, f, u).receptance * relative_noise(36, 0.001, 3)
+        data = FrequencyResponse(f, R, drive=u, controlled="force", quantity="receptance")
+        assert not fit(data, Dahl() + Mass() + Damper() + Spring()).goodness.warnings
 
     def test_controlled_displacement_has_none(self) -> None:
         assert third_harmonic_share(fit(table(), Dahl()).optimum).size == 0

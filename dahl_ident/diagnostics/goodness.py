@@ -92,7 +92,7 @@ class Goodness:
     Attributes
     ----------
     rms_misfit : float
-        Root mean square of |measured - fitted| / |measured|, fundamentals only.
+        Root mean square of |measured - fitted| / |measured|, of fundamentals where there are any.
     chi_square : ChiSquare or None
         None where the noise's scale was estimated: nothing is known to compare with.
     trends : tuple of Trend
@@ -211,13 +211,11 @@ class Goodness:
 def goodness(optimum: Optimum) -> Goodness:
     """Return every test of an optimum's residuals, and physical warnings."""
     space, problem = ResidualSpace(optimum), optimum.problem
-    fundamental = problem.data.harmonic == 1
-    response = problem.data.response
-    misfit = np.abs(response - problem.predict(optimum.theta))[fundamental]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative = misfit / np.abs(response[fundamental])
+    response, harmonic = problem.data.response, problem.data.harmonic
+    fundamental = (harmonic == harmonic.min()) & (response != 0.0)
+    misfit = 1.0 - problem.predict(optimum.theta)[fundamental] / response[fundamental]
     return Goodness(
-        float(np.sqrt(np.mean(relative**2))),
+        float(np.sqrt(np.mean(np.abs(misfit) ** 2))),
         _chi_square(optimum, space),
         tuple(trends(optimum, space)),
         tuple(runs(optimum, space)),

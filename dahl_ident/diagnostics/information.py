@@ -52,7 +52,7 @@ class Information:
 
     def std(self, directions: FloatArray) -> FloatArray:
         """Return the standard deviation of directions . theta."""
-        return np.sqrt(self.variance(directions))
+        return np.sqrt(np.maximum(self.variance(directions), 0.0))  # -eps on a constraint
 
     def weakest(self, natural: FloatArray) -> FloatArray:
         """Return the least determined direction of theta/natural, a unit vector, shape (P,)."""

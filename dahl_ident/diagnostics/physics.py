@@ -26,11 +26,16 @@ def physical_warnings(optimum: Optimum) -> Iterator[str]:
     if optimum.status is Status.AT_BOUND:
         yield optimum.message.removeprefix(Status.AT_BOUND.value).strip()
     yield from _beyond_friction_limit(optimum)
+    yield from _not_a_sine(optimum)
+
+
+def _not_a_sine(optimum: Optimum) -> Iterator[str]:
+    """Yield where the motion of a driven plant is far from the sine that is assumed."""
     share = third_harmonic_share(optimum)
     if share.size and share.max() > _HARMONIC_SHARE:
-        row = int(np.argmax(share))
+        row = np.flatnonzero(optimum.problem.data.controlled == "force")[np.argmax(share)]
         yield (
-            f"the displacement's third harmonic is predicted to be {100.0 * share[row]:.2g} % of "
+            f"the displacement's third harmonic is predicted to be {100.0 * share.max():.2g} % of "
             f"its fundamental in row {row}: a describing function, which assumes a sine, is crude "
             "there; control the displacement, or leave such points out"
         )

@@ -264,7 +264,7 @@ class Profiler:
     @cached_property
     def _reach(self) -> _Reach:
         view, springs = self._problem.stiffness_data, (Spring, LinearSystem)
-        stiffness = np.median(np.abs(view.stiffness))
+        stiffness = view.typical_stiffness
         beside = any(isinstance(e, springs) for e in self._problem.model.elements)
         return _Reach(
             float(np.log(view.amplitude.min() * _LEAST_X_C)),

@@ -24,6 +24,7 @@ from dahl_ident.fitting.losses import loss_named
 
 _RANK = 1e-9  # singular value of the Jacobian, over the largest, that counts as none
 _GAUSSIAN = 1e12  # degrees of freedom beyond which Student's t is the normal distribution
+_NOTHING = 1e-100  # length of a column that is none
 _LEFT = 1e-4  # length of a column after projection, over that before, that counts as none
 
 
@@ -78,7 +79,7 @@ class _Space(ABC):
 
 
 class RelativeSpace(_Space):
-    """ln(R/R_model) of the fundamentals, all rows alike: for the size of a departure.
+    """ln(R/R_model) of fundamentals other than 0, all rows alike: for the size of a departure.
 
     Whatever the noise model, the weights here do not depend on it, so that a departure of 30 %
     reads as one also where the data claim errors of 1 %.
@@ -87,7 +88,7 @@ class RelativeSpace(_Space):
     def __init__(self, optimum: Optimum) -> None:
         problem, theta = optimum.problem, optimum.theta
         predicted = problem.predict(theta)
-        self._rows = problem.data.harmonic == 1
+        self._rows = (problem.data.harmonic == 1) & (problem.data.response != 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
             y = np.log(problem.data.response / predicted)[self._rows]
             J = (problem.prediction_jacobian(theta) / predicted[:, None])[self._rows]
@@ -170,7 +171,7 @@ class ResidualSpace(_Space):
 def _orthonormal(columns: FloatArray) -> FloatArray:
     """Return an orthonormal basis of the column space, shape (m, rank)."""
     size = np.linalg.norm(columns, axis=0)
-    used = columns[:, (size > 0.0) & np.isfinite(size)]
+    used = columns[:, (size > _NOTHING) & np.isfinite(size)]
     if used.shape[1] == 0:
         return np.zeros((len(columns), 0))
     U, singular, _ = np.linalg.svd(used / np.linalg.norm(used, axis=0), full_matrices=False)

@@ -31,7 +31,8 @@ _SAME = 0.01  # of the covariate's logarithm: values closer than this are one
 _LEAST_RANGE = np.log(1.05)
 _LEAST_DOF_PER_COLUMN = 3
 _FEWEST_SIGNS = 10
-_STEEPEST = np.log(10.0)
+_STEEPEST = np.log(10.0)  # change of a logarithm that is worth a number
+_FARTHEST = 9.0  # departure that is
 
 
 @dataclass(frozen=True)
@@ -66,10 +67,10 @@ class Trend:
 
     def __str__(self) -> str:
         ends = f"from {self.low:.3g} to {self.high:.3g} {self.unit}".rstrip()
-        text = (
-            f"over {self.covariate}, {ends}, the data depart from the model by up to "
-            f"{100.0 * self.largest:.2g} %"
-        )
+        size = "more than tenfold"
+        if self.largest < _FARTHEST:
+            size = f"by up to {100.0 * self.largest:.2g} %"
+        text = f"over {self.covariate}, {ends}, the data depart from the model {size}"
         parts = [
             f"friction's {name} {_change(part)}"
             for name, part in (("stiffness", self.stiffness), ("loss", self.loss))
@@ -116,7 +117,7 @@ def trends(optimum: Optimum, space: ResidualSpace) -> list[Trend]:
                 unit,
                 stiffness,
                 loss,
-                float(np.abs(np.expm1(relative.fitted(changes))).max()),
+                _largest(relative.fitted(changes)),
                 p,
             )
         )
@@ -182,6 +183,13 @@ def _friction_parts(optimum: Optimum) -> tuple[ComplexArray, ComplexArray]:
     with np.errstate(divide="ignore", invalid="ignore"):
         parts = sign * stiffness / total, sign * loss / total
     return np.nan_to_num(parts[0]), np.nan_to_num(parts[1])
+
+
+def _largest(logarithms: ComplexArray) -> float:
+    """Return the largest relative change of a response whose logarithm changes so much."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        sizes = np.abs(np.expm1(logarithms))
+    return float(np.where(np.isnan(sizes), np.inf, sizes).max())
 
 
 def _distinct(x: FloatArray) -> int:
