@@ -174,6 +174,36 @@ def test_a_record_is_simulated_inspected_and_extracted(run: Runner) -> None:
     assert Path("points.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_extraction_of_several_files_names_levels_and_files(run: Runner) -> None:
+    for level in ("2e-3", "8e-3"):
+        run("simulate", "--f-max", "0.1", "--sigma", "30", "--record", "--levels", level,
+            "--force-std", "1e-4", "-o", f"run_{level}m.csv")  # fmt: skip
+    files = ["run_2e-3m.csv", "run_8e-3m.csv"]
+    told = run("extract", *files, "--level-from-name", r"run_(.*)m", "--harmonics", "3")
+    assert told.status == 0, told.err
+    levels = [line.split()[0] for line in told.out.splitlines() if "good" in line]
+    assert levels == ["0.002", "0.008"]
+    Path("flat.csv").write_text("time [s],x [m],F [N]\n0,1,2\n1,1,2\n2,1,2\n")
+    refused = run("extract", *files, "flat.csv")
+    assert refused.status == 1
+    assert "flat.csv: no stretch of constant amplitude" in refused.err
+
+
+def test_no_good_point_is_an_error_of_its_own(run: Runner) -> None:
+    run("simulate", "--f-max", "0.1", "--sigma", "30", "--record", "--levels", "1e-4",
+        "--force-std", "1e-6", "-o", "run.csv")  # fmt: skip
+    table = Path("run.csv").read_text().replace("force [N]", "minus force [N]")
+    Path("turned.csv").write_text(table)
+    turned = (
+        'time = "time"\ndisplacement = "displacement"\n[force]\ncolumn = "minus force"\nsign = -1\n'
+    )
+    Path("lab.toml").write_text(turned)
+    outcome = run("extract", "turned.csv", "--columns", "lab.toml", "--good-only")
+    assert outcome.status == 1
+    assert "creates energy, a sign is turned" in outcome.err
+    assert "no point is good" in outcome.err
+
+
 def test_sample_tells_the_posterior(run: Runner) -> None:
     table = run("datasets", "noisy", "-o", "-").out
     outcome = run("sample", "-", "--prior", "f_max=0.01:1", "--json", stdin=table)

@@ -132,18 +132,14 @@ def extract(
     if mode not in MODES:
         raise ValidationError(f"mode is {mode!r}; expected one of {', '.join(MODES)}")
     known = None if frequency is None else positive_number(frequency, "frequency")
-    channels = np.stack([record.motion_samples, record.force_samples])
-    points, refused = [], []
-    for segment in record_segments(record.time, channels[0], known, mode, num_periods):
-        try:
-            stretch = stretch_of(record.time, channels, segment, known)
-            points.append(measure(stretch, settings, sweep=segment.sweep))
-        except ExtractionError as exc:
-            refused.append(str(exc))
-    if not points:
-        raise ExtractionError(_summary(refused))
+    provenance = dict(record.provenance or {})
+    file = f"{provenance['file']}: " if "file" in provenance else ""
+    try:
+        points, refused = _points(record, known, mode, settings)
+    except ExtractionError as exc:
+        raise ExtractionError(f"{file}{exc}") from exc
     if refused:
-        warnings.warn(f"left out: {_summary(refused)}", stacklevel=2)
+        warnings.warn(f"{file}left out: {_summary(refused)}", stacklevel=2)
     options = {
         "frequency": known,
         "mode": mode,
@@ -153,8 +149,7 @@ def extract(
         "min_share": settings.min_share,
         "refused": refused,
     }
-    provenance = {**(record.provenance or {}), "extraction": options}
-    return _table(points, record, settings, level, provenance)
+    return _table(points, record, settings, level, {**provenance, "extraction": options})
 
 
 def _settings(
@@ -181,6 +176,23 @@ def _settings(
     return Settings(
         orders, num_periods, settling_periods, min_share, record.motion_channel, controlled
     )
+
+
+def _points(
+    record: Record, frequency: float | None, mode: Mode, settings: Settings
+) -> tuple[list[Point], list[str]]:
+    """Return the points, and why other stretches give none; at least one does."""
+    channels = np.stack([record.motion_samples, record.force_samples])
+    points, refused = [], []
+    for segment in record_segments(record.time, channels[0], frequency, mode, settings.num_periods):
+        try:
+            stretch = stretch_of(record.time, channels, segment, frequency)
+            points.append(measure(stretch, settings, sweep=segment.sweep))
+        except ExtractionError as exc:
+            refused.append(str(exc))
+    if not points:
+        raise ExtractionError(_summary(refused))
+    return points, refused
 
 
 def _summary(refused: Sequence[str]) -> str:
