@@ -211,9 +211,7 @@ def test_every_call_is_finite_to_the_edges_of_what_is_accepted(
     friction = Dahl(f_max, sigma, alpha)
     A = np.array([0.0, 5e-324, 1e-300, 1e-100, 1e-30, 1.0, 1e30, 1e90])
     N = friction.describing_function(A)
-    assert np.all(
-        (N.real >= 0.0) & (N.imag >= 0.0) & (np.abs(N) <= 4.0 / np.pi * 2.0**alpha * sigma)
-    )
+    assert np.all((N.real >= 0.0) & (N.imag >= 0.0) & (np.abs(N) <= sigma * (1.0 + 1e-15)))
     assert N[0] == sigma
     for values in friction.gradient(A).values():
         assert np.isfinite(values).all()

@@ -326,6 +326,9 @@ def test_histories_that_an_element_needs_are_asked_for() -> None:
         (Spring(1.0) + Damper(0.24)).force(x)
     with pytest.raises(ValidationError, match=r"velocity\[1\] is nan"):
         Damper(0.24).force(x, velocity=[0.0, np.nan])
+    for element in (Damper(0.24), Spring(1.0) + Damper(0.24), Damper(1.0) + Dahl(1.0, 1.0)):
+        with pytest.raises(ValidationError, match=r"velocity has shape \(3,\); expected .* \(2,\)"):
+            element.force(x, velocity=[0.0, 1.0, 2.0])
 
 
 def test_names_clash_or_are_refused() -> None:
@@ -333,5 +336,7 @@ def test_names_clash_or_are_refused() -> None:
         Dahl(1.0, 1.0) + Dahl(2.0, 2.0)
     with pytest.raises(ValidationError, match=r"name is 'two words'"):
         Spring(1.0, name="two words")
+    with pytest.raises(ValidationError, match=r"name is 3; expected letters"):
+        Spring(1.0, name=3)  # type: ignore[arg-type]  # the point of the test
     with pytest.raises(ModelError, match="at least one element"):
         Model()

@@ -15,6 +15,7 @@ from dahl_ident.arrays import (
     broadcast_shape,
     finite_array,
     non_negative_array,
+    real_array,
     whole_number,
 )
 from dahl_ident.elements.parameter import Parameter
@@ -166,15 +167,22 @@ def prefixed(name: str | None, label: str) -> str:
     """Return the full name of the parameter `label` of an element called `name`."""
     if name is None:
         return label
-    if not name.isidentifier():
+    if not str(name).isidentifier():
         raise ValidationError(
             f"name is {name!r}; expected letters, digits and underscores, such as 'pivot'"
         )
     return f"{name}_{label}"
 
 
-def motion(value: ArrayLike | None, name: str, needed_by: Element) -> FloatArray:
-    """Return a checked velocity or acceleration history, or say which element needs it."""
+def motion(
+    value: ArrayLike | None, name: str, displacement: ArrayLike, needed_by: Element
+) -> FloatArray:
+    """Return a checked history as long as `displacement`, or say which element needs it."""
     if value is None:
         raise ValidationError(f"{needed_by!r} needs {name} to give its force; pass {name}=")
-    return finite_array(value, name)
+    history, x = finite_array(value, name), real_array(displacement, "displacement")
+    if history.shape != x.shape:
+        raise ValidationError(
+            f"{name} has shape {history.shape}; expected that of displacement, {x.shape}"
+        )
+    return history

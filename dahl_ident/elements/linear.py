@@ -79,7 +79,8 @@ class Lumped(Element):
         ModelError
             If the parameter has no value.
         ValidationError
-            If the needed history is missing, or a value is NaN, infinite or complex.
+            If the needed history is missing or not as long as the displacement, or a value is
+            NaN, infinite or complex.
 
         Examples
         --------
@@ -92,7 +93,7 @@ class Lumped(Element):
             ("acceleration", acceleration),
         )
         name, history = histories[self.order]
-        return np.asarray(self.known_values()[0] * motion(history, name, self))
+        return np.asarray(self.known_values()[0] * motion(history, name, displacement, self))
 
 
 class Mass(Lumped):

@@ -125,7 +125,8 @@ class Model(Element):
         Raises
         ------
         ValidationError
-            If a needed history is missing, or a value is NaN, infinite or complex.
+            If a needed history is missing or not as long as the displacement, or a value is
+            NaN, infinite or complex.
 
         Examples
         --------

@@ -58,12 +58,13 @@ class Friction:
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Return what |N| and A |N| never exceed, for each vector.
 
-        The loop is nowhere steeper than 2^alpha sigma and nowhere higher than f_max; the
-        fundamental of a wave of slope or height 1 is at most 4/pi, that of the square wave.
+        The force is largest where the motion turns: there it is at most f_max and, since z^-alpha
+        is convex, at most sigma A. The fundamental of a wave of height 1 is at most 4/pi, that of
+        the square wave.
         """
         steepest, largest = np.zeros(()), np.zeros(())
-        for f_max, sigma, alpha in self.values:
-            steepest = steepest + 4.0 / np.pi * 2.0**alpha * sigma
+        for f_max, sigma, _ in self.values:
+            steepest = steepest + 4.0 / np.pi * sigma
             largest = largest + 4.0 / np.pi * f_max
         return steepest, largest
 
