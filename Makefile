@@ -58,6 +58,7 @@ bench: install  ## timings side by side with the peers
 # Stated errors against records and tables whose truth is known; each page says what was met.
 validation: install  ## long statistical checks, written into docs/validation
 	$(BIN)/python -m benchmarks.extraction_validation --write docs/validation/extraction.md
+	$(BIN)/python -m benchmarks.coverage
 
 lock: install  ## renew the pinned environment from pyproject.toml
 	$(BIN)/uv pip compile --quiet --no-emit-index-url --no-emit-find-links --upgrade \

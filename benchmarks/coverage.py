@@ -193,6 +193,8 @@ class Row:
 
     scenario: str
     name: str
+    data_sets: int
+    bootstrapped: int
     bound: float
     clear: bool
     rmse: float
@@ -244,6 +246,8 @@ def rows(scenario: Scenario, result: Tally, cells: int) -> Iterator[Row]:
         yield Row(
             scenario.name,
             name,
+            result.count,
+            result.bootstrapped,
             float(bounds[i]),
             bool(bounds[i] > NOT_IDENTIFIED_ABOVE or (bounds[i] < IDENTIFIED_BELOW and closed[i])),
             float(np.sqrt(result.squares[i] / result.count)),
@@ -291,21 +295,22 @@ def _job(job: tuple[int, int, int, int, int]) -> Tally:
     return tally(scenarios()[index], first, count, bootstrapped, replicates)
 
 
-def as_markdown(table: Sequence[Row], count: int, bootstrapped: int) -> str:
+def as_markdown(table: Sequence[Row]) -> str:
     """Return the table as a page."""
     lines = [
         "# Coverage of the intervals, and verdicts",
         "",
-        f"{count} synthetic data sets of each scenario ({bootstrapped} for the bootstrap). "
-        "`bound` is the Cramer-Rao bound of the parameter's logarithm; intervals are judged where "
-        "it is below 0.25, verdicts where it is below 0.25 or above 1. Coverage in percent, of "
-        "68.27 and 95.45 % intervals; outside binomial error (corrected for the number of "
-        'coverages) it is marked. "Not clear": exact data leave another explanation within '
-        "4.3 standard deviations, so that the local bound does not decide.",
+        "Each scenario is measured many times on the computer and fitted each time; the bootstrap "
+        "is run on a part of these data sets. `bound` is the Cramer-Rao bound of the parameter's "
+        "logarithm; intervals are judged where it is below 0.25, verdicts where it is below 0.25 "
+        "or above 1. Coverage in percent, of 68.27 and 95.45 % intervals; what lies outside "
+        'binomial error (corrected for the number of coverages) is marked (!). "Not clear": '
+        "exact data leave another explanation within 4.3 standard deviations, so that the local "
+        "bound does not decide.",
         "",
-        "| scenario | parameter | bound | RMSE / bound | Wald | profile | bootstrap | "
-        "verdict right |",
-        "|---|---|---|---|---|---|---|---|",
+        "| scenario | parameter | data sets (bootstrap) | bound | RMSE / bound | Wald | profile | "
+        "bootstrap | verdict right |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in table:
         rmse = f"{row.rmse / row.bound:.3f}" if row.identified else ""
@@ -313,8 +318,8 @@ def as_markdown(table: Sequence[Row], count: int, bootstrapped: int) -> str:
         right += "" if row.clear or not right else " (not clear)"
         cells = [_covers(row, method) for method in METHODS]
         lines.append(
-            f"| {row.scenario} | {row.name} | {row.bound:.2g} | {rmse} | {' | '.join(cells)} | "
-            f"{right} |"
+            f"| {row.scenario} | {row.name} | {row.data_sets} ({row.bootstrapped}) | "
+            f"{row.bound:.2g} | {rmse} | {' | '.join(cells)} | {right} |"
         )
     failures = [f"- {r.scenario}, {r.name}: {text}" for r in table for text in r.failures]
     lines += ["", "Everything holds." if not failures else "Does not hold:", *failures]
@@ -339,7 +344,7 @@ def main() -> None:
     count, bootstrapped, replicates = (
         SMALL if options.small else (options.count, BOOTSTRAPPED, REPLICATES)
     )
-    page = as_markdown(run(count, bootstrapped, replicates, options.scenario), count, bootstrapped)
+    page = as_markdown(run(count, bootstrapped, replicates, options.scenario))
     print(page)
     if not options.small and not options.scenario:
         DESTINATION.parent.mkdir(parents=True, exist_ok=True)
