@@ -144,13 +144,7 @@ class FrequencySweep:
     ramp_periods: float = 2.0
 
     def __post_init__(self) -> None:
-        for name in ("level", "start_hz", "stop_hz", "duration"):
-            object.__setattr__(self, name, positive_number(getattr(self, name), name))
-        one_of(self.spacing, "spacing", get_args(Spacing))
-        one_of(self.controlled, "controlled", get_args(Controlled))
-        object.__setattr__(
-            self, "ramp_periods", non_negative_number(self.ramp_periods, "ramp_periods")
-        )
+        _check_passage(self, "level", "start_hz", "stop_hz", "duration")
 
     def waveform(self, seed: int) -> Waveform:
         """Return the ramp and the sweep."""
@@ -200,13 +194,7 @@ class AmplitudeRamp:
     ramp_periods: float = 2.0
 
     def __post_init__(self) -> None:
-        for name in ("start_level", "stop_level", "frequency_hz", "duration"):
-            object.__setattr__(self, name, positive_number(getattr(self, name), name))
-        one_of(self.spacing, "spacing", get_args(Spacing))
-        one_of(self.controlled, "controlled", get_args(Controlled))
-        object.__setattr__(
-            self, "ramp_periods", non_negative_number(self.ramp_periods, "ramp_periods")
-        )
+        _check_passage(self, "start_level", "stop_level", "frequency_hz", "duration")
 
     def waveform(self, seed: int) -> Waveform:
         """Return the smooth start and the ramp."""
@@ -214,6 +202,16 @@ class AmplitudeRamp:
         run.go_to(self.start_level, self.frequency_hz, self.ramp_periods / self.frequency_hz)
         run.go_to(self.stop_level, self.frequency_hz, self.duration, self.spacing)
         return run.finish()
+
+
+def _check_passage(passage: FrequencySweep | AmplitudeRamp, *positive: str) -> None:
+    """Check a steady passage, and turn its numbers into floats."""
+    for name in positive:
+        object.__setattr__(passage, name, positive_number(getattr(passage, name), name))
+    one_of(passage.spacing, "spacing", get_args(Spacing))
+    one_of(passage.controlled, "controlled", get_args(Controlled))
+    ramp = non_negative_number(passage.ramp_periods, "ramp_periods")
+    object.__setattr__(passage, "ramp_periods", ramp)
 
 
 Excitation = SteppedSine | FrequencySweep | AmplitudeRamp
