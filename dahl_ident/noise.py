@@ -359,6 +359,10 @@ def noise_for(rows: Rows, kind: str | None) -> Noise:
     if kind == "relative":
         return _relative(rows)
     if kind == "absolute":
+        empty = ~rows.response.any(axis=-1)
+        if empty.any():
+            table = f" of table {int(np.argmax(empty))}" if empty.ndim else ""
+            raise DataError(f"every response{table} is 0; there is nothing to estimate from")
         return Absolute(rows.response, np.zeros(rows.response.shape[:-1]))
     return _measured(rows)
 

@@ -460,3 +460,16 @@ def test_start_without_steady_amplitude() -> None:
 def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
     solve_ipopt(Problem(friction_data(), Dahl()), constraints=lambda p: [p["sigma"] <= 29])
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("constraints", "message"),
+    [
+        (lambda p: p["sigma"] == 300.0 * p["f_max"], "expected a list of comparisons: lambda p"),
+        (dict.clear, "constraints returned None; expected a list of comparisons"),
+        ("sigma <= 1", "constraints is 'sigma <= 1'; expected a function: lambda p"),
+    ],
+)
+def test_what_is_no_list_of_constraints_is_refused(constraints: Any, message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        solve_ipopt(Problem(friction_data(), Dahl()), constraints=constraints)

@@ -25,6 +25,7 @@ from dahl_ident.elements.model import as_model
 from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting import Status, solve, solve_many
 from dahl_ident.fitting.losses import LOSSES
+from dahl_ident.fitting.trust_region import minimise_within
 from dahl_ident.problem import ProblemBatch
 
 n = 20
@@ -297,3 +298,32 @@ def test_an_outlier_among_exact_data_is_no_rounding() -> None:
     robust = fit(data, Dahl(), loss="student_t")
     assert robust.optimum.is_exact
     assert [point.row for point in robust.goodness.suspicious] == [4]
+
+
+ODD_RESPONSES: dict[str, ComplexArray] = {
+    "negative loss": Dahl(0.1, 30.0).describing_function(A).conj(),
+    "negative": -Dahl(0.1, 30.0).describing_function(A),
+    "no loss": np.full(n, 3.0 + 0j),
+    "loss alone": np.full(n, 3.0j),
+    "mostly nothing": np.where(np.arange(n) < 5, 1.0 + 1.0j, 0.0),
+    "noise alone": np.random.default_rng(3).normal(size=2 * n).view(np.complex128),
+}
+
+
+@pytest.mark.parametrize("model", [Dahl(), Dahl() + Spring()], ids=repr)
+@pytest.mark.parametrize("name", ODD_RESPONSES)
+def test_whatever_is_measured_ends_in_words_and_is_not_trusted(name: str, model: Any) -> None:
+    data = FrequencyResponse(np.ones(n), ODD_RESPONSES[name], A)
+    found = fit(data, model, noise="absolute", throw=False)
+    assert not found.trusted
+    assert "NOT to be trusted" in found.fit_report()
+    assert not np.isnan(found.optimum.values).any()
+
+
+def test_a_jacobian_out_of_range_makes_a_step_that_is_taken_back() -> None:
+    N = Dahl(0.1, 30.0).describing_function(A)
+    problem = Problem(FrequencyResponse(np.ones(n), N, A), Dahl())
+    far = np.log([1e-200, 1e200])
+    found = minimise_within(problem, far, 1.0, None)
+    assert found.converged is False
+    assert found.cost == np.inf

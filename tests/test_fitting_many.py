@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from benchmarks.harness import peak_bytes
 from dahl_ident import Dahl, FrequencyResponse, Problem, Sensors, Spring
 from dahl_ident.elements import Element
 from dahl_ident.errors import ValidationError
@@ -97,3 +98,13 @@ def test_bootstrap_spread_equals_the_stated_one() -> None:
     assert replicates.success.all()
     np.testing.assert_allclose(np.cov(replicates.theta.T), found.covariance, rtol=0.12)
     assert replicates.stderr.shape == (2000, 2)
+
+
+def test_many_elements_do_not_exhaust_memory() -> None:
+    """Two elements have a grid of a thousand nodes, which few tables may share at once."""
+    A = np.geomspace(1e-3, 1e-1, n)
+    Z = (Dahl(0.1, 30.0, name="a") + Dahl(1.0, 30.0, name="b")).dynamic_stiffness(A)
+    batch = ProblemBatch(
+        [FrequencyResponse(np.ones(n), Z, A)] * 100, Dahl(name="a") + Dahl(name="b")
+    )
+    assert peak_bytes(lambda: solve_many(batch)) < 250e6

@@ -36,6 +36,13 @@ TRUE = (0.1, 30.0, 0.3, 0.24, 0.3)
 FREE = Dahl() + Mass() + Damper() + Spring()
 RNG = np.random.default_rng(2)
 NOISE = np.exp(0.05 * (RNG.normal(size=n) + 1j * RNG.normal(size=n)))
+
+
+def odd(value: object) -> Any:
+    """Return what no type checker lets pass."""
+    return value
+
+
 QUANTITIES = {
     "receptance": (0, -1),
     "mobility": (1, -1),
@@ -292,7 +299,29 @@ def test_free_and_fixed_reach_model_and_sensors() -> None:
             ValidationError,
             "the prior of delay is uniform; least squares takes normal priors",
         ),
-        (lambda: ProblemBatch([], FREE), DataError, "there is no table"),
+        (lambda: ProblemBatch([], FREE), DataError, "data is no table; expected a sequence"),
+        (lambda: ProblemBatch(data(), FREE), DataError, "data is one table; expected a sequence"),
+        (lambda: Problem(odd(A), FREE), DataError, "data is a ndarray; expected a Frequency"),
+        (
+            lambda: Problem(FrequencyResponse(FREQUENCY, 0.0 * A, A), Dahl(), noise="absolute"),
+            DataError,
+            "every response is 0; there is nothing to estimate from",
+        ),
+        (
+            lambda: Problem(data(), FREE, free="alpha"),
+            ValidationError,
+            r"free is 'alpha'; expected a collection of names: \['alpha'\]",
+        ),
+        (
+            lambda: Problem(data(), FREE, fixed=odd(["mass"])),
+            ValidationError,
+            r"fixed is \['mass'\]; expected a mapping of names to numbers",
+        ),
+        (
+            lambda: Problem(data(), FREE, sensors=odd({"delay": 1e-3})),
+            ValidationError,
+            r"sensors is \{'delay': 0.001\}; expected Sensors",
+        ),
         (
             lambda: ProblemBatch([data(), FrequencyResponse([1.0], [1.0], [1.0])], FREE),
             DataError,

@@ -27,6 +27,9 @@ Constraints = Callable[[Mapping[str, "ca.SX"]], Iterable["ca.SX"]]
 """What a user gives; see the head of this module."""
 
 
+_EXAMPLE = "lambda p: [p['f_max'] <= 1e-3 * p['sigma']]"
+
+
 @dataclass(frozen=True)
 class Relations:
     """The user's constraints: text, and lhs - rhs of all parameters' values."""
@@ -91,8 +94,12 @@ class _Symbols(dict[str, "ca.SX"]):
 
 
 def _called(constraints: Constraints, symbols: _Symbols) -> list[Any]:
+    import casadi as ca
+
+    if not callable(constraints):
+        raise ValidationError(f"constraints is {constraints!r}; expected a function: {_EXAMPLE}")
     try:
-        return list(constraints(symbols))
+        found = constraints(symbols)
     except RuntimeError as exc:  # casadi's, for the truth value that 0 <= x <= 1 asks for
         if "truth value" not in str(exc):
             raise
@@ -100,6 +107,11 @@ def _called(constraints: Constraints, symbols: _Symbols) -> list[Any]:
             "a constraint chains comparisons or joins them with 'and'; write each as one item, "
             "such as [p['sigma'] >= 1, p['sigma'] <= 2]"
         ) from None
+    if isinstance(found, ca.SX) or not isinstance(found, Iterable):
+        raise ValidationError(
+            f"constraints returned {found!r}; expected a list of comparisons: {_EXAMPLE}"
+        )
+    return list(found)
 
 
 def _is_comparison(item: Any) -> int | None:

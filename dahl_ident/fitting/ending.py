@@ -67,7 +67,8 @@ def optimum(
         inner, lost = inverse(problem.information(theta, scale, chart))
     else:
         inner, lost = end.inverse
-    inner = inner * (final / scale) ** 2
+    with np.errstate(invalid="ignore"):  # infinite variances of what no residual holds
+        inner = inner * (final / scale) ** 2
     values = problem.to_values(theta)
     combinations: tuple[Combination, ...] = ()
     covariance, undetermined = inner, lost

@@ -20,7 +20,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Dahl
-from dahl_ident.errors import FitError, ModelError
+from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting.ending import End, optimum
 from dahl_ident.fitting.levenberg_marquardt import (
     Evaluate,
@@ -139,7 +139,9 @@ class _Search:
 
     def _starts(self, start: Mapping[str, float] | None) -> FloatArray:
         begin, names = starts(self.problem), self.problem.names
-        if start:
+        if start is not None:
+            if not isinstance(start, Mapping):
+                raise ValidationError(f"start is {start!r}; expected a mapping of names to numbers")
             unknown = [name for name in start if name not in names]
             if unknown:
                 raise ModelError(
@@ -273,4 +275,5 @@ class _Search:
         covariance, _ = end.inverse
         adapted = self.problem.scale_known or self.rescales
         variance = 1.0 if adapted else 2.0 * end.cost / max(self.m - len(end.theta), 1)
-        return float(np.sqrt(variance * covariance.diagonal()[self.friction].max(initial=0.0)))
+        largest = covariance.diagonal()[self.friction].max(initial=0.0)
+        return float(np.sqrt(variance * largest)) if largest < np.inf else np.inf

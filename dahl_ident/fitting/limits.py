@@ -111,7 +111,7 @@ class Reach:
     def __init__(self, problem: Problem) -> None:
         view = problem.stiffness_data
         smallest, largest = view.amplitude.min(axis=-1), view.amplitude.max(axis=-1)
-        softest = np.log(np.median(np.abs(view.stiffness), axis=-1)) + _LEAST_FRICTION
+        softest = np.log(view.typical_stiffness) + _LEAST_FRICTION
         springs = bool(_free_springs(problem))
         rows, limits = [], []
         for element in problem.model.elements:
@@ -188,7 +188,7 @@ def limits(problem: Problem) -> list[Limit]:
         return []
     view = problem.stiffness_data
     low, high = np.log(view.amplitude.min(axis=-1)), np.log(view.amplitude.max(axis=-1))
-    least = np.log(np.median(np.abs(view.stiffness), axis=-1) * _NO_FRICTION)
+    least = np.log(view.typical_stiffness) + np.log(_NO_FRICTION)
     stuck, slipping = high + np.log(_NO_LOSS), low + np.log(_GROSS_SLIP)  # ln x_c
     found = []
     for element in problem.model.elements:

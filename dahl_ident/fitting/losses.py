@@ -64,6 +64,8 @@ class Loss:
 
     def inflation(self, z: FloatArray, dof: int) -> float:
         """Return kappa, by which the covariance exceeds that of least squares."""
+        if dof <= 0:
+            return np.inf
         psi2 = (self.slope(z) ** 2 * z).sum() / dof
         return float(psi2 / np.mean(self.slope(z) + self.bend(z) * z) ** 2)
 

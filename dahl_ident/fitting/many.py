@@ -20,11 +20,12 @@ from dahl_ident.fitting.least_squares import AT_LIMIT, DOUBTFUL, NEARLY, SAME, T
 from dahl_ident.fitting.levenberg_marquardt import IntArray, Minima, minimise
 from dahl_ident.fitting.limits import Chart, Limit, Reach, limits, stiffness_valleys, valleys
 from dahl_ident.fitting.optimum import Optimum, OptimumBatch, estimated_scale, inverse, spread
-from dahl_ident.fitting.start import best_starts, edge_starts
+from dahl_ident.fitting.start import best_starts, edge_starts, grid_size
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import ProblemBatch, Quadratic
 
 _ROWS_AT_ONCE = 16384  # of data: their intermediate arrays stay in the processor's cache
+_CURVES_AT_ONCE = 2**20  # rows of data times nodes of the grid where starts are searched
 _LOOSENESS = 30.0  # a step of 3e-7 standard deviations no longer matters
 
 
@@ -76,7 +77,8 @@ def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> Optimu
         begin = np.broadcast_to(begin, (S, P))
     singly = np.isfinite(batch.bounds()).any() or (batch.priors and not batch.scale_known)
     rows = batch.n_residuals // 2
-    size = 1 if singly else max(1, _ROWS_AT_ONCE // rows)
+    at_once = min(_ROWS_AT_ONCE, _CURVES_AT_ONCE // grid_size(batch.take(slice(0, 1))))
+    size = 1 if singly else max(1, at_once // rows)
     parts = []
     for first in range(0, S, size):
         chunk = slice(first, first + size)

@@ -18,6 +18,7 @@ from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem, ProblemBatch
 
 _NULL = 1e-13  # eigenvalue of the scaled information below which a direction is undetermined
+_NOTHING = 1e-100  # information on a parameter, as its root, that is none
 _BARELY = 1.001  # of the rounding, below which a scale is that
 _PART = 1e-4  # of a parameter in such a direction that matters
 
@@ -222,7 +223,7 @@ def inverse(information: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     finite = np.asarray(np.isfinite(information).all(axis=(-2, -1)))[..., None, None]
     information = np.where(finite, information, 0.0)
     size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
-    size = np.where(size > 0.0, size, 1.0)
+    size = np.where(size > _NOTHING, size, 1.0)
     sizes = size[..., :, None] * size[..., None, :]
     values, vectors = np.linalg.eigh(information / sizes)
     null = values <= _NULL * np.maximum(1.0, values[..., -1:])
@@ -256,6 +257,6 @@ def _blanked(covariance: FloatArray, undetermined: NDArray[np.bool_]) -> FloatAr
 
 def propagated(covariance: FloatArray, slopes: FloatArray) -> FloatArray:
     """Return D covariance D with D = diag(slopes); what is undetermined stays infinite."""
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         product = slopes[..., :, None] * covariance * slopes[..., None, :]
     return np.where(np.isnan(product), np.inf, product)

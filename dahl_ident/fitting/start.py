@@ -87,6 +87,11 @@ def best_starts(problem: Problem) -> FloatArray:
     return np.where(best == nodes - 1, theta[:, 2], vertex)
 
 
+def grid_size(problem: Problem) -> int:
+    """Return the number of nodes of the grid where starts are searched."""
+    return len(_grid(problem).nodes)
+
+
 def edge_starts(problem: Problem) -> list[FloatArray]:
     """Return the best nodes at both ends of each Dahl element's grid, each (P,) or (S, P).
 

@@ -62,6 +62,13 @@ class _Rows:
         return self._pair
 
     def _evaluate(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        r, J = self._bent(theta)
+        if not np.isfinite(J).all():
+            r = np.full(r.shape, np.nan)  # a step that scipy takes back
+        return r, J
+
+    def _bent(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return residuals and Jacobian of which half the sum of squares is the cost."""
         r, J = self._problem.residuals_and_jacobian(theta, self._scale, tails=self._loss is None)
         if self._loss is None:
             return r, J

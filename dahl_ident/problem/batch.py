@@ -11,10 +11,9 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Element
-from dahl_ident.elements.model import as_model
 from dahl_ident.errors import DataError
-from dahl_ident.problem.problem import Problem
-from dahl_ident.sensors import EXACT, Sensors
+from dahl_ident.problem.problem import Problem, checked_table
+from dahl_ident.sensors import Sensors
 
 
 class ProblemBatch(Problem):
@@ -59,10 +58,11 @@ class ProblemBatch(Problem):
         free: Iterable[str] = (),
         fixed: Mapping[str, float] | None = None,
     ) -> None:
-        if not data:
-            raise DataError("there is no table to estimate from; give at least one")
-        self._set_model(as_model(model), sensors or EXACT, tuple(free), dict(fixed or {}))
-        self._set_rows(Rows.stack(data), noise)
+        if isinstance(data, FrequencyResponse) or not len(data):
+            found = "one table" if isinstance(data, FrequencyResponse) else "no table"
+            raise DataError(f"data is {found}; expected a sequence of at least one")
+        self._set_model(model, sensors, free, fixed)
+        self._set_rows(Rows.stack([checked_table(table) for table in data]), noise)
 
     @classmethod
     def replicates(cls, problem: Problem, responses: ComplexArray) -> ProblemBatch:

@@ -5,7 +5,7 @@ The logarithm of positive parameters, the number itself for the others.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -91,9 +91,20 @@ def interchangeable_elements(model: Model, names: tuple[str, ...]) -> list[NDArr
 
 
 def with_changes(
-    model: Model, sensors: Sensors, free: tuple[str, ...], fixed: dict[str, float]
+    model: Model, sensors: Sensors, free: Iterable[str], fixed: Mapping[str, float]
 ) -> tuple[Model, Sensors]:
     """Free and fix parameters by name, wherever they live."""
+    if not isinstance(sensors, Sensors):
+        raise ValidationError(f"sensors is {sensors!r}; expected Sensors(...)")
+    if isinstance(free, str):
+        raise ValidationError(f"free is {free!r}; expected a collection of names: [{free!r}]")
+    if not isinstance(fixed, Mapping):
+        raise ValidationError(
+            f"fixed is {fixed!r}; expected a mapping of names to numbers, such as {{'f_max': 0.1}}"
+        )
+    free = tuple(free)
+    if not free and not fixed:
+        return model, sensors
     both = set(free) & set(fixed)
     if both:
         raise ModelError(f"{', '.join(sorted(both))} is both in free= and in fixed=; choose one")

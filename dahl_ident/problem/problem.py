@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import Rows
-from dahl_ident.elements import Element, Model, Parameter
+from dahl_ident.elements import Element, Parameter
 from dahl_ident.elements.model import as_model
-from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.errors import DataError, ModelError, ValidationError
 from dahl_ident.noise import Measured, Rho, Student, bend, correct_amplitude, noise_for
 from dahl_ident.problem.coordinates import (
     Coordinates,
@@ -108,15 +108,18 @@ class Problem:
         free: Iterable[str] = (),
         fixed: Mapping[str, float] | None = None,
     ) -> None:
-        self.data = data
-        self._set_model(as_model(model), sensors or EXACT, tuple(free), dict(fixed or {}))
+        self.data = checked_table(data)
+        self._set_model(model, sensors, free, fixed)
         self._set_rows(Rows.of(data), noise)
 
     def _set_model(
-        self, model: Model, sensors: Sensors, free: tuple[str, ...], fixed: dict[str, float]
+        self,
+        model: Element,
+        sensors: Sensors | None,
+        free: Iterable[str],
+        fixed: Mapping[str, float] | None,
     ) -> None:
-        if free or fixed:
-            model, sensors = with_changes(model, sensors, free, fixed)
+        model, sensors = with_changes(as_model(model), sensors or EXACT, free, fixed or {})
         self.model, self.sensors = model, sensors
         parameters = [p for p in (*model.parameters, *sensors.parameters) if p.free]
         if not parameters:
@@ -504,6 +507,16 @@ class Problem:
     def _shape(self, theta: FloatArray) -> tuple[int, ...]:
         """Return the shape of the rows' numbers for `theta`."""
         return (*theta.shape[:-1], self._rows.n)
+
+
+def checked_table(data: object) -> FrequencyResponse:
+    """Return `data` if it is a table, or say what it is instead."""
+    if isinstance(data, FrequencyResponse):
+        return data
+    raise DataError(
+        f"data is a {type(data).__name__}; expected a FrequencyResponse, as "
+        "read_frequency_response gives it, or extract from a Record"
+    )
 
 
 def _normal(name: str, prior: Prior) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
 from dahl_ident.elements import Element
 
 
@@ -36,6 +36,11 @@ class StiffnessData:
     harmonic: NDArray[np.int64]
     orders: tuple[int, ...]
     weights: FloatArray
+
+    @property
+    def typical_stiffness(self) -> FloatArray:
+        """Median of |Z|, shape () or (S,); above zero also where most responses are zero."""
+        return np.asarray(np.maximum(np.median(np.abs(self.stiffness), axis=-1), SMALLEST))
 
     def of(self, element: Element, values: Sequence[FloatArray]) -> ComplexArray:
         """Return an element's Z_k at every row."""
