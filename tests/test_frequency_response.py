@@ -529,7 +529,12 @@ class TestTelling:
         top, bottom = levels.plot()
         assert bottom.get_xlabel() == "frequency [Hz]"
         assert len(top.get_lines()) == 2
-        sweep = full_table(frequency_hz=np.ones(7), level=None, harmonic=[1, 1, 1, 1, 1, 3, 3])
+        sweep = full_table(
+            frequency_hz=np.ones(7),
+            level=None,
+            harmonic=[1, 1, 1, 1, 1, 3, 3],
+            controlled="displacement",
+        )
         axes = plt.figure().subplots(2)
         top, bottom = sweep.plot(ax=axes)
         assert top is axes[0]

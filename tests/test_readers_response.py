@@ -266,7 +266,7 @@ class TestRefusal:
                 {"frequency_hz": [1.0, 0.0, 2.0]},
                 r"row 2, column 'frequency_hz': found 0.0 .*a f",
             ),
-            ({"amplitude [mm]": [1.0, -2.0, 3.0]}, "row 2, column 'amplitude'.*an amplitude > 0"),
+            ({"amplitude [mm]": [1.0, -2.0, 3.0]}, "row 2, column 'amplitude'.*a value > 0"),
             ({"drive [N]": [1.0, 2.0, 0.0]}, "row 3, column 'drive': found 0.0"),
             ({"real [N/m]": [1.0, np.nan, 1.0]}, "row 2, column 'real': the cell is empty or NaN"),
             ({"real [N/m]": [1.0, "x", 1.0]}, "row 2, column 'real': 'x' is not a number"),
@@ -284,6 +284,13 @@ class TestRefusal:
     def test_negative_gain(self) -> None:
         with pytest.raises(DataError, match=r"row 3, column 'gain': found -1.0 .* a gain >= 0"):
             read({**BASE, "gain [N/m]": [1.0, 1.0, -1.0], "phase_deg": 10.0})
+
+    @pytest.mark.parametrize(("role", "value"), [("amplitude", "5 um"), ("drive", "0.2 N")])
+    def test_a_column_and_a_value_for_the_file(self, role: str, value: str) -> None:
+        table = {**RECTANGULAR, "drive [N]": [1.0, 2.0, 3.0]}
+        message = f"{role}='{value}' is given, and column '{role}' holds the {role} too"
+        with pytest.raises(DataError, match=message):
+            read(table, **{role: value})
 
     def test_no_response(self) -> None:
         with pytest.raises(DataError, match="no response; expected real and imag, gain"):

@@ -10,7 +10,7 @@ dissipating element has a positive imaginary part of its dynamic stiffness.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,10 +38,10 @@ from dahl_ident.data.fields import (
     one_of,
     plain_values,
     spread,
-    thawed,
 )
 from dahl_ident.data.quantities import converted, jacobian
-from dahl_ident.data.summary import as_html, as_text, distinct, listed, response_lines
+from dahl_ident.data.summary import Lines, distinct, listed, response_lines
+from dahl_ident.data.tabular import Tabular
 from dahl_ident.errors import ValidationError
 from dahl_ident.units import MOTIONS, QUANTITIES, Motion, Quantity, si_unit
 
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
-class FrequencyResponse:
+class FrequencyResponse(Tabular):
     """Complex response, its amplitude and frequency, and what is known of their errors.
 
     Parameters
@@ -201,19 +201,8 @@ class FrequencyResponse:
     def __len__(self) -> int:
         return self.frequency_hz.size
 
-    def __repr__(self) -> str:
-        return as_text(*response_lines(self))
-
-    def _repr_html_(self) -> str:
-        return as_html(*response_lines(self))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuild, (thawed((f.name, getattr(self, f.name)) for f in fields(self)),)
-
-    @property
-    def n(self) -> int:
-        """Number of points."""
-        return len(self)
+    def _summary(self) -> tuple[str, Lines]:
+        return response_lines(self)
 
     @property
     def omega(self) -> FloatArray:
@@ -460,39 +449,6 @@ class FrequencyResponse:
         origin = (data.provenance or {}).get("origin")
         return data if origin is None else replace(data, provenance=origin)
 
-    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the table to a file that :func:`~dahl_ident.read_frequency_response` reads.
-
-        Parameters
-        ----------
-        path : path
-            Ending in ``.csv``, ``.csv.gz``, ``.tsv``, ``.parquet``, ``.h5`` or ``.hdf5``.
-        overwrite : bool, default False
-            Replace a file that is there already.
-
-        Returns
-        -------
-        Path
-            The file, complete; an interrupted run leaves none.
-
-        Raises
-        ------
-        ValidationError
-            If the ending is another one.
-        DataError
-            If a file is there already, or the place cannot be written to.
-
-        Examples
-        --------
-        >>> from tempfile import mkdtemp
-        >>> data = FrequencyResponse([1.0], [4.0 + 3.0j], amplitude=[1e-3])
-        >>> data.save(Path(mkdtemp()) / "levels.csv").name
-        'levels.csv'
-        """
-        from dahl_ident.data.storage import save_frame
-
-        return save_frame(self.to_frame(), path, overwrite=overwrite)
-
     def to_control(self) -> dict[Any, Any]:
         """Return one python-control frequency response for each level.
 
@@ -542,7 +498,3 @@ class FrequencyResponse:
         from dahl_ident.data.picture import draw_response
 
         return draw_response(self, ax)
-
-
-def _rebuild(arguments: dict[str, Any]) -> FrequencyResponse:
-    return FrequencyResponse(**arguments)

@@ -8,17 +8,17 @@ displacement, velocity or acceleration. SI units throughout.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray, finite_array, positive_number
-from dahl_ident.data.fields import column, frozen_copy, frozen_mapping, one_of, thawed
+from dahl_ident.data.fields import column, frozen_copy, frozen_mapping, one_of
 from dahl_ident.data.sampling import gaps, is_even, sample_rate
-from dahl_ident.data.summary import as_html, as_text, record_lines
+from dahl_ident.data.summary import Lines, record_lines
+from dahl_ident.data.tabular import Tabular
 from dahl_ident.errors import ValidationError
 from dahl_ident.units import MOTION_KINDS, MOTIONS, Motion
 
@@ -29,7 +29,7 @@ DriveUnit = Literal["N", "N m", "V", "A"]
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
-class Record:
+class Record(Tabular):
     """Time, one channel of motion, and force or drive.
 
     Parameters
@@ -137,14 +137,6 @@ class Record:
     def __len__(self) -> int:
         return self.time.size
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuild, (thawed((f.name, getattr(self, f.name)) for f in fields(self)),)
-
-    @property
-    def n(self) -> int:
-        """Number of samples."""
-        return len(self)
-
     @property
     def motion_channel(self) -> Literal["displacement", "velocity", "acceleration"]:
         """Which kind of motion was recorded."""
@@ -196,11 +188,8 @@ class Record:
         """Start and end of every gap, (m, 2), s: steps above 1.5 times the median step."""
         return gaps(self.time)
 
-    def __repr__(self) -> str:
-        return as_text(*record_lines(self))
-
-    def _repr_html_(self) -> str:
-        return as_html(*record_lines(self))
+    def _summary(self) -> tuple[str, Lines]:
+        return record_lines(self)
 
     def to_frame(self) -> pd.DataFrame:
         """Return a pandas table with one row for each sample and units in the headers.
@@ -218,43 +207,6 @@ class Record:
         from dahl_ident.data.table import record_frame
 
         return record_frame(self)
-
-    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the samples to a file that :func:`~dahl_ident.read_record` reads.
-
-        Parameters
-        ----------
-        path : path
-            Ending in ``.csv``, ``.csv.gz``, ``.tsv``, ``.parquet``, ``.h5`` or ``.hdf5``.
-        overwrite : bool, default False
-            Replace a file that is there already.
-
-        Returns
-        -------
-        Path
-            The file, complete; an interrupted run leaves none.
-
-        Raises
-        ------
-        ValidationError
-            If the ending is another one.
-        DataError
-            If a file is there already, or the place cannot be written to.
-
-        Examples
-        --------
-        >>> from tempfile import mkdtemp
-        >>> record = Record([0.0, 0.1], displacement=[0.0, 1.0], force=[0.0, 2.0])
-        >>> record.save(Path(mkdtemp()) / "run.parquet").name
-        'run.parquet'
-        """
-        from dahl_ident.data.storage import save_frame
-
-        return save_frame(self.to_frame(), path, overwrite=overwrite)
-
-
-def _rebuild(arguments: dict[str, Any]) -> Record:
-    return Record(**arguments)
 
 
 def _time(value: ArrayLike) -> FloatArray:

@@ -28,6 +28,7 @@ from dahl_ident.data.suspicion import doubt_drive, doubt_phase_unit, refuse_crea
 from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import (
     DRIVE_KINDS,
+    MECHANICAL_KINDS,
     MOTION_KINDS,
     QUANTITIES,
     Quantity,
@@ -154,42 +155,43 @@ class _Table:
         return self._hertz(values)
 
     def _amplitude(self, frequency_hz: FloatArray) -> FloatArray | None:
-        channel = self.bound.channel("amplitude")
-        if channel is None:
-            return self._constant("amplitude", frequency_hz, MOTION_KINDS)
-        values = self.bound.numbers("amplitude", channel)
-        self.bound.source.require(values >= SMALLEST, channel, "an amplitude > 0")
-        unit = self.bound.unit("amplitude", channel)
-        kind, factor = self.bound.kind("amplitude", unit, MOTION_KINDS)
-        self.bound.note_peak("amplitude", unit)
-        return per_frequency(values * factor * unit.to_peak, frequency_hz, kind)
+        found = self._peaks("amplitude", MOTION_KINDS, frequency_hz.shape)
+        return None if found is None else per_frequency(found[1], frequency_hz, found[0])
 
     def _drive(self, frequency_hz: FloatArray) -> FloatArray | None:
-        channel = self.bound.channel("drive")
+        found = self._peaks("drive", DRIVE_KINDS, frequency_hz.shape)
+        return None if found is None else found[1] * self._force_per(found[0])
+
+    def _peaks(
+        self, role: str, kinds: tuple[str, ...], shape: tuple[int, ...]
+    ) -> tuple[str, FloatArray] | None:
+        """Return kind and zero-to-peak values of a column, or of the one value for the file."""
+        bound, text = self.bound, getattr(self.options, role)
+        channel = bound.channel(role)
         if channel is None:
-            return self._constant("drive", frequency_hz, DRIVE_KINDS)
-        values = self.bound.numbers("drive", channel)
-        self.bound.source.require(values >= SMALLEST, channel, "a drive amplitude > 0")
-        unit = self.bound.unit("drive", channel)
-        kind, factor = self.bound.kind("drive", unit, DRIVE_KINDS)
-        self.bound.note_peak("drive", unit)
-        return values * factor * unit.to_peak * self._force_per(kind)
+            return None if text is None else self._constant(role, text, kinds, shape)
+        if text is not None:
+            raise DataError(
+                f"{bound.source.name}: {role}={text!r} is given, and column {channel.name!r} holds "
+                f"the {role} too; leave out one of them"
+            )
+        values = bound.numbers(role, channel)
+        bound.source.require(values >= SMALLEST, channel, "a value > 0")
+        unit = bound.unit(role, channel)
+        kind, factor = bound.kind(role, unit, kinds)
+        bound.note_peak(role, unit)
+        return kind, values * factor * unit.to_peak
 
     def _constant(
-        self, role: str, frequency_hz: FloatArray, kinds: tuple[str, ...]
-    ) -> FloatArray | None:
+        self, role: str, text: str, kinds: tuple[str, ...], shape: tuple[int, ...]
+    ) -> tuple[str, FloatArray]:
         """Return one amplitude or drive that holds for the whole file."""
-        text = getattr(self.options, role)
-        if text is None:
-            return None
         value, kind, motion = parse_quantity(text, kinds, f"{self.bound.source.name}: {role}")
         if not 0.0 < value < np.inf:
             raise DataError(f"{self.bound.source.name}: {role} is {text!r}; expected a value > 0")
-        values = np.full(frequency_hz.shape, value)
-        if kind in ("voltage", "current"):
-            return values * self._force_per(kind)
-        self.bound.motions[role] = motion
-        return values if role == "drive" else per_frequency(values, frequency_hz, kind)
+        if kind in MECHANICAL_KINDS:
+            self.bound.motions[role] = motion
+        return kind, np.full(shape, value)
 
     def _force_per(self, kind: str) -> float:
         """Return the force for one SI unit of the drive."""
