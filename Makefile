@@ -8,7 +8,7 @@ BIN    := $(VENV)/bin
 JOBS   ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint types rooms unit test-lowest examples docs bench validation lock clean
+.PHONY: help install demo test lint types rooms unit test-lowest examples docs bench validation nuts lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -52,13 +52,19 @@ examples: install  ## renew the outputs printed in README and manual
 docs: install  ## the manual into docs/_build/html; any warning fails
 	$(BIN)/python -m sphinx -q -W --keep-going -b html -j $(JOBS) docs docs/_build/html
 
-bench: install  ## timings side by side with the peers
-	$(BIN)/python -m benchmarks
+bench: install  ## timings side by side with the peers, written into the manual
+	$(BIN)/python -m benchmarks --write docs/benchmarks.md
 
 # Stated errors against records and tables whose truth is known; each page says what was met.
 validation: install  ## long statistical checks, written into docs/validation
 	$(BIN)/python -m benchmarks.extraction_validation --write docs/validation/extraction.md
+	$(BIN)/python -m benchmarks.calibration
 	$(BIN)/python -m benchmarks.coverage
+
+nuts: install  ## an independent sampler on the same posterior, in an environment of its own
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python .venv-nuts
+	$(BIN)/uv pip install --quiet --python .venv-nuts/bin/python --editable ".[nuts,peers]"
+	.venv-nuts/bin/python -m benchmarks.nuts
 
 lock: install  ## renew the pinned environment from pyproject.toml
 	$(BIN)/uv pip compile --quiet --no-emit-index-url --no-emit-find-links --upgrade \
@@ -66,4 +72,4 @@ lock: install  ## renew the pinned environment from pyproject.toml
 		--custom-compile-command "make lock" pyproject.toml
 
 clean:  ## remove what the commands above made
-	rm -rf $(VENV) .venv-lowest build dist out .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-lowest .venv-nuts build dist out .pytest_cache .mypy_cache .ruff_cache
