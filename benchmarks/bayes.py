@@ -14,6 +14,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,12 @@ def table(rows: int = 30, noise: float = 0.01) -> di.FrequencyResponse:
     error = noise * (random.normal(size=rows) + 1j * random.normal(size=rows))
     exact = di.Dahl(f_max=0.1, sigma=30.0).describing_function(amplitude)
     return di.FrequencyResponse(np.ones(rows), exact * np.exp(error), amplitude)
+
+
+def beside_spring() -> di.FrequencyResponse:
+    """Return the same data with a spring of 30 N/m beside the friction."""
+    data = table()
+    return replace(data, response=data.response + 30.0)
 
 
 def ours(data: di.FrequencyResponse, folder: Path, seed: int, steps: int) -> float:
@@ -97,9 +104,10 @@ def run() -> list[Row]:
         folder.mkdir()
         short = _median(lambda seed: ours(data, folder, seed, 400), 5)
     peer = _median(lambda seed: lmfit_emcee(data, seed), 2)
+    problems = ((data, di.Dahl()), (heavy, di.Dahl()), (beside_spring(), di.Dahl() + di.Spring()))
     grids = []
-    for which in (data, heavy):
-        work = partial(di.posterior_grid, which, di.Dahl(), priors=priors)
+    for which, model in problems:
+        work = partial(di.posterior_grid, which, model, priors=priors)
         grids.append(statistics.median(seconds(work) for _ in range(9)))
     name = "lmfit.Minimizer.emcee"
     return [
@@ -107,6 +115,7 @@ def run() -> list[Row]:
         Row("one effective draw, 400 steps", short, peer, name, 25.0, faster=True),
         Row("grid of f_max, sigma, unknown scale", grids[0], 0.05, "the limit", 1.0),
         Row("the same, 3 points, 50 % noise", grids[1], 0.05, "the limit", 1.0),
+        Row("grid of f_max, sigma, stiffness, unknown scale", grids[2], 0.5, "the limit", 1.0),
     ]
 
 

@@ -5,10 +5,9 @@ laid around their conditional mode (:mod:`dahl_ident.bayes.lattice`), so that ri
 narrow and curved, are followed and not searched for. What is left is the marginal density of the
 outer parameter, integrated from wall to wall of its prior in panels: around the posterior's
 centre they are as wide as its spread, outwards they grow until the prior ends or nothing is left.
-A panel has the 9 nodes of Clenshaw and Curtis, which hold their rules of 5 and of 3 points. With
-e5 and e3 what changes when those take the place of 9, a panel's error is e5 (e5/e3)^(1/2), or e5
-if that is smaller; panels of largest error are halved until the errors add up to less than the
-tolerance.
+A panel has the 9 nodes of Clenshaw and Curtis; its error is told from the last two coefficients of
+the Chebyshev series through them, which cannot vanish by chance as a difference of two integrals
+can. Panels of largest error are halved until the errors add up to less than the tolerance.
 
 The evidence comes out once for each parameter, from points that have nothing in common. As far as
 they disagree, that is error as well. What lies apart from the ridges that start at the
@@ -38,34 +37,27 @@ _BISECTIONS = 50
 _STEP = {0: 1.0, 1: 0.5, 2: 0.75}  # of the lattice, by its axes
 _FINER, _REFINEMENTS = 0.6, 5  # by which an axis is refined until its error is small enough
 _LATTICE_SHARE = 0.3  # of the tolerance
-_LEAST = 0.1  # of e5: no panel is taken to be better than that
+_PART = 0.125  # of the last two Chebyshev coefficients that the integral of what follows is
 
 
 class Rule(NamedTuple):
-    """Nodes on [-1, 1], weights, those of 5 and of 3 of the nodes, and nodes to integrals."""
+    """Nodes on [-1, 1], weights, and matrices from values at the nodes to Chebyshev series."""
 
     nodes: FloatArray
     weights: FloatArray
-    coarse: FloatArray
-    """Of 5 and of 3 points, (2, POINTS)."""
+    series: FloatArray
+    """Of the function, (POINTS, POINTS)."""
     primitive: FloatArray
-    """Values at the nodes -> Chebyshev coefficients of the integral from -1."""
+    """Of its integral from -1, (POINTS + 1, POINTS)."""
 
 
 @lru_cache(maxsize=1)
 def rule() -> Rule:
-    """Return Clenshaw and Curtis's rule of 9 points with those inside it."""
+    """Return Clenshaw and Curtis's rule of 9 points."""
     nodes = -np.cos(np.pi * np.arange(POINTS) / (POINTS - 1))
-    primitive = _primitive(nodes)
-    coarse = np.zeros((2, POINTS))
-    for row, stride in zip(coarse, (2, 4), strict=True):
-        row[::stride] = _primitive(nodes[::stride]).sum(axis=0)
-    return Rule(nodes, primitive.sum(axis=0), coarse, primitive)
-
-
-def _primitive(nodes: FloatArray) -> FloatArray:
-    coefficients = np.linalg.inv(chebyshev.chebvander(nodes, len(nodes) - 1))
-    return np.asarray(chebyshev.chebint(coefficients, lbnd=-1))
+    series = np.linalg.inv(chebyshev.chebvander(nodes, POINTS - 1)).astype(np.float64)
+    primitive = chebyshev.chebint(series, lbnd=-1)
+    return Rule(nodes, primitive.sum(axis=0), series, primitive)
 
 
 @dataclass(frozen=True)
@@ -315,12 +307,12 @@ def _errors(panels: Panels) -> _Errors:
     value = np.exp(panels.log_value - panels.log_value.max())
     fine = value @ rule().weights * panels.half
     total = fine.sum()
-    e5, e3 = (np.abs(fine - value @ coarse * panels.half) for coarse in rule().coarse)
+    series = np.abs(value @ rule().series.T)
+    outer = _PART * series[:, -2:].sum(axis=1) * panels.half
     with np.errstate(divide="ignore", invalid="ignore"):
-        gain = np.nan_to_num(np.clip(np.sqrt(e5 / e3), _LEAST, 1.0), nan=1.0)
         second, fourth = (value * panels.errors) @ rule().weights @ panels.half / total
         inner = second * np.nan_to_num(np.minimum(1.0, second / fourth))
-    return _Errors(e5 * gain / total, inner)
+    return _Errors(outer / total, inner)
 
 
 def _largest(errors: FloatArray, rest: float) -> NDArray[np.bool_]:
