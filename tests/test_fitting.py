@@ -300,6 +300,20 @@ def test_an_outlier_among_exact_data_is_no_rounding() -> None:
     assert [point.row for point in robust.goodness.suspicious] == [4]
 
 
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("noise", ["relative", "absolute"])
+@pytest.mark.parametrize("factor", [1e-9, 1e-3, 0.1, 10.0, 1e3])
+def test_one_wrong_row_does_not_even_rule_the_start(loss: str, noise: str, factor: float) -> None:
+    rng = np.random.default_rng(0)
+    error = 0.02 * (rng.normal(size=n) + 1j * rng.normal(size=n))
+    N = Dahl(0.1, 30.0).describing_function(A) * np.exp(error)
+    for row in (0, 7, n - 1):
+        R = N.copy()
+        R[row] *= factor
+        found = fit(FrequencyResponse(np.ones(n), R, A), Dahl(), noise=noise, loss=loss)
+        np.testing.assert_allclose(found.optimum.values, [0.1, 30.0], rtol=0.06)
+
+
 ODD_RESPONSES: dict[str, ComplexArray] = {
     "negative loss": Dahl(0.1, 30.0).describing_function(A).conj(),
     "negative": -Dahl(0.1, 30.0).describing_function(A),

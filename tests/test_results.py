@@ -127,7 +127,11 @@ class TestFit:
         ("options", "message"),
         [
             ({"method": "newton"}, "method is 'newton'; expected scipy or ipopt"),
-            ({"constraints": list}, "constraints and drive_std need method='ipopt'"),
+            ({"constraints": list}, "constraints given; only method='ipopt' takes that"),
+            (
+                {"drive_std": 0.1, "drive_covariance": 0.0},
+                "drive_std and drive_covariance given; only method='ipopt' takes that",
+            ),
             ({"loss": "cubic"}, "loss is 'cubic'"),
             ({"noise": "white"}, "noise is 'white'"),
         ],

@@ -31,7 +31,7 @@ from dahl_ident.fitting.levenberg_marquardt import (
 from dahl_ident.fitting.limits import Chart, Limit, Reach, limits, stiffness_valleys, valleys
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.optimum import Optimum, scale_ratio
-from dahl_ident.fitting.start import edge_starts, starts
+from dahl_ident.fitting.start import edge_starts, resistant_starts, starts
 from dahl_ident.fitting.trust_region import minimise_within
 from dahl_ident.problem import Problem, Quadratic
 
@@ -120,8 +120,8 @@ class _Search:
         """Search, with the noise's scale adapted where the optimum depends on it."""
         begin, scale = self._starts(start), 1.0
         if self.rescales:
-            y, _ = self.problem.whitened(begin[0], derivatives=False)
-            size = float(np.median(np.abs(y))) / np.sqrt(np.log(4.0))
+            y, _ = self.problem.whitened(begin, derivatives=False)
+            size = float(np.median(np.abs(y), axis=-1).min()) / np.sqrt(np.log(4.0))
             scale = max(size, float(self.problem.rounding))
         end = self._search(begin, scale)
         step, last = 0.0, 0.0
@@ -138,7 +138,8 @@ class _Search:
         return optimum(self.problem, end, scale, self.loss, self.evaluations)
 
     def _starts(self, start: Mapping[str, float] | None) -> FloatArray:
-        begin, names = starts(self.problem), self.problem.names
+        begin = starts(self.problem) if self.loss is None else resistant_starts(self.problem)
+        names = self.problem.names
         if start is not None:
             if not isinstance(start, Mapping):
                 raise ValidationError(f"start is {start!r}; expected a mapping of names to numbers")

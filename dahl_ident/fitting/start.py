@@ -19,13 +19,13 @@ h is read from a table over ln beta whose steps divide those of the grid.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
 from dahl_ident.elements import Dahl, Damper, Mass, Parameter, Spring
 from dahl_ident.errors import FitError
 from dahl_ident.problem import Problem
@@ -51,7 +51,23 @@ def starts(problem: Problem) -> FloatArray:
 
     Values that the user gave to free parameters make one more start, the last.
     """
-    grid = _grid(problem)
+    return _starts(problem, problem.stiffness_data)
+
+
+def resistant_starts(problem: Problem) -> FloatArray:
+    """Return starts of which an outlier rules some, but not all: by other weights as well.
+
+    A response far too large has no say where errors count relative to it, one far too small has
+    none where all count alike.
+    """
+    view = problem.stiffness_data
+    size = np.maximum(np.abs(view.stiffness), SMALLEST)
+    views = (view, replace(view, weights=1.0 / size), replace(view, weights=np.ones(size.shape)))
+    return np.vstack([_starts(problem, each) for each in views])
+
+
+def _starts(problem: Problem, view: StiffnessData) -> FloatArray:
+    grid = _grid(problem, view)
     cost, coefficients = grid.solved()
     places = _local_minima(cost.reshape(grid.shape))[:_MOST_STARTS]
     first = places[0]
@@ -74,7 +90,7 @@ def starts(problem: Problem) -> FloatArray:
 
 def best_starts(problem: Problem) -> FloatArray:
     """Return the best start of each table of a batch, shape (S, P)."""
-    grid = _grid(problem)
+    grid = _grid(problem, problem.stiffness_data)
     cost, coefficients = grid.solved()
     best = cost.argmin(axis=-1)[:, None]
     nodes = cost.shape[-1]
@@ -89,7 +105,7 @@ def best_starts(problem: Problem) -> FloatArray:
 
 def grid_size(problem: Problem) -> int:
     """Return the number of nodes of the grid where starts are searched."""
-    return len(_grid(problem).nodes)
+    return len(_grid(problem, problem.stiffness_data).nodes)
 
 
 def edge_starts(problem: Problem) -> list[FloatArray]:
@@ -97,7 +113,7 @@ def edge_starts(problem: Problem) -> list[FloatArray]:
 
     They are where searches for limits start.
     """
-    grid = _grid(problem)
+    grid = _grid(problem, problem.stiffness_data)
     cost, coefficients = grid.solved()
     found = []
     for index, count in enumerate(grid.shape):
@@ -203,8 +219,7 @@ class _Grid:
         return theta
 
 
-def _grid(problem: Problem) -> _Grid:
-    view = problem.stiffness_data
+def _grid(problem: Problem, view: StiffnessData) -> _Grid:
     searched = [e for e in problem.model.elements if isinstance(e, Dahl) and _is_free(e.parameters)]
     each = _MOST_COMBINATIONS ** (1.0 / max(1, len(searched)))
     friction = [_nodes(element, view, each) for element in searched]

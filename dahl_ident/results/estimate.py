@@ -98,7 +98,10 @@ def fit(
     (0.1, True)
     """
     problem = Problem(data, model, noise=noise, sensors=sensors, free=free, fixed=fixed)
-    tied = constraints is not None or drive_std is not None
+    own = {
+        "constraints": constraints, "drive_std": drive_std, "drive_covariance": drive_covariance
+    }  # fmt: skip
+    beyond = [name for name, value in own.items() if value is not None]
     if method == "ipopt":
         from dahl_ident.fitting.ipopt import solve_ipopt
 
@@ -112,11 +115,11 @@ def fit(
         )
     elif method != "scipy":
         raise ValidationError(f"method is {method!r}; expected scipy or ipopt")
-    elif tied:
-        raise ValidationError("constraints and drive_std need method='ipopt'")
+    elif beyond:
+        raise ValidationError(f"{' and '.join(beyond)} given; only method='ipopt' takes that")
     else:
         optimum = solve(problem, loss=loss, start=start)
-    result = FitResult(optimum, first_order=tied)
+    result = FitResult(optimum, first_order=bool(beyond))
     if throw and not result.success:
         raise FitError(result.message, result)
     return result
