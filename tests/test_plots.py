@@ -149,7 +149,7 @@ def test_trace() -> Figure:
 def test_cycles() -> Figure:
     decay = 0.5 ** np.arange(8)
     axes = plots.plot_cycles(
-        30.0 + 5j + decay * (1 - 2j), 1e-3 * decay, response_std=0.05, mean_std=1e-5
+        30.0 + 5j + decay * (1 - 2j), 1e-3 * decay, left_out=2, response_std=0.05, mean_std=1e-5
     )
     return the_figure(axes)
 

@@ -73,5 +73,5 @@ def plot_frequency_response(
     style.readable_log_ticks(top)
     style.readable_log_ticks(bottom)
     if any(label for label, _, _ in levels):
-        style.legend_above(top, columns=4)
+        style.legend_above(top)
     return top, bottom

@@ -58,7 +58,7 @@ def plot_amplitude_response(
     bottom.set(xscale="log", xlabel=amplitude_label, ylabel="phase [degrees]")
     style.readable_log_ticks(top)
     style.readable_log_ticks(bottom)
-    style.legend_above(top, columns=2)
+    style.legend_above(top)
     return top, bottom
 
 
@@ -104,7 +104,7 @@ def plot_universal_curve(
         )  # fmt: skip
     axis.set(xlabel="Re N / sigma", ylabel="Im N / sigma")
     axis.margins(y=0.12)
-    style.legend_above(axis, columns=2)
+    style.legend_above(axis)
     return axis
 
 
@@ -153,5 +153,5 @@ def plot_loops(
     for (displacement, force, label), colour in zip(loops, colours, strict=False):
         axis.plot(displacement, force, color=colour, label=label)
     axis.set(xlabel=displacement_label, ylabel=force_label)
-    style.legend_above(axis, columns=3)
+    style.legend_above(axis)
     return axis

@@ -79,7 +79,7 @@ def plot_residuals(
         axis.set_xscale("log")
         style.readable_log_ticks(axis)
     axis.set(xlabel=x_label, ylabel="residual [standard deviations]")
-    style.legend_above(axis, columns=2)
+    style.legend_above(axis)
     return axis
 
 
@@ -146,7 +146,7 @@ def plot_profile(
         axis.set_xscale("log")
         style.readable_log_ticks(axis)
     else:
-        axis.locator_params(axis="x", nbins=5)
+        axis.locator_params(axis="x", nbins=3)
         axis.ticklabel_format(axis="x", useOffset=False)
     return axis
 

@@ -142,5 +142,5 @@ def _styled(
 
 def _with_legend(axis: Axes, levels: Sequence[tuple[str, ArrayLike]]) -> Axes:
     if any(name for name, _ in levels):
-        style.legend_above(axis, columns=4)
+        style.legend_above(axis)
     return axis

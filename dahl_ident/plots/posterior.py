@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import FloatArray
@@ -55,7 +56,7 @@ def plot_corner(
     p = values.shape[1]
     logs = _logarithmic(values, log)
     if ax is None:
-        side = 1.2 + 1.5 * p
+        side = 1.6 + 0.9 * p
         grid = style.new_axes(p, p, size=(side, side), sharex=False)
     else:
         grid = np.asarray(ax, dtype=object)
@@ -80,6 +81,7 @@ def plot_corner(
                 axis.set_yscale("log" if logs[i] else "linear")
             axis.set_xscale("log" if logs[j] else "linear")
             axis.grid(visible=False)
+            _few_ticks(axis)
             _mark(axis, names, i, j, truth or {})
             axis.tick_params(labelbottom=i == p - 1, labelleft=j == 0 and i > 0, which="both")
             axis.tick_params(axis="x", labelrotation=30, which="both")
@@ -154,6 +156,13 @@ def _edges(values: Any, log: bool) -> Any:
     if not high > low:
         low, high = low - 0.5 * abs(low) - 1e-300, high + 0.5 * abs(high) + 1e-300
     return np.geomspace(low, high, 31) if log else np.linspace(low, high, 31)
+
+
+def _few_ticks(axis: Axes) -> None:
+    """Leave room between the numbers of small panels."""
+    for scale, line in ((axis.get_xscale(), axis.xaxis), (axis.get_yscale(), axis.yaxis)):
+        if scale == "linear":
+            line.set_major_locator(MaxNLocator(2))
 
 
 def _mark(axis: Axes, names: Sequence[str], i: int, j: int, truth: Mapping[str, float]) -> None:

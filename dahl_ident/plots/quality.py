@@ -15,6 +15,7 @@ def plot_cycles(
     response: ArrayLike,
     force_mean: ArrayLike,
     *,
+    left_out: int = 0,
     response_std: float | None = None,
     mean_std: float | None = None,
     ax: Sequence[Axes] | None = None,
@@ -27,15 +28,17 @@ def plot_cycles(
         Dynamic stiffness of each cycle, N/m.
     force_mean : array_like, shape (n,)
         Mean force of each cycle, N: its decay is where unsettled friction shows first.
+    left_out : int, default 0
+        Leading cycles that do not count, shaded.
     response_std, mean_std : float, optional
-        Standard deviation of one cycle's value, drawn as a band around the last cycle's.
+        Standard deviation of one cycle's value, drawn as a band around the median.
     ax : sequence of two Axes, optional
         New where left out.
 
     Returns
     -------
     tuple of Axes
-        Change of the response above, mean force below.
+        Response above, in percent of its median and relative to it; mean force below.
 
     Examples
     --------
@@ -46,17 +49,20 @@ def plot_cycles(
     top, bottom = style.axes_pair(ax)
     R, mean = np.asarray(response), np.asarray(force_mean)
     cycle = np.arange(1, R.size + 1)
-    change = 100.0 * (R - R[-1]) / np.abs(R[-1])
-    top.plot(cycle, change.real, "o-", color=style.BLUE, lw=0.8, label="real part")
-    top.plot(cycle, change.imag, "s-", color=style.VERMILION, lw=0.8, label="imaginary part")
+    middle = np.median(R[left_out:].real) + 1j * np.median(R[left_out:].imag)
+    away = 100.0 * (R - middle) / np.abs(middle)
+    top.plot(cycle, away.real, "o-", color=style.BLUE, lw=0.8, label="real part")
+    top.plot(cycle, away.imag, "s-", color=style.VERMILION, lw=0.8, label="imaginary part")
     bottom.plot(cycle, mean, "o-", color=style.GREEN, lw=0.8)
     if response_std is not None:
-        half = 200.0 * response_std / np.abs(R[-1])
+        half = 200.0 * response_std / np.abs(middle)
         top.axhspan(-half, half, color=style.GREY, alpha=0.15, lw=0)
     if mean_std is not None:
-        half = 2.0 * mean_std
-        bottom.axhspan(mean[-1] - half, mean[-1] + half, color=style.GREY, alpha=0.15, lw=0)
-    top.set(ylabel="change to last cycle [%]")
+        centre, half = np.median(mean[left_out:]), 2.0 * mean_std
+        bottom.axhspan(centre - half, centre + half, color=style.GREY, alpha=0.15, lw=0)
+    for axis in (top, bottom) if left_out else ():
+        axis.axvspan(0.5, left_out + 0.5, color=style.GREY, alpha=0.3, lw=0)
+    top.set(ylabel="response, off its median [%]")
     bottom.set(xlabel="cycle", ylabel="mean force [N]")
-    top.legend()
+    style.legend_above(top)
     return top, bottom

@@ -25,6 +25,7 @@ SERIES = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 MARKERS = ("o", "s", "^", "D", "v", "P")
 FIT = BLACK
 GREY = "#767676"
+_MOST_IN_A_ROW = 4  # of legends
 
 RC: dict[Any, Any] = {
     "axes.grid": True,
@@ -86,8 +87,10 @@ def labelled_levels(count: int, most: int = 8) -> set[int]:
     return set(np.linspace(0, count - 1, most).round().astype(int).tolist())
 
 
-def legend_above(axis: Axes, *, columns: int) -> None:
+def legend_above(axis: Axes) -> None:
     """Put the legend above the axes, where it hides no data."""
+    entries = len(axis.get_legend_handles_labels()[1])
+    columns = entries if entries <= _MOST_IN_A_ROW else -(-entries // 2)
     axis.legend(
         ncols=columns, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2,
         columnspacing=1.0, handletextpad=0.5,

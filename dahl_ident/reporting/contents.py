@@ -8,6 +8,7 @@ from typing import Any
 
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.diagnostics.comparison import compare_models
+from dahl_ident.diagnostics.formatting import listed
 from dahl_ident.reporting import posteriors, provenance, tables
 from dahl_ident.reporting.document import (
     Block,
@@ -114,7 +115,10 @@ def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
         fit.conf_interval(method)
     intervals = fit.intervals_run(tables.LEVEL)
     yield tables.parameters(fit, intervals, drawn)
-    notes = [f"{found.method} intervals: {found.note}" for found in intervals]
+    by_note: dict[str, list[str]] = {}
+    for found in intervals:
+        by_note.setdefault(found.note, []).append(tables.method_name(found))
+    notes = [f"Intervals by {listed(names)}: {note}" for note, names in by_note.items()]
     yield Bullets((*notes, *(f"Derived: {quantity}" for quantity in fit.derived())))
 
 

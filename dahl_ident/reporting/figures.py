@@ -15,6 +15,7 @@ from dahl_ident.diagnostics.levels import LEVELS, percent, thresholds
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.elements import Dahl
 from dahl_ident.elements.linear_dahl import describing_function
+from dahl_ident.plots.style import new_axes
 from dahl_ident.reporting.document import Picture, figure_of
 from dahl_ident.reporting.loops import loops
 from dahl_ident.units import engineering, si_unit
@@ -33,16 +34,16 @@ _STRAIGHT = 1.5  # log of a profile's range beyond which its axis is logarithmic
 def pictures_of_fit(fit: FitResult) -> Iterator[Picture]:
     """Yield what a fit has to show."""
     yield _response(fit)
-    yield _residuals(fit)
     if fit.success and _is_plant_over_amplitude(fit):
         yield _over_levels(fit)
+    yield _residuals(fit)
     friction = [e for e in fit.model.elements if isinstance(e, Dahl)]
     if _is_linear_dahl_alone(fit) and fit.success:
         yield _universal(fit, friction[0])
     if len(friction) == 1 and _all_finite(fit):
         yield loops(fit, friction[0])
     if fit.success:
-        yield from (_profile(fit, i) for i in range(fit.nvarys))
+        yield _profiles(fit)
     if fit.nvarys > 1 and np.isfinite(fit.covar).all():
         yield _correlation(fit)
     yield _information(fit)
@@ -145,33 +146,43 @@ def _universal(fit: FitResult, friction: Dahl) -> Picture:
     )
 
 
-def _profile(fit: FitResult, index: int) -> Picture:
-    name = fit.var_names[index]
-    estimate = fit.params[name]
-    parameter = fit.problem.parameters[index]
+def _profiles(fit: FitResult) -> Picture:
+    """Return the profile of every free parameter, two panels a row."""
+    best = (f"{name} is {fit.params[name].value:.4g}" for name in fit.var_names)
 
     def draw() -> Figure:
-        profiler = Profiler(fit.optimum)
-        q = thresholds(fit.optimum, np.array(LEVELS))
-        coordinate = _profile_range(fit, index, profiler, q)
-        values = np.exp(coordinate) if parameter.transform == "log" else coordinate
-        return figure_of(
-            plots.plot_profile(
-                values,
-                profiler.curve(index, coordinate),
-                best=estimate.value,
-                limits={percent(c): float(t**2) for c, t in zip(LEVELS, q, strict=True)},
-                label=_with_unit(name, estimate.unit),
-                log=bool(np.ptp(coordinate) > _STRAIGHT and parameter.transform == "log"),
-            )
-        )
+        rows = -(-fit.nvarys // 2)
+        grid = new_axes(rows, 2, size=(4.8, 1.9 * rows), sharex=False)
+        for index, axis in enumerate(grid.flat):
+            if index < fit.nvarys:
+                _draw_profile(fit, index, axis)
+            else:
+                axis.set_axis_off()
+        return figure_of(grid)
 
     return Picture(
-        f"profile_{name}",
-        f"Profile likelihood of {name}: where the curve meets a dashed line is the limit at that "
-        "confidence.",
-        f"The best {name} is {estimate.value:.4g} {estimate.unit}.",
+        "profiles",
+        "Profile likelihood of each parameter: where the curve meets a dashed line is the limit at "
+        "that confidence.",
+        f"At the lowest points {', '.join(best)}.",
         draw,
+    )
+
+
+def _draw_profile(fit: FitResult, index: int, axis: plots.Axes) -> None:
+    name, parameter = fit.var_names[index], fit.problem.parameters[index]
+    profiler = Profiler(fit.optimum)
+    q = thresholds(fit.optimum, np.array(LEVELS))
+    coordinate = _profile_range(fit, index, profiler, q)
+    logarithmic = parameter.transform == "log"
+    plots.plot_profile(
+        np.exp(coordinate) if logarithmic else coordinate,
+        profiler.curve(index, coordinate),
+        best=fit.params[name].value,
+        limits={percent(c): float(t**2) for c, t in zip(LEVELS, q, strict=True)},
+        label=_with_unit(name, parameter.unit),
+        log=bool(logarithmic and np.ptp(coordinate) > _STRAIGHT),
+        ax=axis,
     )
 
 

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 _FONT = "DejaVu"
 _FACES = {"": "DejaVuSans.ttf", "B": "DejaVuSans-Bold.ttf", "I": "DejaVuSans-Oblique.ttf"}
 _PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
+_HEADING_HEIGHT = 10.0  # mm
+_WIDEST = 26  # characters that a column of a table has room for
 _GOOD, _BAD = (17, 99, 41), (164, 14, 38)
 
 
@@ -45,14 +47,16 @@ def pdf(document: Document) -> bytes:
     for line in document.verdict:
         _text(page, line)
     for section in document.sections:
+        pictures = [_Drawn(block) for block in section.blocks if isinstance(block, Picture)]
         page.ln(4)
+        if isinstance(section.blocks[0], Picture):  # a heading stays with what it heads
+            _turn_unless_room(page, pictures[:2], _HEADING_HEIGHT)
         page.set_font(_FONT, "B", 13)
         page.start_section(section.title)
         page.multi_cell(0, 7, section.title, new_x="LMARGIN", new_y="NEXT")
         for block in section.blocks:
             if not isinstance(block, Picture):
                 _block(page, block)
-        pictures = [block for block in section.blocks if isinstance(block, Picture)]
         for i in range(0, len(pictures), 2):
             _pictures(page, pictures[i : i + 2])
     return bytes(page.output())
@@ -93,36 +97,53 @@ def _text(page: FPDF, text: str) -> None:
     page.ln(1)
 
 
-def _pictures(page: FPDF, row: Sequence[Picture]) -> None:
-    """Draw up to two pictures side by side, their captions below."""
-    from PIL import Image
+class _Drawn:
+    """A picture as PNG, with the height that it takes on the page."""
 
-    contents = [io.BytesIO(picture.rendered("png")) for picture in row]
-    heights = []
-    for content in contents:
-        with Image.open(content) as image:
-            heights.append(_PICTURE_WIDTH * image.height / image.width)
-    if page.get_y() + max(heights) + _CAPTION_HEIGHT > page.h - page.b_margin:
-        page.add_page()
+    def __init__(self, picture: Picture) -> None:
+        from PIL import Image
+
+        self.picture = picture
+        self.content = io.BytesIO(picture.rendered("png"))
+        with Image.open(self.content) as image:
+            self.height = _PICTURE_WIDTH * image.height / image.width
+
+
+def _pictures(page: FPDF, row: Sequence[_Drawn]) -> None:
+    """Draw up to two pictures side by side, their captions below."""
+    _turn_unless_room(page, row, 0.0)
     top, ends = page.get_y(), []
-    for i, (picture, content, height) in enumerate(zip(row, contents, heights, strict=True)):
+    for i, drawn in enumerate(row):
         x = page.l_margin + i * (_PICTURE_WIDTH + _GAP)
-        page.image(content, x=x, y=top, w=_PICTURE_WIDTH, alt_text=picture.alt)
-        page.set_xy(x, top + height + 1.0)
+        page.image(drawn.content, x=x, y=top, w=_PICTURE_WIDTH, alt_text=drawn.picture.alt)
+        page.set_xy(x, top + drawn.height + 1.0)
         page.set_font(_FONT, "I", 8)
-        page.multi_cell(_PICTURE_WIDTH, 4, picture.caption, align="L", new_y="NEXT")
+        page.multi_cell(_PICTURE_WIDTH, 4, drawn.picture.caption, align="L", new_y="NEXT")
         ends.append(page.get_y())
     page.set_xy(page.l_margin, max(ends) + 3.0)
+
+
+def _turn_unless_room(page: FPDF, row: Sequence[_Drawn], more: float) -> None:
+    """Begin a new page where a row of pictures, and so much more, does not fit."""
+    needed = max(drawn.height for drawn in row) + _CAPTION_HEIGHT + more
+    if page.get_y() + needed > page.h - page.b_margin:
+        page.add_page()
 
 
 def _table(page: FPDF, table: Table) -> None:
     page.set_font(_FONT, "B", 9.5)
     _text(page, table.caption)
     page.set_font(_FONT, "", 7.5)
+    rows = (table.header, *(tuple(cell.text for cell in row) for row in table.rows))
+    widths = [min(max(map(len, column)), _WIDEST) + 2 for column in zip(*rows, strict=True)]
     with page.table(
-        text_align="LEFT", line_height=4, padding=0.8, borders_layout="HORIZONTAL_LINES"
+        col_widths=widths,
+        text_align="LEFT",
+        line_height=4,
+        padding=0.8,
+        borders_layout="HORIZONTAL_LINES",
     ) as drawn:
-        for row in (table.header, *(tuple(cell.text for cell in row) for row in table.rows)):
+        for row in rows:
             line = drawn.row()
             for text in row:
                 line.cell(text)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dahl_ident.diagnostics.formatting import rounded
 from dahl_ident.reporting.document import (
     Block,
     Bullets,
@@ -18,6 +19,9 @@ from dahl_ident.reporting.document import (
     number,
 )
 from dahl_ident.results.posterior import QUANTILES, Posterior
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def sections(posterior: Posterior) -> Iterator[Section]:
@@ -54,7 +58,7 @@ def _numbers(posterior: Posterior) -> Iterator[Block]:
     table = posterior.summary()
     columns = ["mean", "std", *QUANTILES, "mcse", "ess", "r_hat"]
     rows = tuple(
-        (Cell(str(name)), Cell(str(row["unit"]) or "-"), *(_cell(row[c]) for c in columns))
+        (Cell(str(name)), Cell(str(row["unit"]) or "-"), *_row(row))
         for name, row in table.iterrows()
     )
     yield Table("Posterior of each parameter", ("parameter", "unit", *columns), rows)
@@ -69,8 +73,16 @@ def _numbers(posterior: Posterior) -> Iterator[Block]:
     yield Paragraph(f"Seed {posterior.seed}; the same seed gives the same chain.")
 
 
-def _cell(value: float) -> Cell:
-    return number(value, 5) if np.isfinite(value) else Cell("-")
+def _row(row: pd.Series[Any]) -> Iterator[Cell]:
+    """Yield the numbers of one parameter, no finer than its standard deviation."""
+    std = float(row["std"])
+    for name in ("mean", *QUANTILES):
+        value, error = rounded(float(row[name]), std)
+        yield Cell(value, float(row[name]))
+        if name == "mean":
+            yield Cell(error, std)
+    for name, digits in (("mcse", 2), ("ess", 4), ("r_hat", 5)):
+        yield number(row[name], digits) if np.isfinite(row[name]) else Cell("-")
 
 
 def _corner(posterior: Posterior) -> Picture:

@@ -18,8 +18,8 @@ _TOLD_APART = {"parts", "file", "sha256", "notes"}
 
 
 def sources(data: FrequencyResponse) -> Iterator[tuple[str, str]]:
-    """Yield name and SHA-256 of every file that the data came from."""
-    for part in parts(data):
+    """Yield name and SHA-256 of every file that the data came from, and what those came from."""
+    for part in _with_origins(data):
         if "file" in part:
             yield str(part["file"]), str(part.get("sha256", ""))
 
@@ -30,14 +30,17 @@ def notes(data: FrequencyResponse) -> list[str]:
 
 
 def options(data: FrequencyResponse) -> list[tuple[str, str]]:
-    """Return how the data were made, key by key, where they say so."""
+    """Return how the data were made, key by key, where they say so and it is not the default."""
     found: dict[str, str] = {}
-    for part in parts(data):
-        for key, value in part.items():
-            if key not in _TOLD_APART and not isinstance(value, Mapping):
-                found.setdefault(str(key), str(value))
-        for key, value in dict(part.get("extraction") or {}).items():
-            found.setdefault(f"extraction {key}", str(value))
+    for part in _with_origins(data):
+        told = {k: v for k, v in part.items() if k not in _TOLD_APART}
+        for name in ("options", "extraction"):
+            inner = told.pop(name, None)
+            given = inner if isinstance(inner, Mapping) else {"": inner}
+            told |= {f"{name} {key}".strip(): value for key, value in given.items()}
+        for key, value in told.items():
+            if not isinstance(value, Mapping) and value not in (None, [], ()):
+                found.setdefault(key, str(value))
     return list(found.items())
 
 
@@ -56,3 +59,14 @@ def parts(data: FrequencyResponse) -> list[Mapping[str, Any]]:
     """Return the provenance of each table that was joined."""
     provenance = data.provenance or {}
     return list(provenance.get("parts", [provenance]))
+
+
+def _with_origins(data: FrequencyResponse) -> Iterator[Mapping[str, Any]]:
+    """Yield the provenance of each table, and after it of what that was made from."""
+    waiting = list(parts(data))
+    while waiting:
+        part = waiting.pop(0)
+        yield part
+        origin = part.get("origin")
+        if isinstance(origin, Mapping):
+            waiting[:0] = origin.get("parts", [origin])

@@ -11,7 +11,7 @@ from dahl_ident import plots
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.errors import ValidationError
 from dahl_ident.reporting.document import Picture, figure_of
-from dahl_ident.reporting.provenance import sources
+from dahl_ident.reporting.provenance import parts, sources
 from dahl_ident.units import si_unit
 
 if TYPE_CHECKING:
@@ -39,16 +39,19 @@ def settling(data: FrequencyResponse, record: Record) -> Picture:
     start, end = (float(points.quality[name][i]) for name in ("start_time", "end_time"))
     response, mean = cycle_by_cycle(record, f, start - dropped / f, end)
     one_cycle = float(error[i]) * np.sqrt(max(response.size - dropped, 1))
-    change = 100.0 * abs(response[0] - response[-1]) / abs(response[-1])
+    used = response[dropped:]
+    scatter = 100.0 * float(np.std(used) / np.abs(np.mean(used)))
     where = f"{f:.4g} Hz, {points.amplitude[i]:.3g} {si_unit('displacement', data.motion)}"
     return Picture(
         "cycles",
         f"How the point at {where} settled, the one with the largest bias beside its error: "
-        f"{dropped} of these {response.size} cycles are left out. Grey: two standard deviations "
-        "of one cycle.",
-        f"From the first to the last of {response.size} cycles the response changes by "
-        f"{change:.2g} %; the bias is {excess[i]:.2g} standard errors.",
-        lambda: figure_of(plots.plot_cycles(response, mean, response_std=one_cycle)),
+        f"{dropped} of {response.size} cycles are left out. The grey band is two standard "
+        "deviations of one cycle.",
+        f"The response of the {used.size} cycles used scatters by {scatter:.2g} %; the bias is "
+        f"{excess[i]:.2g} standard errors.",
+        lambda: figure_of(
+            plots.plot_cycles(response, mean, left_out=dropped, response_std=one_cycle)
+        ),
     )
 
 
@@ -74,8 +77,8 @@ def cycle_by_cycle(
 def _check_origin(data: FrequencyResponse, record: Record) -> None:
     digest = dict(record.provenance or {}).get("sha256")
     known = [own for _, own in sources(data) if own]
-    if "start_time" not in data.quality or len(known) > 1 or digest not in (*known, None):
+    if "start_time" not in data.quality or len(parts(data)) > 1 or digest not in (*known, None):
         raise ValidationError(
-            "the data were not extracted from this record alone; give the record of "
-            f"{known[0] if known else 'these data'}, or none"
+            "the data were not extracted from this record alone; give the one that they were "
+            "extracted from, or none"
         )

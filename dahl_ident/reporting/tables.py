@@ -43,10 +43,15 @@ def parameters(
             row.append(Cell(interval(limits.lower, limits.upper, "") if limits else "-"))
         row += [Cell(credible_interval(posterior, name)) for posterior in drawn]
         rows.append((*row, Cell(estimate.description)))
-    methods = [*(one.method for one in intervals), *("posterior" for _ in drawn)]
+    methods = [*(method_name(one) for one in intervals), *("posterior" for _ in drawn)]
     told = (f"{method} {percent(LEVEL)}" for method in methods)
     header = ("parameter", "estimate", "standard error", "unit", *told, "what it is")
     return Table("Estimates and intervals, one column a method", header, tuple(rows))
+
+
+def method_name(intervals: ConfidenceIntervals) -> str:
+    """Return how a method is called in running text."""
+    return "Wald" if intervals.method == "wald" else intervals.method
 
 
 def credible_interval(posterior: Posterior, name: str) -> str:
