@@ -99,6 +99,12 @@ class TestParquet:
         frame.to_parquet(tmp_path / "run.parquet")
         assert_the_run(read_record(tmp_path / "run.parquet"))
 
+    def test_a_named_index_is_a_column(self, tmp_path: Path) -> None:
+        frame = pd.DataFrame({"x [mm]": X * 1e3, "F [kN]": F / 1e3})
+        frame.index = pd.Index(TIME, name="time [s]")
+        frame.to_parquet(tmp_path / "run.parquet")
+        assert_the_run(read_record(tmp_path / "run.parquet"))
+
     def test_nullable_numbers(self, tmp_path: Path) -> None:
         frame = pd.DataFrame(cells(), columns=["time [s]", "x [mm]", "F [kN]"]).convert_dtypes()
         frame.to_parquet(tmp_path / "run.parquet")
@@ -417,6 +423,9 @@ class TestUniversalFile:
             read_frequency_response(path, drive="1 N")
         path = write_uff(tmp_path / "c.uff", SI)
         with pytest.raises(DataError, match=r"no frequency response or time record .* \[164\]"):
+            read_frequency_response(path, drive="1 N")
+        path = write_uff(tmp_path / "psd.uff", uff_function(abs(RECEPTANCE), FREQUENCY, 2, 8))
+        with pytest.raises(DataError, match=r"data sets \[58\] with function types \[2\]"):
             read_frequency_response(path, drive="1 N")
         path = write_uff(tmp_path / "d.uff", SI, {**function, "binary": 1})
         path.write_bytes(path.read_bytes()[:-40])

@@ -223,7 +223,10 @@ class TestRefusal:
             (PLAIN.replace("2.5", "True"), r"line 3, column 'x': 'True' is not a number"),
             (PLAIN.replace("\n1,", "\n0.2,"), r"line 4, column 'time': time is 0.2 after 0.5 \(1 "),
             (PLAIN.replace("\n1,", "\n0.5,"), "time is 0.5 after 0.5"),
-            (PLAIN.replace("F [kN]", "x [mm]"), "2 columns may be the displacement: x \\[mm\\]"),
+            (
+                PLAIN.replace("F [kN]", "x [mm]"),
+                r"2 columns may be the displacement: x \[mm\], x \[mm\]; rename them in the file",
+            ),
             (PLAIN.replace("F [kN]", "disp [mm]"), "say which one with columns={'displacement'"),
             (
                 PLAIN.replace("x [mm]", "v [mm/s]").replace("F [kN]", "x [mm]"),

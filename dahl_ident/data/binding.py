@@ -83,10 +83,12 @@ class Binding:
             if c.role == role or (c.role is None and plain(c.short or c.name) in self.names[role])
         ]
         if len(found) > 1:
+            distinct = len({c.name for c in found}) == len(found)
+            way = f"say which one with columns={{{role!r}: {found[0].name!r}}}"
             raise DataError(
                 f"{self.source.name}: {len(found)} columns may be the {role}: "
-                f"{listed([c.header for c in found])}; say which one with "
-                f"columns={{{role!r}: {found[0].name!r}}}"
+                f"{listed([c.header for c in found])}; "
+                + (way if distinct else "rename them in the file")
             )
         if not found and role in self.map.roles:
             raise DataError(

@@ -51,9 +51,11 @@ def read_uff(file: File) -> Source:
     wanted = (_TIME_RESPONSE, _FRF)
     functions = [s for s in sets if s.get("type") == 58 and s.get("func_type") in wanted]
     if not functions:
+        others = sorted({int(s["func_type"]) for s in sets if s.get("type") == 58})
         raise DataError(
             f"{file.name}: no frequency response or time record (data set 58, function type 4 or "
             f"1); the file holds data sets {sorted({int(s.get('type', 0)) for s in sets})}"
+            + (f" with function types {others}" if others else "")
         )
     channels: list[Channel] = []
     notes: list[str] = []

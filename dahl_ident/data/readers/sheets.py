@@ -112,13 +112,15 @@ def read_parquet(file: File) -> Source:
 def frame_source(
     frame: pd.DataFrame, name: str = "the table", kind: str = "table", sha256: str | None = None
 ) -> Source:
-    """Return the columns of a pandas table, with units out of their names."""
+    """Return the columns of a pandas table, a named index among them, units out of their names."""
+    metadata = frame.attrs.get("dahl_ident", {})
+    if any(level is not None for level in frame.index.names):
+        frame = frame.reset_index()
     if not len(frame) or not len(frame.columns):
         raise DataError(f"{name}: the table is empty")
     channels = tuple(
         Channel(*_named(label, _plain(frame.iloc[:, i]))) for i, label in enumerate(frame.columns)
     )
-    metadata = frame.attrs.get("dahl_ident", {})
     return Source(name, kind, channels, sha256, metadata=metadata)
 
 
