@@ -106,8 +106,8 @@ class Plant:
         """Return amplitudes below and above every solution."""
         steepest, largest = _rows(self.friction.bounds(), self.vector)
         stiffness = np.abs(self.linear)
-        low = 0.999 * self.drive / (stiffness + steepest)
         with np.errstate(divide="ignore", over="ignore"):
+            low = 0.999 * self.drive / (stiffness + steepest)
             high = np.minimum(1.001 * (self.drive + largest) / stiffness, _LARGEST)
         return low, high
 
