@@ -299,6 +299,11 @@ def test_free_and_fixed_reach_model_and_sensors() -> None:
             ValidationError,
             "the prior of delay is uniform; least squares takes normal priors",
         ),
+        (
+            lambda: Problem(FrequencyResponse([1.0], [1.0], [1.0], harmonic=2), Dahl()),
+            DataError,
+            "every row holds an even harmonic",
+        ),
         (lambda: ProblemBatch([], FREE), DataError, "data is no table; expected a sequence"),
         (lambda: ProblemBatch(data(), FREE), DataError, "data is one table; expected a sequence"),
         (lambda: Problem(odd(A), FREE), DataError, "data is a ndarray; expected a Frequency"),

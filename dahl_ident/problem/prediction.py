@@ -219,6 +219,11 @@ def _check(rows: Rows) -> None:
         _require(~rows.forced, "displacement", "amplitude")
     if rows.drive is None:
         _require(rows.forced, "force", "drive")
+    if not any(k % 2 for k in rows.orders):
+        raise DataError(
+            "every row holds an even harmonic, which the friction modelled here does not have; "
+            "give odd ones as well"
+        )
     bad = rows.forced & (rows.harmonic > 1)
     if rows.orders != (1,) and bad.any():
         row = int(np.argmax(bad))
