@@ -42,3 +42,21 @@ def with_covariance(table: di.FrequencyResponse, noise: float) -> di.FrequencyRe
     return di.FrequencyResponse(
         table.frequency_hz, table.response, table.amplitude, covariance=covariance
     )
+
+
+def harmonic_table(amplitude_error: float) -> di.FrequencyResponse:
+    """Return fundamental and third harmonic at 6 amplitudes, themselves measured with error."""
+    random = np.random.default_rng(4)
+    amplitude = np.tile(np.geomspace(0.5, 5.0, 6) * X_C, 2)
+    harmonic = np.repeat([1, 3], 6)
+    exact = np.concatenate([FRICTION.dynamic_stiffness(amplitude[:6], harmonic=k) for k in (1, 3)])
+    error = 0.02 * np.abs(exact) * (random.normal(size=12) + 1j * random.normal(size=12))
+    measured = amplitude * (1.0 + amplitude_error * np.tile(random.normal(size=6), 2))
+    return di.FrequencyResponse(
+        np.ones(12),
+        exact + error,
+        measured,
+        harmonic=harmonic,
+        covariance=(0.02 * np.abs(exact))[:, None, None] ** 2 * np.eye(2),
+        amplitude_std=amplitude_error * amplitude if amplitude_error else None,
+    )

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
+from dahl_ident.bayes import checkpoint
 from dahl_ident.data.readers.file import library
 from dahl_ident.errors import SamplingError
 from tests.bayes_cases import friction_table
@@ -41,6 +42,7 @@ def refused(path: Path, message: str, **options: Any) -> None:
     with pytest.raises(SamplingError, match=message):
         sampled(path, **options)
     assert hashlib.sha256(path.read_bytes()).digest() == before
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
 @pytest.fixture
@@ -57,6 +59,7 @@ def test_resume_goes_on_to_a_total_and_changes_nothing(begun: Path) -> None:
     np.testing.assert_array_equal(resumed.get_chain(), whole.get_chain())
     np.testing.assert_array_equal(resumed.get_log_prob(), whole.get_log_prob())
     assert sampled(begun, steps=130).steps == 130
+    assert [p.name for p in begun.parent.iterdir()] == [begun.name]
 
 
 def test_resume_until_convergence_ends_where_one_run_ends(begun: Path) -> None:
@@ -163,6 +166,27 @@ def test_two_runs_exclude_each_other(tmp_path: Path) -> None:
                 sampled(path, steps=50)
         finally:
             process.kill()
+
+
+def test_a_lock_left_by_a_killed_run_or_removed_by_another_does_not_matter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "chain.h5"
+    lock = tmp_path / "chain.h5.lock"
+    lock.touch()
+    seen: list[bool] = []
+    is_still = checkpoint._is_still
+
+    def removed_once(path: Path, file: Any) -> bool:
+        if not seen:
+            lock.unlink()
+        seen.append(is_still(path, file))
+        return seen[-1]
+
+    monkeypatch.setattr(checkpoint, "_is_still", removed_once)
+    assert sampled(path, seed=9, steps=60).steps == 60
+    assert seen == [False, True]
+    assert not lock.exists()
 
 
 def test_a_missing_folder_is_said(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from dahl_ident.bayes.priors import joint_prior
 from dahl_ident.data.readers.file import library
 from dahl_ident.errors import SamplingError, ValidationError
 from dahl_ident.results.predictive import pointwise_log_likelihood
-from tests.bayes_cases import friction_table, spring_table, with_covariance
+from tests.bayes_cases import friction_table, harmonic_table, spring_table, with_covariance
 
 LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
 
@@ -35,6 +35,8 @@ def scenarios() -> dict[str, tuple[di.FrequencyResponse, Any, dict[str, Any]]]:
         "gross slip": (friction_table(10, 30.0, 300.0), di.Dahl(), {}),
         "known noise": (with_covariance(friction_table(), 0.02), di.Dahl(), {}),
         "gain from a sheet": (friction_table(8), di.Dahl(), {"sensors": gain}),
+        "harmonics, noisy amplitudes": (harmonic_table(0.03), di.Dahl(), {}),
+        "student's t": (harmonic_table(0.0), di.Dahl(), {"likelihood": "student_t"}),
         "beside a spring": (spring_table(0.05), di.Dahl() + di.Spring(), {}),
     }
 

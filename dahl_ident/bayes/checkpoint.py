@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -158,14 +158,30 @@ def _locked(file: Path) -> Iterator[None]:
         return
     import fcntl
 
-    with file.with_name(file.name + ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise SamplingError(
-                f"another run is writing {file}; wait for its end, or give another file"
-            ) from None
-        yield  # the lock ends with the open file, whichever way the process ends
+    path = file.with_name(file.name + ".lock")
+    while True:
+        with path.open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise SamplingError(
+                    f"another run is writing {file}; wait for its end, or give another file"
+                ) from None
+            if not _is_still(path, lock):  # its last owner has removed it meanwhile
+                continue
+            try:
+                yield  # the lock ends with the open file, whichever way the process ends
+            finally:
+                path.unlink(missing_ok=True)
+            return
+
+
+def _is_still(path: Path, file: IO[str]) -> bool:
+    """Return whether an open file is the one that the path names."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False
 
 
 def _write(path: Path, chain: Chain, seed: int, identity: Identity) -> None:

@@ -56,7 +56,7 @@ def rule() -> Rule:
     """Return Clenshaw and Curtis's rule of 9 points."""
     nodes = -np.cos(np.pi * np.arange(POINTS) / (POINTS - 1))
     series = np.linalg.inv(chebyshev.chebvander(nodes, POINTS - 1)).astype(np.float64)
-    primitive = chebyshev.chebint(series, lbnd=-1)
+    primitive = chebyshev.chebint(series, lbnd=-1).astype(np.float64)
     return Rule(nodes, primitive.sum(axis=0), series, primitive)
 
 
