@@ -303,3 +303,46 @@ def test_the_bootstrap_stands_beside_the_others_once_it_was_run(tmp_path: Path) 
     fit.conf_interval("bootstrap", replicates=200)
     after = report(fit, tmp_path / "b.md").read_text(encoding="utf-8")
     assert "| bootstrap 95.45 % |" in after
+
+
+def test_pdf_shows_characters_that_its_font_lacks(fit: di.FitResult, tmp_path: Path) -> None:
+    pypdf = pytest.importorskip("pypdf")
+    place = report(fit, tmp_path / "r.pdf", title="pivot \u65e5 \u03a9")
+    assert pypdf.PdfReader(place).pages[0].extract_text().startswith("pivot <U+65E5> \u03a9")
+
+
+def test_files_and_the_files_that_those_were_made_from_are_listed(tmp_path: Path) -> None:
+    origin = {"file": "raw.csv", "sha256": "1" * 64, "extraction": {"mode": "steps"}}
+    data = replace(
+        plain_table(), provenance={"file": "levels.csv", "sha256": "2" * 64, "origin": origin}
+    )
+    text = report(di.fit(data, di.Dahl()), tmp_path / "r.md").read_text(encoding="utf-8")
+    assert text.startswith("# Friction identified from levels.csv\n")
+    for row in ("| levels.csv | " + "2" * 64, "| raw.csv | " + "1" * 64, "extraction mode | steps"):
+        assert row in text
+
+
+def test_a_report_is_replaced_on_request_only(fit: di.FitResult, tmp_path: Path) -> None:
+    place = tmp_path / "r.md"
+    (tmp_path / "r_pictures").mkdir()
+    mine = tmp_path / "r_pictures" / "residuals.png"
+    mine.write_text("mine", encoding="utf-8")
+    with pytest.raises(DataError, match=r"residuals\.png: there is such a file already"):
+        report(fit, place)
+    assert [p.name for p in tmp_path.rglob("*.*")] == ["residuals.png"]
+    assert report(fit, place, overwrite=True).exists()
+    assert mine.read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(DataError, match="overwrite=True"):
+        report(fit, place)
+
+
+def test_a_fit_is_saved_as_json_and_replaced_on_request_only(
+    fit: di.FitResult, tmp_path: Path
+) -> None:
+    place = fit.save(tmp_path / "fit.json")
+    assert di.FitResult.load(place).params == fit.params
+    with pytest.raises(DataError, match="there is such a file already"):
+        fit.save(place)
+    assert fit.save(place, overwrite=True) == place
+    with pytest.raises(ValidationError, match=r"a fit is written as \.json; got '\.txt'"):
+        fit.save(tmp_path / "fit.txt")

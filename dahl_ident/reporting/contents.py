@@ -77,7 +77,7 @@ def document(
 
 
 def _title(data: FrequencyResponse) -> str:
-    files = [name for name, _ in provenance.sources(data)]
+    files = [str(part["file"]) for part in provenance.parts(data) if "file" in part]
     return (
         f"Friction identified from {Path(files[0]).name}"
         if len(files) == 1

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,10 +27,12 @@ if TYPE_CHECKING:
     from fpdf import FPDF
 
 _FONT = "DejaVu"
+_FONTS = Path(mpl.get_data_path()) / "fonts" / "ttf"
 _FACES = {"": "DejaVuSans.ttf", "B": "DejaVuSans-Bold.ttf", "I": "DejaVuSans-Oblique.ttf"}
 _PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
 _HEADING_HEIGHT = 10.0  # mm
 _WIDEST = 26  # characters that a column of a table has room for
+_MARGIN, _BOLD = 3.0, 1.25  # characters beside the text; how much wider bold ones are
 _GOOD, _BAD = (17, 99, 41), (164, 14, 38)
 
 
@@ -65,14 +68,19 @@ def pdf(document: Document) -> bytes:
 def _page(document: Document) -> FPDF:
     from fpdf import FPDF
 
-    page = FPDF(format="A4")
+    class Page(FPDF):
+        """A page that shows what its font lacks, where fpdf2 would leave it out."""
+
+        def normalize_text(self, text: str) -> str:
+            return super().normalize_text(_printable(text))
+
+    page = Page(format="A4")
     page.set_margins(16, 16, 16)
     page.set_auto_page_break(True, 16)
     page.set_title(document.title)
     page.set_lang("en")
-    fonts = Path(mpl.get_data_path()) / "fonts" / "ttf"
     for face, file in _FACES.items():
-        page.add_font(_FONT, face, fonts / file)
+        page.add_font(_FONT, face, _FONTS / file)
     page.add_page()
     return page
 
@@ -134,8 +142,8 @@ def _table(page: FPDF, table: Table) -> None:
     page.set_font(_FONT, "B", 9.5)
     _text(page, table.caption)
     page.set_font(_FONT, "", 7.5)
-    rows = (table.header, *(tuple(cell.text for cell in row) for row in table.rows))
-    widths = [min(max(map(len, column)), _WIDEST) + 2 for column in zip(*rows, strict=True)]
+    rows = [tuple(cell.text for cell in row) for row in table.rows]
+    widths = [_width(name, texts) for name, *texts in zip(table.header, *rows, strict=True)]
     with page.table(
         col_widths=widths,
         text_align="LEFT",
@@ -143,8 +151,27 @@ def _table(page: FPDF, table: Table) -> None:
         padding=0.8,
         borders_layout="HORIZONTAL_LINES",
     ) as drawn:
-        for row in rows:
+        for row in (table.header, *rows):
             line = drawn.row()
             for text in row:
                 line.cell(text)
     page.ln(2)
+
+
+def _width(name: str, texts: Sequence[str]) -> float:
+    """Return the width of a column in characters; its name may be wrapped between words."""
+    longest = max(_BOLD * max(map(len, name.split())), *map(len, texts))
+    return min(longest, _WIDEST) + _MARGIN
+
+
+@cache
+def _known_characters() -> frozenset[int]:
+    from matplotlib.ft2font import FT2Font
+
+    return frozenset(FT2Font(str(_FONTS / _FACES[""])).get_charmap())
+
+
+def _printable(text: str) -> str:
+    """Return text with the codes of characters in place of those that the font has not."""
+    known = _known_characters()
+    return "".join(c if ord(c) in known or c.isspace() else f"<U+{ord(c):04X}>" for c in text)
