@@ -9,13 +9,13 @@ import numpy as np
 
 from dahl_ident import Dahl, FrequencyResponse, Problem, Spring
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements import Model
+from dahl_ident.elements import Element, Model
 from dahl_ident.elements.model import as_model
 from dahl_ident.fitting.levenberg_marquardt import minimise
 
 
 class Case(NamedTuple):
-    """One problem, and its least cost by a dense scan over x_c."""
+    """One problem, and its least cost by a dense scan over x_c, or by searches from many starts."""
 
     problem: Problem
     least_cost: float
@@ -64,6 +64,65 @@ def friction_and_spring(seed: int, count: int) -> Iterator[Case]:
         least = min(float(cost.min()), alone)
         edge = int(cost.argmin()) in (*range(5), *range(1495, 1500)) or alone <= cost.min()
         yield Case(problem, least, edge)
+
+
+def exponent_free(seed: int, count: int) -> Iterator[Case]:
+    """Yield problems of one Dahl element of unknown exponent, seen from stick to slip."""
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        f_max, sigma = 10.0 ** rng.uniform(-6.0, 6.0, 2)
+        A = _around_the_knee(rng) * f_max / sigma
+        truth = Dahl(f_max, sigma, float(np.exp(rng.uniform(-1.0, 1.0))))
+        problem, x_c, stiffness = _observed(truth, Dahl(alpha=None), A, rng)
+        starts = [(x * stiffness, stiffness, a) for x in x_c for a in (0.3, 0.6, 1.0, 2.0, 3.5)]
+        yield _searched(problem, np.log(starts))
+
+
+def two_elements(seed: int, count: int) -> Iterator[Case]:
+    """Yield problems of two Dahl elements, whose knees are half a decade or more apart."""
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        f_max, sigma = 10.0 ** rng.uniform(-6.0, 6.0, 2)
+        A = _around_the_knee(rng) * f_max / sigma
+        wider, stiffer = 10.0 ** rng.uniform(0.5, 1.5), 10.0 ** rng.uniform(-0.5, 0.5)
+        truth = Dahl(f_max, sigma, name="a") + Dahl(f_max * wider, sigma * stiffer, name="b")
+        problem, x_c, stiffness = _observed(truth, Dahl(name="a") + Dahl(name="b"), A, rng)
+        starts = [
+            (x * share * stiffness, share * stiffness, y * rest * stiffness, rest * stiffness)
+            for x in x_c
+            for y in x_c[x_c > x]
+            for share, rest in ((0.3, 0.7), (0.7, 0.3))
+        ]
+        yield _searched(problem, np.log(starts))
+
+
+def _around_the_knee(rng: np.random.Generator) -> FloatArray:
+    """Return 10 to 30 amplitudes over one to two and a half decades of beta about 1."""
+    decades = np.sort(rng.uniform(0.0, rng.uniform(1.0, 2.5), int(rng.integers(10, 30))))
+    return np.asarray(10.0 ** (rng.uniform(-1.0, 0.3) + decades))
+
+
+def _observed(
+    truth: Element, model: Element, A: FloatArray, rng: np.random.Generator
+) -> tuple[Problem, FloatArray, float]:
+    """Return a problem with noise of 1e-4 to 0.03, nine x_c to start from, and the stiffness."""
+    Z = truth.dynamic_stiffness(A)
+    level = 10.0 ** rng.uniform(-4.0, -1.5)
+    measured = Z * np.exp(level * (rng.normal(size=A.size) + 1j * rng.normal(size=A.size)))
+    problem = Problem(FrequencyResponse(np.ones(A.size), measured, A), model)
+    return problem, np.geomspace(0.03 * A.min(), 30.0 * A.max(), 9), float(np.abs(Z).max())
+
+
+def _searched(problem: Problem, starts: FloatArray) -> Case:
+    """Return the least cost of searches from every start."""
+    found = minimise(
+        lambda at, _: problem.quadratic(at),
+        starts,
+        np.ones(len(problem.names), dtype=np.bool_),
+        problem.n_residuals,
+        steps=150,
+    )
+    return Case(problem, float(np.nanmin(found.cost)), at_edge=False)
 
 
 def _with_spring() -> Model:

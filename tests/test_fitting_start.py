@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from dahl_ident.errors import FitError
 from dahl_ident.fitting import solve
 from dahl_ident.fitting.start import best_starts, starts
 from dahl_ident.problem import ProblemBatch
-from tests.random_problems import friction_alone
+from tests.random_problems import Case, exponent_free, friction_alone, two_elements
 
 A = np.geomspace(1e-4, 1e-1, 20)
 
@@ -24,6 +25,14 @@ def test_optimum_equals_that_of_a_dense_scan_in_a_thousand_random_problems() -> 
         assert found.success is not at_edge
         worst = max(worst, found.cost / least_cost - 1.0)
     assert worst < 1e-9
+
+
+@pytest.mark.parametrize("problems", [exponent_free, two_elements])
+def test_optimum_equals_the_best_of_searches_from_all_over(
+    problems: Callable[[int, int], Iterator[Case]],
+) -> None:
+    for problem, least_cost, _ in problems(2, 8):
+        assert solve(problem).cost / least_cost - 1.0 < 1e-9
 
 
 def test_start_of_a_plant_is_close_where_the_data_say_much() -> None:
