@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import integrate as scipy_integrate
 from scipy import stats
+from scipy.integrate import trapezoid
 
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
@@ -231,6 +232,21 @@ def test_a_microslip_posterior_names_the_prior() -> None:
     assert rule_.at_upper_end
     assert "reaches the prior's upper end" in str(rule_)
     assert "f_max is set by its prior" in grid.report()
+
+
+def test_marginals_are_densities_with_the_right_quantiles() -> None:
+    grid = di.posterior_grid(friction_table(), di.Dahl())
+    for name in grid.names:
+        ends = grid.quantile(name, np.array([1e-5, 0.3, 1.0 - 1e-5]))
+        x = np.linspace(ends[0], ends[2], 4001)
+        density = grid.marginal(name, x)
+        assert trapezoid(density, x) == pytest.approx(1.0, abs=1e-4)
+        below = x <= ends[1]
+        assert trapezoid(density[below], x[below]) == pytest.approx(0.3, abs=2e-3)
+    low, high = np.exp(joint_prior(grid.problem).limits)
+    assert grid.marginal("f_max", [0.5 * low[0], 2.0 * high[0]]).tolist() == [0.0, 0.0]
+    with pytest.raises(ValidationError, match=r"f_max\[0\] is -1"):
+        grid.marginal("f_max", [-1.0])
 
 
 def test_expectation_and_draws() -> None:

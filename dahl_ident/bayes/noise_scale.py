@@ -38,6 +38,13 @@ class ScalePosterior:
         square = self.weights @ self.squares / (2.0 * (self.rows - 1))
         return float(np.sqrt(square - self.mean() ** 2))
 
+    def density(self, s: FloatArray) -> FloatArray:
+        """Return the density of s at points of shape (Q,)."""
+        squares, weights = self._atoms
+        z = 0.5 * squares * s[:, None] ** -2.0
+        n = self.rows
+        return np.asarray(2.0 / s * (np.exp(n * np.log(z) - z - gammaln(n)) @ weights))
+
     def quantiles(self, probabilities: FloatArray) -> FloatArray:
         """Return quantiles of s."""
         squares, weights = self._atoms

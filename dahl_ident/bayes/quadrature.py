@@ -104,7 +104,7 @@ class Marginal:
     Attributes
     ----------
     low, high : ndarray, shape (C,)
-        Walls of the panels.
+        Walls of the panels, rising.
     density : ndarray, shape (C, POINTS)
         At their nodes, normalised.
     theta, weights : ndarray, shapes (N, D) and (N,)
@@ -126,8 +126,8 @@ class Marginal:
 
     def quantiles(self, probabilities: FloatArray) -> FloatArray:
         """Return the theta below which there is a given part of the probability."""
-        low = np.full(len(probabilities), self.low.min())
-        high = np.full(len(probabilities), self.high.max())
+        low = np.full(len(probabilities), self.low[0])
+        high = np.full(len(probabilities), self.high[-1])
         for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
             under = self.below(middle) < probabilities
@@ -140,6 +140,16 @@ class Marginal:
         angle = np.arccos(np.clip(x, -1.0, 1.0))
         terms = np.cos(angle[..., None] * np.arange(POINTS + 1))
         return np.asarray(np.einsum("qlk,lk->q", terms, self._primitive))
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """Return the density at each of Q points."""
+        panel = np.clip(np.searchsorted(self.low, points) - 1, 0, len(self.low) - 1)
+        low, high = self.low[panel], self.high[panel]
+        angle = np.arccos(np.clip((2.0 * points - low - high) / (high - low), -1.0, 1.0))
+        terms = np.cos(angle[:, None] * np.arange(POINTS))
+        density = np.einsum("qk,qk->q", terms, self.density[panel] @ rule().series.T)
+        outside = (points < self.low[0]) | (points > self.high[-1])
+        return np.where(outside, 0.0, np.maximum(density, 0.0))
 
     @cached_property
     def _primitive(self) -> FloatArray:
@@ -338,10 +348,11 @@ def _finished(panels: Panels, lattice: Lattice, error: float, evaluations: int) 
     theta, log_mass, ids = lattice.points.joined()
     weights = np.exp(log_mass + of_id[ids] - log_evidence)
     some = weights > 0.0
+    rising = np.argsort(panels.low)
     return Marginal(
-        panels.low,
-        panels.high,
-        np.exp(panels.log_value - log_evidence),
+        panels.low[rising],
+        panels.high[rising],
+        np.exp(panels.log_value[rising] - log_evidence),
         theta[some],
         weights[some] / weights.sum(),
         log_evidence,

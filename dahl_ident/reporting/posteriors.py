@@ -18,7 +18,8 @@ from dahl_ident.reporting.document import (
     Table,
     number,
 )
-from dahl_ident.results.posterior import QUANTILES, Posterior
+from dahl_ident.results.bayesian import QUANTILES
+from dahl_ident.results.posterior import Posterior
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import FloatArray, whole_number
+from dahl_ident.arrays import FloatArray, finite_array, positive_array
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.noise_scale import ScalePosterior
 from dahl_ident.bayes.quadrature import Grid
 from dahl_ident.errors import ModelError
-from dahl_ident.problem import Problem
-from dahl_ident.results.posterior import QUANTILES
+from dahl_ident.results.bayesian import QUANTILES, BayesianResult
 from dahl_ident.results.prior_rule import PriorRule, prior_rules
 
 if TYPE_CHECKING:
@@ -23,58 +23,23 @@ if TYPE_CHECKING:
 _RULE_DRAWS = 4000
 
 
-class GridPosterior:
+class GridPosterior(BayesianResult):
     """The posterior by quadrature: the same answer at every call, with its error.
 
     Made by :func:`dahl_ident.posterior_grid`. An unknown scale of the noise is integrated out
     and shown as ``noise_scale`` all the same.
-
-    Attributes
-    ----------
-    names, units : tuple of str
-        The parameters and their SI units.
-    problem : Problem
-        Data, model, noise and sensors.
-    priors : mapping of str to str
-        Every prior in words.
-    log_evidence : float
-        ln of the data's density under model and prior. Differences between models of the same
-        data are logarithms of Bayes factors; the scale's prior 1/s cancels there.
-    error : float
-        Estimated relative error of the evidence, and of any probability.
-    converged : bool
-        Whether `error` is as small as was asked for.
-    evaluations : int
-        Points at which the likelihood was computed.
     """
 
     def __init__(self, density: Density, grid: Grid, tolerance: float) -> None:
         self._density, self._grid, self._tolerance = density, grid, tolerance
 
     @property
-    def problem(self) -> Problem:
-        """Data, model, noise and sensors."""
-        return self._density.problem
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters, an unknown noise scale last."""
-        return self._density.names
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """SI units of the parameters."""
-        own = [p.unit for p in self.problem.parameters]
-        return (*own, *([""] * (len(self.names) - len(own))))
-
-    @property
-    def priors(self) -> Mapping[str, str]:
-        """Every prior in words."""
-        return self._density.priors
-
-    @property
     def log_evidence(self) -> float:
-        """Logarithm of the data's density under model and prior."""
+        """Logarithm of the data's density under model and prior.
+
+        Differences between models of the same data are logarithms of Bayes factors; the scale's
+        prior 1/s cancels there.
+        """
         return self._grid.log_evidence
 
     @property
@@ -115,16 +80,42 @@ class GridPosterior:
         ndarray, shape () or (Q,)
             In SI units.
         """
-        if name not in self.names:
-            raise ModelError(f"there is no {name!r}; expected one of {', '.join(self.names)}")
+        axis = self._axis(name)
         q = np.atleast_1d(np.asarray(probabilities, dtype=float))
-        axis = self.names.index(name)
         if axis == self._grid.dims:
             found = self._scale.quantiles(q)
         else:
             found = self._grid.quantiles(axis, q)
             found = np.exp(found) if self._density.logarithmic[axis] else found
         return found.reshape(np.shape(probabilities))
+
+    def marginal(self, name: str, values: ArrayLike) -> FloatArray:
+        """Return the posterior density of one parameter.
+
+        Parameters
+        ----------
+        name : str
+            One of `names`.
+        values : array_like, shape (Q,)
+            In SI units; those of a positive parameter above zero.
+
+        Returns
+        -------
+        ndarray, shape (Q,)
+            Probability per SI unit.
+        """
+        axis = self._axis(name)
+        logarithmic = self._density.logarithmic[axis]
+        x = (positive_array if logarithmic else finite_array)(values, name)
+        if axis == self._grid.dims:
+            return self._scale.density(x)
+        theta = np.log(x) if logarithmic else x
+        return self._grid.marginals[axis].at(theta) / (x if logarithmic else 1.0)
+
+    def _axis(self, name: str) -> int:
+        if name not in self.names:
+            raise ModelError(f"there is no {name!r}; expected one of {', '.join(self.names)}")
+        return self.names.index(name)
 
     @cached_property
     def _values(self) -> FloatArray:
@@ -183,13 +174,8 @@ class GridPosterior:
         columns["unit"] = list(self.units)
         return pd.DataFrame(columns, index=pd.Index(self.names, name="parameter"))
 
-    def draws(self, size: int, seed: int = 0) -> FloatArray:
-        """Return values at points drawn by their probability, shape (size, P)."""
-        return self.problem.to_values(self._draws(size, seed))
-
     def _draws(self, size: int, seed: int) -> FloatArray:
         random = np.random.default_rng(seed)
-        size = whole_number(size, "size", 1)
         chosen = random.choice(len(self._grid.theta), size=size, p=self._grid.weights)
         return self._grid.theta[chosen]
 
@@ -204,12 +190,7 @@ class GridPosterior:
         """Return the posterior as text; the first line says whether to trust it."""
         table = self.summary().to_string(float_format=lambda v: f"{v:.5g}")
         rules = [str(rule) for rule in self.prior_rules]
-        priors = [f"  {name}: {text}" for name, text in self.priors.items()]
-        evidence = f"ln evidence: {self.log_evidence:.4f}"
-        return "\n".join([self.message, "", table, *rules, evidence, "", "Priors:", *priors])
-
-    def __str__(self) -> str:
-        return self.report()
+        return self._report(table, [*rules, f"ln evidence: {self.log_evidence:.4f}"])
 
     def __repr__(self) -> str:
         return f"<GridPosterior: {', '.join(self.names)}; error {self.error:.1g}>"

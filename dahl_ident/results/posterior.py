@@ -14,19 +14,16 @@ from dahl_ident.arrays import ComplexArray, FloatArray, whole_number
 from dahl_ident.bayes.chain import Chain, Settings
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density
-from dahl_ident.bayes.priors import PriorLike
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.errors import SamplingError, ValidationError
 from dahl_ident.fitting import Optimum
-from dahl_ident.problem import Problem
 from dahl_ident.results.arviz_export import to_arviz
+from dahl_ident.results.bayesian import QUANTILES, BayesianResult
 from dahl_ident.results.predictive import PredictiveCheck, predictive_checks
 from dahl_ident.results.prior_rule import PriorRule, prior_rules
 
 if TYPE_CHECKING:
     import pandas as pd
-
-QUANTILES = {"2.5%": 0.025, "16%": 0.16, "median": 0.5, "84%": 0.84, "97.5%": 0.975}
 
 _CHECK_DRAWS = 1000
 
@@ -45,30 +42,11 @@ class PredictionBand:
     phase_deg: FloatArray
 
 
-class Posterior:
+class Posterior(BayesianResult):
     """Draws from the posterior, with the verdict on whether they can be trusted.
 
     Made by :func:`dahl_ident.sample`. Names follow emcee where both have the same thing. The
     unknown scale of the noise is a parameter of its own, ``noise_scale``.
-
-    Attributes
-    ----------
-    names : tuple of str
-        The parameters, those of the model first; they order the last axis of every chain.
-    units : tuple of str
-        Their SI units.
-    problem : Problem
-        Data, model, noise and sensors.
-    priors : mapping of str to str
-        Every prior in words.
-    converged : bool
-        Whether the chain is long enough to be used.
-    message : str
-        The same in words; what is missing.
-    convergence : Convergence
-        tau, ESS and R-hat as numbers.
-    seed : int
-        With which the same chain comes out again.
 
     Examples
     --------
@@ -91,30 +69,9 @@ class Posterior:
         self._settings, self._optimum = settings, optimum
 
     @property
-    def problem(self) -> Problem:
-        """Data, model, noise and sensors."""
-        return self._density.problem
-
-    @property
     def data(self) -> FrequencyResponse:
         """The data."""
         return self.problem.data
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters sampled."""
-        return self._density.names
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """SI units of the parameters."""
-        own = [p.unit for p in self.problem.parameters]
-        return (*own, *([""] * (len(self.names) - len(own))))
-
-    @property
-    def likelihood(self) -> str:
-        """How rows count: "gaussian", "student_t" or "none"."""
-        return self._density.likelihood
 
     @property
     def seed(self) -> int:
@@ -125,17 +82,6 @@ class Posterior:
     def optimum(self) -> Optimum | None:
         """The least-squares optimum around which the walkers started."""
         return self._optimum
-
-    @property
-    def priors(self) -> Mapping[str, str]:
-        """Every prior in words."""
-        return self._density.priors
-
-    @property
-    def given_priors(self) -> Mapping[str, PriorLike]:
-        """The priors that were given, as they were given; the others follow the data's size."""
-        parts = self._density.prior.parts
-        return {part.parameter.name: part.given for part in parts if part.source == "given"}
 
     # The chain
 
@@ -203,12 +149,7 @@ class Posterior:
         """All coordinates after warm-up, flat."""
         return self._thinned(self._chain.points, self.warm_up, 1, True)
 
-    def draws(self, size: int, seed: int = 0) -> FloatArray:
-        """Return values drawn from the chain after warm-up, shape (size, D)."""
-        return self._density.to_values(self._draws(size, seed))
-
     def _draws(self, size: int, seed: int) -> FloatArray:
-        size = whole_number(size, "size", 1)
         random = np.random.default_rng(seed)
         return self._points[random.integers(len(self._points), size=size)]
 
@@ -292,11 +233,7 @@ class Posterior:
         table = self.summary().to_string(float_format=lambda v: f"{v:.5g}")
         rules = [str(rule) for rule in self.prior_rules]
         rules += [str(check) for check in self.checks if not check.passed]
-        priors = [f"  {name}: {text}" for name, text in self.priors.items()]
-        return "\n".join([self.message, "", table, *rules, "", "Priors:", *priors])
-
-    def __str__(self) -> str:
-        return self.report()
+        return self._report(table, rules)
 
     def __repr__(self) -> str:
         verdict = "converged" if self.converged else "NOT CONVERGED"

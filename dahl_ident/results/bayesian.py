@@ -1,0 +1,85 @@
+"""What posteriors by chain and by quadrature have in common."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+
+from dahl_ident.arrays import FloatArray, whole_number
+from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.priors import PriorLike
+from dahl_ident.problem import Problem
+from dahl_ident.results.prior_rule import PriorRule
+
+QUANTILES = {"2.5%": 0.025, "16%": 0.16, "median": 0.5, "84%": 0.84, "97.5%": 0.975}
+
+
+class BayesianResult(ABC):
+    """Parameters, priors and draws of one posterior density."""
+
+    _density: Density
+
+    @property
+    def problem(self) -> Problem:
+        """Data, model, noise and sensors."""
+        return self._density.problem
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, the model's first, an unknown noise scale last."""
+        return self._density.names
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """SI units of the parameters."""
+        own = [p.unit for p in self.problem.parameters]
+        return (*own, *([""] * (len(self.names) - len(own))))
+
+    @property
+    def likelihood(self) -> str:
+        """How rows count: "gaussian", "student_t" or "none"."""
+        return self._density.likelihood
+
+    @property
+    def priors(self) -> Mapping[str, str]:
+        """Every prior in words."""
+        return self._density.priors
+
+    @property
+    def given_priors(self) -> Mapping[str, PriorLike]:
+        """The priors that were given, as they were given; the others follow the data's size."""
+        parts = self._density.prior.parts
+        return {part.parameter.name: part.given for part in parts if part.source == "given"}
+
+    @property
+    @abstractmethod
+    def message(self) -> str:
+        """Whether the numbers can be used, and what is missing if not."""
+
+    @property
+    @abstractmethod
+    def prior_rules(self) -> tuple[PriorRule, ...]:
+        """The parameters that the prior determines rather than the data."""
+
+    def draws(self, size: int, seed: int = 0) -> FloatArray:
+        """Return values drawn from the posterior, shape (size, number of parameters).
+
+        Quadrature draws no noise scale, which it integrates.
+        """
+        return self._density.to_values(self._draws(whole_number(size, "size", 1), seed))
+
+    @abstractmethod
+    def _draws(self, size: int, seed: int) -> FloatArray:
+        """Return the coordinates of draws."""
+
+    def _report(self, table: str, findings: Sequence[str]) -> str:
+        """Return verdict, numbers, findings and priors, in this order."""
+        priors = [f"  {name}: {text}" for name, text in self.priors.items()]
+        return "\n".join([self.message, "", table, *findings, "", "Priors:", *priors])
+
+    @abstractmethod
+    def report(self) -> str:
+        """Return the posterior as text; the first line says whether to trust it."""
+
+    def __str__(self) -> str:
+        return self.report()
