@@ -92,7 +92,8 @@ class Goodness:
     Attributes
     ----------
     rms_misfit : float
-        Root mean square of |measured - fitted| / |measured|, of fundamentals where there are any.
+        Root mean square of abs(measured - fitted)/abs(measured), of fundamentals where there
+        are any.
     chi_square : ChiSquare or None
         None where the noise's scale was estimated: nothing is known to compare with.
     trends : tuple of Trend
