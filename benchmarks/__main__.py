@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import importlib.metadata
+import os
 import platform
 from pathlib import Path
 
@@ -35,7 +36,9 @@ def main() -> None:
     parts = [
         "# Benchmarks\n\nMeasured side by side in one run of `make bench`; ratios carry over to "
         "other machines, times do not.\n\n"
-        f"Python {platform.python_version()}, {versions}."
+        f"Python {platform.python_version()}, {versions}. {os.cpu_count()} processors, "
+        f"load average {os.getloadavg()[0]:.1f} at the start; bounds in seconds are meant for an "
+        "idle machine."
     ]
     print(parts[0])
     for topic in arguments.topics:
