@@ -149,7 +149,7 @@ def _count(
 ) -> None:
     profile = profile_intervals(optimum)
     kinds = {"wald": wald_intervals(optimum), "profile": profile}
-    if bootstrap and np.isfinite(optimum.values).all():
+    if bootstrap:
         kinds["bootstrap"] = bootstrap_intervals(optimum, LEVELS[:2], replicates, seed)
         result.bootstrapped += 1
     for method, found in kinds.items():

@@ -166,6 +166,8 @@ class TestDepartures:
         assert unused.scatter is not None
         assert unused.scatter.ratio == pytest.approx(3.0, rel=0.3)
         assert unused.acceptable
+        assert ", but the scatter is 2.6 times what the data's covariance says" in unused.headline
+        assert "scatter" not in judge(replace(data, covariance=9.0 * C), noise="relative").headline
 
     def test_a_third_harmonic_of_another_size(self) -> None:
         A = np.repeat(np.geomspace(0.5, 20.0, 12), 2) * X_C

@@ -31,6 +31,7 @@ from dahl_ident.problem import Problem
 
 _FALSE_ALARM = 0.01
 _HINT = 0.05
+_FAR_MORE = 2.0  # scatter over what was measured
 
 
 @dataclass(frozen=True)
@@ -176,6 +177,8 @@ class Goodness:
         if self.objections:
             return f"The model does not describe these data ({misfit}): {_joined(self.objections)}."
         hint = f", with a hint that {_joined(self.hints)}" if self.hints else ""
+        if self.scatter is not None and self.scatter.ratio > _FAR_MORE:
+            hint += f", but {self.scatter}"
         return f"The residuals look like noise ({misfit}){hint}."
 
     @property
