@@ -327,6 +327,22 @@ def test_no_color_is_obeyed_on_a_terminal() -> None:
         assert b"noisy" in out
 
 
+def test_a_progress_bar_stays_out_of_the_results(tmp_path: Path) -> None:
+    pty = pytest.importorskip("pty", reason="terminals are POSIX")
+    table = tmp_path / "noisy.csv"
+    assert subprocess.run([str(PROGRAM), "datasets", "noisy", "-o", str(table)]).returncode == 0
+    ours, theirs = pty.openpty()
+    done = subprocess.run(
+        [str(PROGRAM), "sample", str(table), "--steps", "30", "--json"],
+        stdout=subprocess.PIPE, stderr=theirs, env={**os.environ, "TERM": "xterm-256color"},
+    )  # fmt: skip
+    os.close(theirs)
+    bar = os.read(ours, 65536)
+    os.close(ours)
+    assert b"sampling" in bar
+    assert json.loads(done.stdout)["steps"] == 30
+
+
 def test_completion_knows_the_commands() -> None:
     environment = {
         **os.environ, "_DAHL_IDENT_COMPLETE": "complete_bash", "COMP_WORDS": "dahl-ident da",

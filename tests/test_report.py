@@ -174,6 +174,10 @@ def test_what_cannot_be_written_is_refused(fit: di.FitResult, tmp_path: Path) ->
         report(fit, tmp_path / "report.docx")
     with pytest.raises(ValidationError, match="there is no result to report on"):
         report([], tmp_path / "report.html")
+    with pytest.raises(ValidationError, match="result 1 is a str; expected a FitResult"):
+        report([fit, "fit"], tmp_path / "report.html")  # type: ignore[list-item]
+    with pytest.raises(ValidationError, match="result 1 is on other data than the first"):
+        report([fit, di.fit(plain_table(), di.Dahl())], tmp_path / "report.html")
     with pytest.raises(DataError, match="cannot be written"):
         report(fit, tmp_path / "absent" / "report.json")
 

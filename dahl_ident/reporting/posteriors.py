@@ -18,7 +18,7 @@ from dahl_ident.reporting.document import (
     Table,
     number,
 )
-from dahl_ident.results.bayesian import QUANTILES
+from dahl_ident.results.bayesian import QUANTILES, BayesianResult
 from dahl_ident.results.posterior import Posterior
 
 if TYPE_CHECKING:
@@ -39,19 +39,18 @@ def verdict(posterior: Posterior) -> list[str]:
     ]
 
 
-def facts(posterior: Posterior) -> dict[str, Any]:
+def facts(posterior: BayesianResult) -> dict[str, Any]:
     """Return a posterior for machines."""
-    return {
+    told = {
         "converged": posterior.converged,
         "message": posterior.message,
-        "seed": posterior.seed,
-        "steps": posterior.steps,
-        "warm_up": posterior.warm_up,
         "likelihood": posterior.likelihood,
         "priors": dict(posterior.priors),
         "set_by_prior": [rule.name for rule in posterior.prior_rules],
         "summary": posterior.summary().to_dict(orient="index"),
     }
+    how = ("seed", "steps", "warm_up", "log_evidence", "error", "evaluations")
+    return told | {name: getattr(posterior, name) for name in how if hasattr(posterior, name)}
 
 
 def _numbers(posterior: Posterior) -> Iterator[Block]:

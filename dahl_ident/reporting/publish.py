@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dahl_ident.data import Record
 from dahl_ident.data.storage import place_of, refuse_existing, write_whole
 from dahl_ident.errors import DataError, ValidationError
@@ -15,6 +17,7 @@ from dahl_ident.reporting.contents import Result, document
 from dahl_ident.reporting.document import Document, Picture
 from dahl_ident.reporting.html import html
 from dahl_ident.reporting.markdown import markdown
+from dahl_ident.results import FitResult, Posterior
 
 SCHEMA = 1
 FORMATS = (".html", ".pdf", ".md", ".json")
@@ -71,9 +74,7 @@ def report(
     place = place_of(path, "a report", FORMATS)
     if not overwrite:
         refuse_existing(place)
-    told = list(results) if isinstance(results, Sequence) else [results]
-    if not told:
-        raise ValidationError("there is no result to report on; expected at least one")
+    told = _checked(list(results) if isinstance(results, Sequence) else [results])
     whole = document(told, title=title, command=command, record=record)
     kind = place.suffix.lower()
     if kind == ".md":
@@ -84,6 +85,22 @@ def report(
         content = _content(whole, kind)
     write_whole(place, content, overwrite=overwrite)
     return place
+
+
+def _checked(results: list[Any]) -> list[Result]:
+    """Return the results, which have to be of kinds that are reported, and on the same data."""
+    if not results:
+        raise ValidationError("there is no result to report on; expected at least one")
+    for i, result in enumerate(results):
+        if not isinstance(result, (FitResult, Posterior)):
+            raise ValidationError(
+                f"result {i} is a {type(result).__name__}; expected a FitResult or a Posterior"
+            )
+        if not np.array_equal(result.data.response, results[0].data.response):
+            raise ValidationError(
+                f"result {i} is on other data than the first; write a report for each"
+            )
+    return results
 
 
 def _content(whole: Document, kind: str) -> bytes:

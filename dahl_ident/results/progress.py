@@ -23,11 +23,13 @@ def expected_steps(settings: Settings, verdict: Convergence | None) -> int | Non
 @contextmanager
 def progress_bar(settings: Settings) -> Iterator[Listener]:
     """Yield a listener that moves a bar."""
+    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
     from rich.progress import TimeRemainingColumn as Remaining
 
     columns = (TextColumn("sampling"), BarColumn(), MofNCompleteColumn(), Remaining())
-    with Progress(*columns) as bar:
+    # standard output is for results
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("sampling", total=settings.steps)
 
         def update(chain: Chain, verdict: Convergence | None) -> None:
