@@ -14,14 +14,16 @@ from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Element, Parameter
 from dahl_ident.elements.model import as_model
-from dahl_ident.errors import DataError, ModelError, ValidationError
+from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.noise import Measured, Rho, Student, bend, correct_amplitude, noise_for
+from dahl_ident.problem.checks import checked_table, normal_moments
 from dahl_ident.problem.coordinates import (
     Coordinates,
     in_order,
     interchangeable_elements,
     with_changes,
 )
+from dahl_ident.problem.pairs import squares, weighted
 from dahl_ident.problem.prediction import Predictor
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import EXACT, Prior, Sensors
@@ -306,28 +308,13 @@ class Problem:
             cost = 0.5 * products[..., 0, 0]
         else:
             m = self.n_residuals
-            z = _squares(rows[..., 0, :m])
+            z = squares(rows[..., 0, :m])
             loss, slope, bend = rho(z)
             cost = 0.5 * (loss.sum(axis=-1) + (rows[..., 0, m:] ** 2).sum(axis=-1))
             along = np.maximum(2.0 * bend, -slope / np.maximum(z, 1e-300))
-            products = self._weighted(rows, slope, along) @ rows.swapaxes(-1, -2)
+            products = weighted(rows, m, slope, along) @ rows.swapaxes(-1, -2)
         cost = np.where(cost < np.inf, cost, np.inf)
         return Quadratic(cost, products[..., 0, 1:], products[..., 1:, 1:])
-
-    def _weighted(self, rows: FloatArray, size: FloatArray, along: FloatArray) -> FloatArray:
-        """Return residuals times `size`, derivatives d of each pair y as size d + along y (y' d).
-
-        `rows` are residuals and, below them, their derivatives; those of priors stay.
-        """
-        m = self.n_residuals
-        first, second = rows[..., :1, 0:m:2], rows[..., :1, 1:m:2]
-        by_first, by_second = rows[..., 1:, 0:m:2], rows[..., 1:, 1:m:2]
-        lever = along[..., None, :] * (first * by_first + second * by_second)
-        weighted = rows.copy()
-        weighted[..., :m] *= np.repeat(size, 2, axis=-1)[..., None, :]
-        weighted[..., 1:, 0:m:2] += first * lever
-        weighted[..., 1:, 1:m:2] += second * lever
-        return weighted
 
     def whitened(
         self, theta: FloatArray, *, derivatives: bool = True, tails: bool = True
@@ -437,7 +424,7 @@ class Problem:
             slopes = self._coordinates.slopes(values)
             for place, (name, prior) in enumerate(self.priors.items(), start=m):
                 index = self.names.index(name)
-                mean, std = _normal(name, prior)
+                mean, std = normal_moments(name, prior)
                 rows[..., 0, place] = (values[..., index] - mean) / std
                 if changes:
                     rows[..., 1 + index, place] = slopes[..., index] / std
@@ -476,13 +463,13 @@ class Problem:
                 f"scale is given, but {self.noise} noise has a known scale; leave it out"
             )
         y, _ = self.whitened(theta, derivatives=False)
-        squares = np.sum(y.real**2 + y.imag**2, axis=-1)
+        total = np.sum(y.real**2 + y.imag**2, axis=-1)
         n = self._rows.n
         s2 = np.asarray(1.0 if scale is None else scale) ** 2
         if scale is None and not self.scale_known:
-            s2 = squares / (2.0 * n)
+            s2 = total / (2.0 * n)
         with np.errstate(divide="ignore", invalid="ignore"):
-            result = self._noise.log_area - n * np.log(2.0 * np.pi * s2) - 0.5 * squares / s2
+            result = self._noise.log_area - n * np.log(2.0 * np.pi * s2) - 0.5 * total / s2
         return np.where(np.isnan(result), -np.inf, result)[()]
 
     def information(
@@ -495,41 +482,15 @@ class Problem:
         """
         theta = self._coordinates.checked(theta)
         rows = self._with_priors(theta, *self.whitened(theta, tails=False), scale)
-        weighted = rows
+        counted = rows
         if self._tail is not None:
-            z = _squares(rows[..., 0, : self.n_residuals])
-            weighted = self._weighted(rows, *self._tail.information(z))
-        J, weighted = rows[..., 1:, :], weighted[..., 1:, :]
+            m = self.n_residuals
+            counted = weighted(rows, m, *self._tail.information(squares(rows[..., 0, :m])))
+        J, counted = rows[..., 1:, :], counted[..., 1:, :]
         if chart is not None:
-            J, weighted = chart.T @ J, chart.T @ weighted
-        return weighted @ J.swapaxes(-1, -2)
+            J, counted = chart.T @ J, chart.T @ counted
+        return counted @ J.swapaxes(-1, -2)
 
     def _shape(self, theta: FloatArray) -> tuple[int, ...]:
         """Return the shape of the rows' numbers for `theta`."""
         return (*theta.shape[:-1], self._rows.n)
-
-
-def checked_table(data: object) -> FrequencyResponse:
-    """Return `data` if it is a table, or say what it is instead."""
-    if isinstance(data, FrequencyResponse):
-        return data
-    raise DataError(
-        f"data is a {type(data).__name__}; expected a FrequencyResponse, as "
-        "read_frequency_response gives it, or extract from a Record"
-    )
-
-
-def _normal(name: str, prior: Prior) -> tuple[float, float]:
-    """Return mean and standard deviation of a normal prior, the only kind least squares takes."""
-    kind = getattr(getattr(prior, "dist", None), "name", type(prior).__name__)
-    if kind != "norm":
-        raise ValidationError(
-            f"the prior of {name} is {kind}; least squares takes normal priors "
-            "(scipy.stats.norm), any other needs sampling"
-        )
-    return float(prior.mean()), float(prior.std())
-
-
-def _squares(residuals: FloatArray) -> FloatArray:
-    """Return the sum of squares of each pair, (..., 2 n) -> (..., n)."""
-    return np.asarray(residuals[..., 0::2] ** 2 + residuals[..., 1::2] ** 2)
