@@ -27,7 +27,7 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 _NODES_PER_DECADE = (4, 180)
 _SCAN_PER_DECADE = 128
 _SCAN_CELLS = 2**18  # points times nodes of the scan in work at once
-_CHUNK = 8192  # points solved together: their scratch arrays stay in the processor's cache
+_CHUNK = 4096  # points solved together: their scratch arrays stay in the processor's cache
 
 
 class Roots(NamedTuple):
@@ -113,7 +113,7 @@ def _interpolated_roots(plant: Plant, table: _Table) -> tuple[FloatArray, Comple
     """Return amplitude and force of each passive point, and whether one step has settled them."""
     below = _search(plant, table)
     with np.errstate(all="ignore"):  # beyond the table's ends the result is not used
-        start, per_misfit, slope = _inverse_cubic(plant, table, *_cell(plant, table, below))
+        start, per_misfit, slope = _inverse_cubic(plant, table, _cell(plant, table, below))
         friction = plant.friction.force(start, plant.vector)
         rest = start * plant.linear
         force = rest + friction
@@ -140,43 +140,42 @@ def _bracketed_roots(plant: Plant, table: _Table, guess: FloatArray) -> FloatArr
     return _polish(plant, low, high, start, np.ones(low.shape, dtype=bool))
 
 
-def _cell(plant: Plant, table: _Table, below: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the nodes on both sides of each solution; the end node twice beyond the ends."""
-    first = plant.vector * table.nodes
-    return first + np.maximum(below - 1, 0), first + np.minimum(below, table.nodes - 1)
+def _cell(plant: Plant, table: _Table, below: IntArray) -> IntArray:
+    """Return the nodes left and right of each solution; the end node twice beyond the ends."""
+    sides = np.stack([np.maximum(below - 1, 0), np.minimum(below, table.nodes - 1)])
+    sides += plant.vector * table.nodes
+    return sides
 
 
 def _search(plant: Plant, table: _Table) -> IntArray:
     """Return at how many nodes A |Z| lies below the drive, by bisection without branches."""
     offset = plant.vector * table.nodes - 1
-    below = np.zeros(plant.drive.shape, dtype=np.intp)
+    last_below = offset.copy()
     width = (table.nodes + 1) // 2
     while width:
-        node = offset + (below + width)
+        node = last_below + width
         total = table.amplitude.take(node, mode="clip") * plant.linear
         total += table.force.take(node, mode="clip")
-        below += width * (np.abs(total) < plant.drive)
+        last_below += width * (np.abs(total) < plant.drive)
         width //= 2
-    return below
+    return last_below - offset
 
 
 def _inverse_cubic(
-    plant: Plant, table: _Table, left: IntArray, right: IntArray
+    plant: Plant, table: _Table, cell: IntArray
 ) -> tuple[FloatArray, FloatArray, ComplexArray]:
     """Return A and dlnA/dg at g = ln(A |Z|/u_0) = 0, from Hermite's cubic of ln A over g.
 
     And the friction force's derivative by ln A there, between those of the nodes.
     """
-    A0, A1 = table.amplitude[left], table.amplitude[right]
-    slope0, slope1 = table.slope[left], table.slope[right]
-    g0, s0 = plant.misfit(A0, table.force[left], slope0)
-    g1, s1 = plant.misfit(A1, table.force[right], slope1)
-    width, log_ratio = g1 - g0, np.log(A1 / A0)
-    t = -g0 / width
-    m0, m1 = width / s0, width / s1
+    A, slope = table.amplitude[cell], table.slope[cell]
+    g, s = plant.misfit(A, table.force[cell], slope)
+    width, log_ratio = g[1] - g[0], np.log(A[1] / A[0])
+    t = -g[0] / width
+    m0, m1 = width / s
     y = t * ((1 - t) ** 2 * m0 + t * ((3 - 2 * t) * log_ratio + (t - 1) * m1))
     rise = 6 * t * (1 - t) * log_ratio + (1 - t) * (1 - 3 * t) * m0 + t * (3 * t - 2) * m1
-    return A0 * np.exp(y), rise / width, slope0 + (slope1 - slope0) * (y / log_ratio)
+    return A[0] * np.exp(y), rise / width, slope[0] + (slope[1] - slope[0]) * (y / log_ratio)
 
 
 def _polish(
