@@ -300,13 +300,13 @@ def as_markdown(table: Sequence[Row]) -> str:
     lines = [
         "# Coverage of the intervals, and verdicts",
         "",
-        "Each scenario is measured many times on the computer and fitted each time; the bootstrap "
-        "is run on a part of these data sets. `bound` is the Cramer-Rao bound of the parameter's "
-        "logarithm; intervals are judged where it is below 0.25, verdicts where it is below 0.25 "
-        "or above 1. Coverage in percent, of 68.27 and 95.45 % intervals; what lies outside "
-        'binomial error (corrected for the number of coverages) is marked (!). "Not clear": '
-        "exact data leave another explanation within 4.3 standard deviations, so that the local "
-        "bound does not decide.",
+        "Made by `python -m benchmarks.coverage`. Each scenario is measured many times on the "
+        "computer and fitted each time; the bootstrap is run on a part of these data sets. "
+        "`bound` is the Cramer-Rao bound of the parameter's logarithm; intervals are judged where "
+        "it is below 0.25, verdicts where it is below 0.25 or above 1. Coverage in percent, of "
+        "68.27 and 95.45 % intervals; what lies outside binomial error (corrected for the number "
+        'of coverages) is marked (!). "Not clear": exact data leave another explanation within '
+        "4.3 standard deviations, so that the local bound does not decide.",
         "",
         "| scenario | parameter | data sets (bootstrap) | bound | RMSE / bound | Wald | profile | "
         "bootstrap | verdict right |",
@@ -327,7 +327,7 @@ def as_markdown(table: Sequence[Row]) -> str:
 
 
 def _covers(row: Row, method: str) -> str:
-    if not row.identified:
+    if not row.identified or (method == "bootstrap" and not row.bootstrapped):
         return ""
     off = np.abs(row.coverage[method] - LEVELS[:2]) > row.tolerance[method]
     cells = zip(row.coverage[method], off, strict=True)

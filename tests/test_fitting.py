@@ -24,9 +24,10 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.model import as_model
 from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting import Status, solve, solve_many
+from dahl_ident.fitting.levenberg_marquardt import minimise
 from dahl_ident.fitting.losses import LOSSES
 from dahl_ident.fitting.trust_region import minimise_within
-from dahl_ident.problem import ProblemBatch
+from dahl_ident.problem import ProblemBatch, Quadratic
 
 n = 20
 A = np.geomspace(1e-4, 1e-1, n)
@@ -341,3 +342,18 @@ def test_a_jacobian_out_of_range_makes_a_step_that_is_taken_back() -> None:
     found = minimise_within(problem, far, 1.0, None)
     assert found.converged is False
     assert found.cost == np.inf
+
+
+def test_columns_alike_to_rounding_end_no_search() -> None:
+    """A Hessian of two columns whose cosine exceeds 1 by the first damping: exactly singular."""
+    hessian = np.array([[1.0, 1.0 + 1e-9], [1.0 + 1e-9, 1.0]])
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.solve(hessian + 1e-9 * np.eye(2), np.ones(2))
+
+    def evaluate(theta: FloatArray, which: object) -> Quadratic:
+        gradient = np.repeat(theta.sum(axis=1, keepdims=True), 2, axis=1)
+        cost = 0.5 * theta.sum(axis=1) ** 2
+        return Quadratic(cost, gradient, np.broadcast_to(hessian, (len(theta), 2, 2)).copy())
+
+    found = minimise(evaluate, np.array([[1.0, 2.0]]), np.zeros(2, dtype=np.bool_), 4)
+    assert found.cost[0] < 1e-12

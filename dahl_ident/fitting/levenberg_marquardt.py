@@ -30,6 +30,7 @@ _EPS = float(np.finfo(np.float64).eps)
 _FIRST_DAMPING = 1e-9
 _GAUSS_NEWTON = 1e-3  # with more damping a short step says nothing
 _MOST_DAMPING = 1e12
+_ROUNDING = 1e-12  # of a scaled Hessian's entries, with room
 _LONGEST_STEP = 2.0  # of a logarithm
 _NOISE_TOLERANCE = 1e-8
 _REMAINDER = 3e-7
@@ -237,7 +238,10 @@ def _step(
     if not np.isfinite(damped).all():
         bad = ~np.isfinite(damped).all(axis=(1, 2))
         damped[bad], g[bad] = np.eye(P), 0.0
-    delta = -np.linalg.solve(damped, g[:, :, None])[:, :, 0]
+    try:
+        delta = -np.linalg.solve(damped, g[:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError:  # somewhere two columns are alike to rounding
+        delta = -np.linalg.solve(damped + _ROUNDING * np.eye(P), g[:, :, None])[:, :, 0]
     longest = np.abs(delta / size * logarithmic).max(axis=1)
     if longest.max() > _LONGEST_STEP:
         delta *= np.minimum(1.0, _LONGEST_STEP / np.maximum(longest, 1e-300))[:, None]
