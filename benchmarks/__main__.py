@@ -34,7 +34,7 @@ def main() -> None:
     arguments = parser.parse_args()
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
     parts = [
-        "# Benchmarks\n\nMeasured side by side in one run of `make bench`; ratios carry over to "
+        "# Benchmarks\n\nMeasured side by side by `make bench`; ratios carry over to "
         "other machines, times do not.\n\n"
         f"Python {platform.python_version()}, {versions}. {os.cpu_count()} processors, "
         f"load average {os.getloadavg()[0]:.1f} at the start; bounds in seconds are meant for an "
