@@ -214,6 +214,25 @@ def test_sample_tells_the_posterior(run: Runner) -> None:
     assert abs(row["median"] - 0.1) < 4.0 * row["std"]
 
 
+def test_sample_integrates_at_once_where_asked(run: Runner) -> None:
+    table = run("datasets", "noisy", "-o", "-").out
+    options = ("sample", "-", "--prior", "f_max=0.01:1")
+    told = json.loads(run(*options, "--grid", "--json", stdin=table).out)
+    assert told["converged"]
+    assert told["error"] < 1e-4
+    chain = json.loads(run(*options, "--json", stdin=table).out)
+    for name in ("f_max", "sigma"):
+        exact, drawn = told["summary"][name], chain["summary"][name]
+        assert abs(exact["median"] - drawn["median"]) < 0.1 * exact["std"]
+    text = run(*options, "--grid", stdin=table)
+    assert text.status == 0
+    assert text.out.startswith("Converged: error ")
+    assert "ln evidence: " in text.out
+    refused = run(*options, "--grid", "--max-steps", "30", "--report", "r.html", stdin=table)
+    assert refused.status == 1
+    assert "--max-steps, --report is given beside --grid, which runs no chain" in refused.err
+
+
 def test_a_chain_that_is_too_short_ends_with_3(run: Runner) -> None:
     table = run("datasets", "noisy", "-o", "-").out
     outcome = run("sample", "-", "--steps", "20", stdin=table)

@@ -92,8 +92,9 @@ class Density:
         return texts | ({SCALE: "1/s"} if self.has_scale else {})
 
     def to_values(self, x: FloatArray) -> FloatArray:
-        """Return values at points of shape (..., D)."""
-        return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, x, 0.0)), x)
+        """Return values at points of shape (..., D), or (..., P) without the scale."""
+        logarithmic = self.logarithmic[: x.shape[-1]]
+        return np.where(logarithmic, np.exp(np.where(logarithmic, x, 0.0)), x)
 
     def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return theta, (S, P), and s, (S,), which is 1 where it is known."""

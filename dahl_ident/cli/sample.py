@@ -15,11 +15,13 @@ from dahl_ident.cli.fit import ReportPlace, check_reports, tell_report
 from dahl_ident.cli.groups import grouped
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.options import STANDARD, Files, General, Reading, Seed, Writing
+from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:
-    from dahl_ident.results.posterior import Posterior
+    from dahl_ident.results.bayesian import BayesianResult
 
 _SAMPLING = "Sampling"
+_CHAIN = ("seed", "steps", "max_steps", "ess", "walkers", "ensembles", "resume")
 
 
 @dataclass(frozen=True)
@@ -68,11 +70,34 @@ class Sampling:
         ),
     ] = None
 
+    grid: Annotated[
+        bool,
+        typer.Option(
+            "--grid",
+            help="Integrate instead, at once and without a chain: up to three parameters.",
+            rich_help_panel=_SAMPLING,
+        ),
+    ] = False
+
     def keywords(self) -> dict[str, Any]:
-        """Return the arguments of ``sample``."""
-        given = dict(vars(self))
-        priors = dict(prior(text) for text in given.pop("prior") or [])
-        return {**given, "priors": priors, "progress": sys.stderr.isatty()}
+        """Return the arguments of ``sample``, or those of ``posterior_grid``."""
+        priors = dict(prior(text) for text in self.prior or [])
+        what = {"priors": priors, "noise": self.noise, "likelihood": self.likelihood}
+        if self.grid:
+            return what
+        how = {name: getattr(self, name) for name in _CHAIN}
+        return {**what, **how, "progress": sys.stderr.isatty()}
+
+    def check(self, report: str | None) -> None:
+        """Refuse with --grid what only a chain has."""
+        chain = Sampling()
+        given = [n for n in _CHAIN if n != "seed" and getattr(self, n) != getattr(chain, n)]
+        given += ["report"] if report is not None else []
+        if self.grid and given:
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+            raise ValidationError(
+                f"{options} is given beside --grid, which runs no chain; leave one of them out"
+            )
 
 
 @grouped
@@ -89,23 +114,25 @@ def sample(
 
     Example: dahl-ident datasets noisy -o - | dahl-ident sample - --prior f_max=0.01:1
     """
+    from dahl_ident.results import Posterior, posterior_grid
     from dahl_ident.results import sample as sample_data
 
     writing.check([report], files, json=general.json)
     check_reports(report)
-    how = {**model.keywords(), **sampling.keywords()}
-    posterior = sample_data(reading.read(files), **how)
+    sampling.check(report)
+    estimate = posterior_grid if sampling.grid else sample_data
+    posterior = estimate(reading.read(files), **model.keywords(), **sampling.keywords())
     if general.json:
         from dahl_ident.reporting.posteriors import facts
 
         telling.say_json(facts(posterior))
     elif report != STANDARD:
         telling.say(posterior.report())
-    if report is not None:
+    if report is not None and isinstance(posterior, Posterior):
         tell_report([posterior], report, writing)
     finish(posterior)
 
 
-def finish(posterior: Posterior) -> None:
-    """End with status 3 where the chain has not converged."""
+def finish(posterior: BayesianResult) -> None:
+    """End with status 3 where the posterior has not converged."""
     telling.finish(posterior.converged, posterior.message)

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import PriorLike
 from dahl_ident.problem import Problem
 from dahl_ident.results.prior_rule import PriorRule
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 QUANTILES = {"2.5%": 0.025, "16%": 0.16, "median": 0.5, "84%": 0.84, "97.5%": 0.975}
 
@@ -53,6 +57,11 @@ class BayesianResult(ABC):
 
     @property
     @abstractmethod
+    def converged(self) -> bool:
+        """Whether the numbers can be used."""
+
+    @property
+    @abstractmethod
     def message(self) -> str:
         """Whether the numbers can be used, and what is missing if not."""
 
@@ -76,6 +85,10 @@ class BayesianResult(ABC):
         """Return verdict, numbers, findings and priors, in this order."""
         priors = [f"  {name}: {text}" for name, text in self.priors.items()]
         return "\n".join([self.message, "", table, *findings, "", "Priors:", *priors])
+
+    @abstractmethod
+    def summary(self) -> pd.DataFrame:
+        """Return one row a parameter: moments and quantiles."""
 
     @abstractmethod
     def report(self) -> str:
