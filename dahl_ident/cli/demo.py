@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,7 +14,8 @@ from dahl_ident.cli.groups import grouped
 from dahl_ident.cli.options import Writing
 
 if TYPE_CHECKING:
-    from dahl_ident.results import FitResult
+    from dahl_ident.data import FrequencyResponse, Record
+    from dahl_ident.results import FitResult, Posterior
 
 _DATASET = "plant_recording"
 
@@ -31,49 +32,60 @@ def demo(
     Example: dahl-ident demo
     """
     from dahl_ident.data import inspect, read_record
-    from dahl_ident.elements import Dahl, Damper, Mass, Spring
-    from dahl_ident.extraction import extract as extract_record
-    from dahl_ident.reporting import report
-    from dahl_ident.results import fit
-    from dahl_ident.results.sampling import sample
     from dahl_ident.synthetic.shipped import datasets_directory, load_dataset
 
     table, page = output / "levels.csv", output / "report.html"
     writing.check([table, page])
     output.mkdir(parents=True, exist_ok=True)
-    recording = load_dataset(_DATASET)
-    facts = recording.provenance or {}
+    facts = load_dataset(_DATASET).provenance or {}
     file = datasets_directory() / facts["file"]
 
     telling.heading(f"1. inspect: {file}")
     telling.say(repr(inspect(file)))
-    telling.heading("2. extract: waveforms to dynamic stiffness")
     record = read_record(file)
+    data = _extracted(record)
+    data.save(table, overwrite=writing.overwrite)
+    result, posterior = _estimated(data, facts["truth"])
+    telling.heading("6. report")
+    with progress_bar() as bar:
+        bar.add_task("drawing", total=None)
+        _report([result, posterior], page, record, overwrite=writing.overwrite)
+    telling.say(f"table: {table}\nreport: {page.resolve()}")
+    telling.finish(result.trusted and posterior.converged, result.verdict)
+
+
+def _extracted(record: Record) -> FrequencyResponse:
+    from dahl_ident.extraction import extract as extract_record
+
+    telling.heading("2. extract: waveforms to dynamic stiffness")
     data = extract_record(record, controlled="force", harmonics=[1])
     extract.show(data)
-    data = extract.good_points(data)
-    data.save(table, overwrite=writing.overwrite)
+    return extract.good_points(data)
+
+
+def _estimated(data: FrequencyResponse, truth: Mapping[str, float]) -> tuple[FitResult, Posterior]:
+    from dahl_ident.elements import Dahl, Damper, Mass, Spring
+    from dahl_ident.results import fit, sample
+
     telling.heading("3. fit: friction, mass, damper and spring, nothing known beforehand")
     result = fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
     telling.say(result.fit_report())
-    _compare(result, facts["truth"])
+    _compare(result, truth)
     telling.heading("4. identifiability: what the data determine")
     telling.say(str(result.identifiability))
     telling.heading("5. posterior: emcee, from the same likelihood")
     posterior = sample(result, seed=1)
     telling.say(posterior.report())
-    telling.heading("6. report")
-    with progress_bar() as bar:
-        bar.add_task("drawing", total=None)
-        report(
-            [result, posterior],
-            page,
-            command=telling.typed_command(),
-            record=record,
-            overwrite=writing.overwrite,
-        )
-    telling.say(f"table: {table}\nreport: {page.resolve()}")
-    telling.finish(result.trusted and posterior.converged, result.verdict)
+    return result, posterior
+
+
+def _report(
+    results: Sequence[FitResult | Posterior], page: Path, record: Record, *, overwrite: bool
+) -> None:
+    from dahl_ident.reporting import report
+
+    command = telling.typed_command()
+    report(list(results), page, command=command, record=record, overwrite=overwrite)
 
 
 def _compare(result: FitResult, truth: Mapping[str, float]) -> None:

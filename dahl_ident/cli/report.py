@@ -48,19 +48,17 @@ def report(
 
     writing.check(output, files, json=general.json)
     check_reports(*output)
-    if any(file.endswith(".json") for file in files):
-        chosen = (reading, model, estimating) != (Reading(), ModelOptions(), Estimating())
-        if len(files) > 1 or chosen:
-            raise ValidationError(
-                "a saved fit is reported as it is: give one file, and no options of reading, "
-                "model or estimate beside it"
-            )
-        result = FitResult.load(files[0])
-    else:
-        result = fitted(files, reading, model, estimating)
+    saved = any(file.endswith(".json") for file in files)
+    chosen = (reading, model, estimating) != (Reading(), ModelOptions(), Estimating())
+    if saved and (len(files) > 1 or chosen):
+        raise ValidationError(
+            "a saved fit is reported as it is: give one file, and no options of reading, model or "
+            "estimate beside it"
+        )
+    result = FitResult.load(files[0]) if saved else fitted(files, reading, model, estimating)
+    told: list[FitResult | Posterior] = [result]
     if bootstrap:
         result.conf_interval("bootstrap", seed=seed)
-    told: list[FitResult | Posterior] = [result]
     if posterior:
         told.append(sample(result, seed=seed, progress=sys.stderr.isatty()))
     places = [write_report(told, place, writing, title) for place in output]

@@ -15,7 +15,7 @@ from dahl_ident.errors import ValidationError
 from dahl_ident.plots import style
 
 _WIDE = 3.0
-_QUANTILES = (0.025, 0.16, 0.5, 0.84, 0.975)
+_QUANTILES = (0.16, 0.5, 0.84)
 
 
 def plot_corner(
@@ -63,32 +63,20 @@ def plot_corner(
         if grid.shape != (p, p):
             raise ValidationError(f"ax has shape {grid.shape}; expected {(p, p)}")
     edges = [_edges(values[:, i], logs[i]) for i in range(p)]
-    for i in range(p):
-        for j in range(p):
-            axis = grid[i, j]
-            if j > i:
-                axis.set_axis_off()
-                continue
-            if i == j:
-                axis.hist(values[:, i], edges[i], color=style.SKY, histtype="stepfilled")
-                for q in np.quantile(values[:, i], _QUANTILES[1:4]):
-                    axis.axvline(q, color=style.BLUE, lw=0.8, ls="--")
-                axis.set_yticks([])
-            else:
-                axis.hist2d(
-                    values[:, j], values[:, i], [edges[j], edges[i]], cmap="Blues", rasterized=True
-                )
-                axis.set_yscale("log" if logs[i] else "linear")
-            axis.set_xscale("log" if logs[j] else "linear")
-            axis.grid(visible=False)
-            _few_ticks(axis)
-            _mark(axis, names, i, j, truth or {})
-            axis.tick_params(labelbottom=i == p - 1, labelleft=j == 0 and i > 0, which="both")
-            axis.tick_params(axis="x", labelrotation=30, which="both")
-            if i == p - 1:
-                axis.set_xlabel(names[j])
-            if j == 0 and i > 0:
-                axis.set_ylabel(names[i])
+    for (i, j), axis in np.ndenumerate(grid):
+        if j > i:
+            axis.set_axis_off()
+            continue
+        axis.set_xscale("log" if logs[j] else "linear")
+        axis.set_yscale("log" if logs[i] and i != j else "linear")
+        _few_ticks(axis)
+        if i == j:
+            _marginal(axis, values[:, i], edges[i])
+        else:
+            pair = [edges[j], edges[i]]
+            axis.hist2d(values[:, j], values[:, i], pair, cmap="Blues", rasterized=True)
+        _mark(axis, names, i, j, truth or {})
+        _name_outer_axes(axis, names, i, j)
     return grid
 
 
@@ -156,6 +144,23 @@ def _edges(values: Any, log: bool) -> Any:
     if not high > low:
         low, high = low - 0.5 * abs(low) - 1e-300, high + 0.5 * abs(high) + 1e-300
     return np.geomspace(low, high, 31) if log else np.linspace(low, high, 31)
+
+
+def _marginal(axis: Axes, values: FloatArray, edges: Any) -> None:
+    """Draw the density of one parameter, and its quantiles."""
+    axis.hist(values, edges, color=style.SKY, histtype="stepfilled")
+    for q in np.quantile(values, _QUANTILES):
+        axis.axvline(q, color=style.BLUE, lw=0.8, ls="--")
+    axis.set_yticks([])
+
+
+def _name_outer_axes(axis: Axes, names: Sequence[str], i: int, j: int) -> None:
+    """Put numbers and names on the axes of a panel that no other panel lies outside of."""
+    bottom, left = i == len(names) - 1, j == 0 and i > 0
+    axis.grid(visible=False)
+    axis.tick_params(labelbottom=bottom, labelleft=left, which="both")
+    axis.tick_params(axis="x", labelrotation=30, which="both")
+    axis.set(xlabel=names[j] if bottom else "", ylabel=names[i] if left else "")
 
 
 def _few_ticks(axis: Axes) -> None:
