@@ -33,7 +33,7 @@ from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ValidationError
 
 _EXPONENTS = (1e-9, 1e3)
-_AT_REST = 1e-100
+_AT_REST = 1e-30
 """Smaller beta are rest, to more digits than a number has."""
 
 
@@ -450,14 +450,16 @@ class Dahl(Element):
             h, by_f_max, by_sigma = _per(c, beta), _per(c - slope, beta), _per(slope, beta)
         if not with_alpha:
             by_alpha = np.zeros(h.shape, dtype=np.complex128)
-        elif closed and harmonic == 1:
-            by_alpha = general_dahl.describing_function_gradient(beta, alpha)[3]
-        elif closed:
-            by_alpha = _per(general_dahl.harmonic_gradient(beta, alpha, harmonic)[2], beta)
+        else:
+            if closed and harmonic == 1:
+                by_alpha = general_dahl.describing_function_gradient(beta, alpha)[3]
+            elif closed:
+                by_alpha = _per(general_dahl.harmonic_gradient(beta, alpha, harmonic)[2], beta)
+            by_alpha = sigma * by_alpha
         by_amplitude = _by_amplitude(values, beta, harmonic, by_f_max)
         h *= sigma
         by_f_max *= sigma / f_max
-        return StiffnessGradient(h, by_amplitude, (by_f_max, by_sigma, sigma * by_alpha))
+        return StiffnessGradient(h, by_amplitude, (by_f_max, by_sigma, by_alpha))
 
 
 def _positive(name: str, unit: str, description: str, value: float | None) -> Parameter:
@@ -478,8 +480,7 @@ def _by_amplitude(
 ) -> ComplexArray:
     """Return dN/dA = -(sigma/A) times the derivative of h by ln f_max, also at rest."""
     f_max, sigma, _ = values
-    slope: ComplexArray = np.asarray(by_ln_f_max * (1.0 / np.maximum(beta, _AT_REST)))
-    slope *= -sigma / f_max * sigma
+    slope = np.asarray(by_ln_f_max * (-sigma / f_max * sigma / np.maximum(beta, _AT_REST)))
     rests = beta < _AT_REST
     if np.any(rests):
         slope = np.where(rests, _slope_at_rest(values, harmonic, slope.shape), slope)
