@@ -72,4 +72,4 @@ lock: install  ## renew the pinned environment from pyproject.toml
 		--custom-compile-command "make lock" pyproject.toml
 
 clean:  ## remove what the commands above made
-	rm -rf $(VENV) .venv-lowest .venv-nuts build dist out .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-lowest .venv-nuts build dist docs/_build out .pytest_cache .mypy_cache .ruff_cache
