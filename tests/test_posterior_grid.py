@@ -17,9 +17,15 @@ from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.noise_scale import ScalePosterior
 from dahl_ident.bayes.priors import joint_prior
 from dahl_ident.bayes.quadrature import Grid, integrate, rule
-from dahl_ident.bayes.slices import GaussianSlices
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
-from tests.bayes_cases import FRICTION, X_C, friction_table, spring_table, with_covariance
+from tests.bayes_cases import (
+    FRICTION,
+    X_C,
+    GaussianSlices,
+    friction_table,
+    spring_table,
+    with_covariance,
+)
 
 LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
 

@@ -11,7 +11,7 @@ Parameters of springs, dampers and masses follow friction along curves; they are
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -28,37 +28,6 @@ _NEAR = 0.1  # length of a step, in standard deviations, at which the mode is ne
 _DAMPING = (1e-3, 0.2, 8.0)  # first; factors after a success and after a failure
 _SLOPE = 1e-4  # of ln f_max, ln sigma, ..., for slopes of the shear
 _RIDGE = 1e-13  # keeps what the data leave open solvable
-
-
-@dataclass
-class GaussianSlices:
-    """Slices of a normal density of any covariance, shape (D, D)."""
-
-    outer: int
-    centre: FloatArray
-    covariance: FloatArray
-
-    followers = 0
-
-    @property
-    def inner(self) -> tuple[int, ...]:
-        """The other axes."""
-        return tuple(i for i in range(len(self.centre)) if i != self.outer)
-
-    def charts(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return conditional means, and the conditional spread."""
-        a, b = self.outer, list(self.inner)
-        C = self.covariance
-        offset = values - self.centre[a]
-        modes = np.repeat(self.centre[None], len(values), axis=0)
-        modes[:, a] = values
-        modes[:, b] += offset[:, None] * C[b, a] / C[a, a]
-        rest = C[np.ix_(b, b)] - np.outer(C[b, a], C[b, a]) / C[a, a]
-        return modes, np.repeat(np.linalg.cholesky(rest)[None], len(values), axis=0)
-
-    def follow(self, theta: FloatArray) -> FloatArray:
-        """Return nothing; nothing follows."""
-        return theta[:, :0]
 
 
 class _Fit(NamedTuple):
