@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,7 +13,7 @@ from benchmarks.extraction_validation import accuracy, one_over_f, steady, white
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.elements import Dahl
-from dahl_ident.errors import ExtractionError, ValidationError
+from dahl_ident.errors import DahlIdentError, ExtractionError, ValidationError
 from dahl_ident.extraction import extract
 
 RATE = 200.0
@@ -385,6 +386,60 @@ def test_one_bad_stretch_is_left_out_with_a_warning() -> None:
     assert data.n == 1
     assert data.provenance is not None
     assert len(data.provenance["extraction"]["refused"]) == 1
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    samples=st.integers(2, 600),
+    steps=st.sampled_from(["even", "jitter", "gaps", "wild"]),
+    motion=st.sampled_from(["sine", "noise", "walk", "chirp", "steps", "nothing"]),
+    force=st.sampled_from(["cube", "other", "noise", "nothing", "tiny"]),
+    frequency=st.one_of(st.none(), st.floats(1e-4, 1.0)),
+    mode=st.sampled_from(["auto", "steps", "sweep"]),
+    min_share=st.sampled_from([0.6, 0.0]),
+)
+@settings(max_examples=150)
+def test_any_record_gives_points_or_a_named_error(
+    seed: int, samples: int, steps: str, motion: str, force: str, frequency: float | None,
+    mode: Literal["auto", "steps", "sweep"], min_share: float,
+) -> None:  # fmt: skip
+    rng = np.random.default_rng(seed)
+    step = {
+        "even": np.ones(samples),
+        "jitter": rng.uniform(0.1, 2.0, samples),
+        "gaps": np.where(rng.random(samples) < 0.02, 50.0, 1.0),
+        "wild": 10.0 ** rng.uniform(-6.0, 3.0, samples),
+    }[steps]
+    time = np.cumsum(step)
+    theta = 2.0 * np.pi * 10.0 ** rng.uniform(-3.0, -0.3) * time / np.median(step)
+    x = {
+        "sine": np.sin(theta),
+        "noise": rng.standard_normal(samples),
+        "walk": np.cumsum(rng.standard_normal(samples)),
+        "chirp": np.sin(theta * np.arange(samples) / samples),
+        "steps": np.round(1.5 * np.sin(theta)),
+        "nothing": np.zeros(samples),
+    }[motion]
+    f = {
+        "cube": x**3,
+        "other": np.sin(0.7 * theta),
+        "noise": rng.standard_normal(samples),
+        "nothing": np.zeros(samples),
+        "tiny": 1e-90 * x,
+    }[force]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "(?s).*left out")
+        try:
+            data = extract(
+                Record(time, displacement=x, force=f),
+                frequency=frequency, mode=mode, min_share=min_share,
+            )  # fmt: skip
+        except DahlIdentError:
+            return
+    assert data.covariance is not None
+    assert data.dof is not None
+    assert np.isfinite(data.covariance).all()
+    assert (data.dof > 0.0).all()
 
 
 @pytest.mark.parametrize(

@@ -247,7 +247,7 @@ def _with_hole(time: FloatArray, edges: FloatArray) -> NDArray[np.bool_]:
     periods = np.diff(edges)
     broken = np.zeros(periods.size, dtype=bool)
     steps = np.diff(time)
-    for i in np.flatnonzero(steps > _HOLE * periods.min()):
+    for i in np.flatnonzero(steps > _HOLE * periods.min(initial=np.inf)):
         first = max(int(np.searchsorted(edges, time[i], side="right")) - 1, 0)
         last = int(np.searchsorted(edges, time[i + 1]))
         broken[first:last] |= steps[i] > _HOLE * periods[first:last]

@@ -372,7 +372,8 @@ def _harmonic(phasors: _Phasors, k: int) -> tuple[complex, FloatArray, FloatArra
         np.outer(along, along) + k**2 * np.outer(across, across)
     )
     referred = relative * (1.0 + k**2) * abs(N) ** 2
-    dof = (force + referred) ** 2 / (force**2 / noise.dof + referred**2 / phasors.noise[0].dof)
+    own = force / max(force + referred, _TINY)
+    dof = 1.0 / (own**2 / noise.dof + (1.0 - own) ** 2 / phasors.noise[0].dof)
     return N, covariance, -along * relative * A, dof
 
 

@@ -109,4 +109,4 @@ def distortion(fit: SineFit, integrations: int) -> float:
         [abs(fit.phasors(k)[0]) ** 2 - noise * fit.phasor_variance(k) for k in orders.tolist()]
     )
     power /= orders.astype(np.float64) ** (2 * integrations)
-    return float(np.sqrt(max(power[1:].sum(), 0.0) / power[0]))
+    return float(np.sqrt(max(power[1:].sum(), 0.0)) / abs(fit.phasors(1)[0]))

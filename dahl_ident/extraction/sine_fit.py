@@ -34,6 +34,9 @@ _AFFORDABLE = 4e5  # samples times harmonics; leakage falls with the number of s
 _NYQUIST_MARGIN = 0.45  # highest harmonic over the sampling rate
 _BLOCK = 16384  # samples whose columns stay in the cache
 _BLOCKS_PER_CYCLE = 64  # block means that lose 4e-4 of the fundamental
+_FEWEST_SAMPLES = 2  # that have a phase from one to the next
+_LEAST_WEIGHT = 1e-6  # of a cycle beside the strongest
+_TINY = float(np.finfo(np.float64).tiny)
 _MAX_STEPS = 20
 _TRACKED = 0.1  # phase error that is left to the four-parameter fit, rad
 _STEP_TOLERANCE = 1e-4  # phase at the ends of the stretch, rad; its square is the error left
@@ -79,6 +82,12 @@ class Stretch:
 
     def with_samples(self, time: FloatArray, channels: FloatArray) -> Stretch:
         """Return other samples with the same phase as a function of time."""
+        if time.size < _FEWEST_SAMPLES:
+            raise ExtractionError(
+                f"{time.size} samples near t = {self.centre:.6g} s for cycles of "
+                f"{2.0 * np.pi / self.omega:.4g} s; expected at least 3 a cycle and 2 cycles: "
+                "sample faster, record longer, or check frequency="
+            )
         new = Stretch(time, channels, self.phase)
         inner = Polynomial(
             [(new.centre - self.centre) / self.half_width, new.half_width / self.half_width]
@@ -178,7 +187,7 @@ def sine_fit(stretch: Stretch, *, trend: bool = False, most: int = _MOST_HARMONI
     trending = orders if trend else 0
     theta, tau = stretch.theta, stretch.tau
     normal, right = _normal_equations(theta, tau, stretch.channels, orders, trending)
-    inverse = _inverse(normal, stretch)
+    inverse = solvable_inverse(normal, stretch)
     coefficients = inverse @ right
     residual = stretch.channels.copy()
     for part, block in _column_blocks(theta, tau, orders, trending):
@@ -235,7 +244,8 @@ def _phase_error(stretch: Stretch, degree: int) -> Polynomial:
     counts = np.diff(starts, append=theta.size)
     sums = np.add.reduceat(motion * np.exp(-1j * theta), starts)
     at = np.add.reduceat(stretch.tau, starts) / counts
-    bend = Polynomial.fit(at, np.unwrap(np.angle(sums)), degree, w=np.abs(sums)).convert()
+    weights = np.abs(sums) + _LEAST_WEIGHT * np.abs(sums).max() + _TINY
+    bend = Polynomial.fit(at, np.unwrap(np.angle(sums)), degree, w=weights).convert()
     return bend - bend(0.0)
 
 
@@ -257,7 +267,7 @@ def _frequency_step(stretch: Stretch) -> float:
     theta, tau, y = stretch.theta, stretch.tau, stretch.channels
     normal, right = _normal_equations(theta, tau, y, orders, 1)
     n = 2 * orders + 2
-    inverse = _inverse(normal[:n, :n], stretch)
+    inverse = solvable_inverse(normal[:n, :n], stretch)
     slope = step = 0.0
     for channel in range(len(y)):
         coefficients = inverse @ right[:n, channel]
@@ -315,7 +325,8 @@ def _normal_equations(
     return normal, right
 
 
-def _inverse(normal: FloatArray, stretch: Stretch) -> FloatArray:
+def solvable_inverse(normal: FloatArray, stretch: Stretch) -> FloatArray:
+    """Return the inverse of normal equations, or say that the samples do not determine it."""
     if np.linalg.cond(normal) > 1e8:
         raise ExtractionError(
             f"the samples around t = {stretch.centre:.6g} s do not tell the harmonics of "

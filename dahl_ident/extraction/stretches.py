@@ -21,9 +21,11 @@ from dahl_ident.extraction.sine_fit import (
     Stretch,
     columns,
     estimate_frequency,
+    solvable_inverse,
     steady_stretch,
     thinned,
     track_phase,
+    whole_cycles,
 )
 
 _PLATEAU_CYCLES = 3  # fewer only where no plateau has so many
@@ -100,10 +102,17 @@ def stretch_of(
 ) -> Stretch:
     """Return the samples of a segment with their phase."""
     first, last = np.searchsorted(time, [segment.start, segment.stop]).tolist()
+    if last - first < 2:
+        raise ExtractionError(
+            f"{last - first} samples from t = {segment.start:.6g} to {segment.stop:.6g} s; "
+            "expected at least 3 a cycle and 2 cycles: sample faster, or check frequency="
+        )
     omega = 2.0 * np.pi * (segment.frequency_hz if frequency is None else frequency)
     stretch = steady_stretch(time[first:last], channels[:, first:last], omega)
     if segment.sweep:
         return track_phase(stretch, _SWEEP_DEGREE)
+    if frequency is not None and whole_cycles(stretch) < FEWEST_CYCLES:
+        return stretch  # which whoever measures it will refuse
     if frequency is None:
         stretch = estimate_frequency(track_phase(stretch, 1))
     least, most = np.searchsorted(time, [segment.earliest, segment.latest]).tolist()
@@ -124,7 +133,7 @@ def _extended(
     """
     few = thinned(stretch)
     basis = columns(few.theta, few.tau, 1)
-    fitted = np.linalg.solve(basis @ basis.T, basis @ few.channels[0])
+    fitted = solvable_inverse(basis @ basis.T, few) @ (basis @ few.channels[0])
     cycle = 2.0 * np.pi / stretch.omega
 
     def misfit(where: slice) -> float:
