@@ -18,6 +18,7 @@ from dahl_ident.bayes.noise_scale import ScalePosterior
 from dahl_ident.bayes.priors import joint_prior
 from dahl_ident.bayes.quadrature import Grid, integrate, rule
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
+from dahl_ident.results import GridPosterior
 from tests.bayes_cases import (
     FRICTION,
     X_C,
@@ -141,6 +142,32 @@ def gauss(low: float, high: float, panels: int) -> tuple[FloatArray, FloatArray]
     return (walls[:-1, None] + half * (1.0 + x)).ravel(), (half * w).ravel()
 
 
+def brute_force(
+    grid: GridPosterior, priors: dict[str, Any], panels: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return nodes all over the prior, (..., D), and the probability that the grid gives them."""
+    density = Density(grid.problem, joint_prior(grid.problem, priors))
+    rules = [gauss(low, high, panels) for low, high in np.transpose(density.prior.limits)]
+    nodes = np.stack(np.meshgrid(*[x for x, _ in rules], indexing="ij"), axis=-1)
+    mass = np.exp(density.marginal(nodes.reshape(-1, nodes.shape[-1])) - grid.log_evidence)
+    mass = mass.reshape(nodes.shape[:-1])
+    for axis, (_, weights) in enumerate(rules):
+        mass = mass * weights.reshape(-1, *[1] * (mass.ndim - 1 - axis))
+    return nodes, mass
+
+
+@pytest.mark.parametrize("seed", [0, 5, 10, 13])
+def test_few_points_and_much_noise_stay_inside_the_stated_error(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    low, noise = 10.0 ** random.uniform([-2.0, -1.2], [1.5, 0.0])
+    data = friction_table(int(random.integers(2, 6)), low, 30.0 * low, noise, seed)
+    priors = {"f_max": (1e-3, 10.0), "sigma": (0.3, 3e3)}
+    grid = di.posterior_grid(data, di.Dahl(), priors=priors)
+    assert grid.error < 1e-4
+    _, mass = brute_force(grid, priors, 90)
+    assert abs(mass.sum() - 1.0) < grid.error
+
+
 @pytest.mark.parametrize(
     ("data", "model", "priors", "panels"),
     [
@@ -165,13 +192,7 @@ def test_the_stated_error_holds_against_brute_force(
 ) -> None:
     grid = di.posterior_grid(data, model, priors=priors)
     assert grid.error < 1e-4
-    density = Density(grid.problem, joint_prior(grid.problem, priors))
-    rules = [gauss(low, high, panels) for low, high in np.transpose(density.prior.limits)]
-    nodes = np.stack(np.meshgrid(*[x for x, _ in rules], indexing="ij"), axis=-1)
-    mass = np.exp(density.marginal(nodes.reshape(-1, nodes.shape[-1])) - grid.log_evidence)
-    mass = mass.reshape(nodes.shape[:-1])
-    for axis, (_, weights) in enumerate(rules):
-        mass = mass * weights.reshape(-1, *[1] * (mass.ndim - 1 - axis))
+    nodes, mass = brute_force(grid, priors, panels)
     assert abs(mass.sum() - 1.0) < grid.error
     for axis, name in enumerate(grid.problem.names):
         values = np.exp(nodes[..., axis]) if name != "stiffness" else nodes[..., axis]
@@ -180,7 +201,7 @@ def test_the_stated_error_holds_against_brute_force(
             found = grid.expectation(lambda _n=name, _m=moment, **by_name: by_name[_n] ** _m)
             assert found == pytest.approx(exact, rel=3e-4)
         # the mass below a wall between panels has no error of its own
-        low, high = (limit[axis] for limit in density.prior.limits)
+        low, high = (limit[axis] for limit in joint_prior(grid.problem, priors).limits)
         wall = low + (high - low) * (panels // 2) / panels
         below = float(np.sum(mass * (nodes[..., axis] < wall)))
         middle = np.exp(wall) if name != "stiffness" else wall
