@@ -107,13 +107,13 @@ class Profiler:
 
     def _from_best_start(self, index: IntArray, theta: FloatArray, change: FloatArray) -> _Solution:
         """Return constrained optima near theta + change, also from along microslip's valleys."""
-        best = self._constrained(index, theta + change)
+        begins, rows = [theta + change], [np.arange(len(index))]
         for chart in self._valleys:
-            bent, applies = _along_valley(chart, index, theta, change)
-            if applies.any():
-                other = self._constrained(index[applies], bent[applies])
-                best = best.replaced(other, applies)
-        return best
+            bent, applies = _along_valley(chart, index, theta, change, self._reach.smallest)
+            begins.append(bent[applies])
+            rows.append(np.flatnonzero(applies))
+        row = np.concatenate(rows)
+        return self._constrained(index[row], np.concatenate(begins)).lowest(row)
 
     @cached_property
     def _valleys(self) -> list[Chart]:
@@ -306,22 +306,20 @@ class _Solution:
     slope: FloatArray
     tangent: FloatArray
 
-    def replaced(self, other: _Solution, where: BoolArray) -> _Solution:
-        """Return these solutions with those of another search of the rows `where`, if better."""
-        places = np.flatnonzero(where)
-        better = other.deviance < self.deviance[places]
-        merged = [array.copy() for array in vars(self).values()]
-        for array, new in zip(merged, vars(other).values(), strict=True):
-            array[places[better]] = new[better]
-        return _Solution(*merged)
+    def lowest(self, row: IntArray) -> _Solution:
+        """Return the solution of the least deviance for each row, of several that belong to it."""
+        order = np.lexsort((self.deviance, row))
+        best = order[np.unique(row[order], return_index=True)[1]]
+        return _Solution(*(array[best] for array in vars(self).values()))
 
 
 def _along_valley(
-    chart: Chart, index: IntArray, theta: FloatArray, change: FloatArray
+    chart: Chart, index: IntArray, theta: FloatArray, change: FloatArray, least: float
 ) -> tuple[FloatArray, BoolArray]:
     """Return theta with one coordinate moved at constant sigma^2/f_max and sigma + stiffness.
 
-    Also which rows this is for: those whose coordinate is part of the valley.
+    Also which rows this is for: those whose coordinate is part of the valley, and which stay
+    above the `least` ln x_c of microslip.
     """
     assert chart.tied is not None
     spring, sigma = chart.tied
@@ -339,7 +337,8 @@ def _along_valley(
         phi[:, f_max] = np.where(index == column, value, phi[:, f_max])
     bent = chart.theta(phi)
     bent[np.arange(len(index)), index] = wanted
-    return bent, np.isin(index, np.array([*ln_x_c])) & np.isfinite(bent).all(axis=1)
+    applies = np.isin(index, np.array([*ln_x_c])) & (phi[:, f_max] > least)
+    return bent, applies & np.isfinite(bent).all(axis=1)
 
 
 def _tangent(hessian: FloatArray, index: IntArray) -> FloatArray:

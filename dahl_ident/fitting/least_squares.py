@@ -23,6 +23,7 @@ from dahl_ident.elements import Dahl
 from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting.ending import End, optimum
 from dahl_ident.fitting.levenberg_marquardt import (
+    NEARLY,
     Evaluate,
     Minima,
     gauss_newton,
@@ -39,10 +40,10 @@ DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm
 _RESCALINGS = 100
 _SAME_SCALE = 1e-9
 _LONGEST_SECANT = 20.0
-_FIRST_LOOK, _HOPELESS = 15, 3.0  # steps at a limit, and how much higher it may then still be
+FIRST_LOOK, HOPELESS = 15, 3.0  # steps at a limit, and how much higher it may then still be
 _PATIENCE = 1000  # steps where friction is so faint that each takes little
 AT_LIMIT = 1e4  # looseness: so far out, large terms cancel
-TIE, NEARLY = 1e-12, 1e-4  # relative differences of cost at which a limit wins
+TIE = 1e-12  # relative difference of costs at which a limit wins over a real optimum
 SAME = 1e-5  # among limits, of which the one with fewest parameters is then taken
 
 
@@ -242,8 +243,8 @@ class _Search:
         edges = np.vstack([end.theta, *edge_starts(self.problem)])
         ends = []
         for limit in limits(self.problem):
-            there = self._descend_in(limit.chart, edges, scale, limit, _FIRST_LOOK)
-            if not there.converged and there.cost < _HOPELESS * end.cost:
+            there = self._descend_in(limit.chart, edges, scale, limit, FIRST_LOOK)
+            if not there.converged and there.cost < HOPELESS * end.cost:
                 there = self._descend_in(limit.chart, there.theta[None], scale, limit)
             if there.converged:
                 ends.append(there)

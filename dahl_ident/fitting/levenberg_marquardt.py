@@ -36,6 +36,7 @@ _NOISE_TOLERANCE = 1e-8
 _REMAINDER = 3e-7
 _LAST_STEP = 1e-6  # of a logarithm: the Hessian is that before the last step
 _ROUNDING_TOLERANCE = 1e-13
+NEARLY = 1e-4  # relative difference of costs that are nearly alike
 
 
 @dataclass(frozen=True)
@@ -58,10 +59,26 @@ class Minima:
             self.evaluations[which],
         )
 
+    def put(self, which: IntArray, other: Minima) -> None:
+        """Let some of the searches end where those of `other`, which went on from there, did."""
+        for name in ("theta", "cost", "hessian", "converged"):
+            getattr(self, name)[which] = getattr(other, name)
+        self.evaluations[which] += other.evaluations
+
     def better(self, other: Minima) -> Minima:
         """Return, search by search, the other where it is lower or alone has converged."""
         wins = (other.cost < self.cost) & ~(self.converged & ~other.converged)
-        wins |= other.converged & ~self.converged
+        return self._or(other, wins | (other.converged & ~self.converged))
+
+    def lower(self, other: Minima) -> Minima:
+        """Return, search by search, the other where it is lower, converged or not.
+
+        Where costs are nearly alike, the one that has converged counts as the lower.
+        """
+        own, others = (m.cost * np.where(m.converged, 1.0, 1.0 + NEARLY) for m in (self, other))
+        return self._or(other, others < own)
+
+    def _or(self, other: Minima, wins: BoolArray) -> Minima:
         row = wins[:, None]
         return Minima(
             np.where(row, other.theta, self.theta),

@@ -16,8 +16,16 @@ from numpy.typing import ArrayLike
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Dahl
 from dahl_ident.errors import ValidationError
-from dahl_ident.fitting.least_squares import AT_LIMIT, DOUBTFUL, NEARLY, SAME, TIE, solve
-from dahl_ident.fitting.levenberg_marquardt import IntArray, Minima, minimise
+from dahl_ident.fitting.least_squares import (
+    AT_LIMIT,
+    DOUBTFUL,
+    FIRST_LOOK,
+    HOPELESS,
+    SAME,
+    TIE,
+    solve,
+)
+from dahl_ident.fitting.levenberg_marquardt import NEARLY, IntArray, Minima, minimise
 from dahl_ident.fitting.limits import Chart, Limit, Reach, limits, stiffness_valleys, valleys
 from dahl_ident.fitting.optimum import Optimum, OptimumBatch, estimated_scale, inverse, spread
 from dahl_ident.fitting.start import best_starts, edge_starts, grid_size
@@ -146,6 +154,7 @@ def _descend(
     begin: FloatArray,
     chart: Chart | None = None,
     looseness: float = _LOOSENESS,
+    steps: int = 80,
 ) -> Minima:
     """Return the ends of all tables' searches, by phi in a chart where one is given."""
     logarithmic = np.array([p.transform == "log" for p in batch.parameters])
@@ -162,8 +171,8 @@ def _descend(
         theta = own.theta(phi)
         return part.quadratic(theta, chart=own.derivative(theta))
 
-    logarithmic = ~((chart.matrix != 0.0).T @ ~logarithmic)
-    return minimise(evaluate_in_chart, chart.phi(begin), logarithmic, m, looseness=looseness)
+    logarithmic, phi = ~((chart.matrix != 0.0).T @ ~logarithmic), chart.phi(begin)
+    return minimise(evaluate_in_chart, phi, logarithmic, m, looseness=looseness, steps=steps)
 
 
 def _look_wider(batch: ProblemBatch, end: Minima) -> _Part:
@@ -182,14 +191,28 @@ def _look_wider(batch: ProblemBatch, end: Minima) -> _Part:
     ceiling = end.cost * (1.0 + np.where(real, TIE, NEARLY))
     edges = [end.theta, *edge_starts(batch)]
     for limit in sorted(limits(batch), key=lambda lim: lim.chart.matrix.shape[1]):
-        found = _descend(batch, edges[0], limit.chart, AT_LIMIT)
-        for begin in edges[1:]:
-            found = found.better(_descend(batch, begin, limit.chart, AT_LIMIT))
+        found = _descend_at_limit(batch, edges, limit.chart, end.cost * HOPELESS)
         wins = np.flatnonzero(found.converged & (found.cost <= ceiling))
         if wins.size:
             ceiling[wins] = found.cost[wins] * (1.0 - SAME)  # for limits with more parameters
             part.put(wins, _at_limit(batch.take(wins), limit, wins, found.take(wins)))
     return part
+
+
+def _descend_at_limit(
+    batch: ProblemBatch, edges: list[FloatArray], chart: Chart, hopeless: FloatArray
+) -> Minima:
+    """Return the best ends of searches in a limit's chart, left early above a `hopeless` cost."""
+    looks = [_descend(batch, begin, chart, AT_LIMIT, FIRST_LOOK) for begin in edges]
+    found = looks[0]
+    for other in looks[1:]:
+        found = found.lower(other)
+    further = np.flatnonzero(~found.converged & (found.cost < hopeless))
+    if further.size:
+        own = chart.of(further)
+        begin = own.theta(found.theta[further])
+        found.put(further, _descend(batch.take(further), begin, own, AT_LIMIT))
+    return found
 
 
 def _finite(batch: ProblemBatch, minima: Minima) -> _Part:
