@@ -202,6 +202,12 @@ def test_refusals() -> None:
         di.sample(data, di.Dahl(), walkers=100)
     with pytest.raises(ValidationError, match="likelihood is 'cauchy'; expected one of gaussian"):
         di.sample(data, di.Dahl(), likelihood="cauchy")
+    for ess in (-1.0, np.nan):
+        with pytest.raises(ValidationError, match=r"ess is .*; expected"):
+            di.sample(data, di.Dahl(), ess=ess)
+    pool: Any = 3
+    with pytest.raises(ValidationError, match="pool is 3; expected an object with map"):
+        di.sample(data, di.Dahl(), pool=pool)
     exact = FRICTION.describing_function(np.array([1e-3, 2e-3, 4e-3]))
     perfect = di.FrequencyResponse(np.ones(3), exact, np.array([1e-3, 2e-3, 4e-3]))
     with pytest.raises(SamplingError, match="leaves no noise whose scale could be estimated"):

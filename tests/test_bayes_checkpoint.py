@@ -148,7 +148,7 @@ def test_other_hdf5_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "table.h5"
     with h5py.File(path, "w") as file:
         file["amplitude"] = np.ones(3)
-    refused(path, "an HDF5 file, but not a chain that this version can resume")
+    refused(path, f"^{path} is an HDF5 file, but not a chain that this version can resume")
 
 
 def test_two_runs_exclude_each_other(tmp_path: Path) -> None:
@@ -189,6 +189,8 @@ def test_a_lock_left_by_a_killed_run_or_removed_by_another_does_not_matter(
     assert not lock.exists()
 
 
-def test_a_missing_folder_is_said(tmp_path: Path) -> None:
+def test_a_missing_folder_and_a_folder_are_said(tmp_path: Path) -> None:
+    with pytest.raises(SamplingError, match="is a folder; give the path of a file in it"):
+        sampled(tmp_path, steps=50)
     with pytest.raises(SamplingError, match="nowhere is no folder; make it"):
         sampled(tmp_path / "nowhere" / "chain.h5", steps=50)

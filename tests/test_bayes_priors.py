@@ -97,7 +97,11 @@ def test_defaults_of_plants_hold_a_larger_estimate() -> None:
     [
         ((0.0, 1.0), "has the bounds 0 and 1; expected 0 < low < high"),
         ((2.0, 1.0), "has the bounds 2 and 1; expected 0 < low < high"),
-        (3.0, "prior of f_max is 3.0; expected a frozen distribution"),
+        (3.0, "prior of f_max is 3.0; expected a frozen, continuous distribution"),
+        (stats.poisson(3), "expected a frozen, continuous distribution of one number"),
+        (stats.lognorm, "expected a frozen, continuous distribution of one number"),
+        (stats.norm(1.0, 0.0), "prior of f_max, norm, has no probabilities"),
+        (stats.norm(np.nan, 1.0), "prior of f_max, norm, has no probabilities"),
         (stats.norm(0.1, 0.1), "norm, mean 0.1, std 0.1, has 0.16 of its probability outside"),
         ((0.1, np.nan), r"prior of f_max\[1\] is nan"),
     ],
@@ -105,6 +109,22 @@ def test_defaults_of_plants_hold_a_larger_estimate() -> None:
 def test_bad_priors_are_refused(given: Any, message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         joint_prior(problem(), {"f_max": given})
+
+
+def test_limits_reach_beyond_an_estimate_in_the_tail_unless_nothing_is_there() -> None:
+    estimate = np.array([0.1, 30.0])
+    for prior, low in (
+        (stats.lognorm(0.01, scale=1.0), 2.0 * np.log(0.1) + 0.01 * 6.3613),  # 6.36 deviations
+        (stats.uniform(1.0, 1.0), 0.0),
+    ):
+        part = joint_prior(problem(), {"f_max": prior}, estimate).parts[0]
+        assert part.limits[0] == pytest.approx(low, abs=1e-4)
+        assert part.limits[1] == part.bulk[1]
+
+
+def test_a_prior_without_moments_is_told_by_its_quantiles() -> None:
+    prior = joint_prior(problem(), {"f_max": stats.halfcauchy(scale=0.1)})
+    assert str(prior.parts[0]) == "halfcauchy, median 0.1, 95 % from 0.003929 to 2.545 N"
 
 
 def test_priors_of_unknown_names_are_refused() -> None:

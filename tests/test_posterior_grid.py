@@ -28,6 +28,7 @@ from tests.bayes_cases import (
     with_covariance,
 )
 
+TIGHT = with_covariance(friction_table(30, 0.1, 10.0, 0.01), 0.01)  # f_max to 0.3 %
 LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
 
 
@@ -261,6 +262,36 @@ def test_a_microslip_posterior_names_the_prior() -> None:
     assert "f_max is set by its prior" in grid.report()
 
 
+@pytest.mark.parametrize(
+    "prior", [stats.norm(1.0, 0.1), stats.norm(0.105, 0.0005), stats.lognorm(0.1, scale=1.0)]
+)
+def test_data_outweigh_the_tail_of_a_prior(prior: Any) -> None:
+    grid = di.posterior_grid(TIGHT, di.Dahl(), priors={"f_max": prior})
+    # the likelihood of f_max, sigma profiled out, is nearly normal over its value
+    optimum = di.fit(TIGHT, di.Dahl()).optimum
+    f, std = optimum.values[0], np.sqrt(optimum.values_covariance[0, 0])
+    x = np.linspace(f - 8.0 * std, f + 16.0 * std, 20001)
+    density = prior.logpdf(x) - 0.5 * ((x - f) / std) ** 2
+    weights = np.exp(density - density.max())
+    mean = (weights @ x) / weights.sum()
+    assert grid.converged
+    assert grid.mean()[0] == pytest.approx(mean, abs=0.2 * std)
+    assert "PRIOR AGAINST DATA: f_max lies beyond 99 % of its prior's" in grid.report()
+
+
+def test_a_prior_that_keeps_the_data_out_is_told_with_its_misfit() -> None:
+    walled = di.posterior_grid(TIGHT, di.Dahl(), priors={"f_max": (1.0, 2.0)})
+    assert "at the lower end; check the prior, its unit" in walled.report()
+    assert "MISFIT: the residuals are larger than the noise that the data state" in walled.report()
+    assert not di.posterior_grid(TIGHT, di.Dahl()).findings[:-1]
+
+
+def test_a_lattice_laid_amiss_is_no_silent_answer() -> None:
+    priors = {"f_max": stats.norm(1.0, 0.01)}  # ninety deviations from what the data say
+    grid = di.posterior_grid(TIGHT, di.Dahl(), priors=priors)
+    assert grid.converged or grid.report().startswith("NOT CONVERGED: error")
+
+
 def test_marginals_are_densities_with_the_right_quantiles() -> None:
     grid = di.posterior_grid(friction_table(), di.Dahl())
     for name in grid.names:
@@ -282,6 +313,16 @@ def test_expectation_and_draws() -> None:
     assert x_c == pytest.approx(X_C, rel=0.05)
     draws = grid.draws(4000, seed=1)
     assert (draws[:, 0] / draws[:, 1]).mean() == pytest.approx(x_c, rel=0.01)
+    assert draws.mean(axis=0) == pytest.approx(grid.mean(), rel=0.01)
+    assert draws.std(axis=0) == pytest.approx(grid.std(), rel=0.06)
+
+
+@pytest.mark.parametrize("bad", [0.0, 1.0, 1.5, np.nan])
+def test_quantiles_of_what_is_no_probability_are_refused(bad: float) -> None:
+    grid = di.posterior_grid(friction_table(), di.Dahl())
+    for name in grid.names:
+        with pytest.raises(ValidationError, match=r"probabilities\[1\] is .*; expected"):
+            grid.quantile(name, [0.5, bad])
 
 
 def test_refusals() -> None:

@@ -138,9 +138,11 @@ def open_chain(path: str | os.PathLike[str], identity: Identity) -> Iterator[Cha
     Raises
     ------
     SamplingError
-        If the folder does not exist, or another run holds the lock.
+        If the path names a folder, or lies in none, or another run holds the lock.
     """
     file = Path(path)
+    if file.is_dir():
+        raise SamplingError(f"{file} is a folder; give the path of a file in it")
     if not file.parent.is_dir():
         raise SamplingError(f"{file.parent} is no folder; make it, or give another path")
     with _locked(file):
@@ -209,6 +211,8 @@ def _read(path: Path) -> tuple[Stored, dict[str, str]]:
             attributes = {name: _plain(value) for name, value in file.attrs.items()}
             _check_format(path, attributes)
             arrays = {name: file[name][()] for name in _NAMES}
+    except SamplingError:
+        raise
     except (OSError, KeyError, RuntimeError) as exc:
         raise SamplingError(
             f"{path} cannot be read as a chain ({exc}); it is damaged or something else. Give "

@@ -10,12 +10,17 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import gammaincc, gammaln
+from scipy.special import gammaincc, gammainccinv, gammaln
 
 from dahl_ident.arrays import FloatArray
 
 _ATOMS = 256  # groups of like S that stand for all points in quantiles
 _BISECTIONS = 50
+
+
+def ln_scale_draws(squares: FloatArray, rows: int, random: np.random.Generator) -> FloatArray:
+    """Return a draw of ln s for each sum of squares, (N,)."""
+    return np.asarray(0.5 * np.log(0.5 * squares / random.gamma(rows, size=squares.shape)))
 
 
 @dataclass(frozen=True)
@@ -48,9 +53,9 @@ class ScalePosterior:
     def quantiles(self, probabilities: FloatArray) -> FloatArray:
         """Return quantiles of s."""
         squares, weights = self._atoms
-        middle = 0.5 * np.log(squares.mean() / self.rows)
-        low = np.full(len(probabilities), middle - 40.0)
-        high = np.full(len(probabilities), middle + 40.0)
+        # a quantile of the mixture lies between the same of the parts of least and largest S
+        alone = -0.5 * np.log(gammainccinv(self.rows, probabilities))
+        low, high = (alone + 0.5 * np.log(0.5 * S) for S in (squares.min(), squares.max()))
         for _ in range(_BISECTIONS):
             ln_s = 0.5 * (low + high)
             below = gammaincc(self.rows, 0.5 * squares * np.exp(-2.0 * ln_s)[:, None]) @ weights

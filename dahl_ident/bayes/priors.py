@@ -64,11 +64,15 @@ class ParameterPrior:
         A distribution of the value, or the ends of a log-uniform or uniform one.
     source : {"given", "sensors", "default"}
         Where it comes from; a default follows the size of the data.
+    estimate : float
+        The least-squares value, not finite where unknown. `limits` reach beyond it, because data
+        can outweigh a prior in whose far tail they lie.
     """
 
     parameter: Parameter
     given: PriorLike
     source: str = "given"
+    estimate: float = float("nan")
 
     @property
     def logarithmic(self) -> bool:
@@ -82,15 +86,29 @@ class ParameterPrior:
 
     @cached_property
     def limits(self) -> tuple[float, float]:
-        """Ends of theta, beyond which there is no, or next to no, probability."""
+        """Ends of theta, beyond which there is no, or next to no, posterior probability."""
         if isinstance(self.given, tuple):
-            low, high = self.given
-        else:
-            low, high = (float(self.given.ppf(q)) for q in (_TAIL, 1.0 - _TAIL))
-        low, high = max(low, self.parameter.lower), min(high, self.parameter.upper)
-        if self.logarithmic:
-            return float(np.log(max(low, 1e-300))), float(np.log(high))
+            return self._theta(self.given[0]), self._theta(self.given[1])
+        low, high = self.bulk
+        at = self._theta(self.estimate)
+        if np.isfinite(at):  # as far beyond the estimate as that is from the prior
+            first, last = (self._theta(float(self.given.ppf(q))) for q in (0.0, 1.0))
+            low = max(first, min(low, 2.0 * at - low))
+            high = min(last, max(high, 2.0 * at - high))
         return low, high
+
+    @cached_property
+    def bulk(self) -> tuple[float, float]:
+        """Ends of theta, beyond which there is no, or next to no, prior probability."""
+        if isinstance(self.given, tuple):
+            return self.limits
+        low, high = (self._theta(float(self.given.ppf(q))) for q in (_TAIL, 1.0 - _TAIL))
+        return low, high
+
+    def _theta(self, value: float) -> float:
+        """Return the coordinate of a value, which is moved inside the parameter's bounds."""
+        value = min(max(value, self.parameter.lower), self.parameter.upper)
+        return float(np.log(max(value, 1e-300))) if self.logarithmic else value
 
     @cached_property
     def width(self) -> float:
@@ -147,6 +165,12 @@ class JointPrior:
     def limits(self) -> tuple[FloatArray, FloatArray]:
         """Ends of every theta, each of shape (P,)."""
         low, high = np.array([part.limits for part in self.parts]).T
+        return low, high
+
+    @cached_property
+    def bulk(self) -> tuple[FloatArray, FloatArray]:
+        """Ends of every theta, beyond which there is next to no prior probability."""
+        low, high = np.array([part.bulk for part in self.parts]).T
         return low, high
 
     @cached_property
@@ -219,10 +243,11 @@ def joint_prior(
     for parameter, at in zip(problem.parameters, estimates, strict=True):
         name = parameter.name
         if name in given:
-            parts.append(ParameterPrior(parameter, _checked(parameter, given[name])))
+            prior = _checked(parameter, given[name])
+            parts.append(ParameterPrior(parameter, prior, "given", float(at)))
         elif name in problem.priors:
             prior = _checked(parameter, problem.priors[name])
-            parts.append(ParameterPrior(parameter, prior, "sensors"))
+            parts.append(ParameterPrior(parameter, prior, "sensors", float(at)))
         else:
             bounds = _default(problem, parameter, float(at))
             parts.append(ParameterPrior(parameter, bounds, "default"))
@@ -230,14 +255,16 @@ def joint_prior(
 
 
 def _checked(parameter: Parameter, given: Any) -> PriorLike:
-    if hasattr(given, "logpdf") and hasattr(given, "ppf") and hasattr(given, "cdf"):
+    frozen = not hasattr(given, "freeze")  # as those of scipy.stats without parameters have
+    if frozen and all(hasattr(given, name) for name in ("logpdf", "cdf", "ppf")):
         _check_support(parameter, given)
         prior: Distribution = given
         return prior
     if not isinstance(given, Sequence) or len(given) != 2:
         raise ValidationError(
-            f"the prior of {parameter.name} is {given!r}; expected a frozen distribution of "
-            "scipy.stats, or a pair (low, high)"
+            f"the prior of {parameter.name} is {given!r}; expected a frozen, continuous "
+            "distribution of one number, such as scipy.stats.norm(1.0, 0.005), or a pair "
+            "(low, high)"
         )
     low, high = finite_array(given, f"prior of {parameter.name}").tolist()
     if not low < high or (parameter.transform == "log" and low <= 0.0):
@@ -256,8 +283,15 @@ def _checked(parameter: Parameter, given: Any) -> PriorLike:
 
 def _check_support(parameter: Parameter, given: Distribution) -> None:
     """Refuse a distribution with noticeable probability where the parameter cannot be."""
-    outside = float(given.cdf(parameter.lower)) + 1.0 - float(given.cdf(parameter.upper))
-    if not outside <= 1e-3:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        outside = float(given.cdf(parameter.lower)) + 1.0 - float(given.cdf(parameter.upper))
+        median = float(given.ppf(0.5))
+    if np.isnan([outside, median]).any():
+        raise ValidationError(
+            f"the prior of {parameter.name}, {_name(given)}, has no probabilities: its own "
+            "parameters are not numbers that it allows, such as a standard deviation of 0"
+        )
+    if outside > 1e-3:
         raise ValidationError(
             f"the prior of {parameter.name}, {_described(given)}, has {outside:.2g} of its "
             f"probability outside {parameter.lower:g} to {parameter.upper:g}; take one that lives "
@@ -323,4 +357,7 @@ def _moments(distribution: Any) -> tuple[float, float]:
 
 def _described(distribution: Distribution) -> str:
     mean, std = _moments(distribution)
-    return f"{_name(distribution)}, mean {mean:.6g}, std {std:.4g}"
+    if np.isfinite(std):
+        return f"{_name(distribution)}, mean {mean:.6g}, std {std:.4g}"
+    low, median, high = (float(distribution.ppf(q)) for q in (0.025, 0.5, 0.975))
+    return f"{_name(distribution)}, median {median:.6g}, 95 % from {low:.4g} to {high:.4g}"

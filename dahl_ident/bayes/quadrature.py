@@ -126,26 +126,35 @@ class Marginal:
 
     def quantiles(self, probabilities: FloatArray) -> FloatArray:
         """Return the theta below which there is a given part of the probability."""
-        low = np.full(len(probabilities), self.low[0])
-        high = np.full(len(probabilities), self.high[-1])
+        panel = np.searchsorted(self._below[1:-1], probabilities)
+        rest = probabilities - self._below[panel]
+        low, high = self.low[panel], self.high[panel]
         for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
-            under = self.below(middle) < probabilities
+            under = self._within(panel, middle) < rest
             low, high = np.where(under, middle, low), np.where(under, high, middle)
         return np.asarray(0.5 * (low + high))
 
     def below(self, points: FloatArray) -> FloatArray:
         """Return the probability below each of Q points."""
-        x = (2.0 * points[:, None] - self.low - self.high) / (self.high - self.low)
-        angle = np.arccos(np.clip(x, -1.0, 1.0))
-        terms = np.cos(angle[..., None] * np.arange(POINTS + 1))
-        return np.asarray(np.einsum("qlk,lk->q", terms, self._primitive))
+        panel = np.clip(np.searchsorted(self.low, points) - 1, 0, len(self.low) - 1)
+        return self._below[panel] + self._within(panel, points)
+
+    def _within(self, panel: NDArray[np.intp], points: FloatArray) -> FloatArray:
+        """Return the probability from the lower wall of a panel to a point in it, (Q,)."""
+        angle = np.arccos(self._place(panel, points))
+        terms = np.cos(angle[:, None] * np.arange(POINTS + 1))
+        return np.asarray(np.einsum("qk,qk->q", terms, self._primitive[panel]))
+
+    def _place(self, panel: NDArray[np.intp], points: FloatArray) -> FloatArray:
+        """Return where points are in their panels, from -1 to 1."""
+        low, high = self.low[panel], self.high[panel]
+        return np.clip((2.0 * points - low - high) / (high - low), -1.0, 1.0)
 
     def at(self, points: FloatArray) -> FloatArray:
         """Return the density at each of Q points."""
         panel = np.clip(np.searchsorted(self.low, points) - 1, 0, len(self.low) - 1)
-        low, high = self.low[panel], self.high[panel]
-        angle = np.arccos(np.clip((2.0 * points - low - high) / (high - low), -1.0, 1.0))
+        angle = np.arccos(self._place(panel, points))
         terms = np.cos(angle[:, None] * np.arange(POINTS))
         density = np.einsum("qk,qk->q", terms, self.density[panel] @ rule().series.T)
         outside = (points < self.low[0]) | (points > self.high[-1])
@@ -155,6 +164,11 @@ class Marginal:
     def _primitive(self) -> FloatArray:
         half = 0.5 * (self.high - self.low)
         return half[:, None] * (self.density @ rule().primitive.T)
+
+    @cached_property
+    def _below(self) -> FloatArray:
+        """The probability below each wall, (C + 1,); a Chebyshev series at 1 is its sum."""
+        return np.concatenate([[0.0], np.cumsum(self._primitive.sum(axis=1))])
 
 
 @dataclass(frozen=True)
@@ -166,7 +180,7 @@ class Grid:
     @cached_property
     def best(self) -> Marginal:
         """The marginal of smallest error, whose points stand for the posterior."""
-        return min(self.marginals, key=lambda m: m.error)
+        return min(self.marginals, key=lambda m: np.inf if np.isnan(m.error) else m.error)
 
     @property
     def dims(self) -> int:
@@ -192,7 +206,7 @@ class Grid:
     def error(self) -> float:
         """The largest error of a marginal, or disagreement between two of them, relative."""
         each = [m.log_evidence for m in self.marginals]
-        return float(max(*(m.error for m in self.marginals), np.expm1(max(each) - min(each))))
+        return float(np.max([*(m.error for m in self.marginals), np.expm1(np.ptp(each))]))
 
     @property
     def evaluations(self) -> int:
@@ -231,12 +245,14 @@ def integrate(
     most : int
         Evaluations for one parameter at which refinement ends all the same.
     """
-    return Grid(
-        tuple(
-            _marginal(log_density, box, slicer, centre, spread, tolerance, most)
-            for slicer in slicers
+    # a lattice laid far amiss overflows; its error is infinite then, and said
+    with np.errstate(over="ignore", invalid="ignore"):
+        return Grid(
+            tuple(
+                _marginal(log_density, box, slicer, centre, spread, tolerance, most)
+                for slicer in slicers
+            )
         )
-    )
 
 
 def _marginal(

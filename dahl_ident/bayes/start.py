@@ -118,21 +118,21 @@ def _inside(density: Density, optimum: Optimum | None, random: np.random.Generat
 
 
 def _moved_inside(density: Density, optimum: Optimum) -> FloatArray:
-    """Return the optimum; where it is outside the prior, the best with its first culprit inside.
+    """Return the optimum; where it is outside the prior's bulk, the likeliest of what is near.
 
-    In microslip, say, sigma and the spring have to follow an f_max that cannot be infinite.
+    That may be the optimum all the same, or has its first culprit inside: in microslip, say,
+    sigma and the spring have to follow an f_max that cannot be infinite.
     """
     problem = density.problem
-    low, high = density.prior.limits
-    margin = _INSIDE * (high - low)
-    low, high = low + margin, high - margin
+    low, high = _narrowed(*density.prior.bulk)
     nearest = np.clip(optimum.theta, low, high)
     outside = np.flatnonzero(nearest != optimum.theta)
-    if not outside.size or len(problem.names) == 1:
+    if not outside.size:
         return nearest
+    candidates = [nearest, np.clip(optimum.theta, *_narrowed(*density.prior.limits))]
     first = outside[0]
-    candidates = [nearest]
-    for position in np.linspace(nearest[first], 0.5 * (low + high)[first], _POSITIONS):
+    positions = np.linspace(nearest[first], 0.5 * (low + high)[first], _POSITIONS)
+    for position in positions if len(problem.names) > 1 else ():
         candidate = nearest.copy()
         candidate[first] = position
         value = float(problem.to_values(candidate)[first])
@@ -142,6 +142,11 @@ def _moved_inside(density: Density, optimum: Optimum) -> FloatArray:
             candidates.append(np.clip(candidate, low, high))
     values = density.highest(np.array(candidates))
     return candidates[int(np.argmax(values))]
+
+
+def _narrowed(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+    margin = _INSIDE * (high - low)
+    return low + margin, high - margin
 
 
 def _holding(problem: Problem, held: dict[str, float]) -> Problem:

@@ -32,11 +32,8 @@ def sections(posterior: Posterior) -> Iterator[Section]:
 
 
 def verdict(posterior: Posterior) -> list[str]:
-    """Return whether to use it, and what the prior decides."""
-    return [
-        f"Posterior: {posterior.message}",
-        *(str(rule) for rule in posterior.prior_rules),
-    ]
+    """Return whether to use it, what the prior decides, and what does not fit."""
+    return [f"Posterior: {posterior.message}", *posterior.findings]
 
 
 def facts(posterior: BayesianResult) -> dict[str, Any]:
@@ -47,6 +44,7 @@ def facts(posterior: BayesianResult) -> dict[str, Any]:
         "likelihood": posterior.likelihood,
         "priors": dict(posterior.priors),
         "set_by_prior": [rule.name for rule in posterior.prior_rules],
+        "findings": list(posterior.findings),
         "summary": posterior.summary().to_dict(orient="index"),
     }
     how = ("seed", "steps", "warm_up", "log_evidence", "error", "evaluations")
@@ -68,8 +66,8 @@ def _numbers(posterior: Posterior) -> Iterator[Block]:
     )
     yield Paragraph(f"Priors (likelihood: {posterior.likelihood.replace('_', ' ')}):")
     yield Bullets(tuple(f"{name}: {text}" for name, text in posterior.priors.items()))
-    if posterior.prior_rules:
-        yield Bullets(tuple(str(rule) for rule in posterior.prior_rules))
+    if posterior.findings:
+        yield Bullets(posterior.findings)
     yield Paragraph(f"Seed {posterior.seed}; the same seed gives the same chain.")
 
 

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from functools import cached_property
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import PriorLike
 from dahl_ident.problem import Problem
-from dahl_ident.results.prior_rule import PriorRule
+from dahl_ident.results.predictive import PredictiveCheck, predictive_checks
+from dahl_ident.results.prior_rule import PriorRule, prior_rules
 
 if TYPE_CHECKING:
     import pandas as pd
 
+_RULE_DRAWS = 4000
+_CHECK_DRAWS = 1000
 QUANTILES = {"2.5%": 0.025, "16%": 0.16, "median": 0.5, "84%": 0.84, "97.5%": 0.975}
 
 
@@ -65,34 +71,44 @@ class BayesianResult(ABC):
     def message(self) -> str:
         """Whether the numbers can be used, and what is missing if not."""
 
-    @property
-    @abstractmethod
+    @cached_property
     def prior_rules(self) -> tuple[PriorRule, ...]:
-        """The parameters that the prior determines rather than the data."""
+        """The parameters that the prior determines rather than the data, or against them."""
+        if self.likelihood == "none":
+            return ()
+        return prior_rules(self._density.prior, self._draws(_RULE_DRAWS, 0))
+
+    @cached_property
+    def checks(self) -> tuple[PredictiveCheck, ...]:
+        """Posterior predictive checks of the residuals; none where the prior was sampled."""
+        if self.likelihood == "none":
+            return ()
+        draws = self._draws(_CHECK_DRAWS, 0)
+        return predictive_checks(self._density, draws, np.random.default_rng(0))
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What to know besides the numbers: what the prior decides, and what does not fit."""
+        failed = (str(check) for check in self.checks if not check.passed)
+        return (*map(str, self.prior_rules), *failed)
 
     def draws(self, size: int, seed: int = 0) -> FloatArray:
-        """Return values drawn from the posterior, shape (size, number of parameters).
-
-        Quadrature draws no noise scale, which it integrates.
-        """
+        """Return values drawn from the posterior, shape (size, number of parameters)."""
         return self._density.to_values(self._draws(whole_number(size, "size", 1), seed))
 
     @abstractmethod
     def _draws(self, size: int, seed: int) -> FloatArray:
         """Return the coordinates of draws."""
 
-    def _report(self, table: str, findings: Sequence[str]) -> str:
-        """Return verdict, numbers, findings and priors, in this order."""
-        priors = [f"  {name}: {text}" for name, text in self.priors.items()]
-        return "\n".join([self.message, "", table, *findings, "", "Priors:", *priors])
-
     @abstractmethod
     def summary(self) -> pd.DataFrame:
         """Return one row a parameter: moments and quantiles."""
 
-    @abstractmethod
     def report(self) -> str:
-        """Return the posterior as text; the first line says whether to trust it."""
+        """Return the posterior as text: verdict, numbers, findings and priors, in this order."""
+        table = self.summary().to_string(float_format=lambda v: f"{v:.5g}")
+        priors = [f"  {name}: {text}" for name, text in self.priors.items()]
+        return "\n".join([self.message, "", table, *self.findings, "", "Priors:", *priors])
 
     def __str__(self) -> str:
         return self.report()

@@ -9,18 +9,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import FloatArray, finite_array, positive_array
+from dahl_ident.arrays import FloatArray, array_between, finite_array, positive_array
 from dahl_ident.bayes.density import Density
-from dahl_ident.bayes.noise_scale import ScalePosterior
+from dahl_ident.bayes.noise_scale import ScalePosterior, ln_scale_draws
 from dahl_ident.bayes.quadrature import Grid
 from dahl_ident.errors import ModelError
 from dahl_ident.results.bayesian import QUANTILES, BayesianResult
-from dahl_ident.results.prior_rule import PriorRule, prior_rules
 
 if TYPE_CHECKING:
     import pandas as pd
 
-_RULE_DRAWS = 4000
+_END = 1e-6  # of the probability, beyond which quadrature tells nothing
 
 
 class GridPosterior(BayesianResult):
@@ -28,6 +27,16 @@ class GridPosterior(BayesianResult):
 
     Made by :func:`dahl_ident.posterior_grid`. An unknown scale of the noise is integrated out
     and shown as ``noise_scale`` all the same.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> grid = di.posterior_grid(di.load_dataset("noisy"), di.Dahl())
+    >>> print(grid.message)
+    Converged: error 2e-05 of the probability, 3280 points.
+    >>> low, high = grid.quantile("f_max", [0.025, 0.975])
+    >>> print(f"f_max from {low:.4f} to {high:.4f} N")
+    f_max from 0.0993 to 0.1004 N
     """
 
     def __init__(self, density: Density, grid: Grid, tolerance: float) -> None:
@@ -63,9 +72,12 @@ class GridPosterior(BayesianResult):
         text = f"error {self.error:.1g} of the probability, {self.evaluations} points"
         if self.converged:
             return f"Converged: {text}."
-        return f"NOT CONVERGED: {text}, expected {self._tolerance:.1g}; use sampling, or check it."
+        return (
+            f"NOT CONVERGED: {text}, expected {self._tolerance:.1g}. The numbers are provisional: "
+            "use dahl_ident.sample, or give narrower priors."
+        )
 
-    def quantile(self, name: str, probabilities: float | FloatArray) -> FloatArray:
+    def quantile(self, name: str, probabilities: ArrayLike) -> FloatArray:
         """Return quantiles of one parameter.
 
         Parameters
@@ -73,7 +85,7 @@ class GridPosterior(BayesianResult):
         name : str
             One of `names`.
         probabilities : float or array_like, shape (Q,)
-            Between 0 and 1.
+            From 1e-6 to 1 - 1e-6.
 
         Returns
         -------
@@ -81,7 +93,7 @@ class GridPosterior(BayesianResult):
             In SI units.
         """
         axis = self._axis(name)
-        q = np.atleast_1d(np.asarray(probabilities, dtype=float))
+        q = np.atleast_1d(array_between(probabilities, "probabilities", _END, 1.0 - _END))
         if axis == self._grid.dims:
             found = self._scale.quantiles(q)
         else:
@@ -176,21 +188,17 @@ class GridPosterior(BayesianResult):
 
     def _draws(self, size: int, seed: int) -> FloatArray:
         random = np.random.default_rng(seed)
-        chosen = random.choice(len(self._grid.theta), size=size, p=self._grid.weights)
-        return self._grid.theta[chosen]
+        theta = random.choice(self._grid.theta, size=size, p=self._grid.weights)
+        if not self._density.has_scale:
+            return theta
+        squares = self._density.squares(theta).sum(axis=-1)
+        rows = self.problem.n_residuals // 2
+        return np.column_stack([theta, ln_scale_draws(squares, rows, random)])
 
-    @cached_property
-    def prior_rules(self) -> tuple[PriorRule, ...]:
-        """The parameters that the prior determines rather than the data."""
-        if self._density.likelihood == "none":
-            return ()
-        return prior_rules(self._density.prior, self._draws(_RULE_DRAWS, 0))
-
-    def report(self) -> str:
-        """Return the posterior as text; the first line says whether to trust it."""
-        table = self.summary().to_string(float_format=lambda v: f"{v:.5g}")
-        rules = [str(rule) for rule in self.prior_rules]
-        return self._report(table, [*rules, f"ln evidence: {self.log_evidence:.4f}"])
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What to know besides the numbers, the evidence among it."""
+        return (*super().findings, f"ln evidence: {self.log_evidence:.4f}")
 
     def __repr__(self) -> str:
         return f"<GridPosterior: {', '.join(self.names)}; error {self.error:.1g}>"

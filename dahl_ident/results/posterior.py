@@ -19,13 +19,9 @@ from dahl_ident.errors import SamplingError, ValidationError
 from dahl_ident.fitting import Optimum
 from dahl_ident.results.arviz_export import to_arviz
 from dahl_ident.results.bayesian import QUANTILES, BayesianResult
-from dahl_ident.results.predictive import PredictiveCheck, predictive_checks
-from dahl_ident.results.prior_rule import PriorRule, prior_rules
 
 if TYPE_CHECKING:
     import pandas as pd
-
-_CHECK_DRAWS = 1000
 
 
 @dataclass(frozen=True)
@@ -211,29 +207,6 @@ class Posterior(BayesianResult):
         quantiles = np.quantile(found, list(QUANTILES.values())).tolist()
         moments = {"mean": float(found.mean()), "std": float(found.std(ddof=1))}
         return moments | dict(zip(QUANTILES, quantiles, strict=True))
-
-    @cached_property
-    def prior_rules(self) -> tuple[PriorRule, ...]:
-        """The parameters that the prior determines rather than the data."""
-        if self.likelihood == "none":
-            return ()
-        return prior_rules(self._density.prior, self._points)
-
-    @cached_property
-    def checks(self) -> tuple[PredictiveCheck, ...]:
-        """Posterior predictive checks of the residuals; none where the prior was sampled."""
-        if self.likelihood == "none":
-            return ()
-        return predictive_checks(
-            self._density, self._draws(_CHECK_DRAWS, 0), np.random.default_rng(0)
-        )
-
-    def report(self) -> str:
-        """Return the posterior as text; the first line says whether to trust it."""
-        table = self.summary().to_string(float_format=lambda v: f"{v:.5g}")
-        rules = [str(rule) for rule in self.prior_rules]
-        rules += [str(check) for check in self.checks if not check.passed]
-        return self._report(table, rules)
 
     def __repr__(self) -> str:
         verdict = "converged" if self.converged else "NOT CONVERGED"

@@ -122,6 +122,8 @@ def sample(
     >>> posterior.converged, posterior.names
     (True, ('f_max', 'sigma', 'noise_scale'))
     """
+    if pool is not None and not callable(getattr(pool, "map", None)):
+        raise ValidationError(f"pool is {pool!r}; expected an object with map, such as a Pool")
     problem, optimum = _problem(data, model, noise, sensors, free, fixed)
     density = Density(problem, joint_prior(problem, priors, _estimate(optimum)), likelihood)
     settings = _settings(density, seed, steps, max_steps, ess, walkers, ensembles)
@@ -302,5 +304,5 @@ def _settings(
         whole_number(seed, "seed", 0),
         None if steps is None else whole_number(steps, "steps", _LEAST_STEPS),
         whole_number(max_steps, "max_steps", _LEAST_STEPS),
-        ess,
+        positive_number(ess, "ess"),
     )
