@@ -90,7 +90,10 @@ _SPELLINGS = {
     "Nms": "N*m*s",
     "mil": "thou",
     "mils": "thou",
+    "VDC": "V",
+    "VAC": "V",
 }
+_AMBIGUOUS = {"grad": "a degree in German and a gon elsewhere; write deg or gon"}
 _TOKEN = re.compile(r"[A-Za-zµμ°%Ω_]\w*|\b1\b|(?<![\d(])\^-?\d(?!\d)|[*/() ]")
 _LONGEST = 60
 
@@ -306,6 +309,8 @@ def _normalised(text: str, written: str) -> str:
             f"[{written}] is not a unit; expected one such as [m], [um rms], [kN], [m/s^2] or "
             "[N m/rad]"
         )
+    for word in _AMBIGUOUS.keys() & set(re.findall(r"[a-z]+", out)):
+        raise UnitError(f"[{written}] is ambiguous: {word} is {_AMBIGUOUS[word]}")
     return out
 
 

@@ -489,6 +489,9 @@ class TestInspect:
         assert contents.sampling == "100 Hz, uneven, 89 samples in 0.98 s"
         assert contents.gaps == ("0.49 to 0.6 s",)
         assert '[force]\ncolumn = "F"\nunit = "N"' in contents.column_map
+        path.write_text("Zeit,Weg\n[ s ],[ mm ]\n0,1\n0.5,2\n1,1\n")
+        assert inspect(path).sampling == "2 Hz, even, 3 samples in 1 s"
+        assert '[displacement]\ncolumn = "Weg"\nunit = "mm"' in inspect(path).column_map
         path.write_text("time [s],x [mm]\n1,1\n0,1\n")
         assert inspect(path).sampling == "time does not increase with every sample"
         path.write_text("x [mm],note,empty\n1,a,\n2,b,\n")

@@ -59,6 +59,9 @@ class TestDialects:
             "time,x,F\n[s],[mm],[kN]\n0,1,1\n0.5,2.5,2\n1,-3,3.5\n",
             "Test rig 5\nSample rate,2\nOperator;A. Hill\n\n" + PLAIN,
             "Channel 1,Channel 2,Channel 3\n" + PLAIN,
+            PLAIN.replace("\n0,", "\nRate=2 Hz,24 Bit,\n0,"),
+            PLAIN.replace(" [", " / ").replace("]", ""),
+            PLAIN.replace(" [", " in ").replace("]", ""),
             "# made by a logger\n# 3 channels\n" + PLAIN,
             "% made by a logger\n" + PLAIN + "% the end\n",
             "# " + PLAIN,
@@ -74,6 +77,10 @@ class TestDialects:
     )
     def test_every_dialect_reads_alike(self, tmp_path: Path, text: str) -> None:
         assert_the_run(read_record(written(tmp_path, text)))
+
+    def test_channels_called_by_numbers(self, tmp_path: Path) -> None:
+        path = written(tmp_path, "x-axis,1,2\nsecond,Volt,Volt\n0,1,1\n0.5,2.5,2\n1,-3,3.5\n")
+        assert_the_run(read_record(path, time="x-axis", displacement="1 [mm]", force="2 [kN]"))
 
     @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
     def test_encodings(self, tmp_path: Path, encoding: str) -> None:
@@ -242,6 +249,22 @@ class TestRefusal:
     def test_bad_tables(self, tmp_path: Path, text: str, message: str) -> None:
         with pytest.raises((DataError, UnitError), match=message):
             read_record(written(tmp_path, text))
+
+    @pytest.mark.parametrize("odd", ["1.024,5", "1.024", "OVERLOAD"])
+    def test_a_decimal_comma_leaves_points_to_nobody(self, tmp_path: Path, odd: str) -> None:
+        text = PLAIN.replace(",", ";").replace(".", ",").replace("2,5", odd)
+        with pytest.raises(DataError, match=f"line 3, column 'x': '{odd}' is not a number with a"):
+            read_record(written(tmp_path, text))
+
+    @pytest.mark.parametrize(("lost", "found"), [(1, 3), (3, 1), (5, 0)])
+    def test_a_last_number_without_its_last_digits(
+        self, tmp_path: Path, lost: int, found: int
+    ) -> None:
+        text = PLAIN + "".join(f"{i},{i}.5,12.0{i:03}\n" for i in range(2, 102))
+        text = text.replace("\n0,1,1\n0.5,2.5,2\n1,-3,3.5", "")
+        assert read_record(written(tmp_path, text.rstrip())).time.size == 100
+        with pytest.raises(DataError, match=f"has {found} decimals and no line end, where all ab"):
+            read_record(written(tmp_path, text[: -1 - lost]))
 
     def test_line_numbers_count_preamble_comments_and_blanks(self, tmp_path: Path) -> None:
         text = "rig 5\n\n# c\n" + PLAIN.replace("0.5", "\n# pause\n0.5").replace("2.5", "two")

@@ -128,6 +128,8 @@ def test_decibels_keep_their_reference(text: str) -> None:
         ("/", "not a known unit"),
         ("__class__", "not a known unit"),
         ("dB", "does not say what 0 dB is"),
+        ("Grad", "ambiguous: grad is a degree in German and a gon elsewhere; write deg or gon"),
+        ("grad/s", "ambiguous"),
     ],
 )
 def test_what_is_no_unit(text: str, message: str) -> None:

@@ -11,6 +11,7 @@ from dahl_ident.data.binding import Binding, scaled
 from dahl_ident.data.columns import RECORD_NAMES, ColumnMap
 from dahl_ident.data.record import DriveUnit, Record
 from dahl_ident.data.source import Channel, Source
+from dahl_ident.data.summary import listed
 from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS, si_unit
 
@@ -58,7 +59,8 @@ def _channels(bound: Binding) -> dict[str, Channel]:
     if len(motions) != 1:
         raise DataError(
             f"{bound.source.name}: {' and '.join(motions) or 'no motion'} found; expected one of "
-            "displacement, velocity and acceleration. Name it, such as displacement='x'"
+            "displacement, velocity and acceleration. Name it, such as displacement='x'; there "
+            f"are {listed([c.header for c in bound.source.channels], 20)}"
         )
     found = {role: bound.required(role) for role in motions}
     if bound.map.sample_rate is None:

@@ -19,6 +19,8 @@ from dahl_ident.units import parse_unit
 _NUMBER = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\s*|[-+]?inf|nan", re.ASCII)
 _SUFFIXES = {"hz": "Hz", "deg": "deg", "rad": "rad", "s": "s"}
 _INDEX = re.compile(r"[\d:, ]+")
+_UNBRACKETED = re.compile(r"\s*(.*\S)\s+(?:/|in)\s+(\S.*)")  # as ISO 80000 has it, F / N
+_CURVED = re.compile(r"\s*(.*?\S)\s*\((.*)\)\s*")
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,9 @@ class Channel:
 class Source:
     """All channels of one file.
 
-    `row_name` turns the index of a value into the words that find it in the file. `metadata`
-    is what an earlier save of this package left in the file, `options` what the user said.
+    `row_name` turns the index of a value into the words that find it in the file. `decimal` is
+    the decimal mark of numbers in columns of text. `metadata` is what an earlier save of this
+    package left in the file, `options` what the user said.
     """
 
     name: str
@@ -59,6 +62,7 @@ class Source:
     channels: tuple[Channel, ...]
     sha256: str | None = None
     headerless: bool = False
+    decimal: str = "."
     row_name: Callable[[int], str] = field(default=lambda i: f"row {i + 1}")
     metadata: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
@@ -187,10 +191,14 @@ class Source:
 
     def _from_text(self, channel: Channel) -> FloatArray:
         numbers = np.empty(channel.values.size)
+        swapped = str.maketrans(",.", ".,") if self.decimal == "," else {}
+        mark = " with a decimal comma" if self.decimal == "," else ""
         for i, cell in enumerate(channel.values.flat):
-            text = str(cell)
+            text = str(cell).translate(swapped)
             if not _NUMBER.fullmatch(text):
-                raise DataError(f"{self.where(channel, i)}: {text[:40]!r} is not a number")
+                raise DataError(
+                    f"{self.where(channel, i)}: {str(cell)[:40]!r} is not a number{mark}"
+                )
             numbers[i] = float(text)
         return numbers
 
@@ -201,22 +209,21 @@ def plain(name: str) -> str:
 
 
 def split_header(text: str) -> tuple[str, str | None]:
-    """Split ``"force [kN]"`` or ``"force (kN)"`` into name and unit.
+    """Split ``"force [kN]"``, ``"force (kN)"``, ``"F / kN"`` or ``"force in kN"``.
 
-    Round brackets count only where what they hold is a unit, square ones always, unless it is
-    an index.
+    What stands in square brackets is the unit, unless it is an index; the other ways count
+    only where they lead to a unit.
     """
     square = re.fullmatch(r"\s*(.*?)(\s*)\[([^\[\]]*)\]\s*", text)
     if square and square[1] and square[3].strip():
         unit = square[3].strip()
         if not _INDEX.fullmatch(unit) or (unit == "1" and square[2]):
             return square[1], unit
-    curved = re.fullmatch(r"\s*(.*?)\s*\((.*)\)\s*", text)
-    if curved and curved[1]:
-        if curved[2].strip() == "dB":
-            return curved[1], "dB"  # of what, whoever needs the gain will ask
+    for found in filter(None, (p.fullmatch(text) for p in (_CURVED, _UNBRACKETED))):
+        if found[2].strip() == "dB":
+            return found[1], "dB"  # of what, whoever needs the gain will ask
         try:
-            return curved[1], parse_unit(curved[2]).text
+            return found[1], parse_unit(found[2]).text
         except UnitError:
-            pass
+            continue
     return text.strip(), None

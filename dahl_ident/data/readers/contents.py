@@ -111,9 +111,11 @@ def _summary(channel: Channel) -> ChannelSummary:
 
 
 def _sampling(source: Source) -> tuple[str, tuple[str, ...]]:
-    """Describe the sampling of the first channel that is time and increases."""
-    for channel in source.channels:
-        if not _named(channel, "time", RECORD_NAMES) or channel.values.dtype.kind not in "fiu":
+    """Describe the sampling of the first channel that is time, by its name or its unit."""
+    by_name = [c for c in source.channels if _named(c, "time", RECORD_NAMES)]
+    by_unit = [c for c in source.channels if _of_kind(c, ("time",))]
+    for channel in by_name or by_unit:
+        if channel.values.dtype.kind not in "fiu":
             continue
         try:
             time = channel.values * parse_unit(channel.unit or "s").factor

@@ -35,6 +35,7 @@ _LINE_END = re.compile(rb"\r\n|\n|\r")
 _BEFORE_BRACKET = re.compile(r"(?<=[^\s\])])[ \t]+(?=[\[(])")  # "time [s]" is one field
 _BLANK_SEPARATED = re.compile(r"(?:\[[^\]]*\]|\([^)]*\)|\S)+")
 _HEAD_BYTES = 1 << 15
+_MANY_LINES = 50  # from which decimals of one length are a format, not chance
 _MISSING = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "n/a", "#N/A", "null", "1.#QNAN"]
 _DIALECTS = (
     ("\t", "."), (";", "."), (",", "."), ("|", "."),
@@ -79,6 +80,7 @@ def read_text_table(data: bytes, name: str, sha256: str | None = None) -> Source
         channels,
         sha256,
         headerless=not layout.header.names,
+        decimal=layout.mark,
         row_name=lambda i: f"line {_line_of(data[layout.offset :], layout.line, i)}",
         metadata=metadata,
     )
@@ -161,15 +163,28 @@ def _metadata(lines: list[tuple[int, str]], name: str) -> Mapping[str, Any]:
 
 
 def _refuse_cut_end(data: bytes, layout: _Layout, name: str) -> None:
-    """Refuse a last line with missing fields."""
+    """Refuse a last line with missing fields, or with missing digits and no line end."""
     ends = _LINE_END.split(data[max(layout.offset, len(data) - _HEAD_BYTES) :])
-    last = next(t for t in reversed(ends) if _counts(t)).decode("utf-8", "replace")
-    fields = len(_split(last, layout.delimiter))
-    if fields < layout.width:
+    *before, last = [t.decode("utf-8", "replace") for t in ends if _counts(t)]
+    cells = _split(last, layout.delimiter)
+    if len(cells) < layout.width:
         raise DataError(
-            f"{name}: the last line has {fields} fields, {last[:40]!r}, where the others have "
+            f"{name}: the last line has {len(cells)} fields, {last[:40]!r}, where the others have "
             f"{layout.width}; the file looks cut off"
         )
+    if not ends[-1] or len(before) < _MANY_LINES:
+        return
+    found, usual = _decimals(last, layout), {_decimals(line, layout) for line in before[1:]}
+    if len(usual) == 1 and found < min(usual):
+        raise DataError(
+            f"{name}: the last number, {cells[-1]!r}, has {found} decimals and no line end, where "
+            f"all above have {min(usual)}; the file looks cut off"
+        )
+
+
+def _decimals(line: str, layout: _Layout) -> int:
+    """Return how much of the line's last number stands behind its decimal mark."""
+    return len(_split(line, layout.delimiter)[-1].strip().partition(layout.mark)[2])
 
 
 def _counts(line: bytes) -> bool:

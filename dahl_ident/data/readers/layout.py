@@ -21,6 +21,7 @@ _CELL = {
     )
     for mark in ".,"
 }
+_NUMBERED = "x-axis"  # before the numbers by which Keysight oscilloscopes call their channels
 
 
 @dataclass(frozen=True)
@@ -75,14 +76,16 @@ def header(above: Sequence[Sequence[str]], width: int) -> Header:
     for row in reversed(above):
         cells = _without_trailing(row)
         fits = width - 1 <= len(cells) <= width and len(row) == len(above[-1])
-        if not cells or not fits or _holds_number(cells):
+        numbered = bool(cells) and cells[0].casefold() == _NUMBERED
+        if not cells or not fits or (_holds_number(cells) and not numbered):
             break
         lines.insert(0, [*cells, *[""] * (width - len(cells))])
     if not lines:
         return Header((), (), 0)
     k = next((k for k in range(len(lines) - 1, 0, -1) if _are_units(lines[k])), None)
     if k is None:
-        named = [split_header(cell) for cell in lines[-1]]
+        split = [[split_header(cell) for cell in line] for line in reversed(lines)]
+        named = max(split, key=lambda cells: sum(unit is not None for _, unit in cells))
         return _header([n for n, _ in named], [u for _, u in named])
     named = [split_header(cell) for cell in lines[k - 1]]
     units = [own or _bare(cell) for (_, own), cell in zip(named, lines[k], strict=True)]
@@ -106,7 +109,7 @@ def _holds_number(cells: Sequence[str]) -> bool:
 
 def _bare(cell: str) -> str | None:
     """Return the unit in a cell of a row of units; None for an empty one."""
-    text = re.sub(r"^[\[(](.*)[\])]$", r"\1", cell.strip())
+    text = re.sub(r"^[\[(]\s*(.*?)\s*[\])]$", r"\1", cell.strip())
     return "1" if text == "-" else text or None
 
 
