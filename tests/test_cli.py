@@ -123,11 +123,40 @@ def test_options_come_from_a_file_and_the_command_line_wins(run: Runner) -> None
     assert json.loads(again)["params"]["sigma"]["value"] == 20.0
 
 
-def test_an_unknown_option_in_a_file_is_named(run: Runner) -> None:
-    Path("lab.toml").write_text("[fit]\nnosie = 1\n", encoding="utf-8")
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ("[fit]\nnosie = 1\n", "fit has no option nosie; there are "),
+        ('nosie = "absolute"\n', "no command has the option nosie; there are "),
+        ('[fti]\nnoise = "absolute"\n', "no command is called fti; there are datasets, demo, "),
+        ("fit = 3\n", "no command has the option fit; "),
+    ],
+)
+def test_an_unknown_name_in_a_file_of_options_is_refused(
+    run: Runner, options: str, says: str
+) -> None:
+    Path("lab.toml").write_text(options, encoding="utf-8")
     outcome = run("fit", "x.csv", "--config", "lab.toml")
     assert outcome.status == 1
-    assert "lab.toml: fit has no option nosie; it has " in outcome.err
+    assert outcome.err.startswith(f"error: lab.toml: {says}")
+    assert outcome.err.count("\n") == 1
+
+
+def test_a_report_shows_how_waveforms_settled(run: Runner) -> None:
+    Path("run.csv").write_text(run("datasets", "plant_recording", "-o", "-").out, encoding="utf-8")
+    assert run("extract", "run.csv", "--controlled", "force", "-o", "levels.csv").status == 0
+    plant = ("--mass", "free", "--damping", "free", "--stiffness", "free")
+    told = run("report", "levels.csv", *plant, "--record", "run.csv", "-o", "a.html")
+    assert told.status == 0, told.err
+    assert "settled, the one with the largest bias" in Path("a.html").read_text(encoding="utf-8")
+    Path("map.toml").write_text("[time]\ncolumn = 'clock'\n", encoding="utf-8")
+    wrong = run(
+        "report", "levels.csv", *plant, "--record", "run.csv", "--record-columns", "map.toml",
+        "-o", "b.html",
+    )  # fmt: skip
+    assert wrong.status == 1
+    assert "no column is called 'clock'" in wrong.err
+    assert not Path("b.html").exists()
 
 
 def test_levels_come_from_file_names(run: Runner) -> None:

@@ -46,6 +46,31 @@ def test_demo_recovers_the_plant(
     assert "Can be trusted" in page.read_text(encoding="utf-8")
 
 
+def test_demo_for_machines_tells_its_steps_on_standard_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("lab.toml").write_text("json = true\noutput = 'here'\n", encoding="utf-8")
+    assert run("demo", "--config", "lab.toml") == 0
+    printed = capsys.readouterr()
+    told = json.loads(printed.out)
+    assert "6. report" in printed.err
+    for name, truth in told["truth"].items():
+        assert told["fit"]["params"][name]["value"] == pytest.approx(truth, rel=0.3)
+    assert told["posterior"]["converged"]
+    assert Path(told["report"]) == tmp_path / "here" / "report.html"
+    assert Path(told["report"]).is_file()
+
+
+def test_demo_says_where_no_folder_can_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("there").write_text("", encoding="utf-8")
+    assert run("demo", "-o", "there") == 1
+    assert capsys.readouterr().err == "error: there: the folder cannot be made: File exists\n"
+
+
 @pytest.mark.skipif(not MEASURED.is_dir(), reason="DAHL_IDENT_MEASURED_DATA names no brfd folder")
 def test_measured_damper_from_files_to_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -1,7 +1,8 @@
 """Options from a TOML file: a laboratory's standard run in one word.
 
 What stands outside of tables is meant for every command that knows it; a table named after a
-command is for that one alone. An option that may be given several times is a list, or, where it
+command is for that one alone. A name that nothing knows is refused: a slip of the pen must not
+leave a default standing. An option that may be given several times is a list, or, where it
 assigns values to names, a table: ``[sample.prior]`` with ``f_max = [0.01, 1]`` and
 ``mass = "norm(0.3, 0.001)"`` is the calibration sheet of a laboratory.
 """
@@ -9,7 +10,7 @@ assigns values to names, a table: ``[sample.prior]`` with ``f_max = [0.01, 1]`` 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,17 +27,32 @@ def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
         given = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as exc:
         raise DataError(f"{path}: no TOML file of options: {exc}") from exc
-    known = {p.name for p in ctx.command.params} - {"config", None}
-    own = _named(given.pop(ctx.info_name or "", {}))
-    unknown = sorted(own.keys() - known)
-    if unknown:
-        raise DataError(
-            f"{path}: {ctx.info_name} has no option {', '.join(unknown)}; it has "
-            f"{', '.join(sorted(map(str, known)))}"
-        )
-    shared = _named({k: v for k, v in given.items() if not isinstance(v, dict)})
+    tables = {k: v for k, v in given.items() if isinstance(v, dict)}
+    shared = _named({k: v for k, v in given.items() if k not in tables})
+    own = _named(tables.get(ctx.info_name or "", {}))
+    commands = _options_of_commands(ctx)
+    known = commands.get(ctx.info_name or "", set())
+    _refuse_unknown(path, "no command is called", tables, commands.keys())
+    _refuse_unknown(path, f"{ctx.info_name} has no option", own, known)
+    _refuse_unknown(path, "no command has the option", shared, set().union(*commands.values()))
     ctx.default_map = {k: v for k, v in shared.items() if k in known} | own
     return path
+
+
+def _options_of_commands(ctx: typer.Context) -> dict[str, set[str]]:
+    """Return the names of the options of every command."""
+    commands: Mapping[str, Any] = getattr(ctx.find_root().command, "commands", {})
+    return {
+        name: {p.name for p in command.params} - {"config"} for name, command in commands.items()
+    }
+
+
+def _refuse_unknown(path: Path, what: str, given: Iterable[str], known: Collection[str]) -> None:
+    unknown = sorted(set(given) - set(known))
+    if unknown:
+        raise DataError(
+            f"{path}: {what} {', '.join(unknown)}; there are {', '.join(sorted(known))}"
+        )
 
 
 def _named(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dahl_ident.cli import extract, telling
-from dahl_ident.cli.files import progress_bar
+from dahl_ident.cli.files import make_folder, progress_bar
+from dahl_ident.cli.fit import as_json
 from dahl_ident.cli.groups import grouped
-from dahl_ident.cli.options import Writing
+from dahl_ident.cli.options import General, Writing
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse, Record
@@ -22,6 +25,7 @@ _DATASET = "plant_recording"
 
 @grouped
 def demo(
+    general: General,
     writing: Writing,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for the table and the report.")
@@ -29,29 +33,52 @@ def demo(
 ) -> None:
     """Run the whole chain on a shipped recording of a plant, the true values beside the result.
 
+    With --json the steps are told on standard error.
+
     Example: dahl-ident demo
     """
-    from dahl_ident.data import inspect, read_record
-    from dahl_ident.synthetic.shipped import datasets_directory, load_dataset
+    from dahl_ident.reporting.posteriors import facts
+    from dahl_ident.synthetic.shipped import load_dataset
 
     table, page = output / "levels.csv", output / "report.html"
     writing.check([table, page])
-    output.mkdir(parents=True, exist_ok=True)
-    facts = load_dataset(_DATASET).provenance or {}
-    file = datasets_directory() / facts["file"]
+    make_folder(output)
+    origin = load_dataset(_DATASET).provenance or {}
+    with redirect_stdout(sys.stderr) if general.json else nullcontext():
+        result, posterior = _chain(origin, table, page, overwrite=writing.overwrite)
+    if general.json:
+        telling.say_json(
+            {
+                "truth": origin["truth"],
+                "fit": as_json(result),
+                "posterior": facts(posterior),
+                "table": str(table),
+                "report": str(page.resolve()),
+            }
+        )
+    telling.finish(result.trusted and posterior.converged, result.verdict)
 
+
+def _chain(
+    origin: Mapping[str, Any], table: Path, page: Path, *, overwrite: bool
+) -> tuple[FitResult, Posterior]:
+    """Take every step from the recording to the report, and tell each."""
+    from dahl_ident.data import inspect, read_record
+    from dahl_ident.synthetic.shipped import datasets_directory
+
+    file = datasets_directory() / origin["file"]
     telling.heading(f"1. inspect: {file}")
     telling.say(repr(inspect(file)))
     record = read_record(file)
     data = _extracted(record)
-    data.save(table, overwrite=writing.overwrite)
-    result, posterior = _estimated(data, facts["truth"])
+    data.save(table, overwrite=overwrite)
+    result, posterior = _estimated(data, origin["truth"])
     telling.heading("6. report")
     with progress_bar() as bar:
         bar.add_task("drawing", total=None)
-        _report([result, posterior], page, record, overwrite=writing.overwrite)
+        _report([result, posterior], page, record, overwrite=overwrite)
     telling.say(f"table: {table}\nreport: {page.resolve()}")
-    telling.finish(result.trusted and posterior.converged, result.verdict)
+    return result, posterior
 
 
 def _extracted(record: Record) -> FrequencyResponse:

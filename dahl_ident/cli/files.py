@@ -36,6 +36,22 @@ def written(write: Callable[[str | Path], Path], output: str, ending: str) -> st
     return output
 
 
+def make_folder(place: Path) -> None:
+    """Make a folder where it is missing.
+
+    Raises
+    ------
+    DataError
+        If that cannot be done.
+    """
+    from dahl_ident.errors import DataError
+
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as exc:
+        raise DataError(f"{place}: the folder cannot be made: {exc.strerror or exc}") from exc
+
+
 def write_picture(axes: Any, path: str, *, overwrite: bool) -> None:
     """Write the figure of some axes in the format of the file's name."""
     from dahl_ident.data.storage import write_whole

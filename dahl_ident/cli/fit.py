@@ -125,17 +125,18 @@ def write_report(
     results: Sequence[FitResult | Posterior],
     place: str,
     writing: Writing,
-    title: str | None = None,
+    **how: Any,
 ) -> str:
-    """Write a report, as HTML where that is standard output, and return where it is."""
+    """Write a report, as HTML where that is standard output, and return where it is.
+
+    `how` are further arguments of ``report``.
+    """
     from functools import partial
 
     from dahl_ident.reporting import report
 
-    write = partial(
-        report, list(results), title=title, command=telling.typed_command(),
-        overwrite=writing.overwrite,
-    )  # fmt: skip
+    told = {**how, "command": telling.typed_command(), "overwrite": writing.overwrite}
+    write = partial(report, list(results), **told)
     return written(write, place, ".html")
 
 

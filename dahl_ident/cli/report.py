@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -31,6 +32,13 @@ def report(
             help="Report: .html, .pdf, .md, .json; or several. - is HTML on standard output.",
         ),
     ] = ["report.html"],  # noqa: B006 - typer takes lists as lists
+    record: Annotated[
+        Path | None,
+        typer.Option(help="Waveforms that the table is from: the report shows how they settled."),
+    ] = None,
+    record_columns: Annotated[
+        Path | None, typer.Option(help="Column map of these waveforms, a TOML file.")
+    ] = None,
     title: Annotated[str | None, typer.Option(help="First line of the report.")] = None,
     bootstrap: Annotated[
         bool, typer.Option("--bootstrap", help="Bootstrap intervals as well, beside the others.")
@@ -44,6 +52,7 @@ def report(
 
     Example: dahl-ident datasets noisy -o - | dahl-ident report - -o report.html
     """
+    from dahl_ident.data import read_record
     from dahl_ident.results import FitResult, Posterior, sample
 
     writing.check(output, files, json=general.json)
@@ -55,13 +64,15 @@ def report(
             "a saved fit is reported as it is: give one file, and no options of reading, model or "
             "estimate beside it"
         )
+    waveforms = None if record is None else read_record(record, columns=record_columns)
     result = FitResult.load(files[0]) if saved else fitted(files, reading, model, estimating)
     told: list[FitResult | Posterior] = [result]
     if bootstrap:
         result.conf_interval("bootstrap", seed=seed)
     if posterior:
         told.append(sample(result, seed=seed, progress=sys.stderr.isatty()))
-    places = [write_report(told, place, writing, title) for place in output]
+    how = {"title": title, "record": waveforms}
+    places = [write_report(told, place, writing, **how) for place in output]
     if general.json:
         telling.say_json(places)
     elif STANDARD not in places:

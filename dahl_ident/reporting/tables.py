@@ -160,8 +160,8 @@ def goodness(fit: FitResult) -> Table:
     rows = [
         words("data (real numbers)", f"{fit.ndata}"),
         words("degrees of freedom", f"{fit.nfree}"),
-        (Cell("chi-square"), number(fit.chisqr)),
-        (Cell("reduced chi-square"), number(fit.redchi)),
+        (Cell("sum of squares"), number(fit.chisqr)),
+        (Cell("sum of squares over degrees of freedom"), number(fit.redchi)),
         words("noise scale", scale),
         (Cell("AIC"), number(fit.aic, 6)),
         (Cell("BIC"), number(fit.bic, 6)),
