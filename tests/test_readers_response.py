@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.data import FrequencyResponse, inspect, read_frequency_response
 from dahl_ident.errors import DataError, DataWarning, UnitError
+from dahl_ident.synthetic import load_dataset
 
 FREQUENCY = np.array([1.0, 2.0, 4.0])
 OMEGA = 2 * np.pi * FREQUENCY
@@ -467,6 +468,25 @@ class TestInspect:
         assert "# not used: n" in contents.column_map
         assert "Kraft" in repr(contents)
         assert "<td" in contents._repr_html_()
+
+    def test_columns_with_names_of_their_own_are_nothing_else(self, tmp_path: Path) -> None:
+        path, columns = tmp_path / "ours.csv", tmp_path / "ours.toml"
+        table = load_dataset("noisy")
+        assert isinstance(table, FrequencyResponse)
+        table.save(path)
+        text = inspect(path).column_map
+        assert "drive" not in text
+        assert "# not used" not in text
+        assert "# read by their names: covariance_real_real" in text
+        columns.write_text(text)
+        same = read_frequency_response(path, columns=columns)
+        assert np.array_equal(same.covariance, table.covariance)
+
+    def test_f_is_force_beside_time_or_motion_and_frequency_else(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.csv"
+        for names, role in (("f,x_um,K", "frequency"), ("t,x,f", "force"), ("x,y,f", "force")):
+            path.write_text(f"{names}\n1,100,29.9\n2,900,28.4\n")
+            assert f'[{role}]\ncolumn = "f"' in inspect(path).column_map
 
     def test_missing_units_are_left_to_fill_in(self, tmp_path: Path) -> None:
         path, columns = tmp_path / "a.csv", tmp_path / "lab.toml"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +36,7 @@ _RESPONSE_UNITS: dict[str, tuple[str, ...]] = {
     "level": (),
 }
 _NO_UNIT = ("level",)
+_PROPOSED_NAMES = RESPONSE_NAMES | {"frequency": (*RESPONSE_NAMES["frequency"], "f")}
 
 
 @dataclass(frozen=True)
@@ -141,23 +142,45 @@ def _named(channel: Channel, role: str, names: Mapping[str, tuple[str, ...]]) ->
 def _proposal(source: Source) -> str:
     """Return a column map in TOML: roles by name first, by unit where no name claims them."""
     groups = _patterns(source)
-    response = any(
-        _named(c, "frequency", RESPONSE_NAMES) or _of_kind(c, _RESPONSE_UNITS["frequency"])
-        for c in groups.values()
-    )
-    names = RESPONSE_NAMES if response else RECORD_NAMES
+    response = _is_response(groups.values())
+    names = _PROPOSED_NAMES if response else RECORD_NAMES
     units = _RESPONSE_UNITS if response else _RECORD_UNITS
     roles: dict[str, str] = {}
     for role in units:
         free = {p: c for p, c in groups.items() if p not in roles.values()}
         by_name = (p for p, c in free.items() if _named(c, role, names))
-        by_unit = (p for p, c in free.items() if _of_kind(c, units[role]))
-        found = next(by_name, None) or next(by_unit, None)
-        if found is not None and not (role in MOTION_KINDS and set(MOTION_KINDS) & roles.keys()):
-            roles[role] = found
+        by_unit = (
+            p
+            for p, c in free.items()
+            if _of_kind(c, units[role]) and not _has_name(c, names, names)
+        )
+        best = next(by_name, None) or next(by_unit, None)
+        if best is not None and not (role in MOTION_KINDS and set(MOTION_KINDS) & roles.keys()):
+            roles[role] = best
     lines = [line for role, path in roles.items() for line in _entry(role, path, groups[path])]
-    unused = [path for path in groups if path not in roles.values()]
-    return "\n".join([*lines, *([f"# not used: {listed(unused, 20)}"] if unused else [])])
+    others = [path for path in groups if path not in roles.values()]
+    found = [path for path in others if _has_name(groups[path], names.keys() - roles, names)]
+    unused = [path for path in others if path not in found]
+    for what, paths in (("read by their names", found), ("not used", unused)):
+        lines += [f"# {what}: {listed(paths, 20)}"] if paths else []
+    return "\n".join(lines)
+
+
+def _has_name(channel: Channel, roles: Iterable[str], names: Mapping[str, tuple[str, ...]]) -> bool:
+    return any(_named(channel, role, names) for role in roles)
+
+
+def _is_response(channels: Collection[Channel]) -> bool:
+    """Return whether channels are a table of response: f is force beside time or motion only."""
+
+    def any_is(role: str, names: Mapping[str, tuple[str, ...]]) -> bool:
+        kinds = (_RECORD_UNITS | _RESPONSE_UNITS)[role]
+        return any(_named(c, role, names) or _of_kind(c, kinds) for c in channels)
+
+    if any_is("frequency", RESPONSE_NAMES):
+        return True
+    sampled = any(any_is(role, RECORD_NAMES) for role in ("time", *MOTION_KINDS))
+    return not sampled and any_is("frequency", _PROPOSED_NAMES)
 
 
 def _of_kind(channel: Channel, kinds: tuple[str, ...]) -> bool:
