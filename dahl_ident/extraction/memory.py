@@ -108,6 +108,8 @@ def estimate_memory(
     start = float(_path(fit.stretch.theta[:1] + displacement_phase)[0])
 
     slow = _SlowLines.of(few)
+    unsteady = few.channels[0] - steady.T @ (steady @ few.channels[0])
+    seen = slow.tones @ unsteady
     rates = _RATES
     centre = np.log(_friction_rate(response))
     for _ in range(_REFINEMENTS):
@@ -117,8 +119,7 @@ def estimate_memory(
         sizes = decays @ few.channels[0] / power
         gain = sizes**2 * power
         best = int(np.argmax(gain))
-        left = few.channels[0] - sizes[best] * decays[best]
-        variance = slow.variance(left - steady.T @ (steady @ left), decays[best])
+        variance = slow.variance(seen, sizes[best], decays[best])
         i = int(np.argmin(((np.log(rates) - centre) / _RATE_SPREAD) ** 2 - gain / variance))
         departure, std, rate = sizes[i], np.sqrt(variance / power[i]), rates[i]
         rates = np.geomspace(rates[max(i - 1, 0)], rates[min(i + 1, rates.size - 1)], 11)
@@ -150,14 +151,16 @@ class _SlowLines:
         p = np.arange(1.0, min(cycles, _SLOW_LINES + 1))
         return cls(p, powers(np.exp(-1j / cycles * angle), p.size)[1:])
 
-    def variance(self, noise: FloatArray, decay: FloatArray) -> float:
+    def variance(self, lines: ComplexArray, departure: float, decay: FloatArray) -> float:
         """Return the variance of white noise that moves D_0 as much as the slow noise does.
 
-        The lines are taken as c/f; the decay sees c times its own mean of 1/f.
+        `lines` are those of noise and departure together. They are taken as c/f; the decay sees
+        c times its own mean of 1/f.
         """
-        level = float(np.mean(self.p * np.abs(self.tones @ noise) ** 2)) / noise.size
-        seen = np.abs(self.tones @ decay) ** 2
-        return max(level * float(np.sum(seen / self.p) / np.sum(seen)), _TINY)
+        decaying = self.tones @ decay
+        power = np.abs(decaying) ** 2
+        level = float(np.mean(self.p * np.abs(lines - departure * decaying) ** 2)) / decay.size
+        return max(level * float(np.sum(power / self.p) / np.sum(power)), _TINY)
 
 
 def _friction_rate(response: complex) -> float:
