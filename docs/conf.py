@@ -37,6 +37,12 @@ nb_merge_streams = True
 html_theme = "pydata_sphinx_theme"
 html_title = "dahl_ident"
 html_show_sourcelink = False
+html_static_path = ["_static"]
+html_css_files = ["manual.css"]
+# pages without others below them have nothing to list on the left
+html_sidebars = {
+    page: [] for page in ("theory", "reference", "benchmarks", "changelog", "contributing")
+}
 
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import re
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,13 @@ def _has_example(value: object) -> bool:
 
 def test_every_public_docstring_has_an_example() -> None:
     assert [name for name in di.__all__ if not _has_example(getattr(di, name))] == []
+
+
+def test_every_class_and_function_of_the_reference_has_an_example() -> None:
+    page = (DOCS / "reference.md").read_text("utf-8")
+    names = re.findall(r"auto(?:class|function):: dahl_ident\.(\S+)$", page, re.MULTILINE)
+    assert len(names) > 60
+    assert [name for name in names if not _has_example(attrgetter(name)(di))] == []
 
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)

@@ -35,6 +35,13 @@ class Branches:
         Amplitudes, phases, receptances; NaN where a point has fewer than the most.
     growth_rate : ndarray
         Rate at which the worst small disturbance grows, 1/s; negative on stable branches.
+
+    Examples
+    --------
+    >>> from dahl_ident import Dahl, Damper, Mass, Spring, response_branches
+    >>> plant = Dahl(f_max=0.1, sigma=30) + Mass(0.3) + Damper(-0.03) + Spring(3.0)
+    >>> response_branches(plant, 0.525, 0.114).stable.tolist()
+    [True, False, True]
     """
 
     steady: SteadyResponse

@@ -58,6 +58,12 @@ class LimitCycle:
         Hz.
     growth_rate : float
         Rate at which a small disturbance of the amplitude grows, 1/s; negative where it dies.
+
+    Examples
+    --------
+    >>> cycle = LimitCycle(amplitude=5.8e-6, frequency_hz=16.2, growth_rate=-3.0)
+    >>> cycle.stable, round(cycle.omega, 1)
+    (True, 101.8)
     """
 
     amplitude: float

@@ -64,6 +64,13 @@ class ModelComparison:
         Those that could be fitted.
     failed : mapping of str to str
         Why the others could not.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> comparison = di.compare_models(di.fit(di.load_dataset("alpha_2"), di.Dahl()))
+    >>> comparison.best.name
+    'exponent free'
     """
 
     models: tuple[ComparedModel, ...]

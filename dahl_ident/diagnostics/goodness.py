@@ -115,6 +115,13 @@ class Goodness:
         Rows that the extraction flagged, with the reason.
     level : float
         p-value below which one test counts.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> goodness = di.fit(di.load_dataset("noisy"), di.Dahl()).goodness
+    >>> goodness.acceptable, round(goodness.rms_misfit, 3), goodness.suspicious
+    (True, 0.014, ())
     """
 
     rms_misfit: float

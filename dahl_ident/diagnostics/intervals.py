@@ -64,6 +64,15 @@ class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
         Limits in the parameters' units.
     note : str
         What the method assumes here, such as the degrees of freedom of its threshold.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> fit = di.fit(di.load_dataset("noisy"), di.Dahl())
+    >>> intervals = fit.conf_interval("profile", levels=(0.95,))
+    >>> limits = intervals["f_max"][0]
+    >>> print(f"f_max from {limits.lower:.4f} to {limits.upper:.4f} N")
+    f_max from 0.0993 to 0.1004 N
     """
 
     method: Method
@@ -212,7 +221,16 @@ class Disagreement(NamedTuple):
 
 @dataclass(frozen=True)
 class IntervalComparison:
-    """Intervals of several methods side by side, with the limits on which they disagree."""
+    """Intervals of several methods side by side, with the limits on which they disagree.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> fit = di.fit(di.load_dataset("noisy"), di.Dahl())
+    >>> comparison = fit.compare_intervals(levels=(0.95,))
+    >>> [one.method for one in comparison.intervals], comparison.disagreements
+    (['wald', 'bootstrap', 'profile'], ())
+    """
 
     intervals: tuple[ConfidenceIntervals, ...]
     disagreements: tuple[Disagreement, ...]

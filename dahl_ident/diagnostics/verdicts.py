@@ -115,6 +115,13 @@ class Identifiability:
         logarithms (in sizes that matter for those that have none).
     information_shares : mapping of str to ndarray, shape (n,)
         What part of the information on each parameter each row of data carries.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> judged = di.identifiability(di.fit(di.load_dataset("microslip"), di.Dahl()))
+    >>> {name: p.verdict.value for name, p in judged.parameters.items()}
+    {'f_max': 'not identified', 'sigma': 'identified'}
     """
 
     parameters: Mapping[str, ParameterVerdict]

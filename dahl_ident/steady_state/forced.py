@@ -50,6 +50,14 @@ class SteadyResponse:
     message : str
         Empty where every point has exactly one amplitude; else which have none or several,
         and why.
+
+    Examples
+    --------
+    >>> from dahl_ident import Dahl, Damper, Mass, Spring, response
+    >>> plant = Dahl(f_max=0.1, sigma=30) + Mass(0.3) + Damper(0.24) + Spring(0.3)
+    >>> steady = response(plant, frequency_hz=1.0, drive=[0.05, 0.2])
+    >>> steady.amplitude.round(5).tolist(), steady.number_of_solutions.tolist()
+    ([0.00337, 0.01845], [1, 1])
     """
 
     frequency_hz: FloatArray
