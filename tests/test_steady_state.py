@@ -234,8 +234,9 @@ def test_start_chooses_among_several() -> None:
     every = response(plant, omega / (2.0 * np.pi), 0.01, all_roots=True).amplitude
     for root in every:
         near = solve(plant, values, np.asarray(omega), np.asarray(0.01), start=1.01 * root)
-        assert near == root
-    assert solve(plant, values, np.asarray(omega), np.asarray(0.01)) == every[0]
+        assert near == pytest.approx(root, rel=1e-14)
+    smallest = solve(plant, values, np.asarray(omega), np.asarray(0.01))
+    assert smallest == pytest.approx(every[0], rel=1e-14)
 
 
 # no amplitude

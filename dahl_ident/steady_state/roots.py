@@ -6,9 +6,9 @@ Newton's method in ln A that never leaves its bracket. With the dense table used
 points, one step from the interpolated start is enough almost everywhere.
 
 **Active points** (Im L < 0) may have several. All lie between the bounds that |N| and A |N|
-set. A grid over this range finds where A |Z| turns, each turning point is located, and each
-rising or falling piece that crosses the drive holds one amplitude. Turning points nearer to
-each other than the grid's nodes, 1.8 % in amplitude, may be missed.
+set. A grid over this range finds the cells where A |Z| crosses the drive, each of which holds one
+amplitude, and those where it turns near the drive, which hold two if it reaches it. Turning
+points nearer to each other than the grid's nodes, 1.8 % in amplitude, may be missed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 _NODES_PER_DECADE = (4, 180)
 _SCAN_PER_DECADE = 128
-_SCAN_CELLS = 2**18  # points times nodes of the scan in work at once
+_SCAN_CELLS = 2**15  # points times nodes of the scan in work at once
 _CHUNK = 4096  # points solved together: their scratch arrays stay in the processor's cache
 
 
@@ -40,8 +40,11 @@ class Roots(NamedTuple):
     force: ComplexArray
 
 
-def find_roots(plant: Plant) -> Roots:
-    """Return every amplitude of every point, and the force that it takes."""
+def find_roots(plant: Plant, per_decade: int = _SCAN_PER_DECADE) -> Roots:
+    """Return every amplitude of every point, and the force that it takes.
+
+    `per_decade` is the number of nodes a decade of amplitude in the search at active points.
+    """
     resonant = np.abs(plant.linear) <= plant.rounding
     if not plant.friction.values:
         with np.errstate(divide="ignore", over="ignore"):
@@ -64,7 +67,7 @@ def find_roots(plant: Plant) -> Roots:
     active = np.flatnonzero(known & ~passive)
     if not active.size:
         return Roots(amplitude[:, None], force[:, None])
-    point, found = _scan(plant, active)
+    point, found = _scan(plant, active, per_decade)
     column = _places(point)
     most = 1 + int(column.max(initial=0))
     roots = Roots(_widened(amplitude, most), _widened(force, most))
@@ -214,31 +217,74 @@ def _polish(
     return amplitude
 
 
-def _scan(plant: Plant, points: IntArray) -> tuple[IntArray, FloatArray]:
+def _scan(plant: Plant, points: IntArray, per_decade: int) -> tuple[IntArray, FloatArray]:
     """Return every amplitude of the chosen points, as pairs (point, amplitude) in rising order."""
-    low, high = plant.at(points).bounds()
-    least, most = np.min(low), np.max(high)
-    nodes = 2 + int(np.ceil(_SCAN_PER_DECADE * (np.log10(most) - np.log10(least))))
-    grid = np.geomspace(least, most, nodes)
-    points_found, amplitudes_found = [], []
-    together = max(1, _SCAN_CELLS // nodes)
+    chosen = plant.at(points)
+    low, high = chosen.bounds()
+    order = np.argsort(high)  # the few near resonance, which need a long grid, come together
+    decades = np.log10(high[order[order.size // 2]] / low.min())
+    together = max(1, int(_SCAN_CELLS / (per_decade * max(decades, 1.0))))
+    parts = []
     for first in range(0, points.size, together):
-        chunk = points[first : first + together]
-        which, amplitude = _scan_grid(plant.at(chunk), grid)
-        points_found.append(chunk[which])
-        amplitudes_found.append(amplitude)
-    at, amplitude = np.concatenate(points_found), np.concatenate(amplitudes_found)
-    order = np.lexsort((amplitude, at))
-    return at[order], amplitude[order]
-
-
-def _scan_grid(plant: Plant, grid: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return the amplitudes of every point within `grid`, pairs in one cell included."""
-    vectors, which = np.unique(plant.vector, return_inverse=True)
-    tables = plant.friction.force_and_slope(
-        np.tile(grid, vectors.size), np.repeat(vectors, grid.size)
+        part = order[first : first + together]
+        least, most = low[part].min(), high[part].max()
+        nodes = 2 + int(np.ceil(per_decade * (np.log10(most) - np.log10(least))))
+        parts.append(_scan_grid(chosen.at(part), part, np.geomspace(least, most, nodes)))
+    cells = _Cells(*map(np.concatenate, zip(*parts, strict=True)))
+    once = cells.take(cells.above != cells.above_after)
+    twice, between = _separated(chosen, cells.take(cells.above == cells.above_after))
+    at = np.concatenate((once.point, twice.point, twice.point))
+    amplitude = _polish(
+        chosen.at(at),
+        np.concatenate((once.low, twice.low, between)),
+        np.concatenate((once.high, between, twice.high)),
+        np.full(at.shape, np.nan),
+        np.concatenate((~once.above, ~twice.above, twice.above)),
     )
-    force, slope = (table.reshape(vectors.size, -1)[which] for table in tables)
+    order = np.lexsort((amplitude, at))
+    return points[at[order]], amplitude[order]
+
+
+class _Cells(NamedTuple):
+    """Cells of a grid in which A |Z| crosses the drive, or may cross it twice where it turns."""
+
+    point: IntArray
+    low: FloatArray
+    high: FloatArray
+    above: BoolArray  # whether A |Z| exceeds u_0 at the lower end
+    above_after: BoolArray  # and at the upper
+    falling: BoolArray  # whether it falls at the lower end
+
+    def take(self, which: BoolArray | IntArray) -> _Cells:
+        point, low, high, *signs = self
+        return _Cells(point[which], low[which], high[which], *(sign[which] for sign in signs))
+
+
+def _scan_grid(plant: Plant, names: IntArray, grid: FloatArray) -> _Cells:
+    """Return the cells of every point that need a closer look; `names` are the points' numbers."""
+    above, falling, near = _signs(plant, grid)
+    crosses = above[:, 1:] != above[:, :-1]
+    turns_towards = (falling[:, :-1] == above[:, :-1]) & (falling[:, 1:] != above[:, 1:])
+    row, cell = np.nonzero(crosses | (turns_towards & near))
+    ends = above[row, cell], above[row, cell + 1]
+    return _Cells(names[row], grid[cell], grid[cell + 1], *ends, falling[row, cell])
+
+
+def _signs(plant: Plant, grid: FloatArray) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Return where A |Z| exceeds u_0 and where it falls, (points, nodes), and where it is near.
+
+    The last for every cell: whether A |Z| may reach u_0 from either of its ends.
+    """
+    shared = all(v.ndim == 0 for values in plant.friction.values for v in values)
+    vectors, which = np.unique(plant.vector, return_inverse=True)
+    if shared:
+        vectors, which = vectors[:1], np.zeros(1, dtype=np.intp)
+    force, slope = (
+        table.reshape(vectors.size, -1)[which]
+        for table in plant.friction.force_and_slope(
+            np.tile(grid, vectors.size), np.repeat(vectors, grid.size)
+        )
+    )
     wide = Plant(
         plant.linear[:, None],
         plant.rounding[:, None],
@@ -247,33 +293,51 @@ def _scan_grid(plant: Plant, grid: FloatArray) -> tuple[IntArray, FloatArray]:
         plant.friction,
         plant.unit[:, None],
     )
-    g, s = wide.misfit(grid, force, slope)
-    above, falling = g > 0.0, s < 0.0
-    turns = falling[:, 1:] != falling[:, :-1]
-    at, cell = np.nonzero(turns)
-    turn, over = _turning_point(plant.at(at), grid[cell], grid[cell + 1], falling[at, cell])
-    plain, whole = np.nonzero((above[:, 1:] != above[:, :-1]) & ~turns)
-    point = np.concatenate((plain, at, at))
-    low = np.concatenate((grid[whole], grid[cell], turn))
-    high = np.concatenate((grid[whole + 1], turn, grid[cell + 1]))
-    before = np.concatenate((above[plain, whole], above[at, cell], over))
-    after = np.concatenate((above[plain, whole + 1], over, above[at, cell + 1]))
-    crossed = np.flatnonzero(before != after)
-    point, low, high = point[crossed], low[crossed], high[crossed]
-    start = np.full(point.shape, np.nan)
-    return point, _polish(plant.at(point), low, high, start, after[crossed])
+    above, falling, near = _compared(wide, grid, force, slope, grid[1] / grid[0])
+    return above, falling, near[:, 1:] | near[:, :-1]
 
 
-def _turning_point(
-    plant: Plant, low: FloatArray, high: FloatArray, falling: BoolArray
-) -> tuple[FloatArray, BoolArray]:
-    """Return where A |Z| turns in each cell, by bisection, and whether it exceeds u_0 there."""
-    for _ in range(54):
-        middle = np.sqrt(low) * np.sqrt(high)
-        g, s = plant.misfit(middle, *plant.friction.force_and_slope(middle, plant.vector))
-        before = (s < 0.0) == falling
-        low, high = np.where(before, middle, low), np.where(before, high, middle)
-    return middle, g > 0.0
+def _compared(
+    plant: Plant,
+    amplitude: FloatArray,
+    force: ComplexArray,
+    slope: ComplexArray,
+    ratio: FloatArray,
+) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Return whether A |Z| exceeds u_0, whether it falls, and whether a change of A may reach u_0.
+
+    `force` and `slope` are A N and its derivative by ln A. A changes by at most `ratio`; A |Z|
+    then changes by no more than twice its steepest slope at A.
+    """
+    rest = plant.linear * amplitude
+    total, slope = rest + force, rest + slope
+    size = np.sqrt(total.real**2 + total.imag**2)
+    steepest = np.sqrt(slope.real**2 + slope.imag**2)
+    falling = total.real * slope.real + total.imag * slope.imag < 0.0
+    near = np.abs(size - plant.drive) <= 2.0 * np.log(ratio) * steepest
+    return size > plant.drive, falling, near
+
+
+def _separated(plant: Plant, cells: _Cells) -> tuple[_Cells, FloatArray]:
+    """Return the cells where A |Z| crosses u_0 twice, and an amplitude between the two.
+
+    By bisection towards the turning point, until it is beyond u_0 or too far to reach it.
+    """
+    found, between = np.zeros(cells.point.shape, dtype=np.bool_), np.empty(cells.point.shape)
+    low, high = cells.low.copy(), cells.high.copy()
+    active = np.arange(found.size)
+    while active.size:
+        middle = np.sqrt(low[active]) * np.sqrt(high[active])
+        part = plant.at(cells.point[active])
+        force, slope = part.friction.force_and_slope(middle, part.vector)
+        above, falling, near = _compared(part, middle, force, slope, high[active] / low[active])
+        across = above != cells.above[active]
+        going = near & ~across & (middle > low[active]) & (middle < high[active])
+        found[active[across]], between[active[across]] = True, middle[across]
+        before = falling == cells.falling[active]
+        low[active[before]], high[active[~before]] = middle[before], middle[~before]
+        active = active[going]
+    return cells.take(found), between[found]
 
 
 def _places(point: IntArray) -> IntArray:
