@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from dataclasses import replace
@@ -14,6 +15,8 @@ import pytest
 import dahl_ident as di
 from dahl_ident import report
 from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.reporting.document import Cell, Document, Section, Table
+from dahl_ident.reporting.pdf import pdf
 from dahl_ident.reporting.settling import cycle_by_cycle
 from dahl_ident.results.posterior import Posterior
 from dahl_ident.results.sampling import sample
@@ -139,6 +142,31 @@ def test_pdf_has_text_pictures_and_outline(fit: di.FitResult, tmp_path: Path) ->
     assert {(round(p.mediabox.width), round(p.mediabox.height)) for p in reader.pages} == {
         (595, 842)
     }
+
+
+def test_headings_and_captions_in_pdf_stay_with_what_they_head() -> None:
+    pypdf = pytest.importorskip("pypdf")
+    sections = tuple(
+        Section(
+            f"heading {i}.",
+            (Table(f"caption {i}.", ("x",), tuple((Cell(f"row {i}.{j}."),) for j in range(i))),),
+        )
+        for i in range(1, 25)
+    )
+    whole = Document(title="t", trusted=True, verdict=("v",), sections=sections, facts={})
+    pages = [page.extract_text() for page in pypdf.PdfReader(io.BytesIO(pdf(whole))).pages]
+    assert len(pages) > 5
+    for i in range(1, 25):
+        (page,) = (text for text in pages if f"caption {i}." in text)
+        assert f"heading {i}." in page
+        assert f"row {i}.0." in page
+
+
+def test_the_verdict_is_told_once(fit: di.FitResult, tmp_path: Path) -> None:
+    text = report(fit, tmp_path / "once.md").read_text(encoding="utf-8")
+    told = [line for line in text.splitlines() if not line.startswith("![")]  # alt texts tell more
+    assert sum("The residuals look like noise" in line for line in told) == 1
+    assert f"| rms misfit | {100.0 * fit.goodness.rms_misfit:.2g} % |" in text
 
 
 def test_a_fit_that_ran_away_is_not_trusted(tmp_path: Path) -> None:

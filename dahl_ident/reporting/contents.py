@@ -125,8 +125,7 @@ def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
 def _goodness(fit: FitResult) -> Iterator[Block]:
     left = fit.goodness
     yield Paragraph(NOISE[fit.noise])
-    yield Paragraph(left.headline)
-    yield Bullets(tuple(line.removeprefix("- ") for line in str(left).splitlines()[1:]))
+    yield Bullets(tuple(left.details))
     yield tables.goodness(fit)
     if not left.acceptable:
         compared = compare_models(fit)

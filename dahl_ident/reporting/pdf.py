@@ -30,7 +30,7 @@ _FONT = "DejaVu"
 _FONTS = Path(mpl.get_data_path()) / "fonts" / "ttf"
 _FACES = {"": "DejaVuSans.ttf", "B": "DejaVuSans-Bold.ttf", "I": "DejaVuSans-Oblique.ttf"}
 _PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
-_HEADING_HEIGHT = 10.0  # mm
+_HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; what a heading or a caption has below itself
 _WIDEST = 26  # characters that a column of a table has room for
 _MARGIN, _BOLD = 3.0, 1.25  # characters beside the text; how much wider bold ones are
 _GOOD, _BAD = (17, 99, 41), (164, 14, 38)
@@ -52,8 +52,9 @@ def pdf(document: Document) -> bytes:
     for section in document.sections:
         pictures = [_Drawn(block) for block in section.blocks if isinstance(block, Picture)]
         page.ln(4)
-        if isinstance(section.blocks[0], Picture):  # a heading stays with what it heads
-            _turn_unless_room(page, pictures[:2], _HEADING_HEIGHT)
+        begins_drawn = isinstance(section.blocks[0], Picture)
+        below = _row_height(pictures[:2]) if begins_drawn else _BEGINNING
+        _turn_unless_room(page, _HEADING_HEIGHT + below)
         page.set_font(_FONT, "B", 13)
         page.start_section(section.title)
         page.multi_cell(0, 7, section.title, new_x="LMARGIN", new_y="NEXT")
@@ -119,7 +120,7 @@ class _Drawn:
 
 def _pictures(page: FPDF, row: Sequence[_Drawn]) -> None:
     """Draw up to two pictures side by side, their captions below."""
-    _turn_unless_room(page, row, 0.0)
+    _turn_unless_room(page, _row_height(row))
     top, ends = page.get_y(), []
     for i, drawn in enumerate(row):
         x = page.l_margin + i * (_PICTURE_WIDTH + _GAP)
@@ -131,14 +132,18 @@ def _pictures(page: FPDF, row: Sequence[_Drawn]) -> None:
     page.set_xy(page.l_margin, max(ends) + 3.0)
 
 
-def _turn_unless_room(page: FPDF, row: Sequence[_Drawn], more: float) -> None:
-    """Begin a new page where a row of pictures, and so much more, does not fit."""
-    needed = max(drawn.height for drawn in row) + _CAPTION_HEIGHT + more
-    if page.get_y() + needed > page.h - page.b_margin:
+def _row_height(row: Sequence[_Drawn]) -> float:
+    return max(drawn.height for drawn in row) + _CAPTION_HEIGHT
+
+
+def _turn_unless_room(page: FPDF, height: float) -> None:
+    """Begin a new page where so much does not fit below."""
+    if page.get_y() + height > page.h - page.b_margin:
         page.add_page()
 
 
 def _table(page: FPDF, table: Table) -> None:
+    _turn_unless_room(page, _BEGINNING)
     page.set_font(_FONT, "B", 9.5)
     _text(page, table.caption)
     page.set_font(_FONT, "", 7.5)

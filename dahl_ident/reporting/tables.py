@@ -160,6 +160,7 @@ def goodness(fit: FitResult) -> Table:
     rows = [
         words("data (real numbers)", f"{fit.ndata}"),
         words("degrees of freedom", f"{fit.nfree}"),
+        words("rms misfit", f"{100.0 * fit.goodness.rms_misfit:.2g} %"),
         (Cell("sum of squares"), number(fit.chisqr)),
         (Cell("sum of squares over degrees of freedom"), number(fit.redchi)),
         words("noise scale", scale),
