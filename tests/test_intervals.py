@@ -300,7 +300,7 @@ class TestTable:
         flagged = {(d.name, d.side) for d in compared.disagreements}
         assert ("f_max", "upper") in flagged
         assert "sigma" not in {name for name, _ in flagged}
-        assert "by wald and inf by profile; trust the latter" in str(compared)
+        assert "by wald and open by profile; trust the latter" in str(compared)
 
     def test_mapping_and_frame(self) -> None:
         found = self.result().conf_interval()

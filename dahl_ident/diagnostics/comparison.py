@@ -1,8 +1,10 @@
 """Would another model describe the data better? Akaike's and Schwarz's criteria say.
 
 Both are -2 ln L plus a price on parameters, 2 each for AIC and ln(2n) for BIC; the lower, the
-better. A difference above 10 is plain, below 2 means nothing. They compare models, they do not
-prove one: if none describes the data, the best of them does not either.
+better. A difference above 10 is plain, below 2 means nothing. The lowest of several is often that
+of a model too rich, by chance; so another model is called best only where it is plainly better than
+the one fitted. Criteria compare models, they do not prove one: if none describes the data, the
+best of them does not either, and one of negative damping is no mechanism's.
 """
 
 from __future__ import annotations
@@ -13,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from dahl_ident.diagnostics.formatting import table, with_unit
+from dahl_ident.diagnostics.formatting import listed, table, with_unit
+from dahl_ident.diagnostics.physics import negative_parameters
 from dahl_ident.diagnostics.units import shown_unit
 from dahl_ident.diagnostics.verdicts import Fit
 from dahl_ident.elements import Dahl, Element, Model, Spring
@@ -47,11 +50,13 @@ class ComparedModel:
 
     @property
     def estimates(self) -> str:
-        """The free parameters in one line."""
+        """The free parameters in one line; a number without an error is none."""
         o = self.optimum
         units = [shown_unit(p.unit, o.problem.data.motion) for p in o.problem.parameters]
         rows = zip(o.names, o.values.tolist(), o.stderr.values(), units, strict=True)
-        return ", ".join(f"{name} = {with_unit(v, e, unit)}" for name, v, e, unit in rows)
+        known = [f"{n} = {with_unit(v, e, unit)}" for n, v, e, unit in rows if np.isfinite(e)]
+        unknown = [name for name, error in o.stderr.items() if not np.isfinite(error)]
+        return ", ".join(known + ([f"{listed(unknown)} not determined"] if unknown else []))
 
 
 @dataclass(frozen=True)
@@ -78,18 +83,29 @@ class ModelComparison:
 
     @property
     def best(self) -> ComparedModel:
-        """The model of the lowest BIC."""
+        """The model of the lowest BIC where that is lower by more than 10, else the one fitted."""
+        return self._lowest if self._gain > _PLAIN else self.models[0]
+
+    @property
+    def _lowest(self) -> ComparedModel:
         return min(self.models, key=lambda model: model.bic)
 
     @property
+    def _gain(self) -> float:
+        """How far the lowest BIC is below that of the model fitted."""
+        return self.models[0].bic - self._lowest.bic
+
+    @property
     def headline(self) -> str:
-        """The verdict in one sentence."""
-        fitted, best = self.models[0], self.best
-        aic, bic = fitted.aic - best.aic, fitted.bic - best.bic
-        if best is fitted or bic < _MEANS_NOTHING:
+        """The verdict in a sentence or two."""
+        lowest = self._lowest
+        if self._gain < _MEANS_NOTHING:
             return "No model compared is better than the one fitted."
-        word = "plainly better" if bic > _PLAIN else "perhaps better"
-        return f"{best.name} would be {word} (AIC lower by {aic:.0f}, BIC by {bic:.0f})."
+        word = "plainly better" if self._gain > _PLAIN else "perhaps better"
+        aic = self.models[0].aic - lowest.aic
+        text = f"{lowest.name} would be {word} (AIC lower by {aic:.0f}, BIC by {self._gain:.0f})."
+        absurd = [f"There {warning}." for warning in negative_parameters(lowest.optimum)]
+        return " ".join([text, *absurd])
 
     def __str__(self) -> str:
         head = ("model", "AIC", "BIC", "estimates")

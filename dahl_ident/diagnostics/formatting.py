@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 _DIGITS = 12  # of a number that is known more exactly than anyone reads
+_LEAST_P = 1e-12  # smaller ones depend on tails that nobody knows
 
 
 def rounded(value: float, uncertainty: float | None) -> tuple[str, str]:
@@ -34,6 +35,8 @@ def rounded(value: float, uncertainty: float | None) -> tuple[str, str]:
     ('1.5', '?')
     >>> rounded(0.1, 3e-16)
     ('0.1', '3e-16')
+    >>> rounded(51310.0, 17598.0)
+    ('51000', '18000')
     >>> rounded(31.4, 8.2e5)
     ('31', '8.2e+05')
     """
@@ -55,8 +58,8 @@ def _alike(numbers: Sequence[float], last: int) -> list[str]:
     """Return numbers with one exponent, the last digit standing for 10^last."""
     power = math.floor(math.log10(max(abs(number) for number in numbers)))
     exponent = power if power >= 5 or power < -3 else 0
-    decimals = max(0, exponent - last)
-    texts = [f"{number / 10.0**exponent:.{decimals}f}" for number in numbers]
+    digits = exponent - last  # negative where the last digit that counts stands before the point
+    texts = [f"{round(number / 10.0**exponent, digits):.{max(0, digits)}f}" for number in numbers]
     return [f"{text}e{exponent:+03d}" for text in texts] if exponent else texts
 
 
@@ -82,6 +85,17 @@ def with_unit(value: float, uncertainty: float | None, unit: str) -> str:
     """
     number, error = rounded(value, uncertainty)
     return f"{number} +- {error} {unit}".rstrip()
+
+
+def p_text(p: float) -> str:
+    """Return ``"p = 0.012"``, or a bound where noise alone cannot be the reason.
+
+    Examples
+    --------
+    >>> p_text(0.01234), p_text(6e-41)
+    ('p = 0.012', 'p < 1e-12')
+    """
+    return f"p = {p:.2g}" if p >= _LEAST_P else f"p < {_LEAST_P:.0e}"
 
 
 def listed(words: Sequence[str]) -> str:

@@ -1,8 +1,9 @@
 """Goodness of fit: whether what is left is noise, and what was fitted is physics.
 
 Every test that applies is made: chi-square where the noise is known, trends and runs of the
-residuals over amplitude, frequency and drive, the exponent's score (departure from the universal
-curve h(beta)), the third harmonic against the model's. Together they may cry wolf once in a
+residuals over amplitude, frequency and drive, a stiffness that rises with amplitude, the
+exponent's score (departure from the universal curve h(beta)), the third harmonic against the
+model's. Together they may cry wolf once in a
 hundred data sets, so each has a hundredth over their number as its level.
 
 A fit can be statistically perfect and physically absurd; what no mechanism does is said as a
@@ -20,10 +21,11 @@ from scipy import special
 
 from dahl_ident.arrays import ComplexArray
 from dahl_ident.diagnostics.flags import flagged_rows
-from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.diagnostics.formatting import p_text, with_unit
 from dahl_ident.diagnostics.outliers import SuspiciousPoint, suspicious_points
 from dahl_ident.diagnostics.physics import physical_warnings
 from dahl_ident.diagnostics.residual_space import ResidualSpace
+from dahl_ident.diagnostics.stiffening import Stiffening, stiffening
 from dahl_ident.diagnostics.trends import Runs, Trend, runs, trends
 from dahl_ident.elements import Dahl
 from dahl_ident.fitting import Optimum
@@ -32,6 +34,9 @@ from dahl_ident.problem import Problem
 _FALSE_ALARM = 0.01
 _HINT = 0.05
 _FAR_MORE = 2.0  # scatter over what was measured
+_NO_SENSOR = 0.3  # noise over the response
+_LEAST_DOF = 6  # with fewer, no test of residuals of unknown scale applies
+_MOST_DEPARTURES = 3  # in the verdict; the details hold them all
 
 
 @dataclass(frozen=True)
@@ -97,6 +102,12 @@ class Goodness:
         are any.
     chi_square : ChiSquare or None
         None where the noise's scale was estimated: nothing is known to compare with.
+    noise_share : float or None
+        Estimated noise over the size of the response; None where the noise's scale is known.
+    dof : int
+        Degrees of freedom.
+    stiffening : Stiffening or None
+        Largest rise of stiffness with amplitude, where there is one.
     trends : tuple of Trend
         Departure over each covariate that varies.
     runs : tuple of Runs
@@ -126,6 +137,9 @@ class Goodness:
 
     rms_misfit: float
     chi_square: ChiSquare | None
+    noise_share: float | None
+    dof: int
+    stiffening: Stiffening | None
     trends: tuple[Trend, ...]
     runs: tuple[Runs, ...]
     exponent: Exponent | None
@@ -138,14 +152,24 @@ class Goodness:
     @cached_property
     def level(self) -> float:
         """p-value below which one test counts."""
-        single = (self.chi_square, self.exponent, self.third_harmonic)
-        tests = len(self.trends) + len(self.runs) + sum(test is not None for test in single)
-        return _FALSE_ALARM / max(tests, 1)
+        return _FALSE_ALARM / max(len(self._tests), 1)
+
+    @property
+    def _tests(self) -> list[ChiSquare | Stiffening | Trend | Runs | Exponent | ThirdHarmonic]:
+        """Every test that applies."""
+        first, last = (self.chi_square, self.stiffening), (self.exponent, self.third_harmonic)
+        every = (*first, *self.trends, *self.runs, *last)
+        return [test for test in every if test is not None]
 
     @property
     def acceptable(self) -> bool:
-        """Whether the residuals look like noise, and no row was flagged when it was measured."""
-        return not self.objections and not self.flagged
+        """Whether residuals that can be judged look like noise, of rows without a flag."""
+        return not self.objections and not self.flagged and self.judged
+
+    @property
+    def judged(self) -> bool:
+        """Whether noise is known, or there are enough points to tell a wrong model from it."""
+        return self.noise_share in (None, 0.0) or self.dof >= _LEAST_DOF
 
     @cached_property
     def objections(self) -> tuple[str, ...]:
@@ -161,7 +185,11 @@ class Goodness:
         """Yield every departure whose p-value is below `level`, those over frequency first."""
         found = [trend for trend in self.trends if trend.p_value < level]
         rate = [trend for trend in found if trend.covariate == "frequency"]
+        if self.noise_share is not None and self.noise_share > _NO_SENSOR:
+            yield f"the scatter is {100.0 * self.noise_share:.2g} % of the response, as no sensor's"
         yield from (f"{trend}, which no rate-independent model does" for trend in rate)
+        if self.stiffening is not None and self.stiffening.p_value < level:
+            yield str(self.stiffening)
         curve = [test for test in (self.exponent,) if test is not None and test.p_value < level]
         over = [trend for trend in found if trend not in rate]
         if self.exponent is not None and self.exponent.fixed == 1.0 and (curve or over):
@@ -174,15 +202,32 @@ class Goodness:
             yield from (f"{r}" for r in self.runs if r.p_value < level)
 
     @property
+    def statements(self) -> tuple[str, ...]:
+        """The verdict in its parts, the gravest first."""
+        parts = (self._flaws, self._fit, self._apart)
+        if self.objections or not self.judged:
+            parts = (self._fit, self._flaws, self._apart)
+        return tuple(filter(None, parts))
+
+    @property
     def headline(self) -> str:
         """The verdict in a few sentences."""
-        return " ".join(filter(None, (self._flaws, self._fit, self._apart)))
+        return " ".join(self.statements)
 
     @property
     def _fit(self) -> str:
         misfit = f"{100.0 * self.rms_misfit:.2g} % rms misfit"
         if self.objections:
-            return f"The model does not describe these data ({misfit}): {_joined(self.objections)}."
+            reasons = "; ".join(self.objections[:_MOST_DEPARTURES])
+            more = len(self.objections) - _MOST_DEPARTURES
+            others = f"; {more} more of the tests say so" if more > 0 else ""
+            return f"The model does not describe these data ({misfit}): {reasons}{others}."
+        if not self.judged:
+            return (
+                f"Noise and a wrong model look alike with {self.dof} degrees of freedom "
+                f"({misfit}): "
+                "measure more points, or repeat them so that their covariance is known."
+            )
         hint = f", with a hint that {_joined(self.hints)}" if self.hints else ""
         if self.scatter is not None and self.scatter.ratio > _FAR_MORE:
             hint += f", but {self.scatter}"
@@ -207,8 +252,7 @@ class Goodness:
     @property
     def details(self) -> list[str]:
         """Every test with its p-value, suspicious points and warnings, a line each."""
-        tests = (self.chi_square, *self.trends, *self.runs, self.exponent, self.third_harmonic)
-        lines = [f"{test} (p = {test.p_value:.2g})" for test in tests if test is not None]
+        lines = [f"{test} ({p_text(test.p_value)})" for test in self._tests]
         if self.scatter is not None:
             lines.append(str(self.scatter))
         lines += [f"suspicious: {point}" for point in self.suspicious]
@@ -228,6 +272,9 @@ def goodness(optimum: Optimum) -> Goodness:
     return Goodness(
         float(np.sqrt(np.mean(np.abs(misfit) ** 2))),
         _chi_square(optimum, space),
+        _noise_share(optimum),
+        optimum.dof,
+        stiffening(optimum),
         tuple(trends(optimum, space)),
         tuple(runs(optimum, space)),
         _exponent(optimum, space),
@@ -244,6 +291,18 @@ def _chi_square(optimum: Optimum, space: ResidualSpace) -> ChiSquare | None:
         return None
     value = float(space.residuals @ space.residuals)
     return ChiSquare(value, optimum.dof, float(special.chdtrc(optimum.dof, value)))
+
+
+def _noise_share(optimum: Optimum) -> float | None:
+    """Return the estimated noise over the size of the response, 0 where it is rounding."""
+    if optimum.scale_known:
+        return None
+    if optimum.is_exact:
+        return 0.0
+    size = 1.0
+    if optimum.problem.noise == "absolute":
+        size = float(np.sqrt(np.mean(np.abs(optimum.problem.data.response) ** 2)))
+    return optimum.scale / size
 
 
 def _scatter(optimum: Optimum) -> Scatter | None:

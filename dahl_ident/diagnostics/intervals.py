@@ -218,6 +218,13 @@ class Disagreement(NamedTuple):
     methods: tuple[str, str]
     limits: tuple[float, float]
 
+    def __str__(self) -> str:
+        theirs, ours = (f"{v:.4g}" if np.isfinite(v) and v else "open" for v in self.limits)
+        return (
+            f"{self.name}: the {self.side} {percent(self.level)} limit is {theirs} by "
+            f"{self.methods[0]} and {ours} by {self.methods[1]}; trust the latter"
+        )
+
 
 @dataclass(frozen=True)
 class IntervalComparison:
@@ -239,12 +246,9 @@ class IntervalComparison:
         parts = [str(one) for one in self.intervals]
         if not self.disagreements:
             return "\n\n".join([*parts, "The methods agree."])
-        lines = [
-            f"{d.name}: the {d.side} {percent(d.level)} limit is "
-            f"{' and '.join(f'{v:.5g} by {m}' for v, m in zip(d.limits, d.methods, strict=True))}"
-            "; trust the latter"
-            for d in self.disagreements
-        ]
+        by_interest = sorted(self.disagreements, key=lambda d: -abs(d.level - LEVELS[1]))
+        told = {(d.name, d.methods[0], d.side): d for d in by_interest}  # one level is enough
+        lines = [str(told[key]) for key in sorted(told)]
         return "\n\n".join([*parts, "\n".join(["The methods disagree:", *lines])])
 
 

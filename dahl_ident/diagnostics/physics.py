@@ -12,7 +12,7 @@ from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.third_harmonic import third_harmonic_share
 from dahl_ident.diagnostics.units import shown_unit
-from dahl_ident.elements import Dahl, Damper, Mass, Spring
+from dahl_ident.elements import Dahl, Damper, Element, Mass, Spring
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.status import Status
 
@@ -22,7 +22,7 @@ _HARMONIC_SHARE = 0.1
 
 def physical_warnings(optimum: Optimum) -> Iterator[str]:
     """Yield a sentence for everything in an estimate that physics forbids or that is unsafe."""
-    yield from _negative(optimum)
+    yield from negative_parameters(optimum)
     if optimum.status is Status.AT_BOUND:
         yield optimum.message.removeprefix(Status.AT_BOUND.value).strip()
     yield from _beyond_friction_limit(optimum)
@@ -41,7 +41,8 @@ def _not_a_sine(optimum: Optimum) -> Iterator[str]:
         )
 
 
-def _negative(optimum: Optimum) -> Iterator[str]:
+def negative_parameters(optimum: Optimum) -> Iterator[str]:
+    """Yield every mass, damping or stiffness below zero, with its number."""
     problem = optimum.problem
     values = parameter_values(optimum)
     values |= dict(zip(optimum.names, optimum.values.tolist(), strict=True))
@@ -92,15 +93,18 @@ def friction_force(optimum: Optimum) -> tuple[FloatArray, FloatArray]:
     return force, error
 
 
-def friction_stiffness(optimum: Optimum) -> ComplexArray:
-    """Return the measured dynamic stiffness less the modelled linear part, sensors corrected."""
+def friction_stiffness(optimum: Optimum, kept: tuple[type[Element], ...] = (Dahl,)) -> ComplexArray:
+    """Return the measured dynamic stiffness, sensors corrected, of elements of the `kept` kinds.
+
+    The modelled parts of all the others are subtracted.
+    """
     problem = optimum.problem
     view = problem.stiffness_data
     ratio = _sensed(optimum)
     linear = np.zeros(len(view.amplitude), dtype=np.complex128)
     values = parameter_values(optimum)
     for element in problem.model.elements:
-        if not isinstance(element, Dahl):
+        if not isinstance(element, kept):
             linear += view.of(element, [np.asarray(values[p.name]) for p in element.parameters])
     return np.asarray(view.stiffness * ratio - linear)
 

@@ -156,8 +156,21 @@ class Identifiability:
         if not lost:
             return f"Every parameter is determined, but {listed(weak)} only weakly."
         known = self.determined
-        only = f"Only {listed(known)} {'is' if len(known) == 1 else 'are'} determined"
-        return f"{only if known else 'Nothing is determined'}; not {listed(lost)}."
+        only = "Nothing is determined"
+        if known:
+            only = f"Only {listed(known)} {'is' if len(known) == 1 else 'are'} determined"
+        weakly = f", {listed(weak)} weakly" if weak else ""
+        return f"{only}{weakly}; not {listed(lost)}."
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """What is known of each parameter that is not identified, and why no more.
+
+        Those without any limit are left out where another one has some.
+        """
+        lost = [p for p in self.parameters.values() if p.verdict is Verdict.NOT_IDENTIFIED]
+        limited = [p for p in lost if p.interval.lower > 0.0 or np.isfinite(p.interval.upper)]
+        return tuple(f"{p.text}." for p in limited or lost)
 
     def __str__(self) -> str:
         lines = [self.headline, *(f"- {p.text}" for p in self.parameters.values())]

@@ -142,8 +142,8 @@ def _message(
         gone = [f"{name} {ends[value]}" for name, value in limit.extremes.items()]
         parts.append(f"Here: {', '.join(gone)}.")
         if combinations:
-            known = [f"{c.expression} = {c.value:.6g} +- {c.stderr:.2g}" for c in combinations]
-            parts.append(f"Determined: {', '.join(known)}.")
+            left = [f"{c.expression} = {c.value:.4g} +- {c.stderr:.2g}" for c in combinations]
+            parts.append(f"The limit depends on {', '.join(left)}.")
     elif status is Status.SINGULAR:
         names = [n for n, lost in zip(problem.names, undetermined, strict=True) if lost]
         parts.append(f"Involved: {', '.join(names)}.")

@@ -50,6 +50,11 @@ class Status(Enum):
     )
 
     @property
+    def outcome(self) -> str:
+        """The outcome without its meaning: the status up to its colon."""
+        return self.value.partition(":")[0]
+
+    @property
     def found_optimum(self) -> bool:
         """Whether the estimate is a finite optimum."""
         return self in (Status.CONVERGED, Status.AT_BOUND)

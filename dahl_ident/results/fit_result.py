@@ -196,7 +196,12 @@ class FitResult(FitNumbers):
     @property
     def verdict(self) -> str:
         """Whether to trust the numbers, in words, with what speaks against it."""
-        return report.verdict(self)
+        return " ".join(self.statements)
+
+    @cached_property
+    def statements(self) -> tuple[str, ...]:
+        """The verdict in its parts: the first is what to remember, the others say why."""
+        return report.statements(self)
 
     # What follows from the estimate
 

@@ -13,7 +13,6 @@ from dahl_ident.diagnostics.formatting import interval, rounded, table, with_uni
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals
 from dahl_ident.diagnostics.levels import percent
 from dahl_ident.diagnostics.units import shown_unit
-from dahl_ident.diagnostics.verdicts import Verdict
 
 if TYPE_CHECKING:
     from dahl_ident.results.fit_result import FitResult
@@ -34,30 +33,34 @@ class Section:
     lines: list[str]
 
 
-def verdict(fit: FitResult) -> str:
-    """Return whether to trust a fit, and what speaks against it."""
+def statements(fit: FitResult) -> tuple[str, ...]:
+    """Return whether to trust a fit, then what speaks against it, the gravest first."""
     if fit.trusted:
-        return f"To be trusted. {fit.identifiability.headline} {fit.goodness.headline}"
-    return " ".join(["NOT to be trusted.", *_objections(fit)])
+        return (f"To be trusted. {fit.identifiability.headline} {fit.goodness.headline}",)
+    first, *others = _objections(fit)
+    return (f"NOT to be trusted. {first}", *others)
 
 
 def _objections(fit: FitResult) -> Iterator[str]:
     """Yield what speaks against a fit, a sentence or more each."""
+    known = fit.identifiability
+    can_tell = fit.scale_known or fit.nfree > 0
+    if can_tell and not known.complete:
+        yield known.headline
+        if known.combinations:
+            yield f"Determined: {'; '.join(map(str, known.combinations))}."
     if not fit.success:
-        yield fit.message
+        yield fit.status.value if fit.status.at_infinity else fit.message
     if fit.nfree <= 0:
         judged = "the model" if fit.scale_known else "noise and model"
         yield (
             f"{fit.nvarys} parameters leave nothing of {fit.ndata} numbers to judge {judged} by: "
             "measure more points."
         )
-    known = fit.scale_known or fit.nfree > 0
-    if known and not fit.identifiability.complete:
-        lost = fit.identifiability.named(Verdict.NOT_IDENTIFIED)
-        yield fit.identifiability.headline
-        yield from (f"{fit.identifiability.parameters[name].text}." for name in lost)
+    if can_tell and not known.complete:
+        yield from known.reasons
     if not fit.goodness.acceptable:
-        yield fit.goodness.headline
+        yield from fit.goodness.statements
 
 
 def fit_report(fit: FitResult, intervals: ConfidenceIntervals) -> str:
@@ -78,7 +81,7 @@ def as_html(fit: FitResult, intervals: ConfidenceIntervals) -> str:
 
 
 def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[Section]:
-    yield Section("Verdict", [verdict(fit)])
+    yield Section("Verdict", list(statements(fit)))
     yield Section("Parameters", _parameters(fit, intervals))
     combined = [str(c) for c in fit.identifiability.combinations]
     if combined:
@@ -108,6 +111,8 @@ def _parameters(fit: FitResult, intervals: ConfidenceIntervals) -> list[str]:
             rows.append([name, f"{p.value:g}", "", unit, "", "fixed"])
             continue
         value, error = rounded(p.value, p.stderr)
+        if math.isfinite(p.value) and p.stderr == math.inf and fit.nfree > 0:
+            value = "?"  # any other would do as well
         limits = intervals[name][-1]
         positive = p.min == 0.0
         lower = -math.inf if positive and limits.lower == 0.0 else limits.lower
@@ -146,10 +151,16 @@ def _noise(fit: FitResult) -> list[str]:
     return lines
 
 
+def _counted(fit: FitResult) -> str:
+    """Return how residuals enter the sum, where that is not by their squares alone."""
+    if fit.optimum.loss != "linear":
+        return " (robust)"
+    return "" if fit.problem.gaussian else " (after Student's t)"
+
+
 def _solver(fit: FitResult) -> list[str]:
     return [
         f"{fit.method}, {fit.nfev} evaluations; {fit.ndata} numbers, {fit.nvarys} parameters",
-        fit.message,
-        f"AIC {fit.aic:.2f}, BIC {fit.bic:.2f}, chi-square {fit.chisqr:.5g}, "
-        f"reduced {fit.redchi:.5g}",
+        f"{fit.status.outcome}; AIC {fit.aic:.2f}, BIC {fit.bic:.2f}",
+        f"sum of squares{_counted(fit)} {fit.chisqr:.5g}, over degrees of freedom {fit.redchi:.5g}",
     ]

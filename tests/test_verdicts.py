@@ -1,0 +1,138 @@
+"""What a fit says: whether to trust it, in the fewest words that hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dahl_ident import Dahl, FitResult, FrequencyResponse, Spring, compare_models, fit
+from dahl_ident.diagnostics.stiffening import Stiffening, stiffening
+from tests.friction_tables import FRICTION, X_C, relative_noise, table
+
+
+def stiffened(rise: float, noise: float = 0.01, seed: int = 1) -> FrequencyResponse:
+    """Return microslip on a spring whose stiffness rises by a share over the upper half."""
+    A = np.geomspace(1e-3, 1e-1, 48) * X_C
+    N = FRICTION.describing_function(A)
+    upper = np.clip(np.log(A / A[24]) / np.log(A[-1] / A[24]), 0.0, 1.0)
+    return FrequencyResponse(
+        np.ones(48), N * relative_noise(48, noise, seed) + 30.0 * rise * upper, A
+    )
+
+
+def rise(data: FrequencyResponse) -> Stiffening | None:
+    return stiffening(fit(data, Dahl() + Spring(), throw=False).optimum)
+
+
+class TestStiffening:
+    def test_size_and_place_of_a_rise(self) -> None:
+        found = rise(stiffened(0.2))
+        assert found is not None
+        assert found.rise == pytest.approx(0.17, abs=0.02)
+        assert found.low < 0.02 * X_C < 0.06 * X_C < found.high
+        assert found.p_value < 1e-9
+
+    def test_the_verdict_says_so(self) -> None:
+        result = fit(stiffened(0.2), Dahl() + Spring(), throw=False)
+        assert "stiffness rises with amplitude, by" in result.verdict
+        assert "which no Dahl element's does" in result.verdict
+
+    def test_noise_alone_seldom_looks_so(self) -> None:
+        made = [rise(stiffened(0.0, noise=0.05, seed=seed)) for seed in range(80)]
+        p = np.array([1.0 if one is None else one.p_value for one in made])
+        assert np.mean(p < 0.05) < 0.1
+
+    def test_other_exponents_do_not_look_so(self) -> None:
+        for alpha in (0.3, 1.0, 2.0):
+            found = stiffening(fit(table(model=Dahl(0.1, 30.0, alpha=alpha)), Dahl()).optimum)
+            assert found is None or found.p_value > 0.01
+
+    def test_it_needs_friction_and_points(self) -> None:
+        assert stiffening(fit(stiffened(0.2), Spring()).optimum) is None
+        assert stiffening(fit(table(n=4), Dahl()).optimum) is None
+
+
+class TestTrust:
+    def test_two_points_leave_noise_and_model_alike(self) -> None:
+        result = fit(table(n=2, noise=0.03), Dahl())
+        assert result.identifiability.complete
+        assert not result.trusted
+        assert "look alike with 2 degrees of freedom" in result.verdict
+        assert "measure more points, or repeat them" in result.verdict
+
+    def test_two_points_of_known_noise_are_judged_by_it(self) -> None:
+        data = table(n=2, noise=0.01, seed=3)
+        C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
+        known = FrequencyResponse(data.frequency_hz, data.response, data.amplitude, covariance=C)
+        assert fit(known, Dahl()).goodness.judged
+
+    @pytest.mark.parametrize("noise", ["relative", "absolute"])
+    def test_a_scatter_that_no_sensor_has(self, noise: str) -> None:
+        result = fit(table(n=12), Spring(), noise=noise)
+        assert not result.trusted
+        assert "% of the response, as no sensor's" in result.verdict
+
+    def test_much_noise_is_borne(self) -> None:
+        result = fit(table(n=60, noise=0.1), Dahl())
+        assert result.trusted
+        assert result.goodness.noise_share == pytest.approx(0.1, rel=0.2)
+
+
+class TestWords:
+    @staticmethod
+    def unlimited() -> FitResult:
+        return fit(table(beta=(1e-3, 1e-2), seed=3), Dahl() + Spring(), throw=False)
+
+    def test_an_optimum_at_infinity_is_said_once(self) -> None:
+        result = self.unlimited()
+        assert result.fit_report().count("No finite optimum: ") == 1
+        assert result.verdict.count("sigma + stiffness =") == 1
+        assert "Here:" not in result.verdict
+        assert "Here: f_max without bound" in result.message
+
+    def test_what_is_determined_comes_first_with_its_number(self) -> None:
+        first, second, *_ = self.unlimited().statements
+        assert first.startswith("NOT to be trusted. Only ")
+        assert second.startswith("Determined: ")
+        assert "sigma + stiffness = 30." in second
+
+    def test_each_statement_has_its_line(self) -> None:
+        result = self.unlimited()
+        lines = result.fit_report().splitlines()
+        assert tuple(line.strip() for line in lines[1 : 1 + len(result.statements)]) == (
+            result.statements
+        )
+
+    def test_parameters_without_any_limit_give_way_to_those_with_one(self) -> None:
+        known = self.unlimited().identifiability
+        assert len(known.reasons) < len(known.parameters)
+        assert all("anything" not in reason for reason in known.reasons)
+
+    def test_one_chi_square(self) -> None:
+        data = table(n=12)
+        C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
+        rough = FrequencyResponse(
+            data.frequency_hz, data.response, data.amplitude, covariance=C, dof=np.full(12, 4.0)
+        )
+        report = fit(rough, Dahl()).fit_report()
+        assert report.count("chi-square ") == 1 + report.count("and chi-square")
+        assert "sum of squares (after Student's t)" in report
+
+
+class TestComparison:
+    def test_chance_does_not_make_another_model_the_best(self) -> None:
+        for seed in range(12):
+            found = compare_models(fit(table(seed=seed), Dahl()))
+            assert found.best is found.models[0]
+
+    def test_an_element_without_a_number_is_named(self) -> None:
+        found = compare_models(fit(table(noise=0.0), Dahl()))
+        (two,) = (m for m in found.models if m.name == "two Dahl elements")
+        assert "not determined" in two.estimates
+        assert "?" not in two.estimates
+
+    def test_a_better_model_that_is_absurd_is_said_to_be(self) -> None:
+        maker = FRICTION + Spring(-3.0)
+        found = compare_models(fit(table(model=maker), Dahl()))
+        assert found.best.name == "spring added"
+        assert "There stiffness is negative" in found.headline
