@@ -59,3 +59,9 @@ def test_few_samples_are_told() -> None:
         "harmonics fold at 8 samples a cycle"
     ]
     assert sampled(64, 10.0, 1e-4).quality["verdict"].tolist() == ["good"]
+
+
+@pytest.mark.parametrize(("per_cycle", "told"), [(2.994, True), (4.0, True), (4.3, False)])
+def test_harmonics_that_fold_before_they_are_seen_are_told(per_cycle: float, told: bool) -> None:
+    verdict = "harmonics fold at" if told else "good"
+    assert str(sampled(per_cycle, 1.0, 1e-4).quality["verdict"][0]).startswith(verdict)

@@ -332,6 +332,13 @@ def two_tones(n: int = 4000) -> Record:
     return Record(time, displacement=x, force=x)
 
 
+@pytest.mark.parametrize(("seed", "n"), [(10, 16626), (16, 3314), (28, 10796)])
+def test_noise_is_no_sine_however_often_two_cycles_of_it_look_alike(seed: int, n: int) -> None:
+    motion, force = np.random.default_rng(seed).standard_normal((2, n))
+    with pytest.raises(ExtractionError, match="expected"):
+        extract(Record(np.arange(n) / 1000.0, displacement=motion, force=force))
+
+
 def test_two_tones_are_refused_with_their_share() -> None:
     with pytest.raises(ExtractionError, match=r"fundamental has \d+(\.\d)? % of the power"):
         extract(two_tones(), frequency=1.0)

@@ -19,6 +19,8 @@ from dahl_ident.extraction.sine_fit import SineFit
 _CLEAR = 9.0  # power over that of noise, of a harmonic that is seen
 _SEEN_FROM = 1.0 / 3.0  # of the fitted orders: the powers of low ones differ
 _FLATTEST, _STEEPEST = 1.0, 3.0
+_FIRST = 3  # harmonic of friction beside the fundamental
+_STAYS = 0.01  # of a folded tone, that matters
 
 
 def folded_error(fit: SineFit, harmonic: int, cycles: int) -> FloatArray:
@@ -37,8 +39,18 @@ def folded_error(fit: SineFit, harmonic: int, cycles: int) -> FloatArray:
     clear = size**2 > _CLEAR * np.outer(variance, np.mean(fit.residual**2, axis=1))
     folding = np.array([whole - harmonic, whole + harmonic])
     both = [_extended(seen[c], s[c], folding) for c, s in zip(clear.T, size.T, strict=True)]
-    kept = abs(np.sinc(cycles * (per_cycle - whole)))
-    return np.asarray(kept * np.hypot.reduce(both, axis=1))
+    return np.asarray(_kept(per_cycle, cycles) * np.hypot.reduce(both, axis=1))
+
+
+def folds_unseen(fit: SineFit, cycles: int) -> bool:
+    """Return whether harmonics fold onto the fundamental of which not even the first is seen."""
+    per_cycle = 2.0 * np.pi / fit.stretch.sample_phase
+    return not fit.trending and fit.orders < _FIRST and _kept(per_cycle, cycles) > _STAYS
+
+
+def _kept(per_cycle: float, cycles: int) -> float:
+    """Return the share of a folded tone that stays on the harmonic beside it."""
+    return float(abs(np.sinc(cycles * (per_cycle - round(per_cycle)))))
 
 
 def _extended(seen: NDArray[np.intp], size: FloatArray, orders: NDArray[np.intp]) -> FloatArray:

@@ -22,7 +22,7 @@ import numpy as np
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.suspicion import creates_energy
 from dahl_ident.errors import ExtractionError
-from dahl_ident.extraction.folding import folded_error
+from dahl_ident.extraction.folding import folded_error, folds_unseen
 from dahl_ident.extraction.memory import (
     MOST_CYCLES,
     SIGNIFICANT,
@@ -219,6 +219,7 @@ def measure(stretch: Stretch, settings: Settings, *, sweep: bool = False) -> Poi
         dropped = _settling_periods(rough.stretch, memory, cycles, settings, steps)
     used = last_cycles(whole, cycles - dropped)
     phasors = _phasors(used, memory, cycles - dropped, settings, steps, sweep=sweep)
+    _check_share(phasors.fit, phasors.fit.stretch, settings)
     return _point(phasors, cycles, dropped, steps)
 
 
@@ -447,7 +448,8 @@ def _doubts(phasors: _Phasors, settled: bool) -> list[str]:
     if settled and creates_energy(np.asarray(N.imag), std, np.asarray(dof)):
         doubts.append("creates energy, a sign is turned")
     fit = phasors.fit
-    if (folded_error(fit, 1, phasors.cycles) > _FOLDED * np.abs(fit.phasors(1))).any():
+    folded = folded_error(fit, 1, phasors.cycles) > _FOLDED * np.abs(fit.phasors(1))
+    if folded.any() or folds_unseen(fit, phasors.cycles):
         samples = 2.0 * np.pi / fit.stretch.sample_phase
         doubts.append(f"harmonics fold at {samples:.3g} samples a cycle")
     return doubts

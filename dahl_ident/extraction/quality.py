@@ -21,6 +21,7 @@ _SAME = 1e-9  # of the range: values nearer than this are equal but for rounding
 _RAIL_RUN = 5  # samples in a row at an extreme value
 _CORNER = 3  # samples within which a clipped waveform is ...
 _AWAY = 1e-4  # ... this much of its span away from the rail
+_FITTED = 5  # offset, drift, a sine and its frequency
 
 
 def sensor_step(samples: FloatArray) -> float:
@@ -90,12 +91,15 @@ def crest_samples(amplitude: float, step: float, sample_phase: float) -> float:
 def fundamental_share(fit: SineFit, stretch: Stretch) -> FloatArray:
     """Return the fundamental's share of the power of each channel, offset and drift apart.
 
-    `fit` may be one of block means; the power is that of the samples themselves.
+    `fit` may be one of block means; the power is that of the samples themselves. What is left
+    counts by its degrees of freedom, for a sine fits any few samples well.
     """
+    sine = 0.5 * np.abs(fit.phasors(1)) ** 2
     drift = fit.coefficients[1] ** 2 / 3.0
-    power = np.var(stretch.channels, axis=1) - drift
-    power = np.maximum(power, 0.5 * np.abs(fit.phasors(1)) ** 2)
-    return np.asarray(0.5 * np.abs(fit.phasors(1)) ** 2 / power)
+    left = np.maximum(np.var(stretch.channels, axis=1) - drift - sine, 0.0)
+    n = stretch.time.size
+    left *= n / max(n - _FITTED, 1)
+    return np.asarray(sine / (sine + left))
 
 
 def distortion(fit: SineFit, integrations: int) -> float:

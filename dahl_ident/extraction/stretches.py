@@ -28,7 +28,8 @@ from dahl_ident.extraction.sine_fit import (
     whole_cycles,
 )
 
-_PLATEAU_CYCLES = 3  # fewer only where no plateau has so many
+_PLATEAU_CYCLES = 3  # fewer only where no plateau has so many ...
+_NO_CHANCE = 0.1  # ... and they are this share of all cycles: noise has two alike at times
 _QUIET_CROSSINGS = 0.01  # noise of a cycle's log amplitude that no crossing suffers from
 _WELL_COVERED = 0.5  # of a record: where crossings find segments so long, they are right
 _SWEEP_DEGREE = 3  # of the phase in a window
@@ -56,7 +57,8 @@ def record_segments(
         if frequency is None and (noisy or covered < _WELL_COVERED):
             periods = cut_cycles(time, motion, _strongest_line(time, motion))
             segments = max(segments, find_segments(periods, mode, fewest, window), key=_covered)
-        if segments:
+        moving = sum(float(np.sum(run.stop - run.start)) for run in runs)
+        if segments and (fewest == _PLATEAU_CYCLES or _covered(segments) > _NO_CHANCE * moving):
             return _with_room(segments)
     if frequency is not None and mode != "sweep" and len(runs):
         return [Segment(float(time[0]), float(time[-1]), frequency)]
