@@ -111,9 +111,10 @@ def extract(
     not repeat between the harmonics, plus two errors that do: rounding to sensor steps where no
     noise dithers it, and harmonics above half the sampling rate, which fold onto lower ones (the
     size of those seen is extended to them; with a hundred samples a cycle it hardly counts, and
-    with so few that none are seen the verdict tells). It holds for white and for 1/f noise. The uncertainty of a record's `drive_factor` is common to
-    all points and not part of it. A hum during rests that is a clean sine in both channels is
-    taken for a level; give `frequency` then.
+    with so few that none are seen the verdict tells). It holds for white and for 1/f noise. The
+    uncertainty of a record's `drive_factor` is common to all points and not part of it. A hum
+    during rests that is a clean sine in both channels is taken for a level; give `frequency`
+    then.
 
     Examples
     --------
