@@ -306,14 +306,15 @@ def as_markdown(table: Sequence[Row]) -> str:
         "it is below 0.25, verdicts where it is below 0.25 or above 1. Coverage in percent, of "
         "68.27 and 95.45 % intervals; what lies outside binomial error (corrected for the number "
         'of coverages) is marked (!). "Not clear": exact data leave another explanation within '
-        "4.3 standard deviations, so that the local bound does not decide.",
+        "4.3 standard deviations, so that the local bound does not decide; no RMSE is given, since "
+        "in some data sets the optimum itself lies there, at infinity.",
         "",
         "| scenario | parameter | data sets (bootstrap) | bound | RMSE / bound | Wald | profile | "
         "bootstrap | verdict right |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in table:
-        rmse = f"{row.rmse / row.bound:.3f}" if row.identified else ""
+        rmse = f"{row.rmse / row.bound:.3f}" if row.identified and row.clear else ""
         right = "" if row.verdict_right is None else f"{100.0 * row.verdict_right:.2f} %"
         right += "" if row.clear or not right else " (not clear)"
         cells = [_covers(row, method) for method in METHODS]

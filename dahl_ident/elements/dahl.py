@@ -35,6 +35,7 @@ from dahl_ident.errors import ValidationError
 _EXPONENTS = (1e-9, 1e3)
 _AT_REST = 1e-30
 """Smaller beta are rest, to more digits than a number has."""
+_NONE: ComplexArray = np.zeros((), dtype=np.complex128)  # a derivative that nobody asked for
 
 
 class Dahl(Element):
@@ -167,8 +168,9 @@ class Dahl(Element):
         unknown = [name for name in wanted if name not in known]
         if unknown:
             raise ValidationError(f"names has {unknown[0]!r}; expected some of {', '.join(known)}")
-        with_alpha = self.parameters[2].name in wanted
-        result = self._gradient(self.known_values(), A, 1, with_alpha=with_alpha)
+        asked = {"with_alpha": self.parameters[2].name in wanted}
+        asked["with_amplitude"] = "amplitude" in wanted
+        result = self._gradient(self.known_values(), A, 1, **asked)
         found = dict(zip(known, (*result.by_parameter, result.by_amplitude), strict=True))
         return {name: found[name][()] for name in wanted}
 
@@ -433,6 +435,7 @@ class Dahl(Element):
         harmonic: int,
         *,
         with_alpha: bool,
+        with_amplitude: bool = True,
     ) -> StiffnessGradient:
         f_max, sigma, alpha = values
         beta = sigma * amplitude / f_max
@@ -443,11 +446,11 @@ class Dahl(Element):
             h, by_f_max, by_sigma, by_alpha = general_dahl.describing_function_gradient(beta, alpha)
         else:
             if closed:
-                c, slope = linear_dahl.harmonic_gradient(beta, harmonic)
+                c, rise = linear_dahl.harmonic_gradient(beta, harmonic)
             else:
-                c, slope, by_alpha = general_dahl.harmonic_gradient(beta, alpha, harmonic)
+                c, rise, by_alpha = general_dahl.harmonic_gradient(beta, alpha, harmonic)
                 by_alpha = _per(by_alpha, beta)
-            h, by_f_max, by_sigma = _per(c, beta), _per(c - slope, beta), _per(slope, beta)
+            h, by_f_max, by_sigma = _per(c, beta), _per(c - rise, beta), _per(rise, beta)
         if not with_alpha:
             by_alpha = np.zeros(h.shape, dtype=np.complex128)
         else:
@@ -456,10 +459,10 @@ class Dahl(Element):
             elif closed:
                 by_alpha = _per(general_dahl.harmonic_gradient(beta, alpha, harmonic)[2], beta)
             by_alpha = sigma * by_alpha
-        by_amplitude = _by_amplitude(values, beta, harmonic, by_f_max)
+        slope = _by_amplitude(values, beta, harmonic, by_f_max) if with_amplitude else _NONE
         h *= sigma
         by_f_max *= sigma / f_max
-        return StiffnessGradient(h, by_amplitude, (by_f_max, by_sigma, by_alpha))
+        return StiffnessGradient(h, slope, (by_f_max, by_sigma, by_alpha))
 
 
 def _positive(name: str, unit: str, description: str, value: float | None) -> Parameter:
