@@ -18,6 +18,7 @@ from scipy import stats
 
 import dahl_ident as di
 from dahl_ident.cli.app import app
+from dahl_ident.errors import DataError
 from dahl_ident.synthetic import Experiment
 from tests.command_line import Runner
 
@@ -389,6 +390,25 @@ def test_a_progress_bar_stays_out_of_the_results(tmp_path: Path) -> None:
     os.close(ours)
     assert b"sampling" in bar
     assert json.loads(done.stdout)["steps"] == 30
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_full_disk_behind_standard_output_is_one_line(unbuffered: str) -> None:
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run(
+            [str(PROGRAM), "datasets", "noisy", "-o", "-"],
+            stdout=full, stderr=subprocess.PIPE, text=True, env=environment,
+        )  # fmt: skip
+    assert ended.returncode == 1
+    assert ended.stderr == "error: standard output: No space left on device\n"
+
+
+def test_a_closed_standard_input_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", None)
+    with pytest.raises(DataError, match="standard input is closed; pipe the file into it"):
+        di.read_frequency_response("-")
 
 
 def test_completion_knows_the_commands() -> None:

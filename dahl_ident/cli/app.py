@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Annotated
 
@@ -64,7 +65,15 @@ def main(arguments: list[str] | None = None) -> None:
     typed = sys.argv[1:] if arguments is None else arguments
     telling.begin(typed)
     try:
-        app(args=typed)
+        try:
+            app(args=typed)
+        finally:
+            sys.stdout.flush()
     except DahlIdentError as exc:
         telling.doubt(f"error: {' '.join(str(exc).split())}")
+        sys.exit(telling.BAD_INPUT)
+    except OSError as exc:
+        telling.doubt(f"error: {exc.filename or 'standard output'}: {exc.strerror or exc}")
+        # what is left in the buffer would fail once more when Python ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(telling.BAD_INPUT)

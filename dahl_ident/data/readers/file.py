@@ -86,6 +86,8 @@ def open_file(path: str | PurePath) -> File:
         If it cannot be read, is empty, or holds another format than its extension says.
     """
     if str(path) == "-":
+        if sys.stdin is None:
+            raise DataError("standard input is closed; pipe the file into it, or name the file")
         return _checked(None, "standard input", sys.stdin.buffer.read())
     place = Path(path)
     try:
