@@ -170,4 +170,4 @@ def as_json(result: FitResult) -> dict[str, Any]:
 
 def finish(result: FitResult) -> None:
     """End with status 3 where the fit is not to be trusted."""
-    telling.finish(result.trusted, result.verdict.removeprefix("NOT to be trusted. "))
+    telling.finish(result.trusted, result.statements[0].removeprefix("NOT to be trusted. "))

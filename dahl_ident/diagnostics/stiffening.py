@@ -4,8 +4,9 @@ Re N falls with A for every Dahl element and for every sum of them, whatever the
 spring adds a constant. The real part of the measured dynamic stiffness, less the modelled parts
 of mass and other linear elements, is therefore a falling function of amplitude, and a rise
 between any two amplitudes speaks against every such model, also where the fitted one leaves
-other departures. No curve is assumed: the stiffness is a step function over a few bands of
-amplitude, estimated with a free mass's correction by weighted least squares.
+other departures. No curve is assumed: the stiffness is a straight line over the logarithm of the
+amplitude in each of a few bands, estimated with a free mass's correction by weighted least
+squares, and compared from centre to centre.
 """
 
 from __future__ import annotations
@@ -70,7 +71,10 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
     kept, band = _bands(np.log(view.amplitude[rows]))
     rows = rows[kept]
     count = int(band.max()) + 1 if band.size else 0
-    design = (band[:, None] == np.arange(count)).astype(np.float64)
+    own = (band[:, None] == np.arange(count)).astype(np.float64)
+    x = np.log(view.amplitude[rows])
+    centre = x @ own / own.sum(axis=0)
+    design = np.column_stack([own, own * (x[:, None] - centre)])
     if any(isinstance(e, Mass) and e.parameters[0].free for e in elements):
         square = view.omega[rows] ** 2
         design = np.column_stack([design, square / square.mean() - 1.0])
@@ -79,11 +83,10 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
         return None
     stiffness = friction_stiffness(optimum, (Dahl, Spring)).real[rows]
     values, covariance = _weighted_means(design, stiffness, view.weights[rows], dof)
-    amplitude = [
-        float(np.exp(np.log(view.amplitude[rows[band == i]]).mean())) for i in range(count)
-    ]
     unit = shown_unit("m", optimum.problem.data.motion)
-    return _largest_rise(amplitude, unit, values[:count], covariance[:count, :count], dof)
+    return _largest_rise(
+        np.exp(centre).tolist(), unit, values[:count], covariance[:count, :count], dof
+    )
 
 
 def _bands(x: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:

@@ -31,7 +31,7 @@ from dahl_ident.diagnostics.information import Information, shares
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval
 from dahl_ident.diagnostics.levels import LEVELS, percent, thresholds
 from dahl_ident.diagnostics.units import shown_unit
-from dahl_ident.fitting import Optimum
+from dahl_ident.fitting import Optimum, Status
 
 IDENTIFIED_BELOW = 0.25
 NOT_IDENTIFIED_ABOVE = 1.0
@@ -304,7 +304,7 @@ def _determined(
     told = {c.expression for c in optimum.combinations}
     gone = _run_away(optimum)  # the optimum itself says which combinations of these are left
     for candidate in candidates(optimum):
-        if candidate.expression in told or candidate.members & gone:
+        if candidate.expression in told or _runs_away(candidate, optimum, gone):
             continue
         enough = candidate.members <= lost if candidate.is_sum else candidate.members & lost
         if not enough:
@@ -325,6 +325,13 @@ def _run_away(optimum: Optimum) -> frozenset[str]:
     positive = np.array([p.transform == "log" for p in optimum.problem.parameters])
     gone = ~np.isfinite(optimum.values) | (positive & (optimum.values == 0.0))
     return frozenset(np.array(optimum.names)[gone].tolist())
+
+
+def _runs_away(candidate: Candidate, optimum: Optimum, gone: frozenset[str]) -> bool:
+    """Return whether a combination has no finite value where the parameters in `gone` have none."""
+    going = candidate.direction[[name in gone for name in optimum.names]]
+    together = optimum.status is Status.NO_FULL_SLIP and not candidate.is_sum
+    return bool(going.any()) and not (together and going.sum() == 0.0)
 
 
 def _parts_of(candidate: Candidate) -> FloatArray:

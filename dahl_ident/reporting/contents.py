@@ -87,8 +87,9 @@ def _title(data: FrequencyResponse) -> str:
 
 def _verdict(fit: FitResult) -> list[str]:
     warnings = [f"Warning: {text}" for text in fit.goodness.warnings]
-    text = fit.verdict.removeprefix("NOT to be trusted. ").removeprefix("To be trusted. ")
-    return [text, *warnings]
+    first, *others = fit.statements
+    first = first.removeprefix("NOT to be trusted. ").removeprefix("To be trusted. ")
+    return [first, *others, *warnings]
 
 
 def _sections(fit: FitResult, drawn: Sequence[Posterior], several: bool) -> Iterator[Section]:
