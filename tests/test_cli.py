@@ -411,6 +411,13 @@ def test_a_closed_standard_input_is_named(monkeypatch: pytest.MonkeyPatch) -> No
         di.read_frequency_response("-")
 
 
+def test_a_bootstrap_from_a_negative_seed_is_refused(run: Runner) -> None:
+    table = run("datasets", "noisy", "-o", "-").out
+    outcome = run("report", "-", "--bootstrap", "--seed", "-2", stdin=table)
+    assert outcome.status == 1
+    assert outcome.err == "error: seed is -2; expected a whole number >= 0\n"
+
+
 def test_completion_knows_the_commands() -> None:
     environment = {
         **os.environ, "_DAHL_IDENT_COMPLETE": "complete_bash", "COMP_WORDS": "dahl-ident da",

@@ -62,7 +62,7 @@ def replicate(optimum: Optimum, replicates: int, seed: int) -> Replicates:
     if optimum.status is Status.NOT_CONVERGED or not np.isfinite(optimum.scale):
         raise FitError("there is no optimum to simulate repetitions from")
     scale = 1.0 if optimum.scale_known else optimum.scale
-    problem, rng = optimum.problem, np.random.default_rng(seed)
+    problem, rng = optimum.problem, np.random.default_rng(whole_number(seed, "seed", 0))
     responses = problem.draw(optimum.theta, scale, count, rng)
     found = solve_many(ProblemBatch.replicates(problem, responses), start=optimum.theta)
     error = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
