@@ -100,6 +100,7 @@ class TestBeam:
         assert "f_max: at least" in found.verdict
         assert "hides it below" in found.verdict
         assert "The model does not describe these data" in found.verdict
+        assert "stiffness rises with amplitude, by 0." in found.verdict
 
     def test_controlled_response_has_its_optimum_at_infinity(self, beam: FrequencyResponse) -> None:
         found = self.fitted(beam, "Response")
