@@ -212,7 +212,8 @@ class Profiler:
     def _first_step(self) -> FloatArray:
         """Return the first step of a threshold of 1: a standard error, in logarithms at most 1."""
         error = np.sqrt(np.diagonal(self._optimum.covariance))
-        step = np.where(np.isfinite(error) & (error > 0.0), error, self._conditional)
+        unknown = np.where(self._logarithmic, 1.0, self._conditional)
+        step = np.where(np.isfinite(error) & (error > 0.0), error, unknown)
         step = np.where(np.isfinite(step) & (step > 0.0), step, 1.0)
         return np.where(self._logarithmic, np.minimum(step, 1.0), step)
 
