@@ -473,3 +473,11 @@ def test_a_drive_without_a_factor_is_no_force() -> None:
     record = Record(w.time, displacement=w.displacement, drive=w.force)
     with pytest.raises(ValidationError, match="drive_factor"):
         extract(record)
+
+
+def test_harmonics_by_default_are_those_that_the_control_leaves_to_friction() -> None:
+    record = waves().record()
+    held = extract(record)
+    assert sorted(set(held.harmonic.tolist())) == [1, 3, 5, 7, 9]
+    driven = extract(record, controlled="force")
+    assert set(driven.harmonic.tolist()) == {1}

@@ -101,12 +101,13 @@ class Extracting:
         """Return the arguments of ``extract``."""
         from dahl_ident.errors import ValidationError
 
-        given = self.harmonics or ("1" if self.controlled == "force" else "1,3,5,7,9")
         try:
-            harmonics = [int(k) for k in given.split(",")]
+            harmonics = (
+                None if self.harmonics is None else [int(k) for k in self.harmonics.split(",")]
+            )
         except ValueError as exc:
             raise ValidationError(
-                f"harmonics is {given!r}; expected whole numbers such as 1,3,5"
+                f"harmonics is {self.harmonics!r}; expected whole numbers such as 1,3,5"
             ) from exc
         return {**vars(self), "harmonics": harmonics}
 

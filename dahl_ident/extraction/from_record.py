@@ -25,7 +25,7 @@ def extract(
     mode: Mode = "auto",
     num_periods: int | None = None,
     settling_periods: int | None = None,
-    harmonics: Sequence[int] = (1, 3, 5, 7, 9),
+    harmonics: Sequence[int] | None = None,
     controlled: str = "displacement",
     level: ArrayLike | None = None,
     min_share: float = 0.6,
@@ -55,8 +55,10 @@ def extract(
     settling_periods : int, optional
         Leading periods of `num_periods` that are left out. Default: as many as the memory of
         friction needs, judged from the decaying mean of the force.
-    harmonics : sequence of int, default (1, 3, 5, 7, 9)
+    harmonics : sequence of int, optional
         Which harmonics become rows, 1 to 9; fewer where the sampling cannot tell them apart.
+        Default: 1, 3, 5, 7, 9, or 1 alone where the force was controlled, since the displacement
+        then has harmonics of its own.
     controlled : {"displacement", "force"}, default "displacement"
         What the laboratory held constant. Where it is the force, memory is looked for in the
         displacement's mean.
@@ -157,7 +159,7 @@ def _settings(
     record: Record,
     num_periods: int | None,
     settling_periods: int | None,
-    harmonics: Sequence[int],
+    harmonics: Sequence[int] | None,
     controlled: str,
     min_share: float,
 ) -> Settings:
@@ -165,6 +167,8 @@ def _settings(
         num_periods = whole_number(num_periods, "num_periods", FEWEST_CYCLES)
     if settling_periods is not None:
         settling_periods = whole_number(settling_periods, "settling_periods", 0)
+    if harmonics is None:
+        harmonics = (1,) if controlled == "force" else range(1, HARMONICS + 1, 2)
     orders = tuple(whole_number(k, "harmonics", 1) for k in harmonics)
     if not orders or max(orders) > HARMONICS or len(set(orders)) < len(orders):
         raise ValidationError(
