@@ -27,6 +27,7 @@ def test_the_damper_shows_its_misfit() -> None:
     assert posterior.converged
     size = next(check for check in posterior.checks if check.statistic == "size")
     assert not size.passed
+    assert not posterior.trusted
     assert size.observed > 3.0 * size.replicated
     assert "MISFIT: the residuals are larger than the noise that the data state" in str(posterior)
     grid = di.posterior_grid(data, di.Dahl())

@@ -270,6 +270,14 @@ def test_a_chain_that_is_too_short_ends_with_3(run: Runner) -> None:
     assert outcome.out.startswith("NOT CONVERGED after 20 steps")
 
 
+def test_a_prior_that_keeps_the_data_out_ends_with_3(run: Runner) -> None:
+    table = run("datasets", "noisy", "-o", "-").out
+    outcome = run("sample", "-", "--grid", "--prior", "f_max=1:2", stdin=table)
+    assert outcome.status == 3
+    assert outcome.err.startswith("not to be trusted: PRIOR AGAINST DATA: f_max lies beyond 99 %")
+    assert "; MISFIT: the residuals are larger than the noise that the data state" in outcome.err
+
+
 def test_report_writes_every_format_asked_for(run: Runner) -> None:
     table = run("datasets", "noisy", "-o", "-").out
     outcome = run("report", "-", "-o", "a.html", "-o", "a.json", stdin=table)

@@ -276,14 +276,20 @@ def test_data_outweigh_the_tail_of_a_prior(prior: Any) -> None:
     mean = (weights @ x) / weights.sum()
     assert grid.converged
     assert grid.mean()[0] == pytest.approx(mean, abs=0.2 * std)
-    assert "PRIOR AGAINST DATA: f_max lies beyond 99 % of its prior's" in grid.report()
+    assert (
+        "PRIOR AGAINST DATA: f_max lies beyond 99 % of its prior's" in grid.report().splitlines()[1]
+    )
+    assert not grid.trusted
 
 
 def test_a_prior_that_keeps_the_data_out_is_told_with_its_misfit() -> None:
     walled = di.posterior_grid(TIGHT, di.Dahl(), priors={"f_max": (1.0, 2.0)})
     assert "at the lower end; check the prior, its unit" in walled.report()
     assert "MISFIT: the residuals are larger than the noise that the data state" in walled.report()
-    assert not di.posterior_grid(TIGHT, di.Dahl()).findings[:-1]
+    assert [text[:12] for text in walled.objections[:2]] == ["PRIOR AGAINS", "MISFIT: the "]
+    free = di.posterior_grid(TIGHT, di.Dahl())
+    assert free.trusted
+    assert not free.findings[:-1]
 
 
 def test_a_lattice_laid_amiss_is_no_silent_answer() -> None:

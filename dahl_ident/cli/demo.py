@@ -56,7 +56,9 @@ def demo(
                 "report": str(page.resolve()),
             }
         )
-    telling.finish(result.trusted and posterior.converged, result.verdict)
+    telling.finish(
+        result.trusted and posterior.trusted, "; ".join([result.verdict, *posterior.objections])
+    )
 
 
 def _chain(

@@ -134,5 +134,5 @@ def sample(
 
 
 def finish(posterior: BayesianResult) -> None:
-    """End with status 3 where the posterior has not converged."""
-    telling.finish(posterior.converged, posterior.message)
+    """End with status 3 where the posterior is not to be trusted."""
+    telling.finish(posterior.trusted, "; ".join(posterior.objections))

@@ -54,7 +54,7 @@ def document(
     sections += [section for posterior in drawn for section in posteriors.sections(posterior)]
     return Document(
         title=title or _title(data),
-        trusted=all(fit.trusted for fit in fits) and all(p.converged for p in drawn),
+        trusted=all(fit.trusted for fit in fits) and all(p.trusted for p in drawn),
         verdict=(
             *(line for fit in fits for line in _verdict(fit)),
             *(line for posterior in drawn for line in posteriors.verdict(posterior)),

@@ -40,6 +40,7 @@ def facts(posterior: BayesianResult) -> dict[str, Any]:
     """Return a posterior for machines."""
     told = {
         "converged": posterior.converged,
+        "trusted": posterior.trusted,
         "message": posterior.message,
         "likelihood": posterior.likelihood,
         "priors": dict(posterior.priors),

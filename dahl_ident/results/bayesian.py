@@ -87,10 +87,25 @@ class BayesianResult(ABC):
         return predictive_checks(self._density, draws, np.random.default_rng(0))
 
     @property
+    def objections(self) -> tuple[str, ...]:
+        """Why the numbers are not to be trusted; none where they are."""
+        unfinished = () if self.converged else (self.message,)
+        against = (str(rule) for rule in self.prior_rules if rule.contradicted)
+        return (*unfinished, *against, *self._misfits)
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the posterior has converged, fits the data, and no prior stands against them."""
+        return not self.objections
+
+    @property
     def findings(self) -> tuple[str, ...]:
         """What to know besides the numbers: what the prior decides, and what does not fit."""
-        failed = (str(check) for check in self.checks if not check.passed)
-        return (*map(str, self.prior_rules), *failed)
+        return (*map(str, self.prior_rules), *self._misfits)
+
+    @property
+    def _misfits(self) -> tuple[str, ...]:
+        return tuple(str(check) for check in self.checks if not check.passed)
 
     def draws(self, size: int, seed: int = 0) -> FloatArray:
         """Return values drawn from the posterior, shape (size, number of parameters)."""
@@ -105,10 +120,12 @@ class BayesianResult(ABC):
         """Return one row a parameter: moments and quantiles."""
 
     def report(self) -> str:
-        """Return the posterior as text: verdict, numbers, findings and priors, in this order."""
+        """Return the posterior as text: verdict, objections, numbers, findings and priors."""
         table = self.summary().to_string(float_format=lambda v: f"{v:.5g}")
         priors = [f"  {name}: {text}" for name, text in self.priors.items()]
-        return "\n".join([self.message, "", table, *self.findings, "", "Priors:", *priors])
+        grave = [text for text in self.objections if text != self.message]
+        others = [text for text in self.findings if text not in grave]
+        return "\n".join([self.message, *grave, "", table, *others, "", "Priors:", *priors])
 
     def __str__(self) -> str:
         return self.report()
