@@ -378,3 +378,12 @@ def test_a_fit_is_saved_as_json_and_replaced_on_request_only(
     assert fit.save(place, overwrite=True) == place
     with pytest.raises(ValidationError, match=r"a fit is written as \.json; got '\.txt'"):
         fit.save(tmp_path / "fit.txt")
+
+
+def test_of_several_fits_each_verdict_names_its_model(fit: di.FitResult, tmp_path: Path) -> None:
+    with_spring = di.fit(fit.data, di.Dahl() + di.Spring(), throw=False)
+    path = report([fit, with_spring], tmp_path / "report.md")
+    head = path.read_text().split("\n## ")[0]
+    for one in (fit, with_spring):
+        trust = "To be trusted" if one.trusted else "NOT to be trusted"
+        assert f"{one.problem.model!r}: {trust}" in head.replace("\\", "")

@@ -56,7 +56,7 @@ def document(
         title=title or _title(data),
         trusted=all(fit.trusted for fit in fits) and all(p.trusted for p in drawn),
         verdict=(
-            *(line for fit in fits for line in _verdict(fit)),
+            *(line for fit in fits for line in _verdict(fit, len(fits) > 1)),
             *(line for posterior in drawn for line in posteriors.verdict(posterior)),
         ),
         sections=(
@@ -85,10 +85,14 @@ def _title(data: FrequencyResponse) -> str:
     )
 
 
-def _verdict(fit: FitResult) -> list[str]:
+def _verdict(fit: FitResult, several: bool) -> list[str]:
+    """Return a fit's statements; among others its model and whether to trust it go first."""
     warnings = [f"Warning: {text}" for text in fit.goodness.warnings]
     first, *others = fit.statements
-    first = first.removeprefix("NOT to be trusted. ").removeprefix("To be trusted. ")
+    if several:
+        first = f"{fit.problem.model!r}: {first}"
+    else:
+        first = first.removeprefix("NOT to be trusted. ").removeprefix("To be trusted. ")
     return [first, *others, *warnings]
 
 
