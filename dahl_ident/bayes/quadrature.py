@@ -135,11 +135,6 @@ class Marginal:
             low, high = np.where(under, middle, low), np.where(under, high, middle)
         return np.asarray(0.5 * (low + high))
 
-    def below(self, points: FloatArray) -> FloatArray:
-        """Return the probability below each of Q points."""
-        panel = np.clip(np.searchsorted(self.low, points) - 1, 0, len(self.low) - 1)
-        return self._below[panel] + self._within(panel, points)
-
     def _within(self, panel: NDArray[np.intp], points: FloatArray) -> FloatArray:
         """Return the probability from the lower wall of a panel to a point in it, (Q,)."""
         angle = np.arccos(self._place(panel, points))

@@ -12,7 +12,7 @@ import typer
 
 from dahl_ident.cli import extract, telling
 from dahl_ident.cli.files import make_folder, progress_bar
-from dahl_ident.cli.fit import as_json
+from dahl_ident.cli.fit import as_json, objection
 from dahl_ident.cli.groups import grouped
 from dahl_ident.cli.options import General, Writing
 
@@ -56,9 +56,8 @@ def demo(
                 "report": str(page.resolve()),
             }
         )
-    telling.finish(
-        result.trusted and posterior.trusted, "; ".join([result.verdict, *posterior.objections])
-    )
+    against = [*(() if result.trusted else (objection(result),)), *posterior.objections]
+    telling.finish(not against, "; ".join(against))
 
 
 def _chain(
@@ -87,7 +86,7 @@ def _extracted(record: Record) -> FrequencyResponse:
     from dahl_ident.extraction import extract as extract_record
 
     telling.heading("2. extract: waveforms to dynamic stiffness")
-    data = extract_record(record, controlled="force", harmonics=[1])
+    data = extract_record(record, controlled="force")
     extract.show(data)
     return extract.good_points(data)
 

@@ -170,4 +170,9 @@ def as_json(result: FitResult) -> dict[str, Any]:
 
 def finish(result: FitResult) -> None:
     """End with status 3 where the fit is not to be trusted."""
-    telling.finish(result.trusted, result.statements[0].removeprefix("NOT to be trusted. "))
+    telling.finish(result.trusted, objection(result))
+
+
+def objection(result: FitResult) -> str:
+    """Return the gravest statement on a fit that is not to be trusted."""
+    return result.statements[0].removeprefix("NOT to be trusted. ")
