@@ -102,6 +102,9 @@ class TestBands:
             result.predict(1.0)
         with pytest.raises(ValidationError, match="give either amplitude"):
             result.predict(1.0, amplitude=GRID, drive=GRID)
+        shapes = r"frequency_hz has shape \(3,\) and amplitude \(2,\); expected one shape"
+        with pytest.raises(ValidationError, match=shapes):
+            result.predict([1.0, 2.0, 3.0], amplitude=[1e-3, 1e-2])
         with pytest.raises(ModelError, match="no Dahl element"):
             fit(table(), Spring(), throw=False).describing_function(GRID)
 

@@ -23,6 +23,7 @@ from dahl_ident.diagnostics.outliers import suspicious_points
 from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, ResidualSpace
 from dahl_ident.diagnostics.third_harmonic import third_harmonic_share
 from dahl_ident.diagnostics.trends import Trend
+from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Status
 from tests.friction_tables import (
     FRICTION,
@@ -392,6 +393,8 @@ class TestComparison:
         )
         assert "fewer than" in found.failed["too much"]
         assert "too much could not be fitted" in str(found)
+        with pytest.raises(ValidationError, match="models is a list; expected a mapping of names"):
+            compare_models(fit(data, Dahl()), [Dahl()])  # type: ignore[arg-type]
 
     def test_an_exponent_that_is_free_is_also_tried_at_one(self) -> None:
         names = [m.name for m in compare_models(fit(table(), Dahl(alpha=None))).models]

@@ -189,6 +189,10 @@ class TestReport:
         assert "90 % (wald)" in result.fit_report("wald", 0.9)
         assert "95.45 % (bootstrap)" in result.fit_report("bootstrap")
 
+    def test_one_level_needs_no_sequence(self, result: FitResult) -> None:
+        upper = result.conf_interval(levels=0.95)["f_max"][0].upper
+        assert upper == result.conf_interval(levels=(0.95,))["f_max"][0].upper
+
     def test_what_is_not_to_be_trusted_says_why(self, microslip: FitResult) -> None:
         assert not microslip.trusted
         assert microslip.verdict.startswith("NOT to be trusted.")
@@ -309,6 +313,11 @@ class TestStorage:
         (tmp_path / "cut.json").write_text(json.dumps(content))
         with pytest.raises(DataError, match=r"cut.json says .* lacks or garbles 'theta'"):
             FitResult.load(tmp_path / "cut.json")
+        with pytest.raises(DataError, match=r"lost\.json: the file cannot be read: No such file"):
+            FitResult.load(tmp_path / "lost.json")
+        (tmp_path / "image.json").write_bytes(b"\x89PNG")
+        with pytest.raises(DataError, match=r"image\.json: the file cannot be read: it is no text"):
+            FitResult.load(tmp_path / "image.json")
 
     def test_priors_that_no_file_can_hold(self) -> None:
         result = fit(table(), Dahl())

@@ -100,10 +100,16 @@ def response_band(
     held = drive if amplitude is None else amplitude
     if held is None or (amplitude is not None and drive is not None):
         raise ValidationError("give either amplitude (displacement controlled) or drive (force)")
-    f, given = np.broadcast_arrays(
-        np.atleast_1d(positive_array(frequency_hz, "frequency_hz")),
-        np.atleast_1d(positive_array(held, "drive" if amplitude is None else "amplitude")),
-    )
+    name = "drive" if amplitude is None else "amplitude"
+    f = np.atleast_1d(positive_array(frequency_hz, "frequency_hz"))
+    given = np.atleast_1d(positive_array(held, name))
+    try:
+        f, given = np.broadcast_arrays(f, given)
+    except ValueError:
+        raise ValidationError(
+            f"frequency_hz has shape {f.shape} and {name} {given.shape}; expected one shape, or "
+            "one number for all"
+        ) from None
     problem = optimum.problem
     grid = FrequencyResponse(
         f,

@@ -20,7 +20,7 @@ from dahl_ident.diagnostics.physics import negative_parameters
 from dahl_ident.diagnostics.units import shown_unit
 from dahl_ident.diagnostics.verdicts import Fit
 from dahl_ident.elements import Dahl, Element, Model, Spring
-from dahl_ident.errors import DahlIdentError
+from dahl_ident.errors import DahlIdentError, ValidationError
 from dahl_ident.fitting import Optimum, solve
 from dahl_ident.problem import Problem
 
@@ -169,6 +169,11 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
     >>> compare_models(result).best.name
     'exponent free'
     """
+    if not isinstance(models, Mapping | None):
+        raise ValidationError(
+            f"models is a {type(models).__name__}; expected a mapping of names to models, such as "
+            "{'stiff': Dahl() + Spring()}"
+        )
     problem = fit.optimum.problem
     fitted = [_compared("as fitted", fit.optimum)]
     failed = {}

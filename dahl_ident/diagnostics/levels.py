@@ -20,7 +20,7 @@ from dahl_ident.fitting import Optimum
 LEVELS = (0.6827, 0.9545, 0.9973)
 
 
-def checked_levels(levels: Sequence[float]) -> FloatArray:
+def checked_levels(levels: Sequence[float] | float) -> FloatArray:
     """Return confidence levels as an array, rising, or say what is wrong with them."""
     array = np.sort(np.atleast_1d(array_between(levels, "levels", 0.0, 1.0)))
     if array.ndim != 1 or array.size == 0 or array[0] <= 0.0 or array[-1] >= 1.0:

@@ -30,7 +30,7 @@ from dahl_ident.diagnostics.intervals import (
     profile_intervals,
     wald_intervals,
 )
-from dahl_ident.diagnostics.levels import LEVELS
+from dahl_ident.diagnostics.levels import LEVELS, checked_levels
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting.optimum import Optimum
@@ -93,7 +93,7 @@ class FitResult(FitNumbers):
     def conf_interval(
         self,
         method: Method = "profile",
-        levels: Sequence[float] = LEVELS,
+        levels: Sequence[float] | float = LEVELS,
         *,
         replicates: int = REPLICATES,
         seed: int = 0,
@@ -104,7 +104,7 @@ class FitResult(FitNumbers):
         ----------
         method : {"profile", "wald", "bootstrap"}, default "profile"
             See :mod:`dahl_ident.diagnostics.intervals`, which says what to use when.
-        levels : sequence of float, default 0.6827, 0.9545, 0.9973
+        levels : float or sequence of float, default 0.6827, 0.9545, 0.9973
             Confidence levels.
         replicates, seed : int
             Of the bootstrap.
@@ -126,7 +126,8 @@ class FitResult(FitNumbers):
         """
         if method not in METHODS:
             raise ValidationError(f"method is {method!r}; expected one of {', '.join(METHODS)}")
-        key = (method, tuple(levels), replicates, seed)
+        levels = tuple(checked_levels(levels).tolist())
+        key = (method, levels, replicates, seed)
         if key not in self._intervals:
             self._intervals[key] = self._new_intervals(method, levels, replicates, seed)
         return self._intervals[key]
@@ -150,7 +151,7 @@ class FitResult(FitNumbers):
     def compare_intervals(
         self,
         methods: Sequence[Method] = ("wald", "bootstrap", "profile"),
-        levels: Sequence[float] = LEVELS,
+        levels: Sequence[float] | float = LEVELS,
     ) -> IntervalComparison:
         """Return the intervals of several methods side by side, and where they disagree.
 
@@ -158,7 +159,7 @@ class FitResult(FitNumbers):
         ----------
         methods : sequence of str, default ("wald", "bootstrap", "profile")
             The last is the most trusted; each of the others is compared with it.
-        levels : sequence of float, default 0.6827, 0.9545, 0.9973
+        levels : float or sequence of float, default 0.6827, 0.9545, 0.9973
             Confidence levels.
 
         Returns
@@ -229,12 +230,13 @@ class FitResult(FitNumbers):
         Returns
         -------
         ResponseBand
-            Sensors included: what would be measured.
+            Sensors included: what would be measured. NaN where a drive has no steady amplitude.
 
         Raises
         ------
         ValidationError
-            If both or neither of amplitude and drive are given, or a value is not above zero.
+            If both or neither of amplitude and drive are given, a value is not above zero, or
+            the shapes do not go together.
         """
         return response_band(self._optimum, frequency_hz, amplitude, drive, quantity)
 
@@ -398,7 +400,7 @@ class FitResult(FitNumbers):
         Raises
         ------
         DataError
-            If the file holds no fit, or one of a later version's schema.
+            If the file cannot be read, holds no fit, or one of a later version's schema.
         """
         optimum, first_order = storage.load(path)
         return cls(optimum, first_order=first_order)
