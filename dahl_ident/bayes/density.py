@@ -23,6 +23,7 @@ from scipy.special import gammaln
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.priors import JointPrior
+from dahl_ident.elements.tabulated import tabulated
 from dahl_ident.errors import SamplingError, ValidationError
 from dahl_ident.problem import Problem
 
@@ -133,7 +134,7 @@ class Density:
         result = self.log_prior(theta)
         inside = result > -np.inf
         if self.likelihood != "none" and inside.any():
-            result[inside] += self.problem.log_likelihood(theta[inside])
+            result[inside] += self.tabulated.log_likelihood(theta[inside])
         return result
 
     def log_prior(self, theta: FloatArray) -> FloatArray:
@@ -147,7 +148,7 @@ class Density:
     def log_likelihood(self, theta: FloatArray, scale: FloatArray) -> FloatArray:
         """Return ln of the data's density at theta, (S, P), and s, (S,)."""
         if self.likelihood != "student_t":
-            return self.problem.log_likelihood(theta, scale if self.has_scale else None)
+            return self.tabulated.log_likelihood(theta, scale if self.has_scale else None)
         z = self.squares(theta)
         n = z.shape[-1]
         tails = np.log1p(z / (TAIL_DOF * scale[:, None] ** 2)).sum(axis=-1)
@@ -156,8 +157,17 @@ class Density:
 
     def squares(self, theta: FloatArray) -> FloatArray:
         """Return |y|^2 of every row, (S, n), the scale taken as 1."""
-        y, _ = self.problem.whitened(theta, derivatives=False)
+        y, _ = self.tabulated.whitened(theta, derivatives=False)
         return np.asarray(y.real**2 + y.imag**2)
+
+    @cached_property
+    def tabulated(self) -> Problem:
+        """The problem, friction of any exponent from tables: for very many evaluations."""
+        problem = self.problem
+        model = tabulated(problem.model)
+        if model is problem.model:
+            return problem
+        return Problem(problem.data, model, noise=problem.noise, sensors=problem.sensors)
 
     @cached_property
     def _integral_constant(self) -> float:
@@ -173,7 +183,7 @@ class Density:
         theta = self.prior.draw(np.random.default_rng(0), 64)
         ones = np.ones(len(theta)) if self.has_scale else None
         squares = self.squares(theta).sum(axis=-1)
-        constant = self.problem.log_likelihood(theta, ones) + 0.5 * squares
+        constant = self.tabulated.log_likelihood(theta, ones) + 0.5 * squares
         if not np.isfinite(constant).any():
             raise SamplingError("the model predicts nothing anywhere in the prior; check both")
         return float(constant[np.nanargmin(np.where(np.isfinite(constant), squares, np.nan))])

@@ -52,7 +52,7 @@ class ProfileSlices:
     """
 
     def __init__(self, density: Density, outer: int, centre: FloatArray) -> None:
-        problem = _without_priors(density.problem)
+        problem = _without_priors(density.tabulated)
         self.outer = outer
         self._density, self._problem = density, problem
         self._shear = _without(shear_of(problem), outer)

@@ -294,7 +294,7 @@ def _close_loop(beta: FloatArray, alpha: FloatArray) -> _Closure:
     """Solve ln E(L) = ln(2 beta) + p ln((1 + exp(-L))/2); full slip gives E = 2 beta / 2^p."""
     p = 1.0 - alpha
     p = np.where(p == 0.0, -1e-20, p)  # far below rounding, and spares every limit p -> 0
-    path = 2.0 * beta * np.minimum(1.0, np.exp2(-p))
+    path = 2.0 * beta * np.exp2(-np.maximum(p, 0.0))
     slips = p * path >= 1.0
     for _ in range(30):
         length = _length(p, path, slips)

@@ -1,0 +1,134 @@
+r"""Dahl friction at many amplitudes and exponents at once: series in place of quadratures.
+
+Posteriors ask for h = N/sigma at millions of pairs (beta, alpha). Chebyshev series in both, panel
+by panel, give it for a small part of what :mod:`dahl_ident.elements.general_dahl` takes, whose
+symbols are used here. A panel is computed when a pair first falls into it. Which one that is
+depends on the pair alone, so that h does not depend on what was asked before.
+
+**Coordinates** are those in which h is smooth. For alpha above 0.9 they are ln alpha and ln beta.
+Below, h has a singular point of order 1/p at ``beta_s = 2^-alpha / p``, where full slip sets in;
+panels lie over ln p and ``b = ln(beta/beta_s)``, and where |b| < 1 over ln |b|.
+
+**Accuracy**: 1e-10 of ``1/(1 + beta)``, about the modulus of h, for alpha from 1e-9 to 1000.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import general_dahl
+
+_NODES = 15
+_WALLS = np.array(
+    [*(1.0 - 0.1 ** np.linspace(0.0, 1.0, 6)), 1.0, 1.15, 1.4, 1.8, *(3.5 * 2.0 ** np.arange(10))]
+)
+"""Of the panels over alpha; up to the sixth, 0.9, the onset of slip shows."""
+_ONSET_SHOWS = 5
+
+_WIDTH = 0.5  # of panels over b or ln beta, and over ln |b|
+_LEAST, _MOST = -40.0, 70.0  # ln beta at which h is its limit, to every digit
+_NEAREST = 1e-11  # |b| that counts as the onset itself
+_BELOW, _ABOVE = 10_000, 20_000  # numbers of panels over ln |b| start here
+_VALUES_PER_BLOCK = 8192
+
+
+def describing_function(beta: FloatArray, alpha: FloatArray) -> ComplexArray:
+    """Return h = N/sigma; parameters as in :func:`general_dahl.describing_function`.
+
+    Examples
+    --------
+    >>> describing_function(np.array([1e-9, 1.0]), np.array(2.0)).round(6)
+    array([1.      +0.j      , 0.544039+0.354193j])
+    """
+    if alpha.ndim == 0 or alpha.shape[-1] > 1:
+        return describing_function(beta[..., None], alpha[..., None])[..., 0]
+    shape = np.broadcast_shapes(beta.shape, alpha.shape)
+    rows = np.broadcast_to(beta, shape).reshape(-1, shape[-1])
+    exponent = np.broadcast_to(alpha, (*shape[:-1], 1)).ravel()
+    strip = np.searchsorted(_WALLS, exponent, side="right") - 1
+    result = np.empty(rows.shape, dtype=np.complex128)
+    for index in np.unique(strip):
+        chosen = np.flatnonzero(strip == index)
+        step = max(1, _VALUES_PER_BLOCK // shape[-1])
+        for part in (chosen[i : i + step] for i in range(0, chosen.size, step)):
+            if 0 <= index < len(_WALLS) - 1:
+                result[part] = _on_strip(int(index), rows[part], exponent[part])
+            else:
+                direct = general_dahl.describing_function(rows[part], exponent[part, None])
+                result[part] = direct
+    return result.reshape(shape)
+
+
+def _on_strip(strip: int, beta: FloatArray, alpha: FloatArray) -> ComplexArray:
+    """Return h at beta, (S, n), for alpha, (S,), between two walls."""
+    panel, place = _panels(strip, beta, alpha)
+    first = panel.min()
+    present = np.flatnonzero(np.bincount((panel - first).ravel()))
+    slot = np.zeros(present[-1] + 1, dtype=np.intp)
+    slot[present] = np.arange(present.size)
+    low, high = _over_alpha(strip, _WALLS[strip : strip + 2])
+    across = (2.0 * _over_alpha(strip, alpha) - low - high) / (high - low)
+    tables = np.stack([_series(strip, int(first + k)) for k in present], axis=2)
+    along = chebyshev.chebvander(across, _NODES - 1) @ tables.view(np.float64)
+    terms = along.view(np.complex128).reshape(_NODES, -1)
+    which = slot[panel - first] + present.size * np.arange(len(alpha))[:, None]
+    # the Chebyshev polynomials one after the other, never all of them at once
+    before, now = np.ones(place.shape), place
+    total = terms[0].take(which)
+    for term in terms[1:]:
+        total += now * term.take(which)
+        before, now = now, 2.0 * place * now - before
+    return np.asarray(total / (1.0 + beta))
+
+
+def _over_alpha(strip: int, alpha: FloatArray) -> FloatArray:
+    return np.asarray(np.log1p(-alpha) if strip < _ONSET_SHOWS else np.log(alpha))
+
+
+def _panels(strip: int, beta: FloatArray, alpha: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+    """Return the number of each pair's panel and where in it the pair is, from -1 to 1."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        b = np.fmin(np.fmax(np.log(beta), _LEAST), _MOST)
+    start: FloatArray | int = 0
+    if strip < _ONSET_SHOWS:
+        b = b - _onset(alpha)[:, None]
+        near, size = np.abs(b) < 1.0, np.maximum(np.abs(b), _NEAREST)
+        start = np.where(near, np.where(b < 0.0, _BELOW, _ABOVE), 0)
+        b = np.where(near, np.log(size), b)
+    whole = np.floor(b / _WIDTH)
+    return np.asarray(whole + start, dtype=np.intp), 2.0 * (b / _WIDTH - whole) - 1.0
+
+
+def _onset(alpha: FloatArray) -> FloatArray:
+    """Return ln beta_s."""
+    return np.asarray(-alpha * np.log(2.0) - np.log1p(-alpha))
+
+
+@lru_cache(maxsize=4096)
+def _series(strip: int, panel: int) -> ComplexArray:
+    """Return the coefficients of (1 + beta) h, by amplitude and by exponent."""
+    nodes, to_series = _rule()
+    low, high = _over_alpha(strip, _WALLS[strip : strip + 2])
+    over_alpha = 0.5 * (low + high + (high - low) * nodes)
+    start = max((s for s in (_BELOW, _ABOVE) if panel > s - 1000), default=0)
+    b = _WIDTH * (panel - start + 0.5 * (1.0 + nodes[:, None]))
+    if strip < _ONSET_SHOWS:
+        alpha = -np.expm1(over_alpha)
+        b = {0: b, _BELOW: -np.exp(b), _ABOVE: np.exp(b)}[start] + _onset(alpha)
+    else:
+        alpha = np.exp(over_alpha)
+    beta = np.exp(b)
+    scaled = (1.0 + beta) * general_dahl.describing_function(beta, alpha)
+    return np.asarray(to_series @ scaled @ to_series.T)
+
+
+@lru_cache(maxsize=1)
+def _rule() -> tuple[FloatArray, FloatArray]:
+    """Return Chebyshev's nodes on (-1, 1), and the matrix from values there to a series."""
+    nodes = -np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+    return nodes, np.linalg.inv(chebyshev.chebvander(nodes, _NODES - 1)).astype(np.float64)

@@ -1,0 +1,110 @@
+"""The tables of any exponent, against closed forms, integration to 50 digits and the quadrature."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import dahl_ident as di
+from benchmarks.general_dahl_accuracy import exact_harmonics
+from dahl_ident.arrays import FloatArray
+from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.priors import joint_prior
+from dahl_ident.elements import general_dahl, linear_dahl
+from dahl_ident.elements.general_dahl_table import describing_function
+from tests.bayes_cases import friction_table, harmonic_table
+
+
+def at(value: float) -> FloatArray:
+    return np.asarray(value, dtype=np.float64)
+
+
+def amplitudes(alpha: float) -> FloatArray:
+    """Return beta over 12 decades, and many close to the onset of slip."""
+    beta = 10.0 ** np.random.default_rng(1).uniform(-6.0, 6.0, 400)
+    if alpha >= 1.0:
+        return beta
+    gaps = np.geomspace(1e-13, 0.9, 100)
+    onset = 2.0**-alpha / (1.0 - alpha)
+    return np.concatenate([beta, onset * (1.0 - gaps), [onset], onset * (1.0 + gaps)])
+
+
+@pytest.mark.parametrize(
+    "alpha",
+    [
+        *(1e-9, 0.01, 0.2, 0.36904, 0.5, 0.7, 0.899999, 0.9, 0.95, 1.0 - 1e-9, 1.0 + 1e-9),
+        *(1.2, 1.8, 3.5, 10.0, 100.0, 1000.0),
+    ],
+)
+def test_holds_the_quadrature(alpha: float) -> None:
+    beta = amplitudes(alpha)
+    error = describing_function(beta, at(alpha)) - general_dahl.describing_function(beta, at(alpha))
+    assert np.max(np.abs(error) * (1.0 + beta)) < 1e-10
+
+
+@pytest.mark.parametrize(("beta", "alpha"), [(1.12, 0.25), (30.0, 1.4), (0.3, 0.01), (40.0, 100.0)])
+def test_agrees_with_fifty_digit_integration(beta: float, alpha: float) -> None:
+    exact = exact_harmonics(beta, alpha, (1,))[0].value / beta
+    assert abs(complex(describing_function(at(beta), at(alpha))) - exact) * (1.0 + beta) < 1e-10
+
+
+def test_closed_forms_of_one_and_of_one_half() -> None:
+    beta = np.geomspace(1e-6, 1e6, 500)
+    error = describing_function(beta, at(1.0)) - linear_dahl.describing_function(beta)
+    assert np.max(np.abs(error) * (1.0 + beta)) < 1e-12
+    before_slip = np.geomspace(1e-6, np.sqrt(2.0), 500)
+    exact = np.sqrt(1.0 - before_slip**2 / 4.0) + 2j * before_slip / (3.0 * np.pi)
+    assert np.max(np.abs(describing_function(before_slip, at(0.5)) - exact)) < 1e-10
+
+
+def test_a_value_does_not_depend_on_what_else_is_asked() -> None:
+    random = np.random.default_rng(2)
+    alpha = np.exp(random.uniform(-3.0, 3.0, (200, 1)))
+    beta = np.exp(random.uniform(-5.0, 5.0, (200, 70)))
+    together = describing_function(beta, alpha)
+    assert together.shape == (200, 70)
+    for row in (0, 50, 199):
+        alone = describing_function(beta[row], alpha[row])
+        assert np.max(np.abs(alone - together[row]) * (1.0 + beta[row])) < 1e-15
+    columns = describing_function(beta, np.broadcast_to(alpha, beta.shape))
+    assert np.max(np.abs(columns - together) * (1.0 + beta)) < 1e-15
+    assert describing_function(np.zeros((0, 2)), at(2.0)).shape == (0, 2)
+
+
+def test_ends_and_what_is_no_number() -> None:
+    with np.errstate(invalid="ignore"):
+        found = describing_function(np.array([0.0, 1e-300, np.nan, 1e200]), at(0.5))
+    assert np.abs(found[:2] - 1.0).max() < 1e-15
+    assert np.isnan(found[2])
+    assert found[3] == pytest.approx(4j / np.pi * 1e-200, rel=1e-10)
+    with np.errstate(invalid="ignore"):
+        assert np.isnan(describing_function(at(1.0), at(np.nan)))
+    # beyond the tables by quadrature
+    far = np.array([1e-4, 1e-3]), at(5e3)
+    assert np.array_equal(describing_function(*far), general_dahl.describing_function(*far))
+
+
+@pytest.mark.parametrize(
+    ("data", "model"),
+    [
+        (friction_table(), di.Dahl(alpha=None)),
+        (friction_table(), di.Dahl(alpha=0.6)),
+        (harmonic_table(0.0), di.Dahl(alpha=None)),
+        (friction_table(), di.Dahl(alpha=None) + di.Spring()),
+    ],
+    ids=["free", "given", "harmonics", "beside a spring"],
+)
+def test_the_posterior_has_the_density_of_its_problem(
+    data: di.FrequencyResponse, model: di.Element
+) -> None:
+    problem = di.Problem(data, model)
+    density = Density(problem, joint_prior(problem))
+    assert type(density.tabulated.model.elements[0]).__name__ == "TabulatedDahl"
+    theta = density.prior.draw(np.random.default_rng(3), 300)
+    expected = density.log_prior(theta) + problem.log_likelihood(theta)
+    assert density.highest(theta) == pytest.approx(expected, rel=1e-9, abs=1e-7)
+
+
+def test_linear_friction_keeps_its_closed_form() -> None:
+    problem = di.Problem(friction_table(), di.Dahl())
+    assert Density(problem, joint_prior(problem)).tabulated is problem
