@@ -186,6 +186,25 @@ def test_robust_losses_stay_with_the_bulk(loss: str) -> None:
 
 
 @pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("factor", [1e9, 1e12])
+@pytest.mark.parametrize("row", [7, -1])
+def test_a_robust_estimate_does_not_depend_on_how_far_off_a_row_is(
+    loss: str, factor: float, row: int
+) -> None:
+    """Its pull is bounded, also where its cost is so large that the others' is rounding."""
+    near, far = MEASURED.copy(), MEASURED.copy()
+    near[row] *= 1e5
+    far[row] *= factor
+    expected, found = (
+        solve(Problem(table(N), Dahl(), noise="absolute"), loss=loss) for N in (near, far)
+    )
+    assert found.status is expected.status is Status.CONVERGED
+    error = np.sqrt(np.diagonal(expected.covariance))
+    assert np.all(np.abs(found.theta - expected.theta) < 0.01 * error)
+    assert found.scale == pytest.approx(expected.scale, rel=1e-3)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
 def test_robust_intervals_and_scale_hold_for_gaussian_noise(loss: str) -> None:
     rng, z, scales = np.random.default_rng(1), [], []
     for _ in range(80):

@@ -36,6 +36,7 @@ _NOISE_TOLERANCE = 1e-8
 _REMAINDER = 3e-7
 _LAST_STEP = 1e-6  # of a logarithm: the Hessian is that before the last step
 _ROUNDING_TOLERANCE = 1e-13
+_UNSEEN = 4.0 * _EPS  # relative change of a cost that may be rounding
 NEARLY = 1e-4  # relative difference of costs that are nearly alike
 
 
@@ -193,8 +194,10 @@ def _minimise(
         which = None if active.size == S else active
         new = _State(trial, *evaluate(trial, which))
         evaluations[active] += 1
-        better = new.cost < at.cost
-        gain = (at.cost - new.cost) / foretold
+        # a fall too small to see beside one enormous row's cost is taken as foretold
+        unseen = foretold <= _UNSEEN * at.cost
+        better = (new.cost < at.cost) | (unseen & (new.cost <= (1.0 + _UNSEEN) * at.cost))
+        gain = np.where(unseen, 1.0, at.cost - new.cost) / np.where(unseen, 1.0, foretold)
         calmer = np.maximum(damping * np.maximum(0.05, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
         damping = np.where(better, calmer, np.maximum(damping * growth, 1e-6))
         growth = np.where(better, 2.0, 4.0 * growth)
