@@ -42,7 +42,8 @@ from dahl_ident.fitting import Optimum, Status, solve
 
 F_MAX, SIGMA = 0.1, 30.0
 X_C = F_MAX / SIGMA
-DATA_SETS, BOOTSTRAPPED, REPLICATES = 2000, 200, 1999
+SEED = 2006
+DATA_SETS, BOOTSTRAPPED, REPLICATES = 5000, 500, 1999
 SMALL = (60, 12, 399)
 METHODS = ("wald", "profile", "bootstrap")
 VERDICTS_RIGHT = 0.99
@@ -130,13 +131,18 @@ class Tally:
         self.verdicts += other.verdicts
 
 
-def tally(scenario: Scenario, first: int, count: int, bootstrapped: int, replicates: int) -> Tally:
-    """Fit `count` data sets; the first `bootstrapped` of them are bootstrapped as well."""
+def tally(
+    scenario: Scenario, seed: int, first: int, count: int, bootstrapped: int, replicates: int
+) -> Tally:
+    """Fit `count` data sets; the first `bootstrapped` of them are bootstrapped as well.
+
+    Each data set has its own stream of random numbers, given by `seed` and its index.
+    """
     P = len(scenario.truth)
     result = Tally(covered={m: np.zeros((2, P)) for m in METHODS}, squares=np.zeros(P))
     problem, theta = scenario.problem, scenario.theta
     for index in range(first, first + count):
-        rng = np.random.default_rng([2006, index])
+        rng = np.random.default_rng([SEED, seed, index])
         drawn = problem.draw(theta, scenario.noise, 1, rng)
         data = replace(problem.data, response=drawn[0])
         optimum = solve(Problem(data, problem.model, noise=problem.noise))
@@ -292,7 +298,7 @@ def run(
 
 def _job(job: tuple[int, int, int, int, int]) -> Tally:
     index, first, count, bootstrapped, replicates = job
-    return tally(scenarios()[index], first, count, bootstrapped, replicates)
+    return tally(scenarios()[index], index, first, count, bootstrapped, replicates)
 
 
 def as_markdown(table: Sequence[Row]) -> str:

@@ -186,9 +186,16 @@ class TestProfile:
         assert tied.upper == pytest.approx(0.1002)
         assert tied.lower == pytest.approx(free.lower, rel=1e-3)
 
-    def test_beside_a_hidden_spring_the_limits_are_those_of_a_global_search(self) -> None:
-        """The profile's valley is bent and long; fits with the value fixed find it from scratch."""
-        hidden = table(model=Dahl(0.1, 30.0) + Spring(30.0), beta=(100.0, 1000.0), seed=4)
+    @pytest.mark.parametrize("seed", [4, 8, 53, 204])
+    def test_beside_a_hidden_spring_the_limits_are_those_of_a_global_search(
+        self, seed: int
+    ) -> None:
+        """The profile's valley is bent and long; fits with the value fixed find it from scratch.
+
+        But for the first table, the optimum lies in microslip with the spring at minus infinity,
+        and a second valley, gross slip, holds the limits.
+        """
+        hidden = table(model=Dahl(0.1, 30.0) + Spring(30.0), beta=(100.0, 1000.0), seed=seed)
         result = fit(hidden, Dahl() + Spring(), throw=False)
         q2 = thresholds(result.optimum, np.array(LEVELS)) ** 2
         for name in ("f_max", "sigma", "stiffness"):
@@ -197,7 +204,7 @@ class TestProfile:
                     if 0.0 < limit < np.inf:
                         held = fit(result.data, Dahl() + Spring(), fixed={name: limit}, throw=False)
                         rise = 2.0 * (held.optimum.cost - result.optimum.cost) / result.scale**2
-                        assert rise == pytest.approx(target, rel=0.05)
+                        assert rise == pytest.approx(target, rel=0.02)
 
     def test_robust_fits_have_intervals_like_those_of_their_covariance(self) -> None:
         result = fit(table(), Dahl(), loss="huber")

@@ -32,6 +32,8 @@ class Bracket:
         Where a search has to stop, such as a parameter's bound.
     logarithmic : ndarray of bool, shape (S,)
         Whose steps have a longest length.
+    narrow_enough : ndarray, shape (S,)
+        Width of a bracket that needs no further narrowing.
 
     Attributes
     ----------
@@ -50,8 +52,10 @@ class Bracket:
         step: FloatArray,
         furthest: FloatArray,
         logarithmic: BoolArray,
+        narrow_enough: FloatArray,
     ) -> None:
         self._target, self._furthest, self._logarithmic = target, furthest, logarithmic
+        self._narrow_enough = narrow_enough
         self.position, self._step = np.minimum(first, furthest), step
         self._inner, self._outer = np.zeros(target.shape), np.full(target.shape, np.inf)
         self.end = np.full(target.shape, np.nan)
@@ -72,7 +76,8 @@ class Bracket:
             newton = (target - value) / slope
             width = self._outer[a] - self._inner[a]
             met = (np.abs(value - target) < _NEAR) & np.isfinite(newton)
-            met |= np.isfinite(self._outer[a]) & (width <= _NARROW * self._outer[a])
+            narrow = np.minimum(_NARROW * self._outer[a], self._narrow_enough[a])
+            met |= np.isfinite(self._outer[a]) & (width <= narrow)
         newton = np.where(np.isfinite(newton), newton, np.inf)
         stuck = below & (position >= self._furthest[a]) & ~met
         lost = below & hopeless & ~met & ~stuck

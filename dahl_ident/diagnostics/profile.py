@@ -27,21 +27,25 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.bracket import BoolArray, Bracket, IntArray
 from dahl_ident.elements import Dahl, LinearSystem, Parameter, Spring
 from dahl_ident.fitting import Optimum
+from dahl_ident.fitting.least_squares import DOUBTFUL
 from dahl_ident.fitting.levenberg_marquardt import minimise
 from dahl_ident.fitting.limits import Chart, valleys
 from dahl_ident.fitting.losses import loss_named
+from dahl_ident.fitting.start import edge_starts
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Quadratic
 
 _STEPS = 60  # of the searches for limits, all together
 _SEARCH_STEPS = 40  # of a constrained search
 _LOOSENESS = 1e5  # a search this loose still gives the deviance, flat at its minimum, to 1e-6
+_ENOUGH = 1e-8  # fall of the cost at which a search along a flat valley ends
 _LONGEST = 3.0  # step of a logarithm
 _FARTHEST = 1e6  # conditional standard errors of a parameter that is no logarithm
 _LEAST_X_C = 1e-14  # over the smallest amplitude
 _MOST_X_C, _MOST_X_C_BESIDE = 1e8, 1e5  # over the largest, alone and beside a spring
 _SOFTEST, _STIFFEST = 1e-12, 1e6  # sigma over the median stiffness
 _FARTHEST_LOG = 80.0  # of a logarithm, from the optimum
+_NARROW = 0.01  # conditional standard errors: a limit is known as well as that
 _FARTHEST_RATIO = 4.0  # of the logarithm of a pure number: an exponent or a gain
 
 
@@ -103,17 +107,32 @@ class Profiler:
         jumps = np.isfinite(jump)
         first = np.where(jumps, jump, step)
         step = np.where(jumps, np.abs(origin + sign * jump), step)
-        return Bracket(target, first, step, furthest, self._logarithmic[index])
+        narrow = _NARROW * self._conditional[index]
+        return Bracket(target, first, step, furthest, self._logarithmic[index], narrow)
 
     def _from_best_start(self, index: IntArray, theta: FloatArray, change: FloatArray) -> _Solution:
-        """Return constrained optima near theta + change, also from along microslip's valleys."""
+        """Return constrained optima near theta + change, or far from it where friction is vague."""
         begins, rows = [theta + change], [np.arange(len(index))]
+        for edge in self._edges:
+            begins.append(np.where(np.arange(theta.shape[1]) == index[:, None], begins[0], edge))
+            rows.append(rows[0])
         for chart in self._valleys:
             bent, applies = _along_valley(chart, index, theta, change, self._reach.smallest)
             begins.append(bent[applies])
             rows.append(np.flatnonzero(applies))
         row = np.concatenate(rows)
         return self._constrained(index[row], np.concatenate(begins)).lowest(row)
+
+    @cached_property
+    def _edges(self) -> list[FloatArray]:
+        """Starts in gross slip, where data beside a free spring do not rule out microslip."""
+        sd, found = np.sqrt(np.diagonal(self._optimum.covariance)), []
+        for chart in self._valleys:
+            f_max, sigma = _friction_of(chart)
+            if max(sd[f_max], sd[sigma]) > DOUBTFUL:
+                ends = edge_starts(self._problem)
+                found += [e for e in ends if e[f_max] - e[sigma] < self._reach.smallest]
+        return found
 
     @cached_property
     def _valleys(self) -> list[Chart]:
@@ -168,6 +187,7 @@ class Profiler:
             self._logarithmic,
             self._problem.n_residuals,
             looseness=_LOOSENESS,
+            enough=_ENOUGH,
             steps=_SEARCH_STEPS,
         ).theta
 
@@ -323,8 +343,8 @@ def _along_valley(
     above the `least` ln x_c of microslip.
     """
     assert chart.tied is not None
-    spring, sigma = chart.tied
-    (f_max,) = (int(i) for i in np.flatnonzero(chart.matrix[sigma]) if i != sigma)
+    spring, _ = chart.tied
+    f_max, sigma = _friction_of(chart)
     wanted = (theta + change)[np.arange(len(index)), index]
     phi = chart.phi(theta)
     ln_kappa, total = phi[:, sigma], phi[:, spring]
@@ -340,6 +360,14 @@ def _along_valley(
     bent[np.arange(len(index)), index] = wanted
     applies = np.isin(index, np.array([*ln_x_c])) & (phi[:, f_max] > least)
     return bent, applies & np.isfinite(bent).all(axis=1)
+
+
+def _friction_of(chart: Chart) -> tuple[int, int]:
+    """Return the indices of f_max and sigma of the element whose valley it is."""
+    assert chart.tied is not None
+    sigma = chart.tied[1]
+    (f_max,) = (int(i) for i in np.flatnonzero(chart.matrix[sigma]) if i != sigma)
+    return f_max, sigma
 
 
 def _tangent(hessian: FloatArray, index: IntArray) -> FloatArray:

@@ -98,6 +98,7 @@ def minimise(
     *,
     inside: Callable[[FloatArray, IntArray | None], BoolArray] | None = None,
     looseness: float = 1.0,
+    enough: float = 0.0,
     steps: int = 80,
 ) -> Minima:
     """Return the minima of the costs that searches from `theta`, shape (S, P), find.
@@ -105,10 +106,13 @@ def minimise(
     `logarithmic` says which coordinates are logarithms: their steps have a longest length.
     Searches that leave the region `inside`, which is called like `evaluate`, end there, not
     converged. `looseness` multiplies the
-    length of the step at which a search has converged.
+    length of the step at which a search has converged; `enough` is a fall of the cost that is
+    not worth a step, however long.
     """
     with np.errstate(all="ignore"):
-        return _minimise(evaluate, theta, logarithmic, n_residuals, inside, looseness, steps)
+        return _minimise(
+            evaluate, theta, logarithmic, n_residuals, inside, looseness, enough, steps
+        )
 
 
 def gauss_newton(
@@ -160,6 +164,7 @@ def _minimise(
     n_residuals: int,
     inside: Callable[[FloatArray, IntArray | None], BoolArray] | None,
     looseness: float,
+    enough: float,
     steps: int,
 ) -> Minima:
     S, P = theta.shape
@@ -174,7 +179,9 @@ def _minimise(
         shortest = looseness**2 * _tolerance(at, logarithmic, n_residuals)
         settled = moves * np.minimum(1.0, moves / last) <= shortest
         settled |= foretold <= looseness**2 * _EPS * at.cost
-        settled &= (damping < _GAUSS_NEWTON) & (longest <= looseness * _LAST_STEP)
+        settled &= longest <= looseness * _LAST_STEP
+        settled |= foretold < enough
+        settled &= damping < _GAUSS_NEWTON
         lost = ~np.isfinite(at.cost) | (damping > _MOST_DAMPING)
         which = None if active.size == S else active
         if inside is not None:
