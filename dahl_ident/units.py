@@ -57,6 +57,14 @@ SI_UNITS: dict[str, tuple[str, str]] = {
     "number": ("1", "1"),
 }
 MOTIONS: tuple[Motion, ...] = get_args(Motion)
+_ROTATION = {
+    "N": "N m",
+    "m": "rad",
+    "N/m": "N m/rad",
+    "N/m^2": "N m/rad^2",
+    "N s/m": "N m s/rad",
+    "kg": "kg m^2",
+}
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 MOTION_KINDS = ("displacement", "velocity", "acceleration")
 DRIVE_KINDS = ("force", "voltage", "current")
@@ -262,6 +270,11 @@ def engineering(value: float, unit: str) -> str:
     if unit not in ("N", "m", "s", "Hz", "J", "rad") or exponent not in prefixes:
         return f"{value:.3g} {unit}".strip()
     return f"{value / 10.0**exponent:.3g} {prefixes[exponent]}{unit}"
+
+
+def shown_unit(unit: str, motion: Motion) -> str:
+    """Return a model's unit, declared for translation, as it is written for `motion`."""
+    return _ROTATION.get(unit, unit) if motion == "rotation" else unit
 
 
 def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float, str, Motion]:

@@ -19,6 +19,10 @@ def verdicts(result: FitResult) -> dict[str, Verdict]:
     return {name: p.verdict for name, p in identifiability(result).parameters.items()}
 
 
+def turned(data: FrequencyResponse) -> FrequencyResponse:
+    return FrequencyResponse(data.frequency_hz, data.response, data.amplitude, motion="rotation")
+
+
 class TestVerdicts:
     def test_every_parameter(self) -> None:
         found = identifiability(fit(table(), Dahl()))
@@ -142,14 +146,14 @@ class TestVerdicts:
             assert "slip" not in parameter.text
 
     def test_rotation_has_its_units(self) -> None:
-        data = table(beta=(1e-4, 1e-3))
-        assert data.amplitude is not None
-        turned = FrequencyResponse(
-            data.frequency_hz, data.response, data.amplitude, motion="rotation"
-        )
-        found = identifiability(fit(turned, Dahl(), throw=False))
+        found = identifiability(fit(turned(table(beta=(1e-4, 1e-3))), Dahl(), throw=False))
         assert " N m (95.45 %)" in found.parameters["f_max"].text
         assert "up to 3.3e-06 rad reaches slip" in found.parameters["f_max"].text
+
+    def test_combinations_have_them_too(self) -> None:
+        data = table(model=FRICTION + Spring(SIGMA), beta=(1e-2, 1e-1), noise=0.004)
+        found = identifiability(fit(turned(data), Dahl() + Spring(), throw=False))
+        assert [c.unit for c in found.combinations] == ["N m/rad^2", "N m/rad"]
 
 
 class TestTheory:

@@ -26,6 +26,7 @@ from dahl_ident import (
     Spring,
     fit,
     fit_many,
+    posterior_grid,
 )
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
@@ -84,6 +85,21 @@ class TestFit:
         assert result.log_likelihood == pytest.approx(density)
         assert result.aic == pytest.approx(-2.0 * density + 2.0 * 3.0)
         assert result.bic == pytest.approx(-2.0 * density + 3.0 * np.log(60.0))
+
+    def test_rotation_has_its_units_everywhere(self) -> None:
+        data = table()
+        turned = FrequencyResponse(
+            data.frequency_hz, data.response, data.amplitude, motion="rotation"
+        )
+        result = fit(turned, Dahl() + Mass(1e-6))
+        units = {name: p.unit for name, p in result.params.items()}
+        assert units == {"f_max": "N m", "sigma": "N m/rad", "alpha": "", "mass": "kg m^2"}
+        assert " N m, sigma = " in repr(result)
+        assert list(result.to_frame()["unit"]) == list(units.values())
+        assert "f_max [N m]" in str(result.conf_interval("wald"))
+        grid = posterior_grid(turned, Dahl())
+        assert grid.units[:2] == ("N m", "N m/rad")
+        assert " N m (from" in grid.priors["f_max"]
 
     def test_free_fixed_and_start(self) -> None:
         data = table()

@@ -6,9 +6,9 @@ import numpy as np
 
 from dahl_ident.diagnostics.intervals import Interval
 from dahl_ident.diagnostics.parameters import parameter_values
-from dahl_ident.diagnostics.units import shown_unit
 from dahl_ident.elements import Dahl, Element, Spring
 from dahl_ident.fitting import Optimum
+from dahl_ident.units import shown_unit
 
 _CHANNELS = {"force_gain": "force", "displacement_gain": "displacement"}
 

@@ -20,11 +20,11 @@ from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import Information
 from dahl_ident.diagnostics.levels import checked_levels, thresholds
 from dahl_ident.diagnostics.parameters import parameter_values
-from dahl_ident.diagnostics.units import shown_unit
 from dahl_ident.elements import Dahl
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
+from dahl_ident.units import shown_unit
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Dahl, Parameter, Spring
 from dahl_ident.fitting import Optimum
+from dahl_ident.units import shown_unit
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,7 @@ def _product(
     direction = np.array([powers.get(name, 0.0) for name in optimum.names])
     with np.errstate(over="ignore", under="ignore"):
         value = float(np.exp(sum(power * np.log(theta[name]) for name, power in powers.items())))
+    unit = shown_unit(unit, optimum.problem.data.motion)
     return Candidate(text, unit, value, direction, frozenset(powers))
 
 

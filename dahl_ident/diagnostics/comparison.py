@@ -17,7 +17,6 @@ import numpy as np
 
 from dahl_ident.diagnostics.formatting import listed, table, with_unit
 from dahl_ident.diagnostics.physics import negative_parameters
-from dahl_ident.diagnostics.units import shown_unit
 from dahl_ident.diagnostics.verdicts import Fit
 from dahl_ident.elements import Dahl, Element, Model, Spring
 from dahl_ident.errors import DahlIdentError, ValidationError
@@ -52,7 +51,7 @@ class ComparedModel:
     def estimates(self) -> str:
         """The free parameters in one line; a number without an error is none."""
         o = self.optimum
-        units = [shown_unit(p.unit, o.problem.data.motion) for p in o.problem.parameters]
+        units = [p.unit for p in o.problem.parameters]
         rows = zip(o.names, o.values.tolist(), o.stderr.values(), units, strict=True)
         known = [f"{n} = {with_unit(v, e, unit)}" for n, v, e, unit in rows if np.isfinite(e)]
         unknown = [name for name, error in o.stderr.items() if not np.isfinite(error)]

@@ -11,10 +11,10 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.third_harmonic import third_harmonic_share
-from dahl_ident.diagnostics.units import shown_unit
 from dahl_ident.elements import Dahl, Damper, Element, Mass, Spring
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.status import Status
+from dahl_ident.units import shown_unit
 
 _LEVEL = 1e-3
 _HARMONIC_SHARE = 0.1

@@ -22,9 +22,9 @@ from scipy import special
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.physics import friction_stiffness
-from dahl_ident.diagnostics.units import shown_unit
 from dahl_ident.elements import Dahl, Mass, Spring
 from dahl_ident.fitting import Optimum
+from dahl_ident.units import shown_unit
 
 _BANDS = 8
 _NARROWEST = np.log(1.1)  # of a band, in the logarithm of the amplitude

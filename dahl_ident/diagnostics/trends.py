@@ -22,13 +22,13 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, ResidualSpace
-from dahl_ident.diagnostics.units import shown_unit
 from dahl_ident.elements import Dahl, Element, Spring
 from dahl_ident.fitting import Optimum
+from dahl_ident.units import shown_unit
 
 _DEGREES = {"amplitude": 3, "drive": 3, "frequency": 2}
 _SAME = 0.01  # of the covariate's logarithm: values closer than this are one
-_LEAST_RANGE = np.log(1.05)
+LEAST_RANGE = np.log(1.05)  # of a covariate that varies
 _LEAST_DOF_PER_COLUMN = 3
 _FEWEST_SIGNS = 10
 _STEEPEST = np.log(10.0)  # change of a logarithm that is worth a number
@@ -156,7 +156,7 @@ def covariates(optimum: Optimum) -> Iterator[tuple[str, FloatArray, str]]:
             ("frequency", data.frequency_hz, "Hz"),
             ("drive", driven, shown_unit("N", motion)),
         )
-        if values is not None and np.ptp(np.log(values)) > _LEAST_RANGE
+        if values is not None and np.ptp(np.log(values)) > LEAST_RANGE
     )
 
 

@@ -30,7 +30,6 @@ from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.information import Information, shares
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval
 from dahl_ident.diagnostics.levels import LEVELS, percent, thresholds
-from dahl_ident.diagnostics.units import shown_unit
 from dahl_ident.fitting import Optimum, Status
 
 IDENTIFIED_BELOW = 0.25
@@ -226,10 +225,9 @@ def judged(optimum: Optimum, intervals: ConfidenceIntervals) -> Identifiability:
     }
     lost = frozenset(n for n, v in verdicts.items() if v is Verdict.NOT_IDENTIFIED)
     found = _determined(optimum, information, lost)
-    motion = problem.data.motion
     parameters = {}
     for i, (name, parameter) in enumerate(zip(problem.names, problem.parameters, strict=True)):
-        unit = shown_unit(parameter.unit, motion)
+        unit = parameter.unit
         limits = _shown(intervals[name], verdicts[name])
         text = _text(optimum, name, unit, verdicts[name], limits, lost)
         parameters[name] = ParameterVerdict(
@@ -295,9 +293,15 @@ def _determined(
     optimum: Optimum, information: Information, lost: frozenset[str]
 ) -> tuple[DeterminedCombination, ...]:
     """Return the combinations of parameters that are not identified, but are together."""
-    units = {c.expression: c.unit for c in candidates(optimum)}
+    units = {p.name: p.unit for p in optimum.problem.parameters}
+    units |= {c.expression: c.unit for c in candidates(optimum)}
     found = [
-        DeterminedCombination(c.expression, units.get(c.expression, ""), c.value, c.stderr)
+        DeterminedCombination(
+            c.expression,
+            units.get(c.expression, units.get(c.expression.partition("/")[0], "")),  # f_max/alpha
+            c.value,
+            c.stderr,
+        )
         for c in optimum.combinations
         if c.expression not in optimum.names and c.stderr < IDENTIFIED_BELOW * abs(c.value)
     ]

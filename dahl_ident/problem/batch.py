@@ -62,8 +62,9 @@ class ProblemBatch(Problem):
         if isinstance(data, FrequencyResponse) or not len(data):
             found = "one table" if isinstance(data, FrequencyResponse) else "no table"
             raise DataError(f"data is {found}; expected a sequence of at least one")
-        self._set_model(model, sensors, free, fixed)
-        self._set_rows(Rows.stack([checked_table(table) for table in data]), noise)
+        tables = [checked_table(table) for table in data]
+        self._set_model(model, sensors, free, fixed, tables[0].motion)
+        self._set_rows(Rows.stack(tables), noise)
 
     @classmethod
     def replicates(cls, problem: Problem, responses: ComplexArray) -> ProblemBatch:

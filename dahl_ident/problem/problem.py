@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple, TypeVar
 
@@ -27,6 +28,7 @@ from dahl_ident.problem.pairs import squares, weighted
 from dahl_ident.problem.prediction import Predictor
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import EXACT, Prior, Sensors
+from dahl_ident.units import Motion, shown_unit
 
 _Kind = TypeVar("_Kind", bound="Problem")
 
@@ -64,7 +66,8 @@ class Problem:
     noise : str
         The name of the noise model.
     parameters : tuple of Parameter
-        The free ones, the model's first, then the sensors'. P is their number.
+        The free ones, the model's first, then the sensors', in units of the data's motion. P is
+        their number.
     names : tuple of str
         Their names.
     priors : dict of str to Prior
@@ -111,7 +114,7 @@ class Problem:
         fixed: Mapping[str, float] | None = None,
     ) -> None:
         self.data = checked_table(data)
-        self._set_model(model, sensors, free, fixed)
+        self._set_model(model, sensors, free, fixed, data.motion)
         self._set_rows(Rows.of(data), noise)
 
     def _set_model(
@@ -120,10 +123,15 @@ class Problem:
         sensors: Sensors | None,
         free: Iterable[str],
         fixed: Mapping[str, float] | None,
+        motion: Motion,
     ) -> None:
         model, sensors = with_changes(as_model(model), sensors or EXACT, free, fixed or {})
         self.model, self.sensors = model, sensors
-        parameters = [p for p in (*model.parameters, *sensors.parameters) if p.free]
+        parameters = [
+            replace(p, unit=shown_unit(p.unit, motion))
+            for p in (*model.parameters, *sensors.parameters)
+            if p.free
+        ]
         if not parameters:
             raise ModelError(f"{model!r} has no free parameter; leave one out, or name it in free=")
         self._coordinates = Coordinates(parameters)

@@ -17,6 +17,7 @@ from dahl_ident.elements import Model, Parameter
 from dahl_ident.fitting.optimum import Combination, Optimum
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem
+from dahl_ident.units import Motion, shown_unit
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class Estimate:
     Attributes
     ----------
     name, unit, description : str
-        As declared beside the element.
+        As declared beside the element; the unit is that of the data's motion.
     value : float
         The estimate, or the fixed value.
     stderr : float or None
@@ -114,7 +115,8 @@ class FitNumbers:
         own = self.problem.model.parameters
         sensed = self.problem.sensors.parameters
         shown = own if self.problem.sensors.are_exact else (*own, *sensed)
-        return MappingProxyType({p.name: _estimate(p, values, stderr) for p in shown})
+        motion = self.data.motion
+        return MappingProxyType({p.name: _estimate(p, values, stderr, motion) for p in shown})
 
     @property
     def var_names(self) -> list[str]:
@@ -218,13 +220,16 @@ class FitNumbers:
 
 
 def _estimate(
-    parameter: Parameter, values: Mapping[str, float], stderr: Mapping[str, float]
+    parameter: Parameter,
+    values: Mapping[str, float],
+    stderr: Mapping[str, float],
+    motion: Motion,
 ) -> Estimate:
     vary = parameter.name in values
     value = values[parameter.name] if vary else parameter.value
     return Estimate(
         name=parameter.name,
-        unit=parameter.unit,
+        unit=shown_unit(parameter.unit, motion),
         description=parameter.description,
         value=math.nan if value is None else value,
         stderr=stderr.get(parameter.name),

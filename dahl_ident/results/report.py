@@ -12,7 +12,6 @@ from dahl_ident.diagnostics.comparison import compare_models
 from dahl_ident.diagnostics.formatting import interval, rounded, table, with_unit
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals
 from dahl_ident.diagnostics.levels import percent
-from dahl_ident.diagnostics.units import shown_unit
 
 if TYPE_CHECKING:
     from dahl_ident.results.fit_result import FitResult
@@ -104,11 +103,9 @@ def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[Section]:
 def _parameters(fit: FitResult, intervals: ConfidenceIntervals) -> list[str]:
     level = float(intervals.levels[-1])
     rows = [["", "value", "stderr", "unit", f"{percent(level)} ({intervals.method})", ""]]
-    motion = fit.data.motion
     for name, p in fit.params.items():
-        unit = shown_unit(p.unit, motion)
         if not p.vary:
-            rows.append([name, f"{p.value:g}", "", unit, "", "fixed"])
+            rows.append([name, f"{p.value:g}", "", p.unit, "", "fixed"])
             continue
         value, error = rounded(p.value, p.stderr)
         if math.isfinite(p.value) and p.stderr == math.inf and fit.nfree > 0:
@@ -118,7 +115,7 @@ def _parameters(fit: FitResult, intervals: ConfidenceIntervals) -> list[str]:
         lower = -math.inf if positive and limits.lower == 0.0 else limits.lower
         within = interval(lower, limits.upper, "")
         word = fit.identifiability.parameters[name].verdict.value
-        rows.append([name, value, error, unit, within, word])
+        rows.append([name, value, error, p.unit, within, word])
     return [*table(rows, left=(0, 3, 4, 5)).splitlines(), f"({intervals.note})"]
 
 
