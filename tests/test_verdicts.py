@@ -76,6 +76,19 @@ class TestTrust:
         known = FrequencyResponse(data.frequency_hz, data.response, data.amplitude, covariance=C)
         assert fit(known, Dahl()).goodness.judged
 
+    def test_one_amplitude_does_not_test_the_model(self) -> None:
+        """A spring and a damper without any friction, which two parameters meet all the same."""
+        f, A = np.ones(12), np.full(12, 1e-3)
+        damped = FrequencyResponse(f, (20.0 + 5.0j) * relative_noise(12, 0.01, 1), A)
+        result = fit(damped, Dahl())
+        assert result.identifiability.complete
+        assert not result.goodness.judged
+        assert "so that any mechanism fits" in result.verdict
+        both = np.where(np.arange(12) < 6, 1e-3, 2e-3)
+        tested = fit(FrequencyResponse(f, damped.response, both), Dahl())
+        assert tested.goodness.judged
+        assert "does not describe these data" in tested.verdict
+
     @pytest.mark.parametrize("noise", ["relative", "absolute"])
     def test_a_scatter_that_no_sensor_has(self, noise: str) -> None:
         result = fit(table(n=12), Spring(), noise=noise)

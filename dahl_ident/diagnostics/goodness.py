@@ -26,7 +26,7 @@ from dahl_ident.diagnostics.outliers import SuspiciousPoint, suspicious_points
 from dahl_ident.diagnostics.physics import physical_warnings
 from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.diagnostics.stiffening import Stiffening, stiffening
-from dahl_ident.diagnostics.trends import Runs, Trend, runs, trends
+from dahl_ident.diagnostics.trends import LEAST_RANGE, Runs, Trend, runs, trends
 from dahl_ident.elements import Dahl
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
@@ -124,6 +124,9 @@ class Goodness:
         What no mechanism does.
     flagged : tuple of str
         Rows that the extraction flagged, with the reason.
+    untested : bool
+        Whether the amplitudes give no more numbers than friction has free parameters, which then
+        meet them whatever the mechanism is.
     level : float
         p-value below which one test counts.
 
@@ -148,6 +151,7 @@ class Goodness:
     suspicious: tuple[SuspiciousPoint, ...]
     warnings: tuple[str, ...]
     flagged: tuple[str, ...]
+    untested: bool
 
     @cached_property
     def level(self) -> float:
@@ -168,7 +172,11 @@ class Goodness:
 
     @property
     def judged(self) -> bool:
-        """Whether noise is known, or there are enough points to tell a wrong model from it."""
+        """Whether the data test the model, and tell a wrong one from noise."""
+        return not self.untested and self._enough_points
+
+    @property
+    def _enough_points(self) -> bool:
         return self.noise_share in (None, 0.0) or self.dof >= _LEAST_DOF
 
     @cached_property
@@ -222,11 +230,16 @@ class Goodness:
             more = len(self.objections) - _MOST_DEPARTURES
             others = f"; {more} more of the tests say so" if more > 0 else ""
             return f"The model does not describe these data ({misfit}): {reasons}{others}."
-        if not self.judged:
+        if not self._enough_points:
             return (
                 f"Noise and a wrong model look alike with {self.dof} degrees of freedom "
                 f"({misfit}): "
                 "measure more points, or repeat them so that their covariance is known."
+            )
+        if self.untested:
+            return (
+                "One amplitude tells no more numbers than friction has parameters, so that any "
+                f"mechanism fits ({misfit}): measure at other amplitudes as well."
             )
         hint = f", with a hint that {_joined(self.hints)}" if self.hints else ""
         if self.scatter is not None and self.scatter.ratio > _FAR_MORE:
@@ -283,7 +296,18 @@ def goodness(optimum: Optimum) -> Goodness:
         suspicious_points(optimum, space),
         tuple(physical_warnings(optimum)),
         flagged_rows(problem.data),
+        _untested(optimum),
     )
+
+
+def _untested(optimum: Optimum) -> bool:
+    """Return whether friction's free parameters alone meet all that one amplitude tells."""
+    problem = optimum.problem
+    view = problem.stiffness_data
+    elements = [e for e in problem.model.elements if isinstance(e, Dahl)]
+    free = sum(bool(p.free) for e in elements for p in e.parameters)
+    alike = bool(np.ptp(np.log(view.amplitude)) < LEAST_RANGE)
+    return alike and free >= 2 * len(view.orders)
 
 
 def _chi_square(optimum: Optimum, space: ResidualSpace) -> ChiSquare | None:
