@@ -233,6 +233,14 @@ def test_a_bolted_ridge_keeps_its_time() -> None:
     assert (rule_.name, rule_.at_upper_end) == ("f_max", True)
 
 
+def test_what_contradicts_itself_is_told_before_it_is_refined() -> None:
+    # sigma alone shows; beside a free spring friction may as well be none, at either end
+    grid = di.posterior_grid(di.load_dataset("microslip"), di.Dahl() + di.Spring())
+    assert grid.message.startswith("NOT CONVERGED: error")
+    assert grid.error > 0.1
+    assert grid.evaluations < 200_000  # 675,000 with every lattice refined
+
+
 def test_evidence_of_a_free_exponent_is_lower_where_the_exponent_is_one() -> None:
     data = friction_table(rows=8, noise=0.05)
     priors = {"f_max": (0.01, 1.0), "sigma": (3.0, 300.0)}

@@ -10,8 +10,10 @@ the Chebyshev series through them, which cannot vanish by chance as a difference
 can. Panels of largest error are halved until the errors add up to less than the tolerance.
 
 The evidence comes out once for each parameter, from points that have nothing in common. As far as
-they disagree, that is error as well. What lies apart from the ridges that start at the
-least-squares optimum, a second mode behind a valley e^-40 deep, is not looked for.
+they disagree, that is error as well. Where they contradict each other while panels are still few,
+lattices miss part of the posterior, and nothing more is refined. What lies apart from the ridges
+that start at the least-squares optimum, a second mode behind a valley e^-40 deep, is not looked
+for.
 """
 
 from __future__ import annotations
@@ -37,6 +39,8 @@ _BISECTIONS = 50
 _STEP = {0: 1.0, 1: 0.5, 2: 0.75}  # of the lattice, by its axes
 _FINER, _REFINEMENTS = 0.6, 5  # by which an axis is refined until its error is small enough
 _LATTICE_SHARE = 0.3  # of the tolerance
+_ROUGH = 1e-3  # error at which the parameters' evidences are compared
+_CONTRADICTION = 10.0  # times the errors seen, by which evidences may differ
 _PART = 0.125  # of the last two Chebyshev coefficients that the integral of what follows is
 
 
@@ -242,45 +246,96 @@ def integrate(
     """
     # a lattice laid far amiss overflows; its error is infinite then, and said
     with np.errstate(over="ignore", invalid="ignore"):
-        return Grid(
-            tuple(
-                _marginal(log_density, box, slicer, centre, spread, tolerance, most)
-                for slicer in slicers
-            )
-        )
+        works = [_Work(log_density, box, slicer, centre, spread, most) for slicer in slicers]
+        rough = max(_ROUGH, tolerance)
+        for work in works:
+            work.halve_panels(rough)
+        if not _contradict(works, rough):
+            for work in works:
+                work.complete(tolerance)
+        return Grid(tuple(work.marginal() for work in works))
 
 
-def _marginal(
-    log_density: LogDensity,
-    box: Box,
-    slicer: Slicer,
-    centre: FloatArray,
-    spread: FloatArray,
-    tolerance: float,
-    most: int,
-) -> Marginal:
-    """Return one marginal, from a lattice that is fine enough."""
-    axis = slicer.outer
-    low, high = float(box[0][axis]), float(box[1][axis])
-    inner = len(slicer.inner)
-    step, spent = np.full(inner, _STEP[inner]), 0
-    for _ in range(_REFINEMENTS):
-        lattice = Lattice(log_density, box, slicer, step)
-        panels = _outwards(lattice, float(centre[axis]), float(spread[axis]), (low, high))
-        rough = _errors(panels)
-        while rough.outer.sum() > (1.0 - _LATTICE_SHARE) * tolerance:
-            if spent + lattice.evaluations > most:
+class _Work:
+    """One marginal in the making: panels, and the lattice that fills them."""
+
+    def __init__(
+        self,
+        log_density: LogDensity,
+        box: Box,
+        slicer: Slicer,
+        centre: FloatArray,
+        spread: FloatArray,
+        most: int,
+    ) -> None:
+        self._log_density, self._box, self._slicer = log_density, box, slicer
+        self._centre, self._spread = float(centre[slicer.outer]), float(spread[slicer.outer])
+        self._most, self._spent = most, 0
+        self._inner = len(slicer.inner)
+        self._lay(np.full(self._inner, _STEP[self._inner]))
+
+    def _lay(self, step: FloatArray) -> None:
+        """Begin with a lattice of some step."""
+        axis = self._slicer.outer
+        ends = float(self._box[0][axis]), float(self._box[1][axis])
+        self._step = step
+        self._lattice = Lattice(self._log_density, self._box, self._slicer, step)
+        self._panels = _outwards(self._lattice, self._centre, self._spread, ends)
+        self._errors = _errors(self._panels)
+
+    @property
+    def evaluations(self) -> int:
+        """Points at which the density was computed."""
+        return self._spent + self._lattice.evaluations
+
+    @property
+    def error(self) -> float:
+        """Relative error of the integral."""
+        return float(self._errors.outer.sum() + self._errors.inner.sum())
+
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of the integral."""
+        return float(logsumexp(self._panels.log_value + _log_weights(self._panels)))
+
+    def halve_panels(self, tolerance: float) -> None:
+        """Halve the worst panels until the error along the outer axis is small enough."""
+        while self._errors.outer.sum() > (1.0 - _LATTICE_SHARE) * tolerance:
+            if self.evaluations > self._most:
                 break
-            chosen = _largest(rough.outer, 0.3 * tolerance)
-            panels = panels[~chosen] + _at(lattice, *_halves(panels[chosen]))
-            rough = _errors(panels)
-        spent += lattice.evaluations
-        coarse = rough.inner > _LATTICE_SHARE * tolerance / max(1, inner)
-        if not coarse.any() or spent > most:
-            break
-        step = np.where(coarse, _FINER * step, step)
-    error = float(rough.outer.sum() + rough.inner.sum())
-    return _finished(panels, lattice, error, spent)
+            chosen = _largest(self._errors.outer, 0.3 * tolerance)
+            panels = self._panels
+            self._panels = panels[~chosen] + _at(self._lattice, *_halves(panels[chosen]))
+            self._errors = _errors(self._panels)
+
+    def complete(self, tolerance: float) -> None:
+        """Refine panels and lattice until both are fine enough, or would cost too much."""
+        self.halve_panels(tolerance)
+        for _ in range(_REFINEMENTS - 1):
+            coarse = self._errors.inner > _LATTICE_SHARE * tolerance / max(1, self._inner)
+            denser = self._lattice.evaluations * _FINER ** -coarse.sum()
+            if not coarse.any() or self.evaluations + denser > self._most:
+                break
+            self._spent = self.evaluations
+            self._lay(np.where(coarse, _FINER * self._step, self._step))
+            self.halve_panels(tolerance)
+
+    def marginal(self) -> Marginal:
+        """Return the marginal as it is."""
+        return _finished(self._panels, self._lattice, self.error, self.evaluations)
+
+
+def _contradict(works: Sequence[_Work], rough: float) -> bool:
+    """Return whether evidences differ by far more than the errors seen explain."""
+    each = [work.log_evidence for work in works]
+    stated = max(rough, *(work.error for work in works))
+    return bool(np.expm1(np.ptp(each)) > _CONTRADICTION * stated)
+
+
+def _log_weights(panels: Panels) -> FloatArray:
+    """Return ln of the weights of all nodes, (C, POINTS)."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(rule().weights * panels.half[:, None]))
 
 
 class _Errors(NamedTuple):
@@ -351,8 +406,7 @@ def _halves(panels: Panels) -> tuple[FloatArray, FloatArray]:
 
 def _finished(panels: Panels, lattice: Lattice, error: float, evaluations: int) -> Marginal:
     """Return the marginal with its points, those of panels that were halved left out."""
-    with np.errstate(divide="ignore"):
-        log_weights = np.log(rule().weights * panels.half[:, None])
+    log_weights = _log_weights(panels)
     of_id = np.full(lattice.values, -np.inf)
     of_id[panels.ids.ravel()] = log_weights.ravel()
     log_evidence = float(logsumexp(panels.log_value + log_weights))

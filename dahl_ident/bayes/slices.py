@@ -15,7 +15,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.density import Density
@@ -101,18 +100,24 @@ class ProfileSlices:
         theta = self._inside(start)
         best = self._model(theta)
         damping = np.full(len(theta), _DAMPING[0])
+        active = np.arange(len(theta))
         for _ in range(_STEPS if inner else 0):
-            step, length = _step(best, inner, damping)
-            if length.max() < _NEAR:
+            here = _Fit(*(part[active] for part in best))
+            step, length = _step(here, inner, damping[active])
+            far = ~(length < _NEAR)
+            active, step, here = active[far], step[far], _Fit(*(part[far] for part in here))
+            if not active.size:
                 break
-            phi = self._straight(theta)
+            phi = self._straight(theta[active])
             phi[:, inner] += step
             proposed = self._inside(self._bent(phi))
             fit = self._model(proposed)
-            better = fit.value < best.value
-            theta = np.where(better[:, None], proposed, theta)
-            best = _Fit(*(_chosen(better, a, b) for a, b in zip(fit, best, strict=True)))
-            damping *= np.where(better, _DAMPING[1], _DAMPING[2])
+            better = fit.value < here.value
+            took = active[better]
+            theta[took] = proposed[better]
+            for old, new in zip(best, fit, strict=True):
+                old[took] = new[better]
+            damping[active] *= np.where(better, _DAMPING[1], _DAMPING[2])
         return theta, best
 
     def _model(self, theta: FloatArray) -> _Fit:
@@ -122,7 +127,7 @@ class ProfileSlices:
         value = 0.5 * (offset**2 * self._prior_precision).sum(axis=1)
         gradient = offset * self._prior_precision
         chart = self._chart(theta)
-        hessian = np.broadcast_to(np.diag(self._prior_precision), chart.shape)
+        hessian = np.repeat(np.diag(self._prior_precision)[None], len(theta), axis=0)
         if density.likelihood == "none":
             return _Fit(value, gradient, hessian)
         data = problem.quadratic(theta, chart=chart)
@@ -195,10 +200,6 @@ def _roots_of_inverse(H: FloatArray) -> FloatArray:
     reverse = np.linalg.cholesky(scaled[:, ::-1, ::-1])
     root = np.linalg.inv(reverse).swapaxes(-1, -2)[:, ::-1, ::-1]
     return np.asarray(size[:, :, None] * root)
-
-
-def _chosen(better: NDArray[np.bool_], new: FloatArray, old: FloatArray) -> FloatArray:
-    return np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 def _without(shear: Shear | None, outer: int) -> Shear | None:
