@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import hypothesis
+import pytest
+
+if TYPE_CHECKING:
+    from tests.command_line import Runner
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 # before numpy is first imported: the matrices are small, and several tests run at once
@@ -12,3 +18,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("repeatable")
+
+
+@pytest.fixture
+def run(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Runner:
+    """Return what runs the command line, in a folder of its own."""
+    from tests.command_line import Runner
+
+    monkeypatch.chdir(tmp_path)
+    return Runner(capsys, monkeypatch)

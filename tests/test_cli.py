@@ -26,14 +26,6 @@ COMMANDS = ("demo", "inspect", "extract", "fit", "sample", "report", "simulate",
 PROGRAM = Path(sys.executable).with_name("dahl-ident")
 
 
-@pytest.fixture
-def run(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> Runner:
-    monkeypatch.chdir(tmp_path)
-    return Runner(capsys, monkeypatch)
-
-
 def test_fit_recovers_the_truth_and_ends_with_0(run: Runner) -> None:
     assert run("simulate", "--f-max", "0.2", "--sigma", "50", "-o", "clean.csv").status == 0
     outcome = run("fit", "clean.csv", "--json", "--noise", "relative")

@@ -143,13 +143,17 @@ def next_check(steps: int, end: int) -> int:
 def _sampler(density: Density, settings: Settings, pool: Pool | None) -> Any:
     import emcee
 
-    return emcee.EnsembleSampler(
+    function = density if pool is None else _Mapped(density, pool)
+    sampler = emcee.EnsembleSampler(
         settings.walkers,
         len(density.names),
-        density if pool is None else _Mapped(density, pool),
+        function,
         moves=moves_for(settings.ensembles, shear_of(density.problem)),
         vectorize=True,
     )
+    # emcee's wrapper prints points and traceback on standard output when a run is interrupted
+    sampler.log_prob_fn = function
+    return sampler
 
 
 def _continued(sampler: Any, chain: Chain, steps: int) -> Chain:

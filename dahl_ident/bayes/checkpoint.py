@@ -18,7 +18,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -138,7 +138,7 @@ def open_chain(path: str | os.PathLike[str], identity: Identity) -> Iterator[Cha
     Raises
     ------
     SamplingError
-        If the path names a folder, or lies in none, or another run holds the lock.
+        If the path names a folder, lies in none or cannot be written, or another run holds it.
     """
     file = Path(path)
     if file.is_dir():
@@ -162,7 +162,11 @@ def _locked(file: Path) -> Iterator[None]:
 
     path = file.with_name(file.name + ".lock")
     while True:
-        with path.open("w") as lock:
+        try:
+            opened = path.open("w")
+        except OSError as exc:
+            raise SamplingError(f"{file} cannot be written: {exc.strerror or exc}") from exc
+        with opened as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -192,15 +196,26 @@ def _write(path: Path, chain: Chain, seed: int, identity: Identity) -> None:
     text = json.dumps(dict(identity), sort_keys=True)
     arrays = _arrays(chain)
     partial = path.with_name(path.name + ".partial")
-    with h5py.File(partial, "w") as file:
-        for name, array in arrays.items():
-            file[name] = array
-        file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
-        file.attrs["identity"], file.attrs["seed"] = text, str(seed)
-        file.attrs["digest"] = _digest(text, str(seed), *arrays.values())
-    with partial.open("rb+") as written:
-        os.fsync(written.fileno())
-    partial.replace(path)
+    try:
+        try:
+            with h5py.File(partial, "w") as file:
+                for name, array in arrays.items():
+                    file[name] = array
+                file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
+                file.attrs["identity"], file.attrs["seed"] = text, str(seed)
+                file.attrs["digest"] = _digest(text, str(seed), *arrays.values())
+            with partial.open("rb+") as written:
+                os.fsync(written.fileno())
+            partial.replace(path)
+        except BaseException:
+            with suppress(OSError):
+                partial.unlink()
+            raise
+    except (OSError, RuntimeError) as exc:  # h5py raises either, with the library's own words
+        why = os.strerror(exc.errno) if isinstance(exc, OSError) and exc.errno else str(exc)
+        raise SamplingError(
+            f"{path}: the chain cannot be written: {why}; what the file held before is as it was"
+        ) from exc
 
 
 def _read(path: Path) -> tuple[Stored, dict[str, str]]:

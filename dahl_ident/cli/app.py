@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Annotated
+from collections.abc import Sequence
+from typing import Annotated, Any
 
 import typer
 
@@ -20,8 +21,12 @@ from dahl_ident.cli.sample import sample
 from dahl_ident.cli.simulate import simulate
 from dahl_ident.errors import DahlIdentError
 
+_NAME = "dahl-ident"
+# every wrong use, whether Typer stands on click or brings its own copy of it
+_WrongUse: type[Exception] = typer.BadParameter.__bases__[0]
+
 app = typer.Typer(
-    name="dahl-ident",
+    name=_NAME,
     help="Identify Dahl friction from sine-sweep measurements, with error bars that are true.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -34,7 +39,7 @@ for command in (demo, inspect, extract, fit, sample, report, simulate, datasets)
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        telling.say(f"dahl-ident {__version__}")
+        telling.say(f"{_NAME} {__version__}")
         raise typer.Exit
 
 
@@ -66,14 +71,33 @@ def main(arguments: list[str] | None = None) -> None:
     telling.begin(typed)
     try:
         try:
-            app(args=typed)
+            status = app(args=typed, prog_name=_NAME, standalone_mode=False)
         finally:
             sys.stdout.flush()
+    except _WrongUse as exc:
+        status = _refuse(exc, typed)
     except DahlIdentError as exc:
         telling.doubt(f"error: {' '.join(str(exc).split())}")
-        sys.exit(telling.BAD_INPUT)
+        status = telling.BAD_INPUT
     except OSError as exc:
-        telling.doubt(f"error: {exc.filename or 'standard output'}: {exc.strerror or exc}")
+        if not isinstance(exc, BrokenPipeError):  # a reader such as head has seen enough
+            telling.doubt(f"error: {exc.filename or 'standard output'}: {exc.strerror or exc}")
         # what is left in the buffer would fail once more when Python ends
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(telling.BAD_INPUT)
+        status = telling.BAD_INPUT
+    if status == telling.INTERRUPTED:
+        telling.doubt("interrupted; no file is left half-written")
+    sys.exit(status)
+
+
+def _refuse(wrong: Any, typed: Sequence[str]) -> int:
+    """Say in two lines what is wrong with a command, and where its options are listed."""
+    message = " ".join(wrong.format_message().split())
+    if message:  # empty where nothing was typed: Typer has printed the help
+        errors = getattr(wrong.__cause__, "errors", None)
+        got = f"; got {errors()[0]['input']!r}" if errors else ""
+        # the parser of options knows no context; all that can stand before the command are flags
+        words = [word for word in typed if not word.startswith("-")]
+        command = wrong.ctx.command_path if wrong.ctx else " ".join([_NAME, *words[:1]])
+        telling.doubt(f"error: {message}{got}\nSee {command} --help")
+    return telling.WRONG_USE

@@ -41,8 +41,8 @@ def demo(
     from dahl_ident.synthetic.shipped import load_dataset
 
     table, page = output / "levels.csv", output / "report.html"
-    writing.check([table, page])
     make_folder(output)
+    writing.check([table, page])
     origin = load_dataset(_DATASET).provenance or {}
     with redirect_stdout(sys.stderr) if general.json else nullcontext():
         result, posterior = _chain(origin, table, page, overwrite=writing.overwrite)

@@ -32,7 +32,10 @@ def written(write: Callable[[str | Path], Path], output: str, ending: str) -> st
     if output != STANDARD:
         return str(write(output))
     with tempfile.TemporaryDirectory() as directory:
-        sys.stdout.write(write(Path(directory) / f"output{ending}").read_text(encoding="utf-8"))
+        content = write(Path(directory) / f"output{ending}").read_bytes()
+    sys.stdout.flush()
+    # UTF-8 as in a file, whatever the terminal's own encoding
+    sys.stdout.buffer.write(content)
     return output
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dahl_ident.cli.config import take_options
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import DataError, ValidationError
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
@@ -61,7 +61,7 @@ class Writing:
         ValidationError
             If an output is one of the inputs, or several things want standard output.
         DataError
-            If an output is there already and may not be replaced.
+            If an output is there already and may not be replaced, or lies in no folder.
         """
         from dahl_ident.data.storage import refuse_existing
 
@@ -79,6 +79,10 @@ class Writing:
                 )
             if not self.overwrite:
                 refuse_existing(place)
+            if not place.parent.is_dir():
+                raise DataError(
+                    f"{place}: there is no folder {place.parent}; make it, or give another place"
+                )
 
 
 @dataclass(frozen=True)

@@ -121,7 +121,12 @@ def sample(
     check_reports(report)
     sampling.check(report)
     estimate = posterior_grid if sampling.grid else sample_data
-    posterior = estimate(reading.read(files), **model.keywords(), **sampling.keywords())
+    data, plant, how = reading.read(files), model.keywords(), sampling.keywords()
+    try:
+        posterior = estimate(data, **plant, **how)
+    except KeyboardInterrupt:
+        telling.doubt(_kept(sampling.resume))
+        raise
     if general.json:
         from dahl_ident.reporting.posteriors import facts
 
@@ -136,3 +141,12 @@ def sample(
 def finish(posterior: BayesianResult) -> None:
     """End with status 3 where the posterior is not to be trusted."""
     telling.finish(posterior.trusted, "; ".join(posterior.objections))
+
+
+def _kept(chain: Path | None) -> str:
+    """Return what is left of a chain that was stopped."""
+    if chain is None:
+        return "the chain is not kept; with --resume chain.h5 one that is stopped can go on"
+    if not chain.exists():
+        return f"{chain}: the chain had not begun"
+    return f"{chain} keeps the chain so far; the same command goes on from there"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import shlex
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 BAD_INPUT = 1
+WRONG_USE = 2
 NOT_TRUSTED = 3
+INTERRUPTED = 130
 
 
 @dataclass
@@ -38,6 +41,9 @@ def begin(typed: Sequence[str]) -> None:
         doubt(f"warning: {message}")
 
     _session.typed = typed
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # the name of a file, or a unit, may hold what the terminal's encoding does not
+        sys.stdout.reconfigure(errors="backslashreplace")
     # setattr, because the signature here has no use for file and line
     setattr(warnings, "showwarning", show)  # noqa: B010
 
@@ -45,6 +51,7 @@ def begin(typed: Sequence[str]) -> None:
 def typed_command() -> str:
     """Return the command of this run, as it would be typed again."""
     command = shlex.join(["dahl-ident", *_session.typed])
+    command = command.encode(errors="backslashreplace").decode()  # as names of files are told
     piped = STANDARD in _session.typed
     return f"{command}  # its input came through standard input" if piped else command
 

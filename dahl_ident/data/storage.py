@@ -72,8 +72,10 @@ def refuse_existing(path: Path) -> None:
     Raises
     ------
     DataError
-        If there is one.
+        If there is one, or a folder.
     """
+    if path.is_dir():
+        raise DataError(f"{path} is a folder; give the path of a file in it")
     if path.exists():
         raise DataError(
             f"{path}: there is such a file already; give another name, or replace it with "
