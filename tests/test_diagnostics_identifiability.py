@@ -89,6 +89,23 @@ class TestVerdicts:
         text = identifiability(fit(data, Dahl() + Spring(), throw=False)).parameters["sigma"].text
         assert "the free stiffness can take its place: drive far into slip" in text
 
+    def test_friction_lost_in_the_noise_gives_no_advice_on_slip(self) -> None:
+        """Deep slip beside a spring: nothing tells it from microslip, so neither is claimed."""
+        data = table(model=FRICTION + Spring(SIGMA), beta=(1e3, 1e4), noise=0.01, seed=11)
+        found = identifiability(fit(data, Dahl() + Spring(), throw=False)).parameters
+        assert np.isinf(found["f_max"].interval.upper)
+        for name in ("f_max", "sigma"):
+            assert found[name].verdict is NOT
+            assert "drive" not in found[name].text
+            assert "the free stiffness" in found[name].text
+            assert "measure the spring and fix stiffness" in found[name].text
+
+    def test_one_unknown_makes_no_combination(self) -> None:
+        """With sigma known, f_max/sigma says no more than f_max, which its profile leaves open."""
+        data = table(beta=(0.03, 0.04), n=2, noise=0.01, seed=4)
+        found = identifiability(fit(data, Dahl()))
+        assert found.determined == ("sigma",)
+
     def test_only_the_sum_of_stiffnesses(self) -> None:
         data = table(model=FRICTION + Spring(SIGMA), beta=(1e-4, 1e-3), noise=0.001, seed=7)
         found = identifiability(fit(data, Dahl() + Spring(), throw=False))

@@ -69,6 +69,13 @@ def _of_friction(
             "because the exponent shows only where stick turns to slip, and the data from "
             f"{least} to {most} do not resolve it: add amplitudes around f_max/sigma, or fix it"
         )
+    unlimited = limits.lower <= 0.0 and np.isinf(limits.upper)
+    if spring and unlimited and element.parameters[0].name in lost:
+        return (
+            f"because friction's share of the response from {least} to {most} is within the noise "
+            f"beside the free {spring}: cover amplitudes where it is larger, reduce the noise, or "
+            f"measure the spring and fix {spring}"
+        )
     if kind == "f_max" and np.isinf(limits.upper):
         if spring:
             return (
@@ -81,7 +88,7 @@ def _of_friction(
             f"because the free {spring} can take its place: drive far into slip, or measure the "
             f"spring and fix {spring}"
         )
-    if kind == "sigma" and np.isinf(limits.upper):
+    if kind == "sigma" and np.isinf(limits.upper) and element.parameters[0].name not in lost:
         beside = f" beside the free {spring}" if spring else ""
         fix = f", or measure the spring and fix {spring}" if spring else ""
         return (

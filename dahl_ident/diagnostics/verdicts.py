@@ -224,7 +224,8 @@ def judged(optimum: Optimum, intervals: ConfidenceIntervals) -> Identifiability:
         for name, f, p in zip(problem.names, fisher, profile, strict=True)
     }
     lost = frozenset(n for n, v in verdicts.items() if v is Verdict.NOT_IDENTIFIED)
-    found = _determined(optimum, information, lost)
+    loose = frozenset(n for n, v in verdicts.items() if v is not Verdict.IDENTIFIED)
+    found = _determined(optimum, information, lost, loose)
     parameters = {}
     for i, (name, parameter) in enumerate(zip(problem.names, problem.parameters, strict=True)):
         unit = parameter.unit
@@ -290,9 +291,13 @@ def _shown(limits: Sequence[Interval], verdict: Verdict) -> Interval:
 
 
 def _determined(
-    optimum: Optimum, information: Information, lost: frozenset[str]
+    optimum: Optimum, information: Information, lost: frozenset[str], loose: frozenset[str]
 ) -> tuple[DeterminedCombination, ...]:
-    """Return the combinations of parameters that are not identified, but are together."""
+    """Return the combinations of parameters that are not identified, but are together.
+
+    Of `loose` parameters, short of identified, a product needs two: beside known ones it says no
+    more than its one unknown member, of which the profile has told.
+    """
     units = {p.name: p.unit for p in optimum.problem.parameters}
     units |= {c.expression: c.unit for c in candidates(optimum)}
     found = [
@@ -310,8 +315,9 @@ def _determined(
     for candidate in candidates(optimum):
         if candidate.expression in told or _runs_away(candidate, optimum, gone):
             continue
-        enough = candidate.members <= lost if candidate.is_sum else candidate.members & lost
-        if not enough:
+        members = candidate.members
+        enough = bool(members & lost) and len(members & loose) > 1
+        if not (members <= lost if candidate.is_sum else enough):
             continue
         std = float(information.std(candidate.direction))
         if candidate.is_sum and std > float(information.std(_parts_of(candidate)).min()):
