@@ -386,6 +386,21 @@ class TestComparison:
             return
         pytest.fail("no data set makes an element vanish")
 
+    @pytest.mark.parametrize("loss", ["huber", "soft_l1", "student_t"])
+    def test_a_robust_loss_is_that_of_every_model(self, loss: str) -> None:
+        """Two rows of thrice the response would make a free exponent look plainly better."""
+        clean = table()
+        response = clean.response.copy()
+        response[[28, 29]] *= 3.0
+        result = fit(
+            FrequencyResponse(clean.frequency_hz, response, clean.amplitude), Dahl(), loss=loss
+        )
+        found = compare_models(result)
+        assert found.best.name == "as fitted"
+        assert found.models[0].aic == pytest.approx(result.aic)
+        same = compare_models(result, {"the same": Dahl()}).models[1]
+        assert same.aic == pytest.approx(result.aic, abs=1e-6)
+
     def test_own_models_and_those_that_fail(self) -> None:
         data = table(n=3)
         found = compare_models(

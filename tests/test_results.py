@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from scipy import stats
+from scipy import optimize, stats
 
 import dahl_ident as di
 from dahl_ident import (
@@ -85,6 +85,21 @@ class TestFit:
         assert result.log_likelihood == pytest.approx(density)
         assert result.aic == pytest.approx(-2.0 * density + 2.0 * 3.0)
         assert result.bic == pytest.approx(-2.0 * density + 3.0 * np.log(60.0))
+
+    def test_criteria_of_a_robust_fit_are_those_of_its_density(self) -> None:
+        """Student's t with 4 degrees of freedom in (ln gain, phase), by scipy."""
+        data = table(n=12)
+        result = fit(data, Dahl(), loss="student_t")
+        y = np.log(data.response / result.best_fit)
+        pairs = np.column_stack([y.real, y.imag])
+
+        def deviance(ln_scale: float) -> float:
+            shape = np.exp(2.0 * ln_scale) * np.eye(2)
+            density = stats.multivariate_t(shape=shape, df=4).logpdf(pairs)
+            return -2.0 * float(np.sum(density - 2.0 * np.log(np.abs(data.response))))
+
+        least = optimize.minimize_scalar(deviance, (-6.0, -4.0)).fun
+        assert result.aic == pytest.approx(least + 6.0, abs=1e-6)
 
     def test_rotation_has_its_units_everywhere(self) -> None:
         data = table()

@@ -146,7 +146,7 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
     Parameters
     ----------
     fit : FitResult
-        From :func:`dahl_ident.fit`; its data, noise model and sensors are used for all.
+        From :func:`dahl_ident.fit`; its data, noise model, sensors and loss are used for all.
     models : mapping of str to Element, optional
         Models to compare with, by a name for each. Left out: the exponent free (or 1, where it
         was free), two Dahl elements in place of one, and a spring added.
@@ -179,7 +179,7 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
     for name, model in (_variants(problem.model) if models is None else models).items():
         try:
             other = Problem(problem.data, model, noise=problem.noise, sensors=problem.sensors)
-            fitted.append(_compared(name, solve(other)))
+            fitted.append(_compared(name, solve(other, loss=fit.optimum.loss)))
         except DahlIdentError as exc:
             failed[name] = str(exc)
     return ModelComparison(tuple(fitted), failed)
@@ -207,6 +207,6 @@ def _compared(name: str, optimum: Optimum) -> ComparedModel:
     problem = optimum.problem
     determined = problem.n_residuals + len(problem.priors) - optimum.dof
     count = determined + (not problem.scale_known)
-    deviance = -2.0 * float(problem.log_likelihood(optimum.theta))
+    deviance = -2.0 * optimum.log_likelihood
     aic = deviance + 2.0 * count
     return ComparedModel(name, optimum, aic, deviance + float(np.log(problem.n_residuals)) * count)

@@ -14,6 +14,8 @@ with E taken for Gaussian noise and z in units of s^2 (2 n - P)/(2 n), so that s
 variance when there are no outliers. chi = psi^2 = rho'(z)^2 z is Huber's proposal 2; for student_t,
 whose psi^2 falls again, chi = rho'(z) z, the scale equation of its likelihood.
 
+**Likelihood**: that of the density proportional to exp(-rho/2), at the likeliest scale.
+
 **Covariance**: s^2 kappa (J' J)^-1 with kappa = mean(psi^2) / mean(psi')^2 (Huber, Robust
 Statistics, 1981, section 7.6).
 """
@@ -31,6 +33,7 @@ from dahl_ident.errors import ValidationError
 
 KNEE = 1.345
 TAIL_DOF = 4.0
+_SCALINGS, _SAME_SCALE = 1000, 1e-12
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,24 @@ class Loss:
     def rescaled(self, z: FloatArray, dof: int) -> float:
         """Return s_new^2/s^2, for squares `z` in units of s^2."""
         return float(np.mean(self.chi(z * (2.0 * z.size / dof))) / self.gaussian_chi)
+
+    @cached_property
+    def log_area(self) -> float:
+        """Logarithm of the integral of exp(-rho/2) over the plane, less a Gaussian's."""
+        from scipy.integrate import quad
+
+        area, _ = quad(lambda z: float(np.exp(-0.5 * self.rho(np.asarray(z)))), 0.0, np.inf)
+        return float(np.log(0.5 * area))
+
+    def likeliest(self, z: FloatArray, least: float) -> float:
+        """Return s^2 at which squares s^2 `z` are likeliest under exp(-rho/2), from `least` on."""
+        s2 = 1.0
+        for _ in range(_SCALINGS):
+            factor = 0.5 * float(np.mean(self.slope(z / s2) * z / s2))
+            s2 = max(s2 * factor, least)
+            if s2 == least or abs(factor - 1.0) < _SAME_SCALE:
+                break
+        return s2
 
     def inflation(self, z: FloatArray, dof: int) -> float:
         """Return kappa, by which the covariance exceeds that of least squares."""

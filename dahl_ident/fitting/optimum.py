@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import FitError
 from dahl_ident.fitting.limits import Limit
-from dahl_ident.fitting.losses import Loss
+from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem, ProblemBatch
 
@@ -116,6 +116,27 @@ class Optimum:
         scale = 1.0 if np.isnan(self.scale) else self.scale
         r, J = self.problem.residuals_and_jacobian(self.theta, scale, tails=self.loss == "linear")
         return r * scale, J * scale
+
+    @cached_property
+    def log_likelihood(self) -> float:
+        """Log-density of the data at theta, at the likeliest scale where that is unknown.
+
+        With a robust loss, that of the density proportional to exp(-rho/2).
+        """
+        loss, problem = loss_named(self.loss), self.problem
+        if loss is None:
+            return float(problem.log_likelihood(self.theta))
+        y, _ = problem.whitened(self.theta, derivatives=False, tails=False)
+        z = y.real**2 + y.imag**2
+        scale = None
+        if not self.scale_known:
+            least = float(problem.rounding) / self.scale
+            scale = self.scale * float(np.sqrt(loss.likeliest(z / self.scale**2, least**2)))
+            z = z / scale**2
+        counted, _ = problem.whitened(self.theta, derivatives=False)
+        squares = np.abs(counted) ** 2 / (1.0 if scale is None else scale) ** 2
+        gaussian = float(problem.log_likelihood(self.theta, scale))
+        return gaussian + 0.5 * float((squares - loss.rho(z) - 2.0 * loss.log_area).sum())
 
     @property
     def values_covariance(self) -> FloatArray:

@@ -185,10 +185,13 @@ class FitNumbers:
         """Evaluations of the residuals."""
         return self._optimum.nfev
 
-    @cached_property
+    @property
     def log_likelihood(self) -> float:
-        """Log-density of the data at the estimate, at the likeliest scale where unknown."""
-        return float(self.problem.log_likelihood(self._optimum.theta))
+        """Log-density of the data at the estimate, at the likeliest scale where unknown.
+
+        With a robust loss rho, that of the density proportional to exp(-rho/2).
+        """
+        return self._optimum.log_likelihood
 
     @property
     def aic(self) -> float:
