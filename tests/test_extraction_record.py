@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import dataclass
 from typing import Literal
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.extraction_validation import accuracy, one_over_f, steady, white
+from benchmarks.extraction_validation import Noise, accuracy, one_over_f, steady, white
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.elements import Dahl
@@ -178,6 +179,43 @@ def test_known_frequency_reads_a_sine_buried_in_noise() -> None:
     data = extract(record, frequency=1.0, min_share=0.1, harmonics=(1,))
     assert data.frequency_hz.tolist() == pytest.approx([1.0], rel=1e-14)
     assert_near_truth(data)
+
+
+@pytest.mark.parametrize(
+    ("given", "cycles", "noise"), [(1.01, 20, 1e-4), (0.99, 40, 0.1), (1.002, 60, 1e-3)]
+)
+def test_a_given_frequency_that_is_wrong_is_refused_with_the_true_one(
+    given: float, cycles: int, noise: float
+) -> None:
+    record = waves(cycles=cycles, noise=noise).record()
+    with pytest.raises(ExtractionError, match=rf"not the given {given:g} Hz: its phase") as caught:
+        extract(record, frequency=given)
+    advised = re.search(r"give frequency=([0-9.]+), or leave it out", str(caught.value))
+    assert advised is not None
+    assert float(advised[1]) == pytest.approx(1.0, abs=0.03 / cycles)
+    assert_near_truth(extract(record, frequency=float(advised[1]), harmonics=(1,)))
+
+
+def test_drift_is_given_in_radians_over_the_cycles() -> None:
+    """At 1.01 Hz a sine of 1 Hz falls back by 2 pi/1.01 a hundredth of a cycle each cycle."""
+    with pytest.raises(ExtractionError, match=r"has (0\.99|1\.00)\d* Hz") as caught:
+        extract(waves(cycles=50).record(), frequency=1.01)
+    found = re.search(r"drifts by (-[0-9.]+) rad in (\d+) cycles", str(caught.value))
+    assert found is not None
+    expected = -2.0 * np.pi * 0.01 / 1.01 * int(found[2])
+    assert float(found[1]) == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize("noise", [white, one_over_f])
+def test_a_given_frequency_that_is_right_is_never_refused(noise: Noise) -> None:
+    rng = np.random.default_rng(8)
+    for _ in range(60):
+        cycles = int(rng.integers(4, 40))
+        n = cycles * 50
+        x, force = steady(2.0, rng.uniform(0.0, 6.0) + 2.0 * np.pi / 50.0 * np.arange(float(n)))
+        x = x + 10.0 ** rng.uniform(-3.0, 0.3) * noise(rng, n)
+        record = Record(np.arange(n) / 50.0, displacement=x, force=force)
+        assert extract(record, frequency=1.0, harmonics=(1,), min_share=0.0).n >= 1
 
 
 def test_noise_that_hides_the_crossings_leaves_the_strongest_line() -> None:

@@ -193,7 +193,7 @@ def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray, turns: in
     turn = np.repeat(2.0 * np.pi * turns / np.diff(edges), counts)
     theta = (time[inside] - np.repeat(edges[:-1], counts)) * turn
     bounds = np.column_stack([cuts[known], cuts[known + 1]]).ravel() - cuts[0]
-    phasor, left = _sine_in_each(theta, motion[inside], bounds, n)
+    phasor, left = sine_in_each(theta, motion[inside], bounds, n)
     amplitude = np.maximum(np.abs(phasor), np.finfo(np.float64).tiny)
     noise = np.sqrt(2.0 * left / n) / amplitude
     return Cycles(
@@ -201,7 +201,7 @@ def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray, turns: in
     )
 
 
-def _sine_in_each(
+def sine_in_each(
     theta: FloatArray, y: FloatArray, bounds: NDArray[np.intp], n: NDArray[np.intp]
 ) -> tuple[ComplexArray, FloatArray]:
     """Return the phasor of each cycle, offset fitted as well, and the variance it leaves."""

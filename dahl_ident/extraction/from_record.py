@@ -102,8 +102,9 @@ def extract(
     Raises
     ------
     ExtractionError
-        If no stretch is usable: too short, motion or force not dominated by one sine, or less
-        motion than the sensor's step. Where only some are, a warning tells which and why.
+        If no stretch is usable: too short, motion or force not dominated by one sine, less
+        motion than the sensor's step, or `frequency` not that of the motion, so that its phase
+        drifts. Where only some are, a warning tells which and why.
     ValidationError
         If an argument is out of range, or the record has only a drive without a factor.
 

@@ -14,14 +14,13 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ExtractionError
-from dahl_ident.extraction.cycles import Cycles, cut_cycles, find_cycles
+from dahl_ident.extraction.cycles import Cycles, cut_cycles, find_cycles, sine_in_each
+from dahl_ident.extraction.ends import cycle_edges, highest_by_chance, steady_part
 from dahl_ident.extraction.segments import Mode, Segment, find_segments
 from dahl_ident.extraction.sine_fit import (
     FEWEST_CYCLES,
     Stretch,
-    columns,
     estimate_frequency,
-    solvable_inverse,
     steady_stretch,
     thinned,
     track_phase,
@@ -33,8 +32,10 @@ _NO_CHANCE = 0.1  # ... and they are this share of all cycles: noise has two ali
 _QUIET_CROSSINGS = 0.01  # noise of a cycle's log amplitude that no crossing suffers from
 _WELL_COVERED = 0.5  # of a record: where crossings find segments so long, they are right
 _SWEEP_DEGREE = 3  # of the phase in a window
-_STRAYING = 0.005  # of the amplitude, that a further cycle may stray from the sine
-_MOST_CYCLES_MORE = 2  # on either side
+_DRIFTED = 0.2  # phase over a stretch, rad, that costs 0.2 % of the amplitude, more of harmonics
+_BY_CHANCE = 1e-6  # of stretches without a drift, how many seem to have one
+_PADDED = 16  # lines for each cycle, so that a peak lies near one
+_FEWEST_SAMPLES = 4  # that a cycle's sine and offset leave something of
 
 
 def record_segments(
@@ -117,40 +118,46 @@ def stretch_of(
         return stretch  # which whoever measures it will refuse
     if frequency is None:
         stretch = estimate_frequency(track_phase(stretch, 1))
+    else:
+        _refuse_drift(stretch)
     least, most = np.searchsorted(time, [segment.earliest, segment.latest]).tolist()
     room = slice(min(least, first), max(most, last))
-    part = _extended(time, channels[0], stretch, slice(first, last), room)
+    part = steady_part(time, channels[0], stretch, slice(first, last), room)
     if part == slice(first, last):
         return stretch
     stretch = steady_stretch(time[part], channels[:, part], stretch.omega)
     return stretch if frequency is not None else estimate_frequency(stretch)
 
 
-def _extended(
-    time: FloatArray, motion: FloatArray, stretch: Stretch, part: slice, room: slice
-) -> slice:
-    """Return the slice with the cycles before and after it that its sine fits as well.
+def _refuse_drift(stretch: Stretch) -> None:
+    """Refuse a given frequency at which the motion's phase drifts from cycle to cycle.
 
-    Where the room ends they may be partial.
+    The phasors of the cycles turn evenly then: their spectrum has its peak beside zero.
     """
     few = thinned(stretch)
-    basis = columns(few.theta, few.tau, 1)
-    fitted = solvable_inverse(basis @ basis.T, few) @ (basis @ few.channels[0])
-    cycle = 2.0 * np.pi / stretch.omega
-
-    def misfit(where: slice) -> float:
-        tau = (time[where] - stretch.centre) / stretch.half_width
-        model = fitted @ columns(np.asarray(stretch.phase(tau)), tau, 1)
-        return float(np.sqrt(np.mean((motion[where] - model) ** 2)))
-
-    start, stop = part.start, part.stop
-    inside = slice(start, int(np.searchsorted(time, time[start] + cycle)))
-    allowed = 1.5 * misfit(inside) + _STRAYING * float(np.hypot(*fitted[2:]))
-    for _ in range(_MOST_CYCLES_MORE):
-        earlier = max(int(np.searchsorted(time, time[start] - cycle)), room.start)
-        if earlier < start and misfit(slice(earlier, start)) <= allowed:
-            start = earlier
-        later = min(int(np.searchsorted(time, time[stop - 1] + cycle, side="right")), room.stop)
-        if later > stop and misfit(slice(stop, later)) <= allowed:
-            stop = later
-    return slice(start, stop)
+    cuts = np.searchsorted(few.time, cycle_edges(stretch))
+    counts = np.diff(cuts)
+    cycle = np.flatnonzero(counts >= _FEWEST_SAMPLES)
+    dof = 2 * cycle.size - 4
+    if dof < 1:
+        return
+    bounds = np.column_stack([cuts[:-1], cuts[1:]])[cycle].ravel()
+    found, _ = sine_in_each(few.theta, few.channels[0], bounds, counts[cycle])
+    phasors = np.zeros(counts.size, dtype=np.complex128)
+    phasors[cycle] = found
+    power = np.abs(np.fft.fft(phasors, _PADDED * counts.size)) ** 2 / cycle.size
+    peak = int(np.argmax(power))
+    turns = float(np.fft.fftfreq(power.size)[peak])
+    beside = np.angle(found * np.exp(-2j * np.pi * turns * cycle))
+    turns += float(np.polyfit(cycle, beside, 1)[0]) / (2.0 * np.pi)
+    drift = 2.0 * np.pi * turns * counts.size
+    left = float(np.sum(np.abs(found) ** 2)) - power[peak]
+    clear = (power[peak] - power[0]) * dof > 2.0 * highest_by_chance(_BY_CHANCE, dof) * left
+    if clear and abs(drift) > _DRIFTED:
+        given = stretch.omega / (2.0 * np.pi)
+        shown = given * (1.0 + turns)
+        raise ExtractionError(
+            f"the motion around t = {stretch.centre:.6g} s has {shown:.6g} Hz, not the given "
+            f"{given:.6g} Hz: its phase drifts by {drift:.3g} rad in {counts.size} cycles; "
+            f"expected less than {_DRIFTED:g} rad: give frequency={shown:.6g}, or leave it out"
+        )

@@ -1,0 +1,179 @@
+r"""Ends of a stretch: which cycles belong to its level, judged by amplitude and phase.
+
+Where a ramp begins or ends, the first cycles that depart are off by a percent, in amplitude or in
+phase. The cycles inside tell how far is too far: a sine that may change linearly is fitted to
+them, and what a fundamental explains of each cycle's residual, Q_i, scatters with the noise, be it
+white or 1/f. With m cycles inside
+
+    s^2 = sum_i Q_i / (2 m - 4),      F = Q / (2 (1 + h) s^2)
+
+and for a cycle that belongs F follows F(2, 2 m - 4), h being the error of the fitted sine there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.extraction.sine_fit import (
+    Stretch,
+    columns,
+    solvable_inverse,
+    thinned,
+    whole_cycles,
+)
+
+_BY_CHANCE = 1e-3  # of the cycles that belong, how many seem to stray
+_NEGLIGIBLE = 1e-4  # of the amplitude, that a cycle may stray in any case
+_UNJUDGED = 2  # cycles at either end that are judged, and do not judge ...
+_OF_THOSE = 5  # ... and a fifth of all at most
+_SOLVABLE = 1e8  # condition of normal equations
+_STRAYING = 0.005  # of the amplitude, that a further cycle may stray from the sine
+_MOST_CYCLES_MORE = 2  # on either side
+
+
+def steady_part(
+    time: FloatArray, motion: FloatArray, stretch: Stretch, part: slice, room: slice
+) -> slice:
+    """Return the part of a record without cycles at its ends that stray, or with more that fit.
+
+    Parameters
+    ----------
+    time, motion : ndarray
+        The record.
+    stretch : Stretch
+        The part's samples with the phase of a steady sine.
+    part, room : slice
+        Where the stretch is, and where it may grow.
+
+    Returns
+    -------
+    slice
+        Where the room ends there may be a partial cycle.
+    """
+    edges = cycle_edges(stretch)
+    start, stop, count = part.start, part.stop, edges.size - 1
+    while True:
+        inside = _inside(stretch, edges)
+        if inside is None or 2 * edges.size <= count:
+            break
+        second, last = np.searchsorted(time, edges[[1, -2]]).tolist()
+        early = inside.strays(time[start:second], motion[start:second])
+        late = inside.strays(time[last:stop], motion[last:stop])
+        if not early and not late:
+            break
+        start, stop = (second if early else start), (last if late else stop)
+        edges = edges[int(early) : edges.size - int(late)]
+    if inside is not None:  # enough are left: the cycle beside a stray departs as well, if less
+        start = int(np.searchsorted(time, edges[1])) if start > part.start else start
+        stop = int(np.searchsorted(time, edges[-2])) if stop < part.stop else stop
+    room = slice(
+        room.start if start == part.start else start, room.stop if stop == part.stop else stop
+    )
+    return _extended(time, motion, stretch, slice(start, stop), room, inside)
+
+
+def highest_by_chance(share: float, dof: int) -> float:
+    """Return what F(2, dof) exceeds in this share of all cases."""
+    return float(0.5 * dof * (share ** (-2.0 / dof) - 1.0))
+
+
+def cycle_edges(stretch: Stretch) -> FloatArray:
+    """Return the bounds of the whole cycles; a partial one is before the first."""
+    end = stretch.time[-1] + 0.5 * stretch.sample_phase / stretch.omega
+    cycle = 2.0 * np.pi / stretch.omega
+    return np.asarray(end - cycle * np.arange(whole_cycles(stretch), -1.0, -1.0))
+
+
+@dataclass(frozen=True)
+class _Inside:
+    """The sine of the cycles inside, which may change linearly, and their scatter about it."""
+
+    stretch: Stretch
+    coefficients: FloatArray
+    inverse: FloatArray
+    variance: float
+    """Of white noise that scatters the cycles as much."""
+    dof: int
+
+    def columns(self, time: FloatArray) -> FloatArray:
+        tau = (time - self.stretch.centre) / self.stretch.half_width
+        return columns(np.asarray(self.stretch.phase(tau)), tau, 1, 1)
+
+    def strays(self, time: FloatArray, motion: FloatArray) -> bool:
+        """Return whether samples of the record depart from the sine by more than by chance."""
+        basis = self.columns(time)
+        sine = basis[2:4] - basis[2:4].mean(axis=1, keepdims=True)  # the mean may wander
+        own = np.linalg.pinv(sine @ sine.T)
+        left = sine @ (motion - self.coefficients @ basis)
+        explained = float(left @ own @ left)
+        onto = sine @ basis.T
+        fitted = 0.5 * float(np.trace(own @ onto @ self.inverse @ onto.T))
+        bound = highest_by_chance(_BY_CHANCE, self.dof)
+        amplitude = float(np.hypot(*self.coefficients[2:4]))
+        least = 0.5 * time.size * (_NEGLIGIBLE * amplitude) ** 2
+        return bool(explained > max(2.0 * bound * (1.0 + fitted) * self.variance, least))
+
+
+def _inside(stretch: Stretch, edges: FloatArray) -> _Inside | None:
+    """Return the sine of all but the cycles at the ends, None where too few are left."""
+    unjudged = min(_UNJUDGED, (edges.size - 1) // _OF_THOSE)
+    if unjudged == 0:
+        return None
+    cuts = np.searchsorted(stretch.time, edges[unjudged:-unjudged])
+    within = slice(int(cuts[0]), int(cuts[-1]))
+    basis = columns(stretch.theta[within], stretch.tau[within], 1, 1)
+    normal = basis @ basis.T
+    if not np.linalg.cond(normal) < _SOLVABLE:
+        return None
+    inverse = np.asarray(np.linalg.inv(normal), np.float64)
+    motion = stretch.channels[0, within]
+    coefficients = inverse @ (basis @ motion)
+    left = motion - coefficients @ basis
+    cos, sin = basis[2:4]
+    products = np.stack([cos * cos, sin * sin, cos * sin, cos * left, sin * left])
+    sums = np.cumsum(np.pad(products, ((0, 0), (1, 0))), axis=1)[:, cuts - cuts[0]]
+    cc, ss, cs, c, s = np.diff(sums, axis=1)
+    determinant = cc * ss - cs**2
+    full = determinant > 0.1 * cc * ss  # a cycle without samples tells nothing
+    dof = 2 * int(full.sum()) - 4
+    if dof < 2:
+        return None
+    explained = (ss * c**2 + cc * s**2 - 2.0 * cs * c * s)[full] / determinant[full]
+    variance = float(explained.sum()) / dof
+    return _Inside(stretch, coefficients, inverse, variance, dof)
+
+
+def _extended(
+    time: FloatArray, motion: FloatArray, stretch: Stretch, part: slice, room: slice,
+    inside: _Inside | None,
+) -> slice:  # fmt: skip
+    """Return the slice with the cycles before and after it that the stretch's sine fits as well."""
+    few = thinned(stretch)
+    basis = columns(few.theta, few.tau, 1)
+    fitted = solvable_inverse(basis @ basis.T, few) @ (basis @ few.channels[0])
+    cycle = 2.0 * np.pi / stretch.omega
+
+    def misfit(where: slice) -> float:
+        tau = (time[where] - stretch.centre) / stretch.half_width
+        model = fitted @ columns(np.asarray(stretch.phase(tau)), tau, 1)
+        return float(np.sqrt(np.mean((motion[where] - model) ** 2)))
+
+    start, stop = part.start, part.stop
+    within = slice(start, int(np.searchsorted(time, time[start] + cycle)))
+    allowed = 1.5 * misfit(within) + _STRAYING * float(np.hypot(*fitted[2:]))
+
+    def fits(where: slice) -> bool:
+        strays = inside is not None and inside.strays(time[where], motion[where])
+        return misfit(where) <= allowed and not strays
+
+    for _ in range(_MOST_CYCLES_MORE):
+        earlier = max(int(np.searchsorted(time, time[start] - cycle)), room.start)
+        if earlier < start and fits(slice(earlier, start)):
+            start = earlier
+        later = min(int(np.searchsorted(time, time[stop - 1] + cycle, side="right")), room.stop)
+        if later > stop and fits(slice(stop, later)):
+            stop = later
+    return slice(start, stop)
