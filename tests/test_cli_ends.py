@@ -221,3 +221,65 @@ def test_a_chain_on_a_full_disk_is_one_line_and_leaves_the_old_file(
     assert sorted(p.name for p in Path().iterdir()) == ["chain.h5", "levels.csv"]
     with pytest.raises(SamplingError, match="No space left"):
         di.sample(friction_table(), di.Dahl(), seed=1, steps=60, resume="new.h5")
+
+
+def test_a_negative_seed_is_refused_without_an_output_too(run: Runner) -> None:
+    outcome = run("simulate", "--f-max", "0.1", "--sigma", "30", "--seed", "-1")
+    assert (outcome.status, outcome.out) == (1, "")
+    assert outcome.err == "error: seed is -1; expected a whole number >= 0\n"
+
+
+TABLE = (
+    "frequency_hz,amplitude [mm],{drive}gain [N/m],phase_deg\n1,1,{value}30,10\n1,2,{value}25,20\n"
+)
+RECORD = "time [s],displacement [m],force [N]\n0,1,1\n1,2,2\n2,1,1\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("fit", "t.csv", "--drive-factor", "2 N/V"),
+         "t.csv: drive_factor is given, but no column holds the drive; expected a drive in V or A"),
+        (("fit", "newton.csv", "--drive-factor", "2 N/V"),
+         "newton.csv: drive_factor is given, but column 'drive [N]' is a force already"),
+        (("fit", "t.csv", "--drive", "2 N", "--drive-factor", "2 N/V"),
+         "t.csv: drive_factor is given, but the drive is a force already"),
+        (("extract", "r.csv", "--drive-factor", "2 N/V"),
+         "r.csv: drive_factor is given, but no column holds the drive"),
+        (("extract", "r.csv", "--drive-factor-uncertainty", "0.1"),
+         "r.csv: drive_factor_uncertainty is given, but no column holds the drive"),
+        (("extract", "volt.csv", "--drive-factor-uncertainty", "0.1"),
+         "volt.csv: drive_factor_uncertainty is given without drive_factor; give both"),
+        (("extract", "r.csv", "--time", "time", "--sample-rate", "5"),
+         "time and sample_rate are both given"),
+        (("fit", "levels.csv", "--level", "high"),
+         "levels.csv: level='high' is given, but the table has its own levels"),
+        (("fit", "t.csv", "--level", "high", "--level-from-name", "(t)"),
+         "level and level_from_name are both given"),
+        (("simulate", "run.toml", "--f-max", "3", "--force-std", "0.1"),
+         "--f-max, --force-std is given beside run.toml, which describes the whole experiment"),
+        (("report", "t.csv", "--record-columns", "map.toml"),
+         "--record-columns is given without --record"),
+    ],
+)  # fmt: skip
+def test_an_option_without_effect_is_refused(
+    run: Runner, arguments: tuple[str, ...], message: str
+) -> None:
+    Path("t.csv").write_text(TABLE.format(drive="", value=""), encoding="utf-8")
+    Path("newton.csv").write_text(TABLE.format(drive="drive [N],", value="1,"), encoding="utf-8")
+    labelled = TABLE.format(drive="level,", value="low,")
+    Path("levels.csv").write_text(labelled, encoding="utf-8")
+    Path("r.csv").write_text(RECORD, encoding="utf-8")
+    Path("volt.csv").write_text(RECORD.replace("force [N]", "drive [V]"), encoding="utf-8")
+    outcome = run(*arguments)
+    assert (outcome.status, outcome.out) == (1, "")
+    assert outcome.err.startswith(f"error: {message}")
+    assert outcome.err.count("\n") == 1
+
+
+def test_a_chain_keeps_the_seed_it_was_begun_with(run: Runner) -> None:
+    friction_table().save("levels.csv")
+    options = ("sample", "levels.csv", "--resume", "chain.h5")
+    assert run(*options, "--steps", "30", "--seed", "5").status == 3
+    assert run(*options, "--steps", "40").err.startswith("not to be trusted: ")
+    assert "begun with seed 5, but seed is 6" in run(*options, "--seed", "6").err

@@ -141,10 +141,10 @@ def next_check(steps: int, end: int) -> int:
 
 
 def _sampler(density: Density, settings: Settings, pool: Pool | None) -> Any:
-    import emcee
+    from emcee import EnsembleSampler
 
     function = density if pool is None else _Mapped(density, pool)
-    sampler = emcee.EnsembleSampler(
+    sampler: Any = EnsembleSampler(
         settings.walkers,
         len(density.names),
         function,

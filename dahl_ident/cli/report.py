@@ -57,6 +57,8 @@ def report(
 
     writing.check(output, files, json=general.json)
     check_reports(*output)
+    if record_columns is not None and record is None:
+        raise ValidationError("--record-columns is given without --record; give both, or neither")
     saved = any(file.endswith(".json") for file in files)
     chosen = (reading, model, estimating) != (Reading(), ModelOptions(), Estimating())
     if saved and (len(files) > 1 or chosen):

@@ -14,7 +14,7 @@ from dahl_ident.cli.distributions import prior
 from dahl_ident.cli.fit import ReportPlace, check_reports, tell_report
 from dahl_ident.cli.groups import grouped
 from dahl_ident.cli.model import ModelOptions
-from dahl_ident.cli.options import STANDARD, Files, General, Reading, Seed, Writing
+from dahl_ident.cli.options import STANDARD, Files, General, Reading, Writing
 from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:
@@ -44,7 +44,13 @@ class Sampling:
         str,
         typer.Option(help="gaussian, student_t or none.", rich_help_panel=_SAMPLING),
     ] = "gaussian"
-    seed: Seed = 1
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            help="Seed of the random numbers; by default that of the chain in --resume, or 1.",
+            rich_help_panel=_SAMPLING,
+        ),
+    ] = None
     steps: Annotated[
         int | None,
         typer.Option(help="Total steps; by default until converged.", rich_help_panel=_SAMPLING),
@@ -86,6 +92,8 @@ class Sampling:
         if self.grid:
             return what
         how = {name: getattr(self, name) for name in _CHAIN}
+        if self.seed is None and (self.resume is None or not self.resume.exists()):
+            how["seed"] = 1
         return {**what, **how, "progress": sys.stderr.isatty()}
 
     def check(self, report: str | None) -> None:

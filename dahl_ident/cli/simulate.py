@@ -114,9 +114,19 @@ def simulate(
 
     Example: dahl-ident simulate --f-max 0.1 --sigma 30 --force-std 0.01 -o synthetic.csv
     """
+    from dahl_ident.arrays import whole_number
     from dahl_ident.synthetic import Experiment
     from dahl_ident.synthetic import simulate as run
 
+    whole_number(seed, "seed", 0)
+    defaults = vars(Plant()) | vars(Excitation()) | vars(Errors())
+    given = vars(plant) | vars(excitation) | vars(errors)
+    idle = [f"--{k.replace('_', '-')}" for k, v in given.items() if v != defaults[k]]
+    if experiment is not None and idle:
+        raise ValidationError(
+            f"{', '.join(idle)} is given beside {experiment}, which describes the whole "
+            "experiment; leave one of them out"
+        )
     inputs = [] if experiment is None else [experiment]
     writing.check([output], inputs, json=general.json)
     described = (

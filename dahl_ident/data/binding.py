@@ -162,6 +162,28 @@ class Binding:
         self.motions["drive_factor"] = motion
         return positive_number(value, "drive_factor"), self.map.drive_factor_uncertainty
 
+    def refuse_idle_factor(self, kind: str | None) -> None:
+        """Refuse keywords on the drive's factor where they would count for nothing.
+
+        `kind` is that of the drive, None where there is none. A column map may serve other files
+        too, and is not refused.
+        """
+        names = ("drive_factor", "drive_factor_uncertainty")
+        given = [n for n in names if self.source.options.get(n) is not None]
+        if not given:
+            return
+        what = " and ".join(given)
+        if kind in (None, "force"):
+            channel = self.channel("drive")
+            column = "the drive" if channel is None else f"column {channel.header!r}"
+            found = "no column holds the drive" if kind is None else f"{column} is a force already"
+            raise DataError(
+                f"{self.source.name}: {what} is given, but {found}; expected a drive in V or A: "
+                "leave the factor out, or name the column with columns={'drive': ...}"
+            )
+        if self.map.drive_factor is None and "drive_factor" not in self.source.metadata:
+            raise DataError(f"{self.source.name}: {what} is given without drive_factor; give both")
+
     def motion(self) -> Motion:
         """Return translation or rotation, on which all units must agree."""
         kinds = set(self.motions.values())

@@ -43,6 +43,8 @@ def record_from(
     }
     if "drive" in channels:
         values |= _drive(bound, channels["drive"])
+    else:
+        bound.refuse_idle_factor(None)
     if "time" not in values:
         values["time"] = _even_time(bound, complete.size)[complete]
     try:
@@ -99,6 +101,7 @@ def _samples(bound: Binding, role: str, channel: Channel) -> FloatArray:
 
 def _drive(bound: Binding, channel: Channel) -> dict[str, Any]:
     kind, _ = bound.kind("drive", bound.unit("drive", channel), DRIVE_KINDS)
+    bound.refuse_idle_factor(kind)
     if kind == "force":
         return {"drive_unit": si_unit("force", bound.motions["drive"])}
     values: dict[str, Any] = {"drive_unit": _DRIVE_UNITS[kind]}

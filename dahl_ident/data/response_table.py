@@ -160,6 +160,7 @@ class _Table:
 
     def _drive(self, frequency_hz: FloatArray) -> FloatArray | None:
         found = self._peaks("drive", DRIVE_KINDS, frequency_hz.shape)
+        self.bound.refuse_idle_factor(None if found is None else found[0])
         return None if found is None else found[1] * self._force_per(found[0])
 
     def _peaks(

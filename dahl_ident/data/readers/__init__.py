@@ -113,6 +113,8 @@ def read_frequency_response(
     >>> read_frequency_response(table).amplitude
     array([1.e-05, 2.e-05])
     """
+    if level is not None and level_from_name is not None:
+        raise ValidationError("level and level_from_name are both given; leave out one of them")
     paths = [path] if isinstance(path, (str, Path)) else list(path)
     if not paths:
         raise DataError("no file to read; expected at least one path")
@@ -136,7 +138,12 @@ def read_frequency_response(
         given = _given(columns=columns, quantity=quantity, drive_factor=drive_factor,
                        drive_factor_uncertainty=drive_factor_uncertainty, controlled=controlled,
                        sheet=sheet, **vars(options))  # fmt: skip
-        parts.append(response_from(open_source(one, sheet, given), mapped, options))
+        part = response_from(open_source(one, sheet, given), mapped, options)
+        if level is not None and part.level is not None and any(v != level for v in part.level):
+            raise DataError(
+                f"{one}: level={level!r} is given, but the table has its own levels; leave it out"
+            )
+        parts.append(part)
     if len(parts) == 1:
         return parts[0]
     try:
@@ -206,6 +213,8 @@ def read_record(
     """
     if missing not in ("error", "drop"):
         raise ValidationError(f"missing is {missing!r}; expected 'error' or 'drop'")
+    if time is not None and sample_rate is not None:
+        raise ValidationError("time and sample_rate are both given; leave out one of them")
     roles = {
         "time": time,
         "displacement": displacement,
