@@ -104,7 +104,12 @@ def run() -> list[Row]:
         folder.mkdir()
         short = _median(lambda seed: ours(data, folder, seed, 400), 5)
     peer = _median(lambda seed: lmfit_emcee(data, seed), 2)
-    problems = ((data, di.Dahl()), (heavy, di.Dahl()), (beside_spring(), di.Dahl() + di.Spring()))
+    problems: tuple[tuple[di.FrequencyResponse, di.Element], ...] = (
+        (data, di.Dahl()),
+        (heavy, di.Dahl()),
+        (beside_spring(), di.Dahl() + di.Spring()),
+        (data, di.Dahl(alpha=None)),
+    )
     grids = []
     for which, model in problems:
         work = partial(di.posterior_grid, which, model, priors=priors)
@@ -116,6 +121,7 @@ def run() -> list[Row]:
         Row("grid of f_max, sigma, unknown scale", grids[0], 0.05, "the limit", 1.0),
         Row("the same, 3 points, 50 % noise", grids[1], 0.05, "the limit", 1.0),
         Row("grid of f_max, sigma, stiffness, unknown scale", grids[2], 0.5, "the limit", 1.0),
+        Row("grid of f_max, sigma, alpha, unknown scale", grids[3], 0.5, "the limit", 1.0),
     ]
 
 
