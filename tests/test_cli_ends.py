@@ -283,3 +283,22 @@ def test_a_chain_keeps_the_seed_it_was_begun_with(run: Runner) -> None:
     assert run(*options, "--steps", "30", "--seed", "5").status == 3
     assert run(*options, "--steps", "40").err.startswith("not to be trusted: ")
     assert "begun with seed 5, but seed is 6" in run(*options, "--seed", "6").err
+
+
+@pytest.mark.parametrize("columns", [40, 60, 80])
+def test_no_number_is_broken_on_a_narrow_terminal(columns: int) -> None:
+    pty = pytest.importorskip("pty", reason="terminals are POSIX")
+    code = (
+        "from dahl_ident.cli.telling import table\n"
+        "head = ['f [Hz]', 'A [m]', 'gain', 'phase [deg]', 'periods', 'verdict']\n"
+        "row = ['2.5', '0.0008863', '56.96', '142.34', '31', 'not settled, by 3 %']\n"
+        "table('points', head, [row])"
+    )
+    ours, theirs = pty.openpty()
+    environment = {**os.environ, "COLUMNS": str(columns), "TERM": "xterm", "NO_COLOR": "1"}
+    subprocess.run([sys.executable, "-c", code], stdout=theirs, env=environment, check=True)
+    told = os.read(ours, 65536).decode()
+    os.close(ours)
+    os.close(theirs)
+    lines = [line.split() for line in told.splitlines()]
+    assert any(line[:5] == ["2.5", "0.0008863", "56.96", "142.34", "31"] for line in lines)

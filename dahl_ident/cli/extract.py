@@ -201,10 +201,8 @@ def show(data: FrequencyResponse) -> None:
     used = points.quality["num_periods"] - points.quality["settling_periods"]
     columns = {
         "level": [] if points.level is None else [str(label) for label in points.level],
-        "frequency [Hz]": [f"{f:.5g}" for f in points.frequency_hz],
-        f"amplitude [{si_unit('displacement', data.motion)}]": [
-            f"{A:.4g}" for A in points.amplitude
-        ],
+        "f [Hz]": [f"{f:.5g}" for f in points.frequency_hz],
+        f"A [{si_unit('displacement', data.motion)}]": [f"{A:.4g}" for A in points.amplitude],
         "gain": [f"{g:.4g}" for g in points.gain],
         "phase [deg]": [f"{p:.2f}" for p in np.degrees(points.phase)],
         "periods": [f"{u:g}" for u in used],

@@ -92,15 +92,23 @@ def say_json(value: Any) -> None:
 def table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print a table; text from files is not taken for markup."""
     from rich import box
+    from rich.measure import Measurement
     from rich.table import Table
     from rich.text import Text
 
     drawn = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-    for name in header:
-        drawn.add_column(Text(name), overflow="fold")
-    for row in rows:
+    cells = [list(row) for row in rows]
+    for i, name in enumerate(header):
+        # a number broken over two lines would be read as another
+        whole = not any(" " in row[i] for row in cells)
+        least = max(len(text) for text in [name, *(row[i] for row in cells)]) if whole else None
+        drawn.add_column(Text(name), overflow="fold", no_wrap=whole, min_width=least)
+    for row in cells:
         drawn.add_row(*(Text(cell) for cell in row))
-    console().print(drawn)
+    screen = console()
+    wide = screen.options.update(max_width=10_000)
+    screen.width = max(screen.width, Measurement.get(screen, wide, drawn).minimum)
+    screen.print(drawn)
 
 
 def heading(text: str) -> None:
