@@ -271,6 +271,22 @@ class TestBootstrap:
         assert found["f_max"][0].upper == np.inf
         assert found["sigma"][0].upper < np.inf
 
+    def test_is_symmetric_where_others_run_away(self) -> None:
+        """Hall's interval: as many sizes of t* below its half width as the level says."""
+        hidden = table(model=Dahl(0.1, 30.0) + Spring(30.0), beta=(100.0, 1000.0), seed=4)
+        optimum = fit(hidden, Dahl() + Spring()).optimum
+        drawn = replicate(optimum, 199, 0)
+        assert drawn.gone[:, 1].mean() > 0.1 > drawn.gone[:, 2].mean()
+        found = bootstrap_intervals(optimum, [0.6827], 199)
+        ((_, lower, upper),) = found["stiffness"]
+        error = np.sqrt(optimum.covariance[2, 2])
+        assert 0.5 * (lower + upper) == pytest.approx(optimum.values[2], rel=1e-12)
+        t = np.abs(drawn.studentised[~drawn.gone[:, 2], 2])
+        assert np.mean(t < 0.5 * (upper - lower) / error) == pytest.approx(0.6827, abs=0.006)
+        assert "symmetric at 68.27 %, since so many replicates end at a limit" in found.note
+        regular = bootstrap_intervals(fit(table(n=8), Dahl()).optimum, [0.6827], 199)
+        assert "symmetric" not in regular.note
+
     def test_refuses_robust_losses_and_few_replicates(self) -> None:
         with pytest.raises(ValidationError, match="robust loss huber"):
             fit(table(), Dahl(), loss="huber").conf_interval("bootstrap")
