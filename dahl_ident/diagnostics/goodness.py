@@ -6,6 +6,9 @@ exponent's score (departure from the universal curve h(beta)), the third harmoni
 model's. Together they may cry wolf once in a
 hundred data sets, so each has a hundredth over their number as its level.
 
+Where the data are not described, the sign of the response and the suspicious rows are tried as
+the cause (:mod:`dahl_ident.diagnostics.causes`); a cause found leads the verdict.
+
 A fit can be statistically perfect and physically absurd; what no mechanism does is said as a
 warning (:mod:`dahl_ident.diagnostics.physics`).
 """
@@ -13,13 +16,20 @@ warning (:mod:`dahl_ident.diagnostics.physics`).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray
+from dahl_ident.diagnostics.causes import (
+    neighbourhood,
+    percent,
+    rms_misfit,
+    set_aside,
+    sign_convention,
+)
 from dahl_ident.diagnostics.flags import flagged_rows
 from dahl_ident.diagnostics.formatting import p_text, with_unit
 from dahl_ident.diagnostics.outliers import SuspiciousPoint, suspicious_points
@@ -75,10 +85,14 @@ class Exponent:
     wanted: float
     stderr: float
     p_value: float
+    widened: float = 1.0
+    """How many times the error is what the data's covariance says, as they scatter more."""
 
     def __str__(self) -> str:
         value = with_unit(self.wanted, self.stderr, "")
-        return f"the data ask for {self.name} near {value} in place of {self.fixed:g}"
+        wide = f" (error widened {self.widened:.2g} times, to the misfit)"
+        told = wide if self.widened > 1.0 else ""
+        return f"the data ask for {self.name} near {value}{told} in place of {self.fixed:g}"
 
 
 @dataclass(frozen=True)
@@ -124,6 +138,12 @@ class Goodness:
         What no mechanism does.
     flagged : tuple of str
         Rows that the extraction flagged, with the reason.
+    sign : str
+        The sign convention that explains data which the fit does not; empty where none does.
+    apart : str
+        The suspicious rows, where they alone speak against the model.
+    neighbours : str
+        Where the suspicious rows lie, if they alone depart from the model, but side by side.
     untested : bool
         Whether the amplitudes give no more numbers than friction has free parameters, which then
         meet them whatever the mechanism is.
@@ -152,6 +172,9 @@ class Goodness:
     warnings: tuple[str, ...]
     flagged: tuple[str, ...]
     untested: bool
+    sign: str = ""
+    apart: str = ""
+    neighbours: str = ""
 
     @cached_property
     def level(self) -> float:
@@ -210,11 +233,18 @@ class Goodness:
             yield from (f"{r}" for r in self.runs if r.p_value < level)
 
     @property
+    def cause(self) -> str:
+        """What explains why the data are not described; empty where nothing does."""
+        return f"{self.sign}. The numbers of this fit mean nothing." if self.sign else self.apart
+
+    @property
     def statements(self) -> tuple[str, ...]:
         """The verdict in its parts, the gravest first."""
-        parts = (self._flaws, self._fit, self._apart)
+        if self.cause:
+            return tuple(filter(None, (self.cause, self._flaws)))
+        parts = (self._flaws, self.described, self._apart)
         if self.objections or not self.judged:
-            parts = (self._fit, self._flaws, self._apart)
+            parts = (self.described, self._flaws, self._apart)
         return tuple(filter(None, parts))
 
     @property
@@ -223,7 +253,8 @@ class Goodness:
         return " ".join(self.statements)
 
     @property
-    def _fit(self) -> str:
+    def described(self) -> str:
+        """Whether the model describes the data."""
         misfit = f"{100.0 * self.rms_misfit:.2g} % rms misfit"
         if self.objections:
             reasons = "; ".join(self.objections[:_MOST_DEPARTURES])
@@ -260,6 +291,11 @@ class Goodness:
         if not self.suspicious:
             return ""
         rows = _joined([str(point.row) for point in self.suspicious], 5, ", ")
+        if self.neighbours:
+            return (
+                f"Suspicious rows: {rows}; without them the model describes the data, but they lie "
+                f"side by side, {self.neighbours}: look at them, or the model fails there."
+            )
         return f"Suspicious rows: {rows}; look at them (a robust loss bears such rows)."
 
     @property
@@ -277,20 +313,52 @@ class Goodness:
 
 
 def goodness(optimum: Optimum) -> Goodness:
+    """Return every test of an optimum's residuals, physical warnings, and what explains both."""
+    found = _tested(optimum)
+    if optimum.method != "scipy" or (optimum.success and not found.objections):
+        return found  # another solver may have had constraints, which no trial would keep
+    sign = sign_convention(optimum)
+    if sign:
+        return replace(found, sign=sign, warnings=(*found.warnings, sign))
+    return _without_suspicious(optimum, found)
+
+
+def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
+    """Return `found` with what is left of its objections without the suspicious rows."""
+    rows = [point.row for point in found.suspicious]
+    other = set_aside(optimum, rows) if rows and found.objections else None
+    rest = None if other is None else _tested(other)
+    if rest is None or rest.objections or rest.untested or not rest.judged:
+        return found
+    where = neighbourhood(optimum, rows)
+    if where:
+        return replace(found, neighbours=where)
+    numbers = _joined([str(row) for row in rows], 10, ", ")
+    them, named = "them", f"{len(rows)} of {optimum.problem.data.n} rows ({numbers}) alone speak"
+    if len(rows) == 1:
+        them, named = "it", f"Row {numbers} alone speaks"
+    left = rest.described[0].lower() + rest.described[1:].rstrip(".")
+    return replace(
+        found,
+        apart=f"{named} against the model ({percent(found.rms_misfit)} rms misfit): without "
+        f"{them} {left}. The fit counts every row: look at {them}, and fit again with a robust "
+        'loss, which bears such rows (loss="huber").',
+    )
+
+
+def _tested(optimum: Optimum) -> Goodness:
     """Return every test of an optimum's residuals, and physical warnings."""
     space, problem = ResidualSpace(optimum), optimum.problem
-    response, harmonic = problem.data.response, problem.data.harmonic
-    fundamental = (harmonic == harmonic.min()) & (response != 0.0)
-    misfit = 1.0 - problem.predict(optimum.theta)[fundamental] / response[fundamental]
+    chi_square = _chi_square(optimum, space)
     return Goodness(
-        float(np.sqrt(np.mean(np.abs(misfit) ** 2))),
-        _chi_square(optimum, space),
+        rms_misfit(problem, optimum.theta),
+        chi_square,
         _noise_share(optimum),
         optimum.dof,
         stiffening(optimum),
         tuple(trends(optimum, space)),
         tuple(runs(optimum, space)),
-        _exponent(optimum, space),
+        _exponent(optimum, space, chi_square),
         _third_harmonic(optimum, space),
         _scatter(optimum),
         suspicious_points(optimum, space),
@@ -338,7 +406,9 @@ def _scatter(optimum: Optimum) -> Scatter | None:
     return Scatter(float(np.sqrt(y @ y / optimum.dof)))
 
 
-def _exponent(optimum: Optimum, space: ResidualSpace) -> Exponent | None:
+def _exponent(
+    optimum: Optimum, space: ResidualSpace, chi_square: ChiSquare | None
+) -> Exponent | None:
     """Return the score of the one Dahl element's fixed exponent."""
     problem = optimum.problem
     elements = [e for e in problem.model.elements if isinstance(e, Dahl)]
@@ -352,7 +422,10 @@ def _exponent(optimum: Optimum, space: ResidualSpace) -> Exponent | None:
     if not error < 1.0 or np.isnan(p):  # so wide an error says nothing of the exponent
         return None
     wanted = alpha.value * float(np.exp(slope))
-    return Exponent(alpha.name, alpha.value, wanted, wanted * error, p)
+    widened = 1.0
+    if chi_square is not None and chi_square.p_value < _FALSE_ALARM:
+        widened = (chi_square.value / chi_square.dof) ** 0.5
+    return Exponent(alpha.name, alpha.value, wanted, wanted * error * widened, p, widened)
 
 
 def _by_alpha(optimum: Optimum, name: str) -> ComplexArray:

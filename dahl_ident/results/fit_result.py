@@ -190,8 +190,8 @@ class FitResult(FitNumbers):
         return bool(
             self.success
             and self.nfree > 0
-            and self.identifiability.complete
             and self.goodness.acceptable
+            and self.identifiability.complete
         )
 
     @property

@@ -42,6 +42,10 @@ def statements(fit: FitResult) -> tuple[str, ...]:
 
 def _objections(fit: FitResult) -> Iterator[str]:
     """Yield what speaks against a fit, a sentence or more each."""
+    if fit.goodness.cause:
+        yield from fit.goodness.statements
+    if fit.goodness.sign:
+        return  # what the numbers leave undetermined says nothing of the mechanism
     known = fit.identifiability
     can_tell = fit.scale_known or fit.nfree > 0
     if can_tell and not known.complete:
@@ -58,7 +62,7 @@ def _objections(fit: FitResult) -> Iterator[str]:
         )
     if can_tell and not known.complete:
         yield from known.reasons
-    if not fit.goodness.acceptable:
+    if not fit.goodness.acceptable and not fit.goodness.cause:
         yield from fit.goodness.statements
 
 
