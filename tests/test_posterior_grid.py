@@ -235,7 +235,9 @@ def test_a_bolted_ridge_keeps_its_time() -> None:
 
 def test_what_contradicts_itself_is_told_before_it_is_refined() -> None:
     # sigma alone shows; beside a free spring friction may as well be none, at either end
-    grid = di.posterior_grid(di.load_dataset("microslip"), di.Dahl() + di.Spring())
+    data = di.load_dataset("microslip")
+    assert isinstance(data, di.FrequencyResponse)
+    grid = di.posterior_grid(data, di.Dahl() + di.Spring())
     assert grid.message.startswith("NOT CONVERGED: error")
     assert grid.error > 0.1
     assert grid.evaluations < 200_000  # 675,000 with every lattice refined

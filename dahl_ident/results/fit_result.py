@@ -63,7 +63,8 @@ class FitResult(FitNumbers):
     chisqr, redchi : float
         Sum of squared residuals, and the same over `nfree`.
     aic, bic : float
-        From the likelihood; an estimated noise scale counts as a parameter.
+        From the likelihood, with a robust loss from that which it stands for; an estimated noise
+        scale counts as a parameter.
     ndata, nvarys, nfree, nfev : int
         Real numbers measured (two a row), free parameters, degrees of freedom, evaluations.
     scale, scale_known : float, bool
