@@ -43,7 +43,7 @@ from dahl_ident.fitting import Optimum, Status, solve
 F_MAX, SIGMA = 0.1, 30.0
 X_C = F_MAX / SIGMA
 SEED = 2006
-DATA_SETS, BOOTSTRAPPED, REPLICATES = 5000, 300, 999
+DATA_SETS, BOOTSTRAPPED, REPLICATES = 2000, 200, 999
 SMALL = (60, 12, 399)
 METHODS = ("wald", "profile", "bootstrap")
 VERDICTS_RIGHT = 0.99
