@@ -10,6 +10,7 @@ import pytest
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit, load_dataset
 from dahl_ident.diagnostics.causes import TURNS, Turn, neighbourhood
 from dahl_ident.elements import Element
+from dahl_ident.errors import FitError
 from tests.friction_tables import FRICTION, plant_table, table
 
 MODEL = Dahl() + Mass(0.3) + Damper() + Spring()
@@ -26,6 +27,12 @@ def noisy() -> FrequencyResponse:
     data = load_dataset("noisy")
     assert isinstance(data, FrequencyResponse)
     return data
+
+
+def test_a_sign_is_named_where_there_is_no_finite_optimum() -> None:
+    data = CONJUGATED(noisy())
+    with pytest.raises(FitError, match=r"^With the response conjugated .* No finite optimum"):
+        fit(data, Dahl())
 
 
 class TestRows:

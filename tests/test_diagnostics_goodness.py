@@ -269,6 +269,10 @@ class TestPhysics:
         assert text.startswith("stiffness is negative, -")
         assert "zero is within" not in text
 
+    def test_a_negative_mass_that_was_given_has_no_error(self) -> None:
+        result = fit(table(), Dahl() + Mass(-1e-6))
+        assert result.goodness.warnings == ("mass is negative, as given: -1e-06 kg",)
+
     def test_a_friction_force_beyond_slip(self) -> None:
         data = table(beta=(10.0, 100.0))
         R = data.response.copy()

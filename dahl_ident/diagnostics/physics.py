@@ -54,7 +54,9 @@ def negative_parameters(optimum: Optimum) -> Iterator[str]:
         if value < 0.0 and np.isfinite(value):
             unit = shown_unit(parameter.unit, problem.data.motion)
             within = " (zero is within two standard errors)" if -value < 2.0 * error else ""
-            yield f"{parameter.name} is negative, {with_unit(value, error or None, unit)}{within}"
+            given = parameter.name not in optimum.names
+            told = f"as given: {value:g} {unit}" if given else with_unit(value, error or None, unit)
+            yield f"{parameter.name} is negative, {told}{within}"
 
 
 def _beyond_friction_limit(optimum: Optimum) -> Iterator[str]:

@@ -121,7 +121,8 @@ def fit(
         optimum = solve(problem, loss=loss, start=start)
     result = FitResult(optimum, first_order=bool(beyond))
     if throw and not result.success:
-        raise FitError(result.message, result)
+        cause = result.goodness.cause
+        raise FitError(f"{cause} {result.message}" if cause else result.message, result)
     return result
 
 
