@@ -172,6 +172,23 @@ class TestVerdicts:
         found = identifiability(fit(turned(data), Dahl() + Spring(), throw=False))
         assert [c.unit for c in found.combinations] == ["N m/rad^2", "N m/rad"]
 
+    @pytest.mark.parametrize("seed", [0, 6, 9, 10])
+    def test_friction_that_does_not_show_leaves_the_stiffness_seen(self, seed: int) -> None:
+        """Where friction may as well be none, sigma and its sum with the spring have no end."""
+        data = table(model=FRICTION + Spring(30.0), beta=(1e-3, 1e-2), seed=seed)
+        found = identifiability(fit(data, Dahl() + Spring(), throw=False))
+        (seen,) = found.combinations
+        assert seen.expression == "the stiffness seen at 1.05e-05 m"
+        assert (
+            found.headline
+            == f"Only {seen.expression} is determined; not f_max, sigma and stiffness."
+        )
+        middle = np.sqrt(1e-3 * 1e-2) * X_C
+        truth = FRICTION.describing_function(middle).real + 30.0
+        assert seen.value == pytest.approx(truth, abs=3.0 * seen.stderr)
+        assert seen.stderr == pytest.approx(0.01 * truth / np.sqrt(30.0), rel=0.3)  # a mean's
+        assert seen.unit == "N/m"
+
 
 class TestTheory:
     """The table of what data can determine: Cramer-Rao bounds, reached by our Fisher matrix."""

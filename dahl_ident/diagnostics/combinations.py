@@ -7,6 +7,7 @@ alpha sigma^2/f_max                       microslip beside a free spring: the lo
 sigma + stiffness                         the same: the stiffness seen at small amplitudes
 f_max/sigma = x_c                         an unknown force gain
 sums of f_max or sigma of two elements    all slipping, or none
+stiffness seen, of friction and springs   springs that hide all of friction
 ========================================  =====================================================
 """
 
@@ -19,6 +20,8 @@ from itertools import combinations
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.bands import friction_and_slopes
+from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.elements import Dahl, Parameter, Spring
 from dahl_ident.fitting import Optimum
 from dahl_ident.units import shown_unit
@@ -58,6 +61,31 @@ def candidates(optimum: Optimum) -> list[Candidate]:
         pairs += [(a.name, b.name) for a, b in zip(one[:2], other[:2], strict=True) if a and b]
     found += [_sum(optimum, theta, free, pair) for pair in pairs]
     return found
+
+
+def stiffness_seen(optimum: Optimum) -> Candidate | None:
+    """Return the stiffness of friction and free springs together, in the middle of the amplitudes.
+
+    None without friction and a free spring. Data of a stiffness always know it; it is worth
+    telling where they know nothing else.
+    """
+    problem, names = optimum.problem, optimum.names
+    springs = [
+        p.name for e in problem.model.elements if isinstance(e, Spring) for p in e.parameters
+    ]
+    free = frozenset(springs) & frozenset(names)
+    if not free or not any(isinstance(e, Dahl) for e in problem.model.elements):
+        return None
+    A = float(np.exp(np.log(problem.stiffness_data.amplitude).mean()))
+    N, by = friction_and_slopes(optimum, np.array([A]))
+    values = parameter_values(optimum)
+    slopes = dict(zip(names, problem.value_slopes(optimum.theta), strict=True))
+    own = np.array([slopes[name] if name in free else 0.0 for name in names])
+    value = float(N[0].real) + sum(values[name] for name in springs)
+    motion = problem.data.motion
+    where = f"the stiffness seen at {A:.3g} {shown_unit('m', motion)}"
+    direction = (by[0].real + own) / value
+    return Candidate(where, shown_unit("N/m", motion), value, direction, free)
 
 
 def _products(

@@ -24,7 +24,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.advice import advice
-from dahl_ident.diagnostics.combinations import Candidate, candidates
+from dahl_ident.diagnostics.combinations import Candidate, candidates, stiffness_seen
 from dahl_ident.diagnostics.formatting import interval as interval_text
 from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.information import Information, shares
@@ -327,7 +327,21 @@ def _determined(
             found.append(
                 DeterminedCombination(candidate.expression, candidate.unit, candidate.value, size)
             )
+    if not found and loose == frozenset(optimum.names):
+        found += _stiffness_seen(optimum, information, lost)
     return tuple(found)
+
+
+def _stiffness_seen(
+    optimum: Optimum, information: Information, lost: frozenset[str]
+) -> list[DeterminedCombination]:
+    seen = stiffness_seen(optimum)
+    if seen is None or not seen.members <= lost or not np.isfinite(seen.value):
+        return []
+    std = float(information.std(seen.direction))
+    if not std < IDENTIFIED_BELOW:
+        return []
+    return [DeterminedCombination(seen.expression, seen.unit, seen.value, abs(seen.value) * std)]
 
 
 def _run_away(optimum: Optimum) -> frozenset[str]:
