@@ -368,6 +368,18 @@ class TestComparison:
         for name, maker in makers.items():
             assert compare_models(fit(table(model=maker), Dahl())).best.name == name
 
+    def test_a_parameter_at_infinity_does_not_count(self) -> None:
+        """Without loss sigma and the noise are all there is: k = 2, as for a spring alone."""
+        tables = (table(beta=(1e-4, 1e-3), seed=seed) for seed in range(20))
+        results = (fit(data, Dahl(), throw=False) for data in tables)
+        lossless = next(r for r in results if r.status.name == "NO_LOSS")
+        spring = fit(lossless.data, Spring())
+        assert lossless.aic == pytest.approx(spring.aic, abs=1e-4)
+        assert lossless.bic == pytest.approx(spring.bic, abs=1e-4)
+        assert lossless.bic == pytest.approx(
+            -2.0 * spring.log_likelihood + 2.0 * np.log(60.0), abs=1e-4
+        )
+
     def test_criteria_are_those_of_the_fits(self) -> None:
         result = fit(table(), Dahl())
         found = compare_models(result)

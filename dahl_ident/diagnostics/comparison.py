@@ -37,15 +37,20 @@ class ComparedModel:
         What distinguishes it.
     optimum : Optimum
         Its estimate.
-    aic, bic : float
-        The criteria; an estimated noise scale counts as a parameter, and parameters at infinity
-        do not.
     """
 
     name: str
     optimum: Optimum
-    aic: float
-    bic: float
+
+    @property
+    def aic(self) -> float:
+        """Akaike's criterion; parameters at infinity do not count."""
+        return self.optimum.aic
+
+    @property
+    def bic(self) -> float:
+        """Schwarz's criterion; parameters at infinity do not count."""
+        return self.optimum.bic
 
     @property
     def estimates(self) -> str:
@@ -174,12 +179,12 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
             "{'stiff': Dahl() + Spring()}"
         )
     problem = fit.optimum.problem
-    fitted = [_compared("as fitted", fit.optimum)]
+    fitted = [ComparedModel("as fitted", fit.optimum)]
     failed = {}
     for name, model in (_variants(problem.model) if models is None else models).items():
         try:
             other = Problem(problem.data, model, noise=problem.noise, sensors=problem.sensors)
-            fitted.append(_compared(name, solve(other, loss=fit.optimum.loss)))
+            fitted.append(ComparedModel(name, solve(other, loss=fit.optimum.loss)))
         except DahlIdentError as exc:
             failed[name] = str(exc)
     return ModelComparison(tuple(fitted), failed)
@@ -201,12 +206,3 @@ def _variants(model: Model) -> dict[str, Element]:
     if not any(isinstance(e, Spring) for e in model.elements):
         found["spring added"] = model + Spring()
     return found
-
-
-def _compared(name: str, optimum: Optimum) -> ComparedModel:
-    problem = optimum.problem
-    determined = problem.n_residuals + len(problem.priors) - optimum.dof
-    count = determined + (not problem.scale_known)
-    deviance = -2.0 * optimum.log_likelihood
-    aic = deviance + 2.0 * count
-    return ComparedModel(name, optimum, aic, deviance + float(np.log(problem.n_residuals)) * count)

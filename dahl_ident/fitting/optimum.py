@@ -139,6 +139,21 @@ class Optimum:
         return gaussian + 0.5 * float((squares - loss.rho(z) - 2.0 * loss.log_area).sum())
 
     @property
+    def aic(self) -> float:
+        """Akaike's criterion, -2 ln L + 2 k; k counts an unknown scale, nothing at infinity."""
+        return -2.0 * self.log_likelihood + 2.0 * self._counted
+
+    @property
+    def bic(self) -> float:
+        """Schwarz's criterion, -2 ln L + k ln n, of n residuals; k as for `aic`."""
+        return -2.0 * self.log_likelihood + float(np.log(self.problem.n_residuals)) * self._counted
+
+    @property
+    def _counted(self) -> int:
+        determined = self.problem.n_residuals + len(self.problem.priors) - self.dof
+        return determined + (not self.scale_known)
+
+    @property
     def values_covariance(self) -> FloatArray:
         """Covariance of the values, propagated to first order, shape (P, P)."""
         return propagated(self.covariance, self.problem.value_slopes(self.theta))

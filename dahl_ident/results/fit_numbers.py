@@ -195,17 +195,16 @@ class FitNumbers:
 
     @property
     def aic(self) -> float:
-        """Akaike's criterion, -2 ln L + 2 k; k counts an estimated noise scale."""
-        return -2.0 * self.log_likelihood + 2.0 * self._counted_parameters
+        """Akaike's criterion, -2 ln L + 2 k.
+
+        k counts an estimated noise scale, and no parameter whose optimum lies at infinity.
+        """
+        return self._optimum.aic
 
     @property
     def bic(self) -> float:
-        """Schwarz's criterion, -2 ln L + k ln(ndata); k counts an estimated noise scale."""
-        return -2.0 * self.log_likelihood + math.log(self.ndata) * self._counted_parameters
-
-    @property
-    def _counted_parameters(self) -> int:
-        return self.nvarys + (not self.scale_known)
+        """Schwarz's criterion, -2 ln L + k ln(ndata); k as for `aic`."""
+        return self._optimum.bic
 
     @cached_property
     def best_fit(self) -> ComplexArray:

@@ -64,7 +64,7 @@ class FitResult(FitNumbers):
         Sum of squared residuals, and the same over `nfree`.
     aic, bic : float
         From the likelihood, with a robust loss from that which it stands for; an estimated noise
-        scale counts as a parameter.
+        scale counts as a parameter, one at infinity does not.
     ndata, nvarys, nfree, nfev : int
         Real numbers measured (two a row), free parameters, degrees of freedom, evaluations.
     scale, scale_known : float, bool
