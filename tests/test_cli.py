@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
-import time
 import tomllib
 from pathlib import Path
 
@@ -309,27 +307,6 @@ def test_help_loads_nothing_heavy() -> None:
     out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     loaded = set(out.stdout[out.stdout.rindex("loaded") :].split())
     assert not loaded & {"numpy", "scipy", "matplotlib", "pandas", "casadi", "emcee", "pint"}
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
-def test_an_interrupt_leaves_the_old_file_whole(tmp_path: Path) -> None:
-    target = tmp_path / "long.csv"
-    target.write_text("as it was", encoding="utf-8")
-    levels = "1e-3:1e-1:400"
-    command = [
-        str(PROGRAM), "simulate", "--f-max", "0.1", "--sigma", "30", "--mass", "0.3", "--damping",
-        "0.2", "--stiffness", "0.3", "--record", "--controlled", "force", "--levels", levels,
-        "--settling-periods", "400", "-o", str(target), "--overwrite",
-    ]  # fmt: skip
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    time.sleep(3.0)
-    assert process.poll() is None, process.communicate()
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert "Traceback" not in err
-    assert target.read_text(encoding="utf-8") == "as it was"
-    assert [p.name for p in tmp_path.iterdir()] == ["long.csv"]
 
 
 def test_a_saved_fit_is_reported_with_its_posterior(run: Runner) -> None:
