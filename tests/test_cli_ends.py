@@ -26,7 +26,7 @@ POSIX = pytest.mark.skipif(sys.platform == "win32", reason="signals and pipes ar
     [
         (("fit",), ("Missing argument", "files"), "fit"),
         (("fit", "x.csv", "--nosuch"), ("--nosuch",), "fit"),
-        (("fit", "x.csv", "--frequency-hz", "a", "2"), ("--frequency-hz", "number", "'a'"), "fit"),
+        (("fit", "x.csv", "--frequency-hz", "a", "2"), ("--frequency-hz", "'a'"), "fit"),
         (("fit", "x.csv", "--frequency-hz", "1"), ("--frequency-hz", "2 arguments"), "fit"),
         (("--no-color", "sample", "x.csv", "--steps"), ("--steps", "argument"), "sample"),
         (("sample", "x.csv", "--steps", "1.5"), ("--steps", "integer", "'1.5'"), "sample"),
@@ -40,7 +40,7 @@ def test_wrong_use_is_two_plain_lines(
     assert (outcome.status, outcome.out) == (2, "")
     message, hint = outcome.err.splitlines()
     assert message.startswith("error: ")
-    assert [part for part in found if part not in message] == []
+    assert [part for part in found if part.lower() not in message.lower()] == []
     assert hint == " ".join(["See dahl-ident", *([command] if command else []), "--help"])
     assert outcome.err.isascii()
 

@@ -80,5 +80,6 @@ def progress_bar() -> Any:
     from rich.console import Console
     from rich.progress import Progress
 
-    console = Console(stderr=True)
-    return Progress(console=console, transient=True, disable=not sys.stderr.isatty())
+    terminal = sys.stderr.isatty()
+    console = Console(stderr=True, quiet=not terminal)  # some releases end with a line even so
+    return Progress(console=console, transient=True, disable=not terminal)
