@@ -11,7 +11,7 @@ from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit, load_
 from dahl_ident.diagnostics.causes import TURNS, Turn, neighbourhood
 from dahl_ident.elements import Element
 from dahl_ident.errors import FitError
-from tests.friction_tables import FRICTION, plant_table, table
+from tests.friction_tables import FRICTION, X_C, plant_table, relative_noise, table
 
 MODEL = Dahl() + Mass(0.3) + Damper() + Spring()
 CONJUGATED, NEGATED, BOTH = TURNS
@@ -141,3 +141,25 @@ def test_the_error_of_an_exponent_asked_for_follows_the_scatter() -> None:
     assert claimed.stderr == pytest.approx(honest.stderr, rel=0.4)
     assert claimed.widened == pytest.approx(3.0, rel=0.4)
     assert "(error widened " in str(claimed)
+
+
+class TestNoCause:
+    def test_a_missing_mass_is_no_wrong_sign(self) -> None:
+        """Far above resonance the response has the sign of the mass, and its loss that of all."""
+        A = np.geomspace(0.1, 10.0, 30) * X_C
+        Z = (FRICTION + Mass(1.0)).dynamic_stiffness(A, 4.0 * np.pi) * relative_noise(30, 0.01, 1)
+        found = fit(FrequencyResponse(np.full(30, 2.0), Z, A), Dahl(), throw=False).goodness
+        assert found.objections
+        assert found.cause == ""
+
+    def test_a_missing_mass_is_no_single_bad_row(self) -> None:
+        A, f = np.tile(np.geomspace(0.1, 10.0, 5) * X_C, 2), np.repeat([1.0, 4.0], 5)
+        Z = (FRICTION + Mass(0.01)).dynamic_stiffness(A, 2.0 * np.pi * f)
+        found = fit(FrequencyResponse(f, Z * relative_noise(10, 0.01, 0), A), Dahl())
+        assert found.goodness.suspicious
+        assert found.goodness.cause == ""
+
+    def test_the_last_row_may_be_where_the_model_ends(self) -> None:
+        found = fit(scaled(table(), [29], [1.5]), Dahl())
+        assert [point.row for point in found.goodness.suspicious] == [29]
+        assert found.goodness.cause == ""

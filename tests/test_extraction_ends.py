@@ -78,3 +78,22 @@ def test_levels_of_a_plant_end_where_they_were_held() -> None:
     assert late.max() < 1.5
     (loudest,) = np.flatnonzero((windows[loud, 0] == 2.0) & (frequency == 5.0))
     assert early[loudest] < 0.0
+
+
+@pytest.mark.parametrize("size", [0.001, 0.003, 0.01])
+def test_a_slow_drift_is_no_ramp(size: float) -> None:
+    time = np.arange(int(100.0 * RATE)) / RATE
+    drifting = 1.0 + size * np.exp(-time / 20.0)
+    noise = 1e-4 * np.random.default_rng(2).standard_normal((2, time.size))
+    data = spring(drifting, np.zeros(time.size), noise)
+    assert data.quality["end_time"][0] - data.quality["start_time"][0] > 90.0
+
+
+@pytest.mark.parametrize("size", [0.25, 0.5])
+def test_a_phase_that_settles_is_no_wrong_frequency(size: float) -> None:
+    time = np.arange(int(100.0 * RATE)) / RATE
+    x = np.cos(2.0 * np.pi * time + size * np.exp(-time / 30.0))
+    noise = 1e-4 * np.random.default_rng(3).standard_normal((2, time.size))
+    record = Record(time, displacement=x + noise[0], force=3.0 * x + noise[1])
+    data = extract(record, frequency=1.0, harmonics=(1,))
+    assert data.response[0] == pytest.approx(3.0, abs=1e-3)

@@ -283,7 +283,7 @@ class TestBootstrap:
         assert 0.5 * (lower + upper) == pytest.approx(optimum.values[2], rel=1e-12)
         t = np.abs(drawn.studentised[~drawn.gone[:, 2], 2])
         assert np.mean(t < 0.5 * (upper - lower) / error) == pytest.approx(0.6827, abs=0.006)
-        assert "symmetric at 68.27 %, since so many replicates end at a limit" in found.note
+        assert "symmetric, since replicates end at a limit of the model" in found.note
         regular = bootstrap_intervals(fit(table(n=8), Dahl()).optimum, [0.6827], 199)
         assert "symmetric" not in regular.note
 

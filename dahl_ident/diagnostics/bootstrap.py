@@ -14,11 +14,11 @@ Replicates whose optimum lies at infinity have no t*. Where more of them run awa
 leaves outside, the distribution of t* says nothing, and the interval is open on both sides; the
 profile knows more there.
 
-Where another parameter runs away in so many replicates, the estimate lies at or near a limit of
-the model, and which tail of t* is long depends on which side of it the truth lies: a bootstrap from
-the estimate cannot know (Andrews, Econometrica 68 (2000) 399-405). The size of t* depends on it
-much less, and the interval is theta_hat -+ C stderr, C from the distribution of |t*| (Hall, Journal
-of the Royal Statistical Society B 50 (1988) 35-45).
+Where any parameter runs away in more than a hundredth of the replicates, the estimate lies at or
+near a limit of the model, and which tail of t* is long depends on which side of it the truth lies:
+a bootstrap from the estimate cannot know (Andrews, Econometrica 68 (2000) 399-405). The size of t*
+depends on it much less, and the interval is theta_hat -+ C stderr, C from the distribution of |t*|
+(Hall, Journal of the Royal Statistical Society B 50 (1988) 35-45).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, intervals_from_search
-from dahl_ident.diagnostics.levels import LEVELS, checked_levels, percent
+from dahl_ident.diagnostics.levels import LEVELS, checked_levels
 from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.fitting import Optimum, solve_many
 from dahl_ident.fitting.status import Status
@@ -39,6 +39,7 @@ from dahl_ident.problem import ProblemBatch
 
 REPLICATES = 4999
 _FEWEST = 99
+_AT_LIMIT = 0.01  # of the replicates, from which on the tails are not told apart
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ def bootstrap_intervals(
     array = checked_levels(levels)
     drawn = replicate(optimum, replicates, seed)
     tail = 0.5 * (1.0 - array)
-    symmetric = drawn.gone.any(axis=1).mean() > tail
+    symmetric = bool(drawn.gone.any(axis=1).mean() > _AT_LIMIT)
     error = np.sqrt(np.diagonal(optimum.covariance))
     lower, upper = (
         np.full((len(array), len(error)), -np.inf),
@@ -122,13 +123,12 @@ def bootstrap_intervals(
         t = drawn.studentised[~drawn.gone[:, i], i]
         known = drawn.gone[:, i].mean() <= tail
         if known.any():
-            ends = np.quantile(t, [tail[known], 1.0 - tail[known]])
             size = np.quantile(np.abs(t), array[known])
-            ends = np.where(symmetric[known], [-size, size], ends)
+            tails = np.quantile(t, [tail[known], 1.0 - tail[known]])
+            ends = np.array([-size, size]) if symmetric else tails
             upper[known, i], lower[known, i] = optimum.theta[i] - ends * error[i]
     result = intervals_from_search(optimum, "bootstrap", array, lower, upper)
     note = f"studentised, {len(drawn.studentised)} replicates, seed {seed}"
-    if symmetric.any():
-        at = ", ".join(percent(level) for level in array[symmetric])
-        note += f"; symmetric at {at}, since so many replicates end at a limit of the model"
+    if symmetric:
+        note += "; symmetric, since replicates end at a limit of the model"
     return result.noted(note)

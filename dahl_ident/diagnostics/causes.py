@@ -6,7 +6,7 @@ itself is left as it is: nothing is corrected, nothing dropped.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import comb
 
@@ -20,9 +20,10 @@ from dahl_ident.fitting import Optimum, Status, solve
 from dahl_ident.fitting.start import starts
 from dahl_ident.problem import Problem
 
-_EXPLAINS = 3.0  # times lower misfit
+EXPLAINS = 3.0  # times lower misfit
 _PROMISING = 1.5  # the same, at the start of a search
 _BY_CHANCE = 0.01
+_RANGE = 5  # values, of which the first and the last are ends
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,12 @@ def rms_misfit(problem: Problem, theta: FloatArray) -> float:
     return float(np.sqrt(np.mean(misfit**2)))
 
 
-def sign_convention(optimum: Optimum) -> str:
-    """Return which sign of the response explains data that the fit does not; "" where none."""
+def sign_convention(optimum: Optimum, described: Callable[[Optimum], bool]) -> str:
+    """Return which sign of the response explains data that the fit does not; "" where none.
+
+    `described` says whether a fit's residuals look like noise: a missing mass or spring is met
+    better with a turned sign as well, but not to the noise.
+    """
     before = rms_misfit(optimum.problem, optimum.theta)
     middle = float(np.median(_misfit(optimum.problem, optimum.theta)))
     found = []
@@ -81,8 +86,9 @@ def sign_convention(optimum: Optimum) -> str:
     if not found:
         return ""
     _, turn, problem = min(found, key=lambda each: each[0])
-    after = rms_misfit(problem, solve(problem, loss=optimum.loss).theta)
-    if not after * _EXPLAINS < before:
+    turned = solve(problem, loss=optimum.loss)
+    after = rms_misfit(problem, turned.theta)
+    if not after * EXPLAINS < before or not described(turned):
         return ""
     return (
         f"With the response {turn.name} the misfit falls from {percent(before)} to "
@@ -115,6 +121,14 @@ def neighbourhood(optimum: Optimum, rows: Sequence[int]) -> str:
         if min(within, 2 * comb(beyond, k)) < _BY_CHANCE * comb(n, k):
             return f"{name} from {low:.3g} to {high:.3g} {unit}"
     return ""
+
+
+def at_an_end(optimum: Optimum, rows: Sequence[int]) -> bool:
+    """Return whether a single row is the first or last of a covariate: the model may fail there."""
+    if len(rows) != 1:
+        return False
+    ranges = (values for _, values, _ in covariates(optimum) if np.unique(values).size >= _RANGE)
+    return any(values[rows[0]] in (values.min(), values.max()) for values in ranges)
 
 
 def percent(share: float) -> str:

@@ -73,8 +73,11 @@ def stiffness_seen(optimum: Optimum) -> Candidate | None:
     springs = [
         p.name for e in problem.model.elements if isinstance(e, Spring) for p in e.parameters
     ]
+    friction = [
+        p.name for e in problem.model.elements if isinstance(e, Dahl) for p in e.parameters[:2]
+    ]
     free = frozenset(springs) & frozenset(names)
-    if not free or not any(isinstance(e, Dahl) for e in problem.model.elements):
+    if not free or not friction:
         return None
     A = float(np.exp(np.log(problem.stiffness_data.amplitude).mean()))
     N, by = friction_and_slopes(optimum, np.array([A]))
@@ -85,7 +88,8 @@ def stiffness_seen(optimum: Optimum) -> Candidate | None:
     motion = problem.data.motion
     where = f"the stiffness seen at {A:.3g} {shown_unit('m', motion)}"
     direction = (by[0].real + own) / value
-    return Candidate(where, shown_unit("N/m", motion), value, direction, free)
+    members = free | (frozenset(friction) & frozenset(names))
+    return Candidate(where, shown_unit("N/m", motion), value, direction, members)
 
 
 def _products(

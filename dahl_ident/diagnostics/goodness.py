@@ -24,6 +24,8 @@ from scipy import special
 
 from dahl_ident.arrays import ComplexArray
 from dahl_ident.diagnostics.causes import (
+    EXPLAINS,
+    at_an_end,
     neighbourhood,
     percent,
     rms_misfit,
@@ -317,7 +319,7 @@ def goodness(optimum: Optimum) -> Goodness:
     found = _tested(optimum)
     if optimum.method != "scipy" or (optimum.success and not found.objections):
         return found  # another solver may have had constraints, which no trial would keep
-    sign = sign_convention(optimum)
+    sign = sign_convention(optimum, lambda turned: not _tested(turned).objections)
     if sign:
         return replace(found, sign=sign, warnings=(*found.warnings, sign))
     return _without_suspicious(optimum, found)
@@ -328,7 +330,9 @@ def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
     rows = [point.row for point in found.suspicious]
     other = set_aside(optimum, rows) if rows and found.objections else None
     rest = None if other is None else _tested(other)
-    if rest is None or rest.objections or rest.untested or not rest.judged:
+    if rest is None or rest.objections or rest.hints or rest.untested or not rest.judged:
+        return found
+    if not rest.rms_misfit * EXPLAINS < found.rms_misfit or at_an_end(optimum, rows):
         return found
     where = neighbourhood(optimum, rows)
     if where:

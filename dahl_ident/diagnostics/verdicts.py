@@ -327,21 +327,19 @@ def _determined(
             found.append(
                 DeterminedCombination(candidate.expression, candidate.unit, candidate.value, size)
             )
-    if not found and loose == frozenset(optimum.names):
-        found += _stiffness_seen(optimum, information, lost)
-    return tuple(found)
+    return tuple(found) if found else _stiffness_seen(optimum, information, loose)
 
 
 def _stiffness_seen(
-    optimum: Optimum, information: Information, lost: frozenset[str]
-) -> list[DeterminedCombination]:
+    optimum: Optimum, information: Information, loose: frozenset[str]
+) -> tuple[DeterminedCombination, ...]:
     seen = stiffness_seen(optimum)
-    if seen is None or not seen.members <= lost or not np.isfinite(seen.value):
-        return []
+    if seen is None or not seen.members <= loose or not np.isfinite(seen.value):
+        return ()
     std = float(information.std(seen.direction))
     if not std < IDENTIFIED_BELOW:
-        return []
-    return [DeterminedCombination(seen.expression, seen.unit, seen.value, abs(seen.value) * std)]
+        return ()
+    return (DeterminedCombination(seen.expression, seen.unit, seen.value, abs(seen.value) * std),)
 
 
 def _run_away(optimum: Optimum) -> frozenset[str]:

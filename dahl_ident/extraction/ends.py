@@ -32,6 +32,7 @@ _OF_THOSE = 5  # ... and a fifth of all at most
 _SOLVABLE = 1e8  # condition of normal equations
 _STRAYING = 0.005  # of the amplitude, that a further cycle may stray from the sine
 _MOST_CYCLES_MORE = 2  # on either side
+_MOST_CYCLES_LESS = 3  # on either side; where more stray, the motion is no ramp but changes slowly
 
 
 def steady_part(
@@ -54,11 +55,14 @@ def steady_part(
         Where the room ends there may be a partial cycle.
     """
     edges = cycle_edges(stretch)
-    start, stop, count = part.start, part.stop, edges.size - 1
+    start, stop = part.start, part.stop
+    count, fewer = edges.size - 1, np.zeros(2, dtype=np.intp)
     while True:
         inside = _inside(stretch, edges)
         if inside is None or 2 * edges.size <= count:
             break
+        if fewer.max() > _MOST_CYCLES_LESS:
+            return _extended(time, motion, stretch, part, room, None)
         second, last = np.searchsorted(time, edges[[1, -2]]).tolist()
         early = inside.strays(time[start:second], motion[start:second])
         late = inside.strays(time[last:stop], motion[last:stop])
@@ -66,6 +70,7 @@ def steady_part(
             break
         start, stop = (second if early else start), (last if late else stop)
         edges = edges[int(early) : edges.size - int(late)]
+        fewer += [early, late]
     if inside is not None:  # enough are left: the cycle beside a stray departs as well, if less
         start = int(np.searchsorted(time, edges[1])) if start > part.start else start
         stop = int(np.searchsorted(time, edges[-2])) if stop < part.stop else stop

@@ -7,10 +7,11 @@ Each segment then gets its frequency, and the cycles beside it that the same sin
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ExtractionError
@@ -33,6 +34,7 @@ _QUIET_CROSSINGS = 0.01  # noise of a cycle's log amplitude that no crossing suf
 _WELL_COVERED = 0.5  # of a record: where crossings find segments so long, they are right
 _SWEEP_DEGREE = 3  # of the phase in a window
 _DRIFTED = 0.2  # phase over a stretch, rad, that costs 0.2 % of the amplitude, more of harmonics
+_EVENLY = 0.5  # of the turn's sum over both halves, by which they may differ
 _BY_CHANCE = 1e-6  # of stretches without a drift, how many seem to have one
 _PADDED = 16  # lines for each cycle, so that a peak lies near one
 _FEWEST_SAMPLES = 4  # that a cycle's sine and offset leave something of
@@ -132,7 +134,8 @@ def stretch_of(
 def _refuse_drift(stretch: Stretch) -> None:
     """Refuse a given frequency at which the motion's phase drifts from cycle to cycle.
 
-    The phasors of the cycles turn evenly then: their spectrum has its peak beside zero.
+    The phasors of the cycles turn evenly then: their spectrum has its peak beside zero. A phase
+    that settles turns them as well, but less and less.
     """
     few = thinned(stretch)
     cuts = np.searchsorted(few.time, cycle_edges(stretch))
@@ -149,11 +152,13 @@ def _refuse_drift(stretch: Stretch) -> None:
     peak = int(np.argmax(power))
     turns = float(np.fft.fftfreq(power.size)[peak])
     beside = np.angle(found * np.exp(-2j * np.pi * turns * cycle))
+    halves = [float(np.polyfit(*half, 1)[0]) for half in _halves(cycle, beside)]
+    evenly = abs(np.diff(halves)[0]) < _EVENLY * abs(np.sum(halves) + 4.0 * np.pi * turns)
     turns += float(np.polyfit(cycle, beside, 1)[0]) / (2.0 * np.pi)
     drift = 2.0 * np.pi * turns * counts.size
     left = float(np.sum(np.abs(found) ** 2)) - power[peak]
     clear = (power[peak] - power[0]) * dof > 2.0 * highest_by_chance(_BY_CHANCE, dof) * left
-    if clear and abs(drift) > _DRIFTED:
+    if clear and evenly and abs(drift) > _DRIFTED:
         given = stretch.omega / (2.0 * np.pi)
         shown = given * (1.0 + turns)
         raise ExtractionError(
@@ -161,3 +166,10 @@ def _refuse_drift(stretch: Stretch) -> None:
             f"{given:.6g} Hz: its phase drifts by {drift:.3g} rad in {counts.size} cycles; "
             f"expected less than {_DRIFTED:g} rad: give frequency={shown:.6g}, or leave it out"
         )
+
+
+def _halves(cycle: NDArray[np.intp], phase: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield the cycles' numbers and phases of the first and the second half."""
+    middle = cycle.size // 2
+    for half in (slice(None, middle), slice(middle, None)):
+        yield cycle[half].astype(np.float64), phase[half]
