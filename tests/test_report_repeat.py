@@ -20,14 +20,6 @@ A = np.geomspace(3e-4, 3e-2, 12)
 NOISE = 0.01 * np.random.default_rng(3).standard_normal((2, 12))
 
 
-@pytest.fixture
-def run(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> Runner:
-    monkeypatch.chdir(tmp_path)
-    return Runner(capsys, monkeypatch)
-
-
 def table(friction: di.Dahl) -> di.FrequencyResponse:
     response = friction.describing_function(A) * np.exp(NOISE[0] + 1j * NOISE[1])
     return di.FrequencyResponse(np.full(12, 2.0), response, A)
