@@ -8,7 +8,8 @@ BIN    := $(VENV)/bin
 JOBS   ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint types rooms unit test-lowest examples docs bench validation nuts lock clean
+.PHONY: help install demo test lint types rooms unit test-lowest examples docs bench validation fuzz nuts \
+	mutants dist lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -60,11 +61,29 @@ validation: install  ## long statistical checks, written into docs/validation
 	$(BIN)/python -m benchmarks.extraction_validation --write docs/validation/extraction.md
 	$(BIN)/python -m benchmarks.calibration
 	$(BIN)/python -m benchmarks.coverage
+	$(BIN)/python -m benchmarks.campaigns
+	$(BIN)/python -m benchmarks.uncertainty --write docs/validation/uncertainty.md
+	$(BIN)/python -m benchmarks.planning --write docs/validation/planning.md
+
+fuzz: install  ## thousands of damaged files of every format, and the table of what became of them
+	$(BIN)/python -m tests.reader_fuzz
 
 nuts: install  ## an independent sampler on the same posterior, in an environment of its own
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python .venv-nuts
 	$(BIN)/uv pip install --quiet --python .venv-nuts/bin/python --editable ".[nuts,peers]"
 	.venv-nuts/bin/python -m benchmarks.nuts
+
+mutants: install  ## small changes that the tests should notice: which survive (hours)
+	$(BIN)/python -m benchmarks.mutants
+
+# What users would install: built, checked, installed alone, and the demonstration run from it.
+dist: install  ## wheel and source archive in dist/, tried in an empty environment
+	rm -rf dist .venv-dist
+	$(BIN)/uv build --quiet --out-dir dist
+	$(BIN)/uvx --quiet twine check --strict dist/*
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python .venv-dist
+	$(BIN)/uv pip install --quiet --python .venv-dist/bin/python dist/*.whl
+	empty=$$(mktemp -d) && cd $$empty && $(CURDIR)/.venv-dist/bin/dahl-ident demo && rm -rf $$empty
 
 lock: install  ## renew the pinned environment from pyproject.toml
 	$(BIN)/uv pip compile --quiet --no-emit-index-url --no-emit-find-links --upgrade \
@@ -72,4 +91,4 @@ lock: install  ## renew the pinned environment from pyproject.toml
 		--custom-compile-command "make lock" pyproject.toml
 
 clean:  ## remove what the commands above made
-	rm -rf $(VENV) .venv-lowest .venv-nuts build dist docs/_build out .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-lowest .venv-nuts .venv-dist build dist docs/_build out .pytest_cache .mypy_cache .ruff_cache

@@ -15,6 +15,7 @@ TOPICS = (
     "describing_function",
     "general_dahl",
     "hysteresis",
+    "time_domain",
     "steady_state",
     "reading",
     "extraction",

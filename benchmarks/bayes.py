@@ -53,7 +53,7 @@ def ours(data: di.FrequencyResponse, folder: Path, seed: int, steps: int) -> flo
     """Return seconds for one effective draw, checkpoint included."""
     priors: dict[str, Any] = dict(_BOUNDS)
     began = time.perf_counter()
-    posterior = di.sample(
+    posterior = di.posterior(
         data, di.Dahl(), priors=priors, seed=seed, steps=steps, resume=folder / f"{seed}.h5"
     )
     took = time.perf_counter() - began
@@ -112,7 +112,7 @@ def run() -> list[Row]:
     )
     grids = []
     for which, model in problems:
-        work = partial(di.posterior_grid, which, model, priors=priors)
+        work = partial(di.posterior, which, model, priors=priors)
         grids.append(statistics.median(seconds(work) for _ in range(9)))
     name = "lmfit.Minimizer.emcee"
     return [

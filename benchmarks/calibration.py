@@ -24,7 +24,8 @@ from scipy import stats
 
 import dahl_ident as di
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.data.readers.file import library
+from dahl_ident.data.storage import library
+from dahl_ident.problem import Problem
 
 RANKS = 100
 LEVEL = 0.01
@@ -87,7 +88,7 @@ SCENARIOS = {"friction": friction, "plant": plant}
 
 def ranks(scenario: Scenario, tables: int, seed: int = 0) -> tuple[FloatArray, int]:
     """Return the rank of each truth, shape (tables, P), and how many chains did not converge."""
-    shape = di.Problem(scenario.table(None), scenario.model())
+    shape = Problem(scenario.table(None), scenario.model())
     found = np.empty((tables, len(shape.names)))
     failed = 0
     for index in range(tables):
@@ -96,7 +97,7 @@ def ranks(scenario: Scenario, tables: int, seed: int = 0) -> tuple[FloatArray, i
         exact = shape.predict(shape.to_search(truth))
         error = random.normal(size=exact.shape) + 1j * random.normal(size=exact.shape)
         data = scenario.table(exact + scenario.noise * error)
-        posterior = di.sample(
+        posterior = di.posterior(
             data, scenario.model(), priors=scenario.priors, seed=index, ess=1000.0, walkers=64,
             ensembles=2,
         )  # fmt: skip
@@ -155,7 +156,7 @@ def report(results: dict[str, tuple[FloatArray, int]], folder: Path) -> str:
     for name, (found, failed) in results.items():
         scenario = SCENARIOS[name]()
         limit = critical(len(found), found.shape[1])
-        names = di.Problem(scenario.table(None), scenario.model()).names
+        names = Problem(scenario.table(None), scenario.model()).names
         for parameter, column in zip(names, found.T, strict=True):
             value = extremity(column)
             lines.append(

@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Model, Problem, Spring, response
+from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Model, Spring, response
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.bootstrap import bootstrap_intervals
+from dahl_ident.diagnostics.confidence_levels import LEVELS
 from dahl_ident.diagnostics.intervals import profile_intervals, wald_intervals
-from dahl_ident.diagnostics.levels import LEVELS
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.diagnostics.verdicts import (
     IDENTIFIED_BELOW,
@@ -39,6 +39,7 @@ from dahl_ident.diagnostics.verdicts import (
     natural_sizes,
 )
 from dahl_ident.fitting import Optimum, Status, solve
+from dahl_ident.problem import Problem
 
 F_MAX, SIGMA = 0.1, 30.0
 X_C = F_MAX / SIGMA
@@ -329,7 +330,15 @@ def as_markdown(table: Sequence[Row]) -> str:
             f"{row.bound:.2g} | {rmse} | {' | '.join(cells)} | {right} |"
         )
     failures = [f"- {r.scenario}, {r.name}: {text}" for r in table for text in r.failures]
-    lines += ["", "Everything holds." if not failures else "Does not hold:", *failures]
+    ordered = len(table) * (len(METHODS) + 1)
+    left_out = sum(not _covers(row, method) for row in table for method in METHODS)
+    left_out += sum(row.verdict_right is None or not row.clear for row in table)
+    holds = (
+        "Everything ordered holds."
+        if not left_out
+        else (f"Every judged cell holds; {left_out} of {ordered} ordered cells were not judged.")
+    )
+    lines += ["", holds if not failures else "Does not hold:", *failures]
     return "\n".join(lines) + "\n"
 
 

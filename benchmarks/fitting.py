@@ -15,11 +15,11 @@ import numpy as np
 from scipy.optimize import brentq, least_squares
 
 from benchmarks.harness import Row, median_of_pairs, print_table, seconds
-from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Problem, Spring, fit, response
+from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit, response
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element, linear_dahl
 from dahl_ident.fitting import solve, solve_many
-from dahl_ident.problem import ProblemBatch
+from dahl_ident.problem import Problem, ProblemBatch
 
 TITLE = "Least squares"
 

@@ -1,7 +1,7 @@
 """An independent sampler on the same posterior: NUTS of numpyro, the model written anew in JAX.
 
 Needs the extra ``nuts``. ``make nuts`` compares means and standard deviations of ln f_max, ln sigma
-and ln s with those of ``dahl_ident.sample``, in Monte Carlo standard errors, and writes
+and ln s with those of ``dahl_ident.posterior``, in Monte Carlo standard errors, and writes
 docs/validation/nuts.md.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 import dahl_ident as di
 from benchmarks.bayes import table
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data.readers.file import library
+from dahl_ident.data.storage import library
 
 _BOUNDS = {"f_max": (1e-3, 10.0), "sigma": (1.0, 1000.0)}
 _SCALE = (1e-6, 10.0)  # numpyro needs a proper prior; the walls are far from any probability
@@ -61,7 +61,7 @@ def compare(draws: int, ess: float) -> list[tuple[str, float, float, float]]:
     """Return moments: what, ours, theirs, and their difference in Monte Carlo errors."""
     data = table()
     priors: dict[str, Any] = dict(_BOUNDS)
-    posterior = di.sample(data, di.Dahl(), priors=priors, seed=1, ess=ess)
+    posterior = di.posterior(data, di.Dahl(), priors=priors, seed=1, ess=ess)
     ours, (theirs, their_ess) = np.log(posterior.values), nuts(data, draws)
     rows = []
     for i, name in enumerate(posterior.names):
@@ -82,7 +82,7 @@ def main() -> None:
         "sampled by NUTS, on 30 points with 1 % noise of unknown scale. Differences are in Monte",
         "Carlo standard errors of both samplers; beyond 4 the posteriors would not be the same.",
         "",
-        "| | dahl_ident.sample | NUTS | difference |",
+        "| | dahl_ident.posterior | NUTS | difference |",
         "|---|---|---|---|",
     ]
     for what, a, b, apart in compare(draws=4000, ess=10000.0):

@@ -1,7 +1,8 @@
-"""Identify Dahl friction from sine-sweep measurements.
+"""Identify friction from measurements: parameters, their uncertainty, and what is not determined.
 
-``import dahl_ident as di`` gives every public name; each is loaded when first used, so that
-the import itself stays light.
+``import dahl_ident as di`` gives what a user types first; each name is loaded when first used, so
+that the import itself stays light. The rest is in rooms of its own: ``di.control`` (friction in
+control loops), ``di.synthetic`` (data with known truth) and ``di.errors``.
 """
 
 from __future__ import annotations
@@ -9,151 +10,110 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from dahl_ident.version import __version__ as __version__
+
 if TYPE_CHECKING:
-    from dahl_ident.control_interop import (
-        DahlNonlinearity,
-        closed_loop_response,
-        equivalent_plant,
-        level_responses,
-        limit_cycles,
-        loop_margins,
-        response_branches,
-    )
+    import dahl_ident.control_interop as control
+    from dahl_ident import errors, synthetic
+    from dahl_ident.campaigns.population import population
+    from dahl_ident.campaigns.run import campaign
     from dahl_ident.data import FrequencyResponse, Record, read_frequency_response, read_record
-    from dahl_ident.diagnostics import compare_models, identifiability
-    from dahl_ident.elements import Dahl, Damper, LinearSystem, Mass, Model, Spring
-    from dahl_ident.errors import (
-        DahlIdentError,
-        DataError,
-        DataWarning,
-        ExtractionError,
-        FitError,
-        MissingDependencyError,
-        ModelError,
-        MultipleSolutionsWarning,
-        SamplingError,
-        UnitError,
-        ValidationError,
+    from dahl_ident.diagnostics import compare_models
+    from dahl_ident.elements import (
+        Backlash,
+        BoucWen,
+        Dahl,
+        Damper,
+        Element,
+        Friction,
+        Iwan,
+        LinearSystem,
+        LuGre,
+        Mass,
+        MaxwellSlip,
+        Model,
+        Parameter,
+        PowerDamper,
+        Spring,
     )
     from dahl_ident.extraction import extract
-    from dahl_ident.problem import Problem
+    from dahl_ident.planning import plan
     from dahl_ident.reporting import report
-    from dahl_ident.results import (
-        FitBatch,
-        FitResult,
-        Posterior,
-        fit,
-        fit_many,
-        posterior_grid,
-        sample,
-    )
+    from dahl_ident.results import FitResult, RecordFit, fit, fit_many
+    from dahl_ident.results.bayesian_estimate import posterior
     from dahl_ident.sensors import Sensors
     from dahl_ident.steady_state import response
-    from dahl_ident.synthetic import load_dataset, simulate
+    from dahl_ident.synthetic import Experiment, load_dataset, simulate
 
-__version__ = "0.1.0"
 
 _ROOMS = {
-    "dahl_ident.control_interop": (
-        "DahlNonlinearity",
-        "closed_loop_response",
-        "equivalent_plant",
-        "level_responses",
-        "limit_cycles",
-        "loop_margins",
-        "response_branches",
-    ),
-    "dahl_ident.data": (
-        "FrequencyResponse",
-        "Record",
-        "read_frequency_response",
-        "read_record",
-    ),
-    "dahl_ident.diagnostics": ("compare_models", "identifiability"),
-    "dahl_ident.elements": ("Dahl", "Damper", "LinearSystem", "Mass", "Model", "Spring"),
-    "dahl_ident.errors": (
-        "DahlIdentError",
-        "DataError",
-        "DataWarning",
-        "ExtractionError",
-        "FitError",
-        "MissingDependencyError",
-        "ModelError",
-        "MultipleSolutionsWarning",
-        "SamplingError",
-        "UnitError",
-        "ValidationError",
-    ),
-    "dahl_ident.extraction": ("extract",),
-    "dahl_ident.problem": ("Problem",),
-    "dahl_ident.reporting": ("report",),
-    "dahl_ident.results": (
-        "FitBatch",
-        "FitResult",
-        "Posterior",
-        "fit",
-        "fit_many",
-        "posterior_grid",
-        "sample",
-    ),
-    "dahl_ident.sensors": ("Sensors",),
-    "dahl_ident.steady_state": ("response",),
-    "dahl_ident.synthetic": ("load_dataset", "simulate"),
+    "campaigns.population": "population",
+    "campaigns.run": "campaign",
+    "data": "FrequencyResponse Record read_frequency_response read_record",
+    "diagnostics": "compare_models",
+    "elements": "Backlash BoucWen Dahl Damper Element Friction Iwan LinearSystem LuGre Mass "
+    "MaxwellSlip Model Parameter PowerDamper Spring",
+    "extraction": "extract",
+    "planning": "plan",
+    "reporting": "report",
+    "results": "FitResult RecordFit fit fit_many posterior",
+    "sensors": "Sensors",
+    "steady_state": "response",
+    "synthetic": "Experiment load_dataset simulate",
 }
-_HOME = {name: room for room, names in _ROOMS.items() for name in names}
+_HOME = {name: room for room, names in _ROOMS.items() for name in names.split()}
+_MODULES = {"control": "control_interop", "errors": "errors", "synthetic": "synthetic"}
 
 __all__ = [
+    "Backlash",
+    "BoucWen",
     "Dahl",
-    "DahlIdentError",
-    "DahlNonlinearity",
     "Damper",
-    "DataError",
-    "DataWarning",
-    "ExtractionError",
-    "FitBatch",
-    "FitError",
+    "Element",
+    "Experiment",
     "FitResult",
     "FrequencyResponse",
+    "Friction",
+    "Iwan",
     "LinearSystem",
+    "LuGre",
     "Mass",
-    "MissingDependencyError",
+    "MaxwellSlip",
     "Model",
-    "ModelError",
-    "MultipleSolutionsWarning",
-    "Posterior",
-    "Problem",
+    "Parameter",
+    "PowerDamper",
     "Record",
-    "SamplingError",
+    "RecordFit",
     "Sensors",
     "Spring",
-    "UnitError",
-    "ValidationError",
-    "closed_loop_response",
+    "campaign",
     "compare_models",
-    "equivalent_plant",
+    "control",
+    "errors",
     "extract",
     "fit",
     "fit_many",
-    "identifiability",
-    "level_responses",
-    "limit_cycles",
     "load_dataset",
-    "loop_margins",
-    "posterior_grid",
+    "plan",
+    "population",
+    "posterior",
     "read_frequency_response",
     "read_record",
     "report",
     "response",
-    "response_branches",
-    "sample",
     "simulate",
+    "synthetic",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    value: Any
+    if name in _MODULES:
+        value = importlib.import_module(f"dahl_ident.{_MODULES[name]}")
+    elif name in _HOME:
+        value = getattr(importlib.import_module(f"dahl_ident.{_HOME[name]}"), name)
+    else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(_HOME[name]), name)
     globals()[name] = value
     return value
 

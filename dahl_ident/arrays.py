@@ -36,6 +36,8 @@ def real_array(value: ArrayLike, name: str) -> FloatArray:
     ValidationError
         If the values are complex, truth values, text, dates or ragged.
     """
+    if np.ma.is_masked(value):
+        raise ValidationError(f"{name}: some values are masked; leave these rows out")
     try:
         array = np.asarray(value)
     except ValueError as exc:

@@ -31,7 +31,7 @@ class DahlIdentError(Exception):
     >>> import dahl_ident as di
     >>> try:
     ...     di.fit(di.load_dataset("microslip"), di.Dahl() + di.Spring())
-    ... except di.DahlIdentError as error:
+    ... except di.errors.DahlIdentError as error:
     ...     print(type(error).__name__)
     FitError
     """
@@ -105,7 +105,7 @@ class DataWarning(UserWarning):
     ...     "frequency_hz,amplitude [um],gain [N/m],phase_deg\n1,5,30,0.5\n1,50,29,1.2\n"
     ... )
     >>> with warnings.catch_warnings():
-    ...     warnings.simplefilter("error", di.DataWarning)
+    ...     warnings.simplefilter("error", di.errors.DataWarning)
     ...     di.read_frequency_response(table)
     Traceback (most recent call last):
     ...
@@ -124,7 +124,7 @@ class ExtractionError(DahlIdentError, ValueError):
     >>> di.extract(di.Record(time, displacement=rest, force=rest))
     Traceback (most recent call last):
     ...
-    dahl_ident.errors.ExtractionError: no stretch of constant amplitude and frequency ...
+    dahl_ident.errors.ExtractionError: no segment of constant amplitude and frequency ...
     """
 
 
@@ -143,7 +143,7 @@ class FitError(DahlIdentError, RuntimeError):
     >>> import dahl_ident as di
     >>> try:
     ...     di.fit(di.load_dataset("microslip"), di.Dahl() + di.Spring())
-    ... except di.FitError as error:
+    ... except di.errors.FitError as error:
     ...     print(error.result.success)
     False
     """
@@ -160,13 +160,13 @@ class SamplingError(DahlIdentError, RuntimeError):
     ----------
     message : str
         What happened, and what to do.
-    posterior : Posterior, optional
+    posterior : ChainPosterior, optional
         The chain all the same, where there is one.
 
     Examples
     --------
     >>> import dahl_ident as di
-    >>> di.posterior_grid(di.load_dataset("noisy"), di.Dahl(alpha=None) + di.Mass())
+    >>> di.posterior(di.load_dataset("noisy"), di.Dahl(alpha=None) + di.Mass(), method="grid")
     Traceback (most recent call last):
     ...
     dahl_ident.errors.SamplingError: 4 parameters are free ...
@@ -183,7 +183,7 @@ class MissingDependencyError(DahlIdentError, ImportError):
     Examples
     --------
     >>> import dahl_ident as di
-    >>> issubclass(di.MissingDependencyError, ImportError)
+    >>> issubclass(di.errors.MissingDependencyError, ImportError)
     True
     """
 

@@ -24,7 +24,8 @@ a V^-1/(nu + 1). The two agree, as they do for a likelihood, for a = nu - 2: the
 likelihood ratios and stated covariances are right, for rows of different nu as well. (The density
 of Student's t that Jeffreys' prior of V leads to has a = nu + 1, and states variances
 (nu + 1)/(nu - 2) times too small.) V^-1 is estimated without bias by (nu - 2) (W + r r')^-1,
-so that the information of a row is (nu - 2)^2/(nu + 1) J' (W + r r')^-1 J.
+so that the information of a row is (nu - 2)^2/(nu + 1) J' (W + r r')^-1 J. A row of one part, the
+mean force (k = 0), which is real and has no error of its imaginary part, counts nu - 1 for nu - 2.
 
 **Noise in the measured amplitude** (``measured`` only). The true ln A of a row is unknown; its
 measured value has a known error, correlated with that of R because R is a quotient with the
@@ -193,8 +194,16 @@ class Measured(Noise):
 
     @property
     def weights(self) -> FloatArray:
-        """One over the root mean square of the two parts' standard deviations."""
-        return np.sqrt(2.0 / (self.covariance.rr + self.covariance.ii))
+        """One over the root mean square of the parts' standard deviations."""
+        parts = np.where(self.covariance.ii == 0.0, 1.0, 2.0)
+        return np.sqrt(parts / (self.covariance.rr + self.covariance.ii))
+
+    @property
+    def tail(self) -> Student | None:
+        """The loss of rows whose covariance was estimated; None where all are known."""
+        if self.dof is None:
+            return None
+        return Student(self.dof, np.where(self.covariance.ii == 0.0, 1.0, 2.0))
 
     @property
     def rounding(self) -> FloatArray:
@@ -223,7 +232,10 @@ class Covariance(NamedTuple):
 
 
 class Whitening(NamedTuple):
-    """Inverse Cholesky factors [[a, 0], [b, c]], which act on a complex number's two parts."""
+    """Inverse Cholesky factors [[a, 0], [b, c]], which act on a complex number's two parts.
+
+    c is 0 in rows of one part: a real number without an imaginary part to weigh.
+    """
 
     a: FloatArray
     b: FloatArray
@@ -231,12 +243,16 @@ class Whitening(NamedTuple):
 
     @classmethod
     def of(cls, covariance: Covariance) -> Whitening:
-        """Return the whitening of `covariance`; NaN or infinite where it is singular."""
+        """Return the whitening of `covariance`; NaN or infinite where it is singular.
+
+        A covariance of the real part alone whitens that part alone.
+        """
         rr, ri, ii = covariance
+        real = (ri == 0.0) & (ii == 0.0)
         first = np.sqrt(rr)
         lower = ri / first
-        second = np.sqrt(ii - lower**2)
-        return cls(1.0 / first, -lower / first / second, 1.0 / second)
+        second = np.where(real, 1.0, np.sqrt(ii - lower**2))
+        return cls(1.0 / first, -lower / first / second, np.where(real, 0.0, 1.0 / second))
 
     def __call__(self, value: ComplexArray) -> ComplexArray:
         """Return the whitened real and imaginary parts."""
@@ -246,7 +262,8 @@ class Whitening(NamedTuple):
     def inverse(self, whitened: ComplexArray) -> ComplexArray:
         """Return the number of which this is the whitened one."""
         x = whitened.real / self.a
-        return np.asarray(x + 1j * (whitened.imag - self.b * x) / self.c)
+        y = (whitened.imag - self.b * x) / np.where(self.c == 0.0, np.inf, self.c)
+        return np.asarray(x + 1j * y)
 
     def solve(self, value: ComplexArray) -> ComplexArray:
         """Return V^-1 value, that is L'^-1 L^-1 value."""
@@ -315,18 +332,21 @@ def correct_amplitude(
 
 @dataclass(frozen=True)
 class Student:
-    """The loss of rows whose covariance was estimated: rho(z) = (dof - 2) ln(1 + z/dof)."""
+    """The loss of rows whose covariance was estimated: rho(z) = (dof - p) ln(1 + z/dof)."""
 
     dof: FloatArray
+    parts: FloatArray | float = 2.0
+    """p, how many numbers a row has: real and imaginary part, or the real part alone."""
 
     def __call__(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return rho and its first two derivatives."""
-        slope = (self.dof - 2.0) / (self.dof + z)
-        return (self.dof - 2.0) * np.log1p(z / self.dof), slope, -slope / (self.dof + z)
+        size = self.dof - self.parts
+        slope = size / (self.dof + z)
+        return size * np.log1p(z / self.dof), slope, -slope / (self.dof + z)
 
     def information(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return a, b of a row's information a J' J + b (J' y)(J' y)', in whitened residuals."""
-        size = (self.dof - 2.0) ** 2 / ((self.dof + 1.0) * self.dof)
+        size = (self.dof - self.parts) ** 2 / ((self.dof + 1.0) * self.dof)
         return size, -size / (self.dof + z)
 
 
@@ -370,9 +390,9 @@ def noise_for(rows: Rows, kind: str | None) -> Noise:
 def _relative(rows: Rows) -> Relative:
     size = np.abs(rows.response)
     fundamental = None
-    if (rows.harmonic > 1).any():
+    if (rows.harmonic != 1).any():
         fundamental = _fundamental(rows, size)
-        size = np.where(rows.harmonic > 1, fundamental, size)
+        size = np.where(rows.harmonic != 1, fundamental, size)
     if not size.all():
         raise DataError(
             f"response{_first(size == 0.0)} is 0, which has no logarithm; relative noise needs a "
@@ -389,7 +409,7 @@ def _fundamental(rows: Rows, size: FloatArray) -> FloatArray:
         amplitude[..., :, None] == amplitude[..., None, :]
     )
     same &= rows.harmonic == 1
-    harmonic = rows.harmonic > 1
+    harmonic = rows.harmonic != 1
     lost = harmonic & ~same.any(axis=-1)
     if lost.any():
         raise DataError(
@@ -411,7 +431,8 @@ def _measured(rows: Rows) -> Measured:
     covariance = Covariance(C[..., 0, 0], C[..., 0, 1], C[..., 1, 1])
     with np.errstate(divide="ignore", invalid="ignore"):
         whitening = Whitening.of(covariance)
-        log_area = np.log(whitening.a) + np.log(whitening.c)
+        mean = rows.harmonic == 0  # real, so that its imaginary part has no error
+        log_area = np.log(whitening.a) + np.log(np.where(mean, 1.0, whitening.c))
     singular = ~np.isfinite(log_area)
     if singular.any():
         raise DataError(

@@ -163,6 +163,8 @@ def parse_unit(text: str) -> Unit:
     ('1e-06', 'rms')
     """
     rest = text.strip()
+    if len(rest) > 2 * _LONGEST:
+        raise UnitError(f"[{rest[:_LONGEST]}...] is not a unit: it has {len(rest)} characters")
     decibel = _DECIBEL.match(rest)
     if decibel:
         rest = rest[decibel.end() :]

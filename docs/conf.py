@@ -5,7 +5,12 @@ The notebooks, which `docs/notebooks` links to, are stored without outputs and r
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import dahl_ident
+
+sys.path.insert(0, str(Path(__file__).parent / "extensions"))
 
 project = "dahl_ident"
 author = "The dahl_ident developers"
@@ -14,11 +19,12 @@ release = version = dahl_ident.__version__
 extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
-    "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
     "numpydoc",
+    "offline",
+    "commands",
 ]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "extensions"]
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:mod", r"dahl_ident\..*"),  # rooms inside, which the reference leaves to their source
@@ -34,6 +40,7 @@ nb_execution_timeout = 120
 nb_output_stderr = "error"
 nb_merge_streams = True
 
+html_math_renderer = "mathml"
 html_theme = "pydata_sphinx_theme"
 html_title = "dahl_ident"
 html_show_sourcelink = False
@@ -41,7 +48,18 @@ html_static_path = ["_static"]
 html_css_files = ["manual.css"]
 # pages without others below them have nothing to list on the left
 html_sidebars = {
-    page: [] for page in ("theory", "reference", "benchmarks", "changelog", "contributing")
+    page: []
+    for page in (
+        "theory",
+        "benchmarks",
+        "changelog",
+        "contributing",
+        "install",
+        "quick_start",
+        "command_line",
+        "gallery",
+        "glossary",
+    )
 }
 
 autodoc_typehints = "none"

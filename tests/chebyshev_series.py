@@ -1,6 +1,6 @@
-"""The Chebyshev coefficients of dahl_ident/fitting/chebyshev.py, from 50-digit arithmetic.
+"""The Chebyshev coefficients of dahl_ident/elements/casadi_series.py, from 50-digit arithmetic.
 
-``python -m tests.chebyshev_series > dahl_ident/fitting/chebyshev.py`` writes them anew.
+``python -m tests.chebyshev_series > dahl_ident/elements/casadi_series.py`` writes them anew.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def coefficients(function: Callable[[Any], Any]) -> tuple[float, ...]:
 
 
 def module() -> str:
-    """Return the text of dahl_ident/fitting/chebyshev.py."""
+    """Return the text of dahl_ident/elements/casadi_series.py."""
     lines = [f"LOW, HIGH = {LOW:.1f}, {HIGH:.1f}\n"]
     for name, function in SERIES.items():
         terms = "".join(f"    {c!r},\n" for c in coefficients(function))

@@ -28,4 +28,5 @@ def run(
     from tests.command_line import Runner
 
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("COLUMNS", raising=False)  # that of a terminal, not of a test
     return Runner(capsys, monkeypatch)

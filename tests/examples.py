@@ -57,9 +57,10 @@ def _run_python(code: str, page: Path, names: dict[str, object]) -> str:
 
 def _run_bash(code: str) -> str:
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    without_terminal = {k: v for k, v in os.environ.items() if k != "COLUMNS"}
     done = subprocess.run(
         ["bash", "-eu", "-c", code],
-        env=os.environ | {"PATH": path, "NO_COLOR": "1"},
+        env=without_terminal | {"PATH": path, "NO_COLOR": "1"},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

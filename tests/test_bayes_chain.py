@@ -22,6 +22,7 @@ from dahl_ident.bayes.moves import (
     snooker,
 )
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
+from dahl_ident.problem import Problem
 from tests.bayes_cases import FRICTION, friction_table, with_covariance
 
 
@@ -96,26 +97,26 @@ def test_checks_come_after_fixed_numbers_of_steps() -> None:
 
 def test_the_same_seed_gives_the_same_chain() -> None:
     data = friction_table()
-    first = di.sample(data, di.Dahl(), seed=4, steps=60)
-    again = di.sample(data, di.Dahl(), seed=4, steps=60)
-    other = di.sample(data, di.Dahl(), seed=5, steps=60)
+    first = di.posterior(data, di.Dahl(), seed=4, steps=60)
+    again = di.posterior(data, di.Dahl(), seed=4, steps=60)
+    other = di.posterior(data, di.Dahl(), seed=5, steps=60)
     np.testing.assert_array_equal(first.get_chain(), again.get_chain())
     assert not np.array_equal(first.get_chain(), other.get_chain())
-    unseeded = di.sample(data, di.Dahl(), steps=60)
-    repeated = di.sample(data, di.Dahl(), steps=60, seed=unseeded.seed)
+    unseeded = di.posterior(data, di.Dahl(), steps=60)
+    repeated = di.posterior(data, di.Dahl(), steps=60, seed=unseeded.seed)
     np.testing.assert_array_equal(unseeded.get_chain(), repeated.get_chain())
 
 
 def test_a_pool_gives_the_same_posterior() -> None:
     data = friction_table()
     with ThreadPoolExecutor(2) as pool:
-        spread = di.sample(data, di.Dahl(), seed=4, steps=40, pool=pool)
-    alone = di.sample(data, di.Dahl(), seed=4, steps=40)
+        spread = di.posterior(data, di.Dahl(), seed=4, steps=40, pool=pool)
+    alone = di.posterior(data, di.Dahl(), seed=4, steps=40)
     np.testing.assert_allclose(spread.get_chain(), alone.get_chain(), rtol=1e-9)
 
 
 def test_walkers_start_at_finite_density_and_wide() -> None:
-    posterior = di.sample(friction_table(), di.Dahl(), seed=1, steps=300)
+    posterior = di.posterior(friction_table(), di.Dahl(), seed=1, steps=300)
     assert np.isfinite(posterior.get_log_prob()).all()
     chain = posterior.get_chain()
     assert chain[0].std(axis=0)[0] > 1.2 * chain[100:].std(axis=(0, 1))[0]
@@ -124,7 +125,7 @@ def test_walkers_start_at_finite_density_and_wide() -> None:
 def test_priors_alone_are_recovered_without_likelihood() -> None:
     f_max = stats.lognorm(0.3, scale=0.2)
     given: dict[str, Any] = {"f_max": f_max, "sigma": (5.0, 50.0)}
-    posterior = di.sample(friction_table(), di.Dahl(), priors=given, likelihood="none", seed=2)
+    posterior = di.posterior(friction_table(), di.Dahl(), priors=given, likelihood="none", seed=2)
     assert posterior.names == ("f_max", "sigma")
     thin = int(np.ceil(4.0 * posterior.get_autocorr_time().max()))
     draws = posterior.get_chain(discard=posterior.warm_up, thin=thin, flat=True)
@@ -137,7 +138,7 @@ def test_the_posterior_moves_with_its_data() -> None:
     data = friction_table()
     assert data.amplitude is not None
     stronger = di.FrequencyResponse(data.frequency_hz, 2.0 * data.response, data.amplitude)
-    one, two = (np.median(di.sample(d, di.Dahl(), seed=1).values, 0) for d in (data, stronger))
+    one, two = (np.median(di.posterior(d, di.Dahl(), seed=1).values, 0) for d in (data, stronger))
     assert (two / one)[:2] == pytest.approx(2.0, rel=0.005)
 
 
@@ -147,8 +148,8 @@ def test_student_t_resists_an_outlier() -> None:
     response[10] *= 1.8
     assert data.amplitude is not None
     dirty = di.FrequencyResponse(data.frequency_hz, response, data.amplitude)
-    plain = di.sample(dirty, di.Dahl(), seed=1).values[:, 0]
-    robust = di.sample(dirty, di.Dahl(), seed=1, likelihood="student_t").values[:, 0]
+    plain = di.posterior(dirty, di.Dahl(), seed=1).values[:, 0]
+    robust = di.posterior(dirty, di.Dahl(), seed=1, likelihood="student_t").values[:, 0]
     assert robust.std() < 0.4 * plain.std()
     assert np.median(robust) == pytest.approx(0.1, abs=0.002)
 
@@ -158,12 +159,12 @@ def test_interchangeable_elements_keep_their_order() -> None:
     truth = di.Dahl(f_max=0.1, sigma=300.0, name="a") + di.Dahl(f_max=0.5, sigma=30.0, name="b")
     random = np.random.default_rng(2)
     noise = 0.01 * (random.normal(size=25) + 1j * random.normal(size=25))
-    exact = di.Problem(
+    exact = Problem(
         di.FrequencyResponse(np.ones(25), np.ones(25) + 0j, amplitude), truth, free=["a_f_max"]
     ).predict(np.log([0.1]))
     data = di.FrequencyResponse(np.ones(25), exact * np.exp(noise), amplitude)
     model = di.Dahl(name="a") + di.Dahl(name="b")
-    posterior = di.sample(data, model, seed=1, max_steps=1500)
+    posterior = di.posterior(data, model, seed=1, max_steps=1500)
     values = posterior.values
     assert (values[:, 0] / values[:, 1] < values[:, 2] / values[:, 3]).all()
     assert np.median(values[:, 0]) == pytest.approx(0.1, rel=0.1)
@@ -171,44 +172,44 @@ def test_interchangeable_elements_keep_their_order() -> None:
 
 def test_sensor_priors_of_any_kind_are_sampled() -> None:
     sensors = di.Sensors(force_gain=stats.uniform(0.95, 0.1))
-    posterior = di.sample(friction_table(), di.Dahl(), sensors=sensors, seed=1)
+    posterior = di.posterior(friction_table(), di.Dahl(), sensors=sensors, seed=1)
     gain = posterior.values[:, posterior.names.index("force_gain")]
     assert 0.95 <= gain.min() < 0.955
     assert 1.045 < gain.max() <= 1.05
-    (rule,) = [r for r in posterior.prior_rules if r.name == "force_gain"]
+    (rule,) = [r for r in posterior.prior_influences if r.name == "force_gain"]
     assert rule.width == pytest.approx(1.0, abs=0.1)
 
 
 def test_known_noise_has_no_scale() -> None:
-    posterior = di.sample(with_covariance(friction_table(), 0.02), di.Dahl(), seed=1, steps=50)
+    posterior = di.posterior(with_covariance(friction_table(), 0.02), di.Dahl(), seed=1, steps=50)
     assert posterior.names == ("f_max", "sigma")
 
 
 def test_a_fit_is_taken_over() -> None:
     data = friction_table()
     fit = di.fit(data, di.Dahl())
-    assert di.sample(fit, seed=1, steps=50).problem is fit.problem
+    assert di.posterior(fit, seed=1, steps=50).problem is fit.problem
     with pytest.raises(ValidationError, match="noise, free is given beside a FitResult"):
-        di.sample(fit, noise="absolute", free=["alpha"])
+        di.posterior(fit, noise="absolute", free=["alpha"])
 
 
 def test_refusals() -> None:
     data = friction_table()
     with pytest.raises(ModelError, match="there is no model"):
-        di.sample(data)
+        di.posterior(data)
     with pytest.raises(ValidationError, match="walkers is 33; expected a whole number >= 48"):
-        di.sample(data, di.Dahl(), walkers=33)
+        di.posterior(data, di.Dahl(), walkers=33)
     with pytest.raises(ValidationError, match="walkers is 100; expected a multiple of 8"):
-        di.sample(data, di.Dahl(), walkers=100)
+        di.posterior(data, di.Dahl(), walkers=100)
     with pytest.raises(ValidationError, match="likelihood is 'cauchy'; expected one of gaussian"):
-        di.sample(data, di.Dahl(), likelihood="cauchy")
+        di.posterior(data, di.Dahl(), likelihood="cauchy")
     for ess in (-1.0, np.nan):
         with pytest.raises(ValidationError, match=r"ess is .*; expected"):
-            di.sample(data, di.Dahl(), ess=ess)
+            di.posterior(data, di.Dahl(), ess=ess)
     pool: Any = 3
     with pytest.raises(ValidationError, match="pool is 3; expected an object with map"):
-        di.sample(data, di.Dahl(), pool=pool)
+        di.posterior(data, di.Dahl(), pool=pool)
     exact = FRICTION.describing_function(np.array([1e-3, 2e-3, 4e-3]))
     perfect = di.FrequencyResponse(np.ones(3), exact, np.array([1e-3, 2e-3, 4e-3]))
     with pytest.raises(SamplingError, match="leaves no noise whose scale could be estimated"):
-        di.sample(perfect, di.Dahl())
+        di.posterior(perfect, di.Dahl())

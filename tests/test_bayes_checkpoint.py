@@ -15,9 +15,11 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.bayes import checkpoint
-from dahl_ident.data.readers.file import library
+from dahl_ident.data import file_lock
+from dahl_ident.data.storage import library
 from dahl_ident.errors import SamplingError
+from dahl_ident.problem import Problem
+from dahl_ident.results import ChainPosterior
 from tests.bayes_cases import friction_table
 
 STEPS = 3000
@@ -28,12 +30,12 @@ import sys
 import dahl_ident as di
 from tests.bayes_cases import friction_table
 print("ready", flush=True)
-di.sample(friction_table(), di.Dahl(), seed=9, steps={STEPS}, resume=sys.argv[1])
+di.posterior(friction_table(), di.Dahl(), seed=9, steps={STEPS}, resume=sys.argv[1])
 """
 
 
-def sampled(path: Path | None, **options: Any) -> di.Posterior:
-    return di.sample(friction_table(), di.Dahl(), resume=path, **options)
+def sampled(path: Path | None, **options: Any) -> ChainPosterior:
+    return di.posterior(friction_table(), di.Dahl(), resume=path, **options)
 
 
 def refused(path: Path, message: str, **options: Any) -> None:
@@ -96,16 +98,16 @@ def test_an_exception_leaves_all_steps_in_the_file(
 ) -> None:
     path = tmp_path / "chain.h5"
     calls = 0
-    likelihood = di.Problem.log_likelihood
+    likelihood = Problem.log_likelihood
 
-    def interrupted(self: di.Problem, *args: Any) -> Any:
+    def interrupted(self: Problem, *args: Any) -> Any:
         nonlocal calls
         calls += 1
         if calls == 300:
             raise KeyboardInterrupt
         return likelihood(self, *args)
 
-    monkeypatch.setattr(di.Problem, "log_likelihood", interrupted)
+    monkeypatch.setattr(Problem, "log_likelihood", interrupted)
     with pytest.raises(KeyboardInterrupt):
         sampled(path, seed=9, steps=400)
     monkeypatch.undo()
@@ -122,9 +124,9 @@ def test_foreign_runs_are_refused(begun: Path) -> None:
     refused(begun, "differs in walkers", walkers=160)
     before = begun.read_bytes()
     with pytest.raises(SamplingError, match="differs in data"):
-        di.sample(friction_table(seed=2), di.Dahl(), resume=begun)
+        di.posterior(friction_table(seed=2), di.Dahl(), resume=begun)
     with pytest.raises(SamplingError, match="differs in model"):
-        di.sample(friction_table(), di.Dahl(alpha=1.1), resume=begun)
+        di.posterior(friction_table(), di.Dahl(alpha=1.1), resume=begun)
     assert begun.read_bytes() == before
 
 
@@ -175,7 +177,7 @@ def test_a_lock_left_by_a_killed_run_or_removed_by_another_does_not_matter(
     lock = tmp_path / "chain.h5.lock"
     lock.touch()
     seen: list[bool] = []
-    is_still = checkpoint._is_still
+    is_still = file_lock._is_still
 
     def removed_once(path: Path, file: Any) -> bool:
         if not seen:
@@ -183,7 +185,7 @@ def test_a_lock_left_by_a_killed_run_or_removed_by_another_does_not_matter(
         seen.append(is_still(path, file))
         return seen[-1]
 
-    monkeypatch.setattr(checkpoint, "_is_still", removed_once)
+    monkeypatch.setattr(file_lock, "_is_still", removed_once)
     assert sampled(path, seed=9, steps=60).steps == 60
     assert seen == [False, True]
     assert not lock.exists()

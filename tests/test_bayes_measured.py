@@ -23,14 +23,14 @@ def test_the_damper_shows_its_misfit() -> None:
     data = di.FrequencyResponse.concatenate(
         [di.extract(measured(name), harmonics=(1,)) for name in FILES]
     )
-    posterior = di.sample(data, di.Dahl(), seed=1)
+    posterior = di.posterior(data, di.Dahl(), seed=1)
     assert posterior.converged
     size = next(check for check in posterior.checks if check.statistic == "size")
     assert not size.passed
     assert not posterior.trusted
     assert size.observed > 3.0 * size.replicated
     assert "MISFIT: the residuals are larger than the noise that the data state" in str(posterior)
-    grid = di.posterior_grid(data, di.Dahl())
+    grid = di.posterior(data, di.Dahl(), method="grid")
     for i, name in enumerate(("f_max", "sigma")):
         middle = float(grid.quantile(name, 0.5))
         assert np.median(posterior.values[:, i]) == pytest.approx(middle, abs=0.1 * grid.std()[i])
@@ -44,14 +44,14 @@ def test_the_bolted_joint_leaves_f_max_to_its_prior(tmp_path: Path) -> None:
     held = beam.select(level=[label for label in beam.levels if "Response" in str(label)])
     data = held.select(rows=np.arange(held.n) % 8 == 0)
     model = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
-    posterior = di.sample(data, model, seed=1, ess=1000.0)
+    posterior = di.posterior(data, model, seed=1, ess=1000.0)
     assert posterior.converged, posterior.message
-    f_max = next(rule for rule in posterior.prior_rules if rule.name == "f_max")
+    f_max = next(rule for rule in posterior.prior_influences if rule.name == "f_max")
     assert f_max.at_upper_end
-    assert "f_max is set by its prior: posterior width 0." in posterior.report()
+    assert "f_max is set by its prior: posterior width 0." in str(posterior)
     # all the same, the microslip loss and the small-amplitude stiffness are well known
-    loss = posterior.derived(lambda f_max, sigma, **_: sigma**2 / f_max)
+    loss = posterior.function(lambda f_max, sigma, **_: sigma**2 / f_max)
     assert loss["84%"] < 1.4 * loss["16%"]
     assert 3.0e7 < loss["median"] < 5.0e7
-    total = posterior.derived(lambda sigma, stiffness, **_: sigma + stiffness)
+    total = posterior.function(lambda sigma, stiffness, **_: sigma + stiffness)
     assert total["84%"] < 1.1 * total["16%"]

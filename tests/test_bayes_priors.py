@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,12 @@ from scipy import stats
 import dahl_ident as di
 from dahl_ident.bayes.priors import joint_prior
 from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.problem import Problem
 from tests.bayes_cases import friction_table
 
 
-def problem(**options: Any) -> di.Problem:
-    return di.Problem(friction_table(), di.Dahl(), **options)
+def problem(**options: Any) -> Problem:
+    return Problem(friction_table(), di.Dahl(), **options)
 
 
 def test_bounds_are_log_uniform() -> None:
@@ -24,12 +26,12 @@ def test_bounds_are_log_uniform() -> None:
     density = prior.log_density(theta)
     assert density[0] == pytest.approx(-2.0 * np.log(np.log(100.0)))
     assert density[1:].tolist() == [-np.inf, -np.inf]
-    assert prior.parts[0].quantile(np.array([0.5])) == pytest.approx(np.log(0.1))
+    assert prior.priors[0].quantile(np.array([0.5])) == pytest.approx(np.log(0.1))
 
 
 def test_a_distribution_of_the_value_gets_its_jacobian() -> None:
     given = stats.lognorm(0.5, scale=0.1)
-    part = joint_prior(problem(), {"f_max": given}).parts[0]
+    part = joint_prior(problem(), {"f_max": given}).priors[0]
     theta = np.array([-3.0, -2.0])
     # the logarithm of a lognormal value is normal
     assert part.log_density(theta) == pytest.approx(stats.norm(np.log(0.1), 0.5).logpdf(theta))
@@ -39,7 +41,7 @@ def test_a_distribution_of_the_value_gets_its_jacobian() -> None:
 def test_a_normal_prior_equals_that_of_scipy() -> None:
     sensors = di.Sensors(force_gain=stats.norm(1.0, 0.005), delay=stats.norm(0.0, 2e-5))
     prior = joint_prior(problem(sensors=sensors))
-    gain, delay = prior.parts[2:]
+    gain, delay = prior.priors[2:]
     assert (gain.source, delay.source) == ("sensors", "sensors")
     theta = np.array([-0.01, 0.004])
     exact = stats.norm(1.0, 0.005).logpdf(np.exp(theta)) + theta
@@ -62,22 +64,22 @@ def test_defaults_hold_what_the_data_show() -> None:
     stiffness = np.abs(data.response)
     assert data.amplitude is not None
     force = stiffness * data.amplitude
-    low, high = np.exp(prior.parts[0].limits)
+    low, high = np.exp(prior.priors[0].limits)
     assert (low, high) == pytest.approx((force.min() / 1e5, force.max() * 1e5))
-    low, high = np.exp(prior.parts[1].limits)
+    low, high = np.exp(prior.priors[1].limits)
     assert (low, high) == pytest.approx((stiffness.min() / 1e5, stiffness.max() * 1e5))
     assert "log-uniform from" in str(prior)
     assert "(from the size of the data)" in str(prior)
-    text = str(joint_prior(problem(), {"f_max": (0.01, 1.0)}).parts[0])
+    text = str(joint_prior(problem(), {"f_max": (0.01, 1.0)}).priors[0])
     assert text == "log-uniform from 0.01 to 1 N"
 
 
 def test_plants_and_sensors_have_defaults() -> None:
     plant = di.Dahl(alpha=1.0) + di.Spring() + di.Mass() + di.Damper()
     sensors = di.Sensors(force_gain=None, delay=None)
-    made = di.Problem(friction_table(), plant, sensors=sensors, free=["alpha"])
+    made = Problem(friction_table(), plant, sensors=sensors, free=["alpha"])
     prior = joint_prior(made)
-    limits = dict(zip(made.names, (part.limits for part in prior.parts), strict=True))
+    limits = dict(zip(made.names, (part.limits for part in prior.priors), strict=True))
     assert np.exp(limits["alpha"]) == pytest.approx((0.1, 10.0))
     assert limits["delay"] == pytest.approx((-0.5, 0.5))
     assert limits["stiffness"][0] == -limits["stiffness"][1]
@@ -86,10 +88,41 @@ def test_plants_and_sensors_have_defaults() -> None:
     assert limits["mass"][1] == pytest.approx(1e3 * largest / (2.0 * np.pi) ** 2)
 
 
+def test_rotation_has_the_same_defaults() -> None:
+    table = friction_table()
+    turned = replace(table, motion="rotation")
+    model = di.Dahl() + di.Spring() + di.Damper()
+    here, there = (joint_prior(Problem(data, model)) for data in (table, turned))
+    assert [p.limits for p in there.priors] == [p.limits for p in here.priors]
+
+
+def test_a_law_gets_defaults_from_its_declaration() -> None:
+    class Law(di.Friction):
+        """dF/dx = k (1 - sign(v) F/g); two more parameters show what defaults they get."""
+
+        parameters = (
+            di.Parameter("g", "N", "limit", lower=0.0, transform="log"),
+            di.Parameter("k", "N/m", "stiffness", lower=0.0, transform="log"),
+            di.Parameter("c", "N s/m", "loss at high speed", lower=0.0, transform="log"),
+            di.Parameter("skew", "", "skew", lower=-1.0, upper=1.0, prior=(-0.2, 0.2)),
+        )
+
+        def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+            return values[1] * (1.0 - direction * force / values[0])
+
+    table = friction_table()
+    prior = joint_prior(Problem(table, Law()))
+    dahl = joint_prior(Problem(table, di.Dahl()))
+    assert [p.limits for p in prior.priors[:2]] == [p.limits for p in dahl.priors]
+    per_speed = np.abs(table.response) / (2.0 * np.pi * table.frequency_hz)
+    assert np.exp(prior.priors[2].limits[1]) == pytest.approx(1e5 * per_speed.max())
+    assert prior.priors[3].limits == (-1.0, 1.0)  # five times wider, within its own bounds
+
+
 def test_defaults_of_plants_hold_a_larger_estimate() -> None:
-    made = di.Problem(friction_table(), di.Dahl() + di.Spring())
+    made = Problem(friction_table(), di.Dahl() + di.Spring())
     prior = joint_prior(made, estimate=np.array([0.1, 30.0, -1e5]))
-    assert prior.parts[2].limits == pytest.approx((-1e6, 1e6), rel=1e-9)
+    assert prior.priors[2].limits == pytest.approx((-1e6, 1e6), rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -117,14 +150,14 @@ def test_limits_reach_beyond_an_estimate_in_the_tail_unless_nothing_is_there() -
         (stats.lognorm(0.01, scale=1.0), 2.0 * np.log(0.1) + 0.01 * 6.3613),  # 6.36 deviations
         (stats.uniform(1.0, 1.0), 0.0),
     ):
-        part = joint_prior(problem(), {"f_max": prior}, estimate).parts[0]
+        part = joint_prior(problem(), {"f_max": prior}, estimate).priors[0]
         assert part.limits[0] == pytest.approx(low, abs=1e-4)
         assert part.limits[1] == part.bulk[1]
 
 
 def test_a_prior_without_moments_is_told_by_its_quantiles() -> None:
     prior = joint_prior(problem(), {"f_max": stats.halfcauchy(scale=0.1)})
-    assert str(prior.parts[0]) == "halfcauchy, median 0.1, 95 % from 0.003929 to 2.545 N"
+    assert str(prior.priors[0]) == "halfcauchy, median 0.1, 95 % from 0.003929 to 2.545 N"
 
 
 def test_priors_of_unknown_names_are_refused() -> None:

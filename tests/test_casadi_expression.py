@@ -9,15 +9,16 @@ import pytest
 from numpy.polynomial import Chebyshev
 from numpy.typing import ArrayLike
 
+from dahl_ident import Dahl
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import casadi_series as chebyshev
 from dahl_ident.elements import general_dahl
-from dahl_ident.fitting import chebyshev
-from dahl_ident.fitting.casadi_expression import (
-    Expansion,
+from dahl_ident.elements.casadi_dahl import (
     Phasor,
     general_describing_function,
     linear_describing_function,
 )
+from dahl_ident.fitting.casadi_expansion import Expansion
 from tests import chebyshev_series
 
 Derivatives = tuple[complex, complex, complex]
@@ -206,11 +207,12 @@ def test_an_expansion_has_the_derivatives_of_what_it_stands_for(
     beta, alpha = x * ca.exp(y * x / (1.0 + x)), ca.exp(y)
     at = [at_x, at_y]
     expected = jets(general_describing_function(beta, alpha, harmonic), [x, y])(at)
-    expansion = Expansion(beta, alpha, harmonic)
+    element = Dahl(1.0, None, None)
+    expansion = Expansion(element, [ca.SX(1.0), beta, alpha], ca.SX(1.0), ca.SX(0.0), harmonic)
     point = ca.Function("point", [ca.vertcat(x, y)], [expansion.point])(at)
-    known = jets(expansion.value, [x, y], expansion.symbols)
+    known = jets(expansion.value.scaled(1.0 / beta), [x, y], expansion.symbols)
     for order in range(3):
-        found = known(at, expansion.coefficients(order)(point))
+        found = known(at, expansion.at(order, 1)(point))
         for part, exact in list(zip(found, expected, strict=True))[: order + 1]:
             np.testing.assert_allclose(part, ca.densify(exact), rtol=1e-11, atol=1e-11)
 

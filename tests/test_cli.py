@@ -20,7 +20,10 @@ from dahl_ident.errors import DataError
 from dahl_ident.synthetic import Experiment
 from tests.command_line import Runner
 
-COMMANDS = ("demo", "inspect", "extract", "fit", "sample", "report", "simulate", "datasets")
+COMMANDS = (
+    "demo", "inspect", "extract", "fit", "sample", "plan", "campaign", "report", "simulate",
+    "datasets",
+)  # fmt: skip
 PROGRAM = Path(sys.executable).with_name("dahl-ident")
 
 
@@ -119,8 +122,8 @@ def test_options_come_from_a_file_and_the_command_line_wins(run: Runner) -> None
     [
         ("[fit]\nnosie = 1\n", "fit has no option nosie; there are "),
         ('nosie = "absolute"\n', "no command has the option nosie; there are "),
-        ('[fti]\nnoise = "absolute"\n', "no command is called fti; there are datasets, demo, "),
-        ("fit = 3\n", "no command has the option fit; "),
+        ('[fti]\nnoise = "absolute"\n', "no command is called fti; there are campaign, datasets, "),
+        ("fti = 3\n", "no command has the option fti; "),
     ],
 )
 def test_an_unknown_name_in_a_file_of_options_is_refused(
@@ -206,7 +209,7 @@ def test_extraction_of_several_files_names_levels_and_files(run: Runner) -> None
     Path("flat.csv").write_text("time [s],x [m],F [N]\n0,1,2\n1,1,2\n2,1,2\n")
     refused = run("extract", *files, "flat.csv")
     assert refused.status == 1
-    assert "flat.csv: no stretch of constant amplitude" in refused.err
+    assert "flat.csv: no segment of constant amplitude" in refused.err
 
 
 def test_no_good_point_is_an_error_of_its_own(run: Runner) -> None:
@@ -220,7 +223,7 @@ def test_no_good_point_is_an_error_of_its_own(run: Runner) -> None:
     Path("lab.toml").write_text(turned)
     outcome = run("extract", "turned.csv", "--columns", "lab.toml", "--good-only")
     assert outcome.status == 1
-    assert "creates energy, a sign is turned" in outcome.err
+    assert "creates energy: a sign is reversed" in outcome.err
     assert "no point is good" in outcome.err
 
 
@@ -237,20 +240,21 @@ def test_sample_tells_the_posterior(run: Runner) -> None:
 def test_sample_integrates_at_once_where_asked(run: Runner) -> None:
     table = run("datasets", "noisy", "-o", "-").out
     options = ("sample", "-", "--prior", "f_max=0.01:1")
-    told = json.loads(run(*options, "--grid", "--json", stdin=table).out)
+    told = json.loads(run(*options, "--method", "grid", "--json", stdin=table).out)
     assert told["converged"]
     assert told["error"] < 1e-4
     chain = json.loads(run(*options, "--json", stdin=table).out)
     for name in ("f_max", "sigma"):
         exact, drawn = told["summary"][name], chain["summary"][name]
         assert abs(exact["median"] - drawn["median"]) < 0.1 * exact["std"]
-    text = run(*options, "--grid", stdin=table)
+    text = run(*options, "--method", "grid", stdin=table)
     assert text.status == 0
     assert text.out.startswith("Converged: error ")
     assert "ln evidence: " in text.out
-    refused = run(*options, "--grid", "--max-steps", "30", "--report", "r.html", stdin=table)
+    chain_options = ("--max-steps", "30", "--report", "r.html")
+    refused = run(*options, "--method", "grid", *chain_options, stdin=table)
     assert refused.status == 1
-    assert "--max-steps, --report is given beside --grid, which runs no chain" in refused.err
+    assert "--max-steps, --report is given beside --method grid, which runs no chain" in refused.err
 
 
 def test_a_chain_that_is_too_short_ends_with_3(run: Runner) -> None:
@@ -262,10 +266,10 @@ def test_a_chain_that_is_too_short_ends_with_3(run: Runner) -> None:
 
 def test_a_prior_that_keeps_the_data_out_ends_with_3(run: Runner) -> None:
     table = run("datasets", "noisy", "-o", "-").out
-    outcome = run("sample", "-", "--grid", "--prior", "f_max=1:2", stdin=table)
+    outcome = run("sample", "-", "--method", "grid", "--prior", "f_max=1:2", stdin=table)
     assert outcome.status == 3
     assert outcome.err.startswith("not to be trusted: PRIOR AGAINST DATA: f_max lies beyond 99 %")
-    assert "; MISFIT: the residuals are larger than the noise that the data state" in outcome.err
+    assert "MISFIT: the residuals are larger than the noise that the data state" in outcome.out
 
 
 def test_report_writes_every_format_asked_for(run: Runner) -> None:
@@ -283,6 +287,11 @@ def test_every_help_has_an_example_that_runs(run: Runner, command: str) -> None:
     assert found, help_text
     if command == "demo":
         return  # run by make demo and by the test of the chain
+    if command == "campaign":
+        run("datasets", "noisy", "-o", "device.csv")
+        Path("lab.toml").write_text(
+            '[files]\npattern = "{device}.csv"\nkind = "response"\n[[model]]\nkind = "dahl"\n'
+        )
     run.line(found[1].strip())
 
 
@@ -423,7 +432,7 @@ def test_what_is_there_is_replaced_on_request_only(run: Runner, command: str) ->
     Path(there).write_text("mine", encoding="utf-8")
     outcome = run(command, *WRITING[command])
     assert (outcome.status, outcome.out) == (1, "")
-    assert f"error: {there}: there is such a file already" in outcome.err
+    assert f"error: {there}: the file exists already" in outcome.err
     assert "--overwrite" in outcome.err
     assert [p.name for p in Path().iterdir()] == [there]
     assert Path(there).read_text(encoding="utf-8") == "mine"
@@ -460,9 +469,8 @@ def test_an_input_is_never_written_over(run: Runner, option: str) -> None:
         (("fit", "-", "--start", "f_max=much"), "start of f_max is 'much'; expected a number"),
         (("fit", "-", "--delay", "soon"), "delay is 'soon'; expected a number"),
         (("fit", "-", "--force-gain", "nrm(1,2)"), "expected a distribution of scipy.stats"),
-        (("fit", "-", "--force-gain", "norm(1,a)"), "which are no arguments of norm"),
+        (("fit", "-", "--force-gain", "norm(1,a)"), "which are not arguments of norm"),
         (("fit", "-", "--force-gain", "norm(1,0)"), "has no finite mean or no width"),
-        (("fit", "-", "--method", "simplex"), "method is 'simplex'; expected scipy or ipopt"),
     ],
 )
 def test_bad_options_are_refused_before_anything_is_written(
@@ -500,8 +508,9 @@ def test_sensors_are_fixed_free_or_have_a_prior(run: Runner) -> None:
     sensors = di.Sensors(force_gain=stats.norm(1, 0.05), delay=1e-4)
     fit = di.fit(di.read_frequency_response("noisy.csv"), di.Dahl(), sensors=sensors)
     for name in ("f_max", "sigma", "force_gain", "delay"):
-        assert params[name]["value"] == fit.params[name].value
-        assert params[name]["stderr"] == fit.params[name].stderr
+        assert params[name]["value"] == pytest.approx(fit.params[name].value, rel=1e-6)
+        expected = fit.params[name].stderr
+        assert params[name]["stderr"] == (expected and pytest.approx(expected, rel=1e-4))
     assert params["force_gain"]["vary"]
     outcome = run("fit", "noisy.csv", "--force-gain", "free")
     assert outcome.status == 3
@@ -525,4 +534,4 @@ def test_a_saved_fit_takes_no_other_model(run: Runner) -> None:
     assert run("fit", "-", "--save", "fit.json", stdin=table).status == 0
     outcome = run("report", "fit.json", "--mass", "free", "-o", "r.html")
     assert outcome.status == 1
-    assert "a saved fit is reported as it is" in outcome.err
+    assert "saved fits are reported as they are" in outcome.err

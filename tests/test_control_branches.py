@@ -6,8 +6,9 @@ import control
 import numpy as np
 import pytest
 
-from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring, response_branches
+from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring
 from dahl_ident.arrays import FloatArray
+from dahl_ident.control_interop import response_branches
 from dahl_ident.elements import Element
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.synthetic.mechanism import Mechanism

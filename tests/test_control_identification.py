@@ -13,15 +13,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from dahl_ident import (
-    Dahl,
-    FrequencyResponse,
-    LinearSystem,
-    closed_loop_response,
-    fit,
-    level_responses,
-)
+from dahl_ident import Dahl, FrequencyResponse, LinearSystem, fit
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.control_interop import closed_loop_response, level_responses
 from dahl_ident.errors import ValidationError
 
 F_MAX, SIGMA = 0.1, 30.0
@@ -81,8 +75,10 @@ def test_given_linear_part_force_controlled(open_loop: tuple[ComplexArray, Float
     ):
         model = Dahl() + LinearSystem(system, quantity="receptance")
         result = fit(data, model)
-        assert result.params["f_max"].value == pytest.approx(F_MAX, rel=0.03)
-        assert result.params["sigma"].value == pytest.approx(SIGMA, rel=0.03)
+        # the least-squares optimum: 3 % is what the describing function itself is off by here
+        f_max, sigma = result.optimum.values
+        assert f_max == pytest.approx(F_MAX, rel=0.03)
+        assert sigma == pytest.approx(SIGMA, rel=0.03)
 
 
 def test_given_linear_part_displacement_controlled(

@@ -14,7 +14,7 @@ from benchmarks.coverage import (
     run,
     scenarios,
 )
-from dahl_ident.diagnostics.levels import LEVELS
+from dahl_ident.diagnostics.confidence_levels import LEVELS
 
 
 @pytest.mark.parametrize("index", range(6))
@@ -57,4 +57,4 @@ def test_what_does_not_hold_is_said() -> None:
         in page
     )
     assert "Does not hold:" in page
-    assert "Everything holds." in as_markdown([row(0.68, 1.0, 1.0)])
+    assert "Everything ordered holds." in as_markdown([row(0.68, 1.0, 1.0)])

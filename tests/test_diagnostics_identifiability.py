@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring, fit, identifiability
-from dahl_ident.diagnostics import Verdict
+from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring, fit
+from dahl_ident.diagnostics import Verdict, identifiability
 from dahl_ident.diagnostics.information import Information, shares
 from dahl_ident.results import FitResult
 from tests.friction_tables import F_MAX, FRICTION, SIGMA, X_C, plant_table, relative_noise, table

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import doctest
+import importlib.util
+import inspect
 import re
 from operator import attrgetter
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -13,15 +16,19 @@ import dahl_ident as di
 from tests.examples import pages, renewed
 
 DOCS = Path(__file__).parents[1] / "docs"
+REFERENCE = "".join(page.read_text("utf-8") for page in (DOCS / "reference").glob("*.md"))
 
 
 def _explained(name: str) -> bool:
-    pattern = rf"auto(?:class|function|exception):: dahl_ident\.(?:errors\.)?{name}$"
-    return bool(re.search(pattern, (DOCS / "reference.md").read_text("utf-8"), re.MULTILINE))
+    pattern = rf"auto(?:class|function|exception):: dahl_ident\.(?:\w+\.)?{name}$"
+    return bool(re.search(pattern, REFERENCE, re.MULTILINE))
+
+
+NAMES = [name for name in di.__all__ if not inspect.ismodule(getattr(di, name))]
 
 
 def test_every_public_name_is_in_the_reference() -> None:
-    assert [name for name in di.__all__ if not _explained(name)] == []
+    assert [name for name in NAMES if not _explained(name)] == []
 
 
 def _has_example(value: object) -> bool:
@@ -30,12 +37,11 @@ def _has_example(value: object) -> bool:
 
 
 def test_every_public_docstring_has_an_example() -> None:
-    assert [name for name in di.__all__ if not _has_example(getattr(di, name))] == []
+    assert [name for name in NAMES if not _has_example(getattr(di, name))] == []
 
 
 def test_every_class_and_function_of_the_reference_has_an_example() -> None:
-    page = (DOCS / "reference.md").read_text("utf-8")
-    names = re.findall(r"auto(?:class|function):: dahl_ident\.(\S+)$", page, re.MULTILINE)
+    names = re.findall(r"auto(?:class|function):: dahl_ident\.(\S+)$", REFERENCE, re.MULTILINE)
     assert len(names) > 60
     assert [name for name in names if not _has_example(attrgetter(name)(di))] == []
 
@@ -50,3 +56,41 @@ def test_files_that_the_manual_names_exist() -> None:
     for page in DOCS.rglob("*.md"):
         for pattern in re.findall(r"`((?:tests|notebooks)/[\w*./]+)`", page.read_text("utf-8")):
             assert list(root.glob(pattern)), f"{page.name} names {pattern}"
+
+
+def _offline() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("offline", DOCS / "extensions" / "offline.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    ("page", "fetches"),
+    [
+        ('<script src="https://cdn.example/a.js"></script>', ["https://cdn.example/a.js"]),
+        ('<link rel="stylesheet" href="//cdn.example/a.css">', ["//cdn.example/a.css"]),
+        ('<img src="http://example/a.png">', ["http://example/a.png"]),
+        ("<style>@import 'https://a/b.css'; p {background: url(//a/c.png)}</style>",
+         ["https://a/b.css", "//a/c.png"]),
+        ('<a href="https://example">x</a> <link rel="next" href="https://example/b.html">', []),
+        ('<script src="_static/a.js?v=//1"></script> <img src="data:image/png;base64,//">', []),
+    ],
+)  # fmt: skip
+def test_what_a_page_of_the_manual_fetches_is_found(page: str, fetches: list[str]) -> None:
+    pytest.importorskip("latex2mathml")
+    assert _offline().fetched(page) == fetches
+
+
+def test_formulas_of_the_manual_are_mathml() -> None:
+    pytest.importorskip("latex2mathml")
+    offline = _offline()
+    blocks = [
+        text for page in DOCS.rglob("*.md") for text in page.read_text("utf-8").split("$$")[1::2]
+    ]
+    assert len(blocks) > 10
+    for text in blocks:
+        assert offline.mathml(text, "block").startswith("<math ")
+        assert "\\" not in re.sub("<[^>]*>", "", offline.mathml(text, "block")), text

@@ -295,7 +295,7 @@ def test_amplitudes_and_frequencies_are_checked(element: Element) -> None:
         element.dynamic_stiffness(1.0, [-2.0])
     with pytest.raises(ValidationError, match=r"amplitude \(2,\), omega \(3,\)"):
         element.dynamic_stiffness([1.0, 2.0], [1.0, 2.0, 3.0])
-    no_harmonics: list[Any] = [0, 1.5, True]
+    no_harmonics: list[Any] = [-1, 1.5, True]
     for harmonic in no_harmonics:
         with pytest.raises(ValidationError, match="harmonic is"):
             element.dynamic_stiffness(1.0, 1.0, harmonic=harmonic)

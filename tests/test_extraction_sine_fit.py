@@ -14,7 +14,7 @@ from dahl_ident.extraction.sine_fit import (
     first_cycles,
     last_cycles,
     sine_fit,
-    steady_stretch,
+    steady_segment,
     thinned,
     track_phase,
     whole_cycles,
@@ -45,8 +45,8 @@ def uneven(n: int, seed: int = 0) -> FloatArray:
 
 
 def phasors_at_zero(time: FloatArray, channels: FloatArray, omega: float, k: int) -> ComplexArray:
-    stretch = steady_stretch(time, channels, omega)
-    return np.asarray(sine_fit(stretch).phasors(k) * np.exp(-1j * k * omega * stretch.centre))
+    segment = steady_segment(time, channels, omega)
+    return np.asarray(sine_fit(segment).phasors(k) * np.exp(-1j * k * omega * segment.centre))
 
 
 def test_fit_is_exact_on_uneven_samples_with_harmonics_offset_and_drift() -> None:
@@ -62,11 +62,11 @@ def test_fit_is_exact_on_uneven_samples_with_harmonics_offset_and_drift() -> Non
 def test_fit_agrees_with_numpy_lstsq_in_noise() -> None:
     time, omega = uneven(600), 2.0 * np.pi * 1.3
     channels = two_channels(time, omega, noise=0.3)
-    stretch = steady_stretch(time, channels, omega)
-    fit = sine_fit(stretch)
+    segment = steady_segment(time, channels, omega)
+    fit = sine_fit(segment)
     k = np.arange(1, fit.orders + 1)[:, None]
     basis = np.vstack(
-        [np.ones_like(time), time, np.cos(k * stretch.theta), np.sin(k * stretch.theta)]
+        [np.ones_like(time), time, np.cos(k * segment.theta), np.sin(k * segment.theta)]
     )
     expected, left, _, _ = np.linalg.lstsq(basis.T, channels.T, rcond=None)
     phasor = expected[2] - 1j * expected[2 + fit.orders]
@@ -79,8 +79,8 @@ def test_phasor_variance_is_that_of_white_noise() -> None:
     rng = np.random.default_rng(1)
     errors = []
     for _ in range(400):
-        stretch = steady_stretch(time, rng.standard_normal((2, time.size)), omega)
-        fit = sine_fit(stretch)
+        segment = steady_segment(time, rng.standard_normal((2, time.size)), omega)
+        fit = sine_fit(segment)
         errors.append(np.abs(fit.phasors(1)) ** 2 / fit.phasor_variance(1))
     assert np.mean(errors) == pytest.approx(1.0, abs=4.0 / np.sqrt(800))
 
@@ -91,20 +91,20 @@ def test_trend_follows_a_growing_amplitude() -> None:
     carrier = np.exp(1j * omega * time)
     x = ((1.0 + 0.02 * time) * carrier).real
     force = (((2.0 + 1.0j) + (0.1 - 0.3j) * time) * carrier).real
-    stretch = steady_stretch(time, np.stack([x, force]), omega)
-    fit = sine_fit(stretch, trend=True)
-    turn = np.exp(1j * omega * stretch.centre)
-    middle = [1.0 + 0.02 * stretch.centre, (2.0 + 1.0j) + (0.1 - 0.3j) * stretch.centre]
+    segment = steady_segment(time, np.stack([x, force]), omega)
+    fit = sine_fit(segment, trend=True)
+    turn = np.exp(1j * omega * segment.centre)
+    middle = [1.0 + 0.02 * segment.centre, (2.0 + 1.0j) + (0.1 - 0.3j) * segment.centre]
     np.testing.assert_allclose(fit.phasors(1), np.array(middle) * turn, atol=1e-10)
-    slopes = np.array([0.02, 0.1 - 0.3j]) * stretch.half_width * turn
+    slopes = np.array([0.02, 0.1 - 0.3j]) * segment.half_width * turn
     np.testing.assert_allclose(fit.slopes(1), slopes, atol=1e-10)
 
 
 @pytest.mark.parametrize("wrong", [0.97, 0.999, 1.001, 1.03])
 def test_frequency_is_found_from_a_wrong_start(wrong: float) -> None:
     time, omega = uneven(3000), 2.0 * np.pi * 1.3
-    stretch = steady_stretch(time, two_channels(time, omega), wrong * omega)
-    found = estimate_frequency(track_phase(stretch, 1))
+    segment = steady_segment(time, two_channels(time, omega), wrong * omega)
+    found = estimate_frequency(track_phase(segment, 1))
     assert found.omega == pytest.approx(omega, rel=1e-9)
 
 
@@ -113,7 +113,7 @@ def test_frequency_minimises_the_weighted_squares_of_both_channels() -> None:
     rng = np.random.default_rng(3)
     clean = np.stack([waveform(omega * time, {1: 1.0}), waveform(omega * time, {1: 2.0j})])
     channels = clean + np.array([[0.2], [0.6]]) * rng.standard_normal(clean.shape)
-    found = estimate_frequency(track_phase(steady_stretch(time, channels, 1.001 * omega), 1))
+    found = estimate_frequency(track_phase(steady_segment(time, channels, 1.001 * omega), 1))
     weights = 1.0 / np.std(sine_fit(found).residual, axis=1)
 
     def residual(relative: FloatArray) -> FloatArray:
@@ -130,7 +130,7 @@ def test_frequency_minimises_the_weighted_squares_of_both_channels() -> None:
 @pytest.mark.parametrize("wrong", [0.8, 1.1])
 def test_frequency_that_is_not_there_is_refused(wrong: float) -> None:
     time, omega = np.arange(3000) / 100.0, 2.0 * np.pi * 1.3
-    start = steady_stretch(time, two_channels(time, omega), wrong * omega)
+    start = steady_segment(time, two_channels(time, omega), wrong * omega)
     with pytest.raises(ExtractionError, match=rf"no steady frequency near {wrong * 1.3:.6g} Hz"):
         estimate_frequency(start)
 
@@ -139,31 +139,31 @@ def test_track_phase_follows_a_sweep() -> None:
     time = np.arange(4000) / 200.0
     phase = 2.0 * np.pi * (1.0 * time + 0.02 * time**2)
     x = np.cos(phase)
-    stretch = track_phase(steady_stretch(time, np.stack([x, x]), 2.0 * np.pi * 1.35), 3)
-    turned = stretch.theta - phase
+    segment = track_phase(steady_segment(time, np.stack([x, x]), 2.0 * np.pi * 1.35), 3)
+    turned = segment.theta - phase
     assert np.ptp(turned) < 0.02
-    expected = 2.0 * np.pi * (1.0 + 0.04 * stretch.centre)
-    assert stretch.omega == pytest.approx(expected, rel=1e-4)
+    expected = 2.0 * np.pi * (1.0 + 0.04 * segment.centre)
+    assert segment.omega == pytest.approx(expected, rel=1e-4)
 
 
 @given(cycles=st.integers(2, 40), per_cycle=st.floats(5.0, 300.0))
 def test_whole_cycles_counts_to_within_half_a_sample(cycles: int, per_cycle: float) -> None:
     n = int(np.ceil(cycles * per_cycle))
     time = np.arange(n) / per_cycle
-    stretch = steady_stretch(time, np.zeros((2, n)), 2.0 * np.pi)
-    assert whole_cycles(stretch) == cycles
-    assert whole_cycles(steady_stretch(time[:-2], np.zeros((2, n - 2)), 2.0 * np.pi)) < cycles
+    segment = steady_segment(time, np.zeros((2, n)), 2.0 * np.pi)
+    assert whole_cycles(segment) == cycles
+    assert whole_cycles(steady_segment(time[:-2], np.zeros((2, n - 2)), 2.0 * np.pi)) < cycles
 
 
 @given(cycles=st.integers(3, 20), left=st.integers(1, 3))
 def test_cycles_are_cut_from_either_end(cycles: int, left: int) -> None:
     time = np.arange(cycles * 50 + 17) / 50.0
-    stretch = steady_stretch(time, np.tile(time, (2, 1)), 2.0 * np.pi)
-    last = last_cycles(stretch, left)
+    segment = steady_segment(time, np.tile(time, (2, 1)), 2.0 * np.pi)
+    last = last_cycles(segment, left)
     assert last.time.size == left * 50
     assert last.time[-1] == time[-1]
-    np.testing.assert_allclose(last.theta, stretch.theta[-left * 50 :], atol=1e-9)
-    first = first_cycles(stretch, left)
+    np.testing.assert_allclose(last.theta, segment.theta[-left * 50 :], atol=1e-9)
+    first = first_cycles(segment, left)
     assert first.time[0] == time[0]
     assert first.time.size == left * 50
 
@@ -171,22 +171,22 @@ def test_cycles_are_cut_from_either_end(cycles: int, left: int) -> None:
 def test_block_means_keep_time_phase_and_phasors() -> None:
     time = np.arange(20_000) / 1000.0
     omega = 2.0 * np.pi * 1.7
-    stretch = steady_stretch(time, two_channels(time, omega), omega)
-    few = thinned(stretch)
+    segment = steady_segment(time, two_channels(time, omega), omega)
+    few = thinned(segment)
     assert 40 < few.time.size / (1.7 * 20.0) <= 65
-    np.testing.assert_allclose(few.theta, np.interp(few.time, time, stretch.theta), atol=1e-9)
-    np.testing.assert_allclose(sine_fit(few).phasors(1), sine_fit(stretch).phasors(1), rtol=1e-3)
+    np.testing.assert_allclose(few.theta, np.interp(few.time, time, segment.theta), atol=1e-9)
+    np.testing.assert_allclose(sine_fit(few).phasors(1), sine_fit(segment).phasors(1), rtol=1e-3)
     assert thinned(few) is few
 
 
 def test_too_few_samples_are_refused_with_their_number() -> None:
     time = np.arange(40) / 2.1
     with pytest.raises(ExtractionError, match=r"40 samples at 2\.1 samples a cycle near t = 9\.2"):
-        sine_fit(steady_stretch(time, np.zeros((2, 40)), 2.0 * np.pi))
+        sine_fit(steady_segment(time, np.zeros((2, 40)), 2.0 * np.pi))
 
 
 def test_samples_that_cannot_tell_harmonics_apart_are_refused() -> None:
     time = np.sort(np.concatenate([np.arange(60.0), np.arange(60.0) + 0.01]))
-    stretch = steady_stretch(time, np.zeros((2, 120)), 2.0 * np.pi)
-    with pytest.raises(ExtractionError, match="do not tell the harmonics of 1 Hz apart"):
-        sine_fit(stretch)
+    segment = steady_segment(time, np.zeros((2, 120)), 2.0 * np.pi)
+    with pytest.raises(ExtractionError, match="do not separate the harmonics of 1 Hz apart"):
+        sine_fit(segment)

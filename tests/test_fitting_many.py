@@ -7,11 +7,11 @@ import pytest
 from scipy import stats
 
 from benchmarks.harness import peak_bytes
-from dahl_ident import Dahl, FrequencyResponse, Problem, Sensors, Spring
+from dahl_ident import Dahl, FrequencyResponse, Sensors, Spring
 from dahl_ident.elements import Element
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Optimum, OptimumBatch, Status, solve, solve_many
-from dahl_ident.problem import ProblemBatch
+from dahl_ident.problem import Problem, ProblemBatch
 
 n = 20
 

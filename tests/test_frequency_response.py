@@ -31,10 +31,12 @@ FIELDS = (
     "amplitude_std",
     "amplitude_covariance",
     "level",
+    "run",
     "controlled",
     "harmonic",
     "quantity",
     "motion",
+    "drive_factor_uncertainty",
 )
 
 
@@ -55,8 +57,10 @@ def full_table(
         "amplitude_std": np.sqrt(joint[:, 0, 0]),
         "amplitude_covariance": joint[:, 0, 1:],
         "level": [f"{k} N, #{k}" for k in range(n)],
+        "run": [f"day {k // 3}" for k in range(n)],
         "controlled": ["force", "displacement"] * (n // 2) + ["force"] * (n % 2),
         "motion": motion,
+        "drive_factor_uncertainty": 0.02,
         "quality": {
             "settled": np.arange(n) % 2 == 0,
             "remaining_bias": np.where(np.arange(n) == 2, np.nan, rng.normal(size=n)),
@@ -136,6 +140,8 @@ class TestValidation:
             ({"controlled": "speed"}, "controlled is 'speed'"),
             ({"harmonic": [1, 1.5]}, "whole numbers, got 1.5"),
             ({"harmonic": [1, 3], "quantity": "receptance"}, "only dynamic stiffness"),
+            ({"harmonic": [1, 0]}, r"response\[1\] is .*mean force"),
+            ({"harmonic": [-1, 1]}, "numbers >= 0"),
             ({"quantity": "stiffness"}, "quantity is 'stiffness'; expected one of receptance"),
             ({"motion": "sideways"}, "translation, rotation"),
             ({"level": [1.0, np.inf]}, r"level\[1\] is inf"),
@@ -320,6 +326,16 @@ class TestSelection:
         with pytest.raises(ValidationError, match=r"parts\[1\] .* does not go with parts\[0\]"):
             FrequencyResponse.concatenate([full_table(), other])
 
+    def test_runs_are_text_and_can_be_selected(self) -> None:
+        data = FrequencyResponse([1.0] * 3, [1j] * 3, [1e-3] * 3, run=[2, 2, 10.5])
+        assert data.runs == ["2", "10.5"]
+        assert data.select(run="2").n == 2
+        assert "2 runs" in repr(data)
+        with pytest.raises(ValidationError, match=r"no run \['3'\]; there are 2, 10.5"):
+            data.select(run="3")
+        with pytest.raises(ValidationError, match="there are none"):
+            FrequencyResponse([1.0], [1j], [1e-3]).select(run="a")
+
     def test_concatenate_refuses_nothing(self) -> None:
         with pytest.raises(ValidationError, match="at least one table"):
             FrequencyResponse.concatenate([])
@@ -353,11 +369,27 @@ class TestTables:
         )
         assert_same(data, read_frequency_response(data.save(tmp_path / "t.csv")))
 
+    @pytest.mark.parametrize("ending", [".csv", ".parquet", ".h5"])
+    def test_mean_force_and_even_harmonics(self, tmp_path: Path, ending: str) -> None:
+        covariance = np.array([np.diag([4.0, 0.0]), np.eye(2), np.eye(2)])
+        data = FrequencyResponse(
+            [1.0] * 3, [-3.0, 50.0 + 9.0j, 1.0 - 2.0j], [1e-3] * 3, covariance=covariance,
+            harmonic=[0, 1, 2], run=["1", "1", "02"],
+        )  # fmt: skip
+        assert_same(data, read_frequency_response(data.save(tmp_path / f"t{ending}")))
+        polar = read_frequency_response(data.to_frame(polar=True))
+        np.testing.assert_allclose(polar.response, data.response, rtol=1e-12)
+        assert polar.response[0].imag == 0.0
+        assert polar.covariance is not None
+        np.testing.assert_array_equal(polar.covariance[0], np.diag([4.0, 0.0]))
+        with pytest.raises(ValidationError, match="imaginary part an error"):
+            FrequencyResponse([1.0], [1.0], [1e-3], covariance=[np.eye(2)], harmonic=0)
+
     @given(
         arrays(
             np.float64,
             (6, 4),
-            elements=st.floats(1e-90, 1e90),
+            elements=st.floats(1e-90, 1e29),  # from 1e30, a lone one is taken for a mark
         ),
         st.lists(st.text(min_size=1).map(str.strip).filter(bool), min_size=6, max_size=6),
     )
@@ -365,7 +397,7 @@ class TestTables:
         data = FrequencyResponse(
             numbers[:, 0], numbers[:, 1] + 1j * numbers[:, 2], numbers[:, 3], level=labels
         )
-        assert_same(data, FrequencyResponse.from_frame(data.to_frame()))
+        assert_same(data, read_frequency_response(data.to_frame()))
 
     @given(
         arrays(np.float64, (3, 4), elements=st.floats(1e-90, 1e90)),
@@ -386,7 +418,7 @@ class TestTables:
 
     def test_frame_keeps_provenance(self) -> None:
         data = full_table()
-        assert FrequencyResponse.from_frame(data.to_frame()).provenance == data.provenance
+        assert read_frequency_response(data.to_frame()).provenance == data.provenance
 
     def test_polar_frame(self) -> None:
         data = full_table()
@@ -417,7 +449,7 @@ class TestTables:
                 "phase [deg]": [30.0, 20.0],
             }
         )
-        data = FrequencyResponse.from_frame(frame)
+        data = read_frequency_response(frame)
         np.testing.assert_allclose(known(data.amplitude), np.sqrt(2) * np.array([1e-5, 2e-5]))
         np.testing.assert_allclose(data.response, [5e3, 4e3] * np.exp(1j * np.radians([30, 20])))
         assert data.quantity == "dynamic_stiffness"
@@ -425,7 +457,7 @@ class TestTables:
     def test_missing_unit_says_how_to_give_it(self) -> None:
         frame = pd.DataFrame({"frequency_hz": [1.0], "amplitude": [1.0], "real": 1.0, "imag": 1.0})
         with pytest.raises(UnitError, match=r"'amplitude' has no unit; .* 'amplitude \[um\]'"):
-            FrequencyResponse.from_frame(frame)
+            read_frequency_response(frame)
 
     def test_quality_must_not_hide_a_column(self) -> None:
         with pytest.raises(ValidationError, match="quality 'gain' is also the name"):
@@ -455,7 +487,7 @@ class TestTables:
     def test_a_file_is_replaced_on_request_only(self, tmp_path: Path) -> None:
         path = full_table().save(tmp_path / "t.csv")
         before = path.read_bytes()
-        with pytest.raises(DataError, match=r"there is such a file already.*overwrite=True"):
+        with pytest.raises(DataError, match=r"the file exists already.*overwrite=True"):
             full_table(5).save(path)
         assert path.read_bytes() == before
         assert full_table(5).save(path, overwrite=True).read_bytes() != before

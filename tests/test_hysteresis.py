@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.hysteresis import force_history, memory_decay, steady_loop
+from dahl_ident.elements import hysteresis
+from dahl_ident.elements.hysteresis import force_history, steady_force, transient_decay
 
 F_MAX, SIGMA = 0.1, 30.0
 X_C = F_MAX / SIGMA
@@ -182,11 +183,16 @@ def test_memory_stays_small(alpha: float) -> None:
     assert peak < 20 * (x.nbytes + force.nbytes)
 
 
+def loop(amplitude: float, alpha: float, points: int) -> tuple[FloatArray, FloatArray]:
+    theta = np.linspace(0.0, 2.0 * np.pi, points)
+    return amplitude * np.cos(theta), steady_force(theta, amplitude, F_MAX, SIGMA, alpha)
+
+
 @pytest.mark.parametrize("alpha", [0.25, 0.5, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("beta", [0.3, 1.0, 30.0])
 @pytest.mark.parametrize("points", [4, 401])
 def test_steady_loop_is_what_a_history_settles_into(alpha: float, beta: float, points: int) -> None:
-    x, force = steady_loop(beta * X_C, F_MAX, SIGMA, alpha, points)
+    x, force = loop(beta * X_C, alpha, points)
     theta = np.linspace(0.0, 2.0 * np.pi, 1201)[:-1]
     assert x == pytest.approx(beta * X_C * np.cos(np.linspace(0.0, 2.0 * np.pi, points)))
     cycles = 120
@@ -199,7 +205,7 @@ def test_steady_loop_is_what_a_history_settles_into(alpha: float, beta: float, p
 
 def test_steady_loop_is_eqns_10_and_11() -> None:
     beta = 1.7
-    x, force = steady_loop(beta * X_C, F_MAX, SIGMA, 1.0, 101)
+    x, force = loop(beta * X_C, 1.0, 101)
     u, half = x / X_C, np.arange(101) <= 50
     eqn_11 = -1.0 + (1.0 + np.tanh(beta)) * np.exp(u - beta)
     eqn_10 = 1.0 - (1.0 + np.tanh(beta)) * np.exp(-(u + beta))
@@ -208,17 +214,37 @@ def test_steady_loop_is_eqns_10_and_11() -> None:
 
 @pytest.mark.parametrize("alpha", [0.5, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("beta", [0.02, 0.2, 0.6])
-def test_memory_decay_is_the_ratio_of_deviations_a_cycle_apart(alpha: float, beta: float) -> None:
-    x, force = steady_loop(beta * X_C, F_MAX, SIGMA, alpha, 3)
+def test_transient_decay_is_the_ratio_of_deviations_a_cycle_apart(
+    alpha: float, beta: float
+) -> None:
+    x, force = loop(beta * X_C, alpha, 3)
     deviation = 1e-6 * F_MAX
     disturbed = force_history(x, F_MAX, SIGMA, alpha, force[0] + deviation)
-    factor = memory_decay(np.array([beta]), alpha)[0]
+    factor = transient_decay(np.array([beta]), alpha)[0]
     assert (disturbed[-1] - force[-1]) / deviation == pytest.approx(factor, rel=1e-5)
 
 
-def test_memory_decay_limits() -> None:
+def test_transient_decay_limits() -> None:
     beta = np.array([1e-4, 1e3])
     for alpha in (0.5, 1.0, 2.0):
-        slow, fast = memory_decay(beta, alpha)
+        slow, fast = transient_decay(beta, alpha)
         assert slow == pytest.approx(np.exp(-4.0 * alpha * 1e-4), rel=1e-9)
         assert 0.0 <= fast < 1e-5
+
+
+def test_linear_history_derivatives() -> None:
+    rng = np.random.default_rng(5)
+    x = np.cumsum(rng.standard_normal(400)) * 1e-3
+    point = np.array([0.05, 0.2, 30.0])  # initial force, f_max, sigma
+
+    def force(at: FloatArray) -> FloatArray:
+        start, f_max, sigma = at.tolist()
+        return force_history(x, f_max, sigma, 1.0, start)
+
+    found, by_start, by = hysteresis.linear_history_gradient(x, 0.2, 30.0, 0.05)
+    np.testing.assert_allclose(found, force(point), rtol=0.0, atol=1e-14)
+    for i, slope in enumerate((by_start, *by.T)):
+        h = np.zeros(3)
+        h[i] = 1e-5 * point[i]
+        expected = (force(point + h) - force(point - h)) / (2.0 * h[i])
+        np.testing.assert_allclose(slope, expected, rtol=0.0, atol=1e-8 * np.abs(expected).max())

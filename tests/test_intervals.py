@@ -15,8 +15,8 @@ from scipy import optimize, special, stats
 from dahl_ident import Dahl, FrequencyResponse, Sensors, Spring, fit
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.bootstrap import bootstrap_intervals, replicate
+from dahl_ident.diagnostics.confidence_levels import LEVELS, thresholds
 from dahl_ident.diagnostics.intervals import compare, profile_intervals, wald_intervals
-from dahl_ident.diagnostics.levels import LEVELS, thresholds
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting.status import Status
@@ -48,7 +48,7 @@ class TestClosedForm:
 
     def test_known_noise_gives_normal_thresholds(self) -> None:
         data = replace(spring_table(), covariance=np.tile(0.01 * np.eye(2), (8, 1, 1)))
-        (interval,) = fit(data, Spring()).conf_interval(levels=[0.95])["stiffness"]
+        (interval,) = fit(data, Spring()).conf_interval("wald", levels=[0.95])["stiffness"]
         half = 1.959963984540054 * 0.1 / np.sqrt(8.0)
         assert 0.5 * (interval.upper - interval.lower) == pytest.approx(half, rel=1e-8)
 
@@ -78,11 +78,12 @@ class TestOtherLibraries:
         mini = lmfit.Minimizer(residuals, parameters)
         peer = mini.minimize(ftol=1e-14, xtol=1e-14)
         for i, name in enumerate(("f_max", "sigma")):
-            assert result.params[name].value == pytest.approx(peer.params[name].value, rel=1e-6)
-            assert result.params[name].stderr == pytest.approx(peer.params[name].stderr, rel=1e-4)
+            peers = peer.params[name]  # which count noise alone
+            assert result.optimum.values[i] == pytest.approx(peers.value, rel=1e-6)
+            assert result.stderr_noise[name] == pytest.approx(peers.stderr, rel=1e-4)
             np.testing.assert_allclose(result.covar[i], peer.covar[i], rtol=2e-4)
         found = lmfit.conf_interval(mini, peer, sigmas=[1, 2])
-        ours = result.conf_interval(levels=[0.682689492, 0.954499736])
+        ours = result.conf_interval("profile", levels=[0.682689492, 0.954499736])
         for name in ("f_max", "sigma"):
             limits = [value for _, value in found[name]]
             (one, two) = ours[name]
@@ -104,9 +105,7 @@ class TestOtherLibraries:
         values, covariance = optimize.curve_fit(
             model, np.zeros(1), target, p0=[0.1, 30.0], ftol=1e-14, xtol=1e-14, gtol=1e-14
         )
-        np.testing.assert_allclose(
-            [result.params[n].value for n in result.var_names], values, rtol=1e-6
-        )
+        np.testing.assert_allclose(result.optimum.values, values, rtol=1e-6)
         np.testing.assert_allclose(result.covar, covariance, rtol=1e-4)
 
 
@@ -152,7 +151,7 @@ class TestProfile:
         result = next(
             r
             for seed in range(20)
-            if (r := fit(table(beta=(1e-4, 1e-3), seed=seed), Dahl(), throw=False)).status
+            if (r := fit(table(beta=(1e-4, 1e-3), seed=seed), Dahl(), throw=False)).optimum.status
             is Status.NO_LOSS
         )
         one, two, three = result.conf_interval()["f_max"]
@@ -180,8 +179,8 @@ class TestProfile:
         (own,) = (p for p in model.parameters if p.name == "f_max")
         bounded = model.with_parameters({"f_max": replace(own, upper=0.1002)})
         data = table(model=Dahl(0.1, 30.0) + Spring(0.3))
-        free = fit(data, model).conf_interval()["f_max"][1]
-        tied = fit(data, bounded).conf_interval()["f_max"][1]
+        free = fit(data, model).conf_interval("profile")["f_max"][1]
+        tied = fit(data, bounded).conf_interval("profile")["f_max"][1]
         assert free.upper > 0.1002
         assert tied.upper == pytest.approx(0.1002)
         assert tied.lower == pytest.approx(free.lower, rel=1e-3)
@@ -225,7 +224,7 @@ class TestProfile:
     ) -> None:
         data = table(beta=(10.0**low, 10.0 ** (low + decades)), n=n, noise=noise, seed=seed)
         result = fit(data, Dahl(), throw=False)
-        found = result.conf_interval()
+        found = result.conf_interval("profile")
         finite = np.isfinite(result.optimum.values) & (result.optimum.values > 0.0)
         for i in np.flatnonzero(finite):
             assert (found.lower[:, i] <= result.optimum.values[i]).all()
@@ -342,7 +341,9 @@ class TestTable:
             self.result().conf_interval(levels=levels)
 
     def test_unknown_method(self) -> None:
-        with pytest.raises(ValidationError, match="method is 'bayes'; expected one of wald"):
+        with pytest.raises(
+            ValidationError, match="method is 'bayes'; expected one of combined, wald"
+        ):
             self.result().conf_interval("bayes")  # type: ignore[arg-type]  # the test's point
 
     def test_comparison_needs_two_of_the_same_levels(self) -> None:

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring, limit_cycles
+from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring
 from dahl_ident.arrays import FloatArray
-from dahl_ident.control_interop import DahlNonlinearity, LimitCycle
+from dahl_ident.control_interop import FrictionNonlinearity, LimitCycle, limit_cycles
 from dahl_ident.elements import Element
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.synthetic.mechanism import Mechanism
@@ -249,7 +249,7 @@ def test_discrete_loop_nears_its_continuous_origin() -> None:
 def test_python_control_finds_the_same_crossings() -> None:
     cycles = limit_cycles(ACTIVE, GRIP)
     theirs = control.describing_function_response(
-        control.tf([1.0], [0.3, -0.3, 0.3]), DahlNonlinearity(GRIP),
+        control.tf([1.0], [0.3, -0.3, 0.3]), FrictionNonlinearity(GRIP),
         np.geomspace(1e-4, 1.0, 200), np.geomspace(0.3, 30.0, 800), refine=False,
     )  # fmt: skip
     for cycle, (A, omega) in zip(cycles, sorted(theirs), strict=True):

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from dahl_ident import Dahl, FrequencyResponse, Problem
+from dahl_ident import Dahl, FrequencyResponse
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.fitting import solve_many
 from dahl_ident.noise import Student, bend
-from dahl_ident.problem import ProblemBatch
+from dahl_ident.problem import Problem, ProblemBatch
 
 n = 8
 A = np.geomspace(1e-4, 1e-1, n)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 import subprocess
 import sys
 import zipfile
@@ -10,64 +12,81 @@ from pathlib import Path
 import pytest
 
 import dahl_ident as di
-from dahl_ident import errors
 
 ROOT = Path(__file__).parents[1]
 
 PUBLIC_NAMES = [
+    "Backlash",
+    "BoucWen",
     "Dahl",
-    "DahlIdentError",
-    "DahlNonlinearity",
     "Damper",
-    "DataError",
-    "DataWarning",
-    "ExtractionError",
-    "FitBatch",
-    "FitError",
+    "Element",
+    "Experiment",
     "FitResult",
     "FrequencyResponse",
+    "Friction",
+    "Iwan",
     "LinearSystem",
+    "LuGre",
     "Mass",
-    "MissingDependencyError",
+    "MaxwellSlip",
     "Model",
-    "ModelError",
-    "MultipleSolutionsWarning",
-    "Posterior",
-    "Problem",
+    "Parameter",
+    "PowerDamper",
     "Record",
-    "SamplingError",
+    "RecordFit",
     "Sensors",
     "Spring",
-    "UnitError",
-    "ValidationError",
-    "closed_loop_response",
+    "campaign",
     "compare_models",
-    "equivalent_plant",
+    "control",
+    "errors",
     "extract",
     "fit",
     "fit_many",
-    "identifiability",
-    "level_responses",
-    "limit_cycles",
     "load_dataset",
-    "loop_margins",
-    "posterior_grid",
+    "plan",
+    "population",
+    "posterior",
     "read_frequency_response",
     "read_record",
     "report",
     "response",
-    "response_branches",
-    "sample",
     "simulate",
+    "synthetic",
 ]
+
+
+# of numpy, pandas and the standard library, protocols, aliases, and what functions return
+USUAL = {
+    *("Any", "ArrayLike", "Callable", "DataFrame", "Iterable", "Mapping", "Path", "PathLike"),
+    *("Sequence", "Fit", "Result", "Records"),
+}
 
 
 def test_public_names_are_frozen() -> None:
     assert sorted(di.__all__) == PUBLIC_NAMES
 
 
-def test_every_error_is_public() -> None:
-    assert set(errors.__all__) <= set(di.__all__)
+def test_rooms_are_reached_through_the_package() -> None:
+    assert di.control.limit_cycles.__module__.startswith("dahl_ident.control_interop")
+    assert di.synthetic.SteppedSine.__doc__
+    assert issubclass(di.errors.FitError, di.errors.DahlIdentError)
+
+
+def test_what_a_signature_needs_is_where_the_function_is() -> None:
+    rooms = [di, di.control, di.synthetic]
+    for room in rooms:
+        for name in room.__all__:
+            function = getattr(room, name)
+            if not inspect.isfunction(function):
+                continue
+            for parameter in inspect.signature(function).parameters.values():
+                if parameter.default is not inspect.Parameter.empty:
+                    continue
+                needed = set(re.findall(r"\b[A-Z][A-Za-z]+", str(parameter.annotation)))
+                missing = {n for n in needed - USUAL if not (hasattr(room, n) or hasattr(di, n))}
+                assert not missing, f"{name}({parameter}) needs {missing}"
 
 
 @pytest.mark.parametrize("name", PUBLIC_NAMES)

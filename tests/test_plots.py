@@ -1,12 +1,12 @@
 """Plots: what they draw, against pictures that were looked at, and what stands on their axes.
 
-The pictures are compared without their text, whose rendering depends on fonts; text is compared
-as text. After a wanted change:
+Pictures are compared with their labels, which must not collide. After a wanted change:
 ``pytest tests/test_plots.py --mpl-generate-path=tests/baseline``.
 """
 
 from __future__ import annotations
 
+import itertools
 import os
 import subprocess
 import sys
@@ -20,9 +20,12 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
 
 import dahl_ident as di
 from dahl_ident import plots
+from dahl_ident.control_interop.linearization import LoopMargins
 from dahl_ident.elements.linear_dahl import describing_function
 from dahl_ident.errors import ValidationError
 from dahl_ident.plots import Curve, style
@@ -40,13 +43,9 @@ BASELINE_VERSION = "3.11"
 
 
 def same_picture(draw: Callable[[], Figure]) -> Callable[[], Figure]:
-    """Compare the figure with its picture, by the version of matplotlib that drew that."""
+    """Compare the figure, labels included, with its picture by the same matplotlib."""
     compare = pytest.mark.mpl_image_compare(
-        baseline_dir="baseline",
-        remove_text=True,
-        tolerance=2,
-        savefig_kwargs={"dpi": 50},
-        style="default",
+        baseline_dir="baseline", tolerance=4, savefig_kwargs={"dpi": 90}, style="default"
     )
     same_version = pytest.mark.skipif(
         not mpl.__version__.startswith(f"{BASELINE_VERSION}."),
@@ -57,15 +56,43 @@ def same_picture(draw: Callable[[], Figure]) -> Callable[[], Figure]:
 
 
 def the_figure(axes: Any) -> Figure:
-    """Return the figure of some axes, rid of its words."""
+    """Return the figure of some axes, in which no labels collide."""
     figure: Figure = np.ravel(np.asarray(axes, dtype=object))[0].figure
-    for ax in figure.axes:
-        ax.set(xlabel="", ylabel="")
-        ax.set_title("", loc="left")
-        for artist in (*ax.texts, ax.get_legend()):
-            if artist is not None:
-                artist.remove()
+    assert colliding_labels(figure) == []
     return figure
+
+
+def colliding_labels(figure: Any) -> list[tuple[str, str]]:
+    """Return the pairs of texts that overlap, and those that leave the page."""
+    page = figure.bbox.padded(1.0)
+    boxes = [(t.get_text(), t.get_window_extent(), t.get_rotation() % 90) for t in _drawn(figure)]
+    found = [(text, "edge of the page") for text, box, _ in boxes if not _inside(box, page)]
+    for (a, one, turned), (b, other, also) in itertools.combinations(boxes, 2):
+        # the boxes of slanted neighbours overlap where their letters do not
+        shrunk = (box.shrunk(0.5 if turned or also else 0.98, 0.9) for box in (one, other))
+        if Bbox.intersection(*shrunk) is not None:
+            found.append((a, b))
+    return found
+
+
+def _drawn(figure: Any) -> list[Text]:
+    """Return the texts that are drawn: tick labels beyond the limits, for one, are not."""
+    drawn: list[Text] = []
+    draw = Text.draw
+
+    def noted(self: Text, renderer: Any) -> None:
+        if self.get_visible() and self.get_text().strip():
+            drawn.append(self)
+        draw(self, renderer)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Text, "draw", noted)
+        figure.canvas.draw()
+    return drawn
+
+
+def _inside(box: Bbox, page: Bbox) -> bool:
+    return bool(page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1)
 
 
 @same_picture
@@ -152,6 +179,114 @@ def test_cycles() -> Figure:
         30.0 + 5j + decay * (1 - 2j), 1e-3 * decay, left_out=2, response_std=0.05, mean_std=1e-5
     )
     return the_figure(axes)
+
+
+@same_picture
+def test_budget() -> Figure:
+    shares = {"noise": (0.2, 0.05), "force calibration": (0.75, 0.9), "between runs": (0.05, 0.05)}
+    rows = [
+        (name, source, share)
+        for source, both in shares.items()
+        for name, share in zip(("f_max", "sigma"), both, strict=True)
+    ]
+    return the_figure(plots.plot_budget(rows))
+
+
+@same_picture
+def test_margins() -> Figure:
+    gain = np.where(A > 1e-2, np.inf, 1.0 / A)
+    return the_figure(plots.plot_margins(A, gain, 50.0 + 1e3 * A))
+
+
+@same_picture
+def test_nichols() -> Figure:
+    f = np.geomspace(0.1, 10.0, 50)
+    levels = [(f"{k} N", 1.0 / (1.0 - f**2 + 0.2j * k * f)) for k in (1, 2, 4)]
+    return the_figure(plots.plot_nichols(levels, gain_label="receptance [m/N]"))
+
+
+@same_picture
+def test_waveforms() -> Figure:
+    t = np.linspace(0.0, 2.0, 400)
+    x = 1e-2 * np.sin(2 * np.pi * t)
+    force = FRICTION.force(x)
+    channels = [("displacement [m]", x), ("force [N]", force)]
+    return the_figure(plots.plot_waveforms(t, channels, fitted=[None, 0.97 * force]))
+
+
+def test_records_draw_themselves() -> None:
+    record = di.Record([0.0, 0.1, 0.2], velocity=[0.0, 1.0, 0.0], force=[0.0, 2.0, 1.0])
+    rows = record.plot()
+    assert [axis.get_ylabel() for axis in rows] == ["velocity [m/s]", "force [N]"]
+    np.testing.assert_array_equal(rows[1].lines[0].get_ydata(), record.force)
+    loop = record.plot("loops")
+    assert (loop.get_xlabel(), loop.get_ylabel()) == ("velocity [m/s]", "force [N]")
+    with pytest.raises(ValidationError, match="kind is 'bode'; expected 'waveforms' or 'loops'"):
+        record.plot("bode")  # type: ignore[arg-type]
+    with pytest.raises(ValidationError, match="ax holds 1 axes; expected 2"):
+        record.plot(ax=[loop])
+    plt.close("all")
+
+
+def test_margins_that_are_infinite_everywhere_are_drawn() -> None:
+    margins = LoopMargins(A, np.full(12, np.inf), np.full(12, 60.0), np.ones(12))
+    top, _ = margins.plot()
+    assert [text.get_text() for text in top.get_legend().get_texts()] == ["infinite"]
+    assert colliding_labels(top.figure) == []
+    draws = LoopMargins(A, np.full((5, 12), np.inf), np.full((5, 12), np.inf), np.ones((5, 12)))
+    assert colliding_labels(draws.plot()[0].figure) == []
+    top, _ = LoopMargins(A, np.full(12, 10.0), np.full(12, 60.0), np.ones(12)).plot()
+    np.testing.assert_allclose(np.asarray(top.lines[0].get_ydata()), 20.0)
+    assert (top.get_yscale(), top.get_ylabel()) == ("linear", "gain margin [dB]")
+    plt.close("all")
+
+
+AWKWARD = {  # name, centre, spread, logarithmic
+    "narrow": ("f_max [N]", 0.09982, 3e-5, False),
+    "tiny": ("damping [N s/m]", 3.2e-7, 4e-9, False),
+    "large": ("stiffness [N/m]", 1.23456e6, 20.0, False),
+    "wide": ("exponent", 0.0, 2.5, True),
+    "two decades": ("another.sigma [N m/rad]", 0.0, 1.0, True),
+}
+
+
+def _awkward(count: int) -> tuple[list[str], np.ndarray[Any, Any], list[bool]]:
+    chosen = list(AWKWARD.values())[:count]
+    normal = np.random.default_rng(3).standard_normal((3200, count))
+    draws = np.stack(
+        [
+            np.exp(centre + spread * z) if log else centre + spread * z
+            for z, (_, centre, spread, log) in zip(normal.T, chosen, strict=True)
+        ],
+        axis=-1,
+    )
+    return [name for name, *_ in chosen], draws, [log for *_, log in chosen]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_labels_of_corner_and_trace_do_not_collide(count: int) -> None:
+    names, draws, log = _awkward(count)
+    grid = plots.plot_corner(names, draws, log=log)
+    assert colliding_labels(grid[0, 0].figure) == []
+    rows = plots.plot_trace(names, draws.reshape(100, 32, count), log=log, discard=20)
+    assert colliding_labels(rows[0].figure) == []
+    plt.close("all")
+
+
+@pytest.mark.parametrize("name", AWKWARD)
+@pytest.mark.parametrize("width", [2.4, 4.6])
+def test_labels_of_profiles_do_not_collide(name: str, width: float) -> None:
+    label, centre, spread, log = AWKWARD[name]
+    z = np.linspace(-3.2, 3.2, 21)
+    value = np.exp(centre + spread * z) if log else centre + spread * z
+    axis = style.new_axes(1, 1, size=(width, 1.9), sharex=False)[0, 0]
+    limits = {"68.27 %": 1.0, "95.45 %": 4.0, "99.73 %": 9.0}
+    best = float(value[10])
+    plots.plot_profile(value, z**2, best=best, limits=limits, label=label, log=log, ax=axis)
+    assert colliding_labels(axis.figure) == []
+    ticks = set(axis.get_xticklabels())
+    assert len(ticks.intersection(_drawn(axis.figure))) >= 2
+    plt.close("all")
 
 
 def _amplitude(ax: Any) -> Any:
@@ -248,14 +383,65 @@ def test_every_axis_has_its_unit() -> None:
     plt.close("all")
 
 
-def test_series_differ_for_every_reader() -> None:
-    """Also without green receptors (Machado, Oliveira and Fernandes 2009), and by their markers."""
-    deuteranopia = np.array([[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]])
-    colours = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in style.SERIES]) / 255.0
-    for seen in (colours, colours @ deuteranopia.T):
-        distance = np.linalg.norm(seen[:, None] - seen[None], axis=-1)
-        assert distance[np.triu_indices(len(seen), 1)].min() > 0.15
+SEEN_BY = {  # matrices of Machado, Oliveira and Fernandes 2009, for missing receptors
+    "all receptors": np.eye(3),
+    "no red": np.array([[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]]),
+    "no green": np.array([[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]]),
+    "no blue": np.array([[1.256, -0.077, -0.179], [-0.078, 0.931, 0.148], [0.005, 0.691, 0.304]]),
+}
+
+
+def _luminance(colours: Any) -> Any:
+    """Return the relative luminance of sRGB colours (WCAG 2)."""
+    c = np.asarray(colours)
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    return linear @ [0.2126, 0.7152, 0.0722]
+
+
+def _distances(colours: Any) -> Any:
+    return np.linalg.norm(colours[:, None] - colours[None], axis=-1)
+
+
+def test_lines_and_markers_stand_out_from_the_page() -> None:
+    """At least 3 to 1 against white (WCAG 2, graphical objects)."""
+    levels = [c for n in range(1, 30) for c in style.level_colours(n)]
+    for colour in (*style.SERIES, style.FIT, style.GREY, *levels):
+        assert 1.05 / (_luminance(mpl.colors.to_rgb(colour)) + 0.05) >= 3.0, colour
+
+
+@pytest.mark.parametrize("reader", SEEN_BY)
+def test_series_differ_for_every_reader(reader: str) -> None:
+    colours = np.array([mpl.colors.to_rgb(c) for c in style.SERIES])
+    seen = np.clip(colours @ SEEN_BY[reader].T, 0.0, 1.0)
+    assert _distances(seen)[np.triu_indices(len(seen), 1)].min() > 0.12
     assert len(set(style.MARKERS)) == len(style.MARKERS) == len(style.SERIES)
+
+
+@pytest.mark.parametrize("reader", [*SEEN_BY, "grey print"])
+@pytest.mark.parametrize("count", [2, 5, 9, 12])
+def test_levels_differ_for_every_reader(reader: str, count: int) -> None:
+    """Two levels of one line style or marker differ in colour, in a grey print in lightness."""
+    colours = np.array([mpl.colors.to_rgb(c) for c in style.level_colours(count)])
+    if reader == "grey print":
+        lightness = 116.0 * np.cbrt(_luminance(colours)) - 16.0
+        apart, least = np.abs(lightness[:, None] - lightness[None]), 10.0
+    else:
+        apart, least = _distances(np.clip(colours @ SEEN_BY[reader].T, 0.0, 1.0)), 0.12
+    looks = (
+        [str(look["linestyle"]) for look in style.level_lines(count)],
+        [look["marker"] for look in style.level_markers(count)],
+    )
+    for own in looks:
+        for i, j in itertools.combinations(range(count), 2):
+            assert own[i] != own[j] or apart[i, j] > least, (i, j, apart[i, j])
+
+
+def test_repeated_measurements_of_a_level_are_not_joined() -> None:
+    top, _ = plots.plot_frequency_response(
+        [("curve", [1.0, 2.0, 3.0], [1.0, 2.0, 3.0]), ("repeats", [1.0, 1.0, 2.0], [1.0, 3.0, 2.0])]
+    )
+    assert [line.get_linestyle() for line in top.lines] == ["-", "None"]
+    plt.close("all")
 
 
 @pytest.mark.parametrize(
@@ -276,6 +462,18 @@ def test_the_house_style_stays_in_its_figures() -> None:
     plt.close("all")
 
 
+def test_axes_of_the_user_are_drawn_on_in_the_house_style() -> None:
+    with mpl.rc_context({"legend.fontsize": 13.0, "lines.linewidth": 4.0}):
+        figure, ax = plt.subplots()
+        plots.plot_loops([(A, A, "a")], ax=ax)
+        assert mpl.rcParams["legend.fontsize"] == 13.0
+    (line,), legend = ax.lines, ax.get_legend()
+    assert line.get_linewidth() == style.RC["lines.linewidth"]
+    assert legend is not None
+    assert legend.get_texts()[0].get_fontsize() == style.RC["legend.fontsize"]
+    plt.close(figure)
+
+
 def test_a_notebook_stays_interactive_after_the_first_picture(tmp_path: Path) -> None:
     backend = tmp_path / "notebook_like.py"
     backend.write_text(
@@ -294,3 +492,18 @@ def test_a_notebook_stays_interactive_after_the_first_picture(tmp_path: Path) ->
     }  # fmt: skip
     for draw in ("plot_loops([([0, 1], [0, 1], 'a')])", "plot_corner(['a'], np.eye(9)[:, :1])"):
         subprocess.run([sys.executable, "-c", code.format(draw=draw)], check=True, env=environment)
+
+
+def test_residuals_of_a_fit_over_amplitude_frequency_and_velocity() -> None:
+    f = np.linspace(0.5, 3.0, 12)
+    data = di.FrequencyResponse(f, N * np.exp(0.01 * (SCATTER[0] + 1j * SCATTER[1])), A)
+    fit = di.fit(data, di.Dahl(), throw=False)
+    places: dict[Any, Any] = {"amplitude": A, "frequency": f, "velocity": 2.0 * np.pi * f * A}
+    for against, x in places.items():
+        axis = fit.plot_residuals(against=against)
+        assert against in axis.get_xlabel()
+        drawn = next(line for line in axis.lines if line.get_label() == "ln gain")
+        np.testing.assert_allclose(np.asarray(drawn.get_xdata()), x)
+    with pytest.raises(ValidationError, match="against is 'time'; expected one of amplitude"):
+        fit.plot_residuals(against="time")  # type: ignore[arg-type]
+    plt.close("all")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,17 +15,20 @@ from dahl_ident.bayes.convergence import autocorrelation_time
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.moves import EnsembleMove
 from dahl_ident.bayes.priors import joint_prior
-from dahl_ident.data.readers.file import library
-from dahl_ident.errors import SamplingError, ValidationError
-from dahl_ident.results.predictive import pointwise_log_likelihood
+from dahl_ident.data.storage import library
+from dahl_ident.errors import DataError, SamplingError, ValidationError
+from dahl_ident.problem import Problem
+from dahl_ident.results import ChainPosterior
+from dahl_ident.results.predictive_checks import pointwise_log_likelihood
+from dahl_ident.results.result import Result
 from tests.bayes_cases import friction_table, harmonic_table, spring_table, with_covariance
 
 LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
 
 
 @pytest.fixture(scope="module")
-def posterior() -> di.Posterior:
-    return di.sample(friction_table(), di.Dahl(), seed=1)
+def posterior() -> ChainPosterior:
+    return di.posterior(friction_table(), di.Dahl(), seed=1)
 
 
 def scenarios() -> dict[str, tuple[di.FrequencyResponse, Any, dict[str, Any]]]:
@@ -44,8 +49,8 @@ def scenarios() -> dict[str, tuple[di.FrequencyResponse, Any, dict[str, Any]]]:
 @pytest.mark.parametrize("name", scenarios())
 def test_sampling_agrees_with_quadrature(name: str) -> None:
     data, model, options = scenarios()[name]
-    drawn = di.sample(data, model, seed=3, ess=3000.0, **options)
-    grid = di.posterior_grid(data, model, **options)
+    drawn = di.posterior(data, model, seed=3, ess=3000.0, **options)
+    grid = di.posterior(data, model, **options, method="grid")
     assert drawn.converged
     ess = drawn.convergence.ess
     D = len(drawn.names)
@@ -78,7 +83,7 @@ def test_sampling_agrees_with_quadrature(name: str) -> None:
             assert abs(squares.mean() - variance) < 4.0 * error
 
 
-def test_the_summary_is_that_of_the_draws(posterior: di.Posterior) -> None:
+def test_the_summary_is_that_of_the_draws(posterior: ChainPosterior) -> None:
     table = posterior.summary()
     values = posterior.values
     assert list(table.index) == ["f_max", "sigma", "noise_scale"]
@@ -91,7 +96,7 @@ def test_the_summary_is_that_of_the_draws(posterior: di.Posterior) -> None:
     assert np.all(table["r_hat"].to_numpy() < 1.01)
 
 
-def test_emcees_names(posterior: di.Posterior) -> None:
+def test_emcees_names(posterior: ChainPosterior) -> None:
     whole = posterior.get_chain()
     assert whole.shape == (posterior.steps, 128, 3)
     some = posterior.get_chain(discard=100, thin=3)
@@ -105,9 +110,9 @@ def test_emcees_names(posterior: di.Posterior) -> None:
 
 
 def test_a_short_chain_is_marked_and_keeps_its_ess_to_itself() -> None:
-    short = di.sample(friction_table(), di.Dahl(), seed=1, steps=60)
+    short = di.posterior(friction_table(), di.Dahl(), seed=1, steps=60)
     assert not short.converged
-    assert short.report().startswith("NOT CONVERGED after 60 steps: ")
+    assert str(short).startswith("NOT CONVERGED after 60 steps: ")
     assert "autocorrelation times, expected 50" in short.message
     assert np.isnan(short.summary()["ess"].to_numpy()).all()
     assert "NOT CONVERGED" in repr(short)
@@ -119,17 +124,17 @@ def test_a_chain_that_never_moved_is_refused_with_its_chain(
     def stay(half: Any, guide: Any, random: Any) -> Any:
         return half, np.full(half.shape[:-1], -np.inf)
 
-    def moves(ensembles: int, shear: Any) -> list[tuple[EnsembleMove, float]]:
+    def moves(ensembles: int, decorrelation: Any) -> list[tuple[EnsembleMove, float]]:
         return [(EnsembleMove(stay, ensembles), 1.0)]
 
     monkeypatch.setattr("dahl_ident.bayes.chain.moves_for", moves)
     with pytest.raises(SamplingError, match="walkers never moved in f_max, sigma") as caught:
-        di.sample(friction_table(), di.Dahl(), seed=1, steps=40)
+        di.posterior(friction_table(), di.Dahl(), seed=1, steps=40)
     assert caught.value.posterior.get_chain().shape == (40, 128, 3)
 
 
-def test_the_report_names_priors(posterior: di.Posterior) -> None:
-    text = posterior.report()
+def test_the_report_names_priors(posterior: ChainPosterior) -> None:
+    text = str(posterior)
     assert text.startswith("Converged: ")
     assert "f_max: log-uniform from" in text
     assert "noise_scale: 1/s" in text
@@ -138,39 +143,107 @@ def test_the_report_names_priors(posterior: di.Posterior) -> None:
 
 def test_a_prior_dominated_parameter_is_named() -> None:
     data = friction_table(10, 0.0003, 0.003, 0.05)
-    posterior = di.sample(data, di.Dahl(), seed=1)
-    (rule,) = posterior.prior_rules
+    posterior = di.posterior(data, di.Dahl(), seed=1)
+    (rule,) = posterior.prior_influences
     assert rule.name == "f_max"
-    assert "f_max is set by its prior: posterior width 0." in posterior.report()
+    assert "f_max is set by its prior: posterior width 0." in str(posterior)
 
 
-def test_derived_quantities(posterior: di.Posterior) -> None:
-    x_c = posterior.derived(lambda f_max, sigma, **_: f_max / sigma)
+def test_derived_quantities(posterior: ChainPosterior) -> None:
+    x_c = posterior.function(lambda f_max, sigma, **_: f_max / sigma)
     exact = posterior.values[:, 0] / posterior.values[:, 1]
     assert x_c["median"] == pytest.approx(np.median(exact))
     assert x_c["std"] == pytest.approx(exact.std(), rel=1e-3)
     with pytest.raises(ValidationError, match="expected one number a draw"):
-        posterior.derived(lambda **_: 1.0)
+        posterior.function(lambda **_: 1.0)
 
 
-def test_prediction_bands_hold_the_best_fit(posterior: di.Posterior) -> None:
-    band = posterior.prediction_band()
-    best = di.fit(posterior.data, di.Dahl()).best_fit
-    assert (band.gain[0] < np.abs(best)).all()
-    assert (np.abs(best) < band.gain[4]).all()
-    assert (band.phase_deg[0] < np.rad2deg(np.angle(best))).all()
-    assert (np.rad2deg(np.angle(best)) < band.phase_deg[4]).all()
+def test_prediction_bands_hold_the_best_fit(posterior: ChainPosterior) -> None:
+    data = posterior.data
+    band = posterior.predict(data.frequency_hz, amplitude=data.amplitude)
+    best = di.fit(data, di.Dahl()).best_fit
+    for limits, value in (
+        (band.gain(0.95), np.abs(best)),
+        (band.phase(0.95), np.angle(best)),
+        (band.real(0.95), best.real),
+        (band.imag(0.95), best.imag),
+    ):
+        assert (limits[0] < value).all()
+        assert (value < limits[1]).all()
+
+
+def test_every_result_has_one_interface() -> None:
+    data = friction_table()
+    results: list[Result] = [
+        di.fit(data, di.Dahl()),
+        di.posterior(data, di.Dahl(), seed=1, ess=500.0, max_steps=2000),
+        di.posterior(data, di.Dahl(), method="grid"),
+    ]
+    fit = results[0]
+    assert isinstance(fit, di.FitResult)
+    band = fit.predict([1.0, 2.0], amplitude=[0.001, 0.002])
+    (x_c, *at) = fit.derived([0.002], 1.0)
+    for result in results:
+        assert isinstance(result, Result)
+        assert (result.status, result.trusted) == ("trusted", True)
+        assert result.verdict.startswith("Trusted. ")
+        assert result.statements[0] in result.verdict
+        names = ["f_max", "sigma", "alpha"]
+        assert [name for name in result.params if name != "noise_scale"] == names
+        for name in ("f_max", "sigma"):
+            mine, theirs = result.params[name], fit.params[name]
+            assert mine.stderr is not None
+            assert theirs.stderr is not None
+            # a fit's errors hold every source, those of a posterior the noise and the priors
+            assert abs(mine.value - theirs.value) < theirs.stderr
+            expected = theirs.stderr if result is fit else fit.stderr_noise[name]
+            assert 0.7 < mine.stderr / expected < 1.5
+            assert name in result.summary().index
+        other = result.predict([1.0, 2.0], amplitude=[0.001, 0.002])
+        for one, two in zip(other.gain(), band.gain(), strict=True):
+            np.testing.assert_allclose(one, two, rtol=0.04)  # a fit's holds every source
+        assert [q.name for q in result.derived([0.002], 1.0)] == [q.name for q in (x_c, *at)]
+        for mine_, theirs_ in zip(result.derived([0.002], 1.0), (x_c, *at), strict=True):
+            assert abs(mine_.value - theirs_.value) < 2.0 * theirs_.stderr
+            assert 0.2 < mine_.stderr / theirs_.stderr < 1.6
+            assert mine_.unit == theirs_.unit
+        assert result.plot() is not None
+        assert result.budget()["f_max"].u == fit.budget()["f_max"].u
+        assert json.loads(result.to_json())["schema"].startswith("dahl_ident.")
+        with pytest.raises(ValidationError, match="kind is 'pie'; expected"):
+            result.plot("pie")
+    assert fit.plot("budget").get_xlabel() == "share of the variance [%]"
+
+
+def test_results_are_saved_and_never_overwritten(tmp_path: Path) -> None:
+    grid = di.posterior(friction_table(), di.Dahl(), method="grid")
+    place = grid.save(tmp_path / "grid.json")
+    stored = json.loads(place.read_text())
+    assert stored["summary"]["f_max"]["mean"] == grid.params["f_max"].value
+    with pytest.raises(DataError, match="the file exists already"):
+        grid.save(place)
+    with pytest.raises(ValidationError, match=r"a posterior is written as \.json; got '\.txt'"):
+        grid.save(tmp_path / "grid.txt")
+
+
+def test_options_of_the_other_method_are_refused() -> None:
+    with pytest.raises(ValidationError, match="steps given with method='grid', which has no such"):
+        di.posterior(friction_table(), di.Dahl(), method="grid", steps=100)  # type: ignore[call-overload]
+    with pytest.raises(ValidationError, match="tolerance given with method='mcmc'"):
+        di.posterior(friction_table(), di.Dahl(), tolerance=1e-3)  # type: ignore[call-overload]
+    with pytest.raises(ValidationError, match="method is 'nuts'; expected mcmc or grid"):
+        di.posterior(friction_table(), di.Dahl(), method="nuts")  # type: ignore[call-overload]
 
 
 def test_predictive_checks_pass_the_right_model_and_fail_the_wrong_one() -> None:
     data = with_covariance(friction_table(30, 0.1, 10.0, 0.02), 0.02)
-    right = di.sample(data, di.Dahl(), seed=1)
+    right = di.posterior(data, di.Dahl(), seed=1)
     assert [check.statistic for check in right.checks] == ["size", "largest", "neighbours"]
     assert all(check.passed for check in right.checks)
-    wrong = di.sample(data, di.Dahl(alpha=2.0), seed=1)
+    wrong = di.posterior(data, di.Dahl(alpha=2.0), seed=1)
     failed = {check.statistic for check in wrong.checks if not check.passed}
     assert {"size", "neighbours"} <= failed
-    assert "MISFIT: neighbouring rows err in the same direction" in wrong.report()
+    assert "MISFIT: neighbouring rows err in the same direction" in str(wrong)
 
 
 def test_checks_of_a_right_model_are_calibrated() -> None:
@@ -178,13 +251,13 @@ def test_checks_of_a_right_model_are_calibrated() -> None:
     shares = []
     for seed in range(12):
         table = friction_table(15, noise=0.05, seed=seed)
-        drawn = di.sample(table, di.Dahl(), seed=1, steps=150)
+        drawn = di.posterior(table, di.Dahl(), seed=1, steps=150)
         shares += [check.share for check in drawn.checks]
     assert np.mean(np.array(shares) < 0.05) < 0.2
 
 
 def test_pointwise_likelihood_adds_up() -> None:
-    problem = di.Problem(with_covariance(friction_table(), 0.02), di.Dahl())
+    problem = Problem(with_covariance(friction_table(), 0.02), di.Dahl())
     for likelihood in ("gaussian", "student_t"):
         density = Density(problem, joint_prior(problem), likelihood)
         points = np.log([[0.1, 30.0], [0.11, 28.0]])
@@ -202,7 +275,7 @@ def test_student_t_is_a_density() -> None:
     total = 0.0
     for x in offsets:
         row = di.FrequencyResponse(np.ones(1), model + x * 0.2, amplitude, covariance=covariance)
-        problem = di.Problem(row, di.Dahl(sigma=30.0))
+        problem = Problem(row, di.Dahl(sigma=30.0))
         density = Density(problem, joint_prior(problem, {"f_max": (0.01, 1.0)}), "student_t")
         value = density.log_likelihood(np.log([[0.1]]), np.ones(1))[0]
         # radial symmetry: integrate over circles
@@ -210,7 +283,7 @@ def test_student_t_is_a_density() -> None:
     assert total == pytest.approx(1.0, abs=2e-3)
 
 
-def test_arviz_gets_every_group(posterior: di.Posterior) -> None:
+def test_arviz_gets_every_group(posterior: ChainPosterior) -> None:
     exported = posterior.to_arviz()
     groups = set(exported.groups())
     assert {
@@ -229,7 +302,7 @@ def test_arviz_gets_every_group(posterior: di.Posterior) -> None:
     assert np.abs(observed).max() < 4.0 * replicated.std()
 
 
-def test_pictures(posterior: di.Posterior) -> None:
+def test_pictures(posterior: ChainPosterior) -> None:
     plt = library("matplotlib.pyplot")
     assert posterior.plot_corner().shape == (3, 3)
     assert len(posterior.plot_trace()) == 3

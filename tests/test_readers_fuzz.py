@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from dahl_ident.data import FrequencyResponse, Record, inspect, read_frequency_response, read_record
-from dahl_ident.data.readers.delimited import read_text_table
+from dahl_ident.data.readers.text_table import read_text_table
 from dahl_ident.errors import DahlIdentError, DataWarning
+from tests import reader_fuzz
 
 NAMES = [
     "time", "t [s]", "x [mm]", "displacement", "F [kN]", "force (N)", "drive [V]", "frequency_hz",
@@ -183,3 +184,16 @@ def test_good_tables_are_read_to_the_last_digit(
     assert [c.name for c in source.channels] == ["a", "b"]
     np.testing.assert_array_equal(source.channels[0].values, [a for a, _ in rows])
     np.testing.assert_array_equal(source.channels[1].values, [b for _, b in rows])
+
+
+@pytest.mark.parametrize("name", list(reader_fuzz.files()))
+def test_damaged_files_are_read_right_or_refused(name: str) -> None:
+    """A hundred mutants a format; ``make fuzz`` takes thousands."""
+    _, content = reader_fuzz.files()[name]
+    reader = reader_fuzz.Reader()
+    assert reader.judge(name, content, "none") == ("accepted", "")
+    mutants = 16 if name == "xlsx" else 100
+    counts, bad = reader_fuzz.fuzz(name, mutants, 7, reader)
+    reader.close()
+    assert not bad
+    assert counts["refused"] > mutants / 8

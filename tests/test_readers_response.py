@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dahl_ident.data import FrequencyResponse, inspect, read_frequency_response
-from dahl_ident.errors import DataError, DataWarning, UnitError
+from dahl_ident.errors import DataError, DataWarning, UnitError, ValidationError
 from dahl_ident.synthetic import load_dataset
 
 FREQUENCY = np.array([1.0, 2.0, 4.0])
@@ -25,7 +25,7 @@ STIFFNESS = np.array([3e3 + 4e3j, 1e3 + 2e3j, 5e2 + 1e2j])
 def read(table: dict[str, Any], **options: Any) -> FrequencyResponse:
     """Read columns as a table, without its file."""
     frame = pd.DataFrame(table)
-    return FrequencyResponse.from_frame(frame, **options)
+    return read_frequency_response(frame, **options)
 
 
 def known(array: NDArray[Any] | None) -> NDArray[Any]:
@@ -162,7 +162,8 @@ class TestForms:
         data = read(columns, columns=mapped)
         np.testing.assert_allclose(known(data.drive), AMPLITUDE * abs(STIFFNESS))
         assert data.provenance is not None
-        assert "drive factor uncertain by 2.00%, all rows alike" in data.provenance["notes"]
+        assert data.drive_factor_uncertainty == 0.02
+        assert "uncertain by 2.00%" in repr(data)
         with pytest.raises(UnitError, match="the drive is a voltage; give drive_factor"):
             read(columns)
         with pytest.raises(UnitError, match=r"drive_factor has the unit \[N/A\]; expected"):
@@ -232,7 +233,7 @@ class TestErrors:
 
     def test_polar_table_reads_back(self) -> None:
         data = read({**RECTANGULAR, "std": [30.0, 20.0, 10.0]})
-        again = FrequencyResponse.from_frame(data.to_frame(polar=True))
+        again = read_frequency_response(data.to_frame(polar=True))
         np.testing.assert_allclose(again.response, data.response)
         np.testing.assert_allclose(known(again.covariance), known(data.covariance), atol=1e-9)
 
@@ -274,7 +275,7 @@ class TestRefusal:
             ({"real [N/m]": 0.0, "imag [N/m]": [1.0, 1.0, 0.0]}, "row 3: the response is 0"),
             ({"real [m]": STIFFNESS.real}, "2 columns may be the real"),
             ({"gain [N/m]": 1.0, "phase_deg": 1.0}, "both real and imag and gain and phase are"),
-            ({"harmonic": [1, 2.5, 3]}, "row 2, column 'harmonic'.*a whole number >= 1"),
+            ({"harmonic": [1, 2.5, 3]}, "row 2, column 'harmonic'.*a whole number >= 0"),
             ({"controlled": "speed"}, "row 1, column 'controlled': found speed"),
         ],
     )
@@ -318,11 +319,11 @@ class TestRefusal:
         columns = {**RECTANGULAR, "frequency_hz": [0.0, 1.0, 2.0], "real [N/m]": [np.nan, 1.0, 1.0]}
         frame = pd.DataFrame(columns)
         with pytest.raises(DataError, match=r"a frequency > 0; frequency_hz=\(low, high\) leaves"):
-            FrequencyResponse.from_frame(frame)
+            read_frequency_response(frame)
 
     def test_empty_frame(self) -> None:
         with pytest.raises(DataError, match="the table is empty"):
-            FrequencyResponse.from_frame(pd.DataFrame())
+            read_frequency_response(pd.DataFrame())
 
 
 class TestDoubts:
@@ -404,6 +405,56 @@ def exported(folder: Path, name: str, drive: float) -> Path:
     return folder / name
 
 
+class TestSilentErrors:
+    """What was once read without a word."""
+
+    def table(self, gain: list[float], phase: list[float]) -> pd.DataFrame:
+        n = len(gain)
+        return pd.DataFrame({
+            "frequency_hz": np.ones(n), "amplitude [m]": np.arange(1.0, n + 1.0),
+            "gain [N/m]": gain, "phase_deg": phase,
+        })  # fmt: skip
+
+    def test_one_phase_against_all_others(self) -> None:
+        with pytest.warns(DataWarning, match="creates energy: row 2"):
+            read_frequency_response(self.table([9, 8, 7, 6], [5.0, -8.0, 9.0, 12.0]))
+
+    def test_small_radians_under_degrees(self) -> None:
+        with pytest.warns(DataWarning, match="gain varies by 33% at 1 Hz, .* in radians"):
+            read_frequency_response(self.table([9, 8, 7, 6], [0.1, 0.2, 0.3, 0.4]))
+
+    @pytest.mark.parametrize("code", [-9999.0, 9999.0, 1e30])
+    def test_marks_of_missing_values(self, code: float) -> None:
+        table = self.table([9, 8, 7, 6, 5], [5.0, 8.0, 9.0, 12.0, 13.0])
+        table.loc[2, "phase_deg"] = code
+        with pytest.raises(DataError, match=r"row 3, column 'phase_deg': the cell is .*missing"):
+            read_frequency_response(table)
+        large = self.table([9999, 8000, 7000, 6000, 5000], [5.0, 8.0, 9.0, 12.0, 13.0])
+        assert read_frequency_response(large).n == 5
+
+    def test_masks(self) -> None:
+        masked = np.ma.array([1e-3, 2e-3], mask=[False, True])
+        with pytest.raises(ValidationError, match="amplitude: some values are masked"):
+            FrequencyResponse([1.0, 1.0], [1j, 1j], masked)
+        with pytest.raises(ValidationError, match="response: some values are masked"):
+            FrequencyResponse([1.0, 1.0], np.ma.array([1j, 2j], mask=[True, False]), [1.0, 1.0])
+
+    @pytest.mark.parametrize(("unit", "expected"), [("m/V", 0.5), ("mm/V", 0.5e-3), ("V/m", 2.0)])
+    def test_gain_for_a_drive(self, unit: str, expected: float) -> None:
+        table = self.table([1.0, 1.0], [-25.0, -25.0] if unit != "V/m" else [25.0, 25.0])
+        table = table.rename(columns={"gain [N/m]": f"gain [{unit}]"})
+        data = read_frequency_response(table, drive_factor="2 N/V", drive_factor_uncertainty=0.01)
+        np.testing.assert_allclose(data.gain, expected)
+        assert data.drive_factor_uncertainty == 0.01
+        assert data.quantity == ("dynamic_stiffness" if unit == "V/m" else "receptance")
+
+    @pytest.mark.parametrize("text", ["{level[0]} N", "{level.__class__} N", "{0} N", "{level!r}"])
+    def test_braces_hold_names_only(self, tmp_path: Path, text: str) -> None:
+        (tmp_path / "a1N.csv").write_text("frequency_hz,real [N/m],imag [N/m]\n1,1,1\n")
+        with pytest.raises(DataError, match="cannot be filled from the file's name"):
+            read_frequency_response(tmp_path / "a1N.csv", level_from_name="a(.)N", drive=text)
+
+
 class TestManyFiles:
     def test_level_and_drive_from_the_name(self, tmp_path: Path) -> None:
         paths = [exported(tmp_path, f"beam_{u}N_a.csv", u) for u in (0.2, 0.5, 1.5)]
@@ -415,6 +466,29 @@ class TestManyFiles:
         sources = known_provenance(data)["parts"]
         assert [p["file"] for p in sources] == [str(p) for p in paths]
         assert sources[1]["options"] == {"controlled": "force", "drive": "0.5 N rms", "level": 0.5}
+
+    def test_every_file_is_a_run(self, tmp_path: Path) -> None:
+        header = "frequency_hz,amplitude [m],real [N/m],imag [N/m]"
+        for name in ("monday.csv", "tuesday.csv"):
+            (tmp_path / name).write_text(f"{header}\n1,1,2,1\n")
+        paths = [tmp_path / "monday.csv", tmp_path / "tuesday.csv"]
+        assert read_frequency_response(paths[0]).run is None
+        assert read_frequency_response(paths).runs == ["monday", "tuesday"]
+        assert read_frequency_response(paths, run="bench").runs == ["bench"]
+        days = read_frequency_response(
+            paths, level_from_name=r"(?P<level>(?P<day>...))", run="day {day}"
+        )
+        assert days.runs == ["day mon", "day tue"]
+
+    def test_the_run_is_found_by_name(self, tmp_path: Path) -> None:
+        path = tmp_path / "t.csv"
+        path.write_text(
+            "file,frequency_hz,amplitude [m],real [N/m],imag [N/m],day\na,1,1,2,1,1\nb,1,1,2,1,2\n"
+        )
+        assert read_frequency_response(path).runs == ["a", "b"]
+        assert read_frequency_response(path, columns={"run": "day"}).runs == ["1", "2"]
+        with pytest.raises(DataError, match="its own runs"):
+            read_frequency_response(path, run="c")
 
     def test_named_groups(self, tmp_path: Path) -> None:
         path = exported(tmp_path, "runB_5um.csv", 1.0)
@@ -502,6 +576,16 @@ class TestInspect:
         text = text.replace(blank, 'unit = "Hz"', 1).replace(blank, 'unit = "N/m"', 1)
         columns.write_text(text)
         assert read_frequency_response(path, columns=columns).quantity == "dynamic_stiffness"
+
+    def test_many_gaps_are_summarised(self, tmp_path: Path) -> None:
+        time = np.delete(np.arange(400) / 100.0, [*range(5, 400, 10), 206])
+        rows = "".join(f"{t},{np.sin(t)},{np.cos(t)}\n" for t in time)
+        path = tmp_path / "gaps.csv"
+        path.write_text("time [s],x [m],F [N]\n" + rows)
+        assert inspect(path).gaps == (
+            "40 gaps, 0.81 s in all, median 0.02 s",
+            "the longest 2.04 to 2.07 s, the first 0.04 to 0.06 s, the last 3.94 to 3.96 s",
+        )
 
     def test_sampling_and_gaps(self, tmp_path: Path) -> None:
         path = tmp_path / "run.csv"

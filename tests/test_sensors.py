@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Problem, Sensors, Spring
+from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring
 from dahl_ident.errors import ValidationError
+from dahl_ident.problem import Problem
 
 A = np.geomspace(1e-4, 1e-1, 7)
 FREQUENCY = np.geomspace(0.2, 4.0, 7)

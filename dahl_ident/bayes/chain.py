@@ -15,9 +15,9 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.convergence import Convergence, judge
+from dahl_ident.bayes.decorrelation import decorrelation_of
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.moves import moves_for
-from dahl_ident.bayes.shear import shear_of
 
 _FIRST_CHECK = 200
 _GROWTH = 1.25
@@ -148,7 +148,7 @@ def _sampler(density: Density, settings: Settings, pool: Pool | None) -> Any:
         settings.walkers,
         len(density.names),
         function,
-        moves=moves_for(settings.ensembles, shear_of(density.problem)),
+        moves=moves_for(settings.ensembles, decorrelation_of(density.problem)),
         vectorize=True,
     )
     # emcee's wrapper prints points and traceback on standard output when a run is interrupted

@@ -15,20 +15,20 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 from dahl_ident.bayes.chain import Chain, RandomState
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density
-from dahl_ident.data.readers.file import library
+from dahl_ident.data.file_lock import locked
+from dahl_ident.data.storage import library, plain_data, put_in_place
 from dahl_ident.elements.description import describe_model
 from dahl_ident.errors import ModelError, SamplingError
 
@@ -145,7 +145,7 @@ def open_chain(path: str | os.PathLike[str], identity: Identity) -> Iterator[Cha
         raise SamplingError(f"{file} is a folder; give the path of a file in it")
     if not file.parent.is_dir():
         raise SamplingError(f"{file.parent} is no folder; make it, or give another path")
-    with _locked(file):
+    with locked(file, SamplingError):
         chain_file = ChainFile(file, identity)
         try:
             yield chain_file
@@ -153,64 +153,22 @@ def open_chain(path: str | os.PathLike[str], identity: Identity) -> Iterator[Cha
             chain_file.flush()
 
 
-@contextmanager
-def _locked(file: Path) -> Iterator[None]:
-    if sys.platform == "win32":
-        yield
-        return
-    import fcntl
-
-    path = file.with_name(file.name + ".lock")
-    while True:
-        try:
-            opened = path.open("w")
-        except OSError as exc:
-            raise SamplingError(f"{file} cannot be written: {exc.strerror or exc}") from exc
-        with opened as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise SamplingError(
-                    f"another run is writing {file}; wait for its end, or give another file"
-                ) from None
-            if not _is_still(path, lock):  # its last owner has removed it meanwhile
-                continue
-            try:
-                yield  # the lock ends with the open file, whichever way the process ends
-            finally:
-                path.unlink(missing_ok=True)
-            return
-
-
-def _is_still(path: Path, file: IO[str]) -> bool:
-    """Return whether an open file is the one that the path names."""
-    try:
-        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
-    except FileNotFoundError:
-        return False
-
-
 def _write(path: Path, chain: Chain, seed: int, identity: Identity) -> None:
     h5py = library("h5py")
 
     text = json.dumps(dict(identity), sort_keys=True)
     arrays = _arrays(chain)
-    partial = path.with_name(path.name + ".partial")
+
+    def write(place: Path) -> None:
+        with h5py.File(place, "w") as file:
+            for name, array in arrays.items():
+                file[name] = array
+            file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
+            file.attrs["identity"], file.attrs["seed"] = text, str(seed)
+            file.attrs["digest"] = _digest(text, str(seed), *arrays.values())
+
     try:
-        try:
-            with h5py.File(partial, "w") as file:
-                for name, array in arrays.items():
-                    file[name] = array
-                file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
-                file.attrs["identity"], file.attrs["seed"] = text, str(seed)
-                file.attrs["digest"] = _digest(text, str(seed), *arrays.values())
-            with partial.open("rb+") as written:
-                os.fsync(written.fileno())
-            partial.replace(path)
-        except BaseException:
-            with suppress(OSError):
-                partial.unlink()
-            raise
+        put_in_place(path, write)
     except (OSError, RuntimeError) as exc:  # h5py raises either, with the library's own words
         why = os.strerror(exc.errno) if isinstance(exc, OSError) and exc.errno else str(exc)
         raise SamplingError(
@@ -223,7 +181,7 @@ def _read(path: Path) -> tuple[Stored, dict[str, str]]:
 
     try:
         with h5py.File(path, "r") as file:
-            attributes = {name: _plain(value) for name, value in file.attrs.items()}
+            attributes = plain_data(dict(file.attrs))
             _check_format(path, attributes)
             arrays = {name: file[name][()] for name in _NAMES}
     except SamplingError:
@@ -281,7 +239,3 @@ def _digest(*parts: Any) -> str:
             plain = part.tolist() if isinstance(part, np.ndarray) else part
             total.update(repr(plain).encode())
     return total.hexdigest()
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value

@@ -23,7 +23,6 @@ from scipy.special import gammaln
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.priors import JointPrior
-from dahl_ident.elements.tabulated import tabulated
 from dahl_ident.errors import SamplingError, ValidationError
 from dahl_ident.problem import Problem
 
@@ -89,7 +88,7 @@ class Density:
     @property
     def priors(self) -> dict[str, str]:
         """Every prior in words."""
-        texts = {part.parameter.name: str(part) for part in self.prior.parts}
+        texts = {part.parameter.name: str(part) for part in self.prior.priors}
         return texts | ({SCALE: "1/s"} if self.has_scale else {})
 
     def to_values(self, x: FloatArray) -> FloatArray:
@@ -138,7 +137,7 @@ class Density:
         return result
 
     def log_prior(self, theta: FloatArray) -> FloatArray:
-        """Return the log-prior; interchangeable Dahl elements have support in order of x_c."""
+        """Return the log-prior; interchangeable elements have support in order of their knees."""
         result = self.prior.log_density(theta)
         ordered = self.problem.in_order(theta)
         if ordered is not theta:
@@ -164,7 +163,7 @@ class Density:
     def tabulated(self) -> Problem:
         """The problem, friction of any exponent from tables: for very many evaluations."""
         problem = self.problem
-        model = tabulated(problem.model)
+        model = problem.model.tabulated()
         if model is problem.model:
             return problem
         return Problem(problem.data, model, noise=problem.noise, sensors=problem.sensors)

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.bayes.shear import Shear
+from dahl_ident.bayes.decorrelation import Decorrelation
 
 Random = np.random.RandomState  # emcee's
 Proposal = Callable[[FloatArray, FloatArray, Random], tuple[FloatArray, FloatArray]]
@@ -39,12 +39,12 @@ _SNOOKER = 1.7
 class EnsembleMove:
     """One kind of proposal, applied to every ensemble by itself; a move of emcee's sampler.
 
-    With a shear, places are proposed where ridges are straight.
+    With a decorrelation, places are proposed where ridges are straight.
     """
 
     proposal: Proposal
     ensembles: int
-    shear: Shear | None = None
+    decorrelation: Decorrelation | None = None
 
     def propose(self, model: Any, state: Any) -> tuple[Any, Any]:
         """Return the state after every walker was asked to move once, and who accepted."""
@@ -54,12 +54,18 @@ class EnsembleMove:
         order = random.uniform(size=(self.ensembles, each)).argsort(axis=1)
         order += each * np.arange(self.ensembles)[:, None]
         accepted = np.zeros(walkers, dtype=bool)
-        straight = state.coords if self.shear is None else self.shear.straight(state.coords)
+        straight = (
+            state.coords
+            if self.decorrelation is None
+            else self.decorrelation.decorrelated(state.coords)
+        )
         halves = (order[:, : each // 2], order[:, each // 2 :])
         for half, guide in (halves, halves[::-1]):
             proposed, factor = self.proposal(straight[half], straight[guide], random)
             who, proposed = half.ravel(), proposed.reshape(-1, dims)
-            places = proposed if self.shear is None else self.shear.bent(proposed)
+            places = (
+                proposed if self.decorrelation is None else self.decorrelation.original(proposed)
+            )
             log_density, _ = model.compute_log_prob_fn(places)
             gain = factor.ravel() + log_density - state.log_prob[who]
             moves = gain > np.log(random.uniform(size=who.size))
@@ -71,12 +77,14 @@ class EnsembleMove:
         return state, accepted
 
 
-def moves_for(ensembles: int, shear: Shear | None) -> list[tuple[EnsembleMove, float]]:
+def moves_for(
+    ensembles: int, decorrelation: Decorrelation | None
+) -> list[tuple[EnsembleMove, float]]:
     """Return the moves and how often each is taken."""
     return [
-        (EnsembleMove(independent, ensembles, shear), 0.5),
-        (EnsembleMove(differential_evolution, ensembles, shear), 0.4),
-        (EnsembleMove(snooker, ensembles, shear), 0.1),
+        (EnsembleMove(independent, ensembles, decorrelation), 0.5),
+        (EnsembleMove(differential_evolution, ensembles, decorrelation), 0.4),
+        (EnsembleMove(snooker, ensembles, decorrelation), 0.1),
     ]
 
 

@@ -6,10 +6,12 @@ mean a log-uniform prior for a positive parameter (every decade is as likely as 
 uniform one for the others. Where the user says nothing, bounds come from the size of the data,
 wide enough to say little and proper all the same:
 
-- f_max and sigma: from 1e-5 times the smallest force or dynamic stiffness in the data to 1e5
-  times the largest, since far from the knee either can lie decades away; alpha: from 0.1 to 10;
-- stiffness, damping, mass: up to a thousand times what the largest dynamic stiffness would take
-  (at a resonance they cancel), or ten times the least-squares estimate, of either sign;
+- positive parameters: the data give every unit a size in each row, made of its force, its
+  displacement amplitude and its angular frequency. Bounds reach from 1e-5 times the smallest to
+  1e5 times the largest, because a law's knee can lie decades away from the data;
+- parameters of either sign, such as stiffness, damping and mass: up to a thousand times the
+  largest size (at a resonance they cancel), or ten times the least-squares estimate;
+- parameters that declare a range of their own, such as an exponent: five times wider than that;
 - gains: from 0.1 to 10; delay: half a period of the highest frequency either way.
 
 They are part of the result, and reports print them. The unknown scale s of the noise has the
@@ -26,12 +28,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from dahl_ident.arrays import FloatArray, finite_array
-from dahl_ident.elements import Dahl, Damper, Mass, Parameter, Spring
+from dahl_ident.elements import Parameter
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.problem import Problem
 
 _DECADES = 1e5
 _WIDER = 10.0
+_BEYOND = 5.0  # times a declared range that a default prior reaches beyond it
 _RESONANCE = 1e3  # by which the parts of a plant may exceed what is left of them
 _TAIL = 1e-10  # of a distribution of unbounded support that lies beyond its `limits`
 
@@ -159,29 +162,29 @@ class ParameterPrior:
 class JointPrior:
     """Independent priors of all free parameters, in the order of the problem's names."""
 
-    parts: tuple[ParameterPrior, ...]
+    priors: tuple[ParameterPrior, ...]
 
     @cached_property
     def limits(self) -> tuple[FloatArray, FloatArray]:
         """Ends of every theta, each of shape (P,)."""
-        low, high = np.array([part.limits for part in self.parts]).T
+        low, high = np.array([part.limits for part in self.priors]).T
         return low, high
 
     @cached_property
     def bulk(self) -> tuple[FloatArray, FloatArray]:
         """Ends of every theta, beyond which there is next to no prior probability."""
-        low, high = np.array([part.bulk for part in self.parts]).T
+        low, high = np.array([part.bulk for part in self.priors]).T
         return low, high
 
     @cached_property
     def widths(self) -> FloatArray:
         """Distance in theta between the quantiles 16 % and 84 %, shape (P,)."""
-        return np.array([part.width for part in self.parts])
+        return np.array([part.width for part in self.priors])
 
     def log_density(self, theta: FloatArray) -> FloatArray:
         """Return the joint log-density over theta, (S, P) -> (S,)."""
         total = self._bounded(theta)
-        for index, part in enumerate(self.parts):
+        for index, part in enumerate(self.priors):
             if part.distribution is not None:
                 total = total + part.log_density(theta[:, index])
         return total
@@ -193,18 +196,18 @@ class JointPrior:
 
     @cached_property
     def _box(self) -> tuple[FloatArray, FloatArray, float]:
-        bounded = np.array([part.distribution is None for part in self.parts])
+        bounded = np.array([part.distribution is None for part in self.priors])
         low, high = self.limits
         constant = -float(np.log((high - low)[bounded]).sum())
         return np.where(bounded, low, -np.inf), np.where(bounded, high, np.inf), constant
 
     def draw(self, random: np.random.Generator, size: int) -> FloatArray:
         """Return independent draws of theta, shape (size, P)."""
-        q = random.uniform(size=(size, len(self.parts)))
-        return np.stack([p.quantile(q[:, i]) for i, p in enumerate(self.parts)], axis=-1)
+        q = random.uniform(size=(size, len(self.priors)))
+        return np.stack([p.quantile(q[:, i]) for i, p in enumerate(self.priors)], axis=-1)
 
     def __str__(self) -> str:
-        return "\n".join(f"{part.parameter.name}: {part}" for part in self.parts)
+        return "\n".join(f"{part.parameter.name}: {part}" for part in self.priors)
 
 
 def joint_prior(
@@ -301,40 +304,55 @@ def _check_support(parameter: Parameter, given: Distribution) -> None:
 
 def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[float, float]:
     """Return default bounds of the value; `estimate` is one, not finite where unknown."""
-    name = parameter.name
-    view = problem.stiffness_data
-    for element in problem.model.elements:
-        own = [p.name for p in element.parameters]
-        if name not in own:
-            continue
-        stiffness = np.abs(view.stiffness)
-        if isinstance(element, Dahl):
-            sizes = (stiffness * view.amplitude, stiffness, None)
-            return _decades_around(sizes[own.index(name)])
-        for kind, order in ((Spring, 0.0), (Damper, 1.0), (Mass, 2.0)):
-            if not isinstance(element, kind):
-                continue
-            largest = float((stiffness / view.omega**order).max())
-            reach = _RESONANCE * largest
-            if np.isfinite(estimate):
-                reach = max(reach, _WIDER * abs(estimate))
-            return -reach, reach
-    if name in ("force_gain", "displacement_gain"):
-        return 1.0 / _WIDER, _WIDER
-    if name == "delay":
-        half = float(np.pi / view.omega.max())
+    if parameter.name == "delay":
+        half = float(np.pi / problem.stiffness_data.omega.max())
         return -half, half
-    raise ValidationError(
-        f"{name} has no default prior, because the data do not tell its size; give priors="
+    if parameter.name in ("force_gain", "displacement_gain"):
+        return 1.0 / _WIDER, _WIDER
+    if parameter.prior is not None:
+        low, high = _widened(parameter, *parameter.prior)
+    elif parameter.transform == "log":
+        sizes = _sizes(problem, parameter)
+        seen = sizes[sizes > 0.0]
+        if not seen.size:
+            raise _without_default(parameter)
+        low, high = float(seen.min()) / _DECADES, float(seen.max()) * _DECADES
+    else:
+        high = _RESONANCE * float(_sizes(problem, parameter).max())
+        if np.isfinite(estimate):
+            high = max(high, _WIDER * abs(estimate))
+        low = -high
+    low, high = max(low, parameter.lower), min(high, parameter.upper)
+    if not (np.isfinite([low, high]).all() and low < high):
+        raise _without_default(parameter)
+    return low, high
+
+
+def _widened(parameter: Parameter, low: float, high: float) -> tuple[float, float]:
+    """Return bounds well beyond a declared range of 95 % probability."""
+    if parameter.transform == "log":
+        return low / _BEYOND, high * _BEYOND
+    return low - _BEYOND * (high - low), high + _BEYOND * (high - low)
+
+
+def _sizes(problem: Problem, parameter: Parameter) -> FloatArray:
+    """Return the sizes that a parameter's unit has in the rows: of force, displacement, time."""
+    # the problem shows units of rotation where the data do; dimensions follow those declared
+    (declared,) = [p for p in problem.model.parameters if p.name == parameter.name]
+    if not any(declared.dimension):
+        raise _without_default(parameter)
+    view = problem.stiffness_data
+    force, displacement, time = declared.dimension
+    size = (np.abs(view.stiffness) * view.amplitude) ** force * view.amplitude**displacement
+    return np.asarray(size / view.omega**time)
+
+
+def _without_default(parameter: Parameter) -> ValidationError:
+    name = parameter.name
+    return ValidationError(
+        f"{name} has no default prior, because the data do not show its size; give priors="
         f'{{"{name}": (low, high)}}, or a frozen distribution of scipy.stats'
     )
-
-
-def _decades_around(size: FloatArray | None) -> tuple[float, float]:
-    if size is None:
-        return 1.0 / _WIDER, _WIDER
-    seen = size[size > 0.0]
-    return float(seen.min()) / _DECADES, float(seen.max()) * _DECADES
 
 
 def _log_density(distribution: Distribution, value: FloatArray) -> FloatArray:

@@ -9,17 +9,19 @@ from typing import Annotated, Any
 
 import typer
 
-from dahl_ident import __version__
-from dahl_ident.cli import telling
+from dahl_ident.cli import console
+from dahl_ident.cli.campaign import campaign
 from dahl_ident.cli.datasets import datasets
 from dahl_ident.cli.demo import demo
 from dahl_ident.cli.extract import extract
 from dahl_ident.cli.fit import fit
 from dahl_ident.cli.inspect import inspect
+from dahl_ident.cli.plan import plan
 from dahl_ident.cli.report import report
 from dahl_ident.cli.sample import sample
 from dahl_ident.cli.simulate import simulate
 from dahl_ident.errors import DahlIdentError
+from dahl_ident.version import __version__
 
 _NAME = "dahl-ident"
 # every wrong use, whether Typer stands on click or brings its own copy of it
@@ -33,18 +35,19 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (demo, inspect, extract, fit, sample, report, simulate, datasets):
+commands = (demo, inspect, extract, fit, sample, plan, campaign, report, simulate, datasets)
+for command in commands:
     app.command()(command)
 
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        telling.say(f"{_NAME} {__version__}")
+        console.write(f"{_NAME} {__version__}")
         raise typer.Exit
 
 
 @app.callback(
-    epilog="Exit status: 0 trusted, 1 bad input, 2 wrong use, 3 result not to be trusted."
+    epilog="Exit status: 0 result can be used, 1 bad input, 2 wrong use, 3 result must not be used."
 )
 def common(
     color: Annotated[
@@ -56,7 +59,7 @@ def common(
     ] = False,
 ) -> None:
     """Identify Dahl friction from sine-sweep measurements, with error bars that are true."""
-    telling.use_color(color)
+    console.use_color(color)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -68,7 +71,7 @@ def main(arguments: list[str] | None = None) -> None:
         As typed after ``dahl-ident``; by default those of the process.
     """
     typed = sys.argv[1:] if arguments is None else arguments
-    telling.begin(typed)
+    console.begin(typed)
     try:
         try:
             status = app(args=typed, prog_name=_NAME, standalone_mode=False)
@@ -77,16 +80,18 @@ def main(arguments: list[str] | None = None) -> None:
     except _WrongUse as exc:
         status = _refuse(exc, typed)
     except DahlIdentError as exc:
-        telling.doubt(f"error: {' '.join(str(exc).split())}")
-        status = telling.BAD_INPUT
+        console.write_error(f"error: {console.in_options(' '.join(str(exc).split()))}")
+        status = console.BAD_INPUT
     except OSError as exc:
         if not isinstance(exc, BrokenPipeError):  # a reader such as head has seen enough
-            telling.doubt(f"error: {exc.filename or 'standard output'}: {exc.strerror or exc}")
+            console.write_error(
+                f"error: {exc.filename or 'standard output'}: {exc.strerror or exc}"
+            )
         # what is left in the buffer would fail once more when Python ends
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        status = telling.BAD_INPUT
-    if status == telling.INTERRUPTED:
-        telling.doubt("interrupted; no file is left half-written")
+        status = console.BAD_INPUT
+    if status == console.INTERRUPTED:
+        console.write_error("interrupted; no file is left half-written")
     sys.exit(status)
 
 
@@ -99,5 +104,5 @@ def _refuse(wrong: Any, typed: Sequence[str]) -> int:
         # the parser of options knows no context; all that can stand before the command are flags
         words = [word for word in typed if not word.startswith("-")]
         command = wrong.ctx.command_path if wrong.ctx else " ".join([_NAME, *words[:1]])
-        telling.doubt(f"error: {message}{got}\nSee {command} --help")
-    return telling.WRONG_USE
+        console.write_error(f"error: {message}{got}\nSee {command} --help")
+    return console.WRONG_USE

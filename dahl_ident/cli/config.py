@@ -35,7 +35,13 @@ def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
     _refuse_unknown(path, "no command is called", tables, commands.keys())
     _refuse_unknown(path, f"{ctx.info_name} has no option", own, known)
     _refuse_unknown(path, "no command has the option", shared, set().union(*commands.values()))
-    ctx.default_map = {k: v for k, v in shared.items() if k in known} | own
+    chosen = {k: v for k, v in shared.items() if k in known} | own
+    several = {p.name for p in ctx.command.params if getattr(p, "multiple", False)}
+    several |= {p.name for p in ctx.command.params if p.nargs != 1}
+    ctx.default_map = {
+        k: ",".join(map(str, v)) if isinstance(v, list) and k not in several else v
+        for k, v in chosen.items()
+    }
     return path
 
 

@@ -6,14 +6,14 @@ from typing import Annotated
 
 import typer
 
-from dahl_ident.cli import telling
+from dahl_ident.cli import console
 from dahl_ident.cli.files import write_data
-from dahl_ident.cli.groups import grouped
+from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import General, Writing
 from dahl_ident.errors import ValidationError
 
 
-@grouped
+@with_option_groups
 def datasets(
     general: General,
     writing: Writing,
@@ -40,16 +40,16 @@ def datasets(
         if output is not None:
             write_data(data, output, overwrite=writing.overwrite)
         elif general.json:
-            telling.say_json(data.provenance)
+            console.write_json(data.provenance)
         else:
-            telling.say(repr(data))
+            console.write(repr(data))
         return
     if general.json:
-        telling.say_json([_facts(one.name) for one in DATA_SETS.values()])
+        console.write_json([_facts(one.name) for one in DATA_SETS.values()])
         return
-    telling.table(
+    console.table(
         "Shipped data sets",
-        ("name", "kind", "what it teaches", "determines"),
+        ("name", "kind", "what it shows", "determines"),
         [
             (one.name, one.kind.replace("_", " "), one.teaches, ", ".join(one.identifiable))
             for one in DATA_SETS.values()

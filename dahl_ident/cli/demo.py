@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dahl_ident.cli import extract, telling
+from dahl_ident.cli import console, extract
 from dahl_ident.cli.files import make_folder, progress_bar
-from dahl_ident.cli.fit import as_json, objection
-from dahl_ident.cli.groups import grouped
+from dahl_ident.cli.fit import as_json, finish
+from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import General, Writing
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse, Record
-    from dahl_ident.results import FitResult, Posterior
+    from dahl_ident.results import ChainPosterior, FitResult
 
 _DATASET = "plant_recording"
 
 
-@grouped
+@with_option_groups
 def demo(
     general: General,
     writing: Writing,
@@ -33,11 +33,10 @@ def demo(
 ) -> None:
     """Run the whole chain on a shipped recording of a plant, the true values beside the result.
 
-    With --json the steps are told on standard error.
+    With --json the steps are printed on standard error.
 
     Example: dahl-ident demo
     """
-    from dahl_ident.reporting.posteriors import facts
     from dahl_ident.synthetic.shipped import load_dataset
 
     table, page = output / "levels.csv", output / "report.html"
@@ -47,72 +46,75 @@ def demo(
     with redirect_stdout(sys.stderr) if general.json else nullcontext():
         result, posterior = _chain(origin, table, page, overwrite=writing.overwrite)
     if general.json:
-        telling.say_json(
+        console.write_json(
             {
                 "truth": origin["truth"],
                 "fit": as_json(result),
-                "posterior": facts(posterior),
+                "posterior": posterior.to_dict(),
                 "table": str(table),
                 "report": str(page.resolve()),
             }
         )
-    against = [*(() if result.trusted else (objection(result),)), *posterior.objections]
-    telling.finish(not against, "; ".join(against))
+    for judged in (result, posterior):
+        finish(judged)
 
 
 def _chain(
     origin: Mapping[str, Any], table: Path, page: Path, *, overwrite: bool
-) -> tuple[FitResult, Posterior]:
+) -> tuple[FitResult, ChainPosterior]:
     """Take every step from the recording to the report, and tell each."""
     from dahl_ident.data import inspect, read_record
     from dahl_ident.synthetic.shipped import datasets_directory
 
     file = datasets_directory() / origin["file"]
-    telling.heading(f"1. inspect: {file}")
-    telling.say(repr(inspect(file)))
+    console.heading(f"1. inspect: {file}")
+    console.write(repr(inspect(file)))
     record = read_record(file)
     data = _extracted(record)
     data.save(table, overwrite=overwrite)
     result, posterior = _estimated(data, origin["truth"])
-    telling.heading("6. report")
+    console.heading("6. report")
     with progress_bar() as bar:
         bar.add_task("drawing", total=None)
         _report([result, posterior], page, record, overwrite=overwrite)
-    telling.say(f"table: {table}\nreport: {page.resolve()}")
+    console.write(f"table: {table}\nreport: {page.resolve()}")
     return result, posterior
 
 
 def _extracted(record: Record) -> FrequencyResponse:
     from dahl_ident.extraction import extract as extract_record
 
-    telling.heading("2. extract: waveforms to dynamic stiffness")
+    console.heading("2. extract: waveforms to dynamic stiffness")
     data = extract_record(record, controlled="force")
     extract.show(data)
     return extract.good_points(data)
 
 
-def _estimated(data: FrequencyResponse, truth: Mapping[str, float]) -> tuple[FitResult, Posterior]:
+def _estimated(
+    data: FrequencyResponse, truth: Mapping[str, float]
+) -> tuple[FitResult, ChainPosterior]:
     from dahl_ident.elements import Dahl, Damper, Mass, Spring
-    from dahl_ident.results import fit, sample
+    from dahl_ident.results import fit
+    from dahl_ident.results.bayesian_estimate import posterior
 
-    telling.heading("3. fit: friction, mass, damper and spring, nothing known beforehand")
+    console.heading("3. fit: friction, mass, damper and spring, nothing known beforehand")
     result = fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
-    telling.say(result.fit_report())
+    console.write_wrapped(result.fit_report())
     _compare(result, truth)
-    telling.heading("4. identifiability: what the data determine")
-    telling.say(str(result.identifiability))
-    telling.heading("5. posterior: emcee, from the same likelihood")
-    posterior = sample(result, seed=1)
-    telling.say(posterior.report())
-    return result, posterior
+    console.heading("4. identifiability: what the data determine")
+    console.write(str(result.identifiability))
+    console.heading("5. posterior: emcee, from the same likelihood")
+    chain = posterior(result, seed=1)
+    console.write(str(chain))
+    return result, chain
 
 
 def _report(
-    results: Sequence[FitResult | Posterior], page: Path, record: Record, *, overwrite: bool
+    results: Sequence[FitResult | ChainPosterior], page: Path, record: Record, *, overwrite: bool
 ) -> None:
     from dahl_ident.reporting import report
 
-    command = telling.typed_command()
+    command = console.typed_command()
     report(list(results), page, command=command, record=record, overwrite=overwrite)
 
 
@@ -123,5 +125,5 @@ def _compare(result: FitResult, truth: Mapping[str, float]) -> None:
         off = (estimate.value - truth[name]) / estimate.stderr if estimate.stderr else 0.0
         error = f"{estimate.stderr:.2g}" if estimate.stderr else "fixed"
         rows.append((name, f"{estimate.value:.5g}", error, f"{truth[name]:g}", f"{off:+.1f}"))
-    header = ("parameter", "estimate", "standard error", "truth", "off by standard errors")
-    telling.table("Beside the truth", header, rows)
+    header = ("parameter", "estimate", "standard error", "truth", "error / standard error")
+    console.table("Compared with the truth", header, rows)

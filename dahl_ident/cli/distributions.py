@@ -88,7 +88,7 @@ def distribution(name: str, text: str) -> Any:
         frozen = kind(*given, **by_name)
     except (TypeError, ValueError) as exc:
         raise ValidationError(
-            f"{name} is {text!r}, which are no arguments of {call[1]}: {exc}"
+            f"{name} is {text!r}, which are not arguments of {call[1]}: {exc}"
         ) from exc
     if not (math.isfinite(frozen.mean()) and frozen.std() > 0.0):
         raise ValidationError(f"{name} is {text!r}, which has no finite mean or no width")

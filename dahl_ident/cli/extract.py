@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dahl_ident.cli import telling
-from dahl_ident.cli.files import with_progress, write_data, write_picture
-from dahl_ident.cli.groups import grouped
+from dahl_ident.cli import console
+from dahl_ident.cli.files import write_data, write_picture
+from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import STANDARD, Files, General, Writing
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class Extracting:
     ] = "auto"
     num_periods: Annotated[
         int | None,
-        typer.Option(help="Last periods of each stretch to use.", rich_help_panel=_EXTRACTING),
+        typer.Option(help="Last periods of each segment to use.", rich_help_panel=_EXTRACTING),
     ] = None
     settling_periods: Annotated[
         int | None,
@@ -82,7 +82,8 @@ class Extracting:
     harmonics: Annotated[
         str | None,
         typer.Option(
-            help="Which become rows: by default 1,3,5,7,9, with force controlled 1 alone.",
+            help="Which become rows, 0 to 9: by default the odd ones, and the even ones of an "
+            "asymmetric force; with force controlled 1 alone.",
             rich_help_panel=_EXTRACTING,
         ),
     ] = None
@@ -112,7 +113,7 @@ class Extracting:
         return {**vars(self), "harmonics": harmonics}
 
 
-@grouped
+@with_option_groups
 def extract(
     files: Files,
     general: General,
@@ -128,6 +129,7 @@ def extract(
         str | None,
         typer.Option(help="Regular expression on the file's name; its group is the level."),
     ] = None,
+    jobs: Annotated[int, typer.Option(help="Processes among which several files are divided.")] = 1,
     good_only: Annotated[
         bool, typer.Option("--good-only", help="Leave out points with another verdict than good.")
     ] = False,
@@ -138,14 +140,16 @@ def extract(
 
     Example: dahl-ident datasets plant_recording -o - | dahl-ident extract - --controlled force
     """
-    from dahl_ident.data import FrequencyResponse
+    from dahl_ident.data.readers import groups_in_name, run_names
+    from dahl_ident.extraction.sources import Task, extract_all
 
     writing.check([output, plot], files, json=general.json)
-    parts = [
-        _points(file, reading, extracting, level_from_name)
-        for file in with_progress(files, "extracting")
+    runs = run_names(files) if len(files) > 1 else [None]
+    tasks = [
+        Task(file, run, groups_in_name(file, level_from_name).get("level"), vars(reading))
+        for file, run in zip(files, runs, strict=True)
     ]
-    data = parts[0] if len(parts) == 1 else FrequencyResponse.concatenate(parts)
+    data = extract_all(tasks, extracting.keywords(), jobs)
     if good_only:
         data = good_points(data)
     if output is not None:
@@ -153,7 +157,7 @@ def extract(
     if plot is not None:
         write_picture(data.plot(), plot, overwrite=writing.overwrite)
     if general.json:
-        telling.say_json(_rows(data))
+        console.write_json(_rows(data))
     elif output != STANDARD:
         show(data)
     judge(data)
@@ -165,7 +169,7 @@ def good_points(data: FrequencyResponse) -> FrequencyResponse:
 
     good = data.quality["verdict"] == "good"
     for i in (~good & (data.harmonic == data.harmonic.min())).nonzero()[0]:
-        telling.doubt(
+        console.write_error(
             f"left out: row {i} at {data.frequency_hz[i]:.5g} Hz: {data.quality['verdict'][i]}"
         )
     if not good.any():
@@ -176,18 +180,6 @@ def good_points(data: FrequencyResponse) -> FrequencyResponse:
 def _one_row_a_point(data: FrequencyResponse) -> FrequencyResponse:
     """Return the fundamental of every point, or the lowest harmonic that was asked for."""
     return data.select(harmonic=int(data.harmonic.min()))
-
-
-def _points(
-    file: str, reading: RecordReading, extracting: Extracting, level_from_name: str | None
-) -> FrequencyResponse:
-    from dahl_ident.data import read_record
-    from dahl_ident.data.readers import groups_in_name
-    from dahl_ident.extraction import extract as extract_record
-
-    record = read_record(file, **vars(reading))
-    level = groups_in_name(file, level_from_name).get("level")
-    return extract_record(record, level=level, **extracting.keywords())
 
 
 def show(data: FrequencyResponse) -> None:
@@ -209,7 +201,7 @@ def show(data: FrequencyResponse) -> None:
         "verdict": [str(v) for v in points.quality["verdict"]],
     }
     shown = {name: cells for name, cells in columns.items() if cells}
-    telling.table(
+    console.table(
         f"{points.n} points of {points.quantity.replace('_', ' ')} [{points.unit}]",
         list(shown),
         list(zip(*shown.values(), strict=True)),
@@ -222,7 +214,7 @@ def judge(data: FrequencyResponse) -> None:
     bad = [(i, str(v)) for i, v in enumerate(verdicts) if v != "good"]
     named = "; ".join(f"point {i}: {verdict}" for i, verdict in bad[:3])
     more = "" if len(bad) <= 3 else "; ..."
-    telling.finish(not bad, f"{len(bad)} of {len(verdicts)} points are not good ({named}{more})")
+    console.finish(not bad, f"{len(bad)} of {len(verdicts)} points are not good ({named}{more})")
 
 
 def _rows(data: FrequencyResponse) -> list[dict[str, Any]]:

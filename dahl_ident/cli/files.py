@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -67,12 +67,6 @@ def write_picture(axes: Any, path: str, *, overwrite: bool) -> None:
     except ValueError as exc:
         raise DataError(f"{path}: no picture of this kind: {exc}") from exc
     write_whole(Path(path), buffer.getvalue(), overwrite=overwrite)
-
-
-def with_progress(items: Sequence[_T], what: str) -> Iterator[_T]:
-    """Yield the items under a progress bar, which appears on a terminal only."""
-    with progress_bar() as bar:
-        yield from bar.track(items, description=what)
 
 
 def progress_bar() -> Any:

@@ -9,18 +9,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dahl_ident.cli import telling
+from dahl_ident.cli import console
 from dahl_ident.cli.distributions import values
 from dahl_ident.cli.files import written
-from dahl_ident.cli.groups import grouped
 from dahl_ident.cli.model import ModelOptions
-from dahl_ident.cli.options import STANDARD, Files, General, Reading, Writing
+from dahl_ident.cli.option_groups import with_option_groups
+from dahl_ident.cli.options import STANDARD, Files, General, Reading, Writing, one_of
 
 if TYPE_CHECKING:
-    from dahl_ident.results import FitResult, Posterior
+    from dahl_ident.results import ChainPosterior, FitResult, RecordFit
+    from dahl_ident.results.result import Result
 
 _ESTIMATING = "Estimating"
 _LEVEL = 0.9545
+_TAKEN = ("model", "free", "fixed", "start")  # by a fit of records
 ReportPlace = Annotated[
     str | None,
     typer.Option(help="Report to write: .html, .pdf, .md or .json; - is HTML on standard output."),
@@ -34,9 +36,11 @@ class Estimating:
     method: Annotated[
         str,
         typer.Option(
-            help="scipy, or ipopt with exact second derivatives.", rich_help_panel=_ESTIMATING
+            help="lm, scipy (least_squares) or ipopt (exact second derivatives).",
+            callback=one_of("lm", "scipy", "ipopt"),
+            rich_help_panel=_ESTIMATING,
         ),
-    ] = "scipy"
+    ] = "lm"
     noise: Annotated[
         str | None,
         typer.Option(
@@ -65,7 +69,7 @@ class Estimating:
         return {**vars(self), "start": start}
 
 
-@grouped
+@with_option_groups
 def fit(
     files: Files,
     general: General,
@@ -77,28 +81,75 @@ def fit(
     save: Annotated[
         Path | None, typer.Option(help="Fit to write, as JSON that report and Python load.")
     ] = None,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Print every section, not the first two.")
+    ] = False,
+    record: Annotated[
+        bool,
+        typer.Option("--record", help="The files are records of any motion, each a run."),
+    ] = False,
 ) -> None:
-    """Estimate f_max and sigma, and say whether the data determine them.
+    """Estimate a model's parameters, and say whether the data determine them.
 
     Example: dahl-ident datasets noisy -o - | dahl-ident fit -
     """
     from dahl_ident.data.storage import place_of
-    from dahl_ident.results.storage import FORMATS
+    from dahl_ident.results.result import FORMATS
 
     writing.check([report, save], files, json=general.json)
     check_reports(report)
     if save is not None:
         place_of(save, "a fit", FORMATS)
+    if record:
+        _fit_records(files, general, model, estimating, writing, report, save)
+        return
     result = fitted(files, reading, model, estimating)
     if save is not None:
         result.save(save, overwrite=writing.overwrite)
     if general.json:
-        telling.say_json(as_json(result))
+        console.write_json(as_json(result))
     elif report != STANDARD:
-        telling.say(result.fit_report())
+        console.write_wrapped(result.fit_report(details=verbose))
+        if not verbose:
+            console.write("-v prints tests of the residuals, other models and the solver's numbers")
     if report is not None:
-        tell_report([result], report, writing)
+        write_report_beside([result], report, writing)
     finish(result)
+
+
+def _fit_records(
+    files: list[str],
+    general: General,
+    model: ModelOptions,
+    estimating: Estimating,
+    writing: Writing,
+    report: str | None,
+    save: Path | None,
+) -> None:
+    """Fit records of any motion sample by sample."""
+    from dahl_ident.data import read_record
+    from dahl_ident.results import fit as fit_data
+
+    result = fit_data(
+        [read_record(name) for name in files],
+        throw=False,
+        **{k: v for k, v in {**model.keywords(), **estimating.keywords()}.items() if k in _TAKEN},
+    )
+    if save is not None:
+        result.save(save, overwrite=writing.overwrite)
+    if general.json:
+        console.write_json(
+            {
+                "status": str(result.status),
+                "verdict": result.verdict,
+                "params": {name: vars(p) for name, p in result.params.items()},
+            }
+        )
+    elif report != STANDARD:
+        console.write(result.fit_report())
+    if report is not None:
+        write_report_beside([result], report, writing)
+    console.finish(result.status.usable, result.statements[0].partition(". ")[2])
 
 
 def fitted(
@@ -122,7 +173,7 @@ def check_reports(*places: str | None) -> None:
 
 
 def write_report(
-    results: Sequence[FitResult | Posterior],
+    results: Sequence[FitResult | ChainPosterior | RecordFit],
     place: str,
     writing: Writing,
     **how: Any,
@@ -135,22 +186,25 @@ def write_report(
 
     from dahl_ident.reporting import report
 
-    told = {**how, "command": telling.typed_command(), "overwrite": writing.overwrite}
-    write = partial(report, list(results), **told)
+    options = {**how, "command": console.typed_command(), "overwrite": writing.overwrite}
+    write = partial(report, list(results), **options)
     return written(write, place, ".html")
 
 
-def tell_report(results: Sequence[FitResult | Posterior], place: str, writing: Writing) -> None:
+def write_report_beside(
+    results: Sequence[FitResult | ChainPosterior | RecordFit], place: str, writing: Writing
+) -> None:
     """Write a report beside other output, and say where it is."""
-    told = write_report(results, place, writing)
-    if told != STANDARD:
-        telling.doubt(f"report: {told}")
+    written_to = write_report(results, place, writing)
+    if written_to != STANDARD:
+        console.write_error(f"report: {written_to}")
 
 
 def as_json(result: FitResult) -> dict[str, Any]:
     """Return a fit as plain data."""
     limits = result.conf_interval().at(_LEVEL)
     return {
+        "status": str(result.status),
         "trusted": result.trusted,
         "verdict": result.verdict,
         "success": result.success,
@@ -168,11 +222,6 @@ def as_json(result: FitResult) -> dict[str, Any]:
     }
 
 
-def finish(result: FitResult) -> None:
-    """End with status 3 where the fit is not to be trusted."""
-    telling.finish(result.trusted, objection(result))
-
-
-def objection(result: FitResult) -> str:
-    """Return the gravest statement on a fit that is not to be trusted."""
-    return result.statements[0].removeprefix("NOT to be trusted. ")
+def finish(result: Result) -> None:
+    """End with status 3 where the result cannot be used."""
+    console.finish(result.status.usable, result.statements[0].partition(". ")[2])

@@ -6,12 +6,12 @@ from typing import Annotated
 
 import typer
 
-from dahl_ident.cli import telling
-from dahl_ident.cli.groups import grouped
+from dahl_ident.cli import console
+from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import Files, General
 
 
-@grouped
+@with_option_groups
 def inspect(
     files: Files,
     general: General,
@@ -27,6 +27,6 @@ def inspect(
 
     found = [contents_of(file, sheet=sheet) for file in files]
     if general.json:
-        telling.say_json([asdict(contents) for contents in found])
+        console.write_json([asdict(contents) for contents in found])
         return
-    telling.say("\n\n".join(repr(contents) for contents in found))
+    console.write("\n\n".join(repr(contents) for contents in found))

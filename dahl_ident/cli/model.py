@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dahl_ident.cli.distributions import known, number_or_free
+from dahl_ident.cli.distributions import FREE, known, number_or_free
+from dahl_ident.errors import ModelError, ValidationError
 
 if TYPE_CHECKING:
     from dahl_ident.elements import Element
@@ -16,11 +20,20 @@ if TYPE_CHECKING:
 _MODEL = "Model"
 _SENSORS = "Sensors"
 _KINDS = "a number, 'free', or a prior as scipy.stats has it, such as 'norm(1, 0.005)'."
+_CALL = re.compile(r"\s*(\w+)\s*(?:\((.*)\))?\s*", re.DOTALL)
+_FRICTION = ("f_max", "sigma", "alpha")
+OTHERS = ("mass", "damping", "stiffness")
 
 
-def part(help_text: str) -> Any:
+def model_option(help_text: str) -> Any:
     """Return an option of the model."""
     return typer.Option(help=help_text, rich_help_panel=_MODEL)
+
+
+ELEMENT_HELP = (
+    "An element in place of the Dahl one, by its kind and what is known: 'bouc_wen', "
+    "'dahl(f_max=0.1, alpha=free)', 'mass(0.3)'; once for each."
+)
 
 
 def _sensor(help_text: str) -> Any:
@@ -31,38 +44,93 @@ def _sensor(help_text: str) -> Any:
 class ModelOptions:
     """Elements and sensors, which of their parameters are known, which are free."""
 
-    f_max: Annotated[str | None, part("Coulomb friction, N; estimated if left out.")] = None
-    sigma: Annotated[str | None, part("Rest stiffness, N/m; estimated if left out.")] = None
-    alpha: Annotated[str, part("Exponent of the Dahl model, or 'free'.")] = "1"
-    mass: Annotated[str | None, part("Add a mass: kg, or 'free'.")] = None
-    damping: Annotated[str | None, part("Add a damper: N s/m, or 'free'.")] = None
-    stiffness: Annotated[str | None, part("Add a spring: N/m, or 'free'.")] = None
+    f_max: Annotated[str | None, model_option("Friction force, N; estimated if left out.")] = None
+    sigma: Annotated[str | None, model_option("Contact stiffness, N/m; estimated if left out.")] = (
+        None
+    )
+    alpha: Annotated[str | None, model_option("Exponent, or 'free'; 1 is assumed if left out.")] = (
+        None
+    )
+    element: Annotated[list[str] | None, model_option(ELEMENT_HELP)] = None
+    mass: Annotated[str | None, model_option("Add a mass: kg, or 'free'.")] = None
+    damping: Annotated[str | None, model_option("Add a damper: N s/m, or 'free'.")] = None
+    stiffness: Annotated[str | None, model_option("Add a spring: N/m, or 'free'.")] = None
     force_gain: Annotated[str | None, _sensor("Measured over true force")] = None
     displacement_gain: Annotated[str | None, _sensor("Measured over true displacement")] = None
     delay: Annotated[str | None, _sensor("Lag of the displacement channel, s")] = None
 
     def keywords(self) -> dict[str, Any]:
-        """Return the arguments of ``fit`` and ``sample`` that describe plant and sensors."""
-        from dahl_ident.elements import Dahl
+        """Return the arguments of ``fit`` and ``posterior`` that describe plant and sensors."""
         from dahl_ident.sensors import Sensors
 
-        f_max, sigma, alpha = (
-            number_or_free(name, getattr(self, name)) for name in ("f_max", "sigma", "alpha")
-        )
-        friction = Dahl(f_max, sigma, 1.0 if alpha is None else alpha)
         others = {name: number_or_free(name, text) for name, text in self._given(*OTHERS).items()}
         sensed = self._given("force_gain", "displacement_gain", "delay")
         return {
-            "model": in_parallel(friction, others),
-            "free": ["alpha"] if alpha is None else [],
+            "model": in_parallel(self._friction(), others),
+            "free": ["alpha"] if self.alpha == FREE else [],
             "sensors": Sensors(**{name: known(name, text) for name, text in sensed.items()}),
         }
+
+    def _friction(self) -> Element:
+        from dahl_ident.elements import Dahl
+
+        given = self._given(*_FRICTION)
+        if self.element:
+            refuse_beside_elements(given)
+            return elements(self.element)
+        values: dict[str, Any] = {name: number_or_free(name, text) for name, text in given.items()}
+        return Dahl(**{name: value for name, value in values.items() if value is not None})
 
     def _given(self, *names: str) -> dict[str, str]:
         return {name: text for name in names if (text := getattr(self, name)) is not None}
 
 
-OTHERS = ("mass", "damping", "stiffness")
+def refuse_beside_elements(given: Mapping[str, Any]) -> None:
+    """Refuse parameters of the Dahl element where --element describes the friction."""
+    if given:
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise ValidationError(
+            f"{options} is given beside --element; write such values inside the element, as in "
+            "--element 'dahl(f_max=0.1)'"
+        )
+
+
+def elements(texts: Sequence[str]) -> Element:
+    """Return the sum of elements written as ``kind(label=value, ...)``.
+
+    Raises
+    ------
+    ValidationError
+        If a text is not of this form.
+    ModelError
+        If a kind or a label is unknown, or a value is impossible.
+    """
+    from dahl_ident.elements.element import KINDS
+
+    return reduce(add, (_element(text, KINDS) for text in texts))
+
+
+def _element(text: str, kinds: Mapping[str, type[Element]]) -> Element:
+    from dahl_ident.elements.description import model_from_description
+
+    call = _CALL.fullmatch(text)
+    if call is None:
+        raise ValidationError(
+            f"--element is {text!r}; expected a kind and its values, such as 'dahl(f_max=0.1)'"
+        )
+    kind, inside = call[1], call[2] or ""
+    if kind not in kinds:
+        raise ModelError(f"--element names the kind {kind!r}; expected one of {', '.join(kinds)}")
+    labels = [parameter.name for parameter in kinds[kind].parameters]
+    entry: dict[str, Any] = {"kind": kind}
+    for place, part in enumerate(part for part in inside.split(",") if part.strip()):
+        label, _, value = (word.strip() for word in part.rpartition("="))
+        if not label and place >= len(labels):
+            raise ModelError(f"--element is {text!r}; {kind} takes {', '.join(labels)}")
+        label = label or labels[place]
+        free = value == FREE
+        entry[label] = value if label == "name" or free else number_or_free(label, value)
+    return model_from_description([entry]).elements[0]
 
 
 def in_parallel(friction: Element, others: Mapping[str, float | None]) -> Element:

@@ -1,8 +1,9 @@
-"""The options that commands share: how files are read and written, how the result is told."""
+"""The options that commands share: how files are read and written, how results are printed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import glob
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,7 +20,45 @@ STANDARD = "-"
 _READING = "Reading"
 
 
-Files = Annotated[list[str], typer.Argument(help="Files to read; - is standard input.")]
+def _existing(files: list[str]) -> list[str]:
+    """Refuse files that are not there, before anything heavy is loaded."""
+    for file in files:
+        if file != STANDARD and not Path(file).exists() and not glob.has_magic(file):
+            raise DataError(f"{file}: the file cannot be read: No such file or directory")
+    return files
+
+
+def one_of(*choices: str) -> Callable[[str], str]:
+    """Return a check of an option's value; any other is a wrong use of the command."""
+
+    def check(value: str) -> str:
+        if value not in choices:
+            raise typer.BadParameter(f"{value!r} is not one of {', '.join(choices)}")
+        return value
+
+    return check
+
+
+def _range(text: str | None) -> tuple[float, float] | None:
+    """Return the two numbers of ``0.2,0.6``."""
+    if text is None:
+        return None
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError as exc:
+        raise typer.BadParameter(f"{text!r} is not a pair of numbers such as 0.2,0.6") from exc
+    return low, high
+
+
+def _is_range(text: str | None) -> str | None:
+    _range(text)
+    return text
+
+
+Files = Annotated[
+    list[str],
+    typer.Argument(help="Files to read; - is standard input.", callback=_existing),
+]
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
 
 
@@ -128,8 +167,27 @@ class Reading:
         ),
     ] = None
     frequency_hz: Annotated[
-        tuple[float, float] | None,
-        typer.Option(help="Read this range only, Hz.", rich_help_panel=_READING),
+        str | None,
+        typer.Option(
+            help="Keep this range only, Hz: 0.2,0.6.", callback=_is_range, rich_help_panel=_READING
+        ),
+    ] = None
+    where: Annotated[
+        str | None,
+        typer.Option(
+            help="Keep the rows that meet a condition: 'level > 3 and harmonic == 1'.",
+            rich_help_panel=_READING,
+        ),
+    ] = None
+    levels: Annotated[
+        str | None, typer.Option(help="Keep these levels only: 1,2,5.", rich_help_panel=_READING)
+    ] = None
+    runs: Annotated[
+        str | None,
+        typer.Option(
+            help="Keep these runs only: day1,day2. Several files are a run each.",
+            rich_help_panel=_READING,
+        ),
     ] = None
     sheet: Annotated[
         str | None, typer.Option(help="Sheet of an Excel workbook.", rich_help_panel=_READING)
@@ -143,6 +201,10 @@ class Reading:
 
     def read(self, files: list[str]) -> FrequencyResponse:
         """Read the files into one table."""
+        from dahl_ident.cli.row_selection import selected
         from dahl_ident.data import read_frequency_response
 
-        return read_frequency_response(files, **vars(self))
+        given = dict(vars(self))
+        where, levels, runs = (given.pop(name) for name in ("where", "levels", "runs"))
+        given["frequency_hz"] = _range(self.frequency_hz)
+        return selected(read_frequency_response(files, **given), where, levels, runs)

@@ -8,15 +8,15 @@ from typing import Annotated
 
 import typer
 
-from dahl_ident.cli import telling
+from dahl_ident.cli import console
 from dahl_ident.cli.fit import Estimating, check_reports, finish, fitted, write_report
-from dahl_ident.cli.groups import grouped
 from dahl_ident.cli.model import ModelOptions
+from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import STANDARD, Files, General, Reading, Seed, Writing
 from dahl_ident.errors import ValidationError
 
 
-@grouped
+@with_option_groups
 def report(
     files: Files,
     general: General,
@@ -40,6 +40,10 @@ def report(
         Path | None, typer.Option(help="Column map of these waveforms, a TOML file.")
     ] = None,
     title: Annotated[str | None, typer.Option(help="First line of the report.")] = None,
+    metadata: Annotated[
+        Path | None,
+        typer.Option(help="Specimen, instruments, operator and so on, a TOML file."),
+    ] = None,
     bootstrap: Annotated[
         bool, typer.Option("--bootstrap", help="Bootstrap intervals as well, beside the others.")
     ] = False,
@@ -48,35 +52,47 @@ def report(
     ] = False,
     seed: Seed = 1,
 ) -> None:
-    """Fit, judge and write a report; or report on a fit that fit --save has written.
+    """Fit, judge and write a report; or report on fits that fit --save has written.
+
+    Several saved fits are overlaid, and the changes from each to the next are listed.
 
     Example: dahl-ident datasets noisy -o - | dahl-ident report - -o report.html
     """
     from dahl_ident.data import read_record
-    from dahl_ident.results import FitResult, Posterior, sample
+    from dahl_ident.results import ChainPosterior, FitResult
 
     writing.check(output, files, json=general.json)
     check_reports(*output)
     if record_columns is not None and record is None:
         raise ValidationError("--record-columns is given without --record; give both, or neither")
-    saved = any(file.endswith(".json") for file in files)
+    saved = all(file.endswith(".json") for file in files)
     chosen = (reading, model, estimating) != (Reading(), ModelOptions(), Estimating())
-    if saved and (len(files) > 1 or chosen):
+    if any(file.endswith(".json") for file in files) and (not saved or chosen):
         raise ValidationError(
-            "a saved fit is reported as it is: give one file, and no options of reading, model or "
-            "estimate beside it"
+            "saved fits are reported as they are: give no tables beside them, and no options of "
+            "reading, model or estimate"
         )
+    if len(files) > 1 and saved and (posterior or record is not None):
+        raise ValidationError("--posterior and --record go with one fit; give one file")
     waveforms = None if record is None else read_record(record, columns=record_columns)
-    result = FitResult.load(files[0]) if saved else fitted(files, reading, model, estimating)
-    told: list[FitResult | Posterior] = [result]
-    if bootstrap:
-        result.conf_interval("bootstrap", seed=seed)
+    fits = (
+        [FitResult.load(file) for file in files]
+        if saved
+        else [fitted(files, reading, model, estimating)]
+    )
+    results: list[FitResult | ChainPosterior] = [*fits]
+    result = fits[0]
+    for fit in fits if bootstrap else ():
+        fit.conf_interval("bootstrap", seed=seed)
     if posterior:
-        told.append(sample(result, seed=seed, progress=sys.stderr.isatty()))
-    how = {"title": title, "record": waveforms}
-    places = [write_report(told, place, writing, **how) for place in output]
+        from dahl_ident.results.bayesian_estimate import posterior as estimate_posterior
+
+        chain = estimate_posterior(result, seed=seed, progress=sys.stderr.isatty())
+        results.append(chain)
+    how = {"title": title, "record": waveforms, "metadata": metadata}
+    places = [write_report(results, place, writing, **how) for place in output]
     if general.json:
-        telling.say_json(places)
+        console.write_json(places)
     elif STANDARD not in places:
-        telling.say("\n".join(places))
-    finish(result)
+        console.write("\n".join(places))
+    finish(next((fit for fit in fits if not fit.status.usable), result))

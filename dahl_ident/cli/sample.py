@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dahl_ident.cli import telling
+from dahl_ident.cli import console
 from dahl_ident.cli.distributions import prior
-from dahl_ident.cli.fit import ReportPlace, check_reports, tell_report
-from dahl_ident.cli.groups import grouped
+from dahl_ident.cli.fit import ReportPlace, check_reports, finish, write_report_beside
 from dahl_ident.cli.model import ModelOptions
-from dahl_ident.cli.options import STANDARD, Files, General, Reading, Writing
+from dahl_ident.cli.option_groups import with_option_groups
+from dahl_ident.cli.options import STANDARD, Files, General, Reading, Writing, one_of
 from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:
-    from dahl_ident.results.bayesian import BayesianResult
+    pass
 
 _SAMPLING = "Sampling"
 _CHAIN = ("seed", "steps", "max_steps", "ess", "walkers", "ensembles", "resume")
@@ -28,6 +28,14 @@ _CHAIN = ("seed", "steps", "max_steps", "ess", "walkers", "ensembles", "resume")
 class Sampling:
     """How the chain is run; the words of ``sample``."""
 
+    method: Annotated[
+        str,
+        typer.Option(
+            help="mcmc, or grid: integration over up to three parameters, without a chain.",
+            callback=one_of("mcmc", "grid"),
+            rich_help_panel=_SAMPLING,
+        ),
+    ] = "mcmc"
     prior: Annotated[
         list[str] | None,
         typer.Option(
@@ -56,7 +64,7 @@ class Sampling:
         typer.Option(help="Total steps; by default until converged.", rich_help_panel=_SAMPLING),
     ] = None
     max_steps: Annotated[
-        int, typer.Option(help="Where to stop all the same.", rich_help_panel=_SAMPLING)
+        int, typer.Option(help="Most steps, converged or not.", rich_help_panel=_SAMPLING)
     ] = 20000
     ess: Annotated[
         float, typer.Option(help="Effective draws wanted.", rich_help_panel=_SAMPLING)
@@ -76,39 +84,27 @@ class Sampling:
         ),
     ] = None
 
-    grid: Annotated[
-        bool,
-        typer.Option(
-            "--grid",
-            help="Integrate instead, at once and without a chain: up to three parameters.",
-            rich_help_panel=_SAMPLING,
-        ),
-    ] = False
-
     def keywords(self) -> dict[str, Any]:
-        """Return the arguments of ``sample``, or those of ``posterior_grid``."""
-        priors = dict(prior(text) for text in self.prior or [])
-        what = {"priors": priors, "noise": self.noise, "likelihood": self.likelihood}
-        if self.grid:
-            return what
-        how = {name: getattr(self, name) for name in _CHAIN}
+        """Return the arguments of ``posterior``."""
+        given = dict(vars(self))
+        given["priors"] = dict(prior(text) for text in given.pop("prior") or [])
         if self.seed is None and (self.resume is None or not self.resume.exists()):
-            how["seed"] = 1
-        return {**what, **how, "progress": sys.stderr.isatty()}
+            given["seed"] = 1
+        return {**given, "progress": sys.stderr.isatty()}
 
     def check(self, report: str | None) -> None:
-        """Refuse with --grid what only a chain has."""
+        """Refuse with --method grid what only a chain has."""
         chain = Sampling()
         given = [n for n in _CHAIN if n != "seed" and getattr(self, n) != getattr(chain, n)]
         given += ["report"] if report is not None else []
-        if self.grid and given:
+        if self.method == "grid" and given:
             options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
             raise ValidationError(
-                f"{options} is given beside --grid, which runs no chain; leave one of them out"
+                f"{options} is given beside --method grid, which runs no chain; leave one out"
             )
 
 
-@grouped
+@with_option_groups
 def sample(
     files: Files,
     general: General,
@@ -122,33 +118,25 @@ def sample(
 
     Example: dahl-ident datasets noisy -o - | dahl-ident sample - --prior f_max=0.01:1
     """
-    from dahl_ident.results import Posterior, posterior_grid
-    from dahl_ident.results import sample as sample_data
+    from dahl_ident.results import ChainPosterior
+    from dahl_ident.results.bayesian_estimate import posterior as estimate_posterior
 
     writing.check([report], files, json=general.json)
     check_reports(report)
     sampling.check(report)
-    estimate = posterior_grid if sampling.grid else sample_data
     data, plant, how = reading.read(files), model.keywords(), sampling.keywords()
     try:
-        posterior = estimate(data, **plant, **how)
+        posterior = estimate_posterior(data, **plant, **how)
     except KeyboardInterrupt:
-        telling.doubt(_kept(sampling.resume))
+        console.write_error(_kept(sampling.resume))
         raise
     if general.json:
-        from dahl_ident.reporting.posteriors import facts
-
-        telling.say_json(facts(posterior))
+        console.write_json(posterior.to_dict())
     elif report != STANDARD:
-        telling.say(posterior.report())
-    if report is not None and isinstance(posterior, Posterior):
-        tell_report([posterior], report, writing)
+        console.write_wrapped(str(posterior))
+    if report is not None and isinstance(posterior, ChainPosterior):
+        write_report_beside([posterior], report, writing)
     finish(posterior)
-
-
-def finish(posterior: BayesianResult) -> None:
-    """End with status 3 where the posterior is not to be trusted."""
-    telling.finish(posterior.trusted, "; ".join(posterior.objections))
 
 
 def _kept(chain: Path | None) -> str:

@@ -7,10 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dahl_ident.cli import telling
+from dahl_ident.cli import console
 from dahl_ident.cli.files import progress_bar, write_data
-from dahl_ident.cli.groups import grouped
-from dahl_ident.cli.model import OTHERS, in_parallel, part
+from dahl_ident.cli.model import (
+    ELEMENT_HELP,
+    OTHERS,
+    elements,
+    in_parallel,
+    model_option,
+    refuse_beside_elements,
+)
+from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import General, Seed, Writing
 from dahl_ident.errors import ValidationError
 
@@ -28,25 +35,31 @@ _COUNT = 30
 class Plant:
     """The truth: friction, and what is beside it."""
 
-    f_max: Annotated[float | None, part("Coulomb friction, N; needed.")] = None
-    sigma: Annotated[float | None, part("Rest stiffness, N/m; needed.")] = None
-    alpha: Annotated[float, part("Exponent of the Dahl model.")] = 1.0
-    mass: Annotated[float | None, part("Add a mass, kg.")] = None
-    damping: Annotated[float | None, part("Add a damper, N s/m.")] = None
-    stiffness: Annotated[float | None, part("Add a spring, N/m.")] = None
+    f_max: Annotated[float | None, model_option("Friction force, N.")] = None
+    sigma: Annotated[float | None, model_option("Contact stiffness, N/m.")] = None
+    alpha: Annotated[float | None, model_option("Exponent; 1 if left out.")] = None
+    element: Annotated[list[str] | None, model_option(ELEMENT_HELP)] = None
+    mass: Annotated[float | None, model_option("Add a mass, kg.")] = None
+    damping: Annotated[float | None, model_option("Add a damper, N s/m.")] = None
+    stiffness: Annotated[float | None, model_option("Add a spring, N/m.")] = None
 
     def built(self) -> Element:
         """Return the plant."""
         from dahl_ident.elements import Dahl
 
-        missing = [name for name in ("f_max", "sigma") if getattr(self, name) is None]
+        own = {name: getattr(self, name) for name in ("f_max", "sigma", "alpha")}
+        given = {name: value for name, value in own.items() if value is not None}
+        beside = {n: value for n in OTHERS if (value := getattr(self, n)) is not None}
+        if self.element:
+            refuse_beside_elements(given)
+            return in_parallel(elements(self.element), beside)
+        missing = [name for name in ("f_max", "sigma") if name not in given]
         if missing:
             raise ValidationError(
-                f"no value for {' and '.join(missing)}; a simulation needs --f-max and --sigma"
+                f"no value for {' and '.join(missing)}; a simulation needs --f-max and --sigma, "
+                "or --element"
             )
-        others = {name: getattr(self, name) for name in OTHERS}
-        beside = {name: value for name, value in others.items() if value is not None}
-        return in_parallel(Dahl(self.f_max, self.sigma, self.alpha), beside)
+        return in_parallel(Dahl(**given), beside)
 
 
 @dataclass(frozen=True)
@@ -56,7 +69,7 @@ class Excitation:
     levels: Annotated[
         str | None,
         typer.Option(
-            help="Amplitudes, 1e-4,1e-3 or low:high:count; by default 30 about f_max/sigma.",
+            help="Amplitudes, 1e-4,1e-3 or low:high:count; by default 30 about the knee.",
             rich_help_panel=_EXCITATION,
         ),
     ] = None
@@ -94,7 +107,7 @@ class Errors:
     ] = 0.0
 
 
-@grouped
+@with_option_groups
 def simulate(
     general: General,
     plant: Plant,
@@ -135,7 +148,7 @@ def simulate(
         else Experiment.read(experiment)
     )
     if output is None:
-        telling.say(described.to_json() if general.json else described.to_toml())
+        console.write(described.to_json() if general.json else described.to_toml())
         return
     with progress_bar() as bar:
         task = bar.add_task("simulating", total=1.0)
@@ -149,7 +162,9 @@ def _experiment(plant: Plant, excitation: Excitation, errors: Errors) -> Experim
     truth = plant.built()
     given: dict[str, Any] = dict(vars(excitation))
     as_record = given.pop("record")
-    given["levels"] = _numbers("levels", excitation.levels or _usual_levels(plant, excitation))
+    given["levels"] = _numbers(
+        "levels", excitation.levels or _usual_levels(truth, excitation.controlled)
+    )
     given["frequencies_hz"] = _numbers("frequencies_hz", excitation.frequencies_hz)
     steps = SteppedSine(**given)
     if not as_record:
@@ -161,12 +176,22 @@ def _experiment(plant: Plant, excitation: Excitation, errors: Errors) -> Experim
     return Experiment(truth, steps, sensors)
 
 
-def _usual_levels(plant: Plant, excitation: Excitation) -> str:
+def _usual_levels(truth: Element, controlled: str) -> str:
     """Return levels about the knee of friction, of displacement or of force."""
-    assert plant.f_max is not None  # the plant has been built
-    assert plant.sigma is not None
-    knee = plant.f_max if excitation.controlled == "force" else plant.f_max / plant.sigma
-    return f"{_SPAN[0] * knee}:{_SPAN[1] * knee}:{_COUNT}"
+    import numpy as np
+
+    from dahl_ident.elements.model import as_model
+
+    laws = [e for e in as_model(truth).elements if not e.is_linear]
+    knees = np.array([[float(knee) for knee in e.knee(e.known_values())] for e in laws])
+    if controlled == "force":
+        # a square wave of the friction force has a fundamental of 4/pi times it
+        limits = [0.25 * np.pi * float(e.force_bounds(e.known_values())[1]) for e in laws]
+        knees = np.array([[sum(limits)] * 2])
+    low, high = (knees[:, 0].min(), knees[:, 1].max()) if laws else (0.0, 0.0)
+    if not (np.isfinite([low, high]).all() and 0.0 < low <= high):
+        raise ValidationError("the plant has no knee to place levels about; give --levels")
+    return f"{_SPAN[0] * low}:{_SPAN[1] * high}:{_COUNT}"
 
 
 def _numbers(name: str, text: str) -> list[float]:

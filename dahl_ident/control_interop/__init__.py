@@ -3,7 +3,7 @@
 python-control's systems come in as :class:`~dahl_ident.elements.LinearSystem` elements; this
 room is the way back.
 
-- :class:`DahlNonlinearity` puts friction into python-control's describing-function tools.
+- :class:`FrictionNonlinearity` puts friction into python-control's describing-function tools.
 - :func:`limit_cycles` finds the free oscillations of a loop, and which of them are approached.
 - :func:`level_responses` gives responses over frequency at several levels, as FRD or pictures.
 - :func:`equivalent_plant` and :func:`loop_margins` help to design a controller: the linear plant
@@ -15,15 +15,15 @@ room is the way back.
 from __future__ import annotations
 
 from dahl_ident.control_interop.branches import Branches, response_branches
-from dahl_ident.control_interop.equivalent import LoopMargins, equivalent_plant, loop_margins
 from dahl_ident.control_interop.feedback import closed_loop_response
 from dahl_ident.control_interop.levels import LevelResponses, level_responses
 from dahl_ident.control_interop.limit_cycles import LimitCycle, limit_cycles
-from dahl_ident.control_interop.nonlinearity import DahlNonlinearity
+from dahl_ident.control_interop.linearization import LoopMargins, equivalent_plant, loop_margins
+from dahl_ident.control_interop.nonlinearity import FrictionNonlinearity
 
 __all__ = [
     "Branches",
-    "DahlNonlinearity",
+    "FrictionNonlinearity",
     "LevelResponses",
     "LimitCycle",
     "LoopMargins",

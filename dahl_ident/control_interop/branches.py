@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
 from dahl_ident.control_interop.limit_cycles import stiffness_of, stiffness_slope
 from dahl_ident.control_interop.nonlinearity import friction_and_slope
-from dahl_ident.control_interop.parts import parts_of
+from dahl_ident.control_interop.split import split
 from dahl_ident.elements.element import Element
 from dahl_ident.steady_state import SteadyResponse, response
 
@@ -38,7 +38,8 @@ class Branches:
 
     Examples
     --------
-    >>> from dahl_ident import Dahl, Damper, Mass, Spring, response_branches
+    >>> from dahl_ident import Dahl, Damper, Mass, Spring
+    >>> from dahl_ident.control_interop import response_branches
     >>> plant = Dahl(f_max=0.1, sigma=30) + Mass(0.3) + Damper(-0.03) + Spring(3.0)
     >>> response_branches(plant, 0.525, 0.114).stable.tolist()
     [True, False, True]
@@ -86,7 +87,8 @@ def response_branches(plant: Element, frequency_hz: ArrayLike, drive: ArrayLike)
 
     Examples
     --------
-    >>> from dahl_ident import Dahl, Damper, Mass, Spring, response_branches
+    >>> from dahl_ident import Dahl, Damper, Mass, Spring
+    >>> from dahl_ident.control_interop import response_branches
     >>> plant = Dahl(f_max=0.1, sigma=30) + Mass(0.3) + Damper(-0.03) + Spring(3.0)
     >>> branches = response_branches(plant, 0.525, 0.114)
     >>> branches.steady.amplitude.round(3).tolist()
@@ -94,11 +96,11 @@ def response_branches(plant: Element, frequency_hz: ArrayLike, drive: ArrayLike)
     >>> branches.stable.tolist()
     [True, False, True]
     """
-    friction, linear = parts_of(plant)
+    friction, linear = split(plant)
     steady = response(plant, positive_array(frequency_hz, "frequency_hz"), drive, all_roots=True)
     omega = 2.0 * np.pi * np.asarray(steady.frequency_hz)
     found = np.asarray(steady.found)
-    N, slope = friction_and_slope(friction, np.where(found, steady.amplitude, 1.0))
+    N, slope = friction_and_slope(friction, np.where(found, steady.amplitude, 1.0), omega)
     w = omega.ravel()
     Z = stiffness_of(linear, w).reshape(omega.shape) + N
     by_s = -1j * stiffness_slope(linear, w).reshape(omega.shape)

@@ -58,7 +58,7 @@ def closed_loop_response(
     Examples
     --------
     >>> import control
-    >>> from dahl_ident import closed_loop_response
+    >>> from dahl_ident.control_interop import closed_loop_response
     >>> pd = control.tf([2.0, 100.0], [1.0])
     >>> data = closed_loop_response([1.0, 2.0], 1e-3, [0.9 - 0.1j, 0.8 - 0.3j], pd)
     >>> data.quantity, data.drive.round(4).tolist()

@@ -15,7 +15,7 @@ from dahl_ident.data.quantities import converted
 from dahl_ident.elements.element import Element
 from dahl_ident.errors import ValidationError
 from dahl_ident.steady_state import response
-from dahl_ident.units import QUANTITIES, Quantity
+from dahl_ident.units import QUANTITIES, Quantity, si_unit
 
 Kind = Literal["bode", "nyquist", "nichols"]
 
@@ -54,7 +54,8 @@ class LevelResponses:
 
         Examples
         --------
-        >>> from dahl_ident import Dahl, Mass, level_responses
+        >>> from dahl_ident import Dahl, Mass
+        >>> from dahl_ident.control_interop import level_responses
         >>> plant = Dahl(f_max=1.0, sigma=1.0) + Mass(1.0)
         >>> list(level_responses(plant, [1.0, 2.0], [0.1, 1.0]).to_control())
         [0.1, 1.0]
@@ -86,9 +87,22 @@ class LevelResponses:
         ValidationError
             If `kind` is unknown.
         """
-        from dahl_ident.control_interop.picture import draw_levels
+        from dahl_ident.plots import plot_frequency_response, plot_nichols, plot_nyquist
 
-        return draw_levels(self, kind, ax)
+        unit = "N" if self.controlled == "force" else "m"
+        label = f"{self.quantity.replace('_', ' ')} [{si_unit(self.quantity)}]"
+        rows = [
+            (f"{level:.3g} {unit}", self.frequency_hz, row)
+            for level, row in zip(self.levels.tolist(), self.response, strict=True)
+        ]
+        if kind == "bode":
+            return plot_frequency_response(rows, gain_label=label, ax=ax)
+        curves = [(name, row) for name, _, row in rows]
+        if kind == "nyquist":
+            return plot_nyquist(curves, label=label, ax=ax)
+        if kind == "nichols":
+            return plot_nichols(curves, gain_label=label, ax=ax)
+        raise ValidationError(f"kind is {kind!r}; expected 'bode', 'nyquist' or 'nichols'")
 
 
 def level_responses(
@@ -128,7 +142,8 @@ def level_responses(
 
     Examples
     --------
-    >>> from dahl_ident import Dahl, Damper, Mass, Spring, level_responses
+    >>> from dahl_ident import Dahl, Damper, Mass, Spring
+    >>> from dahl_ident.control_interop import level_responses
     >>> plant = Dahl(f_max=0.1, sigma=30) + Mass(0.3) + Damper(0.24) + Spring(0.3)
     >>> f, u0 = np.geomspace(0.01, 10.0, 400), np.geomspace(1e-4, 1e1, 51)
     >>> fig_7 = level_responses(plant, f, u0)

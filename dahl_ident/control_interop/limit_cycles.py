@@ -28,8 +28,7 @@ from dahl_ident.control_interop.linear_part import (
     known_range,
     transfer_stiffness,
 )
-from dahl_ident.control_interop.nonlinearity import dahl_elements, friction_and_slope
-from dahl_ident.elements.dahl import Dahl
+from dahl_ident.control_interop.nonlinearity import friction_and_slope, friction_elements
 from dahl_ident.elements.element import Element
 from dahl_ident.elements.linear_system import LinearSystem, check_system
 from dahl_ident.elements.model import Model, as_model
@@ -95,8 +94,9 @@ def limit_cycles(
         H: displacement over a force that acts where the friction acts, all controllers closed,
         such as ``control.feedback(plant, controller)``. Elements give 1/H, their dynamic
         stiffness.
-    friction : Dahl, or a sum of Dahl elements
-        With a value for every parameter.
+    friction : Element
+        Rate-independent friction, such as `Dahl`, or a sum of such elements, with a value for
+        every parameter.
     frequency_range_hz : (float, float), optional
         Where to look, Hz. By default three decades beyond all poles and zeros of H and of the
         loop closed by sigma; for an FRD its own range, for a discrete loop up to half its rate.
@@ -109,8 +109,8 @@ def limit_cycles(
     Raises
     ------
     ModelError
-        If `friction` holds anything but Dahl elements, `loop` holds one, or a parameter has no
-        value.
+        If `friction` is not rate-independent friction alone, `loop` is not linear, or a
+        parameter has no value.
     ValidationError
         If `loop` is no system, or the range is not two rising frequencies.
 
@@ -134,7 +134,8 @@ def limit_cycles(
     free mass; friction turns that into hunting of a small, definite amplitude:
 
     >>> import control
-    >>> from dahl_ident import Dahl, limit_cycles
+    >>> from dahl_ident import Dahl
+    >>> from dahl_ident.control_interop import limit_cycles
     >>> s = control.tf("s")
     >>> pid = 100 + 300 / s + 20 * s / (0.02 * s + 1) ** 2
     >>> loop = control.feedback(1 / s**2, pid)
@@ -143,8 +144,9 @@ def limit_cycles(
     5.78e-06 m at 16.2 Hz, stable: True
     """
     linear = as_linear(loop)
-    knees = [float(e.known_values()[0] / e.known_values()[1]) for e in dahl_elements(friction)]
-    A = _grid(_BEYOND_KNEES[0] * min(knees), _BEYOND_KNEES[1] * max(knees), _AMPLITUDES_PER_DECADE)
+    friction_elements(friction)
+    low, high = (float(v) for v in as_model(friction).knee(friction.known_values()))
+    A = _grid(_BEYOND_KNEES[0] * low, _BEYOND_KNEES[1] * high, _AMPLITUDES_PER_DECADE)
     N, _ = friction_and_slope(as_model(friction), A)
     omega = _frequencies(linear, float(abs(N[0])), frequency_range_hz)
     L = stiffness_of(linear, omega)
@@ -162,9 +164,11 @@ def as_linear(loop: Any) -> Model:
         check_system(loop, "loop")
         loop = LinearSystem(loop, quantity="receptance")
     model = as_model(loop)
-    dahl = [element for element in model.elements if isinstance(element, Dahl)]
-    if dahl:
-        raise ModelError(f"loop holds {dahl[0]!r}; expected linear elements: pass it as friction")
+    friction = [element for element in model.elements if not element.is_linear]
+    if friction:
+        raise ModelError(
+            f"loop holds {friction[0]!r}; expected linear elements: pass it as friction"
+        )
     model.known_values()
     return model
 

@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.data.quantities import DEFINITIONS
 from dahl_ident.elements.element import Element
-from dahl_ident.elements.linear import Lumped
 from dahl_ident.elements.linear_system import LinearSystem, check_system
 from dahl_ident.elements.model import as_model
 from dahl_ident.errors import ModelError
@@ -27,13 +25,10 @@ def transfer_stiffness(model: Element) -> Any:
     control = importlib.import_module("control")
     total = control.tf([0.0], [1.0])
     for element in as_model(model).elements:
-        if isinstance(element, LinearSystem):
-            total = total + _stiffness_of(element)
-        elif isinstance(element, Lumped):
-            (value,) = element.known_values()
-            total = total + float(value) * _s_to_the(element.order)
-        else:
+        rational = element.rational_stiffness()
+        if rational is None:
             raise ModelError(f"{element!r} has no transfer function; expected a linear element")
+        total = total + control.tf(*rational)
     return total
 
 
@@ -63,23 +58,11 @@ def known_range(model: Element) -> tuple[float, float]:
 
 def _systems(model: Element) -> list[Any]:
     """Return the python-control systems of a model at the values of their parameters."""
-    elements = [e for e in as_model(model).elements if isinstance(e, LinearSystem)]
-    return [e.system_at([float(v) for v in e.known_values()]) for e in elements]
+    systems = [e.system_at([float(v) for v in e.known_values()]) for e in as_model(model).elements]
+    return [system for system in systems if system is not None]
 
 
 def coefficients(transfer: Any) -> tuple[FloatArray, FloatArray]:
     """Return numerator and denominator, from the highest power of s down."""
     numerator, denominator = transfer.num[0][0], transfer.den[0][0]
     return np.asarray(numerator, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
-
-
-def _stiffness_of(element: LinearSystem) -> Any:
-    control = importlib.import_module("control")
-    response = control.tf(*element.polynomials())
-    definition = DEFINITIONS[element.quantity]
-    operator = _s_to_the(definition.power_in_stiffness)
-    return operator * response if definition.exponent == 1 else operator / response
-
-
-def _s_to_the(power: int) -> Any:
-    return importlib.import_module("control").tf([1.0, *[0.0] * power], [1.0])

@@ -1,4 +1,4 @@
-"""Dahl friction as a nonlinearity of python-control, with its exact describing function."""
+"""Friction as a nonlinearity of python-control, with its exact describing function."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import control
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray, finite_number, non_negative_array
-from dahl_ident.elements.dahl import Dahl
 from dahl_ident.elements.element import Element
 from dahl_ident.elements.model import as_model
 from dahl_ident.errors import ModelError
@@ -14,18 +13,19 @@ from dahl_ident.errors import ModelError
 _AT_REST = np.zeros(())
 
 
-class DahlNonlinearity(control.DescribingFunctionNonlinearity):
-    """Dahl friction F(x) with N(A) = (a_1 - j b_1)/A, for python-control's describing functions.
+class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
+    """Friction F(x) with N(A) = (a_1 - j b_1)/A, for python-control's describing functions.
 
     Parameters
     ----------
-    friction : Dahl, or a sum of Dahl elements
-        With a value for every parameter.
+    friction : Element
+        A rate-independent friction element, such as `Dahl`, or a sum of them, with a value for
+        every parameter.
 
     Raises
     ------
     ModelError
-        If an element is no Dahl element, or a parameter has no value.
+        If an element is linear or depends on the rate, or a parameter has no value.
 
     Notes
     -----
@@ -36,16 +36,18 @@ class DahlNonlinearity(control.DescribingFunctionNonlinearity):
     loop, python-control looks for H(j omega) N(A) = -1: H is displacement over a force that acts
     with the drive, and friction acts against it.
 
-    Called with one displacement after the other, it returns Eqn. 2's force and remembers it, as
-    python-control's own nonlinearities with memory do. Ask for ``describing_function``, which is
-    exact, rather than for python-control's numerical one, which warms up for a single cycle.
+    Called with one displacement after the other, it returns the law's force and remembers the
+    motion, as python-control's own nonlinearities with memory do. Ask for
+    ``describing_function``, which is exact, rather than for python-control's numerical one,
+    which warms up for a single cycle.
 
     Examples
     --------
     >>> import control
     >>> import numpy as np
-    >>> from dahl_ident import Dahl, DahlNonlinearity
-    >>> friction = DahlNonlinearity(Dahl(f_max=1.0, sigma=1.0))
+    >>> from dahl_ident import Dahl
+    >>> from dahl_ident.control_interop import FrictionNonlinearity
+    >>> friction = FrictionNonlinearity(Dahl(f_max=1.0, sigma=1.0))
     >>> control.describing_function(friction, [0.0, 1.0]).round(4)
     array([1.    +0.j    , 0.7325+0.3035j])
     >>> print(f"{friction(1.0):.4f} {friction(0.5):.4f}")
@@ -54,12 +56,10 @@ class DahlNonlinearity(control.DescribingFunctionNonlinearity):
 
     def __init__(self, friction: Element) -> None:
         super().__init__()
-        self._elements = dahl_elements(friction)
+        friction_elements(friction)
         self._model = as_model(friction)
         self._values = self._model.known_values()
-        self._limits = [float(element.known_values()[0]) for element in self._elements]
-        self._x = 0.0
-        self._forces = [0.0] * len(self._elements)
+        self._turns = [0.0]
 
     @property
     def friction(self) -> Element:
@@ -67,7 +67,7 @@ class DahlNonlinearity(control.DescribingFunctionNonlinearity):
         return self._model
 
     def describing_function(self, A: float) -> complex:
-        """Return N(A), N/m, at one amplitude A >= 0, m; sigma at A = 0.
+        """Return N(A), N/m, at one amplitude A >= 0, m; its limit at A = 0.
 
         Raises
         ------
@@ -76,7 +76,8 @@ class DahlNonlinearity(control.DescribingFunctionNonlinearity):
 
         Examples
         --------
-        >>> print(DahlNonlinearity(Dahl(f_max=1.0, sigma=3.0)).describing_function(0.0))
+        >>> from dahl_ident import Dahl
+        >>> print(FrictionNonlinearity(Dahl(f_max=1.0, sigma=3.0)).describing_function(0.0))
         (3+0j)
         """
         amplitude = non_negative_array(A, "A")
@@ -85,49 +86,52 @@ class DahlNonlinearity(control.DescribingFunctionNonlinearity):
     def __call__(self, A: float) -> float:
         """Return the force, N, after moving on to the displacement `A`, m, in one stretch."""
         x = finite_number(np.squeeze(A), "displacement")
-        self._forces = [
-            float(np.clip(element.force([self._x, x], force)[1], -limit, limit))
-            for element, force, limit in zip(
-                self._elements, self._forces, self._limits, strict=True
-            )
-        ]
-        self._x = x
-        return sum(self._forces)
+        if len(self._turns) > 1 and (x - self._turns[-1]) * (self._turns[-1] - self._turns[-2]) > 0:
+            self._turns[-1] = x  # between turning points the force does not depend on the samples
+        else:
+            self._turns.append(x)
+        return float(self._model.force(self._turns)[-1])
 
     def reset(self) -> None:
         """Forget the past: displacement and force zero.
 
         Examples
         --------
-        >>> friction = DahlNonlinearity(Dahl(f_max=1.0, sigma=1.0))
+        >>> from dahl_ident import Dahl
+        >>> friction = FrictionNonlinearity(Dahl(f_max=1.0, sigma=1.0))
         >>> first = friction(1.0)
         >>> friction.reset()
         >>> friction(1.0) == first
         True
         """
-        self._x = 0.0
-        self._forces = [0.0] * len(self._elements)
+        self._turns = [0.0]
 
     def _isstatic(self) -> bool:
         return False
 
 
-def dahl_elements(friction: Element) -> tuple[Dahl, ...]:
-    """Return the Dahl elements of a friction model, or say what else it holds."""
+def friction_elements(friction: Element) -> tuple[Element, ...]:
+    """Return the elements of a friction model, or say what else than such friction it holds."""
     elements = as_model(friction).elements
     for element in elements:
-        if not isinstance(element, Dahl):
+        if element.is_linear:
             raise ModelError(
-                f"friction holds {element!r}; expected Dahl elements alone: put everything linear "
-                "into the loop"
+                f"friction holds {element!r}; expected friction alone, such as Dahl: put "
+                "everything linear into the loop"
+            )
+        if not element.rate_independent:
+            raise ModelError(
+                f"{element!r} depends on the rate, so its describing function is no function of "
+                "the amplitude alone; expected rate-independent friction, such as Dahl"
             )
     friction.known_values()
-    return tuple(element for element in elements if isinstance(element, Dahl))
+    return elements
 
 
 def friction_and_slope(
-    friction: Element, amplitude: FloatArray
+    friction: Element, amplitude: FloatArray, omega: FloatArray = _AT_REST
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return N(A) and A dN/dA."""
-    Z = friction.stiffness_gradient(friction.known_values(), amplitude, _AT_REST)
-    return Z.value, amplitude * Z.by_amplitude
+    values = friction.known_values()
+    N, by_amplitude = friction.stiffness_slope(values, amplitude, omega)
+    return N, amplitude * by_amplitude

@@ -9,14 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dahl_ident.arrays import FloatArray, finite_array, positive_array, real_array
+from dahl_ident.arrays import FloatArray, finite_array, non_negative_array, real_array
 from dahl_ident.errors import ValidationError
 
 CONTROLLED = ("displacement", "force")
 
 
 def frozen_copy(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a contiguous copy of `array` that cannot be written to."""
+    """Return a contiguous copy of `array` that cannot be written to; one of these, as it is."""
+    flags = array.flags
+    if flags.owndata and flags.c_contiguous and not flags.writeable and type(array) is np.ndarray:
+        return array
     copy = np.array(array, order="C")
     copy.setflags(write=False)
     return copy
@@ -27,7 +30,7 @@ def frozen_mapping(value: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
     return None if value is None else MappingProxyType(dict(value))
 
 
-def thawed(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+def plain_mappings(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     """Return constructor arguments with plain dicts, which pickle where proxies do not."""
     return {k: dict(v) if isinstance(v, MappingProxyType) else v for k, v in pairs}
 
@@ -69,6 +72,8 @@ def spread(
 
 def complex_values(value: ArrayLike, name: str) -> NDArray[np.complex128]:
     """Return finite complex numbers."""
+    if np.ma.is_masked(value):
+        raise ValidationError(f"{name}: some values are masked; leave these rows out")
     array = np.asarray(value)
     if array.dtype.kind not in "cfiu":
         raise ValidationError(f"{name}: expected complex numbers, got dtype {array.dtype}")
@@ -104,9 +109,17 @@ def controlled_words(value: ArrayLike, name: str) -> NDArray[np.str_]:
     return array
 
 
+def run_labels(value: ArrayLike, name: str) -> NDArray[np.str_]:
+    """Return text labels; numbers become text, 3.0 the same as 3."""
+    array = labels(value, name)
+    if array.dtype.kind == "U":
+        return array
+    return np.array([f"{number:.15g}" for number in array.flat], np.str_).reshape(array.shape)
+
+
 def harmonic_numbers(value: ArrayLike, name: str) -> NDArray[np.int64]:
-    """Return whole numbers of 1 and above."""
-    array = positive_array(value, name)
+    """Return whole numbers of 0 and above."""
+    array = non_negative_array(value, name)
     broken = array != np.round(array)
     if broken.any():
         raise ValidationError(f"{name}: expected whole numbers, got {float(array[broken][0])!r}")
@@ -144,4 +157,19 @@ def check_covariance(
         raise ValidationError(
             f"covariance[{row}] is {covariance[row].tolist()}; expected a symmetric positive "
             "semidefinite matrix, also together with the amplitude's variance and covariance"
+        )
+
+
+def check_mean_covariance(
+    covariance: FloatArray, cross: FloatArray | None, mean: NDArray[np.bool_]
+) -> None:
+    """Refuse an error of the imaginary part in rows of the mean force, which have none."""
+    imaginary = np.abs(covariance[:, 1, :]).sum(axis=1)
+    if cross is not None:
+        imaginary = imaginary + np.abs(cross[:, 1])
+    bad = mean & (imaginary != 0.0)
+    if bad.any():
+        raise ValidationError(
+            f"covariance[{int(np.argmax(bad))}] gives the imaginary part an error; expected 0, as "
+            "a row with harmonic 0 is a real number"
         )

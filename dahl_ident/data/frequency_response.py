@@ -9,9 +9,8 @@ dissipating element has a positive imaginary part of its dynamic stiffness.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,12 +20,14 @@ from dahl_ident.arrays import (
     ComplexArray,
     FloatArray,
     finite_array,
+    finite_number,
     non_negative_array,
     positive_array,
 )
-from dahl_ident.data.columnwise import combined, shape_of
+from dahl_ident.data.column_map import ROLES
 from dahl_ident.data.fields import (
     check_covariance,
+    check_mean_covariance,
     column,
     complex_values,
     controlled_words,
@@ -37,16 +38,32 @@ from dahl_ident.data.fields import (
     labels,
     one_of,
     plain_values,
+    run_labels,
     spread,
 )
-from dahl_ident.data.quantities import converted, jacobian
-from dahl_ident.data.summary import Lines, distinct, listed, response_lines
-from dahl_ident.data.tabular import Tabular
+from dahl_ident.data.quantities import converted, jacobian, polar_std
+from dahl_ident.data.storage import plain_data
+from dahl_ident.data.tabular import Lines, Tabular, distinct, extent, listed, noted
 from dahl_ident.errors import ValidationError
 from dahl_ident.units import MOTIONS, QUANTITIES, Motion, Quantity, si_unit
 
 if TYPE_CHECKING:
     import pandas as pd
+
+_COLUMNS = (
+    "frequency_hz",
+    "response",
+    "amplitude",
+    "drive",
+    "covariance",
+    "dof",
+    "amplitude_std",
+    "amplitude_covariance",
+    "level",
+    "run",
+    "controlled",
+    "harmonic",
+)
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -58,8 +75,9 @@ class FrequencyResponse(Tabular):
     frequency_hz : (n,) array_like
         Frequencies, Hz.
     response : (n,) array_like of complex
-        The `quantity` at each point, SI units. A row with harmonic k > 1 holds F_k/X_1, its
-        phase referred to k times the displacement's phase.
+        The `quantity` at each point, SI units. A row with harmonic k other than 1 holds
+        F_k/X_1, its phase referred to k times the displacement's phase; for k = 0 that is the
+        mean force over the displacement amplitude, a real number.
     amplitude : (n,) array_like, optional
         Zero-to-peak displacement amplitude abs(X_1), m or rad.
     drive : (n,) array_like, optional
@@ -76,14 +94,20 @@ class FrequencyResponse(Tabular):
         response is a quotient with the displacement, so they share the displacement's error.
     level : (n,) array_like or one label, optional
         Nominal drive or displacement level, numbers or text.
+    run : (n,) array_like or one label, optional
+        What was measured in one go: a file, a day, a mounting. Kept as text. Scatter between
+        runs is not noise.
     controlled : {"displacement", "force"} or (n,) array_like of them
         What the laboratory held constant.
     harmonic : int or (n,) array_like of int
-        1 for the fundamental.
+        0 for the mean force, 1 for the fundamental, 2, 3, ... above it.
     quantity : str
         One of the six standard quantities.
     motion : {"translation", "rotation"}
         Whether displacement is m or rad.
+    drive_factor_uncertainty : float
+        Relative standard uncertainty of the factor that made forces of a drive in V or A. All
+        rows share it, so it is not in `covariance`.
     quality : mapping of str to (n,) array_like, optional
         Verdicts on each point, such as ``settled``.
     provenance : mapping, optional
@@ -110,10 +134,12 @@ class FrequencyResponse(Tabular):
     amplitude_std: FloatArray | None
     amplitude_covariance: FloatArray | None
     level: NDArray[Any] | None
+    run: NDArray[np.str_] | None
     controlled: NDArray[np.str_]
     harmonic: NDArray[np.int64]
     quantity: Quantity
     motion: Motion
+    drive_factor_uncertainty: float
     quality: Mapping[str, NDArray[Any]]
     provenance: Mapping[str, Any] | None
 
@@ -129,10 +155,12 @@ class FrequencyResponse(Tabular):
         amplitude_std: ArrayLike | None = None,
         amplitude_covariance: ArrayLike | None = None,
         level: ArrayLike | None = None,
+        run: ArrayLike | None = None,
         controlled: ArrayLike = "displacement",
         harmonic: ArrayLike = 1,
         quantity: Quantity = "dynamic_stiffness",
         motion: Motion = "translation",
+        drive_factor_uncertainty: float = 0.0,
         quality: Mapping[str, ArrayLike] | None = None,
         provenance: Mapping[str, Any] | None = None,
     ) -> None:
@@ -154,10 +182,15 @@ class FrequencyResponse(Tabular):
                 amplitude_covariance, "amplitude_covariance", n, finite_array, shape=(2,)
             ),
             "level": spread(level, "level", n, labels),
+            "run": spread(run, "run", n, run_labels),
             "controlled": spread(controlled, "controlled", n, controlled_words),
             "harmonic": spread(harmonic, "harmonic", n, harmonic_numbers),
             "quantity": one_of(quantity, "quantity", QUANTITIES),
             "motion": one_of(motion, "motion", MOTIONS),
+            "drive_factor_uncertainty": finite_number(
+                non_negative_array(drive_factor_uncertainty, "drive_factor_uncertainty"),
+                "drive_factor_uncertainty",
+            ),
             "quality": frozen_mapping(
                 {
                     name: column(verdict, f"quality {name!r}", n, plain_values)
@@ -187,13 +220,21 @@ class FrequencyResponse(Tabular):
             raise ValidationError(
                 "amplitude_covariance is given without amplitude_std and covariance"
             )
-        if self.quantity != "dynamic_stiffness" and (self.harmonic > 1).any():
-            row = int(np.argmax(self.harmonic > 1))
+        if self.quantity != "dynamic_stiffness" and (self.harmonic != 1).any():
+            row = int(np.argmax(self.harmonic != 1))
             raise ValidationError(
                 f"harmonic[{row}] is {self.harmonic[row]} in a table of {self.quantity}; "
                 "only dynamic stiffness has rows for harmonics"
             )
+        mean = self.harmonic == 0
+        if (self.response.imag[mean] != 0.0).any():
+            row = int(np.argmax(mean & (self.response.imag != 0.0)))
+            raise ValidationError(
+                f"response[{row}] is {self.response[row]}; expected a real number, as a row with "
+                "harmonic 0 holds the mean force over the displacement amplitude"
+            )
         if self.covariance is not None:
+            check_mean_covariance(self.covariance, self.amplitude_covariance, mean)
             check_covariance(self.covariance, self.amplitude_std, self.amplitude_covariance)
             even = (self.covariance + self.covariance.swapaxes(1, 2)) / 2.0  # but for rounding
             object.__setattr__(self, "covariance", frozen_copy(even))
@@ -202,7 +243,36 @@ class FrequencyResponse(Tabular):
         return self.frequency_hz.size
 
     def _summary(self) -> tuple[str, Lines]:
-        return response_lines(self)
+        """Return a title, and levels, ranges and units."""
+        name = self.quantity.replace("_", " ")
+        lines = [("frequency", extent(self.frequency_hz, "Hz"))]
+        if self.levels:
+            lines.append((f"{len(self.levels)} levels", listed(self.levels)))
+        if self.runs:
+            lines.append((f"{len(self.runs)} run{'s'[: len(self.runs) > 1]}", listed(self.runs)))
+        for field, kind in (("amplitude", "displacement"), ("drive", "force")):
+            values = getattr(self, field)
+            if values is not None:
+                unit = si_unit(kind, self.motion)
+                lines.append((field, f"{extent(values, unit)}, zero to peak"))
+        lines += [
+            ("gain", extent(self.gain, self.unit)),
+            ("phase", extent(np.degrees(self.phase), "deg")),
+            ("controlled", listed(distinct(self.controlled))),
+        ]
+        if (self.harmonic != 1).any():
+            lines.append(("harmonics", listed(distinct(self.harmonic))))
+        if self.covariance is None:
+            lines.append(("covariance", "unknown"))
+        else:
+            dof = "" if self.dof is None else f", {extent(self.dof, 'degrees of freedom')}"
+            lines.append(("covariance", f"known{dof}"))
+        if self.quality:
+            lines.append(("quality", listed(self.quality)))
+        if self.drive_factor_uncertainty:
+            lines.append(("drive factor", f"uncertain by {self.drive_factor_uncertainty:.2%}"))
+        lines += noted(self.provenance)
+        return f"FrequencyResponse: {self.n} points of {name}, {self.motion}", lines
 
     @property
     def omega(self) -> FloatArray:
@@ -223,6 +293,11 @@ class FrequencyResponse(Tabular):
     def levels(self) -> list[Any]:
         """Distinct level labels in order of appearance; empty where there are none."""
         return [] if self.level is None else distinct(self.level)
+
+    @property
+    def runs(self) -> list[str]:
+        """Distinct run labels in order of appearance; empty where there are none."""
+        return [] if self.run is None else distinct(self.run)
 
     @property
     def unit(self) -> str:
@@ -265,7 +340,7 @@ class FrequencyResponse(Tabular):
         one_of(quantity, "quantity", QUANTITIES)
         if quantity == self.quantity:
             return self
-        if (self.harmonic > 1).any():
+        if (self.harmonic != 1).any():
             raise ValidationError(
                 f"rows with harmonics {listed(np.unique(self.harmonic))} cannot become "
                 f"{quantity}; only dynamic stiffness has harmonics. Use select(harmonic=1) first"
@@ -285,6 +360,7 @@ class FrequencyResponse(Tabular):
         self,
         *,
         level: Any = None,
+        run: Any = None,
         frequency_hz: tuple[float, float] | None = None,
         harmonic: int | None = None,
         rows: ArrayLike | None = None,
@@ -295,6 +371,8 @@ class FrequencyResponse(Tabular):
         ----------
         level : label or list of labels, optional
             Keep these levels.
+        run : label or list of labels, optional
+            Keep these runs.
         frequency_hz : (low, high), optional
             Keep this range, both ends included, Hz.
         harmonic : int, optional
@@ -309,7 +387,7 @@ class FrequencyResponse(Tabular):
         Raises
         ------
         ValidationError
-            If no point is left, or a level is not there.
+            If no point is left, or a level or run is not there.
 
         Examples
         --------
@@ -318,12 +396,14 @@ class FrequencyResponse(Tabular):
         array([2.])
         """
         keep = np.ones(self.n, dtype=bool)
-        if level is not None:
-            wanted = [level] if np.ndim(level) == 0 else list(level)
-            absent = [w for w in wanted if w not in self.levels]
-            if self.level is None or absent:
-                raise ValidationError(f"no level {absent}; there are {listed(self.levels)}")
-            keep &= np.isin(self.level, wanted)
+        for name, label, known in (("level", level, self.levels), ("run", run, self.runs)):
+            if label is None:
+                continue
+            wanted = [label] if np.ndim(label) == 0 else list(label)
+            absent = [w for w in wanted if w not in known]
+            if not known or absent:
+                raise ValidationError(f"no {name} {absent}; there are {listed(known) or 'none'}")
+            keep &= np.isin(getattr(self, name), wanted)
         if frequency_hz is not None:
             low, high = frequency_hz
             keep &= (self.frequency_hz >= low) & (self.frequency_hz <= high)
@@ -339,7 +419,7 @@ class FrequencyResponse(Tabular):
             keep &= mask
         if not keep.any():
             raise ValidationError(f"none of the {self.n} points meets the conditions")
-        return replace(self, **combined([self], lambda arrays: arrays[0][keep]))
+        return replace(self, **_combined([self], lambda arrays: arrays[0][keep]))
 
     @staticmethod
     def concatenate(parts: Sequence[FrequencyResponse]) -> FrequencyResponse:
@@ -370,7 +450,7 @@ class FrequencyResponse(Tabular):
             raise ValidationError("concatenate needs at least one table, got none")
         first = parts[0]
         for i, part in enumerate(parts):
-            ours, theirs = shape_of(first), shape_of(part)
+            ours, theirs = _shape_of(first), _shape_of(part)
             if ours != theirs:
                 raise ValidationError(
                     f"parts[{i}] ({listed(sorted(theirs - ours)) or 'less'}) does not go with "
@@ -379,7 +459,7 @@ class FrequencyResponse(Tabular):
                 )
         sources = [dict(p.provenance) for p in parts if p.provenance is not None]
         provenance = {"parts": sources} if sources else None
-        return replace(first, **combined(parts, np.concatenate), provenance=provenance)
+        return replace(first, **_combined(parts, np.concatenate), provenance=provenance)
 
     def to_frame(self, *, polar: bool = False) -> pd.DataFrame:
         """Return a pandas table with one row for each point and units in the headers.
@@ -401,53 +481,42 @@ class FrequencyResponse(Tabular):
         >>> list(data.to_frame(polar=True).columns[:4])
         ['frequency_hz', 'amplitude [m]', 'gain [N/m]', 'phase_deg']
         """
-        from dahl_ident.data.table import response_frame
+        import pandas as pd
 
-        return response_frame(self, polar=polar)
-
-    @classmethod
-    def from_frame(
-        cls,
-        frame: pd.DataFrame,
-        *,
-        columns: Mapping[str, Any] | str | Path | None = None,
-        amplitude: str | None = None,
-        drive: str | None = None,
-        passive: bool = True,
-    ) -> FrequencyResponse:
-        """Return the frequency response in a pandas table.
-
-        Parameters
-        ----------
-        frame : pandas.DataFrame
-            Columns as :func:`~dahl_ident.read_frequency_response` expects them in a file,
-            units in brackets in their names.
-        columns, amplitude, drive, passive
-            As there.
-
-        Returns
-        -------
-        FrequencyResponse
-
-        Raises
-        ------
-        DataError, UnitError
-            Naming row and column.
-
-        Examples
-        --------
-        >>> data = FrequencyResponse([1.0], [4.0 + 3.0j], amplitude=[1e-3])
-        >>> FrequencyResponse.from_frame(data.to_frame()).response
-        array([4.+3.j])
-        """
-        from dahl_ident.data.columns import column_map
-        from dahl_ident.data.readers.sheets import frame_source
-        from dahl_ident.data.response_table import ResponseOptions, response_from
-
-        options = ResponseOptions(amplitude=amplitude, drive=drive, passive=passive)
-        data = response_from(frame_source(frame), column_map(columns), options)
-        origin = (data.provenance or {}).get("origin")
-        return data if origin is None else replace(data, provenance=origin)
+        clashing = sorted(
+            {name for name in self.quality if name in ROLES or name == "frequency_hz"}
+        )
+        if clashing:
+            raise ValidationError(
+                f"quality {clashing[0]!r} is also the name of a column of the table; rename it"
+            )
+        m, r = si_unit("displacement", self.motion), self.unit
+        columns: dict[str, Any] = {
+            "frequency_hz": self.frequency_hz,
+            "level": self.level,
+            "run": self.run,
+            f"amplitude [{m}]": self.amplitude,
+            f"drive [{si_unit('force', self.motion)}]": self.drive,
+            **(_polar(self) if polar else _rectangular(self)),
+            "dof": self.dof,
+            f"amplitude_std [{m}]": self.amplitude_std,
+        }
+        if self.amplitude_covariance is not None and not polar:
+            for i, part in enumerate(("real", "imag")):
+                columns[f"covariance_amplitude_{part} [({m})*({r})]"] = self.amplitude_covariance[
+                    :, i
+                ]
+        columns |= {"controlled": self.controlled, "harmonic": self.harmonic, **self.quality}
+        frame = pd.DataFrame({name: c for name, c in columns.items() if c is not None})
+        frame.attrs["dahl_ident"] = {
+            "quality": {name: verdict.dtype.kind for name, verdict in self.quality.items()},
+            "text": [
+                str(name) for name, c in columns.items() if c is not None and c.dtype.kind == "U"
+            ],
+            "drive_factor_uncertainty": self.drive_factor_uncertainty,
+            "provenance": plain_data(self.provenance),
+        }
+        return frame
 
     def to_control(self) -> dict[Any, Any]:
         """Return one python-control frequency response for each level.
@@ -469,9 +538,24 @@ class FrequencyResponse(Tabular):
         >>> list(data.to_control())
         ['0.1 N']
         """
-        from dahl_ident.data.table import control_systems
+        import control
 
-        return control_systems(self)
+        if (self.harmonic != 1).any():
+            raise ValidationError(
+                "a transfer function has no harmonics; use select(harmonic=1) first"
+            )
+        systems = {}
+        for label in self.levels or [None]:
+            part = self if label is None else self.select(level=label)
+            order = np.argsort(part.omega, kind="stable")
+            twice = np.flatnonzero(np.diff(part.omega[order]) == 0.0)
+            if twice.size:
+                raise ValidationError(
+                    f"level {label!r} has {part.frequency_hz[order][twice[0]]:g} Hz more "
+                    "than once; a transfer function has one value a frequency. Give the rows levels"
+                )
+            systems[label] = control.FrequencyResponseData(part.response[order], part.omega[order])
+        return systems
 
     def plot(self, ax: Any = None) -> tuple[Any, Any]:
         """Draw gain and phase of the fundamental, over frequency or over amplitude.
@@ -495,6 +579,52 @@ class FrequencyResponse(Tabular):
         >>> top.get_ylabel()
         'dynamic stiffness [N/m]'
         """
-        from dahl_ident.data.picture import draw_response
+        from dahl_ident.data.curves import draw
 
-        return draw_response(self, ax)
+        return draw(self, ax)
+
+
+def _rectangular(data: FrequencyResponse) -> dict[str, Any]:
+    r = data.unit
+    columns: dict[str, Any] = {f"real [{r}]": data.response.real, f"imag [{r}]": data.response.imag}
+    if data.covariance is not None:
+        for name, i, j in (("real_real", 0, 0), ("real_imag", 0, 1), ("imag_imag", 1, 1)):
+            columns[f"covariance_{name} [({r})^2]"] = data.covariance[:, i, j]
+    return columns
+
+
+def _polar(data: FrequencyResponse) -> dict[str, Any]:
+    """Return gain and phase; their standard deviations to first order."""
+    columns: dict[str, Any] = {
+        f"gain [{data.unit}]": data.gain,
+        "phase_deg": np.degrees(data.phase),
+    }
+    if data.covariance is not None:
+        gain_std, phase_std = polar_std(data.response, data.covariance)
+        columns[f"gain_std [{data.unit}]"] = gain_std
+        columns["phase_std_deg"] = np.degrees(phase_std)
+    return columns
+
+
+def _combined(
+    parts: Sequence[FrequencyResponse], combine: Callable[[list[NDArray[Any]]], NDArray[Any]]
+) -> dict[str, Any]:
+    """Apply `combine` to each column of all parts; returns constructor arguments."""
+    columns: dict[str, Any] = {
+        name: combine([getattr(part, name) for part in parts])
+        for name in _COLUMNS
+        if getattr(parts[0], name) is not None
+    }
+    columns["quality"] = {
+        name: combine([part.quality[name] for part in parts]) for name in parts[0].quality
+    }
+    return columns
+
+
+def _shape_of(data: FrequencyResponse) -> set[str]:
+    """Return what two tables must share to become one."""
+    columns = {name for name in _COLUMNS if getattr(data, name) is not None}
+    columns.add(f"a drive factor uncertain by {data.drive_factor_uncertainty:.3g}")
+    if data.level is not None:
+        columns.add("text levels" if data.level.dtype.kind == "U" else "numeric levels")
+    return columns | set(data.quality) | {data.quantity, data.motion}

@@ -16,16 +16,17 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray, finite_array, positive_number
 from dahl_ident.data.fields import column, frozen_copy, frozen_mapping, one_of
-from dahl_ident.data.sampling import gaps, is_even, sample_rate
-from dahl_ident.data.summary import Lines, record_lines
-from dahl_ident.data.tabular import Tabular
+from dahl_ident.data.storage import plain_data
+from dahl_ident.data.tabular import Lines, Tabular, extent, noted
 from dahl_ident.errors import ValidationError
-from dahl_ident.units import MOTION_KINDS, MOTIONS, Motion
+from dahl_ident.units import MOTION_KINDS, MOTIONS, Motion, si_unit
 
 if TYPE_CHECKING:
     import pandas as pd
 
 DriveUnit = Literal["N", "N m", "V", "A"]
+_GAP = 1.5  # a step of more than this many median steps misses a sample
+_EVEN = 0.01  # of a step
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -188,8 +189,82 @@ class Record(Tabular):
         """Start and end of every gap, (m, 2), s: steps above 1.5 times the median step."""
         return gaps(self.time)
 
+    def plot(self, kind: Literal["waveforms", "loops"] = "waveforms", ax: Any = None) -> Any:
+        """Draw the waveforms over time, or force over motion.
+
+        Parameters
+        ----------
+        kind : {"waveforms", "loops"}, default "waveforms"
+            One panel a channel over time, or force (drive where there is none) over motion.
+        ax : matplotlib Axes, optional
+            One for loops, a sequence of one a channel for waveforms; new where left out.
+
+        Returns
+        -------
+        Axes, or ndarray of Axes
+
+        Raises
+        ------
+        ValidationError
+            If `kind` is another one, or `ax` holds another number of axes than there are channels.
+
+        Examples
+        --------
+        >>> record = Record([0.0, 0.1], displacement=[0.0, 1.0], force=[0.0, 2.0])
+        >>> [axis.get_ylabel() for axis in record.plot()]
+        ['displacement [m]', 'force [N]']
+        """
+        from dahl_ident.data.curves import draw_waveforms
+
+        return draw_waveforms(self.time, self.to_frame(), kind, ax)
+
     def _summary(self) -> tuple[str, Lines]:
-        return record_lines(self)
+        """Return a title, and sampling, ranges and units."""
+        kind = self.motion_channel
+        spacing = "even" if self.uniform else "uneven"
+        lines = [
+            ("sampling", f"{self.sample_rate:.6g} Hz, {spacing}, {self.duration:.6g} s"),
+            (kind, extent(self.motion_samples, si_unit(kind, self.motion))),
+        ]
+        if len(self.gaps):
+            lines.insert(1, ("gaps", str(len(self.gaps))))
+        if self.force is not None:
+            lines.append(("force", extent(self.force, si_unit("force", self.motion))))
+        if self.drive is not None:
+            lines.append(("drive", extent(self.drive, self.drive_unit)))
+        if self.drive_unit in ("V", "A") and self.drive_factor is not None:
+            unit = f"{si_unit('force', self.motion)}/{self.drive_unit}"
+            uncertain = f" within {self.drive_factor_uncertainty:.2%}"
+            lines.append(("drive factor", f"{self.drive_factor:.6g} {unit}{uncertain}"))
+        lines += noted(self.provenance)
+        return f"Record: {self.n} samples of {kind} in {self.motion}", lines
+
+    def to_sdypy(self) -> list[dict[str, Any]]:
+        """Return the channels as SDyPy's time series (its enhancement proposal 5).
+
+        Returns
+        -------
+        list of dict
+            ``name``, ``data``, ``unit_str`` and ``time`` of each channel, and ``fs`` where the
+            samples are evenly spaced and begin at zero. :func:`~dahl_ident.read_record` reads
+            the list again.
+
+        Examples
+        --------
+        >>> record = Record([0.0, 0.1], displacement=[0.0, 1.0], force=[0.0, 2.0])
+        >>> [(c["name"], c["unit_str"]) for c in record.to_sdypy()]
+        [('displacement', 'm'), ('force', 'N')]
+        """
+        units = {kind: si_unit(kind, self.motion) for kind in (*MOTION_KINDS, "force")}
+        units["drive"] = self.drive_unit
+        sampling: dict[str, Any] = {"time": self.time}
+        if self.uniform and self.time[0] == 0.0:
+            sampling["fs"] = self.sample_rate
+        return [
+            {"name": name, "data": getattr(self, name), "unit_str": unit, **sampling}
+            for name, unit in units.items()
+            if getattr(self, name) is not None
+        ]
 
     def to_frame(self) -> pd.DataFrame:
         """Return a pandas table with one row for each sample and units in the headers.
@@ -204,9 +279,22 @@ class Record(Tabular):
         >>> list(record.to_frame().columns)
         ['time [s]', 'displacement [m]', 'force [N]']
         """
-        from dahl_ident.data.table import record_frame
+        import pandas as pd
 
-        return record_frame(self)
+        units = {kind: si_unit(kind, self.motion) for kind in (*MOTION_KINDS, "force")}
+        units |= {"time": "s", "drive": self.drive_unit}
+        columns = {
+            f"{name} [{units[name]}]": getattr(self, name)
+            for name in ("time", *MOTION_KINDS, "force", "drive")
+            if getattr(self, name) is not None
+        }
+        frame = pd.DataFrame(columns)
+        frame.attrs["dahl_ident"] = {
+            "drive_factor": self.drive_factor,
+            "drive_factor_uncertainty": self.drive_factor_uncertainty,
+            "provenance": plain_data(self.provenance),
+        }
+        return frame
 
 
 def _time(value: ArrayLike) -> FloatArray:
@@ -221,3 +309,24 @@ def _time(value: ArrayLike) -> FloatArray:
             f"({backwards.size} such steps); expected strictly increasing time"
         )
     return frozen_copy(time)
+
+
+def sample_rate(time: FloatArray) -> float:
+    """Return the mean number of samples per second outside the gaps."""
+    steps = np.diff(time)
+    kept = steps[steps <= _GAP * np.median(steps)]
+    return float(kept.size / kept.sum())
+
+
+def is_even(time: FloatArray) -> bool:
+    """Return whether every sample lies within 1 % of a step of an even grid."""
+    grid = np.linspace(time[0], time[-1], time.size)
+    step = (time[-1] - time[0]) / (time.size - 1)
+    return bool(np.abs(time - grid).max() <= _EVEN * step)
+
+
+def gaps(time: FloatArray) -> FloatArray:
+    """Return start and end of every step above 1.5 times the median step, (m, 2)."""
+    steps = np.diff(time)
+    before = np.flatnonzero(steps > _GAP * np.median(steps))
+    return np.column_stack([time[before], time[before + 1]])

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
+import warnings
 from typing import Any, Literal
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data.binding import Binding, scaled
-from dahl_ident.data.columns import RECORD_NAMES, ColumnMap
+from dahl_ident.data.column_map import RECORD_NAMES, Binding, ColumnMap, scaled
+from dahl_ident.data.plausibility import stuck_samples
+from dahl_ident.data.raw_columns import Channel, Source
 from dahl_ident.data.record import DriveUnit, Record
-from dahl_ident.data.source import Channel, Source
-from dahl_ident.data.summary import listed
-from dahl_ident.errors import DataError, UnitError, ValidationError
+from dahl_ident.data.tabular import listed
+from dahl_ident.errors import DataError, DataWarning, UnitError, ValidationError
 from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS, si_unit
 
+_STAMP = re.compile(r"\s*(?P<date>\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d{1,9})?Z?")
 _DRIVE_UNITS: dict[str, DriveUnit] = {"voltage": "V", "current": "A"}
 
 
@@ -31,7 +35,13 @@ def record_from(
     bound = Binding(source, columns, RECORD_NAMES)
     channels = _channels(bound)
     bound.same_length(channels)
-    complete = np.ones(next(iter(channels.values())).values.size, dtype=bool)
+    if source.runs:
+        raise DataError(
+            f"{source.name}, {source.row_name(source.runs[0])}: the header is repeated above this "
+            f"line ({len(source.runs) + 1} records in one file); expected one record. Split it"
+        )
+    size = next(iter(channels.values())).size
+    complete: Any = slice(None)
     if missing == "drop":
         complete = np.all([np.isfinite(_numeric(c)) for c in channels.values()], axis=0)
         bound.source = source.rows(complete)
@@ -46,11 +56,24 @@ def record_from(
     else:
         bound.refuse_idle_factor(None)
     if "time" not in values:
-        values["time"] = _even_time(bound, complete.size)[complete]
+        values["time"] = _even_time(bound, size)[complete]
+    force: FloatArray = values["force"] if "force" in values else values["drive"]
+    motion = next(values[kind] for kind in MOTION_KINDS if kind in values)
+    stuck = stuck_samples(motion, force)
+    if stuck.size:
+        first = f"{bound.source.row_name(int(stuck[0]))} ({stuck.size} such places)"
+        text = f"the force repeats one value while the motion goes on, and then jumps, from {first}"
+        warnings.warn(f"{source.name}: {text}: does a converter stick?", DataWarning, stacklevel=3)
+        bound.notes.append(text)
     try:
         return Record(**values, motion=bound.motion(), provenance=bound.provenance())
     except ValidationError as exc:
         raise DataError(f"{source.name}: {exc}") from exc
+
+
+def record_size(source: Source, columns: ColumnMap) -> int:
+    """Return how many samples the record of a source has; nothing is read."""
+    return next(iter(_channels(Binding(source, columns, RECORD_NAMES)).values())).size
 
 
 def _channels(bound: Binding) -> dict[str, Channel]:
@@ -85,6 +108,8 @@ def _numeric(channel: Channel) -> FloatArray:
 
 def _samples(bound: Binding, role: str, channel: Channel) -> FloatArray:
     """Return SI samples; for a drive in V or A, volts or amperes."""
+    if role == "time" and channel.kind == "U" and _STAMP.match(str(channel.values.flat[0])):
+        return _seconds(bound, channel)
     values = bound.numbers(role, channel)
     unit = bound.unit(role, channel)
     kinds = DRIVE_KINDS if role == "drive" else (role,)
@@ -96,7 +121,32 @@ def _samples(bound: Binding, role: str, channel: Channel) -> FloatArray:
             f"{bound.source.name}: column {channel.name!r} has the unit [{unit.text}]; expected "
             "the samples of a waveform, not amplitudes"
         )
-    return scaled(values, factor)
+    samples = scaled(values, factor)
+    if samples is not channel.content:
+        samples.setflags(write=False)  # nobody else's, so the record need not copy it
+    return samples
+
+
+def _seconds(bound: Binding, channel: Channel) -> FloatArray:
+    """Return the time since the first stamp: ISO 8601, or times of one day."""
+    nanoseconds = np.empty(channel.size, dtype=np.int64)
+    for i, cell in enumerate(channel.values.flat):
+        text = str(cell).strip().removesuffix("Z")
+        found = _STAMP.fullmatch(text)
+        stamp = "" if found is None else text if found["date"] else f"1970-01-01T{text}"
+        moment: Any = np.datetime64("NaT")
+        with contextlib.suppress(ValueError):
+            moment = np.datetime64(stamp.replace(" ", "T").replace(",", "."), "ns")
+        if np.isnat(moment):
+            raise DataError(
+                f"{bound.source.where(channel, i)}: {str(cell)[:40]!r} is no time stamp such as "
+                "2024-03-31T12:00:00.5 or 12:00:00.5"
+            )
+        nanoseconds[i] = moment.astype(np.int64)
+    time = np.asarray((nanoseconds - nanoseconds[0]) * 1e-9)
+    _require_increasing(bound.source, channel, time)
+    bound.notes.append(f"time counted from the stamp {str(channel.values.flat[0]).strip()}")
+    return time
 
 
 def _drive(bound: Binding, channel: Channel) -> dict[str, Any]:

@@ -10,6 +10,7 @@ response. Standard deviations without a unit have that of their column.
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -19,12 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
-from dahl_ident.data.binding import Binding, by_level, per_frequency
-from dahl_ident.data.columns import RESPONSE_NAMES, ColumnMap
+from dahl_ident.data.column_map import RESPONSE_NAMES, Binding, ColumnMap, by_level, per_frequency
 from dahl_ident.data.fields import CONTROLLED
 from dahl_ident.data.frequency_response import FrequencyResponse
-from dahl_ident.data.source import Source
-from dahl_ident.data.suspicion import doubt_drive, doubt_phase_unit, refuse_created_energy
+from dahl_ident.data.plausibility import (
+    check_drive,
+    check_energy,
+    check_phase_size,
+    check_phase_unit,
+)
+from dahl_ident.data.raw_columns import Source
 from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import (
     DRIVE_KINDS,
@@ -33,7 +38,9 @@ from dahl_ident.units import (
     QUANTITIES,
     Quantity,
     factor_to,
+    kind_of,
     parse_quantity,
+    parse_unit,
     si_unit,
 )
 
@@ -53,6 +60,7 @@ class ResponseOptions:
     amplitude: str | None = None
     drive: str | None = None
     level: str | float | None = None
+    run: str | None = None
     frequency_hz: tuple[float, float] | None = None
     passive: bool = True
 
@@ -87,6 +95,7 @@ class _Table:
     def __init__(self, source: Source, columns: ColumnMap, options: ResponseOptions) -> None:
         self.options = options
         self.bound = Binding(source, columns, RESPONSE_NAMES)
+        self.factor_uncertainty = 0.0
         self._within_range()
 
     def response(self) -> FrequencyResponse:
@@ -103,6 +112,9 @@ class _Table:
         quantity, response = self._response(frequency_hz, amplitude, drive)
         harmonic = self._whole_numbers("harmonic")
         self._refuse_zero(response, harmonic)
+        errors = self._errors(quantity, response)
+        if harmonic is not None:
+            _make_real(response, errors, harmonic == 0)
         try:
             data = FrequencyResponse(
                 frequency_hz,
@@ -110,18 +122,21 @@ class _Table:
                 amplitude,
                 drive,
                 level=self._level(),
+                run=self._run(),
                 controlled=self._controlled(drive is not None and amplitude is None),
                 harmonic=1 if harmonic is None else harmonic,
                 quantity=quantity,
                 motion=bound.motion(),
+                drive_factor_uncertainty=self._factor_uncertainty(),
                 quality=self._quality(),
-                **self._errors(quantity, response),
+                **errors,
             )
         except ValidationError as exc:
             raise DataError(f"{source.name}: {exc}") from exc
-        doubt_drive(source.name, data, source.row_name)
+        check_drive(source.name, data, source.row_name)
+        check_phase_size(source.name, data, source.row_name)
         if self.options.passive:
-            refuse_created_energy(source.name, data, source.row_name)
+            check_energy(source.name, data, source.row_name)
         return data
 
     def _within_range(self) -> None:
@@ -160,7 +175,8 @@ class _Table:
 
     def _drive(self, frequency_hz: FloatArray) -> FloatArray | None:
         found = self._peaks("drive", DRIVE_KINDS, frequency_hz.shape)
-        self.bound.refuse_idle_factor(None if found is None else found[0])
+        if not self._gain_per_drive():
+            self.bound.refuse_idle_factor(None if found is None else found[0])
         return None if found is None else found[1] * self._force_per(found[0])
 
     def _peaks(
@@ -194,12 +210,23 @@ class _Table:
             self.bound.motions[role] = motion
         return kind, np.full(shape, value)
 
+    def _gain_per_drive(self) -> bool:
+        """Return whether the response is one for a drive in V or A, such as m/V."""
+        for role in ("gain", "gain_db", "real", "response"):
+            channel = self.bound.channel(role)
+            if channel is not None and _per_drive(self.bound.unit(role, channel).text) is not None:
+                return True
+        return False
+
     def _force_per(self, kind: str) -> float:
         """Return the force for one SI unit of the drive."""
-        factor, uncertainty = self.bound.force_per(kind)
-        if uncertainty:
-            self.bound.notes.append(f"drive factor uncertain by {uncertainty:.2%}, all rows alike")
+        factor, self.factor_uncertainty = self.bound.force_per(kind)
         return factor
+
+    def _factor_uncertainty(self) -> float:
+        """Return the uncertainty of the factor that was used, or that an earlier save states."""
+        saved = self.bound.source.metadata.get("drive_factor_uncertainty")
+        return self.factor_uncertainty or float(saved or 0.0)
 
     def _response(
         self, frequency_hz: FloatArray, amplitude: FloatArray | None, drive: FloatArray | None
@@ -255,6 +282,12 @@ class _Table:
         """Return which quantity a column's unit makes it, its factor, and whether it is in dB."""
         bound = self.bound
         unit = bound.unit(role, bound.required(role), default)
+        per_drive = _per_drive(unit.text) if bound.map.drive_factor is not None else None
+        if per_drive is not None:  # such as m/V, made m/N by the factor in N/V
+            drive_kind, text, power = per_drive
+            kind, factor = bound.kind(role, parse_unit(text), QUANTITIES)
+            value, self.factor_uncertainty = bound.force_per(drive_kind)
+            return cast(Quantity, kind), factor * value**power, unit.decibel
         kind, factor = bound.kind(role, unit, QUANTITIES)
         wanted = bound.map.quantity
         if wanted is not None and kind != wanted:
@@ -286,7 +319,7 @@ class _Table:
         unit = self.bound.unit("phase", channel)
         _, factor = self.bound.kind("phase", unit, ("angle",))
         source = self.bound.source
-        doubt_phase_unit(source.name, values, factor != 1.0, source.row_name, channel.name)
+        check_phase_unit(source.name, values, factor != 1.0, source.row_name, channel.name)
         return values * factor
 
     def _errors(self, quantity: Quantity, response: ComplexArray) -> dict[str, Any]:
@@ -355,8 +388,8 @@ class _Table:
         if channel is None:
             return None
         values = self.bound.numbers(role, channel)
-        good = (values >= 1.0) & (values == np.round(values))
-        self.bound.source.require(good, channel, "a whole number >= 1")
+        good = (values >= 0.0) & (values == np.round(values))
+        self.bound.source.require(good, channel, "a whole number >= 0")
         return values
 
     def _refuse_zero(self, response: ComplexArray, harmonic: FloatArray | None) -> None:
@@ -373,6 +406,14 @@ class _Table:
         channel = self.bound.channel("level")
         if channel is None:
             return self.options.drive if self.options.level is None else self.options.level
+        if channel.values.dtype.kind == "U":
+            return np.atleast_1d(channel.values)
+        return self.bound.source.numbers(channel)
+
+    def _run(self) -> Any:
+        channel = self.bound.channel("run")
+        if channel is None:
+            return self.options.run
         if channel.values.dtype.kind == "U":
             return np.atleast_1d(channel.values)
         return self.bound.source.numbers(channel)
@@ -405,6 +446,28 @@ class _Table:
         found = {name: self.bound.source.find(name) for name in kinds}
         self.bound.used |= {channel.name for channel in found.values()}
         return {name: _typed(found[name].values, kind) for name, kind in kinds.items()}
+
+
+def _per_drive(text: str) -> tuple[str, str, int] | None:
+    """Return the drive's kind, the unit with N for V or A, and the factor's power in it."""
+    with contextlib.suppress(UnitError):
+        kind_of(parse_unit(text), QUANTITIES, "the gain")
+        return None  # one of the six quantities as it is
+    for kind, symbol in (("voltage", "V"), ("current", "A")):
+        for form, power in ((f"({text})*{symbol}/N", -1), (f"({text})*N/{symbol}", 1)):
+            with contextlib.suppress(UnitError):
+                kind_of(parse_unit(form), QUANTITIES, "the gain")
+                return kind, form, power
+    return None
+
+
+def _make_real(response: ComplexArray, errors: dict[str, Any], mean: NDArray[np.bool_]) -> None:
+    """Take rounding off the rows of the mean force, which are real: a phase of 180 deg, say."""
+    rounding = mean & (np.abs(response.imag) <= 1e-9 * np.abs(response.real))
+    response.imag[rounding] = 0.0
+    if errors["covariance"] is not None:
+        errors["covariance"][mean, 1, :] = 0.0
+        errors["covariance"][mean, :, 1] = 0.0
 
 
 def _typed(values: NDArray[Any], kind: str) -> NDArray[Any]:

@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import contextlib
 import gzip
+import hashlib
+import importlib
 import io
 import json
+import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from dahl_ident.data.readers.file import library
-from dahl_ident.data.source import split_header
-from dahl_ident.errors import DataError, ValidationError
+import numpy as np
+
+from dahl_ident.data.column_names import split_header
+from dahl_ident.errors import DataError, MissingDependencyError, ValidationError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -78,7 +82,7 @@ def refuse_existing(path: Path) -> None:
         raise DataError(f"{path} is a folder; give the path of a file in it")
     if path.exists():
         raise DataError(
-            f"{path}: there is such a file already; give another name, or replace it with "
+            f"{path}: the file exists already; give another name, or replace it with "
             "overwrite=True (on the command line --overwrite)"
         )
 
@@ -93,18 +97,113 @@ def write_whole(path: Path, content: bytes, *, overwrite: bool = False) -> None:
     """
     if not overwrite:
         refuse_existing(path)
+    try:
+        put_in_place(path, lambda part: part.write_bytes(content))
+    except OSError as exc:
+        raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
+
+
+def put_in_place(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file beside its place, flush it to the disk, and move it there when complete.
+
+    `write` gets the path to write to. Whatever it raises is passed on, and leaves `path` alone.
+    """
     # not a file of tempfile, which nobody else may read
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        try:
-            part.write_bytes(content)
-            part.replace(path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                part.unlink()
-            raise
-    except OSError as exc:
-        raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
+        write(part)
+        with part.open("rb+") as written:
+            os.fsync(written.fileno())
+        part.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            part.unlink()
+        raise
+
+
+def library(module: str, extra: str | None = None) -> Any:
+    """Import a library that reads a format.
+
+    Raises
+    ------
+    MissingDependencyError
+        If it is not installed, with the command that installs it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as exc:
+        package = f"dahl_ident[{extra}]" if extra else module
+        raise MissingDependencyError(
+            f"{module} is needed to read this format and is not installed; install it with: "
+            f"pip install '{package}'"
+        ) from exc
+
+
+def digest(value: Any) -> str:
+    """Return the SHA-256 of plain data, the same whatever the order of mappings.
+
+    Examples
+    --------
+    >>> digest({"a": 1, "b": [2.5]}) == digest({"b": [2.5], "a": 1})
+    True
+    """
+    text = json.dumps(plain_data(value), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def read_metadata(text: Any) -> dict[str, Any]:
+    """Return what an earlier save of this package wrote beside a table.
+
+    Raises
+    ------
+    ValueError
+        If it is something else: no JSON object, too deep, or with entries of other types.
+    """
+    try:
+        content = json.loads(text)
+    except (RecursionError, TypeError) as exc:
+        raise ValueError("the comment of this package is no JSON text") from exc
+    if not isinstance(content, dict) or not all(
+        _KNOWN_METADATA.get(key, lambda _: False)(value) for key, value in content.items()
+    ):
+        raise ValueError("the comment of this package holds something else than it wrote")
+    return content
+
+
+def _is_words(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(word, str) for word in value)
+
+
+def _is_number(value: Any) -> bool:
+    return value is None or (isinstance(value, (int, float)) and 0 <= value < 1e90)
+
+
+_KNOWN_METADATA: dict[str, Callable[[Any], bool]] = {
+    "quality": lambda v: isinstance(v, dict) and set(map(str, v.values())) <= set("biufU"),
+    "text": _is_words,
+    "provenance": lambda v: v is None or isinstance(v, dict),
+    "drive_factor": _is_number,
+    "drive_factor_uncertainty": _is_number,
+}
+
+
+def plain_data(value: Any, *, not_finite: Callable[[float], Any] = float) -> Any:
+    """Return mappings as dicts and sequences as lists, down to what JSON holds.
+
+    A complex number becomes the pair of its parts; `not_finite` says what becomes of NaN and
+    infinity, which strict JSON does not know: `str` makes them text.
+    """
+    if isinstance(value, Mapping):
+        return {str(k): plain_data(v, not_finite=not_finite) for k, v in value.items()}
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [plain_data(v, not_finite=not_finite) for v in value]
+    if isinstance(value, complex):
+        return plain_data([value.real, value.imag], not_finite=not_finite)
+    if isinstance(value, float):
+        return value if math.isfinite(value) else not_finite(value)
+    return value if isinstance(value, (str, int, bool, type(None))) else str(value)
 
 
 def _text(frame: pd.DataFrame, separator: str) -> bytes:

@@ -1,18 +1,24 @@
 """Judging an estimate: how far to trust its numbers, and what the data cannot say."""
 
+from dahl_ident.diagnostics.budget import Budget, budget
 from dahl_ident.diagnostics.comparison import ModelComparison, compare_models
+from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.goodness import Goodness
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval, IntervalComparison
 from dahl_ident.diagnostics.verdicts import Identifiability, Verdict, identifiability
 
 __all__ = [
+    "Budget",
     "ConfidenceIntervals",
+    "ErrorModel",
     "Goodness",
     "Identifiability",
     "Interval",
     "IntervalComparison",
     "ModelComparison",
     "Verdict",
+    "budget",
     "compare_models",
+    "error_model",
     "identifiability",
 ]

@@ -6,10 +6,12 @@ import numpy as np
 
 from dahl_ident.diagnostics.intervals import Interval
 from dahl_ident.diagnostics.parameters import parameter_values
-from dahl_ident.elements import Dahl, Element, Spring
+from dahl_ident.diagnostics.physics import is_spring
+from dahl_ident.elements import Element, Parameter
 from dahl_ident.fitting import Optimum
 from dahl_ident.units import shown_unit
 
+_FORCE, _STIFFNESS = (1, 0, 0), (1, -1, 0)  # powers of force, displacement and time
 _CHANNELS = {"force_gain": "force", "displacement_gain": "displacement"}
 
 
@@ -30,10 +32,10 @@ def advice(optimum: Optimum, name: str, limits: Interval, lost: frozenset[str]) 
         names = [p.name for p in element.parameters]
         if name not in names:
             continue
-        if isinstance(element, Dahl):
-            kind = ("f_max", "sigma", "alpha")[names.index(name)]
-            return _of_friction(optimum, element, kind, limits, lost)
-        if isinstance(element, Spring):
+        if element.has_memory:
+            parameter = element.parameters[names.index(name)]
+            return _of_friction(optimum, element, parameter, limits, lost)
+        if is_spring(element):
             return _of_spring(optimum, lost)
     return (
         "because its effect on these data is below their noise or like that of another parameter: "
@@ -55,40 +57,50 @@ def _confounding_gain(optimum: Optimum, name: str, lost: frozenset[str]) -> str:
 
 
 def _of_friction(
-    optimum: Optimum, element: Dahl, kind: str, limits: Interval, lost: frozenset[str]
+    optimum: Optimum,
+    element: Element,
+    parameter: Parameter,
+    limits: Interval,
+    lost: frozenset[str],
 ) -> str:
+    label, dimension = element.label(parameter), parameter.dimension
+    scales = label in element.scale_parameters
     amplitude = optimum.problem.stiffness_data.amplitude
     unit = shown_unit("m", optimum.problem.data.motion)
     least, most = f"{amplitude.min():.2g} {unit}", f"{amplitude.max():.2g} {unit}"
-    rival = _rival(optimum, element, kind, lost)
+    rival = _rival(optimum, element, label, lost)
     if rival:
         return f"because {rival} can take its place: leave one of the two elements out"
     spring = _hiding_spring(optimum, lost)
-    if kind == "alpha":
+    if not scales and not any(dimension):
+        low, high = _knee(optimum, element)
+        near = f"{low:.2g} {unit}" if low == high else f"{low:.2g} to {high:.2g} {unit}"
         return (
-            "because the exponent shows only where stick turns to slip, and the data from "
-            f"{least} to {most} do not resolve it: add amplitudes around f_max/sigma, or fix it"
+            f"because {parameter.name} shows only where stick turns to slip, and the data from "
+            f"{least} to {most} do not resolve it: add amplitudes around {near}, or fix it"
         )
     unlimited = limits.lower <= 0.0 and np.isinf(limits.upper)
-    if spring and unlimited and element.parameters[0].name in lost:
+    is_limit, is_stiffness = scales and dimension == _FORCE, scales and dimension == _STIFFNESS
+    limit_lost = any(p.name in lost for p in _scaled(element, _FORCE))
+    if spring and unlimited and limit_lost:
         return (
             f"because friction's share of the response from {least} to {most} is within the noise "
             f"beside the free {spring}: cover amplitudes where it is larger, reduce the noise, or "
             f"measure the spring and fix {spring}"
         )
-    if kind == "f_max" and np.isinf(limits.upper):
+    if is_limit and np.isinf(limits.upper):
         if spring:
             return (
                 f"because the free {spring} hides it below {most}: drive above that, or measure "
                 f"the spring and fix {spring}"
             )
         return f"because no amplitude up to {most} reaches slip: drive above that"
-    if kind == "sigma" and (spring in lost or (spring and _sticks(optimum, element))):
+    if is_stiffness and (spring in lost or (spring and _sticks(optimum, element))):
         return (
             f"because the free {spring} can take its place: drive far into slip, or measure the "
             f"spring and fix {spring}"
         )
-    if kind == "sigma" and np.isinf(limits.upper) and element.parameters[0].name not in lost:
+    if is_stiffness and np.isinf(limits.upper) and not limit_lost:
         beside = f" beside the free {spring}" if spring else ""
         fix = f", or measure the spring and fix {spring}" if spring else ""
         return (
@@ -106,26 +118,36 @@ def _of_friction(
     )
 
 
-def _sticks(optimum: Optimum, element: Dahl) -> bool:
-    """Return whether no amplitude reaches x_c, where an element begins to slip."""
+def _sticks(optimum: Optimum, element: Element) -> bool:
+    """Return whether no amplitude reaches the knee, where an element begins to slip."""
+    return bool(optimum.problem.stiffness_data.amplitude.max() < _knee(optimum, element)[0])
+
+
+def _knee(optimum: Optimum, element: Element) -> tuple[float, float]:
     values = parameter_values(optimum)
-    f_max, sigma = (values[p.name] for p in element.parameters[:2])
-    return bool(optimum.problem.stiffness_data.amplitude.max() < f_max / sigma)
+    low, high = element.knee([np.asarray(values[p.name]) for p in element.parameters])
+    return float(low), float(high)
 
 
-def _rival(optimum: Optimum, element: Dahl, kind: str, lost: frozenset[str]) -> str:
-    """Return the same parameter of another Dahl element, if that is not identified either."""
-    place = ("f_max", "sigma", "alpha").index(kind)
-    others = (e for e in optimum.problem.model.elements if isinstance(e, Dahl) and e is not element)
-    return next((e.parameters[place].name for e in others if e.parameters[place].name in lost), "")
+def _scaled(element: Element, dimension: tuple[int, int, int]) -> list[Parameter]:
+    """Return the scale parameters of one dimension."""
+    scale = (element.parameter(label) for label in element.scale_parameters)
+    return [p for p in scale if p.dimension == dimension]
+
+
+def _rival(optimum: Optimum, element: Element, label: str, lost: frozenset[str]) -> str:
+    """Return the same parameter of another element of this law, if that is lost as well."""
+    for other in optimum.problem.model.elements:
+        if other is not element and other.kind == element.kind and label in other.labels:
+            name = other.parameter(label).name
+            if name in lost:
+                return name
+    return ""
 
 
 def _of_spring(optimum: Optimum, lost: frozenset[str]) -> str:
-    stiff = [
-        e.parameters[1].name
-        for e in optimum.problem.model.elements
-        if isinstance(e, Dahl) and e.parameters[1].name in lost
-    ]
+    friction = (e for e in optimum.problem.model.elements if e.has_memory)
+    stiff = [p.name for e in friction for p in _scaled(e, _STIFFNESS) if p.name in lost]
     if stiff:
         return (
             f"because friction's stiffness {stiff[0]} can take its place: measure the spring "
@@ -136,9 +158,6 @@ def _of_spring(optimum: Optimum, lost: frozenset[str]) -> str:
 
 def _hiding_spring(optimum: Optimum, lost: frozenset[str]) -> str:
     """Return the name of a free spring that is not identified either, or of any free one."""
-    springs = [e.parameters[0].name for e in optimum.problem.model.elements if _is_free_spring(e)]
+    elements = optimum.problem.model.elements
+    springs = [p.name for e in elements if is_spring(e) for p in e.parameters if p.free]
     return next((name for name in springs if name in lost), springs[0] if springs else "")
-
-
-def _is_free_spring(element: Element) -> bool:
-    return isinstance(element, Spring) and bool(element.parameters[0].free)

@@ -2,29 +2,37 @@
 
 First order: with d = dR/dtheta at the estimate and C its covariance, Re R and Im R have the
 covariance Re(d) C Re(d)', Re(d) C Im(d)', Im(d) C Im(d)', and d(ln R) = dR/R gives ln gain and
-phase together. No half of a complex number is taken for the whole.
+phase together. No half of a complex number is taken for the whole. Where the sources of error are
+known (:mod:`dahl_ident.diagnostics.error_model`) all of them count, around the estimate that takes
+them into account (:mod:`dahl_ident.diagnostics.prediction_error`); else noise alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy import special
 
 from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.confidence_levels import checked_levels
+from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import Information
-from dahl_ident.diagnostics.levels import checked_levels, thresholds
-from dahl_ident.diagnostics.parameters import parameter_values
-from dahl_ident.elements import Dahl
+from dahl_ident.diagnostics.parameters import values_at
+from dahl_ident.diagnostics.prediction_error import noise_near, prediction_error
+from dahl_ident.elements import Element
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
+from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.units import shown_unit
+
+_STEP = 1e-5  # relative, of parameters, for the slope of a knee
 
 
 @dataclass(frozen=True)
@@ -35,43 +43,52 @@ class ResponseBand:
     ----------
     response : ndarray of complex, shape (n,)
         At the estimate.
+    centre : ndarray of complex, shape (n,)
+        Middle of the bands: the response, and how far the device is expected to depart from the
+        model there, judged by the residuals.
     real_std, imag_std : ndarray, shape (n,)
         Standard deviations of real and imaginary part, in the response's unit.
     log_gain_std, phase_std : ndarray, shape (n,)
         Standard deviations of ln gain and of the phase, rad.
+    dof : ndarray, shape (n,)
+        Degrees of freedom of the standard deviations, for the factor of Student's t.
     """
 
     response: ComplexArray
+    centre: ComplexArray
     real_std: FloatArray
     imag_std: FloatArray
     log_gain_std: FloatArray
     phase_std: FloatArray
-    _optimum: Optimum
+    dof: FloatArray
 
     def gain(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the gain at each point."""
         factor = np.exp(self._threshold(level) * self.log_gain_std)
-        size = np.abs(self.response)
+        size = np.abs(self.centre)
         return size / factor, size * factor
 
     def phase(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the phase at each point, rad."""
         width = self._threshold(level) * self.phase_std
-        centre = np.angle(self.response)
+        centre = np.angle(self.centre)
         return centre - width, centre + width
 
     def real(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the real part at each point."""
         width = self._threshold(level) * self.real_std
-        return self.response.real - width, self.response.real + width
+        return self.centre.real - width, self.centre.real + width
 
     def imag(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the imaginary part at each point."""
         width = self._threshold(level) * self.imag_std
-        return self.response.imag - width, self.response.imag + width
+        return self.centre.imag - width, self.centre.imag + width
 
-    def _threshold(self, level: float) -> float:
-        return float(thresholds(self._optimum, checked_levels([level]))[0])
+    def _threshold(self, level: float) -> FloatArray:
+        upper = 0.5 * (1.0 + float(checked_levels([level])[0]))
+        with np.errstate(invalid="ignore"):
+            t = special.stdtrit(np.minimum(self.dof, 1e12), upper)
+        return np.where(np.isinf(self.dof), special.ndtri(upper), t)
 
 
 @dataclass(frozen=True)
@@ -95,8 +112,50 @@ def response_band(
     amplitude: ArrayLike | None,
     drive: ArrayLike | None,
     quantity: Any,
+    errors: ErrorModel | None = None,
+    *,
+    of_a_test: bool = True,
 ) -> ResponseBand:
-    """Return the measured response that the estimate predicts, sensors included."""
+    """Return the response that the estimate predicts, sensors included.
+
+    With `errors` the band is that of one more test, or of the device itself.
+    """
+    problem, theta = _estimate(optimum, errors)
+    there = problem_at(problem, frequency_hz, amplitude, drive, quantity)
+    R, by = there.predict(theta), there.prediction_jacobian(theta)
+    known = np.isfinite(R) & (R != 0.0)
+    if not known.any():
+        return ResponseBand(R, R, *np.full((5, R.size), np.nan))
+    seen = _measured(there, R, known)
+    if errors is None:
+        own = np.zeros((R.size, 2, 2))
+        if of_a_test:
+            own[known] = optimum.scale**2 * noise_near(problem, theta, seen.amplitude, seen.omega)
+        return _noise_band(optimum, R, by, own)
+    return _combined_band(
+        errors, R, by, known, seen.amplitude, seen.omega, seen.stiffness, of_a_test
+    )
+
+
+def _estimate(optimum: Optimum, errors: ErrorModel | None) -> tuple[Problem, FloatArray]:
+    """Return the combined estimate with the problem it belongs to, or the plain one."""
+    return (optimum.problem, optimum.theta) if errors is None else (errors.problem, errors.theta)
+
+
+def _measured(there: Problem, R: ComplexArray, known: NDArray[np.bool_]) -> StiffnessData:
+    """Return amplitude and stiffness of predicted responses, as if they had been measured."""
+    data = replace(there.data.select(rows=known), response=R[known])
+    return Problem(data, there.model, noise="absolute", sensors=there.sensors).stiffness_data
+
+
+def problem_at(
+    problem: Problem,
+    frequency_hz: ArrayLike,
+    amplitude: ArrayLike | None,
+    drive: ArrayLike | None,
+    quantity: Any,
+) -> Problem:
+    """Return the same problem at other operating points, to predict with."""
     held = drive if amplitude is None else amplitude
     if held is None or (amplitude is not None and drive is not None):
         raise ValidationError("give either amplitude (displacement controlled) or drive (force)")
@@ -110,7 +169,6 @@ def response_band(
             f"frequency_hz has shape {f.shape} and {name} {given.shape}; expected one shape, or "
             "one number for all"
         ) from None
-    problem = optimum.problem
     grid = FrequencyResponse(
         f,
         np.ones(f.shape),
@@ -120,26 +178,43 @@ def response_band(
         quantity=problem.data.quantity if quantity is None else quantity,
         motion=problem.data.motion,
     )
-    there = Problem(grid, problem.model, noise="absolute", sensors=problem.sensors)
-    theta = optimum.theta
-    return _band(optimum, there.predict(theta), there.prediction_jacobian(theta))
+    return Problem(grid, problem.model, noise="absolute", sensors=problem.sensors)
 
 
-def describing_function_band(optimum: Optimum, amplitude: ArrayLike) -> ResponseBand:
-    """Return N(A) of all Dahl elements together, whatever stands beside them."""
+def describing_function_band(
+    optimum: Optimum, amplitude: ArrayLike, errors: ErrorModel | None = None
+) -> ResponseBand:
+    """Return N(A) of all friction laws together, whatever stands beside them."""
     A = positive_array(amplitude, "amplitude")
-    return _band(optimum, *friction_and_slopes(optimum, A))
+    N, by = friction_and_slopes(*_estimate(optimum, errors), A)
+    if errors is None:
+        return _noise_band(optimum, N, by)
+    shape = A.shape
+    band = _combined_band(errors, *_flat(N, by), np.isfinite(N.ravel()), A.ravel(), _omega(errors))
+    return ResponseBand(*(np.reshape(getattr(band, f.name), shape) for f in fields(band)))
 
 
-def friction_and_slopes(optimum: Optimum, A: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+def _flat(N: ComplexArray, by: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    return N.ravel(), by.reshape(-1, by.shape[-1])
+
+
+def _omega(errors: ErrorModel) -> FloatArray:
+    """Return the middle of the measured angular frequencies."""
+    return np.asarray(np.exp(np.log(errors.problem.stiffness_data.omega).mean()))
+
+
+def friction_and_slopes(
+    problem: Problem, theta: FloatArray, A: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
     """Return N(A) of the friction, and its derivatives by theta in a last axis."""
-    values, names = parameter_values(optimum), optimum.names
-    slopes = dict(zip(names, optimum.problem.value_slopes(optimum.theta), strict=True))
+    names = problem.names
+    values = values_at(problem, theta)
+    slopes = dict(zip(names, problem.value_slopes(theta), strict=True))
     N = np.zeros(A.shape, dtype=np.complex128)
     by = np.zeros((*A.shape, len(names)), dtype=np.complex128)
-    elements = [e for e in optimum.problem.model.elements if isinstance(e, Dahl)]
+    elements = [e for e in problem.model.elements if e.has_memory]
     if not elements:
-        raise ModelError("the model has no Dahl element, so there is no friction to describe")
+        raise ModelError("the model has no friction law, so there is no friction to describe")
     for element in elements:
         own = [np.asarray(values[p.name]) for p in element.parameters]
         part = element.stiffness_gradient(own, A, np.zeros(()), 1)
@@ -151,62 +226,119 @@ def friction_and_slopes(optimum: Optimum, A: FloatArray) -> tuple[ComplexArray, 
 
 
 def derived(
-    optimum: Optimum, amplitudes: Sequence[float], frequency_hz: float | None
+    optimum: Optimum,
+    amplitudes: Sequence[float],
+    frequency_hz: float | None,
+    errors: ErrorModel | None = None,
 ) -> Iterator[DerivedQuantity]:
-    """Yield x_c of each Dahl element, and at each amplitude stiffness, loss and damping."""
-    information, motion = Information(optimum), optimum.problem.data.motion
-    yield from _characteristic_displacements(optimum, information)
+    """Yield x_c of each law that has one, and at each amplitude stiffness, loss and damping."""
+    motion = optimum.problem.data.motion
+    yield from _characteristic_displacements(optimum, errors)
     A = positive_array(amplitudes, "amplitudes").ravel()
     if not A.size:
         return
-    N, by = friction_and_slopes(optimum, A)
-    loss = np.pi * A**2
+    band = describing_function_band(optimum, A, errors)
+    N, loss = band.response, np.pi * A**2
     rows = [
-        ("energy lost in a cycle", "J", loss * N.imag, loss[:, None] * by.imag),
-        ("equivalent stiffness", shown_unit("N/m", motion), N.real, by.real),
+        ("energy lost in a cycle", "J", loss * N.imag, loss * band.imag_std),
+        ("equivalent stiffness", shown_unit("N/m", motion), N.real, band.real_std),
     ]
     if frequency_hz is not None:
         omega = 2.0 * np.pi * float(positive_array(frequency_hz, "frequency_hz"))
         unit = shown_unit("N s/m", motion)
-        rows.append(("equivalent damping", unit, N.imag / omega, by.imag / omega))
-    for name, unit, value, slope in rows:
-        error = information.std(slope)
+        rows.append(("equivalent damping", unit, N.imag / omega, band.imag_std / omega))
+    for name, unit, value, error in rows:
         for a, v, e in zip(A.tolist(), value.tolist(), error.tolist(), strict=True):
             yield DerivedQuantity(name, unit, a, v, e)
 
 
 def _characteristic_displacements(
-    optimum: Optimum, information: Information
+    optimum: Optimum, errors: ErrorModel | None
 ) -> Iterator[DerivedQuantity]:
-    values, names = parameter_values(optimum), optimum.names
-    for element in optimum.problem.model.elements:
-        if not isinstance(element, Dahl):
-            continue
-        f, s = element.parameters[:2]
+    problem, theta = _estimate(optimum, errors)
+    names = problem.names
+    values = values_at(problem, theta)
+    slopes = dict(zip(names, problem.value_slopes(theta), strict=True))
+    found = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
+    for element in problem.model.elements:
+        own = [float(values[p.name]) for p in element.parameters]
+        x_c, high = _knee(element, own)
+        if not element.has_memory or x_c != high:
+            continue  # a law whose knee is a range has no single displacement
         direction = np.zeros(len(names))
-        for parameter, sign in ((f, 1.0), (s, -1.0)):
+        for i, parameter in enumerate(element.parameters):
             if parameter.free:
-                direction[names.index(parameter.name)] = sign
-        x_c = values[f.name] / values[s.name]
-        error = x_c * float(information.std(direction))
-        if optimum.status.at_infinity and {f.name, s.name} & set(names):
-            ends = dict(zip(names, optimum.values.tolist(), strict=True))
-            if not all(np.isfinite(ends.get(p.name, 1.0)) for p in (f, s)):
-                continue
+                step = _STEP * abs(own[i])
+                up, down = (
+                    _knee(element, [*own[:i], own[i] + by, *own[i + 1 :]])[0]
+                    for by in (step, -step)
+                )
+                slope = np.log(up / down) / (2.0 * step)
+                direction[names.index(parameter.name)] = slope * slopes[parameter.name]
+        if any(
+            d and not np.isfinite(found.get(n, 1.0)) for d, n in zip(direction, names, strict=True)
+        ):
+            continue
+        if errors is None:
+            error = x_c * float(Information(optimum).std(direction))
+        else:
+            error = x_c * float(direction @ errors.covariance @ direction) ** 0.5
         label = "x_c" if element.name is None else f"{element.name}_x_c"
         unit = shown_unit("m", optimum.problem.data.motion)
         yield DerivedQuantity(label, unit, None, x_c, error)
 
 
-def _band(optimum: Optimum, R: ComplexArray, by: ComplexArray) -> ResponseBand:
+def _knee(element: Element, values: Sequence[float]) -> tuple[float, float]:
+    low, high = element.knee([np.asarray(v) for v in values])
+    return float(low), float(high)
+
+
+def _noise_band(
+    optimum: Optimum, R: ComplexArray, by: ComplexArray, own: FloatArray | None = None
+) -> ResponseBand:
+    """Return the band from noise alone, `own` the covariance of a test's ln gain and phase."""
     information = Information(optimum)
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = by / R[..., None]
-    return ResponseBand(
-        R,
-        information.std(by.real),
-        information.std(by.imag),
-        information.std(relative.real),
-        information.std(relative.imag),
-        optimum,
+    dof = np.inf if optimum.scale_known else (optimum.dof if optimum.dof > 0 else np.nan)
+    parts = [information.std(d) for d in (by.real, by.imag, relative.real, relative.imag)]
+    if own is not None:
+        parts = [np.hypot(a, b) for a, b in zip(parts, _parts_std(R, own), strict=True)]
+    real, imag, gain, phase = parts
+    return ResponseBand(R, R, real, imag, gain, phase, np.full(R.shape, dof))
+
+
+def _parts_std(R: ComplexArray, covariance: FloatArray) -> list[FloatArray]:
+    """Return standard deviations of real and imaginary part, ln gain and phase of (n,) responses.
+
+    `covariance`, (n, 2, 2), is that of ln gain and phase.
+    """
+    turned = np.stack([R, 1j * R], axis=-1)  # by ln gain and phase
+    gain, phase = (np.tile(axis, (R.size, 1)) for axis in np.eye(2))
+    variances = [
+        np.einsum("ni,nij,nj->n", lever, covariance, lever)
+        for lever in (turned.real, turned.imag, gain, phase)
+    ]
+    return [np.sqrt(np.maximum(v, 0.0)) for v in variances]
+
+
+def _combined_band(
+    errors: ErrorModel,
+    R: ComplexArray,
+    by: ComplexArray,
+    known: NDArray[np.bool_],
+    amplitude: FloatArray,
+    omega: FloatArray,
+    stiffness: ComplexArray | None = None,
+    of_a_test: bool = False,
+) -> ResponseBand:
+    """Return the band of responses (n,); places of the `known` ones, NaN for the others."""
+    found, parts = R[known], np.full((5, R.size), np.nan)
+    made = prediction_error(
+        errors, by[known] / found[:, None], amplitude, omega, stiffness, of_a_test=of_a_test
     )
+    parts[:4, known] = _parts_std(found, made.covariance)
+    parts[4, known] = made.dof
+    centre = R.copy()
+    centre[known] *= np.exp(made.departure @ np.array([1.0, 1.0j]))
+    return ResponseBand(R, centre, *parts)

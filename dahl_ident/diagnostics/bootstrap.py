@@ -30,8 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray, whole_number
+from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, intervals_from_search
-from dahl_ident.diagnostics.levels import LEVELS, checked_levels
 from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.fitting import Optimum, solve_many
 from dahl_ident.fitting.status import Status
@@ -39,7 +39,7 @@ from dahl_ident.problem import ProblemBatch
 
 REPLICATES = 4999
 _FEWEST = 99
-_AT_LIMIT = 0.01  # of the replicates, from which on the tails are not told apart
+_AT_LIMIT = 0.01  # of the replicates, from which on the tails cannot be distinguished
 
 
 @dataclass(frozen=True)

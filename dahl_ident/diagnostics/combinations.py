@@ -3,17 +3,16 @@
 ========================================  =====================================================
 combination                               left by
 ========================================  =====================================================
-alpha sigma^2/f_max                       microslip beside a free spring: the loss per amplitude
-sigma + stiffness                         the same: the stiffness seen at small amplitudes
-f_max/sigma = x_c                         an unknown force gain
-sums of f_max or sigma of two elements    all slipping, or none
+products that an element names            microslip, an unknown gain: `Element.combinations`
+stiffness of friction + that of a spring  microslip: the stiffness seen at small amplitudes
+sums over two elements of one law         all slipping, or none: of force limits or stiffnesses
 stiffness seen, of friction and springs   springs that hide all of friction
 ========================================  =====================================================
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -22,9 +21,13 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.bands import friction_and_slopes
 from dahl_ident.diagnostics.parameters import parameter_values
-from dahl_ident.elements import Dahl, Parameter, Spring
+from dahl_ident.diagnostics.physics import is_spring
+from dahl_ident.elements import Parameter
 from dahl_ident.fitting import Optimum
 from dahl_ident.units import shown_unit
+
+_UNITS = ("N", "m", "s")
+_STIFFNESS = (1, -1, 0)  # powers of force, displacement and time
 
 
 @dataclass(frozen=True)
@@ -43,22 +46,28 @@ def candidates(optimum: Optimum) -> list[Candidate]:
     """Return every combination that the optimum's free parameters could form."""
     free = {p.name: p for p in optimum.problem.parameters}
     theta = dict(zip(optimum.names, optimum.problem.to_values(optimum.theta), strict=True))
-    dahl = [
-        tuple(free.get(p.name) for p in e.parameters)
-        for e in optimum.problem.model.elements
-        if isinstance(e, Dahl)
-    ]
-    springs = [
-        e.parameters[0].name
-        for e in optimum.problem.model.elements
-        if isinstance(e, Spring) and e.parameters[0].free
-    ]
+    elements = optimum.problem.model.elements
+    friction = [e for e in elements if e.has_memory]
+    springs = [p.name for e in elements if is_spring(e) for p in e.parameters if p.free]
     found: list[Candidate] = []
-    for powers, text, unit in _products(dahl):
-        found.append(_product(optimum, theta, powers, text, unit))
-    pairs = [(s.name, k) for _, s, _ in dahl if s for k in springs]
-    for one, other in combinations(dahl, 2):
-        pairs += [(a.name, b.name) for a, b in zip(one[:2], other[:2], strict=True) if a and b]
+    for element in friction:
+        for combination in element.combinations():
+            powers = {element.parameter(n): power for n, power in combination.powers.items()}
+            if all(p.free for p in powers):
+                text = element.named(combination.expression)
+                found.append(_product(optimum, theta, powers, text))
+    scale = [{n: e.parameter(n) for n in e.scale_parameters} for e in friction]
+    pairs = [
+        (p.name, k)
+        for own in scale
+        for p in own.values()
+        if p.free and p.dimension == _STIFFNESS
+        for k in springs
+    ]
+    for (one, own), (other, its) in combinations(zip(friction, scale, strict=True), 2):
+        if one.kind == other.kind:
+            both = ((own[label], its[label]) for label in own if label in its)
+            pairs += [(a.name, b.name) for a, b in both if a.free and b.free]
     found += [_sum(optimum, theta, free, pair) for pair in pairs]
     return found
 
@@ -70,17 +79,16 @@ def stiffness_seen(optimum: Optimum) -> Candidate | None:
     telling where they know nothing else.
     """
     problem, names = optimum.problem, optimum.names
-    springs = [
-        p.name for e in problem.model.elements if isinstance(e, Spring) for p in e.parameters
-    ]
+    elements = problem.model.elements
+    springs = [p.name for e in elements if is_spring(e) for p in e.parameters]
     friction = [
-        p.name for e in problem.model.elements if isinstance(e, Dahl) for p in e.parameters[:2]
+        e.parameter(label).name for e in elements if e.has_memory for label in e.scale_parameters
     ]
     free = frozenset(springs) & frozenset(names)
     if not free or not friction:
         return None
     A = float(np.exp(np.log(problem.stiffness_data.amplitude).mean()))
-    N, by = friction_and_slopes(optimum, np.array([A]))
+    N, by = friction_and_slopes(problem, optimum.theta, np.array([A]))
     values = parameter_values(optimum)
     slopes = dict(zip(names, problem.value_slopes(optimum.theta), strict=True))
     own = np.array([slopes[name] if name in free else 0.0 for name in names])
@@ -92,27 +100,27 @@ def stiffness_seen(optimum: Optimum) -> Candidate | None:
     return Candidate(where, shown_unit("N/m", motion), value, direction, members)
 
 
-def _products(
-    dahl: list[tuple[Parameter | None, ...]],
-) -> Iterator[tuple[dict[str, float], str, str]]:
-    """Yield powers of parameters, the expression, and its unit."""
-    for f, s, a in dahl:
-        if f is None or s is None:
-            continue
-        exponent = {a.name: 1.0} if a else {}
-        text = " ".join([*exponent, f"{s.name}^2/{f.name}"])
-        yield {**exponent, s.name: 2.0, f.name: -1.0}, text, "N/m^2"
-        yield {f.name: 1.0, s.name: -1.0}, f"{f.name}/{s.name}", "m"
-
-
 def _product(
-    optimum: Optimum, theta: Mapping[str, float], powers: dict[str, float], text: str, unit: str
+    optimum: Optimum, theta: Mapping[str, float], powers: Mapping[Parameter, float], text: str
 ) -> Candidate:
-    direction = np.array([powers.get(name, 0.0) for name in optimum.names])
+    by_name = {p.name: power for p, power in powers.items()}
+    direction = np.array([by_name.get(name, 0.0) for name in optimum.names])
     with np.errstate(over="ignore", under="ignore"):
-        value = float(np.exp(sum(power * np.log(theta[name]) for name, power in powers.items())))
-    unit = shown_unit(unit, optimum.problem.data.motion)
-    return Candidate(text, unit, value, direction, frozenset(powers))
+        value = float(np.exp(sum(power * np.log(theta[n]) for n, power in by_name.items())))
+    unit = shown_unit(_unit(powers), optimum.problem.data.motion)
+    return Candidate(text, unit, value, direction, frozenset(by_name))
+
+
+def _unit(powers: Mapping[Parameter, float]) -> str:
+    """Return the unit of a product, such as "N/m^2"."""
+    above: list[str] = []
+    below: list[str] = []
+    for place, unit in enumerate(_UNITS):
+        power = sum(by * p.dimension[place] for p, by in powers.items())
+        text = unit if abs(power) == 1 else f"{unit}^{abs(power):g}"
+        if power:
+            (above if power > 0 else below).append(text)
+    return "/".join([" ".join(above) or "1", *below]) if above or below else ""
 
 
 def _sum(

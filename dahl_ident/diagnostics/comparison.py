@@ -2,7 +2,7 @@
 
 Both are -2 ln L plus a price on parameters, 2 each for AIC and ln(2n) for BIC; the lower, the
 better. A difference above 10 is plain, below 2 means nothing. The lowest of several is often that
-of a model too rich, by chance; so another model is called best only where it is plainly better than
+of a model too rich, by chance; so another model is called best only where it is clearly better than
 the one fitted. Criteria compare models, they do not prove one: if none describes the data, the
 best of them does not either, and one of negative damping is no mechanism's.
 """
@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.diagnostics.formatting import listed, table, with_unit
-from dahl_ident.diagnostics.physics import negative_parameters
+from dahl_ident.diagnostics.physics import is_spring, negative_parameters
 from dahl_ident.diagnostics.verdicts import Fit
-from dahl_ident.elements import Dahl, Element, Model, Spring
+from dahl_ident.elements import Element, Model, Spring
 from dahl_ident.errors import DahlIdentError, ValidationError
 from dahl_ident.fitting import Optimum, solve
 from dahl_ident.problem import Problem
@@ -105,7 +105,7 @@ class ModelComparison:
         lowest = self._lowest
         if self._gain < _MEANS_NOTHING:
             return "No model compared is better than the one fitted."
-        word = "plainly better" if self._gain > _PLAIN else "perhaps better"
+        word = "clearly better" if self._gain > _PLAIN else "perhaps better"
         aic = self.models[0].aic - lowest.aic
         text = f"{lowest.name} would be {word} (AIC lower by {aic:.0f}, BIC by {self._gain:.0f})."
         absurd = [f"There {warning}." for warning in negative_parameters(lowest.optimum)]
@@ -193,16 +193,12 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
 def _variants(model: Model) -> dict[str, Element]:
     """Return the usual alternatives to a model."""
     found: dict[str, Element] = {}
-    elements = [e for e in model.elements if isinstance(e, Dahl)]
-    free = [p.name for p in (e.parameters[2] for e in elements) if p.free]
-    given = [p.name for p in (e.parameters[2] for e in elements) if not p.free]
-    if given:
-        found["exponent free"] = model.with_free(given)
-    if free:
-        found["exponent 1"] = model.with_fixed(dict.fromkeys(free, 1.0))
-    if len(elements) == 1:
-        rest = [e for e in model.elements if e is not elements[0]]
-        found["two Dahl elements"] = Model(Dahl(name="early"), Dahl(name="late"), *rest)
-    if not any(isinstance(e, Spring) for e in model.elements):
+    offers = [(e, e.alternatives()) for e in model.elements]
+    for name in dict.fromkeys(name for _, offered in offers for name in offered):
+        taken = [offered[name] for _, offered in offers if name in offered]
+        if len(taken) > 1 and any(len(instead) > 1 for instead in taken):
+            continue  # more elements of one law in place of several would share their names
+        found[name] = Model(*(new for e, offered in offers for new in offered.get(name, (e,))))
+    if not any(is_spring(e) for e in model.elements):
         found["spring added"] = model + Spring()
     return found

@@ -1,13 +1,13 @@
-"""Goodness of fit: whether what is left is noise, and what was fitted is physics.
+"""Goodness of fit: whether the residuals are noise, and the estimates physically possible.
 
 Every test that applies is made: chi-square where the noise is known, trends and runs of the
 residuals over amplitude, frequency and drive, a stiffness that rises with amplitude, the
 exponent's score (departure from the universal curve h(beta)), the third harmonic against the
-model's. Together they may cry wolf once in a
-hundred data sets, so each has a hundredth over their number as its level.
+model's. Their joint false-alarm rate is 1 %: the
+level of each is a hundredth over their number.
 
 Where the data are not described, the sign of the response and the suspicious rows are tried as
-the cause (:mod:`dahl_ident.diagnostics.causes`); a cause found leads the verdict.
+the cause (:mod:`dahl_ident.diagnostics.misfit_explanations`); a cause found leads the verdict.
 
 A fit can be statistically perfect and physically absurd; what no mechanism does is said as a
 warning (:mod:`dahl_ident.diagnostics.physics`).
@@ -23,7 +23,8 @@ import numpy as np
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray
-from dahl_ident.diagnostics.causes import (
+from dahl_ident.diagnostics.formatting import p_text, with_unit
+from dahl_ident.diagnostics.misfit_explanations import (
     EXPLAINS,
     at_an_end,
     neighbourhood,
@@ -32,14 +33,12 @@ from dahl_ident.diagnostics.causes import (
     set_aside,
     sign_convention,
 )
-from dahl_ident.diagnostics.flags import flagged_rows
-from dahl_ident.diagnostics.formatting import p_text, with_unit
-from dahl_ident.diagnostics.outliers import SuspiciousPoint, suspicious_points
+from dahl_ident.diagnostics.outliers import SuspiciousPoint, flagged_rows, suspicious_points
 from dahl_ident.diagnostics.physics import physical_warnings
 from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.diagnostics.stiffening import Stiffening, stiffening
 from dahl_ident.diagnostics.trends import LEAST_RANGE, Runs, Trend, runs, trends
-from dahl_ident.elements import Dahl
+from dahl_ident.elements import Parameter
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
 
@@ -48,7 +47,7 @@ _HINT = 0.05
 _FAR_MORE = 2.0  # scatter over what was measured
 _NO_SENSOR = 0.3  # noise over the response
 _LEAST_DOF = 6  # with fewer, no test of residuals of unknown scale applies
-_MOST_DEPARTURES = 3  # in the verdict; the details hold them all
+_MOST_DEPARTURES = 3  # in the verdict; the details list all
 
 
 @dataclass(frozen=True)
@@ -88,13 +87,13 @@ class Exponent:
     stderr: float
     p_value: float
     widened: float = 1.0
-    """How many times the error is what the data's covariance says, as they scatter more."""
+    """How many times the error is what the data's covariance states, as they scatter more."""
 
     def __str__(self) -> str:
         value = with_unit(self.wanted, self.stderr, "")
-        wide = f" (error widened {self.widened:.2g} times, to the misfit)"
-        told = wide if self.widened > 1.0 else ""
-        return f"the data ask for {self.name} near {value}{told} in place of {self.fixed:g}"
+        wide = f" (error widened {self.widened:.2g} times because of the misfit)"
+        widening = wide if self.widened > 1.0 else ""
+        return f"the data favour {self.name} near {value}{widening} over {self.fixed:g}"
 
 
 @dataclass(frozen=True)
@@ -104,12 +103,12 @@ class Scatter:
     ratio: float
 
     def __str__(self) -> str:
-        return f"the scatter is {self.ratio:.2g} times what the data's covariance says"
+        return f"the scatter is {self.ratio:.2g} times what the data's covariance states"
 
 
 @dataclass(frozen=True)
 class Goodness:
-    """What is left after the fit, and what it means.
+    """Residuals after the fit, and what they mean.
 
     Attributes
     ----------
@@ -143,7 +142,7 @@ class Goodness:
     sign : str
         The sign convention that explains data which the fit does not; empty where none does.
     apart : str
-        The suspicious rows, where they alone speak against the model.
+        The suspicious rows, where they alone contradict the model.
     neighbours : str
         Where the suspicious rows lie, if they alone depart from the model, but side by side.
     untested : bool
@@ -192,7 +191,7 @@ class Goodness:
 
     @property
     def acceptable(self) -> bool:
-        """Whether residuals that can be judged look like noise, of rows without a flag."""
+        """Whether residuals that can be judged are consistent with noise, and no row is flagged."""
         return not self.objections and not self.flagged and self.judged
 
     @property
@@ -219,8 +218,11 @@ class Goodness:
         found = [trend for trend in self.trends if trend.p_value < level]
         rate = [trend for trend in found if trend.covariate == "frequency"]
         if self.noise_share is not None and self.noise_share > _NO_SENSOR:
-            yield f"the scatter is {100.0 * self.noise_share:.2g} % of the response, as no sensor's"
-        yield from (f"{trend}, which no rate-independent model does" for trend in rate)
+            yield (
+                f"the scatter is {100.0 * self.noise_share:.2g} % of the response, "
+                "more than any sensor's noise"
+            )
+        yield from (f"{trend}, which no rate-independent model can describe" for trend in rate)
         if self.stiffening is not None and self.stiffening.p_value < level:
             yield str(self.stiffening)
         curve = [test for test in (self.exponent,) if test is not None and test.p_value < level]
@@ -237,11 +239,11 @@ class Goodness:
     @property
     def cause(self) -> str:
         """What explains why the data are not described; empty where nothing does."""
-        return f"{self.sign}. The numbers of this fit mean nothing." if self.sign else self.apart
+        return f"{self.sign}. Do not use the numbers of this fit." if self.sign else self.apart
 
     @property
     def statements(self) -> tuple[str, ...]:
-        """The verdict in its parts, the gravest first."""
+        """The verdict in its parts, most serious first."""
         if self.cause:
             return tuple(filter(None, (self.cause, self._flaws)))
         parts = (self._flaws, self.described, self._apart)
@@ -255,29 +257,34 @@ class Goodness:
         return " ".join(self.statements)
 
     @property
+    def departures(self) -> str:
+        """The most serious objections, and how many more there are."""
+        reasons = "; ".join(self.objections[:_MOST_DEPARTURES])
+        more = len(self.objections) - _MOST_DEPARTURES
+        tests = f"; {more} more test{'s' if more > 1 else ''} failed" if more > 0 else ""
+        return f"{reasons}{tests}"
+
+    @property
     def described(self) -> str:
         """Whether the model describes the data."""
         misfit = f"{100.0 * self.rms_misfit:.2g} % rms misfit"
         if self.objections:
-            reasons = "; ".join(self.objections[:_MOST_DEPARTURES])
-            more = len(self.objections) - _MOST_DEPARTURES
-            others = f"; {more} more of the tests say so" if more > 0 else ""
-            return f"The model does not describe these data ({misfit}): {reasons}{others}."
+            return f"The model does not describe these data ({misfit}): {self.departures}."
         if not self._enough_points:
             return (
-                f"Noise and a wrong model look alike with {self.dof} degrees of freedom "
-                f"({misfit}): "
+                f"With {self.dof} degrees of freedom a wrong model cannot be distinguished from "
+                f"noise ({misfit}): "
                 "measure more points, or repeat them so that their covariance is known."
             )
         if self.untested:
             return (
-                "One amplitude tells no more numbers than friction has parameters, so that any "
-                f"mechanism fits ({misfit}): measure at other amplitudes as well."
+                "One amplitude gives no more numbers than friction has parameters, so any "
+                f"model fits ({misfit}): measure at other amplitudes as well."
             )
         hint = f", with a hint that {_joined(self.hints)}" if self.hints else ""
         if self.scatter is not None and self.scatter.ratio > _FAR_MORE:
             hint += f", but {self.scatter}"
-        return f"The residuals look like noise ({misfit}){hint}."
+        return f"The residuals are consistent with noise ({misfit}){hint}."
 
     @property
     def _flaws(self) -> str:
@@ -295,10 +302,10 @@ class Goodness:
         rows = _joined([str(point.row) for point in self.suspicious], 5, ", ")
         if self.neighbours:
             return (
-                f"Suspicious rows: {rows}; without them the model describes the data, but they lie "
-                f"side by side, {self.neighbours}: look at them, or the model fails there."
+                f"Suspicious rows: {rows}; without them the model describes the data, but they are "
+                f"neighbours, {self.neighbours}: check them, or the model is wrong there."
             )
-        return f"Suspicious rows: {rows}; look at them (a robust loss bears such rows)."
+        return f"Suspicious rows: {rows}; check them (a robust loss down-weights these rows)."
 
     @property
     def details(self) -> list[str]:
@@ -317,7 +324,7 @@ class Goodness:
 def goodness(optimum: Optimum) -> Goodness:
     """Return every test of an optimum's residuals, physical warnings, and what explains both."""
     found = _tested(optimum)
-    if optimum.method != "scipy" or (optimum.success and not found.objections):
+    if optimum.method == "ipopt" or (optimum.success and not found.objections):
         return found  # another solver may have had constraints, which no trial would keep
     sign = sign_convention(optimum, lambda turned: not _tested(turned).objections)
     if sign:
@@ -338,15 +345,16 @@ def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
     if where:
         return replace(found, neighbours=where)
     numbers = _joined([str(row) for row in rows], 10, ", ")
-    them, named = "them", f"{len(rows)} of {optimum.problem.data.n} rows ({numbers}) alone speak"
+    n = optimum.problem.data.n
+    them, named = "them", f"Only {len(rows)} of {n} rows ({numbers}) contradict"
     if len(rows) == 1:
-        them, named = "it", f"Row {numbers} alone speaks"
+        them, named = "it", f"Only row {numbers} contradicts"
     left = rest.described[0].lower() + rest.described[1:].rstrip(".")
     return replace(
         found,
-        apart=f"{named} against the model ({percent(found.rms_misfit)} rms misfit): without "
-        f"{them} {left}. The fit counts every row: look at {them}, and fit again with a robust "
-        'loss, which bears such rows (loss="huber").',
+        apart=f"{named} the model ({percent(found.rms_misfit)} rms misfit): without "
+        f"{them} {left}. The fit includes every row: check {them}, or fit with a robust loss "
+        f'that down-weights {them} (loss="huber").',
     )
 
 
@@ -376,7 +384,7 @@ def _untested(optimum: Optimum) -> bool:
     """Return whether friction's free parameters alone meet all that one amplitude tells."""
     problem = optimum.problem
     view = problem.stiffness_data
-    elements = [e for e in problem.model.elements if isinstance(e, Dahl)]
+    elements = [e for e in problem.model.elements if not e.is_linear]
     free = sum(bool(p.free) for e in elements for p in e.parameters)
     alike = bool(np.ptp(np.log(view.amplitude)) < LEAST_RANGE)
     return alike and free >= 2 * len(view.orders)
@@ -413,13 +421,14 @@ def _scatter(optimum: Optimum) -> Scatter | None:
 def _exponent(
     optimum: Optimum, space: ResidualSpace, chi_square: ChiSquare | None
 ) -> Exponent | None:
-    """Return the score of the one Dahl element's fixed exponent."""
-    problem = optimum.problem
-    elements = [e for e in problem.model.elements if isinstance(e, Dahl)]
-    if len(elements) != 1 or elements[0].parameters[2].free or optimum.status.at_infinity:
+    """Return the score of the fixed exponent of a law that is alone."""
+    elements = [e for e in optimum.problem.model.elements if not e.is_linear]
+    exponents = [p for e in elements for p in e.parameters if _is_exponent(p)]
+    if len(elements) != 1 or len(exponents) != 1 or optimum.status.at_infinity:
         return None
-    alpha = elements[0].parameters[2]
-    assert alpha.value is not None
+    (alpha,) = exponents
+    if alpha.free or alpha.value is None:
+        return None
     change = _by_alpha(optimum, alpha.name)
     slope, error = space.coefficient(change)
     p = space.p_value(change[None])
@@ -430,6 +439,12 @@ def _exponent(
     if chi_square is not None and chi_square.p_value < _FALSE_ALARM:
         widened = (chi_square.value / chi_square.dof) ** 0.5
     return Exponent(alpha.name, alpha.value, wanted, wanted * error * widened, p, widened)
+
+
+def _is_exponent(parameter: Parameter) -> bool:
+    """Return whether a parameter is a positive pure number whose usual range is known."""
+    pure = not any(parameter.dimension) and parameter.transform == "log"
+    return pure and parameter.prior is not None
 
 
 def _by_alpha(optimum: Optimum, name: str) -> ComplexArray:

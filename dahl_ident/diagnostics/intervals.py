@@ -1,6 +1,10 @@
 """Confidence intervals: which numbers the data leave possible for each parameter.
 
-Three ways, from quick to thorough:
+``combined``
+    Every source of the uncertainty budget (:mod:`dahl_ident.diagnostics.budget`), with Student's
+    t for its effective degrees of freedom; the default.
+
+Three ways count noise alone, from quick to thorough:
 
 ``wald``
     Estimate plus and minus standard errors, in search coordinates (for positive parameters a
@@ -27,13 +31,15 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.formatting import table
-from dahl_ident.diagnostics.levels import LEVELS, checked_levels, percent, thresholds
+from dahl_ident.diagnostics.budget import coverage_factor
+from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels, percent, thresholds
+from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.formatting import listed, table
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Optimum
 
-Method = Literal["wald", "profile", "bootstrap"]
+Method = Literal["combined", "wald", "profile", "bootstrap"]
 _ROUNDING = 1e-9  # relative difference of limits that no one sees
 METHODS: tuple[Method, ...] = get_args(Method)
 
@@ -186,6 +192,48 @@ def profile_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> Con
     return intervals_from_search(optimum, "profile", array, lower, upper)
 
 
+def combined_intervals(
+    profile: ConfidenceIntervals, optimum: Optimum, errors: ErrorModel | None
+) -> ConfidenceIntervals:
+    """Return intervals that count every source of error.
+
+    Parameters
+    ----------
+    profile : ConfidenceIntervals
+        Of the same optimum from noise alone, for the intervals' shape: each side is as much
+        longer than k u as the profile's is longer than its first-order length.
+    optimum : Optimum
+        The least-squares fit.
+    errors : ErrorModel or None
+        Its sources of error; None leaves the profile.
+
+    Returns
+    -------
+    ConfidenceIntervals
+        Around the estimates of the error model.
+    """
+    if errors is None:
+        return replace(profile, method="combined")
+    levels = profile.levels
+    noise = thresholds(optimum, levels)[:, None] * np.sqrt(np.diagonal(optimum.covariance))
+    place = [errors.names.index(name) for name in optimum.names]
+    directions = np.eye(len(errors.names))[place]
+    u = np.sqrt(np.maximum(np.diagonal(errors.covariance)[place], 0.0))
+    dof = np.array([errors.dof(direction) for direction in directions])
+    k = np.array([[coverage_factor(nu, level) for nu in dof] for level in levels.tolist()])
+    theta = errors.theta[place]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        below = (optimum.theta - _search(optimum, profile.lower)) / noise
+        above = (_search(optimum, profile.upper) - optimum.theta) / noise
+    below, above = (np.where(np.isnan(side), 1.0, side) for side in (below, above))
+    found = intervals_from_search(
+        optimum, "combined", levels, theta - k * u * below, theta + k * u * above
+    )
+    note = f"every source of the budget: t with {listed([f'{nu:.3g}' for nu in dof])}"
+    note += " degrees of freedom"
+    return replace(found, estimate=errors.problem.to_values(errors.theta)[place], note=note)
+
+
 def intervals_from_search(
     optimum: Optimum, method: Method, levels: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> ConfidenceIntervals:
@@ -247,8 +295,8 @@ class IntervalComparison:
         if not self.disagreements:
             return "\n\n".join([*parts, "The methods agree."])
         by_interest = sorted(self.disagreements, key=lambda d: -abs(d.level - LEVELS[1]))
-        told = {(d.name, d.methods[0], d.side): d for d in by_interest}  # one level is enough
-        lines = [str(told[key]) for key in sorted(told)]
+        shown = {(d.name, d.methods[0], d.side): d for d in by_interest}  # one level is enough
+        lines = [str(shown[key]) for key in sorted(shown)]
         return "\n\n".join([*parts, "\n".join(["The methods disagree:", *lines])])
 
 

@@ -17,12 +17,14 @@ import numpy as np
 from scipy import special
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.fitting import Optimum
 
 _LEVEL = 0.01
 _SHARE = 0.1
 _LEAST_DOF = 4
+_GOOD = "good"
 
 
 @dataclass(frozen=True)
@@ -140,3 +142,22 @@ def _shifts(r: FloatArray, lever: FloatArray) -> FloatArray:
     form = rest[:, 1, 1] * x**2 - 2.0 * rest[:, 0, 1] * x * y + rest[:, 0, 0] * y**2
     fixed = determinant < 1e-8  # a point that alone determines a parameter
     return np.where(fixed, 0.0, form / np.where(fixed, 1.0, determinant))
+
+
+def flagged_rows(data: FrequencyResponse) -> tuple[str, ...]:
+    """Return a sentence for each kind of flaw among the fundamentals, with its rows.
+
+    Examples
+    --------
+    >>> from dahl_ident.data import FrequencyResponse
+    >>> data = FrequencyResponse(
+    ...     [1.0, 1.0], [1.0, 2.0], [1.0, 2.0], quality={"verdict": ["good", "not settled"]}
+    ... )
+    >>> flagged_rows(data)
+    ('row 1: not settled',)
+    """
+    verdicts = data.quality.get("verdict")
+    if verdicts is None:
+        return ()
+    rows = np.flatnonzero((verdicts != _GOOD) & (data.harmonic == 1))
+    return tuple(f"row {row}: {verdicts[row]}" for row in rows)

@@ -11,7 +11,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.third_harmonic import third_harmonic_share
-from dahl_ident.elements import Dahl, Damper, Element, Mass, Spring
+from dahl_ident.elements import Element
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.status import Status
 from dahl_ident.units import shown_unit
@@ -36,8 +36,8 @@ def _not_a_sine(optimum: Optimum) -> Iterator[str]:
         row = np.flatnonzero(optimum.problem.data.controlled == "force")[np.argmax(share)]
         yield (
             f"the displacement's third harmonic is predicted to be {100.0 * share.max():.2g} % of "
-            f"its fundamental in row {row}: a describing function, which assumes a sine, is crude "
-            "there; control the displacement, or leave such points out"
+            f"its fundamental in row {row}: a describing function, which assumes a sine, is "
+            "inaccurate there; control the displacement, or leave such points out"
         )
 
 
@@ -47,7 +47,7 @@ def negative_parameters(optimum: Optimum) -> Iterator[str]:
     values = parameter_values(optimum)
     values |= dict(zip(optimum.names, optimum.values.tolist(), strict=True))
     for element in problem.model.elements:
-        if not isinstance(element, Mass | Damper | Spring):
+        if not (element.is_linear and element.linear_parameters):
             continue
         (parameter,) = element.parameters
         value, error = values[parameter.name], optimum.stderr.get(parameter.name, 0.0)
@@ -55,16 +55,19 @@ def negative_parameters(optimum: Optimum) -> Iterator[str]:
             unit = shown_unit(parameter.unit, problem.data.motion)
             within = " (zero is within two standard errors)" if -value < 2.0 * error else ""
             given = parameter.name not in optimum.names
-            told = f"as given: {value:g} {unit}" if given else with_unit(value, error or None, unit)
-            yield f"{parameter.name} is negative, {told}{within}"
+            size = f"as given: {value:g} {unit}" if given else with_unit(value, error or None, unit)
+            yield f"{parameter.name} is negative, {size}{within}"
 
 
 def _beyond_friction_limit(optimum: Optimum) -> Iterator[str]:
-    """Yield where friction's fundamental exceeds what slip can give, 4 f_max/pi."""
+    """Yield where friction's fundamental exceeds what slip can give, 4/pi of its force limits."""
     values = parameter_values(optimum)
-    dahl = [e for e in optimum.problem.model.elements if isinstance(e, Dahl)]
-    limit = sum(values[e.parameters[0].name] for e in dahl) * 4.0 / np.pi
-    if not dahl or not 0.0 < limit < np.inf:
+    limit = 0.0
+    for element in optimum.problem.model.elements:
+        if not element.is_linear:
+            own = [np.asarray(values[p.name]) for p in element.parameters]
+            limit += float(element.force_bounds(own)[1])
+    if not 0.0 < limit < np.inf:
         return
     force, error = friction_force(optimum)
     excess = (force - limit) / error
@@ -77,8 +80,8 @@ def _beyond_friction_limit(optimum: Optimum) -> Iterator[str]:
         unit = shown_unit("N", optimum.problem.data.motion)
         yield (
             f"in row {row} friction's fundamental is {with_unit(force[row], error[row], unit)}, "
-            f"more than slip can give (4 f_max/pi = {limit:.3g} {unit}): something besides the "
-            "model carries force"
+            f"more than full slip can give ({limit:.3g} {unit}, 4/pi of its limit): something "
+            "besides the model carries force"
         )
 
 
@@ -95,10 +98,15 @@ def friction_force(optimum: Optimum) -> tuple[FloatArray, FloatArray]:
     return force, error
 
 
-def friction_stiffness(optimum: Optimum, kept: tuple[type[Element], ...] = (Dahl,)) -> ComplexArray:
-    """Return the measured dynamic stiffness, sensors corrected, of elements of the `kept` kinds.
+def is_spring(element: Element) -> bool:
+    """Return whether an element is a stiffness that depends neither on amplitude nor frequency."""
+    return element.is_linear and element.rate_independent
 
-    The modelled parts of all the others are subtracted.
+
+def friction_stiffness(optimum: Optimum, *, with_springs: bool = False) -> ComplexArray:
+    """Return the measured dynamic stiffness, sensors corrected, of friction (and springs).
+
+    The modelled parts of all linear elements are subtracted, or of all but springs.
     """
     problem = optimum.problem
     view = problem.stiffness_data
@@ -106,7 +114,7 @@ def friction_stiffness(optimum: Optimum, kept: tuple[type[Element], ...] = (Dahl
     linear = np.zeros(len(view.amplitude), dtype=np.complex128)
     values = parameter_values(optimum)
     for element in problem.model.elements:
-        if not isinstance(element, kept):
+        if element.is_linear and not (with_springs and is_spring(element)):
             linear += view.of(element, [np.asarray(values[p.name]) for p in element.parameters])
     return np.asarray(view.stiffness * ratio - linear)
 

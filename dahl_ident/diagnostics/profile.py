@@ -25,19 +25,19 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.bracket import BoolArray, Bracket, IntArray
-from dahl_ident.elements import Dahl, LinearSystem, Parameter, Spring
+from dahl_ident.elements import Parameter
 from dahl_ident.fitting import Optimum
-from dahl_ident.fitting.least_squares import DOUBTFUL
+from dahl_ident.fitting.asymptotes import Chart, microslip_charts
+from dahl_ident.fitting.global_start import edge_starts
 from dahl_ident.fitting.levenberg_marquardt import minimise
-from dahl_ident.fitting.limits import Chart, valleys
 from dahl_ident.fitting.losses import loss_named
-from dahl_ident.fitting.start import edge_starts
+from dahl_ident.fitting.search import DOUBTFUL
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Quadratic
 
 _STEPS = 60  # of the searches for limits, all together
 _SEARCH_STEPS = 40  # of a constrained search
-_LOOSENESS = 1e5  # a search this loose still gives the deviance, flat at its minimum, to 1e-6
+_TOLERANCE_FACTOR = 1e5  # still gives the deviance, flat at its minimum, to 1e-6
 _ENOUGH = 1e-8  # fall of the cost at which a search along a flat valley ends
 _LONGEST = 3.0  # step of a logarithm
 _FARTHEST = 1e6  # conditional standard errors of a parameter that is no logarithm
@@ -45,6 +45,7 @@ _LEAST_X_C = 1e-14  # over the smallest amplitude
 _MOST_X_C, _MOST_X_C_BESIDE = 1e8, 1e5  # over the largest, alone and beside a spring
 _SOFTEST, _STIFFEST = 1e-12, 1e6  # sigma over the median stiffness
 _FARTHEST_LOG = 80.0  # of a logarithm, from the optimum
+_FORCE, _STIFFNESS = (1, 0, 0), (1, -1, 0)  # powers of force, displacement and time
 _NARROW = 0.01  # conditional standard errors: a limit is known as well as that
 _FARTHEST_RATIO = 4.0  # of the logarithm of a pure number: an exponent or a gain
 
@@ -116,7 +117,7 @@ class Profiler:
         for edge in self._edges:
             begins.append(np.where(np.arange(theta.shape[1]) == index[:, None], begins[0], edge))
             rows.append(rows[0])
-        for chart in self._valleys:
+        for chart in self._microslip_charts:
             bent, applies = _along_valley(chart, index, theta, change, self._reach.smallest)
             begins.append(bent[applies])
             rows.append(np.flatnonzero(applies))
@@ -127,7 +128,7 @@ class Profiler:
     def _edges(self) -> list[FloatArray]:
         """Starts in gross slip, where data beside a free spring do not rule out microslip."""
         sd, found = np.sqrt(np.diagonal(self._optimum.covariance)), []
-        for chart in self._valleys:
+        for chart in self._microslip_charts:
             f_max, sigma = _friction_of(chart)
             if max(sd[f_max], sd[sigma]) > DOUBTFUL:
                 ends = edge_starts(self._problem)
@@ -135,8 +136,8 @@ class Profiler:
         return found
 
     @cached_property
-    def _valleys(self) -> list[Chart]:
-        return valleys(self._problem)
+    def _microslip_charts(self) -> list[Chart]:
+        return microslip_charts(self._problem)
 
     def _along(self, tangent: FloatArray, moved: FloatArray) -> FloatArray:
         """Return the change of theta along its tangent, in logarithms of bearable length."""
@@ -186,7 +187,7 @@ class Profiler:
             start,
             self._logarithmic,
             self._problem.n_residuals,
-            looseness=_LOOSENESS,
+            tolerance_factor=_TOLERANCE_FACTOR,
             enough=_ENOUGH,
             steps=_SEARCH_STEPS,
         ).theta
@@ -253,7 +254,7 @@ class Profiler:
     def _jump(self, index: IntArray, sign: FloatArray) -> FloatArray:
         """Return the first distance where a spring lies at minus infinity: to where it is seen."""
         jump, theta = np.full(len(index), np.nan), self._optimum.theta
-        for chart in self._valleys:
+        for chart in self._microslip_charts:
             assert chart.tied is not None
             spring, _ = chart.tied
             total = float(chart.phi(theta[None])[0, spring])
@@ -278,15 +279,20 @@ class Profiler:
 
     @cached_property
     def _friction(self) -> list[tuple[Parameter, Parameter]]:
-        """f_max and sigma of every Dahl element."""
-        elements = self._problem.model.elements
-        return [(e.parameters[0], e.parameters[1]) for e in elements if isinstance(e, Dahl)]
+        """Force limit and stiffness of every law that they scale together."""
+        pairs: list[tuple[Parameter, Parameter]] = []
+        for element in self._problem.model.elements:
+            scale = {element.parameter(s).dimension: s for s in element.scale_parameters}
+            if element.has_memory and {*scale} == {_FORCE, _STIFFNESS}:
+                force, stiffness = scale[_FORCE], scale[_STIFFNESS]
+                pairs.append((element.parameter(force), element.parameter(stiffness)))
+        return pairs
 
     @cached_property
     def _reach(self) -> _Reach:
-        view, springs = self._problem.stiffness_data, (Spring, LinearSystem)
+        view = self._problem.stiffness_data
         stiffness = view.typical_stiffness
-        beside = any(isinstance(e, springs) for e in self._problem.model.elements)
+        beside = any(e.is_linear and e.holds_at_rest for e in self._problem.model.elements)
         return _Reach(
             float(np.log(view.amplitude.min() * _LEAST_X_C)),
             float(np.log(view.amplitude.max() * (_MOST_X_C_BESIDE if beside else _MOST_X_C))),

@@ -1,7 +1,8 @@
-r"""Does the stiffness of friction and springs rise with amplitude? No Dahl element's does.
+r"""Does the stiffness of friction and springs rise with amplitude? That of many laws cannot.
 
 Re N falls with A for every Dahl element and for every sum of them, whatever the parameters; a
-spring adds a constant. The real part of the measured dynamic stiffness, less the modelled parts
+spring adds a constant. A law says so of itself (`softens`); beside one that does not, there is no
+test. The real part of the measured dynamic stiffness, less the modelled parts
 of mass and other linear elements, is therefore a falling function of amplitude, and a rise
 between any two amplitudes speaks against every such model, also where the fitted one leaves
 other departures. No curve is assumed: the stiffness is a straight line over the logarithm of the
@@ -22,7 +23,7 @@ from scipy import special
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.physics import friction_stiffness
-from dahl_ident.elements import Dahl, Mass, Spring
+from dahl_ident.elements import Element
 from dahl_ident.fitting import Optimum
 from dahl_ident.units import shown_unit
 
@@ -30,6 +31,7 @@ _BANDS = 8
 _NARROWEST = np.log(1.1)  # of a band, in the logarithm of the amplitude
 _FEWEST_ROWS = 3  # in a band
 _LEAST_DOF = 6
+_MASS = (1, -1, 2)  # powers of force, displacement and time
 
 
 @dataclass(frozen=True)
@@ -58,13 +60,14 @@ class Stiffening:
     def __str__(self) -> str:
         size = with_unit(100.0 * self.rise, 100.0 * self.stderr, "%")
         ends = f"from {self.low:.3g} to {self.high:.3g} {self.unit}"
-        return f"stiffness rises with amplitude, by {size} {ends}, which no Dahl element's does"
+        return f"stiffness rises with amplitude, by {size} {ends}, which this law cannot describe"
 
 
 def stiffening(optimum: Optimum) -> Stiffening | None:
     """Return the most significant rise of stiffness with amplitude; None where there is none."""
     elements = optimum.problem.model.elements
-    if optimum.is_exact or not any(isinstance(e, Dahl) for e in elements):
+    friction = [e for e in elements if not e.is_linear]
+    if optimum.is_exact or not friction or not all(e.softens for e in friction):
         return None
     view = optimum.problem.stiffness_data
     rows = np.flatnonzero((view.harmonic == 1) & (view.weights > 0.0))
@@ -75,18 +78,23 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
     x = np.log(view.amplitude[rows])
     centre = x @ own / own.sum(axis=0)
     design = np.column_stack([own, own * (x[:, None] - centre)])
-    if any(isinstance(e, Mass) and e.parameters[0].free for e in elements):
+    if any(_is_free_mass(e) for e in elements):
         square = view.omega[rows] ** 2
         design = np.column_stack([design, square / square.mean() - 1.0])
     dof = len(rows) - design.shape[1]
     if count < 2 or dof < _LEAST_DOF:
         return None
-    stiffness = friction_stiffness(optimum, (Dahl, Spring)).real[rows]
+    stiffness = friction_stiffness(optimum, with_springs=True).real[rows]
     values, covariance = _weighted_means(design, stiffness, view.weights[rows], dof)
     unit = shown_unit("m", optimum.problem.data.motion)
     return _largest_rise(
         np.exp(centre).tolist(), unit, values[:count], covariance[:count, :count], dof
     )
+
+
+def _is_free_mass(element: Element) -> bool:
+    own = [element.parameter(label) for label in element.linear_parameters]
+    return element.is_linear and any(p.free and p.dimension == _MASS for p in own)
 
 
 def _bands(x: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:

@@ -18,15 +18,18 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.parameters import parameter_values
-from dahl_ident.elements import Dahl
-from dahl_ident.elements.hysteresis import margin_change
+from dahl_ident.elements import Element
 from dahl_ident.fitting import Optimum
 
 _STEPS = 240
+_THETA = 2.0 * np.pi * np.arange(_STEPS) / _STEPS
 _CYCLES = 3
 _NEWTON_STEPS = 8
 _LONGEST = 0.1  # of one of them
 _SMALL = 1e-4  # third harmonic over the amplitude, for the derivative
+
+Law = tuple[Element, Sequence[FloatArray]]
+"""An element with memory and the values of its parameters."""
 
 
 def third_harmonic_share(optimum: Optimum) -> FloatArray:
@@ -43,28 +46,29 @@ def third_harmonic_share(optimum: Optimum) -> FloatArray:
     A = problem.stiffness_data.amplitude[forced]
     omega = problem.stiffness_data.omega[forced]
     linear = np.zeros(A.shape, dtype=np.complex128)
-    dahl = []
+    friction = []
     for element in problem.model.elements:
-        own = [values[p.name] for p in element.parameters]
-        if isinstance(element, Dahl):
-            dahl.append(own)
+        own = [np.asarray(values[p.name]) for p in element.parameters]
+        if element.has_memory:
+            friction.append((element, own))
         else:
-            linear += element.stiffness([np.asarray(v) for v in own], A, 3.0 * omega, 1)
+            linear += element.stiffness(own, A, 3.0 * omega, 1)
     X = np.zeros(A.shape, dtype=np.complex128)
     for _ in range(_NEWTON_STEPS):
-        step = _newton_step(X, A, linear, dahl)
+        step = _newton_step(X, A, linear, friction)
         X += step * np.minimum(1.0, _LONGEST / np.maximum(np.abs(step), 1e-300))
     return np.abs(X)
 
 
 def _newton_step(
-    X: ComplexArray, A: FloatArray, linear: ComplexArray, dahl: Sequence[Sequence[float]]
+    X: ComplexArray, A: FloatArray, linear: ComplexArray, friction: Sequence[Law]
 ) -> ComplexArray:
     """Return the change of X_3/A that balances the third harmonic, to first order."""
     trial = X + _SMALL * np.array([[0.0], [1.0], [1.0j]])
     force = np.zeros(trial.shape, dtype=np.complex128)
-    for f_max, sigma, alpha in dahl:
-        force += _third_of_force(trial, A, f_max, sigma, alpha)
+    path = _path(trial, A)
+    for element, values in friction:
+        force += 2.0 / _STEPS * element.steady_force(values, path, _CYCLES) @ np.exp(-3j * _THETA)
     total = linear * trial + force / A
     by_real, by_imag = (total[1:] - total[0]) / _SMALL
     determinant = by_real.real * by_imag.imag - by_real.imag * by_imag.real
@@ -73,22 +77,7 @@ def _newton_step(
     return np.asarray((real + 1j * imag) / determinant)
 
 
-def _third_of_force(
-    trial: ComplexArray, A: FloatArray, f_max: float, sigma: float, alpha: float
-) -> ComplexArray:
-    """Return F_3 under A (cos theta + Re(X_3/A exp(3j theta))), X_3/A of shape (trials, n)."""
-    theta = 2.0 * np.pi * np.arange(_STEPS) / _STEPS
-    shape = np.cos(theta) + (trial[..., None] * np.exp(3j * theta)).real
-    steps = np.diff(shape, append=shape[..., :1], axis=-1)
-    beta = sigma * A / f_max
-    force = np.broadcast_to(np.tanh(beta), (len(trial), A.size)).copy()
-    third = np.zeros(force.shape, dtype=np.complex128)
-    turn = np.asarray(np.exp(-3j * theta))
-    for cycle in range(_CYCLES):
-        for i in range(_STEPS):
-            if cycle == _CYCLES - 1:
-                third += force * turn[i]
-            step = steps[..., i]
-            sign = np.sign(step)
-            force = force - sign * margin_change(1.0 - sign * force, np.abs(step) * beta, alpha)
-    return np.asarray(third * (2.0 * f_max / _STEPS))
+def _path(trial: ComplexArray, A: FloatArray) -> FloatArray:
+    """Return A (cos theta + Re(X_3/A exp(3j theta))) over a cycle, for X_3/A (trials, n)."""
+    third = (trial[..., None] * np.exp(3j * _THETA)).real
+    return np.asarray(A[:, None] * (np.cos(_THETA) + third))

@@ -5,8 +5,8 @@ model, R exp(u), where u is a polynomial of the covariate's logarithm, complex, 
 phase each have their own. What the parameters could explain is taken out
 (:mod:`dahl_ident.diagnostics.residual_space`); an F or chi-square test tells whether the rest is
 more than noise. The departure's size comes with it, in percent and degrees, so that a
-significant trend can be told from one that matters. A Wald-Wolfowitz test of the residuals' signs
-looks for runs that no low polynomial follows.
+significant trend can be distinguished from one that matters. A Wald-Wolfowitz test of the
+residuals' signs looks for runs that no low polynomial follows.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from scipy import special
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
+from dahl_ident.diagnostics.physics import is_spring
 from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, ResidualSpace
-from dahl_ident.elements import Dahl, Element, Spring
 from dahl_ident.fitting import Optimum
 from dahl_ident.units import shown_unit
 
@@ -76,7 +76,7 @@ class Trend:
             for name, part in (("stiffness", self.stiffness), ("loss", self.loss))
             if abs(part.value) > 2.0 * part.stderr
         ]
-        return f"{text} ({', '.join(parts)} against it)" if parts else text
+        return f"{text} ({', '.join(parts)} relative to it)" if parts else text
 
 
 @dataclass(frozen=True)
@@ -168,15 +168,14 @@ def _friction_parts(optimum: Optimum) -> tuple[ComplexArray, ComplexArray]:
     problem = optimum.problem
     values = parameter_values(optimum)
     view = problem.stiffness_data
-    stiff: tuple[type[Element], ...] = (Dahl, Spring) if optimum.status.at_infinity else (Dahl,)
     total, stiffness, loss = np.zeros((3, len(view.amplitude)), dtype=np.complex128)
     for element in problem.model.elements:
         own = [np.asarray(values[p.name]) for p in element.parameters]
         part = view.of(element, own)
         total += part
-        if isinstance(element, stiff):
+        if not element.is_linear or (optimum.status.at_infinity and is_spring(element)):
             stiffness += part.real
-        if isinstance(element, Dahl):
+        if not element.is_linear:
             loss += 1j * part.imag
     inverted = problem.data.quantity in ("receptance", "mobility", "accelerance")
     sign = -1.0 if inverted else 1.0

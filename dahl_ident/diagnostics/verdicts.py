@@ -25,16 +25,24 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.advice import advice
 from dahl_ident.diagnostics.combinations import Candidate, candidates, stiffness_seen
+from dahl_ident.diagnostics.confidence_levels import LEVELS, percent, thresholds
+from dahl_ident.diagnostics.error_model import EXPONENT, ErrorModel
+from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.formatting import interval as interval_text
 from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.information import Information, shares
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval
-from dahl_ident.diagnostics.levels import LEVELS, percent, thresholds
 from dahl_ident.fitting import Optimum, Status
 
 IDENTIFIED_BELOW = 0.25
 NOT_IDENTIFIED_ABOVE = 1.0
 _SIZE_THAT_MATTERS = 0.1  # of the response, for parameters that may be zero
+_BY_RANGE = 0.1  # u of a logarithm that the exponent's assumed range makes, not the data
+_MEASURE = "measure more points, or use a model that misses less"
+_REMEDY = {
+    EXPONENT: "give it if it is known, or measure on both sides of the knee",
+    RUNS: "measure on more days or mountings",
+}
 _VECTOR_PART = 0.05  # component of the undetermined direction worth naming
 
 
@@ -118,7 +126,7 @@ class Identifiability:
     Examples
     --------
     >>> import dahl_ident as di
-    >>> judged = di.identifiability(di.fit(di.load_dataset("microslip"), di.Dahl()))
+    >>> judged = di.diagnostics.identifiability(di.fit(di.load_dataset("microslip"), di.Dahl()))
     >>> {name: p.verdict.value for name, p in judged.parameters.items()}
     {'f_max': 'not identified', 'sigma': 'identified'}
     """
@@ -213,8 +221,13 @@ def identifiability(fit: Fit) -> Identifiability:
     return judged(fit.optimum, fit.conf_interval("profile"))
 
 
-def judged(optimum: Optimum, intervals: ConfidenceIntervals) -> Identifiability:
-    """Return the verdicts on an optimum, given its profile intervals at the three LEVELS."""
+def judged(
+    optimum: Optimum, intervals: ConfidenceIntervals, errors: ErrorModel | None = None
+) -> Identifiability:
+    """Return the verdicts on an optimum, given its profile intervals at the three LEVELS.
+
+    With `errors`, parameters that noise leaves determined and other sources do not are not.
+    """
     information, problem = Information(optimum), optimum.problem
     natural = natural_sizes(optimum)
     fisher = np.sqrt(np.diagonal(optimum.covariance)) / natural
@@ -223,6 +236,13 @@ def judged(optimum: Optimum, intervals: ConfidenceIntervals) -> Identifiability:
         name: _verdict(float(f), float(p), intervals[name][-1])
         for name, f, p in zip(problem.names, fisher, profile, strict=True)
     }
+    beyond = {} if errors is None else _lost_beyond_noise(errors, verdicts, natural)
+    verdicts |= dict.fromkeys(beyond, Verdict.NOT_IDENTIFIED)
+    if errors is not None:
+        for name, size in zip(problem.names, natural.tolist(), strict=True):
+            u = float(errors.covariance[(errors.names.index(name),) * 2]) ** 0.5 / size
+            if verdicts[name] is Verdict.IDENTIFIED and u > IDENTIFIED_BELOW:
+                verdicts[name] = Verdict.WEAK
     lost = frozenset(n for n, v in verdicts.items() if v is Verdict.NOT_IDENTIFIED)
     loose = frozenset(n for n, v in verdicts.items() if v is not Verdict.IDENTIFIED)
     found = _determined(optimum, information, lost, loose)
@@ -231,6 +251,9 @@ def judged(optimum: Optimum, intervals: ConfidenceIntervals) -> Identifiability:
         unit = parameter.unit
         limits = _shown(intervals[name], verdicts[name])
         text = _text(optimum, name, unit, verdicts[name], limits, lost)
+        if name in beyond and errors is not None:
+            shown = with_unit(errors.values[name], errors.stderr[name], unit)
+            text = f"{name}: {shown}, not determined, {beyond[name]}"
         parameters[name] = ParameterVerdict(
             name, unit, verdicts[name], float(fisher[i]), float(profile[i]), limits, text
         )
@@ -242,6 +265,22 @@ def judged(optimum: Optimum, intervals: ConfidenceIntervals) -> Identifiability:
         direction = direction if len(direction) > 1 else {}
     rows = dict(zip(problem.names, shares(optimum), strict=True))
     return Identifiability(parameters, found, information.rank, direction, rows)
+
+
+def _lost_beyond_noise(
+    errors: ErrorModel, verdicts: Mapping[str, Verdict], natural: FloatArray
+) -> dict[str, str]:
+    """Return why parameters that noise alone leaves determined are not, by name."""
+    found = {}
+    for name, size in zip(verdicts, natural.tolist(), strict=True):
+        i = errors.names.index(name)
+        parts = {n: float(C[i, i]) for n, C in errors.contributions.items()}
+        u = sum(parts.values()) ** 0.5 / size
+        source = max(parts, key=lambda n: parts[n])
+        ranged = source == EXPONENT and u > _BY_RANGE and parts[source] > 0.5 * (u * size) ** 2
+        if verdicts[name] is not Verdict.NOT_IDENTIFIED and (u > NOT_IDENTIFIED_ABOVE or ranged):
+            found[name] = f"because of {source}: {_REMEDY.get(source, _MEASURE)}"
+    return found
 
 
 def natural_sizes(optimum: Optimum) -> FloatArray:
@@ -296,7 +335,7 @@ def _determined(
     """Return the combinations of parameters that are not identified, but are together.
 
     Of `loose` parameters, short of identified, a product needs two: beside known ones it says no
-    more than its one unknown member, of which the profile has told.
+    more than its one unknown member, which has a verdict of its own.
     """
     units = {p.name: p.unit for p in optimum.problem.parameters}
     units |= {c.expression: c.unit for c in candidates(optimum)}
@@ -310,17 +349,17 @@ def _determined(
         for c in optimum.combinations
         if c.expression not in optimum.names and c.stderr < IDENTIFIED_BELOW * abs(c.value)
     ]
-    told = {c.expression for c in optimum.combinations}
+    known = {c.expression for c in optimum.combinations}
     gone = _run_away(optimum)  # the optimum itself says which combinations of these are left
     for candidate in candidates(optimum):
-        if candidate.expression in told or _runs_away(candidate, optimum, gone):
+        if candidate.expression in known or _runs_away(candidate, optimum, gone):
             continue
         members = candidate.members
         enough = bool(members & lost) and len(members & loose) > 1
         if not (members <= lost if candidate.is_sum else enough):
             continue
         std = float(information.std(candidate.direction))
-        if candidate.is_sum and std > float(information.std(_parts_of(candidate)).min()):
+        if candidate.is_sum and std > float(information.std(_split(candidate)).min()):
             continue  # one of its parts alone is known better
         if std < IDENTIFIED_BELOW:
             size = abs(candidate.value) * std
@@ -356,7 +395,7 @@ def _runs_away(candidate: Candidate, optimum: Optimum, gone: frozenset[str]) -> 
     return bool(going.any()) and not (together and going.sum() == 0.0)
 
 
-def _parts_of(candidate: Candidate) -> FloatArray:
+def _split(candidate: Candidate) -> FloatArray:
     """Return the direction of each member of a sum, one a row."""
     members = np.flatnonzero(candidate.direction)
     return np.diag(candidate.direction)[members]

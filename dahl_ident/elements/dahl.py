@@ -10,7 +10,9 @@ takes one quadrature, see :mod:`dahl_ident.elements.general_dahl`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,26 +21,43 @@ from dahl_ident.arrays import (
     ComplexArray,
     FloatArray,
     array_between,
-    broadcast_shape,
-    finite_array,
-    finite_number,
     non_negative_array,
-    positive_array,
-    positive_number,
-    whole_number,
 )
-from dahl_ident.elements import general_dahl, hysteresis, linear_dahl
-from dahl_ident.elements.element import Element, StiffnessGradient, prefixed
-from dahl_ident.elements.parameter import Parameter
+from dahl_ident.elements import (
+    asymmetric_dahl,
+    dahl_backlash,
+    general_dahl,
+    general_dahl_table,
+    hysteresis,
+    linear_dahl,
+)
+from dahl_ident.elements.element import (
+    Asymptote,
+    Combination,
+    Element,
+    HistoryGradient,
+    StiffnessGradient,
+    UniversalCurve,
+)
+from dahl_ident.elements.friction import Friction
+from dahl_ident.elements.parameter import Assumed, Parameter
 from dahl_ident.errors import ValidationError
 
+if TYPE_CHECKING:
+    import casadi as ca
+
 _EXPONENTS = (1e-9, 1e3)
+_ALPHA = Assumed(1.0)
 _AT_REST = 1e-30
 """Smaller beta are rest, to more digits than a number has."""
+_NO_LOSS, _MICROSLIP, _GROSS_SLIP = 1e9, 1e5, 1e-16
+"""x_c over the largest amplitude, twice, and over the smallest: the limits, to every digit."""
+_SHARP, _SOFT = 1e-6, 1e3  # alpha
+_ONE_SIDED = 0.9  # asymmetry
 _NONE: ComplexArray = np.zeros((), dtype=np.complex128)  # a derivative that nobody asked for
 
 
-class Dahl(Element):
+class Dahl(Friction):
     """Dahl friction: dF/dx = sigma abs(z)^alpha sgn(z), z = 1 - s F/f_max, s = sgn(dx/dt).
 
     Parameters
@@ -49,6 +68,10 @@ class Dahl(Element):
         Contact stiffness at zero force, N/m (N m/rad), > 0. Given: fixed; left out: free.
     alpha : float or None, default 1
         Exponent, from 1e-9 to 1000: 1 is the linear Dahl model. None: free.
+    asymmetry : float or None, default 0
+        a, between -1 and 1: the limits are f_max (1 + a) while the displacement rises and
+        f_max (1 - a) while it falls. None: free. At exactly 0 it is no parameter of the element.
+        The fundamental hardly shows it; the mean force and the even harmonics do.
     name : str, optional
         Prefix of the parameters' names, such as "pivot" for ``pivot_f_max``; needed where a
         model has several Dahl elements.
@@ -56,8 +79,8 @@ class Dahl(Element):
     Raises
     ------
     ValidationError
-        If f_max or sigma is not a number from 1e-90 to 1e90, alpha is outside its range, or
-        `name` is no identifier.
+        If f_max or sigma is not a number from 1e-90 to 1e90, alpha or asymmetry is outside its
+        range, or `name` is no identifier.
 
     Notes
     -----
@@ -72,64 +95,66 @@ class Dahl(Element):
     >>> N = pivot.describing_function([1e-6, 1e-3, 1.0])
     >>> abs(N).round(4).tolist()
     [30.0, 29.2562, 0.1272]
+    >>> damper = Dahl(f_max=1.0, sigma=2000.0, asymmetry=0.2)
+    >>> print(f"{damper.dynamic_stiffness(1e-3, harmonic=0).real * 1e-3:.6f} N of mean force")
+    0.118069 N of mean force
     """
+
+    kind = "dahl"
+    equation = "dF/dx = sigma |1 - s F/f_max|^alpha sgn(1 - s F/f_max), s = sgn(dx/dt)"
+    unique_response = True
+    parameters: tuple[Parameter, ...] = (
+        Parameter("f_max", "N", "friction limit", lower=0.0, transform="log"),
+        Parameter("sigma", "N/m", "contact stiffness", lower=0.0, transform="log"),
+        Parameter(
+            "alpha",
+            "",
+            "exponent of the Dahl model",
+            _ALPHA,
+            lower=0.0,
+            transform="log",
+            scan=(0.25, 0.5, 1.0, 2.0, 4.0),
+            prior=(0.5, 2.0),
+        ),
+    )
+    scale_parameters = ("f_max", "sigma")
+    softens = True
 
     def __init__(
         self,
         f_max: float | None = None,
         sigma: float | None = None,
-        alpha: float | None = 1.0,
+        alpha: float | None = _ALPHA,
         *,
+        asymmetry: float | None = 0.0,
         name: str | None = None,
     ) -> None:
-        self._name = name
-        self._parameters = (
-            _positive(prefixed(name, "f_max"), "N", "friction limit", f_max),
-            _positive(prefixed(name, "sigma"), "N/m", "contact stiffness", sigma),
-            _positive(prefixed(name, "alpha"), "", "exponent of the Dahl model", alpha),
-        )
+        given = {"f_max": f_max, "sigma": sigma, "alpha": alpha, "asymmetry": asymmetry}
+        self._bind(given, name)
         if alpha is not None:
-            array_between(alpha, self._parameters[2].name, *_EXPONENTS)
+            array_between(alpha, self.parameters[2].name, *_EXPONENTS)
+
+    def __new__(cls, *_: Any, asymmetry: float | None = 0.0, **__: Any) -> Dahl:
+        """Return the element of one limit, or that of two where an asymmetry is given."""
+        return object.__new__(cls if asymmetry == 0.0 else _AsymmetricDahl)
+
+    @classmethod
+    def from_description(cls, rest: Mapping[str, Any], name: str | None) -> Element:
+        """Return the element that :meth:`describe` described."""
+        blank = Dahl(asymmetry=None if "asymmetry" in rest else 0.0, name=name)
+        return blank._described(rest)
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        """Return dF/dx (Eqn. 2)."""
+        f_max, sigma, alpha = values
+        margin = 1.0 - direction * force / f_max
+        return sigma * np.sign(margin) * np.fabs(margin) ** alpha
 
     @property
     def characteristic_displacement(self) -> float:
         """x_c = f_max/sigma, m: the displacement at which friction turns from spring to slip."""
-        f_max, sigma, _ = self.known_values()
+        f_max, sigma, *_ = self.known_values()
         return float(f_max / sigma)
-
-    def describing_function(self, amplitude: ArrayLike) -> ComplexArray:
-        """Return N(A) = (a_1 - j b_1)/A, the fundamental of force over displacement.
-
-        Parameters
-        ----------
-        amplitude : array_like
-            Zero-to-peak displacement A >= 0, m. At A = 0 the limit, sigma.
-
-        Returns
-        -------
-        ndarray of complex, or complex for a scalar
-            N/m.
-
-        Raises
-        ------
-        ModelError
-            If a parameter has no value.
-        ValidationError
-            If an amplitude is negative, NaN, infinite or complex.
-
-        Notes
-        -----
-        Eqns. 51 and 52. Within 1e-13 of each part for alpha = 1, within 1e-10 of abs(N) for other
-        exponents from 0.01 to 100.
-
-        Examples
-        --------
-        >>> N = Dahl(f_max=1.0, sigma=1.0).describing_function(1.0)
-        >>> print(f"{abs(N):.5f} at {np.degrees(np.angle(N)):.2f} degrees")
-        0.79291 at 22.51 degrees
-        """
-        A = non_negative_array(amplitude, "amplitude")
-        return self.stiffness(self.known_values(), A, np.zeros(()))[()]
 
     def gradient(
         self, amplitude: ArrayLike, names: Iterable[str] | None = None
@@ -174,222 +199,214 @@ class Dahl(Element):
         found = dict(zip(known, (*result.by_parameter, result.by_amplitude), strict=True))
         return {name: found[name][()] for name in wanted}
 
-    def fourier_coefficients(
-        self, amplitude: ArrayLike, harmonic: int = 1
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return a_k and b_k of F(t) = sum a_k cos(k omega t) + b_k sin(k omega t)  (Eqn. 1).
-
-        Parameters
-        ----------
-        amplitude : array_like
-            Zero-to-peak displacement A >= 0 of x = A cos(omega t), m.
-        harmonic : int, default 1
-            k >= 1; even harmonics are exactly zero.
-
-        Returns
-        -------
-        a, b : ndarray, or float for a scalar
-            N. Dissipation makes b_1 negative.
-
-        Raises
-        ------
-        ModelError
-            If a parameter has no value.
-        ValidationError
-            If an amplitude is negative, NaN, infinite or complex, or `harmonic` is no whole
-            number of at least 1.
-
-        Notes
-        -----
-        Eqns. 36 and 50, in closed form: a_k = 2 f_max I_k(beta)/cosh(beta) for alpha = 1.
-
-        Examples
-        --------
-        >>> a, b = Dahl(f_max=1.0, sigma=1.0).fourier_coefficients(1.0)
-        >>> print(f"{a:.4f} {b:.4f}")
-        0.7325 -0.3035
-        """
-        A = non_negative_array(amplitude, "amplitude")
-        k = whole_number(harmonic, "harmonic", 1)
-        f_max, sigma, alpha = self.known_values()
-        beta = sigma * A / f_max
+    def _coefficients(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, harmonic: int
+    ) -> ComplexArray:
+        f_max, sigma, alpha = values
+        beta = sigma * amplitude / f_max
         if _is_linear(alpha):
-            c = f_max * linear_dahl.harmonic(beta, k)
-        else:
-            c = f_max * general_dahl.harmonic(beta, alpha, k)
-        return c.real[()], -c.imag[()]
+            return np.asarray(f_max * linear_dahl.harmonic(beta, harmonic))
+        return np.asarray(f_max * general_dahl.harmonic(beta, alpha, harmonic))
 
-    def gain(self, amplitude: ArrayLike) -> FloatArray:
-        """Return abs(N(A)), N/m (Eqn. 51); arguments and errors as `describing_function`.
+    def _loop(self, values: Sequence[float], amplitude: float, theta: FloatArray) -> FloatArray:
+        return hysteresis.steady_force(theta, amplitude, *values)
 
-        Examples
-        --------
-        >>> print(f"{Dahl(f_max=1.0, sigma=1.0).gain(2.2):.4f}")
-        0.4988
-        """
-        return np.abs(self.describing_function(amplitude))[()]
-
-    def phase(self, amplitude: ArrayLike) -> FloatArray:
-        """Return arg N(A), rad, between 0 and pi/2 (Eqn. 52).
-
-        Arguments and errors as `describing_function`.
-
-        Examples
-        --------
-        >>> print(f"{np.degrees(Dahl(f_max=1.0, sigma=1.0).phase(2.7)):.2f}")
-        44.96
-        """
-        return np.angle(self.describing_function(amplitude))[()]
-
-    def equivalent_stiffness(self, amplitude: ArrayLike) -> FloatArray:
-        """Return a_1/A = Re N(A), N/m; arguments and errors as `describing_function`.
-
-        Examples
-        --------
-        >>> print(Dahl(f_max=1.0, sigma=3.0).equivalent_stiffness(0.0))
-        3.0
-        """
-        return self.describing_function(amplitude).real[()]
-
-    def equivalent_damping(self, amplitude: ArrayLike, omega: ArrayLike) -> FloatArray:
-        """Return -b_1/(A omega) = Im N(A)/omega, the viscous damper with the same loss.
-
-        Parameters
-        ----------
-        amplitude : array_like
-            Zero-to-peak displacement A >= 0, m.
-        omega : array_like
-            Angular frequency > 0, rad/s; broadcast with `amplitude`.
-
-        Returns
-        -------
-        ndarray, or float for scalars
-            N s/m.
-
-        Raises
-        ------
-        ModelError
-            If a parameter has no value.
-        ValidationError
-            If an amplitude is negative or a frequency not positive, or shapes do not fit.
-
-        Examples
-        --------
-        >>> print(f"{Dahl(f_max=1.0, sigma=1.0).equivalent_damping(1.0, 2.0):.4f}")
-        0.1518
-        """
-        A = non_negative_array(amplitude, "amplitude")
-        w = positive_array(omega, "omega")
-        broadcast_shape(amplitude=A, omega=w)
-        return (self.describing_function(A).imag / w)[()]
-
-    def dissipated_energy(self, amplitude: ArrayLike) -> FloatArray:
-        """Return W = pi A abs(b_1), the energy lost in one cycle.
-
-        W = 4 f_max A (1 - tanh(beta)/beta) for alpha = 1. Arguments and errors as
-        `describing_function`; joules.
-
-        Examples
-        --------
-        >>> print(f"{Dahl(f_max=1.0, sigma=1.0).dissipated_energy(1.0):.4f}")
-        0.9536
-        """
-        _, b = self.fourier_coefficients(amplitude)
-        return (np.pi * non_negative_array(amplitude, "amplitude") * -b)[()]
-
-    def loop(self, amplitude: float, points: int = 401) -> tuple[FloatArray, FloatArray]:
-        """Return one closed hysteresis loop, force against displacement.
-
-        Parameters
-        ----------
-        amplitude : float
-            Zero-to-peak displacement A > 0, m.
-        points : int, default 401
-            Samples of one cycle of x = A cos(theta), theta from 0 to 2 pi, both ends included.
-
-        Returns
-        -------
-        displacement, force : ndarray, shape (points,)
-            m and N.
-
-        Raises
-        ------
-        ModelError
-            If a parameter has no value.
-        ValidationError
-            If `amplitude` is not one finite number above zero, or `points` is below 3.
-
-        Notes
-        -----
-        Eqns. 10 and 11 for alpha = 1.
-
-        Examples
-        --------
-        >>> x, F = Dahl(f_max=1.0, sigma=1.0).loop(1.0, points=5)
-        >>> F.round(4).tolist()
-        [0.7616, -0.3519, -0.7616, 0.3519, 0.7616]
-        """
-        A = positive_number(amplitude, "amplitude")
-        samples = whole_number(points, "points", 3)
-        f_max, sigma, alpha = (float(v) for v in self.known_values())
-        return hysteresis.steady_loop(A, f_max, sigma, alpha, samples)
-
-    def force(
+    def force_history(
         self,
-        displacement: ArrayLike,
-        initial_force: float = 0.0,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
         *,
-        velocity: ArrayLike | None = None,
-        acceleration: ArrayLike | None = None,
+        acceleration: FloatArray | None = None,
     ) -> FloatArray:
-        """Return the friction force for any displacement history, exactly.
+        """Return the force at every sample, exactly (Eqn. 3, segment by segment), unchecked."""
+        f_max, sigma, alpha = (float(v) for v in values)
+        return hysteresis.force_history(displacement, f_max, sigma, alpha, state)
 
-        Parameters
-        ----------
-        displacement : array_like, shape (n,)
-            m; between samples the motion is taken as monotone. The force does not depend on
-            how densely a monotone stretch is sampled, nor on time.
-        initial_force : float, default 0
-            Force at the first sample, N, between -f_max and f_max.
-        velocity, acceleration : optional
-            Not used by friction; here so that every element has the same call.
+    def force_history_gradient(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
+        *,
+        acceleration: FloatArray | None = None,
+    ) -> HistoryGradient:
+        """Return the force at every sample with its derivatives, unchecked; exact at alpha = 1.
 
-        Returns
-        -------
-        ndarray, shape (n,)
-            N; a scalar displacement gives a scalar, the initial force.
-
-        Raises
-        ------
-        ModelError
-            If a parameter has no value.
-        ValidationError
-            If `displacement` has more than one dimension, is complex, NaN or infinite, or
-            abs(initial_force) exceeds f_max.
-
-        Notes
-        -----
-        Eqn. 3, stretch by stretch.
-
-        Examples
-        --------
-        >>> Dahl(f_max=1.0, sigma=1.0).force([0.0, 1.0, 0.5]).round(4).tolist()
-        [0.0, 0.6321, -0.0101]
+        While alpha is fixed at 1 the derivative by it is left at zero, as in
+        :meth:`stiffness_gradient`.
         """
-        x = finite_array(displacement, "displacement")
-        if x.ndim > 1:
-            raise ValidationError(
-                f"displacement has shape {x.shape}; expected one history, shape (n,)"
+        f_max, sigma, alpha = (float(v) for v in values)
+        if alpha != 1.0 or self.parameters[2].free:
+            return super().force_history_gradient(
+                values, displacement, velocity, state, acceleration=acceleration
             )
-        f_max, sigma, alpha = (float(v) for v in self.known_values())
-        start = finite_number(initial_force, "initial_force")
-        if abs(start) > f_max:
+        force, by_state, by = hysteresis.linear_history_gradient(displacement, f_max, sigma, state)
+        return HistoryGradient(force, by_state, (*by.T, np.zeros(force.shape)))
+
+    def _step(
+        self, values: Sequence[FloatArray], force: FloatArray, step: FloatArray
+    ) -> FloatArray:
+        f_max, sigma, alpha = values
+        sign = np.sign(step)
+        margin = 1.0 - sign * force / f_max
+        change = hysteresis.margin_change(margin, np.abs(step) * sigma / f_max, float(alpha))
+        return np.asarray(force - sign * f_max * change)
+
+    def branch(
+        self, values: Sequence[float], start: FloatArray | float, path: FloatArray
+    ) -> FloatArray | None:
+        """Return the force on the way up from `start` and its slope (Eqn. 3)."""
+        f_max, sigma, alpha = values
+        margin = np.asarray(1.0 - start / f_max)
+        change = hysteresis.margin_change(margin, sigma / f_max * path, alpha)
+        return np.array([start - f_max * change, sigma * (margin + change) ** alpha])
+
+    def _check_start(self, values: Sequence[float], initial_force: float) -> None:
+        f_max = values[0]
+        if abs(initial_force) > f_max:
             raise ValidationError(
-                f"initial_force is {start!r}; expected a force between -f_max and f_max "
+                f"initial_force is {initial_force!r}; expected a force between -f_max and f_max "
                 f"(f_max = {f_max!r})"
             )
-        force = hysteresis.force_history(np.atleast_1d(x), f_max, sigma, alpha, start)
-        return force if x.ndim else force[0]
+
+    def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return 4 sigma/pi and 4 f_max/pi.
+
+        The force is largest where the motion turns: there it is at most f_max and, since z^-alpha
+        is convex, at most sigma A. The fundamental of a wave of height 1 is at most 4/pi, that of
+        the square wave.
+        """
+        f_max, sigma, _ = values
+        return 4.0 / np.pi * np.asarray(sigma), 4.0 / np.pi * np.asarray(f_max)
+
+    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return x_c = f_max/sigma twice."""
+        x_c = np.asarray(values[0] / values[1])
+        return x_c, x_c
+
+    def transient_decay(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> FloatArray:
+        """Return the factor by which a deviation from the steady loop shrinks in one cycle."""
+        f_max, sigma, alpha = values
+        beta = np.asarray(sigma * amplitude / f_max)
+        return hysteresis.transient_decay(beta, alpha) + 0.0 * omega
+
+    def casadi_stiffness(
+        self, values: Sequence[ca.SX], amplitude: ca.SX, omega: ca.SX, harmonic: int = 1
+    ) -> tuple[ca.SX, ca.SX]:
+        """Return real and imaginary part of F_k/X_1; alpha fixed at 1 is in closed form."""
+        from dahl_ident.elements import casadi_dahl
+
+        f_max, sigma, alpha = values
+        beta = sigma * amplitude / f_max
+        exponent = self.parameters[2]
+        if harmonic == 1 and not exponent.free and exponent.value == 1.0:
+            h = casadi_dahl.linear_describing_function(beta)
+        else:
+            h = casadi_dahl.general_describing_function(beta, alpha, harmonic)
+        return sigma * h.real, sigma * h.imag
+
+    def combinations(self) -> tuple[Combination, ...]:
+        """Return what microslip and the knee determine."""
+        kappa = {"sigma": 2.0, "f_max": -1.0}
+        if self.parameters[2].free:
+            loss = Combination("alpha sigma^2/f_max", {"alpha": 1.0, **kappa}, "loss in microslip")
+        else:
+            loss = Combination("sigma^2/f_max", kappa, "loss in microslip")
+        x_c = Combination("f_max/sigma", {"f_max": 1.0, "sigma": -1.0}, "where slip sets in")
+        return loss, x_c
+
+    def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
+        """Return the limits at infinity, for amplitudes from `low` to `high`, m.
+
+        The distances are those at which the model is its limit to five digits or more, three for
+        no full slip.
+        """
+        alpha = self.parameters[2]
+        pins = {"alpha": 1.0} if alpha.free else {}
+        loss = self.combinations()[0]
+        found = [
+            Asymptote(
+                "no_loss",
+                "a spring",
+                pins,
+                ("f_max", "sigma", _NO_LOSS * high),
+                {"f_max": np.inf},
+                (("sigma", {"sigma": 1.0}),),
+            ),
+            Asymptote(
+                "microslip",
+                "a spring with a loss that grows with the amplitude",
+                pins,
+                ("f_max", "sigma", _MICROSLIP * high),
+                {"f_max": np.inf, "sigma": np.inf},
+                ((loss.expression, loss.powers),),
+                adds_to_spring="sigma",
+            ),
+            Asymptote(
+                "gross_slip",
+                "Coulomb friction",
+                pins,
+                ("sigma", "f_max", 1.0 / (_GROSS_SLIP * low)),
+                {"sigma": np.inf},
+                (("f_max", {"f_max": 1.0}),),
+            ),
+        ]
+        if alpha.free:
+            found.append(
+                Asymptote(
+                    "sharp_knee",
+                    "elastic up to f_max, then full slip",
+                    {"alpha": _SHARP},
+                    None,
+                    {"alpha": 0.0},
+                    (("f_max", {"f_max": 1.0}), ("sigma", {"sigma": 1.0})),
+                )
+            )
+            found.append(
+                Asymptote(
+                    "no_full_slip",
+                    "dF/dx = sigma exp(-s F/phi), which never slips fully",
+                    {"alpha": _SOFT},
+                    None,
+                    {"f_max": np.inf, "alpha": np.inf},
+                    (
+                        ("f_max/alpha", {"f_max": 1.0, "alpha": -1.0}),
+                        ("sigma", {"sigma": 1.0}),
+                    ),
+                )
+            )
+        return tuple(found)
+
+    def alternatives(self) -> dict[str, tuple[Element, ...]]:
+        """Return the other exponent, and two elements."""
+        alpha = self.parameter("alpha")
+        name = "exponent 1" if alpha.free else "exponent free"
+        other = alpha.fixed(1.0) if alpha.free else alpha.freed()
+        exponent = self.with_bound(tuple(other if p is alpha else p for p in self.parameters))
+        return {name: (exponent,), "two Dahl elements": (Dahl(name="early"), Dahl(name="late"))}
+
+    def universal_curve(self) -> UniversalCurve | None:
+        """Return h(beta) = N/sigma of the linear Dahl model; None for another exponent."""
+        _, sigma, alpha = (float(v) for v in self.known_values())
+        return UniversalCurve(sigma, linear_dahl.describing_function) if alpha == 1.0 else None
+
+    def tabulated(self) -> Dahl:
+        """Return this element with N from tables in place of quadratures, if it needs any.
+
+        Examples
+        --------
+        >>> Dahl(alpha=2.0).tabulated()
+        TabulatedDahl(f_max=free, sigma=free, alpha=2)
+        >>> Dahl().tabulated()
+        Dahl(f_max=free, sigma=free, alpha=1)
+        """
+        alpha = self.parameters[2]
+        return TabulatedDahl(self) if alpha.free or alpha.value != 1.0 else self
 
     def stiffness(
         self,
@@ -428,6 +445,41 @@ class Dahl(Element):
         """
         return self._gradient(values, amplitude, harmonic, with_alpha=bool(self.parameters[2].free))
 
+    def stiffness_slope(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Return N and dN/dA, unchecked."""
+        found = self._gradient(values, amplitude, 1, with_alpha=False)
+        return found.value, found.by_amplitude
+
+    def normalised(
+        self, values: Sequence[FloatArray]
+    ) -> tuple[FloatArray, FloatArray, Sequence[FloatArray]]:
+        """Return f_max, sigma and (1, 1, alpha)."""
+        f_max, sigma, alpha = values
+        return f_max, sigma, (np.ones(()), np.ones(()), alpha)
+
+    def behind_gap(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        gap: FloatArray,
+        harmonic: int,
+        *,
+        derivatives: bool = True,
+    ) -> StiffnessGradient | None:
+        """Return F_k/X_1 behind a gap, with derivatives, the gap's last; None unless alpha = 1."""
+        f_max, sigma, alpha = values
+        by_alpha = derivatives and self.parameters[2].free
+        if by_alpha or not _is_linear(alpha) or harmonic > dahl_backlash.HIGHEST:
+            return None
+        beta, eta = np.broadcast_arrays(sigma * amplitude / f_max, 0.5 * sigma * gap / f_max)
+        parts = dahl_backlash.curve(beta.ravel(), eta.ravel(), harmonic, derivatives=derivatives)
+        h, by_beta, by_eta = (p.reshape(beta.shape) for p in parts)
+        both = beta * by_beta + eta * by_eta
+        by = (-sigma / f_max * both, h + both, np.zeros_like(h), 0.5 * sigma**2 / f_max * by_eta)
+        return StiffnessGradient(sigma * h, sigma**2 / f_max * by_beta, by)
+
     def _gradient(
         self,
         values: Sequence[FloatArray],
@@ -465,8 +517,147 @@ class Dahl(Element):
         return StiffnessGradient(h, slope, (by_f_max, by_sigma, by_alpha))
 
 
-def _positive(name: str, unit: str, description: str, value: float | None) -> Parameter:
-    return Parameter(name, unit, description, value, lower=0.0, transform="log")
+class _AsymmetricDahl(Dahl):
+    """Dahl friction with two limits: what follows from symmetry comes from the slope instead."""
+
+    equation = (
+        "dF/dx = sigma |1 - s F/f|^alpha sgn(1 - s F/f), f = f_max (1 + s asymmetry), "
+        "s = sgn(dx/dt)"
+    )
+    unique_response = False
+    parameters = (
+        *Dahl.parameters,
+        Parameter(
+            "asymmetry",
+            "",
+            "difference of the limits over their sum",
+            lower=-1.0,
+            upper=1.0,
+            scan=(-0.3, 0.0, 0.3),
+            prior=(-0.5, 0.5),
+        ),
+    )
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        """Return dF/dx (Eqn. 2), with the limit of the direction."""
+        f_max, sigma, alpha, asymmetry = values
+        limit = f_max * (1.0 + direction * asymmetry)
+        return super().slope(force, direction, velocity, (limit, sigma, alpha))
+
+    def stiffness(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> ComplexArray:
+        """Return F_k/X_1, in closed form for alpha = 1."""
+        f_max, sigma, alpha, asymmetry = values
+        if not _is_linear(alpha) or harmonic > asymmetric_dahl.HIGHEST:
+            return Friction.stiffness(self, values, amplitude, omega, harmonic)
+        moving = np.maximum(amplitude, 1e-12 * f_max / sigma)  # rest, to every digit
+        Z = asymmetric_dahl.stiffness(moving, f_max, sigma, asymmetry, harmonic)
+        return np.asarray(Z + 0.0 * omega)
+
+    def stiffness_gradient(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> StiffnessGradient:
+        """Return F_k/X_1 with its derivatives, in closed form for alpha fixed at 1."""
+        f_max, sigma, alpha, asymmetry = values
+        general = self.parameters[2].free or not _is_linear(alpha)
+        if general or harmonic > asymmetric_dahl.HIGHEST:
+            return Friction.stiffness_gradient(self, values, amplitude, omega, harmonic)
+        moving = np.maximum(amplitude, 1e-12 * f_max / sigma) + 0.0 * omega
+        N, by_A, by = asymmetric_dahl.gradient(moving, f_max, sigma, asymmetry, harmonic)
+        return StiffnessGradient(N, by_A, (*by[:2], np.zeros_like(N), by[2]))
+
+    def stiffness_slope(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Return N and dN/dA, unchecked."""
+        if not _is_linear(values[2]):
+            return Friction.stiffness_slope(self, values, amplitude, omega)
+        found = self.stiffness_gradient(values, amplitude, omega)
+        return found.value, found.by_amplitude
+
+    def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
+        """Return those of one limit; in microslip nothing shows the other."""
+        pins = {"asymmetry": 0.0} if self.parameters[3].free else {}
+        return tuple(
+            replace(a, pinned={**a.pinned, **pins}) if a.name in ("no_loss", "microslip") else a
+            for a in super().asymptotes(low, high)
+        )
+
+    def normalised(
+        self, values: Sequence[FloatArray]
+    ) -> tuple[FloatArray, FloatArray, Sequence[FloatArray]]:
+        """Return f_max, sigma and (1, 1, alpha, asymmetry)."""
+        f_max, sigma, *shape = values
+        return f_max, sigma, (np.ones(()), np.ones(()), *shape)
+
+    def physics(self, values: Sequence[float]) -> tuple[str, ...]:
+        """Return an objection to a limit that is hardly there."""
+        if abs(values[3]) < _ONE_SIDED:
+            return ()
+        return (f"{self.parameters[3].name} leaves almost no friction in one direction",)
+
+    def tabulated(self) -> Dahl:
+        """Return this element, which has no tables."""
+        return self
+
+    def __repr__(self) -> str:
+        return super().__repr__().replace(type(self).__name__, "Dahl", 1)
+
+    behind_gap = Friction.behind_gap
+    force_history = Friction.force_history
+    force_history_gradient = Friction.force_history_gradient
+    force_bounds = Friction.force_bounds
+    knee = Friction.knee
+    transient_decay = Friction.transient_decay
+    casadi_stiffness = Friction.casadi_stiffness
+    _check_start = Friction._check_start
+    _step = Friction._step
+    branch = Friction.branch
+    _coefficients = Friction._coefficients
+    _loop = Friction._loop
+
+    def _gradient(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        harmonic: int,
+        *,
+        with_alpha: bool,
+        with_amplitude: bool = True,
+    ) -> StiffnessGradient:
+        every = self.with_bound(tuple(p.freed() for p in self.parameters))
+        return every.stiffness_gradient(values, amplitude, np.zeros(()), harmonic)
+
+
+class TabulatedDahl(Dahl):
+    """The same element with N from tables, to 1e-10; made by :meth:`Dahl.tabulated`."""
+
+    def __init__(self, element: Dahl) -> None:
+        self._name, self.parameters = element.name, element.parameters
+
+    def stiffness(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> ComplexArray:
+        """Return F_k/X_1 at `values`, unchecked; harmonics k > 1 by quadrature."""
+        if harmonic != 1:
+            return super().stiffness(values, amplitude, omega, harmonic)
+        f_max, sigma, alpha = values
+        return np.asarray(
+            sigma * general_dahl_table.describing_function(sigma * amplitude / f_max, alpha)
+        )
 
 
 def _is_linear(alpha: FloatArray) -> bool:

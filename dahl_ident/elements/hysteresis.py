@@ -19,6 +19,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.general_dahl import turning_force
+from dahl_ident.elements.recursion import linear_recursion, stretches
 
 _TINY = 1e-300  # stands for a margin of 0, which has no negative power
 _HUGE = 1e300  # a path beyond any reach, small enough to be scaled without overflow
@@ -71,41 +72,84 @@ def force_history(
     return force
 
 
-def steady_loop(
-    amplitude: float, f_max: float, sigma: float, alpha: float, points: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return displacement and force round one closed loop of x = A cos(theta), unchecked.
+def linear_history_gradient(
+    displacement: FloatArray, f_max: float, sigma: float, initial_force: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the force for alpha = 1, its derivative by the initial force and by f_max, sigma.
+
+    Along a stretch F = s f_max + (F0 - s f_max) exp(-d) with d = sigma path/f_max; the derivatives
+    at the turning points are a linear recursion.
 
     Parameters
     ----------
+    displacement, f_max, sigma, initial_force
+        As for :func:`force_history`.
+
+    Returns
+    -------
+    force, by_initial_force : ndarray, shape (n,)
+    by_parameters : ndarray, shape (n, 2)
+
+    Examples
+    --------
+    >>> _, by_start, by = linear_history_gradient(np.array([0.0, 1.0]), 1.0, 1.0, 0.0)
+    >>> by_start.round(6).tolist(), by[1].round(6).tolist()
+    ([1.0, 0.367879], [0.264241, 0.367879])
+    """
+    legs = stretches(displacement)
+    heading = legs.heading
+    legs_scaled = _path(legs.length, sigma / f_max)
+    path = _path(legs.path, sigma / f_max)
+    turning = f_max * _linear_turning_forces(initial_force / f_max, heading, legs_scaled)
+
+    def slopes(start: FloatArray, s: FloatArray, d: FloatArray) -> tuple[FloatArray, FloatArray]:
+        left = (s * f_max - start) * d * np.exp(-d)
+        return np.exp(-d), np.column_stack([-s * np.expm1(-d) - left / f_max, left / sigma])
+
+    keep, terms = slopes(turning[:-1], heading[:-1], legs_scaled)
+    first = np.array([1.0, 0.0, 0.0])
+    at_turns = linear_recursion(keep, np.column_stack([np.zeros(keep.size), terms]), first)
+    start, s = legs.spread(turning), legs.spread(heading)
+    keep, terms = slopes(start, s, path)
+    gradient = keep[:, None] * legs.spread(at_turns)
+    gradient[:, 1:] += terms
+    force = start + (start - s * f_max) * np.expm1(-path)
+    return force, gradient[:, 0], gradient[:, 1:]
+
+
+def steady_force(
+    theta: FloatArray, amplitude: float, f_max: float, sigma: float, alpha: float
+) -> FloatArray:
+    """Return the force on the closed loop of x = A cos(theta), unchecked.
+
+    Parameters
+    ----------
+    theta : ndarray
+        From 0 to 2 pi.
     amplitude : float
         A >= 0, m.
     f_max, sigma, alpha : float
         Parameters of Eqn. 2.
-    points : int
-        Samples from theta = 0 to 2 pi, both included.
 
     Returns
     -------
-    displacement, force : ndarray, shape (points,)
-        m and N; Eqns. 10 and 11 for alpha = 1.
+    ndarray, shape of `theta`
+        N; Eqns. 10 and 11 for alpha = 1.
 
     Examples
     --------
-    >>> x, F = steady_loop(1.0, 1.0, 1.0, 1.0, 5)
-    >>> F.round(6)
+    >>> steady_force(np.linspace(0.0, 2.0 * np.pi, 5), 1.0, 1.0, 1.0, 1.0).round(6)
     array([ 0.761594, -0.351946, -0.761594,  0.351946,  0.761594])
     """
-    theta = np.linspace(0.0, 2.0 * np.pi, points)
     beta = sigma * amplitude / f_max
-    margin = np.full(points, 1.0 + float(turning_force(np.asarray(beta), np.asarray(alpha))))
+    margin = np.full(theta.shape, 1.0 + float(turning_force(np.asarray(beta), np.asarray(alpha))))
     back = theta <= np.pi
     path = 2.0 * beta * np.where(back, np.sin(theta / 2.0), np.cos(theta / 2.0)) ** 2
     margin += margin_change(margin, path, alpha)
-    return amplitude * np.cos(theta), f_max * np.where(back, margin - 1.0, 1.0 - margin)
+    return np.asarray(f_max * np.where(back, margin - 1.0, 1.0 - margin))
 
 
-def memory_decay(beta: FloatArray, alpha: float) -> FloatArray:
+def transient_decay(beta: FloatArray, alpha: FloatArray | float) -> FloatArray:
     """Return the factor by which a deviation from the steady loop shrinks in one cycle.
 
     ((1 - f0)/(1 + f0))^(2 alpha), f0 the force at the turning point over f_max; exp(-4 beta)
@@ -115,21 +159,21 @@ def memory_decay(beta: FloatArray, alpha: float) -> FloatArray:
     ----------
     beta : ndarray
         sigma A/f_max >= 0 (Eqn. 7).
-    alpha : float
-        Exponent of Eqn. 2.
+    alpha : float or ndarray
+        Exponent of Eqn. 2; broadcast with `beta`.
 
     Returns
     -------
-    ndarray, shape of `beta`
+    ndarray
         Between 0 and 1.
 
     Examples
     --------
-    >>> memory_decay(np.array([0.0, 0.02, 1.0]), 1.0).round(4)
+    >>> transient_decay(np.array([0.0, 0.02, 1.0]), 1.0).round(4)
     array([1.    , 0.9231, 0.0183])
     """
-    if alpha == 1.0:
-        return np.exp(-4.0 * beta)
+    if np.all(alpha == 1.0):
+        return np.asarray(np.exp(-4.0 * beta))
     f0 = turning_force(beta, np.asarray(alpha))
     return np.asarray(((1.0 - f0) / (1.0 + f0)) ** (2.0 * alpha))
 

@@ -3,29 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.quantities import power_of_s
-from dahl_ident.elements.element import Element, StiffnessGradient, motion, prefixed
+from dahl_ident.elements.element import (
+    Element,
+    HistoryGradient,
+    Mechanics,
+    StiffnessGradient,
+    motion,
+)
 from dahl_ident.elements.parameter import Parameter
+
+if TYPE_CHECKING:
+    import casadi as ca
 
 
 class Lumped(Element):
     """One parameter p that enters as Z = p (j omega)^order; a sine answers no harmonic."""
 
-    order: int
-    _label: str
-    _unit: str
-    _description: str
-
-    def _set_up(self, value: float | None, name: str | None) -> None:
-        self._name = name
-        self._parameters = (
-            Parameter(prefixed(name, self._label), self._unit, self._description, value),
-        )
+    order: ClassVar[int]
+    is_linear = True
 
     def _unit_stiffness(self, omega: FloatArray, harmonic: int) -> ComplexArray:
         if harmonic != 1:
@@ -55,45 +56,72 @@ class Lumped(Element):
         unit = np.broadcast_to(self._unit_stiffness(omega, harmonic), value.shape)
         return StiffnessGradient(value, np.zeros_like(value), (unit,))
 
-    def force(
+    def force_history(
         self,
-        displacement: ArrayLike,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
         *,
-        velocity: ArrayLike | None = None,
-        acceleration: ArrayLike | None = None,
+        acceleration: FloatArray | None = None,
     ) -> FloatArray:
-        """Return p times the displacement, velocity or acceleration that the element answers.
+        """Return p times the displacement, velocity or acceleration that the element answers."""
+        return np.asarray(values[0] * self._history(displacement, velocity, acceleration))
 
-        Parameters
-        ----------
-        displacement, velocity, acceleration : array_like, shape (n,)
-            m, m/s and m/s^2; a spring needs the first, a damper the second, a mass the third.
+    def force_history_gradient(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
+        *,
+        acceleration: FloatArray | None = None,
+    ) -> HistoryGradient:
+        """Return the force with its derivatives, exactly."""
+        history = self._history(displacement, velocity, acceleration)
+        force = np.asarray(values[0] * history)
+        return HistoryGradient(force, np.zeros(force.shape), (history,))
 
-        Returns
-        -------
-        ndarray, shape (n,)
-            N.
-
-        Raises
-        ------
-        ModelError
-            If the parameter has no value.
-        ValidationError
-            If the needed history is missing or not as long as the displacement, or a value is
-            NaN, infinite or complex.
-
-        Examples
-        --------
-        >>> Mass(2.0).force([0.0], acceleration=[3.0])
-        array([6.])
-        """
-        histories = (
+    def _history(
+        self,
+        displacement: FloatArray,
+        velocity: FloatArray | None,
+        acceleration: FloatArray | None,
+    ) -> FloatArray:
+        name, history = (
             ("displacement", displacement),
             ("velocity", velocity),
             ("acceleration", acceleration),
-        )
-        name, history = histories[self.order]
-        return np.asarray(self.known_values()[0] * motion(history, name, displacement, self))
+        )[self.order]
+        return motion(history, name, displacement, self)
+
+    def mechanics(
+        self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
+    ) -> Mechanics:
+        """Return p as inertia, or p times the displacement or velocity as force."""
+        if self.order == 2:
+            return Mechanics(values[0], 0.0, 0.0)
+        return Mechanics(0.0, values[0] * (displacement, velocity)[self.order], 0.0)
+
+    def rational_stiffness(self) -> tuple[FloatArray, FloatArray]:
+        """Return p s^n over 1."""
+        (value,) = self.known_values()
+        return np.append(value, np.zeros(self.order)), np.ones(1)
+
+    def casadi_stiffness(
+        self, values: Sequence[ca.SX], amplitude: ca.SX, omega: ca.SX, harmonic: int = 1
+    ) -> tuple[ca.SX, ca.SX]:
+        """Return real and imaginary part of p (j omega)^n."""
+        if harmonic != 1:
+            return 0.0 * values[0], 0.0 * values[0]
+        size = values[0] * omega**self.order
+        real, imag = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0))[self.order]
+        return real * size, imag * size
+
+    def physics(self, values: Sequence[float]) -> tuple[str, ...]:
+        """Return an objection to a negative value."""
+        (parameter,) = self.parameters
+        return (f"{parameter.name} is negative",) if values[0] < 0.0 else ()
 
 
 class Mass(Lumped):
@@ -117,11 +145,16 @@ class Mass(Lumped):
     (-30+0j)
     """
 
+    kind = "mass"
+    equation = "F = m d2x/dt2"
     order = 2
-    _label, _unit, _description = "mass", "kg", "mass"
+    rate_independent = False
+    holds_at_rest = False
+    parameters = (Parameter("mass", "kg", "mass"),)
+    linear_parameters = scale_parameters = ("mass",)
 
     def __init__(self, mass: float | None = None, *, name: str | None = None) -> None:
-        self._set_up(mass, name)
+        self._bind({"mass": mass}, name)
 
 
 class Damper(Lumped):
@@ -145,11 +178,16 @@ class Damper(Lumped):
     2.4j
     """
 
+    kind = "damper"
+    equation = "F = c dx/dt"
     order = 1
-    _label, _unit, _description = "damping", "N s/m", "viscous damping"
+    rate_independent = False
+    holds_at_rest = False
+    parameters = (Parameter("damping", "N s/m", "viscous damping"),)
+    linear_parameters = scale_parameters = ("damping",)
 
     def __init__(self, damping: float | None = None, *, name: str | None = None) -> None:
-        self._set_up(damping, name)
+        self._bind({"damping": damping}, name)
 
 
 class Spring(Lumped):
@@ -173,8 +211,11 @@ class Spring(Lumped):
     (0.3+0j)
     """
 
+    kind = "spring"
+    equation = "F = k x"
     order = 0
-    _label, _unit, _description = "stiffness", "N/m", "spring stiffness"
+    parameters = (Parameter("stiffness", "N/m", "spring stiffness"),)
+    linear_parameters = scale_parameters = ("stiffness",)
 
     def __init__(self, stiffness: float | None = None, *, name: str | None = None) -> None:
-        self._set_up(stiffness, name)
+        self._bind({"stiffness": stiffness}, name)

@@ -15,11 +15,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.fields import one_of
-from dahl_ident.data.quantities import converted
+from dahl_ident.data.quantities import DEFINITIONS, converted
 from dahl_ident.elements.element import Element, StiffnessGradient, prefixed
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError, ValidationError
@@ -75,6 +74,11 @@ class LinearSystem(Element):
     LinearSystem(receptance of mode, mass=2, stiffness=free)
     """
 
+    kind = "linear_system"
+    equation = "F = Z(j omega) X"
+    is_linear = True
+    rate_independent = False
+
     def __init__(
         self,
         system: Any,
@@ -95,7 +99,7 @@ class LinearSystem(Element):
         self._system = system
         self._quantity = quantity
         self._labels = tuple(given)
-        self._parameters = tuple(_parameter(prefixed(name, k), v) for k, v in given.items())
+        self.parameters = tuple(_parameter(prefixed(name, k), v) for k, v in given.items())
         self._last: tuple[FloatArray, ComplexArray] | None = None
         if not is_function:
             check_system(system, "system")
@@ -134,18 +138,66 @@ class LinearSystem(Element):
         Z, *slopes = (row + 0.0 * amplitude for row in table)
         return StiffnessGradient(Z, np.zeros_like(Z), tuple(slopes))
 
-    def force(
+    def force_history(
         self,
-        displacement: ArrayLike,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
         *,
-        velocity: ArrayLike | None = None,
-        acceleration: ArrayLike | None = None,
+        acceleration: FloatArray | None = None,
     ) -> FloatArray:
         """Refuse: a response over frequency gives no force for a displacement history."""
         raise ModelError(
             f"{self!r} is known in the frequency domain alone and has no force over time; build "
             "the model from Mass, Damper and Spring to simulate records"
         )
+
+    def describe(self) -> dict[str, Any]:
+        """Return quantity and system as plain data; a function cannot be written to a file."""
+        if self.parameters:
+            raise ModelError(
+                f"{self!r} is built by a function, which no file can hold; give it as a fixed "
+                "python-control system"
+            )
+        control = importlib.import_module("control")
+        system = self.system
+        entry: dict[str, Any] = {"kind": self.kind, "quantity": self.quantity}
+        if self.name:
+            entry["name"] = self.name
+        if isinstance(system, control.FRD):
+            response = np.ravel(system(1j * np.asarray(system.omega)))
+            return entry | {
+                "omega": np.asarray(system.omega).tolist(),
+                "real": response.real.tolist(),
+                "imag": response.imag.tolist(),
+            }
+        entry["dt"] = system.dt
+        if isinstance(system, control.TransferFunction):
+            numerator, denominator = system.num[0][0], system.den[0][0]
+            return entry | {"numerator": list(numerator), "denominator": list(denominator)}
+        return entry | {key: np.asarray(getattr(system, key)).tolist() for key in "ABCD"}
+
+    @classmethod
+    def from_description(cls, rest: Mapping[str, Any], name: str | None) -> LinearSystem:
+        """Return the linear system that :meth:`describe` described."""
+        control = importlib.import_module("control")
+        try:
+            if "omega" in rest:
+                response = np.asarray(rest["real"]) + 1j * np.asarray(rest["imag"])
+                system = control.FRD(response, rest["omega"])
+            elif "numerator" in rest:
+                system = control.TransferFunction(
+                    rest["numerator"], rest["denominator"], rest["dt"]
+                )
+            else:
+                system = control.StateSpace(rest["A"], rest["B"], rest["C"], rest["D"], rest["dt"])
+            return cls(system, quantity=rest["quantity"], name=name)
+        except KeyError as exc:
+            raise ModelError(
+                f"the linear_system element has no {exc.args[0]}; expected quantity with omega, "
+                "real and imag, with numerator, denominator and dt, or with A, B, C, D and dt"
+            ) from None
 
     def _for_each_vector(
         self,
@@ -194,6 +246,16 @@ class LinearSystem(Element):
         transfer = control.tf(system)
         numerator, denominator = transfer.num[0][0], transfer.den[0][0]
         return np.asarray(numerator, np.float64), np.asarray(denominator, np.float64)
+
+    def rational_stiffness(self) -> tuple[FloatArray, FloatArray]:
+        """Return numerator and denominator of Z(s), from the highest power of s down."""
+        definition = DEFINITIONS[self.quantity]
+        above, below = self.polynomials()[:: definition.exponent]
+        power = definition.power_in_stiffness
+        return (
+            np.append(above, np.zeros(max(power, 0))),
+            np.append(below, np.zeros(max(-power, 0))),
+        )
 
     def _curve(self, vector: tuple[float, ...], omega: FloatArray) -> ComplexArray:
         """Return Z at angular frequencies, shape (n,); a fixed system remembers the last."""

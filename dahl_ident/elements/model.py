@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import ComplexArray, FloatArray, finite_array
+from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.element import Element, StiffnessGradient
 from dahl_ident.elements.parameter import Parameter
-from dahl_ident.errors import ModelError
+from dahl_ident.errors import ModelError, ValidationError
+
+if TYPE_CHECKING:
+    import casadi as ca
+
+Value = TypeVar("Value")
 
 
 class Model(Element):
@@ -45,9 +50,11 @@ class Model(Element):
         if not flat:
             raise ModelError("a model needs at least one element, got none")
         self._elements = tuple(flat)
-        self._name = None
-        self._parameters = tuple(p for element in flat for p in element.parameters)
-        clashes = [n for n, count in Counter(p.name for p in self._parameters).items() if count > 1]
+        self.parameters = tuple(p for element in flat for p in element.parameters)
+        self.is_linear = all(element.is_linear for element in flat)
+        self.rate_independent = all(element.rate_independent for element in flat)
+        self.has_memory = any(element.has_memory for element in flat)
+        clashes = [n for n, count in Counter(p.name for p in self.parameters).items() if count > 1]
         if clashes:
             raise ModelError(
                 f"two elements share the parameter names {', '.join(clashes)}; "
@@ -101,44 +108,108 @@ class Model(Element):
             value, by_amplitude, tuple(d for part in parts for d in part.by_parameter)
         )
 
-    def force(
+    def stiffness_slope(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Return the sum of the elements' F/X and its derivative by amplitude, unchecked."""
+        pairs = [e.stiffness_slope(own, amplitude, omega) for e, own in self.of(values)]
+        value, slope = pairs[0]
+        for one, other in pairs[1:]:
+            value, slope = value + one, slope + other
+        return value, slope
+
+    def force_history(
         self,
-        displacement: ArrayLike,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
         *,
-        velocity: ArrayLike | None = None,
-        acceleration: ArrayLike | None = None,
+        acceleration: FloatArray | None = None,
     ) -> FloatArray:
-        """Return the sum of the elements' forces for one displacement history.
+        """Return the sum of the elements' forces, unchecked; `state` is the friction's."""
+        total = np.zeros(np.shape(displacement))
+        for element, s in zip(self._elements, self._slices, strict=True):
+            start = state if element.has_memory else 0.0
+            total += element.force_history(
+                values[s], displacement, velocity, start, acceleration=acceleration
+            )
+        return total
 
-        Parameters
-        ----------
-        displacement : array_like, shape (n,)
-            m.
-        velocity, acceleration : array_like, shape (n,), optional
-            m/s and m/s^2; needed where the model has a damper or a mass.
+    def _check_start(self, values: Sequence[float], initial_force: float) -> None:
+        remember = [e for e in self._elements if e.has_memory]
+        if not remember:
+            super()._check_start(values, initial_force)
+        if initial_force and len(remember) > 1:
+            raise ValidationError(
+                f"initial_force is {initial_force!r} for {len(remember)} elements with memory; "
+                "evaluate them one by one, or leave it out"
+            )
+        for element, s in zip(self._elements, self._slices, strict=True):
+            if element.has_memory:
+                element._check_start(values[s], initial_force)
 
-        Returns
-        -------
-        ndarray, shape (n,)
-            N. Friction starts from zero force.
+    def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return the sums of the elements' bounds of abs(N) and A abs(N)."""
+        steepest, largest = np.zeros(()), np.zeros(())
+        for element, s in zip(self._elements, self._slices, strict=True):
+            own = element.force_bounds(values[s])
+            steepest, largest = steepest + own[0], largest + own[1]
+        return steepest, largest
 
-        Raises
-        ------
-        ValidationError
-            If a needed history is missing or not as long as the displacement, or a value is
-            NaN, infinite or complex.
+    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return the lowest and highest knee of the elements; NaN where all are linear."""
+        low, high = np.full((), np.nan), np.full((), np.nan)
+        for element, s in zip(self._elements, self._slices, strict=True):
+            own = element.knee(values[s])
+            low, high = np.fmin(low, own[0]), np.fmax(high, own[1])
+        return low, high
+
+    def transient_decay(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> FloatArray:
+        """Return the decay of the element that forgets most slowly."""
+        slowest = np.zeros(np.broadcast_shapes(np.shape(amplitude), np.shape(omega)))
+        for element, s in zip(self._elements, self._slices, strict=True):
+            slowest = np.maximum(slowest, element.transient_decay(values[s], amplitude, omega))
+        return slowest
+
+    def casadi_stiffness(
+        self, values: Sequence[ca.SX], amplitude: ca.SX, omega: ca.SX, harmonic: int = 1
+    ) -> tuple[ca.SX, ca.SX]:
+        """Return real and imaginary part of the sum as casadi expressions."""
+        real, imag = 0.0 * amplitude, 0.0 * amplitude
+        for element, s in zip(self._elements, self._slices, strict=True):
+            own = element.casadi_stiffness(values[s], amplitude, omega, harmonic)
+            real, imag = real + own[0], imag + own[1]
+        return real, imag
+
+    def physics(self, values: Sequence[float]) -> tuple[str, ...]:
+        """Return the objections of all elements to their values."""
+        return tuple(
+            text
+            for element, s in zip(self._elements, self._slices, strict=True)
+            for text in element.physics(values[s])
+        )
+
+    def tabulated(self) -> Model:
+        """Return the model with tables in place of quadratures; itself where it needs none.
 
         Examples
         --------
-        >>> from dahl_ident import Damper, Spring
-        >>> (Spring(2.0) + Damper(1.0)).force([0.0, 1.0], velocity=[3.0, 0.0])
-        array([3., 2.])
+        >>> from dahl_ident import Dahl
+        >>> Model(Dahl(alpha=2.0)).tabulated()
+        TabulatedDahl(f_max=free, sigma=free, alpha=2)
         """
-        x = finite_array(displacement, "displacement")
-        total = np.zeros(x.shape)
-        for element in self._elements:
-            total += element.force(x, velocity=velocity, acceleration=acceleration)
-        return total
+        faster = [element.tabulated() for element in self._elements]
+        if all(new is old for new, old in zip(faster, self._elements, strict=True)):
+            return self
+        return Model(*faster)
+
+    def of(self, values: Sequence[Value]) -> Iterator[tuple[Element, Sequence[Value]]]:
+        """Yield every element with its own part of the model's parameter `values`."""
+        for element, s in zip(self._elements, self._slices, strict=True):
+            yield element, values[s]
 
     def with_parameters(self, changes: Mapping[str, Parameter]) -> Model:
         """Return this model with some parameters replaced, by name."""
@@ -149,33 +220,30 @@ class Model(Element):
             if parameters == element.parameters:
                 elements.append(element)
                 continue
-            copy = object.__new__(type(element))
-            copy.__dict__.update(element.__dict__)
-            copy._parameters = parameters  # the one place where an element is rebuilt
-            elements.append(copy)
+            elements.append(element.with_bound(parameters))
         return Model(*elements)
 
     def with_free(self, names: Iterable[str]) -> Model:
         """Return this model with the named parameters estimated, started from their values."""
-        known = {p.name: p for p in self._parameters}
+        known = {p.name: p for p in self.parameters}
         names = list(names)
         self._check_names(names)
         return self.with_parameters({name: known[name].freed() for name in names})
 
     def with_fixed(self, values: Mapping[str, float]) -> Model:
         """Return this model with the named parameters held at the given values."""
-        known = {p.name: p for p in self._parameters}
+        known = {p.name: p for p in self.parameters}
         self._check_names(values)
         return self.with_parameters({n: known[n].fixed(v) for n, v in values.items()})
 
     def with_values(self, values: Mapping[str, float]) -> Model:
         """Return this model with values put in, each parameter staying free or fixed as it was."""
-        known = {p.name: p for p in self._parameters}
+        known = {p.name: p for p in self.parameters}
         self._check_names(values)
         return self.with_parameters({n: replace(known[n], value=v) for n, v in values.items()})
 
     def _check_names(self, names: Iterable[str]) -> None:
-        known = [p.name for p in self._parameters]
+        known = [p.name for p in self.parameters]
         unknown = [name for name in names if name not in known]
         if unknown:
             raise ModelError(
@@ -193,3 +261,6 @@ def as_model(model: Element) -> Model:
     if not isinstance(model, Element):
         raise ModelError(f"expected a model such as Dahl() + Mass(0.3), got {type(model).__name__}")
     return Model(model)
+
+
+Element._in_parallel = Model

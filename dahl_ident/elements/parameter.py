@@ -2,13 +2,30 @@
 
 from __future__ import annotations
 
+import math
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import lru_cache
+from typing import Any, Literal
 
 import numpy as np
 
 from dahl_ident.arrays import finite_number, positive_number
 from dahl_ident.errors import ValidationError
+
+_UNITS = {
+    "N": (1, 0, 0),
+    "m": (0, 1, 0),
+    "s": (0, 0, 1),
+    "kg": (1, -1, 2),
+    "Pa": (1, -2, 0),
+    "J": (1, 1, 0),
+    "Hz": (0, 0, -1),
+    "rad": (0, 0, 0),
+    "1": (0, 0, 0),
+}
+"""Powers of force, displacement and time in the units that a parameter may have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +49,14 @@ class Parameter:
     transform : {"log", "linear"}
         The coordinate in which searches and priors work: the logarithm for positive
         parameters, the value itself for the others.
+    scan : tuple of float
+        Values that a global start tries where the unit gives no scale, such as 0.5, 1 and 2 for
+        an exponent.
+    prior : tuple of float or None
+        Range that holds the value with 95 % probability before any data are seen; None where
+        the size follows from the data's forces and displacements through the unit.
+    assumed : bool
+        True: the value is a default that nobody gave, such as the exponent of ``Dahl()``.
 
     Raises
     ------
@@ -52,6 +77,9 @@ class Parameter:
     lower: float = -np.inf
     upper: float = np.inf
     transform: Literal["log", "linear"] = "linear"
+    scan: tuple[float, ...] = ()
+    prior: tuple[float, float] | None = None
+    assumed: bool = False
 
     def __post_init__(self) -> None:
         if self.value is not None:
@@ -68,10 +96,83 @@ class Parameter:
         elif not self.free and self.value is None:
             raise ValidationError(f"{self.name} is fixed but has no value; give one, or free it")
 
+    @property
+    def dimension(self) -> tuple[int, int, int]:
+        """Powers of force, displacement and time in the unit: (1, -1, 0) for N/m.
+
+        Raises
+        ------
+        ValidationError
+            If the unit is not made of N, m, s, kg, Pa, J, Hz and rad.
+
+        Examples
+        --------
+        >>> Parameter("damping", "N s/m", "viscous damping").dimension
+        (1, -1, 1)
+        """
+        found = _dimension(self.unit)
+        if found is None:
+            raise ValidationError(
+                f"{self.name} has the unit {self.unit!r}; expected a product of powers of "
+                f"{', '.join(_UNITS)}, such as 'N s/m'"
+            )
+        return found
+
+    def bound(self, name: str, given: float | None) -> Parameter:
+        """Return this declaration as a parameter called `name`: fixed at a number, or free."""
+        assumed = isinstance(given, Assumed)
+        return replace(self, name=name, value=given, free=None, assumed=assumed)
+
+    def describe(self) -> Any:
+        """Return a fixed value as a number, "free", or a mapping of what there is to say."""
+        if not self.free:
+            return {"assumed": self.value} if self.assumed else self.value
+        limits = {"lower": self.lower, "upper": self.upper}
+        bounds = {k: v for k, v in limits.items() if math.isfinite(v) and (k, v) != ("lower", 0.0)}
+        if self.value is None and not bounds:
+            return "free"
+        start = {} if self.value is None else {"start": self.value}
+        return {"free": True, **start, **bounds}
+
+    def described(self, given: Any) -> Parameter:
+        """Return this parameter as :meth:`describe` wrote it."""
+        if given == "free":
+            return replace(self, value=None, free=True, assumed=False)
+        if not isinstance(given, Mapping):
+            return self.fixed(given)
+        if "assumed" in given:
+            return replace(self, value=given["assumed"], free=False, assumed=True)
+        return replace(
+            self,
+            value=given.get("start"),
+            free=True,
+            assumed=False,
+            lower=given.get("lower", self.lower),
+            upper=given.get("upper", self.upper),
+        )
+
     def freed(self) -> Parameter:
         """Return this parameter, to be estimated; its value becomes a start."""
-        return replace(self, free=True)
+        return replace(self, free=True, assumed=False)
 
     def fixed(self, value: float) -> Parameter:
         """Return this parameter, held at `value`."""
-        return replace(self, value=value, free=False)
+        return replace(self, value=value, free=False, assumed=False)
+
+
+class Assumed(float):
+    """A default value that the user did not give, and that a result must state."""
+
+
+@lru_cache(maxsize=256)
+def _dimension(unit: str) -> tuple[int, int, int] | None:
+    """Return powers of force, displacement and time in a unit; None where it has others."""
+    total = [0, 0, 0]
+    for place, part in enumerate(unit.split("/")):
+        for factor in part.split():
+            found = re.fullmatch(r"\(?([A-Za-z]+|1)(?:\^(-?\d+))?\)?", factor)
+            if found is None or found[1] not in _UNITS:
+                return None
+            power = (-1 if place else 1) * int(found[2] or 1)
+            total = [t + power * u for t, u in zip(total, _UNITS[found[1]], strict=True)]
+    return total[0], total[1], total[2]

@@ -1,5 +1,5 @@
 """From sampled waveforms to a frequency response with covariance and verdicts."""
 
-from dahl_ident.extraction.from_record import extract
+from dahl_ident.extraction.sources import extract
 
 __all__ = ["extract"]

@@ -33,6 +33,8 @@ _FEWEST_A_CYCLE = 3
 _NOISIEST_CUT = 0.05  # noise of the log amplitude that a cycle of known frequency may have
 _FEWEST_CUTS = 3
 _NOISIEST_CROSSING = 0.1  # noise of the log amplitude that a cycle between crossings may have
+_GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+_TOGETHER = 100_000  # samples: what is computed of them stays in the cache
 _HOLE = 1.0 / 3.0  # of a cycle without samples: its amplitude is not known
 
 
@@ -102,8 +104,8 @@ def _joined(runs: list[FloatArray]) -> list[FloatArray]:
 
 def _without_noise(cycles: Cycles) -> Cycles:
     """Return the cycles with infinite noise for those that noise alone may have made."""
-    doubtful = cycles.noise > _NOISIEST_CROSSING
-    return replace(cycles, noise=np.where(doubtful, np.inf, cycles.noise))
+    by_noise = cycles.noise > _NOISIEST_CROSSING
+    return replace(cycles, noise=np.where(by_noise, np.inf, cycles.noise))
 
 
 def _crossing_runs(time: FloatArray, motion: FloatArray, depth: int) -> list[FloatArray]:
@@ -119,7 +121,7 @@ def _crossing_runs(time: FloatArray, motion: FloatArray, depth: int) -> list[Flo
 
 def _runs_at(time: FloatArray, motion: FloatArray, quantile: float, depth: int) -> list[FloatArray]:
     """Return the rising crossings of the amplitude that a quantile gives."""
-    seen = motion[:: max(1, time.size // _SAMPLED)]
+    seen = scattered(motion, _SAMPLED)
     low, high = np.quantile(seen, [1.0 - quantile, quantile])
     middle, threshold = 0.5 * (low + high), 0.5 * _THRESHOLD * (high - low)
     if not threshold > 1e-12 * max(abs(low), abs(high)):
@@ -128,8 +130,9 @@ def _runs_at(time: FloatArray, motion: FloatArray, quantile: float, depth: int) 
     beyond = np.flatnonzero(np.abs(moved) > threshold)
     above = moved[beyond] > 0.0
     pause = np.diff(beyond) - 1
-    quiet = (pause > _QUIET * _lobe_spacing(beyond, above)) & (pause >= _FEWEST_SAMPLES)
-    breaks = np.concatenate([[0], np.flatnonzero(quiet) + 1, [beyond.size]])
+    long = np.flatnonzero(pause >= _FEWEST_SAMPLES)
+    quiet = long[pause[long] > _QUIET * _lobe_spacing(beyond, above, long)]
+    breaks = np.concatenate([[0], quiet + 1, [beyond.size]])
     found: list[FloatArray] = []
     done = 0
     for first, last in pairwise(breaks.tolist()):
@@ -145,6 +148,18 @@ def _runs_at(time: FloatArray, motion: FloatArray, quantile: float, depth: int) 
     return found
 
 
+def scattered(samples: FloatArray, count: int) -> FloatArray:
+    """Return so many samples, evenly spread over the record and over the phases of any period.
+
+    The places are multiples of the golden section. A plain stride may fit the period of the
+    motion, and then sees a few phases only.
+    """
+    if samples.size <= count:
+        return samples
+    places = np.arange(count) * _GOLDEN % 1.0
+    return np.asarray(samples[np.sort((places * samples.size).astype(np.intp))])
+
+
 def _with_a_cycle_more(rising: NDArray[np.intp]) -> tuple[int, int]:
     """Return the samples a cycle before the first and after the last of rising crossings.
 
@@ -155,16 +170,19 @@ def _with_a_cycle_more(rising: NDArray[np.intp]) -> tuple[int, int]:
     return max(int(start), 0), int(stop)
 
 
-def _lobe_spacing(beyond: NDArray[np.intp], above: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return, for each pair of samples beyond the threshold, how far lobes near it are apart.
+def _lobe_spacing(
+    beyond: NDArray[np.intp], above: NDArray[np.bool_], pairs: NDArray[np.intp]
+) -> NDArray[np.intp]:
+    """Return, for pairs of samples beyond the threshold, how far lobes near each are apart.
 
     In samples from the start of one lobe to that of the next, before or after the pair's own.
     """
-    lobe = np.concatenate([[0], np.cumsum(above[1:] != above[:-1])])
-    starts = beyond[np.flatnonzero(np.diff(lobe, prepend=-1))]
+    turns = np.flatnonzero(above[1:] != above[:-1]) + 1
+    lobe = np.searchsorted(turns, pairs, side="right")
+    starts = beyond[np.concatenate([[0], turns])]
     far = np.full(1, beyond[-1] + 1)
     spacing = np.concatenate([far, np.diff(starts), far, far])
-    before, after = spacing[lobe[:-1]], spacing[lobe[:-1] + 2]
+    before, after = spacing[lobe], spacing[lobe + 2]
     return np.asarray(np.minimum(before, after))
 
 
@@ -189,11 +207,19 @@ def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray, turns: in
     counts = np.diff(cuts)
     known = np.flatnonzero((counts >= _FEWEST_A_CYCLE) & ~_with_hole(time, edges))
     start, stop, n = edges[known], edges[known + 1], counts[known]
-    inside = slice(int(cuts[0]), int(cuts[-1]))
-    turn = np.repeat(2.0 * np.pi * turns / np.diff(edges), counts)
-    theta = (time[inside] - np.repeat(edges[:-1], counts)) * turn
-    bounds = np.column_stack([cuts[known], cuts[known + 1]]).ravel() - cuts[0]
-    phasor, left = sine_in_each(theta, motion[inside], bounds, n)
+    groups = np.searchsorted(cuts, np.arange(cuts[0], cuts[-1], _TOGETHER), side="right") - 1
+    fits = []
+    for first, last in pairwise([*np.unique(groups).tolist(), edges.size - 1]):
+        inside = slice(int(cuts[first]), int(cuts[last]))
+        per_cycle = counts[first:last]
+        turn = np.repeat(2.0 * np.pi * turns / np.diff(edges[first : last + 1]), per_cycle)
+        theta = (time[inside] - np.repeat(edges[first:last], per_cycle)) * turn
+        those = known[(known >= first) & (known < last)]
+        bounds = np.column_stack([cuts[those], cuts[those + 1]]).ravel() - cuts[first]
+        fits.append(sine_in_each(theta, motion[inside], bounds, counts[those]))
+    if not fits:
+        fits = [sine_in_each(time[:0], motion[:0], known, n)]
+    phasor, left = (np.concatenate(column) for column in zip(*fits, strict=True))
     amplitude = np.maximum(np.abs(phasor), np.finfo(np.float64).tiny)
     noise = np.sqrt(2.0 * left / n) / amplitude
     return Cycles(

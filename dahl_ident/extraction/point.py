@@ -5,6 +5,7 @@ With the phasors X of displacement and F of force and their errors e_X, e_F,
     X_1 = A exp(j phi)                dA + j A dphi = e_X exp(-j phi)
     N   = F_1/X_1                     dN  = (e_F - N e_X)/X_1
     N_k = F_k exp(-j k phi)/A         dN_k = e_Fk exp(-j k phi)/A - N_k (dA/A + j k dphi)
+    N_0 = F_0/A                       dN_0 = e_F0/A - N_0 dA/A,   real
 
 so the response shares the displacement's error with the amplitude. A velocity or an acceleration
 is integrated at the fitted frequency: its phasor at harmonic k is divided by ``j k omega`` once
@@ -20,17 +21,14 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.data.suspicion import creates_energy
+from dahl_ident.data.plausibility import creates_energy
 from dahl_ident.errors import ExtractionError
-from dahl_ident.extraction.folding import folded_error, folds_unseen
-from dahl_ident.extraction.memory import (
-    MOST_CYCLES,
-    SIGNIFICANT,
-    Memory,
-    estimate_memory,
-)
-from dahl_ident.extraction.noise import CYCLES_FOR_SCATTER, LineNoise, line_noise
-from dahl_ident.extraction.quality import (
+from dahl_ident.extraction.aliasing import alias_error, aliases_unseen
+from dahl_ident.extraction.asymmetry import EVEN, asymmetry
+from dahl_ident.extraction.block_means import Samples
+from dahl_ident.extraction.cycles import scattered
+from dahl_ident.extraction.line_noise import CYCLES_FOR_SCATTER, LineNoise, line_noise
+from dahl_ident.extraction.segment_quality import (
     clipped_share,
     crest_samples,
     distortion,
@@ -41,29 +39,37 @@ from dahl_ident.extraction.quality import (
 from dahl_ident.extraction.sine_fit import (
     FEWEST_CYCLES,
     HARMONICS,
+    Segment,
     SineFit,
-    Stretch,
+    columns,
     first_cycles,
     last_cycles,
     sine_fit,
     thinned,
     whole_cycles,
 )
+from dahl_ident.extraction.transient import (
+    MOST_CYCLES,
+    SIGNIFICANT,
+    Transient,
+    estimate_transient,
+)
 
 _NEGLIGIBLE = 0.2  # bias over standard error to which settling cycles are left out
 _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 _DISTORTED = 0.02  # from which the fundamental alone misses percents of the loss
-_MOVING_MEAN = 0.02  # of the amplitude, over the stretch, where the force is controlled
+_MOVING_MEAN = 0.02  # of the amplitude, over the segment, where the force is controlled
 _BEYOND_NOISE = 5.0  # standard errors of a drift in white noise
 _TINY = np.finfo(np.float64).tiny
 _ROUNDING = 1e-9  # of the response
-_FOLDED = 0.01  # of the fundamental, above which folded harmonics are told
+_ALIASED = 0.01  # of the fundamental, above which aliases are reported
+_LOOKED_AT = 50_000  # samples from which their residual is taken
 _FEW_STEPS = 10.0  # amplitude over sensor step below which the step matters
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How stretches are turned into points; see :func:`dahl_ident.extraction.extract`."""
+    """How segments are turned into points; see :func:`dahl_ident.extraction.extract`."""
 
     harmonics: tuple[int, ...]
     num_periods: int | None
@@ -78,44 +84,66 @@ class Settings:
         return ("displacement", "velocity", "acceleration").index(self.motion_channel)
 
     @property
-    def memory_channel(self) -> int:
-        """Where friction's memory shows: in the force, or in a displacement that is free."""
+    def transient_channel(self) -> int:
+        """Where the transient shows: in the force, or in a displacement that is free."""
         free = self.controlled == "force" and self.motion_channel == "displacement"
         return 0 if free else 1
 
 
 @dataclass(frozen=True)
 class Point:
-    """One amplitude and frequency: responses of the fundamental and the harmonics."""
+    """One amplitude and frequency: responses of the fundamental and the harmonics.
+
+    `joint` is the covariance of amplitude, real and imaginary part of each response, (rows, 3, 3);
+    `repeating` is the part of it that is alike in every cycle.
+    """
 
     frequency_hz: float
     amplitude: float
-    amplitude_std: float
     drive: float
     harmonic: list[int]
     response: ComplexArray
-    covariance: FloatArray
+    joint: FloatArray
+    repeating: FloatArray
     dof: FloatArray
-    amplitude_covariance: FloatArray
+    sweep: bool
     quality: dict[str, Any]
+
+    @property
+    def amplitude_std(self) -> float:
+        """Standard deviation of the amplitude."""
+        return float(np.sqrt(self.joint[0, 0, 0]))
+
+    @property
+    def amplitude_covariance(self) -> FloatArray:
+        """Covariance of the amplitude with real and imaginary parts, (rows, 2)."""
+        return np.asarray(self.joint[:, 0, 1:])
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of real and imaginary parts, (rows, 2, 2)."""
+        return np.asarray(self.joint[:, 1:, 1:])
 
 
 @dataclass(frozen=True)
 class _Phasors:
-    """Displacement and force of one stretch with their noise.
+    """Displacement and force of one segment with their noise.
 
-    `fit` is without the memory where that is significant; `remembered` is what the memory adds
-    to the phasors of its channel, and belongs to the response.
+    `fit` is without the transient where that is significant; `transient_phasors` is what the
+    transient adds to the phasors of its channel, and belongs to the response.
     """
 
     fit: SineFit
     cycles: int
     settings: Settings
+    noise_orders: tuple[int, ...]
     noise: tuple[LineNoise, ...]
-    memory: Memory
-    remembered: ComplexArray
+    transient: Transient
+    transient_phasors: ComplexArray
     steps: FloatArray
     """Of the two sensors, 0 where they have none."""
+    samples: Samples
+    """Those that the segment's block means are made of."""
 
     @property
     def harmonics(self) -> list[int]:
@@ -124,13 +152,13 @@ class _Phasors:
     @cached_property
     def integrator(self) -> complex:
         """Displacement over the motion channel at the fundamental."""
-        return complex((1j * self.fit.stretch.omega) ** -self.settings.integrations)
+        return complex((1j * self.fit.segment.omega) ** -self.settings.integrations)
 
     def phasors(self, harmonic: int) -> ComplexArray:
         """Return the phasors of the motion channel and the force, shape (2,)."""
         both = self.fit.phasors(harmonic)
-        if self.memory.significant:
-            both[self.settings.memory_channel] += self.remembered[harmonic]
+        if self.transient.significant and harmonic:  # the mean is that of the steady loop
+            both[self.settings.transient_channel] += self.transient_phasors[harmonic]
         return both
 
     @cached_property
@@ -143,13 +171,33 @@ class _Phasors:
         return quantisation_errors(
             np.abs(self.fit.phasors(1)),
             self.steps,
-            np.sqrt(np.mean(self.fit.residual**2, axis=1)),
-            self.fit.stretch.time.size / self.cycles,
+            self._sample_residual,
+            self.samples.time.size / self.cycles,
         )
+
+    @property
+    def _sample_residual(self) -> FloatArray:
+        """Root mean square of what the fit leaves of single samples of both channels."""
+        fit, segment = self.fit, self.fit.segment
+        if segment.block == 1:
+            return np.asarray(np.sqrt(fit.residual_variance))
+        time, motion, force = (
+            scattered(v, _LOOKED_AT)
+            for v in (self.samples.time, self.samples.motion, self.samples.force)
+        )
+        own = segment.with_samples(time, np.stack([motion, force]))
+        tau = (time - segment.centre) / segment.half_width
+        sine = fit.coefficients.T @ columns(own.theta, tau, fit.orders, fit.trending)
+        left = _without(self.transient, own, self.settings).channels - sine
+        return np.asarray(np.sqrt(np.mean(left**2, axis=1)))
+
+    @cached_property
+    def _alias_errors(self) -> dict[int, FloatArray]:
+        return {k: alias_error(self.fit, k, self.cycles) for k in self.noise_orders}
 
     def repeating_errors(self, harmonic: int) -> FloatArray:
         """Return the errors of the phasors of both channels that are alike in every cycle."""
-        return np.hypot(self.rounding, folded_error(self.fit, harmonic, self.cycles))
+        return np.hypot(self.rounding, self._alias_errors[harmonic])
 
     @cached_property
     def errors(self) -> ComplexArray:
@@ -157,6 +205,23 @@ class _Phasors:
         scale = np.array([[self.integrator], [1.0]])
         noise = self.noise[0].lines * np.sqrt(self.fit.phasor_variance(1))
         return np.asarray(scale * np.hstack([noise, np.diag(self.repeating_errors(1))]))
+
+    def noise_of(self, harmonic: int) -> LineNoise:
+        return self.noise[self.noise_orders.index(harmonic)]
+
+    def force_variance(self, harmonic: int) -> float:
+        """Return E abs(error)^2 of a force phasor."""
+        noise = float(self.noise_of(harmonic).matrix[1, 1].real)
+        repeating = float(self.repeating_errors(harmonic)[1])
+        return noise * self.fit.phasor_variance(harmonic) + repeating**2
+
+    def forgotten(self, harmonic: int) -> float:
+        """Return the standard deviation that the transient's size leaves in a force phasor."""
+        if self.settings.transient_channel == 0 or self.transient.departure == 0.0:
+            return 0.0
+        added = complex(self.transient_phasors[harmonic])
+        size = abs(added) if harmonic else abs(added.real)
+        return size * self.transient.departure_std / abs(self.transient.departure)
 
     @property
     def amplitude_variance(self) -> float:
@@ -181,8 +246,10 @@ class _Phasors:
         return np.array(changes)
 
 
-def measure(stretch: Stretch, settings: Settings, *, sweep: bool = False) -> Point:
-    """Turn a stretch of known phase into a point.
+def measure(
+    segment: Segment, settings: Settings, samples: Samples, *, sweep: bool = False
+) -> Point:
+    """Turn a segment of known phase, and the record's samples, into a point.
 
     In a sweep amplitude and response may change linearly, and no cycles are left out.
 
@@ -191,35 +258,39 @@ def measure(stretch: Stretch, settings: Settings, *, sweep: bool = False) -> Poi
     ExtractionError
         If it is shorter than two cycles, or motion or force is not dominated by one sine.
     """
-    found = whole_cycles(stretch)
+    found = whole_cycles(segment)
     if found < FEWEST_CYCLES:
         raise ExtractionError(
-            f"{found} whole cycles {_where(stretch)}; expected at least {FEWEST_CYCLES}: record "
+            f"{found} whole cycles {_where(segment)}; expected at least {FEWEST_CYCLES}: record "
             "longer, or check frequency="
         )
     cycles = min(found, settings.num_periods or found)
     if not sweep and cycles - (settings.settling_periods or 0) < FEWEST_CYCLES:
         raise ExtractionError(
-            f"{cycles} cycles {_where(stretch)}, {settings.settling_periods} of them for "
+            f"{cycles} cycles {_where(segment)}, {settings.settling_periods} of them for "
             f"settling; expected {FEWEST_CYCLES} more than for settling: record longer, or lower "
             "settling_periods="
         )
-    whole = last_cycles(stretch, cycles)
-    steps = np.array([sensor_step(channel) for channel in whole.channels])
+    whole = last_cycles(segment, cycles)
+    own = samples.of(whole)
+    steps = np.array([sensor_step(channel) for channel in (own.motion, own.force)])
     first = first_cycles(whole, MOST_CYCLES)
     rough = sine_fit(thinned(first), trend=sweep, most=HARMONICS)
     _check_motion(rough, steps, settings)
-    memory = _memory(rough, settings)
-    _check_share(rough, _without(memory, first, settings), settings)
+    transient = _transient(rough, settings)
+    steady = _without(transient, first, settings)
+    _check_share(rough, steady, settings, samples.within_blocks(first))
     if sweep:
         dropped = 0
     elif settings.settling_periods is not None:
         dropped = settings.settling_periods
     else:
-        dropped = _settling_periods(rough.stretch, memory, cycles, settings, steps)
+        dropped = _settling_periods(rough.segment, transient, cycles, settings, steps, own)
     used = last_cycles(whole, cycles - dropped)
-    phasors = _phasors(used, memory, cycles - dropped, settings, steps, sweep=sweep)
-    _check_share(phasors.fit, phasors.fit.stretch, settings)
+    phasors = _phasors(
+        used, transient, cycles - dropped, settings, steps, samples.of(used), sweep=sweep
+    )
+    _check_share(phasors.fit, phasors.fit.segment, settings, samples.within_blocks(used))
     return _point(phasors, cycles, dropped, steps)
 
 
@@ -229,19 +300,19 @@ def _check_motion(fit: SineFit, steps: FloatArray, settings: Settings) -> None:
     for name, amplitude, step in zip(_names(settings), amplitudes, steps, strict=True):
         if amplitude <= step or amplitude == 0.0:
             raise ExtractionError(
-                f"{name} {_where(fit.stretch)}: amplitude {amplitude:.4g} is "
+                f"{name} {_where(fit.segment)}: amplitude {amplitude:.4g} is "
                 f"{amplitude / (step or 1.0):.3g} sensor steps (of {step:.4g}); expected more "
                 "than one step: use a larger amplitude or a finer range"
             )
 
 
-def _check_share(fit: SineFit, stretch: Stretch, settings: Settings) -> None:
+def _check_share(fit: SineFit, segment: Segment, settings: Settings, within: FloatArray) -> None:
     """Refuse what is not one sine."""
-    shares = fundamental_share(fit, stretch)
+    shares = fundamental_share(fit, segment, within)
     for name, share in zip(_names(settings), shares, strict=True):
         if share < settings.min_share:
             raise ExtractionError(
-                f"{name} {_where(stretch)}: the fundamental has {100.0 * share:.3g} % of the "
+                f"{name} {_where(segment)}: the fundamental has {100.0 * share:.3g} % of the "
                 f"power; expected at least {100.0 * settings.min_share:.3g} %, one dominant sine: "
                 "check the channel and frequency=, or lower min_share= if it is noise"
             )
@@ -251,47 +322,51 @@ def _names(settings: Settings) -> tuple[str, str]:
     return settings.motion_channel, "force"
 
 
-def _where(stretch: Stretch) -> str:
-    return f"around t = {stretch.centre:.6g} s, {stretch.omega / (2.0 * np.pi):.6g} Hz"
+def _where(segment: Segment) -> str:
+    return f"around t = {segment.centre:.6g} s, {segment.omega / (2.0 * np.pi):.6g} Hz"
 
 
-def _memory(fit: SineFit, settings: Settings) -> Memory:
-    X = complex(fit.phasors(1)[0] * (1j * fit.stretch.omega) ** -settings.integrations)
+def _transient(fit: SineFit, settings: Settings) -> Transient:
+    X = complex(fit.phasors(1)[0] * (1j * fit.segment.omega) ** -settings.integrations)
     response = complex(fit.phasors(1)[1]) / X
-    return estimate_memory(fit, settings.memory_channel, float(np.angle(X)), response)
+    return estimate_transient(fit, settings.transient_channel, float(np.angle(X)), response)
 
 
-def _without(memory: Memory, stretch: Stretch, settings: Settings) -> Stretch:
-    """Return the stretch without its memory, where that stands out of the noise."""
-    if not memory.significant:
-        return stretch
-    channels = stretch.channels.copy()
-    channels[settings.memory_channel] -= memory.waveform(stretch)
-    return replace(stretch, channels=channels)
+def _without(transient: Transient, segment: Segment, settings: Settings) -> Segment:
+    """Return the segment without its transient, where that stands out of the noise."""
+    if not transient.significant:
+        return segment
+    channels = segment.channels.copy()
+    part = transient.lasting(segment.theta)
+    channels[settings.transient_channel, part] -= transient.waveform(segment.part(part))
+    return replace(segment, channels=channels)
 
 
 def _phasors(
-    stretch: Stretch,
-    memory: Memory,
+    segment: Segment,
+    transient: Transient,
     cycles: int,
     settings: Settings,
     steps: FloatArray,
+    samples: Samples,
     *,
     sweep: bool,
 ) -> _Phasors:
-    """Fit a stretch without its memory, which is no noise, and join the phasors' noise."""
-    fit = sine_fit(_without(memory, stretch, settings), trend=sweep)
-    harmonics = [k for k in settings.harmonics if k <= fit.orders]
-    noise = line_noise(fit, [1, *harmonics], cycles, fit.residual)
-    return _Phasors(fit, cycles, settings, tuple(noise), memory, memory.phasors(fit), steps)
+    """Fit a segment without its transient, which is no noise, and join the phasors' noise."""
+    fit = sine_fit(_without(transient, segment, settings), trend=sweep)
+    orders = (1, *sorted({*settings.harmonics, *EVEN} - {1}))
+    orders = tuple(k for k in orders if k <= fit.orders)
+    noise = tuple(line_noise(fit, orders, cycles, fit.residual))
+    added = transient.phasors(fit)
+    return _Phasors(fit, cycles, settings, orders, noise, transient, added, steps, samples)
 
 
 def _bias(phasors: _Phasors) -> ComplexArray:
-    """Return what the memory adds to the response of each harmonic."""
-    added = phasors.remembered
-    if phasors.settings.memory_channel == 0:
+    """Return what the transient adds to the response of each harmonic."""
+    added = phasors.transient_phasors
+    if phasors.settings.transient_channel == 0:
         return phasors.changed(complex(added[1]), np.zeros(len(phasors.harmonics), complex))
-    return phasors.changed(0.0, added[phasors.harmonics])
+    return phasors.changed(0.0, np.where(phasors.harmonics, added[phasors.harmonics], 0.0))
 
 
 def _lag(phasors: _Phasors) -> ComplexArray:
@@ -310,36 +385,41 @@ def _mean_moves(phasors: _Phasors) -> bool:
     Where a soft spring alone centres it, it may go much farther than the amplitude, and its
     approach is no exponential.
     """
-    fit, channel = phasors.fit, phasors.settings.memory_channel
+    fit, channel = phasors.fit, phasors.settings.transient_channel
     moved = 2.0 * float(fit.coefficients[1, channel])
-    if phasors.memory.significant:
-        first, last = phasors.memory.waveform(fit.stretch)[[0, -1]]
+    if phasors.transient.significant:
+        first, last = phasors.transient.waveform(fit.segment)[[0, -1]]
         moved += float(last - first)
-    by_noise = 2.0 * np.sqrt(fit.inverse[1, 1] * np.mean(fit.residual[channel] ** 2))
+    by_noise = 2.0 * np.sqrt(fit.inverse[1, 1] * fit.residual_variance[channel])
     least = max(
         _MOVING_MEAN * abs(phasors.phasors(1)[0]),
         _BEYOND_NOISE * float(by_noise),
-        SIGNIFICANT * phasors.memory.departure_std,
+        SIGNIFICANT * phasors.transient.departure_std,
     )
     return channel == 0 and abs(moved) > least
 
 
 def _settling_periods(
-    stretch: Stretch, memory: Memory, cycles: int, settings: Settings, steps: FloatArray
+    segment: Segment,
+    transient: Transient,
+    cycles: int,
+    settings: Settings,
+    steps: FloatArray,
+    samples: Samples,
 ) -> int:
     """Return how many leading cycles to leave out.
 
     As few as bring the bias below a fifth of the standard error; where none do, those with the
     least mean squared error.
     """
-    if not memory.significant or cycles <= FEWEST_CYCLES:
+    if not transient.significant or cycles <= FEWEST_CYCLES:
         return 0
     looked_at = min(cycles, MOST_CYCLES)
     only_first = replace(settings, harmonics=(1,))
-    phasors = _phasors(stretch, memory, looked_at, only_first, steps, sweep=False)
+    phasors = _phasors(segment, transient, looked_at, only_first, steps, samples, sweep=False)
     q = np.arange(cycles - FEWEST_CYCLES + 1)
     kept = looked_at / (cycles - q)
-    bias = abs(_bias(phasors)[0]) * np.exp(-memory.rate * q) * kept
+    bias = abs(_bias(phasors)[0]) * np.exp(-transient.rate * q) * kept
     error = np.sqrt(_fundamental(phasors)[1][0, 0] * kept)
     good = bias <= _NEGLIGIBLE * error
     return int(np.argmax(good) if good.any() else np.argmin(bias**2 + 2.0 * error**2))
@@ -362,34 +442,46 @@ def _fundamental(phasors: _Phasors) -> tuple[complex, FloatArray, FloatArray, fl
 
 def _harmonic(phasors: _Phasors, k: int) -> tuple[complex, FloatArray, FloatArray, float]:
     """Return N_k, its covariance, the amplitude's covariance with it, and its dof."""
-    noise = phasors.noise[1 + phasors.harmonics.index(k)]
+    noise = phasors.noise_of(k)
     A, N = abs(phasors.displacement), phasors.response(k)
     along = np.array([N.real, N.imag])
     across = np.array([-N.imag, N.real])
     relative = phasors.amplitude_variance / A**2
-    force = float(noise.matrix[1, 1].real) * phasors.fit.phasor_variance(k)
-    force = (force + float(phasors.repeating_errors(k)[1]) ** 2) / A**2
-    covariance = 0.5 * force * np.eye(2) + relative * (
-        np.outer(along, along) + k**2 * np.outer(across, across)
-    )
+    force = phasors.force_variance(k) / A**2
+    if k == 0:
+        force += (phasors.forgotten(0) / A) ** 2
+    own_part = 0.5 * force * np.eye(2) if k else np.diag([force, 0.0])
+    covariance = own_part + relative * (np.outer(along, along) + k**2 * np.outer(across, across))
     referred = relative * (1.0 + k**2) * abs(N) ** 2
     own = force / max(force + referred, _TINY)
     dof = 1.0 / (own**2 / noise.dof + (1.0 - own) ** 2 / phasors.noise[0].dof)
     return N, covariance, -along * relative * A, dof
 
 
-def _point(phasors: _Phasors, cycles: int, dropped: int, steps: FloatArray) -> Point:
+def _errors(phasors: _Phasors) -> tuple[ComplexArray, FloatArray, FloatArray]:
+    """Return the responses, their joint covariance with the amplitude, and dof."""
     rows = [_fundamental(phasors) if k == 1 else _harmonic(phasors, k) for k in phasors.harmonics]
-    response, covariance, amplitude_covariance, dof = (
-        np.array(column) for column in zip(*rows, strict=True)
-    )
-    stretch = phasors.fit.stretch
-    memory, bias = phasors.memory, _bias(phasors)
-    lagging = _lag(phasors) if phasors.fit.trending else np.zeros(len(rows))
-    error = np.maximum(np.sqrt(0.5 * np.trace(covariance, axis1=1, axis2=2)), _TINY)
+    response, covariance, cross, dof = (np.array(column) for column in zip(*rows, strict=True))
+    joint = np.empty((len(rows), 3, 3))
+    joint[:, 0, 0] = phasors.amplitude_variance
+    joint[:, 0, 1:] = joint[:, 1:, 0] = cross
+    joint[:, 1:, 1:] = covariance
+    return response, joint, dof
+
+
+def _point(phasors: _Phasors, cycles: int, dropped: int, steps: FloatArray) -> Point:
+    response, joint, dof = _errors(phasors)
+    covariance = joint[:, 1:, 1:]
+    silent = tuple(LineNoise(np.zeros_like(n.lines), n.dof) for n in phasors.noise)
+    repeating = _errors(replace(phasors, noise=silent))[1]
+    segment, recorded = phasors.fit.segment, phasors.samples.time
+    transient, bias = phasors.transient, _bias(phasors)
+    lagging = _lag(phasors) if phasors.fit.trending else np.zeros(len(response))
+    only_mean = np.where(np.equal(phasors.harmonics, 0), 2.0, 1.0)  # whose variance is one number
+    error = np.maximum(np.sqrt(0.5 * only_mean * np.trace(covariance, axis1=1, axis2=2)), _TINY)
     excess = np.abs(bias) / (_TOLERATED * error)
-    forgotten = (excess <= 1.0) | (not memory.significant)
-    missing = np.where(forgotten, 0.0, np.ceil(np.log(np.maximum(excess, 1.0)) / memory.rate))
+    forgotten = (excess <= 1.0) | (not transient.significant)
+    missing = np.where(forgotten, 0.0, np.ceil(np.log(np.maximum(excess, 1.0)) / transient.rate))
     if _mean_moves(phasors):
         forgotten, missing = np.zeros_like(forgotten), np.maximum(missing, cycles)
     quality = {
@@ -400,21 +492,23 @@ def _point(phasors: _Phasors, cycles: int, dropped: int, steps: FloatArray) -> P
         "num_periods": cycles,
         "settling_periods": dropped,
         "covariance_from": "cycles" if phasors.cycles >= CYCLES_FOR_SCATTER else "spectrum",
-        "start_time": stretch.time[0],
-        "end_time": stretch.time[-1],
+        "start_time": recorded[0],
+        "end_time": recorded[-1],
         **_channel_quality(phasors, steps),
     }
-    quality["verdict"] = _verdicts(quality, _doubts(phasors, all(quality["settled"])))
+    settled = dict(zip(phasors.harmonics, quality["settled"], strict=True))
+    first_settled = bool(settled.get(1, all(settled.values())))
+    quality["verdict"] = _verdicts(quality, _objections(phasors, first_settled))
     return Point(
-        frequency_hz=stretch.omega / (2.0 * np.pi),
+        frequency_hz=segment.omega / (2.0 * np.pi),
         amplitude=abs(phasors.displacement),
-        amplitude_std=float(np.sqrt(phasors.amplitude_variance)),
         drive=float(abs(phasors.phasors(1)[1])),
         harmonic=phasors.harmonics,
         response=response,
-        covariance=covariance,
+        joint=joint,
+        repeating=repeating,
         dof=dof,
-        amplitude_covariance=amplitude_covariance,
+        sweep=bool(phasors.fit.trending),
         quality=quality,
     )
 
@@ -422,17 +516,18 @@ def _point(phasors: _Phasors, cycles: int, dropped: int, steps: FloatArray) -> P
 def _channel_quality(phasors: _Phasors, steps: FloatArray) -> dict[str, Any]:
     """Return the columns that judge the two waveforms."""
     fit = phasors.fit
-    shares = fundamental_share(fit, fit.stretch)
-    amplitudes = np.abs(fit.phasors(1))
-    noise = np.sqrt(np.diagonal(phasors.noise[0].matrix).real)
-    crest = crest_samples(amplitudes[0], steps[0], fit.stretch.sample_phase)
-    motion, force = fit.stretch.channels
+    shares = fundamental_share(fit, fit.segment, phasors.samples.within_blocks(fit.segment))
+    amplitudes, block = np.abs(fit.phasors(1)), fit.segment.block
+    noise = np.sqrt(np.diagonal(phasors.noise[0].matrix).real * block)
+    crest = crest_samples(amplitudes[0], steps[0], fit.segment.sample_phase / block)
+    motion, force = phasors.samples.motion, phasors.samples.force
     with np.errstate(divide="ignore"):
         in_steps = amplitudes / steps
     return {
         "displacement_share": shares[0],
         "force_share": shares[1],
         "displacement_distortion": distortion(fit, phasors.settings.integrations),
+        "asymmetry": _asymmetry(phasors),
         "displacement_steps": in_steps[0],
         "force_steps": in_steps[1],
         "displacement_clipped": clipped_share(motion, steps[0], noise[0], crest),
@@ -440,24 +535,45 @@ def _channel_quality(phasors: _Phasors, steps: FloatArray) -> dict[str, Any]:
     }
 
 
-def _doubts(phasors: _Phasors, settled: bool) -> list[str]:
+def _asymmetry(phasors: _Phasors) -> float:
+    """Return the force's even harmonics over its fundamental where they are significant.
+
+    The transient has even harmonics of its own: what its error leaves of them is noise.
+    """
+    fit = phasors.fit
+    if fit.trending or phasors.settings.controlled == "force":
+        return 0.0
+    even = [k for k in EVEN if k <= fit.orders]
+    motion, force = np.array([fit.phasors(k) for k in [1, *even]]).T
+    variance = [phasors.force_variance(k) + phasors.forgotten(k) ** 2 for k in even]
+    orders = np.array(even, dtype=np.float64)
+    return asymmetry(
+        orders,
+        force[1:] / force[0],
+        np.array(variance) / abs(force[0]) ** 2,
+        np.array([phasors.noise_of(k).dof for k in even]),
+        np.abs(motion[1:] / motion[0]) / orders**phasors.settings.integrations,
+    )
+
+
+def _objections(phasors: _Phasors, settled: bool) -> list[str]:
     """Return what speaks against the fundamental itself."""
-    doubts = []
+    objections = []
     N, covariance, _, dof = _fundamental(phasors)
     std = np.hypot(np.sqrt(covariance[1, 1]), _ROUNDING * abs(N))
     if settled and creates_energy(np.asarray(N.imag), std, np.asarray(dof)):
-        doubts.append("creates energy, a sign is turned")
+        objections.append("creates energy: a sign is reversed")
     fit = phasors.fit
-    folded = folded_error(fit, 1, phasors.cycles) > _FOLDED * np.abs(fit.phasors(1))
-    if folded.any() or folds_unseen(fit, phasors.cycles):
-        samples = 2.0 * np.pi / fit.stretch.sample_phase
-        doubts.append(f"harmonics fold at {samples:.3g} samples a cycle")
-    return doubts
+    aliased = alias_error(fit, 1, phasors.cycles) > _ALIASED * np.abs(fit.phasors(1))
+    if aliased.any() or aliases_unseen(fit, phasors.cycles):
+        samples = 2.0 * np.pi / fit.segment.sample_phase * fit.segment.block
+        objections.append(f"harmonics alias at {samples:.3g} samples a cycle")
+    return objections
 
 
-def _verdicts(quality: dict[str, Any], doubts: list[str]) -> list[str]:
+def _verdicts(quality: dict[str, Any], objections: list[str]) -> list[str]:
     """Return, for each row, "good" or what speaks against it."""
-    shared = doubts.copy()
+    shared = objections.copy()
     if quality["displacement_distortion"] > _DISTORTED:
         shared.append(f"displacement distorted {100 * quality['displacement_distortion']:.2g} %")
     for name in ("displacement", "force"):

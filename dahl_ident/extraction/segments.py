@@ -1,201 +1,183 @@
-"""Segments: the stretches of a record that hold one amplitude and one frequency, or a sweep.
+"""Segments: the spans of a record as samples with their phase.
 
-Cycle by cycle a piece grows while amplitude and frequency stay what they were on average, to
-within a tolerance that the noise may widen. A piece that is long enough and has no trend is a
-plateau, and becomes a point; the others are ramps, and are left out. Where there is more ramp
-than plateau the record is a sweep; it is cut into windows short enough that amplitude and
-frequency change little in each.
+Spans are looked for between crossings first. Where noise drowns those, or they cover little
+of the record, the periods of its strongest line are tried as well, and the longer reading wins.
+Each span then gets its frequency, and the cycles beside it that the same sine fits.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.extraction.cycles import Cycles
+from dahl_ident.errors import ExtractionError
+from dahl_ident.extraction.cycles import Cycles, cut_cycles, find_cycles, sine_in_each
+from dahl_ident.extraction.plateaus import Mode, Span, find_spans
+from dahl_ident.extraction.segment_bounds import cycle_edges, highest_by_chance, steady_part
+from dahl_ident.extraction.sine_fit import (
+    FEWEST_CYCLES,
+    Segment,
+    estimate_frequency,
+    steady_segment,
+    thinned,
+    track_phase,
+    whole_cycles,
+)
 
-Mode = Literal["auto", "steps", "sweep"]
-MODES: tuple[Mode, ...] = ("auto", "steps", "sweep")
-_AMPLITUDE_TOLERANCE = 0.02
-_FREQUENCY_TOLERANCE = 0.01
-_NOISE_FACTOR = 6.0
-_WIDEST = 0.3  # tolerance that noise makes
-_LEAST_NOISE = 1e-12
-_NOISIEST = 0.2  # noise of a cycle's log amplitude above which it is no cycle
-_EDGE_TOLERANCE = 0.005  # of the amplitude: cycles at the ends of a plateau that stray more go
-_MOSTLY_HELD = 0.5  # plateaus over cycles that change smoothly: with less it is a sweep
-_SWEEP_RANGE = 0.2  # change of log amplitude or frequency that makes a sweep
-_SWEEP_STEP = 0.2  # change of log amplitude or frequency in a cycle that a sweep may make
-_SWEEP_CHANGE = 0.1  # in a window
-_SWEEP_CYCLES = (4, 20)  # in a window
+_PLATEAU_CYCLES = 3  # fewer only where no plateau has so many ...
+_NO_CHANCE = 0.1  # ... and they are this share of all cycles: noise has two alike at times
+_QUIET_CROSSINGS = 0.01  # noise of a cycle's log amplitude that no crossing suffers from
+_WELL_COVERED = 0.5  # of a record: where crossings find spans so long, they are right
+_SWEEP_DEGREE = 3  # of the phase in a window
+_DRIFTED = 0.2  # phase over a segment, rad, that costs 0.2 % of the amplitude, more of harmonics
+_EVENLY = 0.5  # of the turn's sum over both halves, by which they may differ
+_FEWEST_IN_HALF = 2  # cycles that show a slope
+_BY_CHANCE = 1e-6  # of segments without a drift, how many seem to have one
+_PADDED = 16  # lines for each cycle, so that a peak lies near one
+_FEWEST_SAMPLES = 4  # that a cycle's sine and offset leave something of
 
 
-@dataclass(frozen=True)
-class Segment:
-    """Start and stop in s, and the frequency in the middle, Hz.
+def record_cycles(time: FloatArray, motion: FloatArray, frequency: float | None) -> list[Cycles]:
+    """Return the runs of cycles between crossings, or of the period where it is known."""
+    return find_cycles(time, motion) if frequency is None else cut_cycles(time, motion, frequency)
 
-    `earliest` and `latest` are where the segments beside it end and begin.
+
+def record_spans(
+    time: FloatArray,
+    motion: FloatArray,
+    runs: Sequence[Cycles],
+    frequency: float | None,
+    mode: Mode,
+    window: int | None,
+) -> list[Span]:
+    """Return the spans of a record, or say that it has none.
+
+    In noise that drowns the crossings, periods of the strongest line are tried as well.
     """
+    noise = [float(np.median(run.noise)) for run in runs if len(run)]
+    for fewest in (_PLATEAU_CYCLES, FEWEST_CYCLES):
+        spans = find_spans(runs, mode, fewest, window)
+        noisy = max(noise, default=np.inf) > _QUIET_CROSSINGS
+        covered = _covered(spans) / float(time[-1] - time[0])
+        if frequency is None and (noisy or covered < _WELL_COVERED):
+            periods = cut_cycles(time, motion, _strongest_line(time, motion))
+            spans = max(spans, find_spans(periods, mode, fewest, window), key=_covered)
+        moving = sum(float(np.sum(run.stop - run.start)) for run in runs)
+        if spans and (fewest == _PLATEAU_CYCLES or _covered(spans) > _NO_CHANCE * moving):
+            return _with_room(spans)
+    if frequency is not None and mode != "sweep" and len(runs):
+        return [Span(float(time[0]), float(time[-1]), frequency)]
+    raise ExtractionError(_no_spans(time, motion, runs, frequency))
 
-    start: float
-    stop: float
-    frequency_hz: float
-    sweep: bool = False
-    earliest: float = -np.inf
-    latest: float = np.inf
+
+def _with_room(spans: Sequence[Span]) -> list[Span]:
+    """Return the spans in order of time, each with where its neighbours end and begin."""
+    ordered = sorted(spans, key=lambda s: s.start)
+    ends = [-np.inf, *(s.stop for s in ordered[:-1])]
+    begins = [*(s.start for s in ordered[1:]), np.inf]
+    return [
+        replace(span, earliest=end, latest=begin)
+        for span, end, begin in zip(ordered, ends, begins, strict=True)
+    ]
 
 
-@dataclass(frozen=True)
-class _Piece:
-    """Cycles first to last (not included) of one run of cycles."""
+def _covered(spans: Sequence[Span]) -> float:
+    return sum(span.stop - span.start for span in spans)
 
-    cycles: Cycles
-    first: int
-    last: int
 
-    def __len__(self) -> int:
-        return self.last - self.first
+def _strongest_line(time: FloatArray, motion: FloatArray) -> float:
+    """Return the frequency with most power, samples taken as evenly spaced."""
+    spectrum = np.abs(np.fft.rfft(motion - motion.mean()))
+    line = int(np.argmax(spectrum[1:])) + 1
+    return line / float((time[-1] - time[0]) * time.size / (time.size - 1))
 
-    @property
-    def log_amplitude(self) -> FloatArray:
-        return self.cycles.log_amplitude[self.first : self.last]
 
-    @property
-    def log_frequency(self) -> FloatArray:
-        return self.cycles.log_frequency[self.first : self.last - 1]
+def _no_spans(
+    time: FloatArray, motion: FloatArray, runs: Sequence[Cycles], frequency: float | None
+) -> str:
+    cycles = sum(len(run) for run in runs)
+    read = "" if frequency is None else f" of {frequency:.6g} Hz"
+    return (
+        f"no segment of constant amplitude and frequency in {time[-1] - time[0]:.6g} s: "
+        f"{cycles} cycles{read}, motion from {motion.min():.4g} to {motion.max():.4g}; expected "
+        f"at least {FEWEST_CYCLES} similar cycles: record longer, give frequency=, or mode='sweep'"
+    )
 
-    @property
-    def noise(self) -> float:
-        return float(np.median(self.cycles.noise[self.first : self.last]))
 
-    @property
-    def trending(self) -> bool:
-        """Whether amplitude or frequency changes from end to end by more than the tolerance."""
-        amplitude, frequency = _tolerances(self.noise)
-        return (
-            abs(_change(self.log_amplitude)) > amplitude
-            or abs(_change(self.log_frequency)) > frequency
+def segment_of(
+    time: FloatArray, channels: FloatArray, span: Span, frequency: float | None, block: int = 1
+) -> Segment:
+    """Return the samples of a span, or means of a block of them, with their phase."""
+    first, last = np.searchsorted(time, [span.start, span.stop]).tolist()
+    if last - first < 2:
+        raise ExtractionError(
+            f"{last - first} samples from t = {span.start:.6g} to {span.stop:.6g} s; "
+            "expected at least 3 a cycle and 2 cycles: sample faster, or check frequency="
+        )
+    omega = 2.0 * np.pi * (span.frequency_hz if frequency is None else frequency)
+    segment = steady_segment(time[first:last], channels[:, first:last], omega, block)
+    if span.sweep:
+        return track_phase(segment, _SWEEP_DEGREE)
+    if frequency is not None and whole_cycles(segment) < FEWEST_CYCLES:
+        return segment  # which whoever measures it will refuse
+    if frequency is None:
+        segment = estimate_frequency(track_phase(segment, 1))
+    else:
+        _refuse_drift(segment)
+    least, most = np.searchsorted(time, [span.earliest, span.latest]).tolist()
+    room = slice(min(least, first), max(most, last))
+    part = steady_part(time, channels[0], segment, slice(first, last), room)
+    if part == slice(first, last):
+        return segment
+    segment = steady_segment(time[part], channels[:, part], segment.omega, block)
+    return segment if frequency is not None else estimate_frequency(segment)
+
+
+def _refuse_drift(segment: Segment) -> None:
+    """Refuse a given frequency at which the motion's phase drifts from cycle to cycle.
+
+    The phasors of the cycles turn evenly then: their spectrum has its peak beside zero. A phase
+    that settles turns them as well, but less and less.
+    """
+    few = thinned(segment)
+    cuts = np.searchsorted(few.time, cycle_edges(segment))
+    counts = np.diff(cuts)
+    cycle = np.flatnonzero(counts >= _FEWEST_SAMPLES)
+    dof = 2 * cycle.size - 4
+    if dof < 1:
+        return
+    bounds = np.column_stack([cuts[:-1], cuts[1:]])[cycle].ravel()
+    found, _ = sine_in_each(few.theta, few.channels[0], bounds, counts[cycle])
+    phasors = np.zeros(counts.size, dtype=np.complex128)
+    phasors[cycle] = found
+    power = np.abs(np.fft.fft(phasors, _PADDED * counts.size)) ** 2 / cycle.size
+    peak = int(np.argmax(power))
+    turns = float(np.fft.fftfreq(power.size)[peak])
+    beside = np.angle(found * np.exp(-2j * np.pi * turns * cycle))
+    evenly = True
+    if cycle.size >= 2 * _FEWEST_IN_HALF:
+        halves = [float(np.polyfit(*half, 1)[0]) for half in _halves(cycle, beside)]
+        evenly = abs(halves[1] - halves[0]) < _EVENLY * abs(sum(halves) + 4.0 * np.pi * turns)
+    turns += float(np.polyfit(cycle, beside, 1)[0]) / (2.0 * np.pi)
+    drift = 2.0 * np.pi * turns * counts.size
+    left = float(np.sum(np.abs(found) ** 2)) - power[peak]
+    clear = (power[peak] - power[0]) * dof > 2.0 * highest_by_chance(_BY_CHANCE, dof) * left
+    if clear and evenly and abs(drift) > _DRIFTED:
+        given = segment.omega / (2.0 * np.pi)
+        shown = given * (1.0 + turns)
+        raise ExtractionError(
+            f"the motion around t = {segment.centre:.6g} s has {shown:.6g} Hz, not the given "
+            f"{given:.6g} Hz: its phase drifts by {drift:.3g} rad in {counts.size} cycles; "
+            f"expected less than {_DRIFTED:g} rad: give frequency={shown:.6g}, or leave it out"
         )
 
-    def segment(self, *, sweep: bool = False) -> Segment:
-        frequency = self.log_frequency
-        start, stop = self.cycles.start[self.first], self.cycles.stop[self.last - 1]
-        return Segment(float(start), float(stop), float(np.exp(np.mean(frequency))), sweep)
 
-
-def find_segments(
-    runs: Sequence[Cycles], mode: Mode, fewest: int, window: int | None
-) -> list[Segment]:
-    """Return the segments of a record in order of time.
-
-    Parameters
-    ----------
-    runs : sequence of Cycles
-        Runs of consecutive cycles.
-    mode : {"auto", "steps", "sweep"}
-        Plateaus, sweeps, or whichever there is more of.
-    fewest : int
-        Cycles that a plateau has at least.
-    window : int or None
-        Cycles in a window of a sweep; None: as many as change little.
-
-    Returns
-    -------
-    list of Segment
-        None where there is neither.
-    """
-    pieces = [piece for cycles in runs for piece in _pieces(cycles) if len(piece) >= fewest]
-    plateaus = [_trimmed(p, fewest).segment() for p in pieces if not p.trending]
-    if mode == "steps":
-        return plateaus
-    sweeps = [sweep for cycles in runs for sweep in _sweeps(cycles)]
-    swept = sum(map(len, sweeps))
-    held = sum(len(p) for p in pieces if not p.trending)
-    if mode == "auto" and held >= _MOSTLY_HELD * swept:
-        return plateaus
-    return [segment for sweep in sweeps for segment in _windows(sweep, window)]
-
-
-def _tolerances(noise: float) -> tuple[float, float]:
-    """Return how much log amplitude and log frequency may vary within a plateau."""
-    widened = min(_NOISE_FACTOR * noise, _WIDEST)
-    return max(_AMPLITUDE_TOLERANCE, widened), max(_FREQUENCY_TOLERANCE, widened / np.pi)
-
-
-def _change(values: FloatArray) -> float:
-    """Return the change from end to end of the straight line through the values."""
-    if values.size < 2:
-        return 0.0
-    place = np.linspace(-0.5, 0.5, values.size)
-    return float(place @ values / (place @ place))
-
-
-def _pieces(cycles: Cycles) -> Iterator[_Piece]:
-    """Grow pieces cycle by cycle against the mean of what they have."""
-    amplitude, frequency = cycles.log_amplitude.tolist(), cycles.log_frequency.tolist()
-    noise = np.clip(cycles.noise, _LEAST_NOISE, 1.0).tolist()
-    first, a_sum, f_sum, inverse = 0, 0.0, 0.0, 0.0
-    for j in range(len(cycles)):
-        held = j - first
-        if held:
-            usual = min(noise[j], held / inverse)  # a transition is noisier than its neighbours
-            a_tolerance, f_tolerance = _tolerances(usual)
-            f_mean = f_sum / (held - 1) if held > 1 else frequency[j - 1]
-            if (
-                max(noise[j], noise[first]) < _NOISIEST
-                and abs(amplitude[j] - a_sum / held) <= a_tolerance
-                and abs(frequency[j - 1] - f_mean) <= f_tolerance
-            ):
-                f_sum += frequency[j - 1]
-            else:
-                yield _Piece(cycles, first, j)
-                first, a_sum, f_sum, inverse = j, 0.0, 0.0, 0.0
-        a_sum += amplitude[j]
-        inverse += 1.0 / noise[j]
-    if len(cycles):
-        yield _Piece(cycles, first, len(cycles))
-
-
-def _trimmed(piece: _Piece, fewest: int) -> _Piece:
-    """Leave out cycles at the ends that stray from the plateau's level, the rest of a ramp."""
-    a = piece.log_amplitude
-    level = float(np.median(a))
-    scatter = 1.5 * float(np.median(np.abs(a - level)))
-    within = np.abs(a - level) <= max(_EDGE_TOLERANCE, _NOISE_FACTOR * max(piece.noise, scatter))
-    kept = np.flatnonzero(within)
-    if kept.size == 0 or kept[-1] + 1 - kept[0] < fewest:
-        return piece
-    return _Piece(piece.cycles, piece.first + int(kept[0]), piece.first + int(kept[-1]) + 1)
-
-
-def _sweeps(cycles: Cycles) -> Iterator[_Piece]:
-    """Return the parts of a run in which nothing jumps, yet something changes much."""
-    if len(cycles) < 2:
-        return
-    jump = np.abs(np.diff(cycles.log_amplitude)) > _SWEEP_STEP
-    jump[1:] |= np.abs(np.diff(cycles.log_frequency)) > _SWEEP_STEP
-    jump |= np.maximum(cycles.noise[1:], cycles.noise[:-1]) > _NOISIEST
-    bounds = np.concatenate([[0], np.flatnonzero(jump) + 1, [len(cycles)]])
-    for first, last in pairwise(bounds.tolist()):
-        sweep = _Piece(cycles, first, last)
-        ranges = [np.ptp(v) for v in (sweep.log_amplitude, sweep.log_frequency) if v.size]
-        if len(sweep) >= _SWEEP_CYCLES[0] and max(ranges) > _SWEEP_RANGE:
-            yield sweep
-
-
-def _windows(sweep: _Piece, window: int | None) -> Iterator[Segment]:
-    """Cut a sweep into windows in which amplitude and frequency change little."""
-    least, most = _SWEEP_CYCLES
-    first = sweep.first
-    while sweep.last - first >= (window or least):
-        ahead = _Piece(sweep.cycles, first, min(first + most, sweep.last))
-        change = max(abs(_change(ahead.log_amplitude)), abs(_change(ahead.log_frequency)))
-        fitting = int(len(ahead) * min(1.0, _SWEEP_CHANGE / max(change, 1e-12)))
-        size = window or max(least, fitting)
-        yield _Piece(sweep.cycles, first, first + size).segment(sweep=True)
-        first += size
+def _halves(cycle: NDArray[np.intp], phase: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield the cycles' numbers and phases of the first and the second half."""
+    middle = cycle.size // 2
+    for half in (slice(None, middle), slice(middle, None)):
+        yield cycle[half].astype(np.float64), phase[half]

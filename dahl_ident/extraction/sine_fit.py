@@ -1,4 +1,4 @@
-r"""Sine fit: the phasors of motion and force in one stretch of steady sine excitation.
+r"""Sine fit: the phasors of motion and force in one segment of steady sine excitation.
 
 Both channels are fitted with the same columns by linear least squares,
 
@@ -8,16 +8,16 @@ so that what is fitted beside the fundamental (odd and even harmonics, offset, d
 leak into it, and samples are taken where they are: jitter, gaps and missing samples need no
 resampling. A phasor is ``Y_k = c_k - j s_k``, so that ``y = Re(Y_k exp(j k theta))``.
 
-The phase ``theta`` is a polynomial of ``tau``, time from -1 to 1 over the stretch: ``theta =
-omega (t - t_c)`` where the frequency is steady. With the middle of the stretch as origin an
+The phase ``theta`` is a polynomial of ``tau``, time from -1 to 1 over the segment: ``theta =
+omega (t - t_c)`` where the frequency is steady. With the middle of the segment as origin an
 error of the frequency does not turn the phasors. The frequency is either known or estimated
 jointly with them from both channels, the four-parameter fit of IEEE Std 1057. In a sweep theta
-has a higher degree, and each harmonic may change linearly over the stretch.
+has a higher degree, and each harmonic may change linearly over the segment.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -33,26 +33,31 @@ _MOST_HARMONICS = 40  # fitted so that they do not leak where cycles are no whol
 _AFFORDABLE = 4e5  # samples times harmonics; leakage falls with the number of samples
 _NYQUIST_MARGIN = 0.45  # highest harmonic over the sampling rate
 _BLOCK = 16384  # samples whose columns stay in the cache
+_KEPT = 2_000_000  # entries of columns that are kept rather than computed twice
 _BLOCKS_PER_CYCLE = 64  # block means that lose 4e-4 of the fundamental
 _FEWEST_SAMPLES = 2  # that have a phase from one to the next
 _LEAST_WEIGHT = 1e-6  # of a cycle beside the strongest
 _TINY = float(np.finfo(np.float64).tiny)
 _MAX_STEPS = 20
 _TRACKED = 0.1  # phase error that is left to the four-parameter fit, rad
-_STEP_TOLERANCE = 1e-4  # phase at the ends of the stretch, rad; its square is the error left
+_STEP_TOLERANCE = 1e-4  # phase at the ends of the segment, rad; its square is the error left
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """Samples of motion (row 0) and force (row 1) with their phase, a polynomial of tau."""
+class Segment:
+    """Samples of motion (row 0) and force (row 1) with their phase, a polynomial of tau.
+
+    Each may be the mean of a `block` of evenly spaced samples.
+    """
 
     time: FloatArray
     channels: FloatArray
     phase: Polynomial
+    block: int = 1
 
     @property
     def centre(self) -> float:
-        """Middle of the stretch, s."""
+        """Middle of the segment, s."""
         return 0.5 * float(self.time[0] + self.time[-1])
 
     @property
@@ -80,7 +85,14 @@ class Stretch:
         """Phase from one sample to the next, rad."""
         return self.omega * float(np.median(np.diff(self.time)))
 
-    def with_samples(self, time: FloatArray, channels: FloatArray) -> Stretch:
+    def passed(self, orders: int) -> FloatArray | None:
+        """Return how much of harmonics 1, 2, ... passes into block means; None: all."""
+        if self.block == 1:
+            return None
+        half = 0.5 * np.arange(1, orders + 1) * self.sample_phase
+        return np.asarray(np.sin(half) / (self.block * np.sin(half / self.block)))
+
+    def with_samples(self, time: FloatArray, channels: FloatArray, block: int = 1) -> Segment:
         """Return other samples with the same phase as a function of time."""
         if time.size < _FEWEST_SAMPLES:
             raise ExtractionError(
@@ -88,41 +100,41 @@ class Stretch:
                 f"{2.0 * np.pi / self.omega:.4g} s; expected at least 3 a cycle and 2 cycles: "
                 "sample faster, record longer, or check frequency="
             )
-        new = Stretch(time, channels, self.phase)
+        new = Segment(time, channels, self.phase, block)
         inner = Polynomial(
             [(new.centre - self.centre) / self.half_width, new.half_width / self.half_width]
         )
         return replace(new, phase=self.phase(inner))
 
-    def part(self, keep: slice) -> Stretch:
+    def part(self, keep: slice) -> Segment:
         """Return some of the samples, each with the phase it had."""
-        return self.with_samples(self.time[keep], self.channels[:, keep])
+        return self.with_samples(self.time[keep], self.channels[:, keep], self.block)
 
 
-def steady_stretch(time: FloatArray, channels: FloatArray, omega: float) -> Stretch:
-    """Return a stretch of one angular frequency, rad/s."""
+def steady_segment(time: FloatArray, channels: FloatArray, omega: float, block: int = 1) -> Segment:
+    """Return a segment of one angular frequency, rad/s."""
     half_width = 0.5 * float(time[-1] - time[0])
-    return Stretch(time, channels, Polynomial([0.0, omega * half_width]))
+    return Segment(time, channels, Polynomial([0.0, omega * half_width]), block)
 
 
-def first_cycles(stretch: Stretch, cycles: int) -> Stretch:
+def first_cycles(segment: Segment, cycles: int) -> Segment:
     """Return the first so many cycles, or all where there are fewer."""
-    theta = stretch.theta
-    end = theta[0] - 0.5 * stretch.sample_phase + 2.0 * np.pi * cycles
-    return stretch.part(slice(0, int(np.searchsorted(theta, end))))
+    theta = segment.theta
+    end = theta[0] - 0.5 * segment.sample_phase + 2.0 * np.pi * cycles
+    return segment.part(slice(0, int(np.searchsorted(theta, end))))
 
 
-def last_cycles(stretch: Stretch, cycles: int) -> Stretch:
+def last_cycles(segment: Segment, cycles: int) -> Segment:
     """Return the last so many cycles; a partial one at the start is left out."""
-    theta = stretch.theta
-    first = theta[-1] + 0.5 * stretch.sample_phase - 2.0 * np.pi * cycles
-    return stretch.part(slice(int(np.searchsorted(theta, first)), None))
+    theta = segment.theta
+    first = theta[-1] + 0.5 * segment.sample_phase - 2.0 * np.pi * cycles
+    return segment.part(slice(int(np.searchsorted(theta, first)), None))
 
 
-def whole_cycles(stretch: Stretch) -> int:
-    """Return the number of whole cycles, to within half a sample."""
-    theta = stretch.theta
-    turned = float(theta[-1] - theta[0]) + 1.5 * stretch.sample_phase
+def whole_cycles(segment: Segment) -> int:
+    """Return the number of whole cycles, to within half a sample, or one block at the ends."""
+    theta, missing = segment.theta, 0.5 if segment.block == 1 else 1.0
+    turned = float(theta[-1] - theta[0]) + (1.0 + missing) * segment.sample_phase
     return int(turned / (2.0 * np.pi))
 
 
@@ -130,19 +142,29 @@ def whole_cycles(stretch: Stretch) -> int:
 class SineFit:
     """Least-squares fit of both channels; coefficients in the order of the columns."""
 
-    stretch: Stretch
+    segment: Segment
     orders: int
     trending: int  # harmonics 1 to this one may change linearly
     coefficients: FloatArray  # (columns, 2)
     inverse: FloatArray  # of the normal matrix
     residual: FloatArray  # (2, n)
 
+    @cached_property
+    def residual_variance(self) -> FloatArray:
+        """Mean square of what the fit leaves of motion and force, shape (2,)."""
+        power = np.einsum("ij,ij->i", self.residual, self.residual)
+        return np.asarray(power / self.residual.shape[1], dtype=np.float64)
+
     def phasors(self, harmonic: int) -> ComplexArray:
-        """Return the phasors of motion and force at one harmonic, shape (2,)."""
+        """Return the phasors of motion and force at one harmonic, shape (2,); their means at 0."""
+        if harmonic == 0:
+            return np.array(self.coefficients[0], dtype=np.complex128)
         return self._pair(2 * harmonic)
 
     def slopes(self, harmonic: int) -> ComplexArray:
         """Return the change of the phasors with tau, shape (2,), of a fit with trend."""
+        if harmonic == 0:
+            return np.array(self.coefficients[1], dtype=np.complex128)
         return self._pair(2 * (self.orders + harmonic))
 
     def _pair(self, i: int) -> ComplexArray:
@@ -150,58 +172,71 @@ class SineFit:
         return np.asarray(cos - 1j * sin)
 
     def phasors_of(self, waveform: FloatArray) -> ComplexArray:
-        """Return phasors 0, 1, ... that the fit would give a waveform; 0 after its last sample."""
-        theta, tau = self.stretch.theta[: waveform.size], self.stretch.tau[: waveform.size]
+        """Return phasors 0, 1, ... that the fit would give a waveform; 0 after its last sample.
+
+        The real part of the first is the mean.
+        """
+        theta, tau = self.segment.theta[: waveform.size], self.segment.tau[: waveform.size]
         right = np.zeros(self.inverse.shape[0])
-        for part, block in _column_blocks(theta, tau, self.orders, self.trending):
+        passed = self.segment.passed(self.orders)
+        for part, block in _column_blocks(theta, tau, self.orders, self.trending, passed):
             right += block @ waveform[part]
         fitted = (self.inverse @ right)[: 2 * self.orders + 2]
         return np.asarray(fitted[::2] - 1j * fitted[1::2])
 
     def phasor_variance(self, harmonic: int) -> float:
         """Return E abs(phasor error)^2 for white noise of unit variance."""
+        if harmonic == 0:
+            return float(self.inverse[0, 0])
         i = 2 * harmonic
         return float(self.inverse[i, i] + self.inverse[i + 1, i + 1])
 
 
-def resolvable_orders(stretch: Stretch) -> int:
+def resolvable_orders(segment: Segment) -> int:
     """Return how many harmonics are fitted: those that the sampling can tell apart, or fewer."""
-    per_cycle = 2.0 * np.pi / stretch.sample_phase
-    affordable = np.clip(_AFFORDABLE / stretch.time.size, HARMONICS, _MOST_HARMONICS)
+    per_cycle = 2.0 * np.pi / segment.sample_phase
+    affordable = np.clip(_AFFORDABLE / segment.time.size, HARMONICS, _MOST_HARMONICS)
     orders = int(min(affordable, _NYQUIST_MARGIN * per_cycle))
-    if orders < 1 or stretch.time.size < 2 * orders + 4:
+    if orders < 1 or segment.time.size < 2 * orders + 4:
         raise ExtractionError(
-            f"{stretch.time.size} samples at {per_cycle:.3g} samples a cycle near "
-            f"t = {stretch.centre:.6g} s; expected at least 3 a cycle and 2 cycles: "
+            f"{segment.time.size} samples at {per_cycle:.3g} samples a cycle near "
+            f"t = {segment.centre:.6g} s; expected at least 3 a cycle and 2 cycles: "
             "sample faster or record longer"
         )
     return orders
 
 
-def sine_fit(stretch: Stretch, *, trend: bool = False, most: int = _MOST_HARMONICS) -> SineFit:
+def sine_fit(segment: Segment, *, trend: bool = False, most: int = _MOST_HARMONICS) -> SineFit:
     """Fit harmonics, at most so many, offset and drift to both channels, the phase being known.
 
-    With `trend` every harmonic may also change linearly over the stretch, as in a sweep.
+    With `trend` every harmonic may also change linearly over the segment, as in a sweep.
     """
-    orders = min(resolvable_orders(stretch), most)
+    orders = min(resolvable_orders(segment), most)
     trending = orders if trend else 0
-    theta, tau = stretch.theta, stretch.tau
-    normal, right = _normal_equations(theta, tau, stretch.channels, orders, trending)
-    inverse = solvable_inverse(normal, stretch)
+    theta, tau, passed = segment.theta, segment.tau, segment.passed(orders)
+    width = 2 * (orders + trending) + 2
+    blocks: Iterable[tuple[slice, FloatArray]] = ()
+    if width * theta.size <= _KEPT:
+        blocks = tuple(_column_blocks(theta, tau, orders, trending, passed))
+    normal, right = normal_equations(
+        theta, tau, segment.channels, orders, trending,
+        blocks or _column_blocks(theta, tau, orders, trending, passed),
+    )  # fmt: skip
+    inverse = solvable_inverse(normal, segment)
     coefficients = inverse @ right
-    residual = stretch.channels.copy()
-    for part, block in _column_blocks(theta, tau, orders, trending):
+    residual = segment.channels.copy()
+    for part, block in blocks or _column_blocks(theta, tau, orders, trending, passed):
         residual[:, part] -= coefficients.T @ block
-    return SineFit(stretch, orders, trending, coefficients, inverse, residual)
+    return SineFit(segment, orders, trending, coefficients, inverse, residual)
 
 
-def estimate_frequency(stretch: Stretch) -> Stretch:
-    """Return the stretch with the frequency that fits both channels best.
+def estimate_frequency(segment: Segment) -> Segment:
+    """Return the segment with the frequency that fits both channels best.
 
     Gauss-Newton on the four-parameter fit; the channels are weighted by their residuals. The
-    start has to be within about half a cycle over the whole stretch, see `track_phase`.
+    start has to be within about half a cycle over the whole segment, see `track_phase`.
     """
-    few, moved = thinned(stretch), 0.0
+    few, moved = thinned(segment), 0.0
     for _ in range(_MAX_STEPS):
         step = _frequency_step(few)
         moved += step
@@ -209,33 +244,33 @@ def estimate_frequency(stretch: Stretch) -> Stretch:
             break
         few = replace(few, phase=few.phase + Polynomial([0.0, step]))
         if abs(step) < _STEP_TOLERANCE:
-            turned = moved * stretch.half_width / few.half_width
-            return replace(stretch, phase=stretch.phase + Polynomial([0.0, turned]))
+            turned = moved * segment.half_width / few.half_width
+            return replace(segment, phase=segment.phase + Polynomial([0.0, turned]))
     raise ExtractionError(
-        f"no steady frequency near {stretch.omega / (2.0 * np.pi):.6g} Hz around t = "
-        f"{stretch.centre:.6g} s: the fit wanders off; expected one sine of constant frequency: "
+        f"no steady frequency near {segment.omega / (2.0 * np.pi):.6g} Hz around t = "
+        f"{segment.centre:.6g} s: the fit diverges; expected one sine of constant frequency: "
         "give frequency=, or mode='sweep'"
     )
 
 
-def track_phase(stretch: Stretch, degree: int) -> Stretch:
-    """Return the stretch with its phase following the motion's, cycle by cycle.
+def track_phase(segment: Segment, degree: int) -> Segment:
+    """Return the segment with its phase following the motion's, cycle by cycle.
 
     The phase of each cycle's phasor is unwrapped and added to the phase as a polynomial, so a
-    start that is wrong by many cycles over the stretch is put right.
+    start that is wrong by many cycles over the segment is put right.
     """
     for _ in range(_MAX_STEPS):
-        bend = _phase_error(thinned(stretch), degree)
-        stretch = replace(stretch, phase=stretch.phase + bend)
+        bend = _phase_error(thinned(segment), degree)
+        segment = replace(segment, phase=segment.phase + bend)
         if np.abs(bend.coef).sum() < _TRACKED:
             break
-    return stretch
+    return segment
 
 
-def _phase_error(stretch: Stretch, degree: int) -> Polynomial:
+def _phase_error(segment: Segment, degree: int) -> Polynomial:
     """Return by how much the motion's phase departs, a polynomial of tau that is 0 at 0."""
-    theta = stretch.theta
-    motion = stretch.channels[0] - stretch.channels[0].mean()
+    theta = segment.theta
+    motion = segment.channels[0] - segment.channels[0].mean()
     turns = (theta - theta[0]) / (2.0 * np.pi)
     starts = np.searchsorted(turns, np.arange(int(turns[-1] + 0.25)))
     starts = np.unique(starts[starts < theta.size])
@@ -243,31 +278,31 @@ def _phase_error(stretch: Stretch, degree: int) -> Polynomial:
         return Polynomial([0.0])
     counts = np.diff(starts, append=theta.size)
     sums = np.add.reduceat(motion * np.exp(-1j * theta), starts)
-    at = np.add.reduceat(stretch.tau, starts) / counts
+    at = np.add.reduceat(segment.tau, starts) / counts
     weights = np.abs(sums) + _LEAST_WEIGHT * np.abs(sums).max() + _TINY
     bend = Polynomial.fit(at, np.unwrap(np.angle(sums)), degree, w=weights).convert()
     return bend - bend(0.0)
 
 
-def thinned(stretch: Stretch) -> Stretch:
+def thinned(segment: Segment) -> Segment:
     """Return block means, about 64 a cycle, where there are twice as many samples."""
-    if stretch.sample_phase > np.pi / _BLOCKS_PER_CYCLE:
-        return stretch
-    theta = stretch.theta
+    if segment.sample_phase > np.pi / _BLOCKS_PER_CYCLE:
+        return segment
+    theta = segment.theta
     block = np.floor((theta - theta[0]) * (_BLOCKS_PER_CYCLE / (2.0 * np.pi)))
     starts = np.flatnonzero(np.diff(block, prepend=-1.0))
     counts = np.diff(starts, append=theta.size)
-    means = np.add.reduceat(stretch.channels, starts, axis=1) / counts
-    return stretch.with_samples(np.add.reduceat(stretch.time, starts) / counts, means)
+    means = np.add.reduceat(segment.channels, starts, axis=1) / counts
+    return segment.with_samples(np.add.reduceat(segment.time, starts) / counts, means)
 
 
-def _frequency_step(stretch: Stretch) -> float:
+def _frequency_step(segment: Segment) -> float:
     """Return one Gauss-Newton step of the phase at tau = 1, rad."""
-    orders = min(HARMONICS, resolvable_orders(stretch))
-    theta, tau, y = stretch.theta, stretch.tau, stretch.channels
-    normal, right = _normal_equations(theta, tau, y, orders, 1)
+    orders = min(HARMONICS, resolvable_orders(segment))
+    theta, tau, y = segment.theta, segment.tau, segment.channels
+    normal, right = normal_equations(theta, tau, y, orders, 1)
     n = 2 * orders + 2
-    inverse = solvable_inverse(normal[:n, :n], stretch)
+    inverse = solvable_inverse(normal[:n, :n], segment)
     slope = step = 0.0
     for channel in range(len(y)):
         coefficients = inverse @ right[:n, channel]
@@ -287,8 +322,17 @@ def _frequency_step(stretch: Stretch) -> float:
     return step / slope if slope else 0.0
 
 
-def columns(theta: FloatArray, tau: FloatArray, orders: int, trending: int = 0) -> FloatArray:
-    """Return 1, tau, cos theta, sin theta, cos 2 theta, ...; then the first ones times tau."""
+def columns(
+    theta: FloatArray,
+    tau: FloatArray,
+    orders: int,
+    trending: int = 0,
+    passed: FloatArray | None = None,
+) -> FloatArray:
+    """Return 1, tau, cos theta, sin theta, cos 2 theta, ...; then the first ones times tau.
+
+    Of each harmonic the share that has `passed` into block means.
+    """
     width = 2 * orders + 2
     out = np.empty((width + 2 * trending, theta.size))
     out[0] = 1.0
@@ -300,37 +344,45 @@ def columns(theta: FloatArray, tau: FloatArray, orders: int, trending: int = 0) 
         np.multiply(twice, out[i - 2], out=out[i])
         if i != 5:
             out[i] -= out[i - 4] if i > 5 else 1.0
+    if passed is not None:
+        out[2:width] *= np.repeat(passed, 2)[:, None]
     np.multiply(out[2 : 2 + 2 * trending], tau, out=out[width:])
     return out
 
 
 def _column_blocks(
-    theta: FloatArray, tau: FloatArray, orders: int, trending: int
+    theta: FloatArray, tau: FloatArray, orders: int, trending: int, passed: FloatArray | None = None
 ) -> Iterator[tuple[slice, FloatArray]]:
     """Yield slices of the samples with their columns."""
     for start in range(0, theta.size, _BLOCK):
         part = slice(start, start + _BLOCK)
-        yield part, columns(theta[part], tau[part], orders, trending)
+        yield part, columns(theta[part], tau[part], orders, trending, passed)
 
 
-def _normal_equations(
-    theta: FloatArray, tau: FloatArray, channels: FloatArray, orders: int, trending: int
+def normal_equations(
+    theta: FloatArray,
+    tau: FloatArray,
+    channels: FloatArray,
+    orders: int,
+    trending: int,
+    blocks: Iterable[tuple[slice, FloatArray]] = (),
 ) -> tuple[FloatArray, FloatArray]:
+    """Return the normal matrix and the right-hand sides of a fit with these columns."""
     width = 2 * orders + 2 + 2 * trending
     normal = np.zeros((width, width))
     right = np.zeros((width, len(channels)))
-    for part, block in _column_blocks(theta, tau, orders, trending):
+    for part, block in blocks or _column_blocks(theta, tau, orders, trending):
         normal += block @ block.T
         right += block @ channels[:, part].T
     return normal, right
 
 
-def solvable_inverse(normal: FloatArray, stretch: Stretch) -> FloatArray:
+def solvable_inverse(normal: FloatArray, segment: Segment) -> FloatArray:
     """Return the inverse of normal equations, or say that the samples do not determine it."""
     if np.linalg.cond(normal) > 1e8:
         raise ExtractionError(
-            f"the samples around t = {stretch.centre:.6g} s do not tell the harmonics of "
-            f"{stretch.omega / (2.0 * np.pi):.6g} Hz apart; expected samples spread over whole "
+            f"the samples around t = {segment.centre:.6g} s do not separate the harmonics of "
+            f"{segment.omega / (2.0 * np.pi):.6g} Hz apart; expected samples spread over whole "
             "cycles: check frequency= and the sampling"
         )
     return np.asarray(np.linalg.inv(normal))

@@ -10,7 +10,7 @@ order, the nonzeros of the sparse matrices. Left to itself casadi would colour t
 which takes several times as long to build and to evaluate.
 
 What is long-winded in a row, the quadrature of a general exponent, enters as its expansion about
-the row's own numbers (:class:`dahl_ident.fitting.casadi_expression.Expansion`).
+the row's own numbers (:class:`dahl_ident.fitting.casadi_expansion.Expansion`).
 """
 
 from __future__ import annotations
@@ -250,8 +250,7 @@ class _Rows:
             return [*arguments, ca.DM(0, self.n)]
         at = ca.Function("points", self._inputs[:3], points).map(self.n).call(arguments)
         coefficients = [
-            e.coefficients(order).map(self.n)(point)
-            for e, point in zip(self.block.expansions, at, strict=True)
+            e.at(order, self.n)(point) for e, point in zip(self.block.expansions, at, strict=True)
         ]
         return [*arguments, ca.vertcat(*coefficients)]
 

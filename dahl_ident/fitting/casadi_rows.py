@@ -35,20 +35,18 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.quantities import converted
 from dahl_ident.data.rows import Rows
-from dahl_ident.elements import Dahl, Damper, LinearSystem, Mass, Model, Spring
+from dahl_ident.elements import Element
+from dahl_ident.elements.casadi_dahl import Phasor
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import losses
-from dahl_ident.fitting.casadi_expression import (
-    Expansion,
-    Phasor,
-    linear_describing_function,
-)
+from dahl_ident.fitting.casadi_expansion import Expansion, is_short
 from dahl_ident.noise import (
     AmplitudeError,
     Covariance,
     Measured,
     Noise,
     Relative,
+    Student,
     Whitening,
     noise_for,
 )
@@ -137,21 +135,6 @@ def parameter_values(problem: Problem, theta: ca.SX) -> dict[str, ca.SX]:
     return values
 
 
-def check_elements(model: Model) -> None:
-    """Refuse elements that cannot be written as expressions."""
-    for element in model.elements:
-        if isinstance(element, Dahl | Mass | Damper | Spring):
-            continue
-        free = [p.name for p in element.parameters if p.free]
-        if free or not isinstance(element, LinearSystem):
-            raise FitError(
-                f"{element!r} cannot be written as a casadi expression"
-                + (f" with {', '.join(free)} free" if free else "")
-                + "; method='ipopt' takes Dahl, Mass, Damper, Spring and a LinearSystem of fixed "
-                "numbers: use method='scipy'"
-            )
-
-
 def row_blocks(target: Target, theta: ca.SX, start: FloatArray) -> list[RowBlock]:
     """Return the rows of a table, kind by kind.
 
@@ -206,17 +189,35 @@ class _Columns:
         """Return the symbols of a complex column."""
         return Phasor(self.real(values.real), self.real(values.imag))
 
-    def friction(
-        self, element: Dahl, values: Sequence[ca.SX], amplitude: ca.SX, harmonic: int
+    def element(
+        self,
+        element: Element,
+        values: Sequence[ca.SX],
+        amplitude: ca.SX,
+        omega: FloatArray,
+        harmonic: int,
     ) -> Phasor:
-        """Return F_k/X_1 of a Dahl element."""
-        f_max, sigma, alpha = values
-        beta = sigma * amplitude / f_max
-        exponent = element.parameters[2]
-        if harmonic == 1 and not exponent.free and exponent.value == 1.0:
-            return linear_describing_function(beta).scaled(sigma)
-        self.expansions.append(Expansion(beta, alpha, harmonic))
-        return self.expansions[-1].value.scaled(sigma)
+        """Return F_k/X_1 of an element; `omega` is that of the whole table."""
+        import casadi as ca
+
+        linear = bool(values) and element.labels == element.linear_parameters
+        if element.is_linear and (linear or not any(p.free for p in element.parameters)):
+            one, numbers = np.ones(()), [np.asarray(p.value) for p in element.parameters]
+            if not linear:
+                fixed = element.stiffness(numbers, one, omega, harmonic)
+                return self.phasor(np.broadcast_to(fixed, omega.shape))
+            total = Phasor(ca.SX(0.0), ca.SX(0.0))
+            for index, value in enumerate(values):
+                unit = [np.asarray(float(i == index)) for i in range(len(values))]
+                total = total + self.phasor(element.stiffness(unit, one, omega, harmonic)).scaled(
+                    value
+                )
+            return total
+        speed = ca.SX(0.0) if element.rate_independent else self.real(omega)
+        if is_short(element, harmonic):
+            return Phasor(*element.casadi_stiffness(values, amplitude, speed, harmonic))
+        self.expansions.append(Expansion(element, values, amplitude, speed, harmonic))
+        return self.expansions[-1].value
 
     def collected(self) -> tuple[ca.SX, FloatArray]:
         """Return all symbols and their numbers."""
@@ -289,15 +290,7 @@ class _Table:
         total = Phasor(ca.SX(0.0), ca.SX(0.0))
         for element in self.problem.model.elements:
             values = [self.values[p.name] for p in element.parameters]
-            if isinstance(element, Dahl):
-                total = total + columns.friction(element, values, amplitude, harmonic)
-            elif isinstance(element, Mass | Damper | Spring):
-                unit = element.stiffness([np.ones(())], np.ones(()), self.rows.omega, harmonic)
-                total = total + columns.phasor(unit).scaled(values[0])
-            else:
-                known = element.known_values()
-                fixed = element.stiffness(known, np.ones(()), self.rows.omega, harmonic)
-                total = total + columns.phasor(np.broadcast_to(fixed, self.rows.omega.shape))
+            total = total + columns.element(element, values, amplitude, self.rows.omega, harmonic)
         return total
 
     def _response(self, columns: _Columns, stiffness: Phasor, harmonic: int) -> Phasor:
@@ -339,9 +332,9 @@ class _Table:
         """Return rho of a row's sum of squares."""
         if self.target.loss != "linear":
             return _robust(self.target.loss, squares)
-        if not isinstance(self.noise, Measured) or self.noise.dof is None:
+        if not isinstance(self.noise, Measured) or self.noise.tail is None:
             return squares
-        return _student(columns.real(self.noise.dof), squares)
+        return _student(self.noise.tail, columns, squares)
 
     def _displacement(self, start: FloatArray) -> ComplexArray:
         """Return the true displacement phasor X at `start`, 1 in rows that need none."""
@@ -362,10 +355,12 @@ class _Table:
         return np.where(forced, self.rows.drive / sensed[0] / stiffness, 1.0)
 
 
-def _student(dof: ca.SX, squares: ca.SX) -> ca.SX:
+def _student(tail: Student, columns: _Columns, squares: ca.SX) -> ca.SX:
+    """Return rho(z) of rows whose covariance was estimated."""
     import casadi as ca
 
-    return (dof - 2.0) * ca.log1p(squares / dof)
+    size = columns.real(tail.dof - tail.parts)
+    return size * ca.log1p(squares / columns.real(tail.dof))
 
 
 def _robust(name: str, squares: ca.SX) -> ca.SX:
@@ -400,6 +395,6 @@ def _split(
         raise FitError(
             f"row {int(np.argmax(tied))}: the error of amplitude or drive accounts for all of the "
             "response's error in some direction, which would have to fit exactly; give the "
-            "response an error of its own, or use method='scipy'"
+            "response an error of its own, or use method='lm'"
         )
     return spread, shared, Whitening.of(rest)

@@ -1,6 +1,6 @@
 r"""Least squares by IPOPT: constraints between parameters, and noise in the drive as well.
 
-The problem is that of :mod:`dahl_ident.fitting.least_squares`, written as casadi expressions, so
+The problem is that of :mod:`dahl_ident.fitting.search`, written as casadi expressions, so
 IPOPT has the exact Hessian. From the least-squares optimum it takes a step or two.
 
 **Form.** Rows with controlled displacement enter in reduced form: the response is an explicit
@@ -30,11 +30,12 @@ from scipy.linalg import null_space
 
 from dahl_ident.arrays import FloatArray, finite_array, non_negative_array
 from dahl_ident.errors import FitError, ValidationError
-from dahl_ident.fitting import least_squares
 from dahl_ident.fitting.casadi_constraints import Constraints, Relations
 from dahl_ident.fitting.casadi_nlp import RowwiseProblem, SharedTerms
-from dahl_ident.fitting.casadi_rows import Target, check_elements, parameter_values, row_blocks
-from dahl_ident.fitting.ending import End, optimum
+from dahl_ident.fitting.casadi_rows import Target, parameter_values, row_blocks
+from dahl_ident.fitting.convergence import Ends, optima
+from dahl_ident.fitting.global_start import starts
+from dahl_ident.fitting.levenberg_marquardt import Minima
 from dahl_ident.fitting.losses import loss_named
 from dahl_ident.fitting.optimum import (
     Optimum,
@@ -43,7 +44,7 @@ from dahl_ident.fitting.optimum import (
     robust_information,
     scale_ratio,
 )
-from dahl_ident.fitting.start import starts
+from dahl_ident.fitting.search import solve
 from dahl_ident.fitting.status import Status
 from dahl_ident.noise import AmplitudeError
 from dahl_ident.problem import Problem
@@ -89,7 +90,7 @@ def solve_ipopt(
         Takes a mapping of every parameter's name to its casadi symbol, returns comparisons with
         ``<=``, ``>=`` or ``==``.
     start : mapping of str to float, optional
-        One more start for the search that precedes, see `least_squares.solve`.
+        One more start for the search that precedes, see `solve`.
     loss : {"linear", "huber", "soft_l1", "student_t"}, default "linear"
         See :mod:`dahl_ident.fitting.losses`.
     drive_std : (n,) array_like or float, optional
@@ -103,7 +104,7 @@ def solve_ipopt(
     -------
     Optimum
         With ``method="ipopt"``. Where there are no constraints and the optimum lies at infinity,
-        that of `least_squares.solve`. With noise in the drive its `cost` and `covariance` take
+        that of `solve`. With noise in the drive its `cost` and `covariance` take
         that into account; its `residuals` are those at the drives as measured.
 
     Raises
@@ -130,16 +131,15 @@ def solve_ipopt(
     >>> print(f"{tied.values[1] / tied.values[0]:.6f}")
     250.000000
     """
-    check_elements(problem.model)
     drive_error = _drive_error(problem, loss, drive_std, drive_covariance)
     relations = Relations.of(problem, constraints)
-    begin = least_squares.solve(problem, loss=loss, start=start)
+    begin = solve(problem, loss=loss, start=start)
     if begin.status.at_infinity and not relations.texts and drive_error is None:
         return replace(begin, method="ipopt")
     adapts = not problem.scale_known and bool(loss != "linear" or problem.priors)
     target = Target(problem, begin.scale if adapts else 1.0, loss, drive_error)
     found = _search(target, begin, relations)
-    dof = problem.n_residuals + len(problem.priors) - len(problem.names) + relations.freedom_lost
+    dof = problem.n_numbers + len(problem.priors) - len(problem.names) + relations.freedom_lost
     for _ in range(_RESCALINGS if adapts and relations.texts else 0):
         ratio = scale_ratio(problem, found.theta, target.scale, loss_named(loss), dof)
         if abs(ratio - 1.0) < _SAME_SCALE:
@@ -177,7 +177,7 @@ def _search(target: Target, begin: Optimum, relations: Relations) -> _Found:
     """Return the best end of IPOPT's searches.
 
     The least-squares optimum is the one start, unless it is not finite or a constraint binds:
-    the minimum on a constraint may lie in another valley.
+    the minimum on a constraint may lie elsewhere.
     """
     problem, found = target.problem, []
     if begin.success:
@@ -266,6 +266,7 @@ def _run(
             "grad_f": nlp.gradient(),
             "jac_g": nlp.jacobian(),
             "hess_lag": nlp.hessian(),
+            "no_nlp_grad": True,  # what numpy computes has none but those given
             "print_time": False,
             "show_eval_warnings": False,
             "ipopt.print_level": 0,
@@ -345,10 +346,14 @@ def _ended(target: Target, found: _Found, relations: Relations, nfev: int) -> Op
     if not words and elsewhere and found.information is None:
         words = "it ended at another of the plant's several amplitudes than the one measured"
     hessian = at.hessian if found.information is None else found.information
-    end = End(found.theta, found.cost, hessian, not words)
-    result = replace(
-        optimum(problem, end, target.scale, loss, nfev + found.evaluations), method="ipopt"
+    minima = Minima(
+        found.theta[None],
+        np.array([found.cost]),
+        hessian[None],
+        np.array([not words]),
+        np.array([nfev + found.evaluations]),
     )
+    result = optima(problem, Ends(minima), target.scale, loss, "ipopt", minima.evaluations)[0]
     if words:
         return replace(result, message=f"{result.message} IPOPT says: {words}.")
     if not relations.texts and found.information is None:

@@ -12,8 +12,8 @@ the data; it ends with the next step, which needs no evaluation of its own.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,9 +62,33 @@ class Minima:
 
     def put(self, which: IntArray, other: Minima) -> None:
         """Let some of the searches end where those of `other`, which went on from there, did."""
-        for name in ("theta", "cost", "hessian", "converged"):
+        before = self.evaluations[which]
+        self.assign(which, other)
+        self.evaluations[which] += before
+
+    def assign(self, which: IntArray, other: Minima) -> None:
+        """Replace some of the searches."""
+        for name in ("theta", "cost", "hessian", "converged", "evaluations"):
             getattr(self, name)[which] = getattr(other, name)
-        self.evaluations[which] += other.evaluations
+
+    @classmethod
+    def stacked(cls, parts: Sequence[Minima]) -> Minima:
+        """Return the searches of all parts, one after the other."""
+        names = ("theta", "cost", "hessian", "converged", "evaluations")
+        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+
+    def best(self, owner: IntArray, S: int) -> Minima:
+        """Return the best search of each of S owners: converged ones first if nearly as low."""
+        lowest, most = np.full(S, np.inf), np.zeros(S, dtype=np.intp)
+        np.minimum.at(lowest, owner, self.cost)
+        np.maximum.at(most, owner, self.evaluations)
+        good = self.converged & (self.cost <= lowest[owner] * (1.0 + NEARLY))
+        any_good = np.zeros(S, dtype=np.bool_)
+        any_good[owner[good]] = True
+        cost = np.where(good | ~any_good[owner], self.cost, np.inf)
+        order = np.lexsort((~good, cost, owner))
+        first = order[np.searchsorted(owner[order], np.arange(S))]
+        return replace(self.take(first), evaluations=most)
 
     def better(self, other: Minima) -> Minima:
         """Return, search by search, the other where it is lower or alone has converged."""
@@ -97,7 +121,7 @@ def minimise(
     n_residuals: int,
     *,
     inside: Callable[[FloatArray, IntArray | None], BoolArray] | None = None,
-    looseness: float = 1.0,
+    tolerance_factor: float = 1.0,
     enough: float = 0.0,
     steps: int = 80,
 ) -> Minima:
@@ -105,13 +129,13 @@ def minimise(
 
     `logarithmic` says which coordinates are logarithms: their steps have a longest length.
     Searches that leave the region `inside`, which is called like `evaluate`, end there, not
-    converged. `looseness` multiplies the
+    converged. `tolerance_factor` multiplies the
     length of the step at which a search has converged; `enough` is a fall of the cost that is
     not worth a step, however long.
     """
     with np.errstate(all="ignore"):
         return _minimise(
-            evaluate, theta, logarithmic, n_residuals, inside, looseness, enough, steps
+            evaluate, theta, logarithmic, n_residuals, inside, tolerance_factor, enough, steps
         )
 
 
@@ -163,7 +187,7 @@ def _minimise(
     logarithmic: BoolArray,
     n_residuals: int,
     inside: Callable[[FloatArray, IntArray | None], BoolArray] | None,
-    looseness: float,
+    tolerance_factor: float,
     enough: float,
     steps: int,
 ) -> Minima:
@@ -176,10 +200,10 @@ def _minimise(
     last = np.full(S, 1e-300)
     for _ in range(steps if P else 0):
         step, moves, foretold, longest = _step(at, damping, logarithmic)
-        shortest = looseness**2 * _tolerance(at, logarithmic, n_residuals)
+        shortest = tolerance_factor**2 * _tolerance(at, logarithmic, n_residuals)
         settled = moves * np.minimum(1.0, moves / last) <= shortest
-        settled |= foretold <= looseness**2 * _EPS * at.cost
-        settled &= longest <= looseness * _LAST_STEP
+        settled |= foretold <= tolerance_factor**2 * _EPS * at.cost
+        settled &= longest <= tolerance_factor * _LAST_STEP
         settled |= foretold < enough
         settled &= damping < _GAUSS_NEWTON
         lost = ~np.isfinite(at.cost) | (damping > _MOST_DAMPING)

@@ -43,13 +43,13 @@ class Loss:
     name: str
     rho: Callable[[FloatArray], FloatArray]
     slope: Callable[[FloatArray], FloatArray]
-    bend: Callable[[FloatArray], FloatArray]
+    curvature: Callable[[FloatArray], FloatArray]
     power: int
     """Of rho' in chi."""
 
     def __call__(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return rho and its first two derivatives."""
-        return self.rho(z), self.slope(z), self.bend(z)
+        return self.rho(z), self.slope(z), self.curvature(z)
 
     def chi(self, z: FloatArray) -> FloatArray:
         """Return what the scale is measured by; it rises with z."""
@@ -88,7 +88,7 @@ class Loss:
         if dof <= 0:
             return np.inf
         psi2 = (self.slope(z) ** 2 * z).sum() / dof
-        return float(psi2 / np.mean(self.slope(z) + self.bend(z) * z) ** 2)
+        return float(psi2 / np.mean(self.slope(z) + self.curvature(z) * z) ** 2)
 
 
 def _huber(z: FloatArray) -> FloatArray:
@@ -99,12 +99,12 @@ def _huber_slope(z: FloatArray) -> FloatArray:
     return np.where(z <= KNEE**2, 1.0, KNEE / np.sqrt(np.maximum(z, KNEE**2)))
 
 
-def _huber_bend(z: FloatArray) -> FloatArray:
+def _huber_curvature(z: FloatArray) -> FloatArray:
     return np.where(z <= KNEE**2, 0.0, -0.5 * KNEE * np.maximum(z, KNEE**2) ** -1.5)
 
 
 LOSSES = {
-    "huber": Loss("huber", _huber, _huber_slope, _huber_bend, power=2),
+    "huber": Loss("huber", _huber, _huber_slope, _huber_curvature, power=2),
     "soft_l1": Loss(
         "soft_l1",
         lambda z: 2.0 * z / (np.sqrt(1.0 + z) + 1.0),

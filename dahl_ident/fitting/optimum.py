@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import FitError
-from dahl_ident.fitting.limits import Limit
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.status import Status
-from dahl_ident.problem import Problem, ProblemBatch
+from dahl_ident.problem import Problem
 
+_AT_BOUND = 1e-8  # relative distance from a bound that is none
 _NULL = 1e-13  # eigenvalue of the scaled information below which a direction is undetermined
 _NOTHING = 1e-100  # information on a parameter, as its root, that is none
 _BARELY = 1.001  # of the rounding, below which a scale is that
@@ -146,11 +147,11 @@ class Optimum:
     @property
     def bic(self) -> float:
         """Schwarz's criterion, -2 ln L + k ln n, of n residuals; k as for `aic`."""
-        return -2.0 * self.log_likelihood + float(np.log(self.problem.n_residuals)) * self._counted
+        return -2.0 * self.log_likelihood + float(np.log(self.problem.n_numbers)) * self._counted
 
     @property
     def _counted(self) -> int:
-        determined = self.problem.n_residuals + len(self.problem.priors) - self.dof
+        determined = self.problem.n_numbers + len(self.problem.priors) - self.dof
         return determined + (not self.scale_known)
 
     @property
@@ -172,19 +173,63 @@ class Optimum:
 
 
 @dataclass(frozen=True)
-class OptimumBatch:
-    """The minima of S problems of one shape; arrays as in :class:`Optimum`, led by S."""
+class OptimumBatch(Sequence[Optimum]):
+    """The minima of S problems of one shape: a sequence of :class:`Optimum`.
 
-    problem: ProblemBatch
+    Arrays are those of the optima, led by S.
+    """
+
+    problem: Problem
     theta: FloatArray
     values: FloatArray
     covariance: FloatArray
     scale: FloatArray
-    scale_known: bool
     dof: NDArray[np.intp]
     cost: FloatArray
     nfev: NDArray[np.intp]
     status: tuple[Status, ...]
+    undetermined: NDArray[np.bool_]
+    method: str
+    loss: str
+    combinations: Mapping[int, tuple[Combination, ...]]
+    """Of the tables at a limit."""
+    meanings: Mapping[int, str]
+    """Of their limits, where the status does not say it."""
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+    @overload
+    def __getitem__(self, index: int) -> Optimum: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Optimum]: ...
+
+    def __getitem__(self, index: int | slice) -> Optimum | list[Optimum]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        index = range(len(self))[index]
+        return Optimum(
+            problem=self.problem.table(index),
+            theta=self.theta[index],
+            values=self.values[index],
+            covariance=self.covariance[index],
+            scale=float(self.scale[index]),
+            scale_known=self.scale_known,
+            dof=int(self.dof[index]),
+            cost=float(self.cost[index]),
+            nfev=int(self.nfev[index]),
+            status=self.status[index],
+            message=self._message(index),
+            method=self.method,
+            loss=self.loss,
+            combinations=self.combinations.get(index, ()),
+        )
+
+    @property
+    def scale_known(self) -> bool:
+        """Whether the noise model knows the scale."""
+        return self.problem.scale_known
 
     @property
     def success(self) -> NDArray[np.bool_]:
@@ -201,6 +246,73 @@ class OptimumBatch:
     def names(self) -> tuple[str, ...]:
         """The names of the free parameters."""
         return self.problem.names
+
+    @classmethod
+    def joined(cls, problem: Problem, parts: Sequence[OptimumBatch]) -> OptimumBatch:
+        """Return the optima of all parts, one after the other, as those of `problem`."""
+
+        def side_by_side(name: str) -> Any:
+            return np.concatenate([getattr(part, name) for part in parts])
+
+        combinations, meanings, first = {}, {}, 0
+        for part in parts:
+            combinations.update({first + at: c for at, c in part.combinations.items()})
+            meanings.update({first + at: text for at, text in part.meanings.items()})
+            first += len(part)
+        return cls(
+            problem=problem,
+            theta=side_by_side("theta"),
+            values=side_by_side("values"),
+            covariance=side_by_side("covariance"),
+            scale=side_by_side("scale"),
+            dof=side_by_side("dof"),
+            cost=side_by_side("cost"),
+            nfev=side_by_side("nfev"),
+            status=tuple(status for part in parts for status in part.status),
+            undetermined=side_by_side("undetermined"),
+            method=parts[0].method,
+            loss=parts[0].loss,
+            combinations=combinations,
+            meanings=meanings,
+        )
+
+    def _message(self, index: int) -> str:
+        """Return the status with the names and numbers that belong to it."""
+        status, problem, values = self.status[index], self.problem, self.values[index]
+        parts = [status.value]
+        if index in self.meanings:
+            ends = {np.inf: "without bound", -np.inf: "without bound below", 0.0: "to zero"}
+            if status is Status.RUNS_AWAY and self.meanings[index]:
+                parts.append(f"In this limit {self.meanings[index]}.")
+            gone = [
+                f"{p.name} {ends[value]}"
+                for p, value in zip(problem.parameters, values.tolist(), strict=True)
+                if np.isinf(value) or (value == 0.0 and p.transform == "log")
+            ]
+            parts.append(f"Here: {', '.join(gone)}.")
+            left = [
+                f"{c.expression} = {c.value:.4g} +- {c.stderr:.2g}"
+                for c in self.combinations[index]
+            ]
+            if left:
+                parts.append(f"The limit depends on {', '.join(left)}.")
+        elif status is Status.SINGULAR:
+            lost = self.undetermined[index]
+            names = [n for n, gone in zip(problem.names, lost, strict=True) if gone]
+            parts.append(f"Involved: {', '.join(names)}.")
+        elif status is Status.AT_BOUND:
+            hit = at_bound(problem, self.theta[index])
+            found = zip(problem.names, values, hit, strict=True)
+            parts.append(f"At its bound: {', '.join(f'{n} = {v:g}' for n, v, at in found if at)}.")
+        return " ".join(parts)
+
+
+def at_bound(problem: Problem, theta: FloatArray) -> NDArray[np.bool_]:
+    """Return which parameters lie at a bound."""
+    low, high = problem.bounds()
+    with np.errstate(invalid="ignore"):
+        near = _AT_BOUND * np.maximum(1.0, np.abs(theta))
+        return np.asarray((theta - low <= near) | (high - theta <= near))
 
 
 def estimated_scale(problem: Problem, cost: ArrayLike, dof: int | NDArray[np.intp]) -> FloatArray:
@@ -267,24 +379,10 @@ def inverse(information: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     undetermined = np.asarray((parts > _PART).any(axis=-1), dtype=np.bool_)
     inverted = np.where(null, 0.0, 1.0 / np.where(null, 1.0, values))
     covariance = (vectors * inverted[..., None, :]) @ vectors.swapaxes(-1, -2) / sizes
-    return (_blanked(covariance, undetermined) if undetermined.any() else covariance), undetermined
+    return (blanked(covariance, undetermined) if undetermined.any() else covariance), undetermined
 
 
-def spread(
-    limit: Limit, chart: FloatArray, inner: FloatArray, lost: NDArray[np.bool_]
-) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return the covariance of theta, and which of it is undetermined, from that of phi.
-
-    `chart` is dtheta/dphi, (..., P, Q); `inner` and `lost` are the same two of phi.
-    """
-    covariance = chart @ np.where(np.isfinite(inner), inner, 0.0) @ chart.swapaxes(-1, -2)
-    undetermined = np.array([name in limit.extremes for name in limit.names])
-    undetermined = undetermined | ((np.abs(chart) > 0.0) & lost[..., None, :]).any(axis=-1)
-    undetermined |= ~chart.any(axis=-1)
-    return _blanked(covariance, undetermined), undetermined
-
-
-def _blanked(covariance: FloatArray, undetermined: NDArray[np.bool_]) -> FloatArray:
+def blanked(covariance: FloatArray, undetermined: NDArray[np.bool_]) -> FloatArray:
     """Return `covariance` with infinite variances and no covariances of the undetermined."""
     either = undetermined[..., :, None] | undetermined[..., None, :]
     diagonal = either & np.eye(covariance.shape[-1], dtype=np.bool_)

@@ -44,6 +44,10 @@ class Status(Enum):
         "No finite optimum: the fit improves as friction vanishes. The other elements explain "
         "the data: drive more softly, or leave the element out."
     )
+    RUNS_AWAY = (
+        "No finite optimum: the fit improves as a parameter goes to a limit. The amplitudes do not "
+        "reach what it describes: measure where it matters, or fix it."
+    )
     NOT_CONVERGED = (
         "Not converged: the search stopped before it found a minimum. The numbers are not an "
         "optimum: give a start, or fix a parameter."
@@ -72,4 +76,5 @@ _AT_INFINITY = (
     Status.SHARP_KNEE,
     Status.NO_FULL_SLIP,
     Status.NO_FRICTION,
+    Status.RUNS_AWAY,
 )

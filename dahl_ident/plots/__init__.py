@@ -4,6 +4,18 @@ from __future__ import annotations
 
 from matplotlib.axes import Axes
 
+from dahl_ident.plots.bench_time import plot_bench_time
+from dahl_ident.plots.budget import plot_budget
+from dahl_ident.plots.control_charts import plot_control_charts, plot_devices
+from dahl_ident.plots.control_loops import plot_margins, plot_nichols, plot_nyquist
+from dahl_ident.plots.corner import plot_corner, plot_trace
+from dahl_ident.plots.cycles import plot_cycles
+from dahl_ident.plots.fit_diagnostics import (
+    plot_correlation,
+    plot_information,
+    plot_profile,
+    plot_residuals,
+)
 from dahl_ident.plots.frequency import plot_frequency_response
 from dahl_ident.plots.friction import (
     plot_amplitude_response,
@@ -11,27 +23,29 @@ from dahl_ident.plots.friction import (
     plot_universal_curve,
 )
 from dahl_ident.plots.gain_phase import Curve
-from dahl_ident.plots.judging import (
-    plot_correlation,
-    plot_information,
-    plot_profile,
-    plot_residuals,
-)
-from dahl_ident.plots.posterior import plot_corner, plot_trace
-from dahl_ident.plots.quality import plot_cycles
+from dahl_ident.plots.waveforms import plot_recorded_loops, plot_waveforms
 
 __all__ = [
     "Axes",
     "Curve",
     "plot_amplitude_response",
+    "plot_bench_time",
+    "plot_budget",
+    "plot_control_charts",
     "plot_corner",
     "plot_correlation",
     "plot_cycles",
+    "plot_devices",
     "plot_frequency_response",
     "plot_information",
     "plot_loops",
+    "plot_margins",
+    "plot_nichols",
+    "plot_nyquist",
     "plot_profile",
+    "plot_recorded_loops",
     "plot_residuals",
     "plot_trace",
     "plot_universal_curve",
+    "plot_waveforms",
 ]

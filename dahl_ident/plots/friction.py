@@ -49,17 +49,18 @@ def plot_amplitude_response(
     >>> bottom.get_ylabel()
     'phase [degrees]'
     """
-    pair = top, bottom = style.axes_pair(ax)
-    points = Points(amplitude, response, gain_std, phase_std)
-    if curve is not None:
-        draw_curve(pair, curve, near=points, color=style.FIT, label=curve.label)
-    draw_points(pair, points, fmt="o", color=style.BLUE, label="data")
-    top.set(xscale="log", yscale="log", ylabel=gain_label)
-    bottom.set(xscale="log", xlabel=amplitude_label, ylabel="phase [degrees]")
-    style.readable_log_ticks(top)
-    style.readable_log_ticks(bottom)
-    style.legend_above(top)
-    return top, bottom
+    with style.house_style():
+        pair = top, bottom = style.axes_pair(ax)
+        points = Points(amplitude, response, gain_std, phase_std)
+        if curve is not None:
+            draw_curve(pair, curve, near=points, color=style.FIT, label=curve.label)
+        draw_points(pair, points, fmt="o", color=style.BLUE, label="data")
+        top.set(xscale="log", yscale="log", ylabel=gain_label)
+        bottom.set(xscale="log", xlabel=amplitude_label, ylabel="phase [degrees]")
+        style.readable_log_ticks(top)
+        style.readable_log_ticks(bottom)
+        style.legend_above(top)
+        return top, bottom
 
 
 def plot_universal_curve(
@@ -92,20 +93,21 @@ def plot_universal_curve(
     >>> plot_universal_curve([0.9 + 0.1j], curve=[1.0, 0.73 + 0.3j]).get_xlabel()
     'Re N / sigma'
     """
-    axis = style.axes(ax)
-    h, N = np.asarray(curve), np.asarray(normalised)
-    axis.plot(h.real, h.imag, color=style.FIT, label="h(beta), linear Dahl")
-    axis.plot(N.real, N.imag, "o", color=style.BLUE, label="data / sigma", zorder=3)
-    for beta, value in marked_beta:
-        axis.plot(value.real, value.imag, "|", color=style.FIT, markersize=9)
-        axis.annotate(
-            f"{beta:g}", (value.real, value.imag), _inwards(value), textcoords="offset points",
-            ha="center", va="center", fontsize=7, color=style.GREY,
-        )  # fmt: skip
-    axis.set(xlabel="Re N / sigma", ylabel="Im N / sigma")
-    axis.margins(y=0.12)
-    style.legend_above(axis)
-    return axis
+    with style.house_style():
+        axis = style.axes(ax)
+        h, N = np.asarray(curve), np.asarray(normalised)
+        axis.plot(h.real, h.imag, color=style.FIT, label="h(beta), linear Dahl")
+        axis.plot(N.real, N.imag, "o", color=style.BLUE, label="data / sigma", zorder=3)
+        for beta, value in marked_beta:
+            axis.plot(value.real, value.imag, "|", color=style.FIT, markersize=9)
+            axis.annotate(
+                f"{beta:g}", (value.real, value.imag), _inwards(value), textcoords="offset points",
+                ha="center", va="center", fontsize=7, color=style.GREY,
+            )  # fmt: skip
+        axis.set(xlabel="Re N / sigma", ylabel="Im N / sigma")
+        axis.margins(y=0.12)
+        style.legend_above(axis)
+        return axis
 
 
 def _inwards(h: complex) -> tuple[float, float]:
@@ -130,7 +132,7 @@ def plot_loops(
     loops : sequence of (displacement, force, label)
         The model's loops.
     measured : sequence of (displacement, force), optional
-        Measured points, drawn as dots in the colour of the loop at the same place.
+        Measured points, drawn as markers in the colour of the loop at the same place.
     displacement_label, force_label : str
         Axis labels with units.
     ax : Axes, optional
@@ -146,12 +148,16 @@ def plot_loops(
     >>> plot_loops([([0.0, 1.0], [0.0, 1.0], "1 m")]).get_ylabel()
     'force [N]'
     """
-    axis = style.axes(ax)
-    colours = style.level_colours(max(len(loops), len(measured)))
-    for (displacement, force), colour in zip(measured, colours, strict=False):
-        axis.plot(displacement, force, ".", color=colour, markersize=4)
-    for (displacement, force, label), colour in zip(loops, colours, strict=False):
-        axis.plot(displacement, force, color=colour, label=label)
-    axis.set(xlabel=displacement_label, ylabel=force_label)
-    style.legend_above(axis)
-    return axis
+    with style.house_style():
+        axis = style.axes(ax)
+        count = max(len(loops), len(measured))
+        for (displacement, force), look in zip(measured, style.level_markers(count), strict=False):
+            axis.plot(displacement, force, **look, markersize=3, alpha=0.6)
+        for (displacement, force, label), look in zip(
+            loops, style.level_lines(count), strict=False
+        ):
+            axis.plot(displacement, force, **look, label=label)
+        axis.set(xlabel=displacement_label, ylabel=force_label)
+        style.few_plain_ticks(axis.xaxis, most=6)
+        style.legend_above(axis)
+        return axis

@@ -1,31 +1,38 @@
 """One look for every plot: safe for colour-blind readers, in print, and at 400 px.
 
-Colours are those of Okabe and Ito; series differ in marker as well, so that a grey print still
-tells them apart. Levels, which have an order, take a sequential map.
+Every colour of a line or marker has a contrast of at least 3 to 1 against white paper. Series
+differ in marker as well, so that they can be distinguished in a grey print. Levels, which have an
+order, take a sequential map from dark to bright, with line styles and markers in turn.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, cast
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.axis import Axis
+from matplotlib.ticker import Locator, MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from dahl_ident.errors import ValidationError
 
-BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE, YELLOW, BLACK = (
-    "#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7", "#F0E442", "#000000",
+BLUE, VERMILION, GREEN, PURPLE, BROWN, INDIGO, BLACK = (
+    "#0072B2", "#D55E00", "#009E73", "#A0317E", "#6B4E00", "#222255", "#000000",
 )  # fmt: skip
-SERIES = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
+PALE_BLUE = "#B9DDF2"  # fills only, under an outline
+SERIES = (BLUE, VERMILION, GREEN, PURPLE, BROWN, INDIGO)
 MARKERS = ("o", "s", "^", "D", "v", "P")
+LINE_STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)))
 FIT = BLACK
 GREY = "#767676"
 _MOST_IN_A_ROW = 4  # of legends
+_LEVEL_COLOURS = (0.05, 0.66)  # of the map inferno; brighter ones fall below 3 to 1 on white
 
 RC: dict[Any, Any] = {
     "axes.grid": True,
@@ -46,14 +53,25 @@ RC: dict[Any, Any] = {
 }
 
 
-def new_axes(rows: int, columns: int, *, size: tuple[float, float], sharex: bool) -> NDArray[Any]:
-    """Return the axes, shape (rows, columns), of a new figure in the house style.
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Draw in the house style, and leave the user's settings as they were.
 
-    The figure is made outside the style's context: the first figure of a session loads the
+    Only the settings that the style changes are put back: the first figure of a session loads the
     backend, and what that sets (a notebook shows figures only while interactive) has to stay.
     """
-    figure = plt.figure(figsize=size, layout="constrained")
-    with mpl.rc_context(RC):
+    before = {name: mpl.rcParams[name] for name in RC}
+    mpl.rcParams.update(RC)
+    try:
+        yield
+    finally:
+        mpl.rcParams.update(before)
+
+
+def new_axes(rows: int, columns: int, *, size: tuple[float, float], sharex: bool) -> NDArray[Any]:
+    """Return the axes, shape (rows, columns), of a new figure in the house style."""
+    with house_style():
+        figure = plt.figure(figsize=size, layout="constrained")
         return np.asarray(figure.subplots(rows, columns, sharex=sharex, squeeze=False))
 
 
@@ -78,8 +96,24 @@ def axes_pair(
 
 
 def level_colours(count: int) -> list[Any]:
-    """Return `count` colours from dark to light, in the order of the levels."""
-    return list(mpl.colormaps["viridis"](np.linspace(0.0, 0.88, count)))
+    """Return `count` colours from dark to bright, in the order of the levels."""
+    return list(mpl.colormaps["inferno"](np.linspace(*_LEVEL_COLOURS, count)))
+
+
+def level_lines(count: int) -> list[dict[str, Any]]:
+    """Return colour and line style of `count` levels, in the order of the levels."""
+    return [
+        {"color": colour, "linestyle": line}
+        for colour, line in zip(level_colours(count), itertools.cycle(LINE_STYLES), strict=False)
+    ]
+
+
+def level_markers(count: int) -> list[dict[str, Any]]:
+    """Return colour and marker of `count` levels that are drawn as points."""
+    return [
+        {"color": colour, "marker": marker, "linestyle": "none"}
+        for colour, marker in zip(level_colours(count), itertools.cycle(MARKERS), strict=False)
+    ]
 
 
 def labelled_levels(count: int, most: int = 8) -> set[int]:
@@ -98,11 +132,45 @@ def legend_above(axis: Axes) -> None:
 
 
 def readable_log_ticks(axis: Axes) -> None:
-    """Label 1, 2 and 5 on logarithmic axes of less than two decades, without crowding."""
+    """Label logarithmic axes of less than two decades with plain numbers, without crowding."""
     for scale, line in ((axis.get_xscale(), axis.xaxis), (axis.get_yscale(), axis.yaxis)):
         low, high = sorted(line.get_view_interval())
-        if scale != "log" or not 0.0 < low < high < 100.0 * low:
-            continue
-        line.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        line.set_major_formatter(StrMethodFormatter("{x:g}"))
-        line.set_minor_formatter(NullFormatter())
+        if scale == "log" and 0.0 < low < high < 100.0 * low:
+            few_plain_ticks(line, most=6)
+
+
+def few_plain_ticks(line: Axis, most: int = 3) -> None:
+    """Label at most so many places of an axis, with plain numbers and no offset."""
+    logarithmic = line.get_scale() == "log"
+    line.set_major_locator(_FewLogTicks(most) if logarithmic else MaxNLocator(most - 1))
+    line.set_major_formatter(StrMethodFormatter("{x:.10g}"))
+    line.set_minor_formatter(NullFormatter())
+
+
+class _FewLogTicks(Locator):
+    """At most so many round values: 1-2-5 steps, else decades; even steps on a narrow range."""
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+
+    def __call__(self) -> Any:
+        assert self.axis is not None  # set by the axis that takes the locator
+        return self.tick_values(*self.axis.get_view_interval())
+
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        """Return the places between two limits."""
+        low, high = sorted((vmin, vmax))
+        decades = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
+        for steps in ((1.0, 2.0, 5.0), (1.0, 3.0), (1.0,)):
+            ticks = np.ravel(np.outer(10.0**decades, steps))
+            ticks = ticks[(low <= ticks) & (ticks <= high)]
+            if ticks.size < 2:
+                return MaxNLocator(self.most - 1).tick_values(low, high)
+            if ticks.size <= self.most:
+                return ticks
+        return ticks[:: -(-ticks.size // self.most)]
+
+
+def on_two_lines(label: str) -> str:
+    """Return a label with its unit below, for panels that are smaller than the label is long."""
+    return label.replace(" [", "\n[", 1)

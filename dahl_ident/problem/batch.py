@@ -12,8 +12,7 @@ from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Element
 from dahl_ident.errors import DataError
-from dahl_ident.problem.checks import checked_table
-from dahl_ident.problem.problem import Problem
+from dahl_ident.problem.problem import Problem, checked_table
 from dahl_ident.sensors import Sensors
 
 
@@ -65,6 +64,7 @@ class ProblemBatch(Problem):
         tables = [checked_table(table) for table in data]
         self._set_model(model, sensors, free, fixed, tables[0].motion)
         self._set_rows(Rows.stack(tables), noise)
+        self.tables = tuple(tables)
 
     @classmethod
     def replicates(cls, problem: Problem, responses: ComplexArray) -> ProblemBatch:
@@ -86,7 +86,10 @@ class ProblemBatch(Problem):
 
     def table(self, index: int) -> Problem:
         """Return the problem of one table."""
-        return self._with_rows(Problem, self._rows.table(index))
+        problem = self._with_rows(Problem, self._rows.table(index))
+        if "tables" in self.__dict__:  # replicates are responses alone
+            problem.data = self.tables[index]
+        return problem
 
     @property
     def n_tables(self) -> int:

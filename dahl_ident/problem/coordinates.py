@@ -9,10 +9,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray, positive_array, real_array
-from dahl_ident.elements import Dahl, Model, Parameter
+from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.sensors import Sensors
 
@@ -66,28 +66,38 @@ class Coordinates:
         return low, high
 
 
-def in_order(theta: FloatArray, interchangeable: Sequence[NDArray[np.intp]]) -> FloatArray:
-    """Return `theta` with the columns of like Dahl elements exchanged until x_c rises."""
-    array = theta.copy() if interchangeable else theta
-    for columns in interchangeable:
-        ln_x_c = array[..., columns[:, 0]] - array[..., columns[:, 1]]
-        order = np.argsort(ln_x_c, axis=-1)
-        for kind in columns.T:
-            array[..., kind] = np.take_along_axis(array[..., kind], order, axis=-1)
-    return array
+class Interchangeable:
+    """Like elements of a model, whose labels could switch: they are ordered by their knees."""
 
+    def __init__(self, model: Model, names: tuple[str, ...]) -> None:
+        alike: dict[tuple[object, ...], list[Element]] = {}
+        for element in model.elements:
+            if not element.is_linear and any(p.free for p in element.parameters):
+                settings = tuple(
+                    (p.free, None if p.free else p.value, p.lower, p.upper)
+                    for p in element.parameters
+                )
+                alike.setdefault((type(element), element.labels, settings), []).append(element)
+        self._sets = [elements for elements in alike.values() if len(elements) > 1]
+        self._columns = [
+            np.array([[names.index(p.name) for p in e.parameters if p.free] for e in elements])
+            for elements in self._sets
+        ]
 
-def interchangeable_elements(model: Model, names: tuple[str, ...]) -> list[NDArray[np.intp]]:
-    """Return, for each set of like Dahl elements, their columns in theta: f_max, sigma, alpha."""
-    alike: dict[tuple[object, ...], list[list[int]]] = {}
-    for element in model.elements:
-        if not isinstance(element, Dahl) or not all(p.free for p in element.parameters[:2]):
-            continue
-        alpha = element.parameters[2]
-        bounds = tuple((p.lower, p.upper) for p in element.parameters)
-        columns = [names.index(p.name) for p in element.parameters if p.free]
-        alike.setdefault((None if alpha.free else alpha.value, bounds), []).append(columns)
-    return [np.array(columns) for columns in alike.values() if len(columns) > 1]
+    def in_order(self, theta: FloatArray, coordinates: Coordinates) -> FloatArray:
+        """Return `theta` with the columns of like elements exchanged until the knees rise."""
+        array = theta.copy() if self._sets else theta
+        for elements, columns in zip(self._sets, self._columns, strict=True):
+            values = coordinates.to_values(array)
+            knees = []
+            for element, own in zip(elements, columns, strict=True):
+                free = iter(values[..., column] for column in own)
+                at = [next(free) if p.free else np.asarray(p.value) for p in element.parameters]
+                knees.append(np.broadcast_to(element.knee(at)[0], theta.shape[:-1]))
+            order = np.argsort(np.stack(knees, axis=-1), axis=-1)
+            for kind in columns.T:
+                array[..., kind] = np.take_along_axis(array[..., kind], order, axis=-1)
+        return array
 
 
 def with_changes(

@@ -71,7 +71,7 @@ class Predictor:
 
     def _set_rows(self, rows: Rows) -> None:
         self._rows = rows
-        _check(rows)
+        _check(rows, self._model)
         power, self._exponent = DEFINITIONS[rows.quantity]
         self._operator = power_of_s(rows.omega, power)
         self._guess = _measured_amplitude(rows, self._operator, self._exponent)
@@ -213,18 +213,18 @@ def _slot(parameter: Parameter, names: tuple[str, ...]) -> tuple[int | None, Flo
     return None, np.asarray(parameter.value)
 
 
-def _check(rows: Rows) -> None:
-    """Check that every row can be predicted."""
+def _check(rows: Rows, model: Model) -> None:
+    """Check that every row can be predicted, and that some say something about the model."""
     if rows.amplitude is None:
         _require(~rows.forced, "displacement", "amplitude")
     if rows.drive is None:
         _require(rows.forced, "force", "drive")
-    if not any(k % 2 for k in rows.orders):
+    if not any(element.answers(k) for element in model.elements for k in rows.orders):
         raise DataError(
-            "every row holds an even harmonic, which the friction modelled here does not have; "
-            "give odd ones as well"
+            f"the rows hold the harmonics {', '.join(map(str, rows.orders))}, and no element of "
+            f"{model!r} has any of them; give odd ones as well, or use a law that is asymmetric"
         )
-    bad = rows.forced & (rows.harmonic > 1)
+    bad = rows.forced & (rows.harmonic != 1)
     if rows.orders != (1,) and bad.any():
         row = int(np.argmax(bad))
         raise DataError(

@@ -8,23 +8,20 @@ from functools import cached_property
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Element, Parameter
 from dahl_ident.elements.model import as_model
-from dahl_ident.errors import ModelError, ValidationError
-from dahl_ident.noise import Measured, Rho, Student, bend, correct_amplitude, noise_for
-from dahl_ident.problem.checks import checked_table, normal_moments
+from dahl_ident.errors import DataError, ModelError, ValidationError
+from dahl_ident.noise import Measured, Rho, bend, correct_amplitude, noise_for
 from dahl_ident.problem.coordinates import (
     Coordinates,
-    in_order,
-    interchangeable_elements,
+    Interchangeable,
     with_changes,
 )
-from dahl_ident.problem.pairs import squares, weighted
 from dahl_ident.problem.prediction import Predictor
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import EXACT, Prior, Sensors
@@ -78,6 +75,8 @@ class Problem:
         Whether residuals are Gaussian; not where a covariance has few degrees of freedom.
     n_residuals : int
         Residuals of the data, two a row; those of priors come on top.
+    n_numbers : int
+        Residuals that can differ from zero: one in a row of the mean force, which is real.
 
     Raises
     ------
@@ -135,7 +134,7 @@ class Problem:
         if not parameters:
             raise ModelError(f"{model!r} has no free parameter; leave one out, or name it in free=")
         self._coordinates = Coordinates(parameters)
-        self._alike = interchangeable_elements(model, self.names)
+        self._alike = Interchangeable(model, self.names)
         self.priors: dict[str, Prior] = sensors.priors
 
     def _set_rows(self, rows: Rows, noise: str | None) -> None:
@@ -144,16 +143,16 @@ class Problem:
         self._noise = noise_for(rows, noise)
         self.noise = self._noise.name
         self.scale_known = self._noise.scale_known
-        dof = self._noise.dof if isinstance(self._noise, Measured) else None
-        self._tail = None if dof is None else Student(dof)
-        self.gaussian = dof is None
+        self._tail = self._noise.tail if isinstance(self._noise, Measured) else None
+        self.gaussian = self._tail is None
         self.n_residuals = 2 * rows.n
+        self.n_numbers = self.n_residuals - int(np.count_nonzero(rows.harmonic == 0))
 
     def _with_rows(self, kind: type[_Kind], rows: Rows) -> _Kind:
         """Return this problem, or batch, with other rows."""
         other = object.__new__(kind)
         other.__dict__.update(self.__dict__)
-        for stale in ("stiffness_data", "data"):
+        for stale in ("stiffness_data", "data", "tables"):
             other.__dict__.pop(stale, None)
         other._set_rows(rows, self.noise)
         return other
@@ -164,7 +163,28 @@ class Problem:
             f"{self.noise} noise, free {', '.join(self.names)}>"
         )
 
+    # Tables
+
+    @property
+    def n_tables(self) -> int:
+        """The number of tables: one."""
+        return 1
+
+    def take(self, tables: NDArray[np.intp] | slice) -> Problem:
+        """Return this problem: one table stands for as many as are asked for."""
+        return self
+
+    def table(self, index: int) -> Problem:
+        """Return this problem."""
+        return self
+
     # Coordinates
+
+    @cached_property
+    def friction_columns(self) -> NDArray[np.intp]:
+        """Which parameters are those of elements that depend on the amplitude."""
+        names = {p.name for e in self.model.elements if not e.is_linear for p in e.parameters}
+        return np.flatnonzero([name in names for name in self.names])
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -209,12 +229,12 @@ class Problem:
         return self._coordinates.bounds
 
     def in_order(self, theta: ArrayLike) -> FloatArray:
-        """Return theta with interchangeable Dahl elements ordered by rising x_c.
+        """Return theta with interchangeable elements ordered by rising knee, Dahl's by x_c.
 
-        Elements are interchangeable where both f_max and sigma of each are free and their
-        exponents are alike; without an order their labels could switch.
+        Elements are interchangeable where they follow one law, with the same parameters free and
+        the others alike; without an order their labels could switch.
         """
-        return in_order(self._coordinates.checked(theta), self._alike)
+        return self._alike.in_order(self._coordinates.checked(theta), self._coordinates)
 
     # Predictions
 
@@ -316,11 +336,11 @@ class Problem:
             cost = 0.5 * products[..., 0, 0]
         else:
             m = self.n_residuals
-            z = squares(rows[..., 0, :m])
-            loss, slope, bend = rho(z)
+            z = _squares(rows[..., 0, :m])
+            loss, slope, curvature = rho(z)
             cost = 0.5 * (loss.sum(axis=-1) + (rows[..., 0, m:] ** 2).sum(axis=-1))
-            along = np.maximum(2.0 * bend, -slope / np.maximum(z, 1e-300))
-            products = weighted(rows, m, slope, along) @ rows.swapaxes(-1, -2)
+            along = np.maximum(2.0 * curvature, -slope / np.maximum(z, 1e-300))
+            products = _weighted(rows, m, slope, along) @ rows.swapaxes(-1, -2)
         cost = np.where(cost < np.inf, cost, np.inf)
         return Quadratic(cost, products[..., 0, 1:], products[..., 1:, 1:])
 
@@ -403,11 +423,13 @@ class Problem:
         theta = self._coordinates.checked(theta)
         shape, noise = (size, self._rows.n), self._noise
         pairs = rng.standard_normal((2, *shape))
+        pairs[1][..., self._rows.harmonic == 0] = 0.0  # a mean force is real
         y = np.asarray(scale * (pairs[0] + 1j * pairs[1]), dtype=np.complex128)
         if not isinstance(noise, Measured):
             return noise.replicate(self.predict(theta), y)
-        if noise.dof is not None:
-            y = y * np.sqrt(noise.dof / rng.chisquare(noise.dof - 1.0, shape))
+        if noise.tail is not None:
+            dof = noise.tail.dof
+            y = y * np.sqrt(dof / rng.chisquare(dof + 1.0 - noise.tail.parts, shape))
         if noise.amplitude is None:
             return noise.replicate(self.predict(theta), y)
         value, _, slope = self._predictor(theta)
@@ -432,7 +454,7 @@ class Problem:
             slopes = self._coordinates.slopes(values)
             for place, (name, prior) in enumerate(self.priors.items(), start=m):
                 index = self.names.index(name)
-                mean, std = normal_moments(name, prior)
+                mean, std = _normal_moments(name, prior)
                 rows[..., 0, place] = (values[..., index] - mean) / std
                 if changes:
                     rows[..., 1 + index, place] = slopes[..., index] / std
@@ -493,7 +515,7 @@ class Problem:
         counted = rows
         if self._tail is not None:
             m = self.n_residuals
-            counted = weighted(rows, m, *self._tail.information(squares(rows[..., 0, :m])))
+            counted = _weighted(rows, m, *self._tail.information(_squares(rows[..., 0, :m])))
         J, counted = rows[..., 1:, :], counted[..., 1:, :]
         if chart is not None:
             J, counted = chart.T @ J, chart.T @ counted
@@ -502,3 +524,45 @@ class Problem:
     def _shape(self, theta: FloatArray) -> tuple[int, ...]:
         """Return the shape of the rows' numbers for `theta`."""
         return (*theta.shape[:-1], self._rows.n)
+
+
+def checked_table(data: object) -> FrequencyResponse:
+    """Return `data` if it is a table, or say what it is instead."""
+    if isinstance(data, FrequencyResponse):
+        return data
+    raise DataError(
+        f"data is a {type(data).__name__}; expected a FrequencyResponse, as "
+        "read_frequency_response gives it, or extract from a Record"
+    )
+
+
+def _normal_moments(name: str, prior: Prior) -> tuple[float, float]:
+    """Return mean and standard deviation of a normal prior, the only kind least squares takes."""
+    kind = getattr(getattr(prior, "dist", None), "name", type(prior).__name__)
+    if kind != "norm":
+        raise ValidationError(
+            f"the prior of {name} is {kind}; least squares takes normal priors "
+            "(scipy.stats.norm), any other needs sampling"
+        )
+    return float(prior.mean()), float(prior.std())
+
+
+def _squares(residuals: FloatArray) -> FloatArray:
+    """Return the sum of squares of the two residuals of each row, (..., 2 n) -> (..., n)."""
+    return np.asarray(residuals[..., 0::2] ** 2 + residuals[..., 1::2] ** 2)
+
+
+def _weighted(rows: FloatArray, m: int, size: FloatArray, along: FloatArray) -> FloatArray:
+    """Return residuals times `size`, derivatives d of each pair y as size d + along y (y' d).
+
+    `rows` are residuals and, below them, their derivatives, (..., 1 + P, k); what stands after
+    the first `m` residuals, those of priors, stays.
+    """
+    first, second = rows[..., :1, 0:m:2], rows[..., :1, 1:m:2]
+    by_first, by_second = rows[..., 1:, 0:m:2], rows[..., 1:, 1:m:2]
+    lever = along[..., None, :] * (first * by_first + second * by_second)
+    result = rows.copy()
+    result[..., :m] *= np.repeat(size, 2, axis=-1)[..., None, :]
+    result[..., 1:, 0:m:2] += first * lever
+    result[..., 1:, 1:m:2] += second * lever
+    return result

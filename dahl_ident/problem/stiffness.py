@@ -42,13 +42,21 @@ class StiffnessData:
         """Median of |Z|, shape () or (S,); above zero also where most responses are zero."""
         return np.asarray(np.maximum(np.median(np.abs(self.stiffness), axis=-1), SMALLEST))
 
-    def of(self, element: Element, values: Sequence[FloatArray]) -> ComplexArray:
-        """Return an element's Z_k at every row."""
-        if len(self.orders) == 1:
-            return element.stiffness(values, self.amplitude, self.omega, self.orders[0])
-        result = np.empty(self.stiffness.shape, dtype=np.complex128)
+    def of(
+        self, element: Element, values: Sequence[FloatArray], *, at_nodes: bool = False
+    ) -> ComplexArray:
+        """Return an element's Z_k at every row, (..., n).
+
+        With `at_nodes` the values are those of K nodes, () or (..., K), and so is the result,
+        (..., K, n).
+        """
+        A, omega, shape = self.amplitude, self.omega, self.stiffness.shape
+        if at_nodes:
+            A, omega, values = A[..., None, :], omega[..., None, :], [v[..., None] for v in values]
+            nodes = np.broadcast_shapes(*(v.shape for v in values))
+            shape = np.broadcast_shapes((*shape[:-1], 1, shape[-1]), nodes)
+        result = np.empty(shape, dtype=np.complex128)
         for k in self.orders:
-            rows = self.harmonic == k
-            A, w = self.amplitude[..., rows], self.omega[..., rows]
-            result[..., rows] = element.stiffness(values, A, w, k)
+            rows = slice(None) if len(self.orders) == 1 else self.harmonic == k
+            result[..., rows] = element.stiffness(values, A[..., rows], omega[..., rows], k)
         return result

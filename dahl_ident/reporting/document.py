@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,10 +19,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Cell:
-    """A number in a table: as people read it, and as it is copied and sorted."""
+    """A number in a table: as people read it, and as it is copied and sorted.
+
+    A struck one is printed grey and crossed out: the reason stands beside it. A link is the
+    address of another page, relative to this one.
+    """
 
     text: str
     value: float | None = None
+    struck: bool = False
+    link: str | None = None
 
 
 @dataclass(frozen=True)
@@ -81,10 +87,8 @@ class Picture:
         import matplotlib as mpl
         import matplotlib.pyplot as plt
 
-        from dahl_ident.plots import style
-
         buffer = io.BytesIO()
-        with mpl.rc_context(style.RC | {"svg.hashsalt": "dahl_ident", "svg.fonttype": "path"}):
+        with mpl.rc_context({"svg.hashsalt": "dahl_ident", "svg.fonttype": "path"}):
             figure = self.draw()
             metadata = {"Date": None} if kind == "svg" else None
             figure.savefig(buffer, format=kind, dpi=160, metadata=metadata)
@@ -97,10 +101,19 @@ Block = Paragraph | Bullets | Listing | Table | Picture
 
 @dataclass(frozen=True)
 class Section:
-    """A heading and what stands under it."""
+    """A heading and what stands under it; details follow the signature."""
 
     title: str
     blocks: tuple[Block, ...]
+    details: bool = False
+
+
+MARKS = {
+    "trusted": "Trusted",
+    "approximate": "Approximate",
+    "not determined": "Not determined",
+    "not described": "Not described",
+}
 
 
 @dataclass(frozen=True)
@@ -111,21 +124,51 @@ class Document:
     ----------
     title : str
         First line.
-    trusted : bool
-        Whether the results can be used as they are.
+    status : str
+        "trusted", "approximate", "not determined" or "not described".
     verdict : tuple of str
-        The first lines a reader sees: what was found, and what speaks against it.
+        What was found, and what speaks against it.
+    header : tuple of (name, lines)
+        Specimen, model, data, instruments and the like; no lines: to be filled in by hand.
     sections : tuple of Section
-        The rest, in reading order.
+        The rest, in reading order, details last.
     facts : mapping
         The same for machines.
     """
 
     title: str
-    trusted: bool
+    status: str
     verdict: tuple[str, ...]
     sections: tuple[Section, ...]
+    header: tuple[tuple[str, tuple[str, ...]], ...] = ()
     facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the stated uncertainties can be used."""
+        return self.status in ("trusted", "approximate")
+
+    @property
+    def mark(self) -> str:
+        """The status, as a heading."""
+        return MARKS[self.status]
+
+    def numbered(self) -> Document:
+        """Return the document with numbers before the captions of figures and tables."""
+        counts = {"Figure": 0, "Table": 0}
+
+        def numbered(block: Block) -> Block:
+            if not isinstance(block, Table | Picture):
+                return block
+            kind = "Figure" if isinstance(block, Picture) else "Table"
+            counts[kind] += 1
+            return replace(block, caption=f"{kind} {counts[kind]}. {block.caption}")
+
+        sections = (
+            replace(section, blocks=tuple(map(numbered, section.blocks)))
+            for section in self.sections
+        )
+        return replace(self, sections=tuple(sections))
 
 
 def words(*texts: str) -> tuple[Cell, ...]:

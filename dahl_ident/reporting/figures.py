@@ -9,20 +9,20 @@ import numpy as np
 
 from dahl_ident import plots
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data import layout
+from dahl_ident.data import curves
+from dahl_ident.diagnostics.confidence_levels import LEVELS, percent, thresholds
 from dahl_ident.diagnostics.information import shares
-from dahl_ident.diagnostics.levels import LEVELS, percent, thresholds
 from dahl_ident.diagnostics.profile import Profiler
-from dahl_ident.elements import Dahl
-from dahl_ident.elements.linear_dahl import describing_function
+from dahl_ident.elements import Friction, UniversalCurve
 from dahl_ident.plots.style import new_axes
 from dahl_ident.reporting.document import Picture, figure_of
-from dahl_ident.reporting.loops import loops
+from dahl_ident.reporting.hysteresis_loops import loops
 from dahl_ident.units import engineering, si_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from dahl_ident.diagnostics.budget import Budget
     from dahl_ident.results import FitResult
 
 _MARKED_BETA = (0.3, 1.0, 2.2, 5.0, 20.0)
@@ -37,16 +37,32 @@ def pictures_of_fit(fit: FitResult) -> Iterator[Picture]:
     if fit.success and _is_plant_over_amplitude(fit):
         yield _over_levels(fit)
     yield _residuals(fit)
-    friction = [e for e in fit.model.elements if isinstance(e, Dahl)]
-    if _is_linear_dahl_alone(fit) and fit.success:
-        yield _universal(fit, friction[0])
-    if len(friction) == 1 and _all_finite(fit):
+    friction = [e for e in fit.model.elements if isinstance(e, Friction)]
+    if fit.success and _is_friction_alone(fit):
+        universal = friction[0].universal_curve()
+        if universal is not None:
+            yield _universal(fit, universal)
+    if len(friction) == 1 and friction[0].rate_independent and _all_finite(fit):
         yield loops(fit, friction[0])
     if fit.success:
         yield _profiles(fit)
     if fit.nvarys > 1 and np.isfinite(fit.covar).all():
         yield _correlation(fit)
     yield _information(fit)
+
+
+def budget_picture(found: Budget) -> Picture:
+    """Return the shares of the sources in each parameter's variance."""
+    rows = [(p.name, row.source, row.share) for p in found.parameters for row in p.rows]
+    largest = (
+        f"{p.name}: {p.rows[0].source}, {100.0 * p.rows[0].share:.0f} %" for p in found.parameters
+    )
+    return Picture(
+        "budget",
+        "Share of each source in the variance of each parameter.",
+        f"The largest source is, for {'; for '.join(largest)}.",
+        lambda: figure_of(plots.plot_budget(rows)),
+    )
 
 
 def _response(fit: FitResult) -> Picture:
@@ -58,9 +74,9 @@ def _response(fit: FitResult) -> Picture:
         f"{phase.min():.1f} to {phase.max():.1f} degrees; the farthest point lies {worst:.1f} "
         "standard deviations from the fit."
     )
-    over_frequency = layout.is_over_frequency(data)
+    over_frequency = curves.is_over_frequency(data)
     over = "frequency" if over_frequency else "amplitude"
-    if len(layout.curves(data)) > 1:
+    if len(curves.curves(data)) > 1:
         over += ", by level" if over_frequency else ", by frequency"
     caption = (
         f"Data (points, with error bars) and fit (lines) over {over}. Bands are the "
@@ -71,7 +87,7 @@ def _response(fit: FitResult) -> Picture:
 
 def _over_levels(fit: FitResult) -> Picture:
     data = fit.data.select(harmonic=1)
-    drives = np.geomspace(*_ends(layout.held_amplitude(data)), _LEVELS)
+    drives = np.geomspace(*_ends(curves.held_amplitude(data)), _LEVELS)
     grid = np.geomspace(*_ends(data.frequency_hz), _POINTS)
     unit = si_unit("force", data.motion)
     responses = [
@@ -102,7 +118,7 @@ def _is_plant_over_amplitude(fit: FitResult) -> bool:
     data = fit.data.select(harmonic=1)
     low, high = _ends(data.frequency_hz)
     several = len(fit.model.elements) > 1 and high > _APART * low
-    return several and layout.is_force_controlled(data) and not layout.is_over_frequency(data)
+    return several and curves.is_force_controlled(data) and not curves.is_over_frequency(data)
 
 
 def _ends(values: FloatArray) -> tuple[float, float]:
@@ -123,24 +139,23 @@ def _residuals(fit: FitResult) -> Picture:
     return Picture("residuals", caption, alt, lambda: figure_of(fit.plot_residuals()))
 
 
-def _universal(fit: FitResult, friction: Dahl) -> Picture:
-    sigma = fit.params[friction.parameters[1].name].value
+def _universal(fit: FitResult, curve: UniversalCurve) -> Picture:
+    sigma = curve.stiffness
     normalised = fit.data.select(harmonic=1).to("dynamic_stiffness").response / sigma
     off = float(np.max(np.abs(normalised - fit.problem.predict(fit.optimum.theta) / sigma)))
 
     def draw() -> Figure:
-        beta = np.geomspace(1e-3, 1e4, 400)
-        marks = [(b, complex(describing_function(np.array([b]))[0])) for b in _MARKED_BETA]
+        marks = [(b, complex(curve.response(np.array([b]))[0])) for b in _MARKED_BETA]
         return figure_of(
             plots.plot_universal_curve(
-                normalised, curve=describing_function(beta), marked_beta=marks
+                normalised, curve=curve.response(np.geomspace(1e-3, 1e4, 400)), marked_beta=marks
             )
         )
 
     return Picture(
         "universal_curve",
-        "Data over the fitted sigma on the universal curve h(beta); numbers are beta. Data off "
-        "the curve are not linear Dahl friction.",
+        "Data over the fitted stiffness on the universal curve h(beta), which every set of "
+        "parameters of this law follows; numbers are beta.",
         f"The farthest point lies {off:.2g} from the curve, where 1 is the response at rest.",
         draw,
     )
@@ -215,7 +230,7 @@ def _information(fit: FitResult) -> Picture:
     x = fit.problem.stiffness_data.amplitude
     unit = si_unit("displacement", fit.data.motion)
     places = [
-        f"{name} is told most at an amplitude of {x[int(np.argmax(row))]:.3g} {unit}"
+        f"{name} is determined mostly at an amplitude of {x[int(np.argmax(row))]:.3g} {unit}"
         for name, row in zip(fit.var_names, share, strict=True)
         if np.isfinite(row).all()
     ]
@@ -223,7 +238,7 @@ def _information(fit: FitResult) -> Picture:
         "information",
         "Which amplitudes carry the information on which parameter: the area of a disc is the "
         "share of one point, and the largest share is written.",
-        "; ".join(places) + "." if places else "No point tells the parameters apart.",
+        "; ".join(places) + "." if places else "No point distinguishes the parameters.",
         lambda: figure_of(
             plots.plot_information(
                 x,
@@ -240,12 +255,13 @@ def _whitened_pairs(fit: FitResult) -> FloatArray:
     return fit.residual[: fit.ndata].reshape(-1, 2) / scale
 
 
-def _is_linear_dahl_alone(fit: FitResult) -> bool:
+def _is_friction_alone(fit: FitResult) -> bool:
+    """Return whether the data are the dynamic stiffness of one law, through exact channels."""
     elements = fit.model.elements
-    alone = len(elements) == 1 and isinstance(elements[0], Dahl) and "alpha" not in fit.var_names
-    exact = fit.problem.sensors.are_exact and not layout.is_force_controlled(fit.data)
+    exact = fit.problem.sensors.are_exact and not curves.is_force_controlled(fit.data)
     whole = bool((fit.data.harmonic == 1).all()) and fit.data.quantity == "dynamic_stiffness"
-    return alone and exact and whole and fit.params[elements[0].parameters[2].name].value == 1.0
+    free = all(not p.free or p.dimension[0] for e in elements for p in e.parameters)
+    return len(elements) == 1 and elements[0].has_memory and exact and whole and free
 
 
 def _all_finite(fit: FitResult) -> bool:

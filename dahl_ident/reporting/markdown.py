@@ -3,27 +3,45 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Sequence
 
 from dahl_ident.reporting.document import (
     Block,
     Bullets,
+    Cell,
     Document,
     Listing,
     Paragraph,
     Picture,
+    Section,
     Table,
 )
+
+BLANK = "________________"
 
 
 def markdown(document: Document, folder: str) -> bytes:
     """Return the text, with links to the pictures as PNG files in `folder`."""
-    mark = "Can be trusted" if document.trusted else "Not to be trusted"
-    lines = [f"# {_escaped(document.title)}", f"**{mark}.**"]
+    lines = [f"# {_escaped(document.title)}", f"**{document.mark}.**"]
     lines += [_escaped(line) for line in document.verdict]
-    for section in document.sections:
+    if document.header:
+        rows = [
+            f"| {name} | {_escaped('; '.join(given)) or BLANK} |" for name, given in document.header
+        ]
+        lines.append("\n".join(("| | |", "| --- | --- |", *rows)))
+    for section in _with_signature(document.sections):
         lines.append(f"## {_escaped(section.title)}")
         lines += [text for block in section.blocks if (text := _block(block, folder))]
     return ("\n\n".join(lines) + "\n").encode()
+
+
+def _with_signature(sections: Sequence[Section]) -> Iterator[Section]:
+    """Yield the sections, and before the details a field for the signature."""
+    signature = Section("Signature", (Paragraph(f"Date {BLANK} Name {BLANK} Signature {BLANK}"),))
+    for before, section in zip((None, *sections), sections, strict=False):
+        if section.details and not (before and before.details):
+            yield signature
+        yield section
 
 
 def _block(block: Block, folder: str) -> str:
@@ -44,8 +62,12 @@ def _block(block: Block, folder: str) -> str:
 def _table(table: Table) -> str:
     rows = [table.header, tuple("---" for _ in table.header)]
     lines = [" | ".join(map(_escaped, rows[0])), " | ".join(rows[1])]
-    lines += [" | ".join(_escaped(cell.text) for cell in row) for row in table.rows]
+    lines += [" | ".join(map(_cell, row)) for row in table.rows]
     return f"**{_escaped(table.caption)}**\n\n" + "\n".join(f"| {line} |" for line in lines)
+
+
+def _cell(cell: Cell) -> str:
+    return f"~~{_escaped(cell.text)}~~" if cell.struck else _escaped(cell.text)
 
 
 def _escaped(text: str) -> str:

@@ -9,9 +9,11 @@ import io
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import matplotlib as mpl
+from fpdf import FPDF
+from fpdf.fonts import FontFace
+from fpdf.syntax import Name
 
 from dahl_ident.reporting.document import (
     Block,
@@ -20,11 +22,10 @@ from dahl_ident.reporting.document import (
     Listing,
     Paragraph,
     Picture,
+    Section,
     Table,
+    words,
 )
-
-if TYPE_CHECKING:
-    from fpdf import FPDF
 
 _FONT = "DejaVu"
 _FONTS = Path(mpl.get_data_path()) / "fonts" / "ttf"
@@ -33,31 +34,44 @@ _PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
 _HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; what a heading or a caption has below itself
 _WIDEST = 26  # characters that a column of a table has room for
 _MARGIN, _BOLD = 3.0, 1.25  # characters beside the text; how much wider bold ones are
-_GOOD, _BAD = (17, 99, 41), (164, 14, 38)
+_NAME_WIDTH = 38.0  # mm, of the fields' names in the header
+_COLOURS = {
+    "trusted": (17, 99, 41),
+    "approximate": (122, 77, 0),
+    "not determined": (164, 14, 38),
+    "not described": (164, 14, 38),
+}
+_STRUCK = FontFace(emphasis="STRIKETHROUGH", color=(110, 110, 110))
 
 
 def pdf(document: Document) -> bytes:
     """Return the whole file."""
     page = _page(document)
-    page.set_font(_FONT, "B", 17)
-    page.multi_cell(0, 8, document.title, new_x="LMARGIN", new_y="NEXT")
+    _heading(page, document.title, 1)
     page.ln(2)
     page.set_font(_FONT, "B", 11)
-    page.set_text_color(*(_GOOD if document.trusted else _BAD))
-    _text(page, "Can be trusted" if document.trusted else "Not to be trusted")
+    page.set_text_color(*_COLOURS[document.status])
+    _text(page, document.mark)
     page.set_text_color(0, 0, 0)
     page.set_font(_FONT, "", 10)
     for line in document.verdict:
         _text(page, line)
+    _header(page, document)
+    before: Section | None = None
     for section in document.sections:
+        if section.details and not (before and before.details):
+            _signature(page)
+            page.add_page()
+        before = section
         pictures = [_Drawn(block) for block in section.blocks if isinstance(block, Picture)]
-        page.ln(4)
+        if not section.blocks:
+            continue
+        page.ln(3)
         begins_drawn = isinstance(section.blocks[0], Picture)
         below = _row_height(pictures[:2]) if begins_drawn else _BEGINNING
         _turn_unless_room(page, _HEADING_HEIGHT + below)
-        page.set_font(_FONT, "B", 13)
         page.start_section(section.title)
-        page.multi_cell(0, 7, section.title, new_x="LMARGIN", new_y="NEXT")
+        _heading(page, section.title, 2)
         for block in section.blocks:
             if not isinstance(block, Picture):
                 _block(page, block)
@@ -67,13 +81,16 @@ def pdf(document: Document) -> bytes:
 
 
 def _page(document: Document) -> FPDF:
-    from fpdf import FPDF
-
     class Page(FPDF):
         """A page that shows what its font lacks, where fpdf2 would leave it out."""
 
         def normalize_text(self, text: str) -> str:
             return super().normalize_text(_printable(text))
+
+        def footer(self) -> None:
+            self.set_y(-12)
+            self.set_font(_FONT, "", 7.5)
+            self.cell(0, 4, f"Page {self.page_no()} of {{nb}}", align="R")
 
     page = Page(format="A4")
     page.set_margins(16, 16, 16)
@@ -84,6 +101,47 @@ def _page(document: Document) -> FPDF:
         page.add_font(_FONT, face, _FONTS / file)
     page.add_page()
     return page
+
+
+def _heading(page: FPDF, text: str, level: int) -> None:
+    """Print a heading, marked as such for programs that read the page aloud."""
+    page.set_font(_FONT, "B", 17 if level == 1 else 12)
+    height = 8 if level == 1 else 6
+    _turn_unless_room(page, 3.0 * height)  # a marked sequence must not cross pages
+    with page._marked_sequence(title=text) as element:  # the one way that fpdf2 has
+        element.s = Name(f"H{level}")
+        page.multi_cell(0, height, text, new_x="LMARGIN", new_y="NEXT")
+
+
+def _header(page: FPDF, document: Document) -> None:
+    """Print specimen, model, data and so on, with a line to fill in where nothing is known."""
+    page.ln(1)
+    for name, lines in document.header:
+        page.set_font(_FONT, "B", 8)
+        page.set_x(page.l_margin)
+        page.cell(_NAME_WIDTH, 4.4, name)
+        page.set_font(_FONT, "", 8)
+        left = page.l_margin + _NAME_WIDTH
+        if not lines:
+            page.line(left, page.get_y() + 4.2, page.w - page.r_margin, page.get_y() + 4.2)
+            page.ln(5.4)
+        for line in lines:
+            page.set_x(left)
+            page.multi_cell(0, 4.4, line, align="L", new_x="LMARGIN", new_y="NEXT")
+
+
+def _signature(page: FPDF) -> None:
+    _turn_unless_room(page, 22.0)
+    page.ln(14)
+    page.set_font(_FONT, "", 8)
+    width = (page.epw - 2 * _GAP) / 3.0
+    top = page.get_y()
+    for i, name in enumerate(("Date", "Name", "Signature")):
+        x = page.l_margin + i * (width + _GAP)
+        page.line(x, top, x + width, top)
+        page.set_xy(x, top + 1.0)
+        page.cell(width, 4, name)
+    page.set_xy(page.l_margin, top + 6.0)
 
 
 def _block(page: FPDF, block: Block) -> None:
@@ -147,8 +205,8 @@ def _table(page: FPDF, table: Table) -> None:
     page.set_font(_FONT, "B", 9.5)
     _text(page, table.caption)
     page.set_font(_FONT, "", 7.5)
-    rows = [tuple(cell.text for cell in row) for row in table.rows]
-    widths = [_width(name, texts) for name, *texts in zip(table.header, *rows, strict=True)]
+    texts = [tuple(cell.text for cell in row) for row in table.rows]
+    widths = [_width(name, own) for name, *own in zip(table.header, *texts, strict=True)]
     with page.table(
         col_widths=widths,
         text_align="LEFT",
@@ -156,10 +214,10 @@ def _table(page: FPDF, table: Table) -> None:
         padding=0.8,
         borders_layout="HORIZONTAL_LINES",
     ) as drawn:
-        for row in (table.header, *rows):
+        for row in (words(*table.header), *table.rows):
             line = drawn.row()
-            for text in row:
-                line.cell(text)
+            for cell in row:
+                line.cell(cell.text, style=_STRUCK if cell.struck else None)
     page.ln(2)
 
 

@@ -6,22 +6,41 @@ import datetime
 import importlib.metadata
 import platform
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import dahl_ident
+from dahl_ident.version import __version__
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
 
 _PACKAGES = ("numpy", "scipy", "casadi", "emcee", "pandas", "matplotlib", "pint")
-_TOLD_APART = {"parts", "file", "sha256", "notes"}
+_LISTED_ELSEWHERE = {"parts", "file", "sha256", "notes"}
 
 
-def sources(data: FrequencyResponse) -> Iterator[tuple[str, str]]:
-    """Yield name and SHA-256 of every file that the data came from, and what those came from."""
-    for part in _with_origins(data):
-        if "file" in part:
-            yield str(part["file"]), str(part.get("sha256", ""))
+@dataclass(frozen=True)
+class SourceFile:
+    """A file that the data came from.
+
+    Attributes
+    ----------
+    file, sha256 : str
+        Its name, and the hash of what was in it; empty where it is unknown.
+    read : bool
+        Whether the data were read from it; else it is what such a file was made from.
+    """
+
+    file: str
+    sha256: str
+    read: bool
+
+
+def sources(data: FrequencyResponse) -> Iterator[SourceFile]:
+    """Yield every file that was read, each followed by those that it was made from."""
+    for part in parts(data):
+        for i, one in enumerate(_with_origins(part)):
+            if "file" in one:
+                yield SourceFile(str(one["file"]), str(one.get("sha256", "")), read=i == 0)
 
 
 def notes(data: FrequencyResponse) -> list[str]:
@@ -32,13 +51,13 @@ def notes(data: FrequencyResponse) -> list[str]:
 def options(data: FrequencyResponse) -> list[tuple[str, str]]:
     """Return how the data were made, key by key, where they say so and it is not the default."""
     found: dict[str, str] = {}
-    for part in _with_origins(data):
-        told = {k: v for k, v in part.items() if k not in _TOLD_APART}
+    for part in (one for whole in parts(data) for one in _with_origins(whole)):
+        given_keys = {k: v for k, v in part.items() if k not in _LISTED_ELSEWHERE}
         for name in ("options", "extraction"):
-            inner = told.pop(name, None)
+            inner = given_keys.pop(name, None)
             given = inner if isinstance(inner, Mapping) else {"": inner}
-            told |= {f"{name} {key}".strip(): value for key, value in given.items()}
-        for key, value in told.items():
+            given_keys |= {f"{name} {key}".strip(): value for key, value in given.items()}
+        for key, value in given_keys.items():
             if not isinstance(value, Mapping) and value not in (None, [], ()):
                 found.setdefault(key, str(value))
     return list(found.items())
@@ -46,7 +65,7 @@ def options(data: FrequencyResponse) -> list[tuple[str, str]]:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, of this package and of those that it computes with."""
-    found = {"dahl_ident": dahl_ident.__version__, "python": platform.python_version()}
+    found = {"dahl_ident": __version__, "python": platform.python_version()}
     return found | {name: importlib.metadata.version(name) for name in _PACKAGES}
 
 
@@ -61,9 +80,9 @@ def parts(data: FrequencyResponse) -> list[Mapping[str, Any]]:
     return list(provenance.get("parts", [provenance]))
 
 
-def _with_origins(data: FrequencyResponse) -> Iterator[Mapping[str, Any]]:
-    """Yield the provenance of each table, and after it of what that was made from."""
-    waiting = list(parts(data))
+def _with_origins(part: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """Yield the provenance of a table, and after it of what that was made from."""
+    waiting = [part]
     while waiting:
         part = waiting.pop(0)
         yield part

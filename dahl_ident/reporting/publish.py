@@ -3,41 +3,48 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dahl_ident.data import Record
-from dahl_ident.data.storage import place_of, refuse_existing, write_whole
+from dahl_ident.data.storage import place_of, plain_data, refuse_existing, write_whole
 from dahl_ident.errors import DataError, ValidationError
-from dahl_ident.reporting.contents import Result, document
 from dahl_ident.reporting.document import Document, Picture
 from dahl_ident.reporting.html import html
 from dahl_ident.reporting.markdown import markdown
-from dahl_ident.results import FitResult, Posterior
+from dahl_ident.reporting.metadata import metadata_of
+from dahl_ident.reporting.overlay import overlay
+from dahl_ident.reporting.record_report import record_document
+from dahl_ident.reporting.sections import Result, document
+from dahl_ident.results import ChainPosterior, FitResult, RecordFit
 
-SCHEMA = 1
+SCHEMA = 2
 FORMATS = (".html", ".pdf", ".md", ".json")
 
 
 def report(
-    results: Result | Sequence[Result],
+    results: Result | RecordFit | Sequence[Result | RecordFit],
     path: str | Path,
     *,
     title: str | None = None,
     command: str | None = None,
     record: Record | None = None,
+    metadata: Mapping[str, Any] | str | Path | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Write a report on one or several results.
 
+    Results on the same data are reported together. Fits on different data (devices, dates) are
+    overlaid, and the changes of their parameters listed with their significance.
+
     Parameters
     ----------
-    results : FitResult, Posterior, or sequence of them
-        What to report on; all on the same data.
+    results : FitResult, ChainPosterior, RecordFit, or sequence of them
+        What to report on. Results on different data have to be fits. Fits to records are
+        reported by themselves.
     path : path
         Ending in ``.html`` (one file, no network), ``.pdf``, ``.md`` (pictures in a folder
         beside it) or ``.json``.
@@ -47,6 +54,9 @@ def report(
         The command that repeats it; by default the one that fits the same model.
     record : Record, optional
         The waveforms that the data were extracted from; the report shows how a point settled.
+    metadata : mapping or path of a TOML file, optional
+        What only the laboratory knows: title, laboratory, customer, specimen, operator, measured
+        (date), ambient, instruments, remarks. Fields left out are printed as lines to fill in.
     overwrite : bool, default False
         Replace a report that is there already.
 
@@ -58,9 +68,12 @@ def report(
     Raises
     ------
     ValidationError
-        If there is no result, the ending is another one, or the record is of other data.
+        If there is no result, the ending is another one, the record is of other data, a field of
+        the metadata is unknown, or a posterior is on other data than the first result, or fits
+        to records are mixed with other results.
     DataError
-        If a file is there already and `overwrite` is not set, or the place cannot be written to.
+        If the metadata cannot be read, a file is there already and `overwrite` is not set, or the
+        place cannot be written to.
 
     Examples
     --------
@@ -74,8 +87,21 @@ def report(
     place = place_of(path, "a report", FORMATS)
     if not overwrite:
         refuse_existing(place)
-    told = _checked(list(results) if isinstance(results, Sequence) else [results])
-    whole = document(told, title=title, command=command, record=record)
+    given = list(results) if isinstance(results, Sequence) else [results]
+    known = metadata_of(metadata)
+    of_records = [result for result in given if isinstance(result, RecordFit)]
+    if of_records:
+        if len(of_records) < len(given) or record is not None:
+            raise ValidationError(
+                "fits to records are reported by themselves; leave out record= and the results "
+                "on frequency responses, and give those a report of their own"
+            )
+        whole = record_document(of_records, title=title, command=command, metadata=known)
+    elif _on_one_table(checked := _checked(given)):
+        whole = document(checked, title=title, command=command, record=record, metadata=known)
+    else:
+        whole = overlay(checked, title=title, command=command, metadata=known)
+    whole = whole.numbered()
     kind = place.suffix.lower()
     if kind == ".md":
         folder = place.with_name(f"{place.stem}_pictures")
@@ -88,19 +114,21 @@ def report(
 
 
 def _checked(results: list[Any]) -> list[Result]:
-    """Return the results, which have to be of kinds that are reported, and on the same data."""
+    """Return the results, which have to be of kinds that are reported."""
     if not results:
         raise ValidationError("there is no result to report on; expected at least one")
     for i, result in enumerate(results):
-        if not isinstance(result, (FitResult, Posterior)):
+        if not isinstance(result, (FitResult, ChainPosterior)):
             raise ValidationError(
-                f"result {i} is a {type(result).__name__}; expected a FitResult or a Posterior"
-            )
-        if not np.array_equal(result.data.response, results[0].data.response):
-            raise ValidationError(
-                f"result {i} is on other data than the first; write a report for each"
+                f"result {i} is a {type(result).__name__}; expected a FitResult, a RecordFit or a "
+                "Posterior"
             )
     return results
+
+
+def _on_one_table(results: Sequence[Result]) -> bool:
+    first = results[0].data.response
+    return all(np.array_equal(result.data.response, first) for result in results)
 
 
 def _content(whole: Document, kind: str) -> bytes:
@@ -131,19 +159,13 @@ def machine_readable(whole: Document) -> bytes:
     facts = {
         "schema": SCHEMA,
         "title": whole.title,
+        "status": whole.status,
         "trusted": whole.trusted,
         "verdict": list(whole.verdict),
         **whole.facts,
     }
-    return json.dumps(_finite(facts), indent=2, ensure_ascii=False, allow_nan=False).encode()
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    known = plain_data(facts, not_finite=lambda _: None)
+    return json.dumps(known, indent=2, ensure_ascii=False, allow_nan=False).encode()
 
 
 def _pictures(whole: Document) -> list[Picture]:

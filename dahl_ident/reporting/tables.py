@@ -3,29 +3,111 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dahl_ident.diagnostics.confidence_levels import percent
 from dahl_ident.diagnostics.formatting import interval, rounded
-from dahl_ident.diagnostics.levels import percent
-from dahl_ident.elements import Dahl
+from dahl_ident.diagnostics.verdict_status import VerdictStatus
+from dahl_ident.diagnostics.verdicts import Verdict
 from dahl_ident.reporting.document import Cell, Table, number, words
 from dahl_ident.units import si_unit
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
     from dahl_ident.diagnostics import ConfidenceIntervals
+    from dahl_ident.diagnostics.budget import Budget
     from dahl_ident.diagnostics.comparison import ModelComparison
     from dahl_ident.results import FitResult
-    from dahl_ident.results.posterior import Posterior
+    from dahl_ident.results.chain_posterior import ChainPosterior
 
-_EQUIVALENT_ROWS = 9
+_LINEARIZATION_ROWS = 9
 LEVEL = 0.9545
 
 
+def answer(fit: FitResult, *, described: bool) -> Table:
+    """Return every free parameter with its interval; what is not to be used is struck."""
+    limits = fit.conf_interval().at(LEVEL)
+    rows = []
+    for name in fit.var_names:
+        estimate, judged = fit.params[name], fit.identifiability.parameters[name]
+        value, error = rounded(estimate.value, estimate.stderr)
+        lost = judged.verdict is not Verdict.IDENTIFIED
+        struck = lost or not described
+        found = limits[name]
+        closed = lost and bool(np.isfinite([found.lower, found.upper]).all())  # a bound holds
+        reason = judged.text.removeprefix(f"{name}: ") if lost else judged.verdict.value
+        if not described and not lost:
+            reason = "the model does not describe the data: the interval does not hold"
+        if fit.status == VerdictStatus.APPROXIMATE and not lost:
+            reason += "; u includes the misfit"
+        rows.append(
+            (
+                Cell(name),
+                Cell(value, estimate.value, struck)
+                if np.isfinite(estimate.value)
+                else Cell("none finite"),
+                Cell(error, _finite(estimate.stderr), struck),
+                Cell(interval(found.lower, found.upper, ""), struck=not described or closed),
+                Cell(estimate.unit or "-"),
+                Cell(estimate.description),
+                Cell(reason),
+            )
+        )
+    header = (
+        "parameter", "estimate", "standard uncertainty u", f"{percent(LEVEL)} interval", "unit",
+        "description", "what the data say",
+    )  # fmt: skip
+    crossed = any(cell.struck for row in rows for cell in row)
+    hint = ". Numbers that are crossed out must not be used" if crossed else ""
+    return Table(f"Estimates with their standard uncertainties{hint}", header, tuple(rows))
+
+
+def budget(found: Budget) -> Table:
+    """Return every source of uncertainty of every parameter; the combined one stands first."""
+    rows = []
+    for p in found.parameters:
+        unit = p.unit or "-"
+        rows.append(
+            (
+                Cell(p.name), Cell("combined"), Cell("-"), number(p.u, 2), Cell(unit), _dof(p.dof),
+                Cell("100 %", 1.0), number(p.k, 3), number(p.U, 2),
+            )
+        )  # fmt: skip
+        rows += [
+            (
+                Cell(p.name), Cell(row.source), Cell(row.kind), number(row.u, 2), Cell(unit),
+                _dof(row.dof), Cell(f"{100.0 * row.share:.0f} %", row.share), Cell("-"), Cell("-"),
+            )
+            for row in p.rows
+        ]  # fmt: skip
+    header = (
+        "parameter", "source", "type", "standard uncertainty u", "unit", "degrees of freedom",
+        "share", "k", "U = k u",
+    )  # fmt: skip
+    return Table(f"Uncertainty budget; k is for {percent(LEVEL)} coverage", header, tuple(rows))
+
+
+def _dof(dof: float) -> Cell:
+    return number(dof, 3) if np.isfinite(dof) else Cell("infinite")
+
+
+def priors(fit: FitResult) -> dict[str, str]:
+    """Return the prior of each parameter that has one, as it is typed."""
+    return {name: prior_text(given) for name, given in fit.problem.priors.items()}
+
+
+def prior_text(given: Any) -> str:
+    """Return bounds or a frozen distribution as they are typed."""
+    if isinstance(given, tuple):
+        return ":".join(map(repr, given))
+    arguments = [*map(repr, given.args), *(f"{k}={v!r}" for k, v in given.kwds.items())]
+    return f"{given.dist.name}({', '.join(arguments)})"
+
+
 def parameters(
-    fit: FitResult, intervals: Sequence[ConfidenceIntervals], drawn: Sequence[Posterior]
+    fit: FitResult, intervals: Sequence[ConfidenceIntervals], drawn: Sequence[ChainPosterior]
 ) -> Table:
     """Return every parameter with its intervals, one column a method."""
     at = [one.at(LEVEL) for one in intervals]
@@ -44,8 +126,8 @@ def parameters(
         row += [Cell(credible_interval(posterior, name)) for posterior in drawn]
         rows.append((*row, Cell(estimate.description)))
     methods = [*(method_name(one) for one in intervals), *("posterior" for _ in drawn)]
-    told = (f"{method} {percent(LEVEL)}" for method in methods)
-    header = ("parameter", "estimate", "standard error", "unit", *told, "what it is")
+    columns = (f"{method} {percent(LEVEL)}" for method in methods)
+    header = ("parameter", "estimate", "standard error", "unit", *columns, "description")
     return Table("Estimates and intervals, one column a method", header, tuple(rows))
 
 
@@ -54,7 +136,7 @@ def method_name(intervals: ConfidenceIntervals) -> str:
     return "Wald" if intervals.method == "wald" else intervals.method
 
 
-def credible_interval(posterior: Posterior, name: str) -> str:
+def credible_interval(posterior: ChainPosterior, name: str) -> str:
     """Return the central interval of a posterior, rounded as the others are."""
     if name not in posterior.names:
         return "-"
@@ -63,14 +145,14 @@ def credible_interval(posterior: Posterior, name: str) -> str:
     return interval(float(lower), float(upper), "")
 
 
-def equivalents(fit: FitResult) -> Table | None:
+def linearization(fit: FitResult) -> Table | None:
     """Return equivalent stiffness, damping and loss of the friction over amplitude."""
-    friction = any(isinstance(element, Dahl) for element in fit.model.elements)
+    friction = any(element.has_memory for element in fit.model.elements)
     if not friction or not all(np.isfinite(e.value) for e in fit.params.values()):
         return None
     data = fit.data.select(harmonic=1)
     A = fit.problem.stiffness_data.amplitude[fit.data.harmonic == 1]
-    sizes = np.geomspace(A.min(), A.max(), _EQUIVALENT_ROWS)
+    sizes = np.geomspace(A.min(), A.max(), _LINEARIZATION_ROWS)
     f = float(np.median(data.frequency_hz))
     columns: dict[str, list[Cell]] = {
         f"amplitude [{si_unit('displacement', data.motion)}]": [number(v) for v in sizes]
@@ -116,7 +198,7 @@ def measured(data: FrequencyResponse) -> Table:
         (f"gain [{data.unit}]", [number(v, 5) for v in data.gain]),
         ("phase [deg]", [number(v, 4) for v in np.degrees(data.phase)]),
     ]
-    if (data.harmonic > 1).any():
+    if (data.harmonic != 1).any():
         columns.append(("harmonic", [Cell(str(k), float(k)) for k in data.harmonic]))
     return _of_columns("The points as they were fitted", columns)
 

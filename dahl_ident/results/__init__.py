@@ -1,21 +1,24 @@
 """What users hold: estimates with their judgement, from one call."""
 
+from dahl_ident.results.bayesian_estimate import posterior
+from dahl_ident.results.chain_posterior import ChainPosterior
 from dahl_ident.results.estimate import fit, fit_many
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_numbers import Estimate
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.grid_posterior import GridPosterior
-from dahl_ident.results.posterior import Posterior
-from dahl_ident.results.sampling import posterior_grid, sample
+from dahl_ident.results.posterior_base import Posterior
+from dahl_ident.results.record_fit import RecordFit
 
 __all__ = [
+    "ChainPosterior",
     "Estimate",
     "FitBatch",
     "FitResult",
     "GridPosterior",
     "Posterior",
+    "RecordFit",
     "fit",
     "fit_many",
-    "posterior_grid",
-    "sample",
+    "posterior",
 ]

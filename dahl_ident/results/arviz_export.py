@@ -11,8 +11,8 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.bayes.chain import Settings
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density
-from dahl_ident.data.readers.file import library
-from dahl_ident.results.predictive import pointwise_log_likelihood, replicated_noise
+from dahl_ident.data.storage import library
+from dahl_ident.results.predictive_checks import pointwise_log_likelihood, replicated_noise
 
 _PRIOR_DRAWS = 1000
 

@@ -3,28 +3,62 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 from numpy.typing import ArrayLike
 
-from dahl_ident.data import FrequencyResponse
+from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.elements import Element
+from dahl_ident.elements.model import as_model
 from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.fitting import solve, solve_many
 from dahl_ident.problem import Problem, ProblemBatch
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
+from dahl_ident.results.record_fit import RecordFit, fit_records
 from dahl_ident.sensors import Sensors
 
 if TYPE_CHECKING:
     from dahl_ident.fitting.casadi_constraints import Constraints
+    from dahl_ident.problem.record_problem import Output
+    from dahl_ident.time_domain import Excitation
 
 
+@overload
 def fit(
     data: FrequencyResponse,
     model: Element,
     *,
-    method: str = "scipy",
+    method: str = ...,
+    free: Iterable[str] = ...,
+    fixed: Mapping[str, float] | None = ...,
+    noise: str | None = ...,
+    sensors: Sensors | None = ...,
+    loss: str = ...,
+    start: Mapping[str, float] | None = ...,
+    constraints: Constraints | None = ...,
+    drive_std: ArrayLike | None = ...,
+    drive_covariance: ArrayLike | None = ...,
+    throw: bool = ...,
+) -> FitResult: ...
+@overload
+def fit(
+    data: Record | Sequence[Record],
+    model: Element,
+    *,
+    free: Iterable[str] = ...,
+    fixed: Mapping[str, float] | None = ...,
+    start: Mapping[str, float] | None = ...,
+    output: Output | None = ...,
+    excitation: Excitation = ...,
+    substeps: int | None = ...,
+    throw: bool = ...,
+) -> RecordFit: ...
+def fit(
+    data: FrequencyResponse | Record | Sequence[Record],
+    model: Element,
+    *,
+    method: str = "lm",
     free: Iterable[str] = (),
     fixed: Mapping[str, float] | None = None,
     noise: str | None = None,
@@ -34,20 +68,25 @@ def fit(
     constraints: Constraints | None = None,
     drive_std: ArrayLike | None = None,
     drive_covariance: ArrayLike | None = None,
+    output: Output | None = None,
+    excitation: Excitation = "force",
+    substeps: int | None = None,
     throw: bool = True,
-) -> FitResult:
+) -> FitResult | RecordFit:
     """Estimate a model's free parameters by least squares; no guess is needed.
 
     Parameters
     ----------
-    data : FrequencyResponse
+    data : FrequencyResponse, Record or sequence of Record
         What was measured. Displacement-controlled rows need an amplitude, force-controlled rows
-        a drive.
+        a drive. Records of any motion are fitted sample by sample, several as runs of one device.
     model : Element
         One element or a sum, such as ``Dahl() + Mass(0.3)``. Numbers are fixed, the rest free.
-    method : {"scipy", "ipopt"}, default "scipy"
-        "scipy" is least squares with a global start. "ipopt" goes on from there with exact second
-        derivatives, and alone takes `constraints` and noise in the drive; same optimum, slower.
+    method : {"lm", "scipy", "ipopt"}, default "lm"
+        "lm" is Levenberg and Marquardt's method from a global start. "scipy" is
+        `scipy.optimize.least_squares` on the same residuals and Jacobian from the same starts.
+        "ipopt" goes on from the optimum with exact second derivatives, and alone takes
+        `constraints` and noise in the drive. All three find the same optimum; "lm" is the fastest.
     free : iterable of str, optional
         Names of given parameters to estimate all the same, from their values.
     fixed : mapping of str to float, optional
@@ -66,6 +105,14 @@ def fit(
     drive_std, drive_covariance : array_like, shapes (n,) and (n, 2), optional
         With "ipopt", for force-controlled rows: standard deviation of the measured drive, and its
         covariance with real and imaginary part of the response.
+    output : {"force", "motion"}, optional
+        Of records: whether the force is predicted from the measured displacement, or the motion
+        from the measured force. Left out: the motion where the model has a mass.
+    excitation : {"force", "base"}, default "force"
+        Of records whose motion is predicted: "base" where their force channel is the acceleration
+        of the base, m/s^2, and the motion relative to it.
+    substeps : int, optional
+        Of records whose motion is predicted: steps of integration in each sampling interval.
     throw : bool, default True
         Raise where the data give no finite optimum; otherwise return what was found, with its
         `status`.
@@ -97,6 +144,22 @@ def fit(
     >>> result.params["f_max"].value.__round__(9), result.success
     (0.1, True)
     """
+    if not isinstance(data, FrequencyResponse):
+        taken = {
+            "noise": noise, "sensors": sensors, "constraints": constraints,
+            "drive_std": drive_std, "drive_covariance": drive_covariance,
+            "loss": None if loss == "linear" else loss,
+            "method": None if method == "lm" else method,
+        }  # fmt: skip
+        refused = [name for name, value in taken.items() if value is not None]
+        if refused:
+            raise ValidationError(f"{' and '.join(refused)} given; a fit of records takes none")
+        records = [data] if isinstance(data, Record) else list(data)
+        bound = as_model(model).with_free(free).with_fixed(fixed or {})
+        return fit_records(
+            records, bound, start=start, output=output, excitation=excitation,
+            substeps=substeps, throw=throw,
+        )  # fmt: skip
     problem = Problem(data, model, noise=noise, sensors=sensors, free=free, fixed=fixed)
     own = {
         "constraints": constraints, "drive_std": drive_std, "drive_covariance": drive_covariance
@@ -113,12 +176,12 @@ def fit(
             drive_std=drive_std,
             drive_covariance=drive_covariance,
         )
-    elif method != "scipy":
-        raise ValidationError(f"method is {method!r}; expected scipy or ipopt")
+    elif method not in ("lm", "scipy"):
+        raise ValidationError(f"method is {method!r}; expected lm, scipy or ipopt")
     elif beyond:
         raise ValidationError(f"{' and '.join(beyond)} given; only method='ipopt' takes that")
     else:
-        optimum = solve(problem, loss=loss, start=start)
+        optimum = solve(problem, method=method, loss=loss, start=start)
     result = FitResult(optimum, first_order=bool(beyond))
     if throw and not result.success:
         cause = result.goodness.cause
@@ -147,8 +210,8 @@ def fit_many(
     Returns
     -------
     FitBatch
-        Estimates and standard errors of all tables; ``batch[i]`` is the :class:`FitResult` of
-        one of them, with everything that a single fit offers.
+        Estimates of all tables, with standard errors from noise alone; ``batch[i]`` is the
+        :class:`FitResult` of one of them, with everything that a single fit offers.
 
     Raises
     ------

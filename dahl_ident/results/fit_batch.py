@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.fitting import OptimumBatch, Status, solve
-from dahl_ident.problem import Problem
+from dahl_ident.fitting import OptimumBatch, Status
 from dahl_ident.results.fit_result import FitResult
 
 
@@ -21,7 +20,7 @@ from dahl_ident.results.fit_result import FitResult
 class FitBatch(Sequence[FitResult]):
     """One model fitted to each of S tables; made by :func:`dahl_ident.fit_many`.
 
-    A sequence: ``batch[i]`` fits table i by itself, from the estimate found here.
+    A sequence: ``batch[i]`` is the full result of table i.
 
     Attributes
     ----------
@@ -56,11 +55,7 @@ class FitBatch(Sequence[FitResult]):
     def __getitem__(self, index: int | slice) -> FitResult | list[FitResult]:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
-        own, first = self.optima.problem, self.optima.theta[index]
-        problem = Problem(self.tables[index], own.model, noise=own.noise, sensors=own.sensors)
-        found = np.isfinite(self.optima.values[index]).all()
-        start = dict(zip(problem.names, problem.to_values(first).tolist(), strict=True))
-        return FitResult(solve(problem, start=start if found else None))
+        return FitResult(self.optima[index])
 
     def __iter__(self) -> Iterator[FitResult]:
         return (self[i] for i in range(len(self)))
@@ -76,8 +71,11 @@ class FitBatch(Sequence[FitResult]):
         return self.optima.values
 
     @property
-    def stderr(self) -> FloatArray:
-        """Standard errors, first order, shape (S, P)."""
+    def stderr_noise(self) -> FloatArray:
+        """Standard errors from noise alone, first order, shape (S, P).
+
+        Combined uncertainties are those of each table's own result, ``batch[i].params``.
+        """
         return self.optima.stderr
 
     @property
@@ -96,13 +94,13 @@ class FitBatch(Sequence[FitResult]):
         return self.optima.success
 
     def to_frame(self) -> Any:
-        """Return a pandas table: one row a table, value and error of each parameter."""
+        """Return a pandas table: one row a table, value and noise-only error of each parameter."""
         import pandas as pd
 
         columns: dict[str, Any] = {}
         for i, name in enumerate(self.var_names):
             columns[name] = self.values[:, i]
-            columns[f"{name}_stderr"] = self.stderr[:, i]
+            columns[f"{name}_stderr_noise"] = self.stderr_noise[:, i]
         columns["scale"] = self.scale
         columns["status"] = [status.name for status in self.status]
         return pd.DataFrame(columns)

@@ -12,11 +12,12 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.elements import Model, Parameter
 from dahl_ident.fitting.optimum import Combination, Optimum
-from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem
+from dahl_ident.results.result import Result
 from dahl_ident.units import Motion, shown_unit
 
 
@@ -50,14 +51,21 @@ class Estimate:
     max: float
     vary: bool
 
+    @classmethod
+    def of_scale(cls, value: float, stderr: float) -> Estimate:
+        """Return the estimate of an unknown noise scale."""
+        return cls("noise_scale", "", "noise scale", value, stderr, None, 0.0, math.inf, True)
+
     def __str__(self) -> str:
         if not self.vary:
             return f"{self.name} = {self.value:g} {self.unit}".rstrip() + " (fixed)"
         return f"{self.name} = {with_unit(self.value, self.stderr, self.unit)}"
 
 
-class FitNumbers:
+class FitNumbers(Result):
     """An optimum under lmfit's names; see :class:`dahl_ident.FitResult`."""
+
+    _first_order = False  # constraints, or noise in the drive: errors of first order alone
 
     def __init__(self, optimum: Optimum) -> None:
         self._optimum = optimum
@@ -88,11 +96,6 @@ class FitNumbers:
         return self.problem.noise
 
     @property
-    def status(self) -> Status:
-        """How the search ended."""
-        return self._optimum.status
-
-    @property
     def success(self) -> bool:
         """Whether a finite optimum was found."""
         return self._optimum.success
@@ -108,15 +111,24 @@ class FitNumbers:
         return self._optimum.combinations
 
     @cached_property
+    def errors(self) -> ErrorModel | None:
+        """The sources of error; None where there is nothing to estimate them from."""
+        return None if self._first_order else error_model(self._optimum)
+
+    @cached_property
     def params(self) -> Mapping[str, Estimate]:
-        """Every parameter of model and sensors, by name."""
+        """Every parameter of model and sensors, by name, with combined uncertainties."""
         values = dict(zip(self.var_names, self._optimum.values.tolist(), strict=True))
-        stderr = self._optimum.stderr
-        own = self.problem.model.parameters
-        sensed = self.problem.sensors.parameters
-        shown = own if self.problem.sensors.are_exact else (*own, *sensed)
-        motion = self.data.motion
-        return MappingProxyType({p.name: _estimate(p, values, stderr, motion) for p in shown})
+        stderr = dict(self._optimum.stderr)
+        if self.errors is not None:
+            values |= {name: self.errors.values[name] for name in values}
+            stderr |= {name: self.errors.stderr[name] for name in values}
+        return MappingProxyType(estimates(self.problem, values, stderr))
+
+    @property
+    def stderr_noise(self) -> Mapping[str, float]:
+        """Standard errors of the least-squares optimum from noise alone, by name."""
+        return self._optimum.stderr
 
     @property
     def var_names(self) -> list[str]:
@@ -125,7 +137,7 @@ class FitNumbers:
 
     @cached_property
     def covar(self) -> FloatArray:
-        """Covariance of the free values, first order."""
+        """Covariance of the least-squares values from noise alone, first order."""
         return self._optimum.values_covariance
 
     @cached_property
@@ -167,8 +179,8 @@ class FitNumbers:
 
     @property
     def ndata(self) -> int:
-        """Real numbers measured: two for each row."""
-        return self.problem.n_residuals
+        """Real numbers measured: two for each row, one for that of a mean force."""
+        return self.problem.n_numbers
 
     @property
     def nvarys(self) -> int:
@@ -218,7 +230,18 @@ class FitNumbers:
         own = {p.name for p in model.parameters}
         values = self.problem.to_values(self._optimum.theta).tolist()
         found = dict(zip(self.var_names, values, strict=True))
+        if self.errors is not None:
+            found = dict(self.errors.values)
         return model.with_values({name: v for name, v in found.items() if name in own})
+
+
+def estimates(
+    problem: Problem, values: Mapping[str, float], stderr: Mapping[str, float]
+) -> dict[str, Estimate]:
+    """Return every parameter of model and sensors, those in `values` as free ones."""
+    exact = problem.sensors.are_exact
+    shown = (*problem.model.parameters, *(() if exact else problem.sensors.parameters))
+    return {p.name: _estimate(p, values, stderr, problem.data.motion) for p in shown}
 
 
 def _estimate(

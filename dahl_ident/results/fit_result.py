@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dahl_ident.data.storage import place_of, write_whole
 from dahl_ident.diagnostics.bands import (
     DerivedQuantity,
     ResponseBand,
@@ -20,25 +19,32 @@ from dahl_ident.diagnostics.bands import (
     response_band,
 )
 from dahl_ident.diagnostics.bootstrap import REPLICATES, bootstrap_intervals
+from dahl_ident.diagnostics.budget import Budget, budget
+from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
+from dahl_ident.diagnostics.cross_validation import CrossValidation, cross_validation
 from dahl_ident.diagnostics.goodness import Goodness, goodness
 from dahl_ident.diagnostics.intervals import (
     METHODS,
     ConfidenceIntervals,
     IntervalComparison,
     Method,
+    combined_intervals,
     compare,
     profile_intervals,
     wald_intervals,
 )
-from dahl_ident.diagnostics.levels import LEVELS, checked_levels
+from dahl_ident.diagnostics.statements import statements, verdict_status
+from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting.optimum import Optimum
-from dahl_ident.results import report, storage
+from dahl_ident.results import fit_report, fit_storage
 from dahl_ident.results.fit_numbers import FitNumbers
 from dahl_ident.units import Quantity
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from dahl_ident.plots import Axes
 
 
@@ -69,7 +75,7 @@ class FitResult(FitNumbers):
         Real numbers measured (two a row), free parameters, degrees of freedom, evaluations.
     scale, scale_known : float, bool
         The noise's scale, and whether it was known beforehand.
-    success, message, status : bool, str, Status
+    success, message : bool, str
         Whether a finite optimum was found, and how the search ended.
     best_fit : ndarray of complex, shape (n,)
         Predicted response at the estimate.
@@ -84,6 +90,8 @@ class FitResult(FitNumbers):
     (True, 0.1)
     """
 
+    _called = "a fit"
+
     def __init__(self, optimum: Optimum, *, first_order: bool = False) -> None:
         super().__init__(optimum)
         self._first_order = first_order
@@ -93,7 +101,7 @@ class FitResult(FitNumbers):
 
     def conf_interval(
         self,
-        method: Method = "profile",
+        method: Method = "combined",
         levels: Sequence[float] | float = LEVELS,
         *,
         replicates: int = REPLICATES,
@@ -103,8 +111,9 @@ class FitResult(FitNumbers):
 
         Parameters
         ----------
-        method : {"profile", "wald", "bootstrap"}, default "profile"
-            See :mod:`dahl_ident.diagnostics.intervals`, which says what to use when.
+        method : {"combined", "profile", "wald", "bootstrap"}, default "combined"
+            "combined" counts every source of the budget, the others noise alone; see
+            :mod:`dahl_ident.diagnostics.intervals`, which says what to use when.
         levels : float or sequence of float, default 0.6827, 0.9545, 0.9973
             Confidence levels.
         replicates, seed : int
@@ -144,6 +153,9 @@ class FitResult(FitNumbers):
         if self._first_order:
             note = "first order: the fit had constraints or noise in the drive"
             return wald_intervals(self._optimum, levels).noted(note)
+        if method == "combined":
+            profile = self.conf_interval("profile", levels)
+            return combined_intervals(profile, self._optimum, self.errors)
         if method == "bootstrap":
             return bootstrap_intervals(self._optimum, levels, replicates, seed)
         quick = wald_intervals if method == "wald" else profile_intervals
@@ -178,32 +190,47 @@ class FitResult(FitNumbers):
     @cached_property
     def identifiability(self) -> Identifiability:
         """Which parameters, or which combinations of them, the data determine."""
-        return judged(self._optimum, self.conf_interval())
+        return judged(self._optimum, self.conf_interval("profile"), self.errors)
 
     @cached_property
     def goodness(self) -> Goodness:
-        """Whether what is left is noise, and what was fitted is physics."""
+        """Whether the residuals are noise, and the estimates physically possible."""
         return goodness(self._optimum)
 
-    @property
-    def trusted(self) -> bool:
-        """Whether there is an optimum, every parameter is identified, and the residuals noise."""
-        return bool(
-            self.success
-            and self.nfree > 0
-            and self.goodness.acceptable
-            and self.identifiability.complete
-        )
+    @cached_property
+    def cross_validation(self) -> CrossValidation | None:
+        """Held-out tests against their bands; None without tests to hold out."""
+        return None if self.errors is None else cross_validation(self.errors)
+
+    @cached_property
+    def status(self) -> VerdictStatus:
+        """Whether the numbers can be used."""
+        return verdict_status(self)
+
+    @cached_property
+    def _budget(self) -> Budget:
+        return budget(self._optimum, self.errors)
+
+    def budget(self) -> Budget:
+        """Return the uncertainty budget: each parameter's sources, combined and expanded.
+
+        Returns
+        -------
+        Budget
+            Printed, a table: source, type A or B, standard uncertainty, degrees of freedom and
+            share; then the combined and the expanded uncertainty.
+        """
+        return self._budget
 
     @property
-    def verdict(self) -> str:
-        """Whether to trust the numbers, in words, with what speaks against it."""
-        return " ".join(self.statements)
+    def findings(self) -> tuple[str, ...]:
+        """What the tests of residuals and values remark."""
+        return tuple(self.goodness.warnings)
 
     @cached_property
     def statements(self) -> tuple[str, ...]:
-        """The verdict in its parts: the first is what to remember, the others say why."""
-        return report.statements(self)
+        """The verdict sentence by sentence: the first says whether to trust, the others why."""
+        return statements(self)
 
     # What follows from the estimate
 
@@ -214,8 +241,11 @@ class FitResult(FitNumbers):
         amplitude: ArrayLike | None = None,
         drive: ArrayLike | None = None,
         quantity: Quantity | None = None,
+        noise: bool = True,
     ) -> ResponseBand:
         """Return the response that the estimate predicts, with its bands.
+
+        Bands count every source of the budget, and what the device departs from the model.
 
         Parameters
         ----------
@@ -227,6 +257,9 @@ class FitResult(FitNumbers):
             Force amplitude, N or N m, where that is controlled. Give one of the two.
         quantity : str, optional
             One of the six standard quantities; left out, that of the data.
+        noise : bool, default True
+            The band holds what one more test would measure, its noise and scatter included;
+            False: the device's response itself.
 
         Returns
         -------
@@ -239,10 +272,12 @@ class FitResult(FitNumbers):
             If both or neither of amplitude and drive are given, a value is not above zero, or
             the shapes do not go together.
         """
-        return response_band(self._optimum, frequency_hz, amplitude, drive, quantity)
+        return response_band(
+            self._optimum, frequency_hz, amplitude, drive, quantity, self.errors, of_a_test=noise
+        )
 
     def describing_function(self, amplitude: ArrayLike) -> ResponseBand:
-        """Return N(A) of the friction alone, with its bands.
+        """Return N(A) of the friction alone, with bands that hold the device's.
 
         Parameters
         ----------
@@ -256,9 +291,9 @@ class FitResult(FitNumbers):
         Raises
         ------
         ModelError
-            If the model has no Dahl element.
+            If the model has no friction law.
         """
-        return describing_function_band(self._optimum, amplitude)
+        return describing_function_band(self._optimum, amplitude, self.errors)
 
     def derived(
         self, amplitudes: Sequence[float] = (), frequency_hz: float | None = None
@@ -276,25 +311,29 @@ class FitResult(FitNumbers):
         -------
         tuple of DerivedQuantity
         """
-        return tuple(derived(self._optimum, amplitudes, frequency_hz))
+        return tuple(derived(self._optimum, amplitudes, frequency_hz, self.errors))
 
     # Telling
 
-    def fit_report(self, method: Method = "profile", level: float = 0.9545) -> str:
-        """Return the whole report as text, the verdict first.
+    def fit_report(
+        self, method: Method = "combined", level: float = 0.9545, *, details: bool = True
+    ) -> str:
+        """Return the report as text, the verdict first.
 
         Parameters
         ----------
-        method : {"profile", "wald", "bootstrap"}, default "profile"
+        method : {"combined", "profile", "wald", "bootstrap"}, default "combined"
             How the intervals are made.
         level : float, default 0.9545
             Their confidence level.
+        details : bool, default True
+            False: verdict and parameters alone, on at most 15 lines.
 
         Returns
         -------
         str
         """
-        return report.fit_report(self, self._reported(method, level))
+        return fit_report.fit_report(self, self._reported(method, level), details=details)
 
     def _reported(self, method: Method, level: float) -> ConfidenceIntervals:
         if level in LEVELS:
@@ -305,18 +344,53 @@ class FitResult(FitNumbers):
         return self.fit_report()
 
     def _repr_html_(self) -> str:
-        return report.as_html(self, self._reported("profile", LEVELS[1]))
+        return fit_report.as_html(self, self._reported("combined", LEVELS[1]))
 
-    def to_frame(self) -> Any:
-        """Return a pandas table: one row a parameter, with its 95.45 % profile interval."""
+    def summary(self) -> pd.DataFrame:
+        """Return a table, one row a parameter, with its combined 95.45 % interval.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``value, stderr, lower, upper, unit, vary, description, init_value, min, max``.
+        """
         import pandas as pd
 
         limits = self.conf_interval().at(LEVELS[1])
-        rows = []
+        rows = {}
         for name, p in self.params.items():
             known = {"lower": limits[name].lower, "upper": limits[name].upper} if p.vary else {}
-            rows.append({**asdict(p), **known})
-        return pd.DataFrame(rows).set_index("name")
+            rows[name] = {**asdict(p), **known}
+        found = pd.DataFrame.from_dict(rows, orient="index").rename_axis("parameter")
+        columns = ["value", "stderr", "lower", "upper", "unit", "vary", "description"]
+        return found.reindex(columns=[*columns, "init_value", "min", "max"])
+
+    def plot(self, kind: str | None = None, ax: Any = None) -> Any:
+        """Draw the fit.
+
+        Parameters
+        ----------
+        kind : {"fit", "residuals", "budget"}, optional
+            "fit" (the default): data and fit, see :meth:`plot_fit`. "residuals": see
+            :meth:`plot_residuals`. "budget": shares of the uncertainty as bars.
+        ax : matplotlib Axes, or two of them for "fit", optional
+            New ones where left out.
+
+        Returns
+        -------
+        Axes, or a tuple of Axes
+        """
+        if kind in (None, "fit"):
+            return self.plot_fit(ax)
+        if kind == "residuals":
+            return self.plot_residuals(ax)
+        if kind == "budget":
+            from dahl_ident.plots import plot_budget
+
+            table = self.budget()
+            shares = [(name, row.source, row.share) for name in table for row in table[name].rows]
+            return plot_budget(shares, ax=ax)
+        raise ValidationError(f"kind is {kind!r}; expected fit, residuals or budget")
 
     def plot_fit(self, ax: Sequence[Axes] | None = None) -> tuple[Axes, Axes]:
         """Draw data and fit, gain above phase, over amplitude or frequency.
@@ -330,15 +404,23 @@ class FitResult(FitNumbers):
         -------
         tuple of Axes
         """
-        from dahl_ident.results.drawing import draw_fit
+        from dahl_ident.results.fit_plots import draw_fit
 
         return draw_fit(self, ax)
 
-    def plot_residuals(self, ax: Axes | None = None) -> Axes:
+    def plot_residuals(
+        self,
+        ax: Axes | None = None,
+        *,
+        against: Literal["amplitude", "frequency", "velocity"] | None = None,
+    ) -> Axes:
         """Draw the residuals of every row, suspicious points ringed.
 
         Parameters
         ----------
+        against : {"amplitude", "frequency", "velocity"}, optional
+            What to draw them over: the amplitude of displacement, the frequency, or the amplitude
+            of velocity. By default amplitude or frequency, as suits the table.
         ax : matplotlib Axes, optional
             New where left out.
 
@@ -346,15 +428,15 @@ class FitResult(FitNumbers):
         -------
         Axes
         """
-        from dahl_ident.results.drawing import draw_residuals
+        from dahl_ident.results.fit_plots import draw_residuals
 
-        return draw_residuals(self, ax)
+        return draw_residuals(self, against, ax)
 
     # Storage
 
     def to_json(self) -> str:
         """Return the fit as JSON: data, model, noise, sensors and optimum."""
-        return storage.to_json(self._optimum, self._first_order)
+        return fit_storage.to_json(self._optimum, self._first_order)
 
     @classmethod
     def from_json(cls, text: str) -> FitResult:
@@ -365,34 +447,8 @@ class FitResult(FitNumbers):
         DataError
             If the text holds no fit, or one of a later version's schema.
         """
-        optimum, first_order = storage.from_json(text)
+        optimum, first_order = fit_storage.from_json(text)
         return cls(optimum, first_order=first_order)
-
-    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the fit to a file that :meth:`load` reads.
-
-        Parameters
-        ----------
-        path : path
-            Ending in ``.json``.
-        overwrite : bool, default False
-            Replace a file that is there already.
-
-        Returns
-        -------
-        Path
-            The file, complete; an interrupted run leaves none.
-
-        Raises
-        ------
-        ValidationError
-            If the ending is another one.
-        DataError
-            If a file is there already, or the place cannot be written to.
-        """
-        place = place_of(path, "a fit", storage.FORMATS)
-        write_whole(place, self.to_json().encode(), overwrite=overwrite)
-        return place
 
     @classmethod
     def load(cls, path: str | Path) -> FitResult:
@@ -403,9 +459,9 @@ class FitResult(FitNumbers):
         DataError
             If the file cannot be read, holds no fit, or one of a later version's schema.
         """
-        optimum, first_order = storage.load(path)
+        optimum, first_order = fit_storage.load(path)
         return cls(optimum, first_order=first_order)
 
     def __repr__(self) -> str:
         estimates = ", ".join(str(self.params[name]) for name in self.var_names)
-        return f"<FitResult: {estimates}; {self.status.name.lower()}>"
+        return f"<FitResult: {estimates}; {self._optimum.status.name.lower()}>"

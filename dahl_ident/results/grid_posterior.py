@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,8 @@ from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.noise_scale import ScalePosterior, ln_scale_draws
 from dahl_ident.bayes.quadrature import Grid
 from dahl_ident.errors import ModelError
-from dahl_ident.results.bayesian import QUANTILES, BayesianResult
+from dahl_ident.fitting import Optimum
+from dahl_ident.results.posterior_base import QUANTILES, Posterior
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 _END = 1e-6  # of the probability, beyond which quadrature tells nothing
 
 
-class GridPosterior(BayesianResult):
+class GridPosterior(Posterior):
     """The posterior by quadrature: the same answer at every call, with its error.
 
-    Made by :func:`dahl_ident.posterior_grid`. An unknown scale of the noise is integrated out
-    and shown as ``noise_scale`` all the same.
+    Made by :func:`dahl_ident.posterior` with ``method="grid"``. An unknown scale of the noise
+    is integrated out and shown as ``noise_scale`` all the same.
 
     Examples
     --------
     >>> import dahl_ident as di
-    >>> grid = di.posterior_grid(di.load_dataset("noisy"), di.Dahl())
+    >>> grid = di.posterior(di.load_dataset("noisy"), di.Dahl(), method="grid")
     >>> print(grid.message)
     Converged: error 2e-05 of the probability, 3280 points.
     >>> low, high = grid.quantile("f_max", [0.025, 0.975])
@@ -39,8 +39,11 @@ class GridPosterior(BayesianResult):
     f_max from 0.0993 to 0.1004 N
     """
 
-    def __init__(self, density: Density, grid: Grid, tolerance: float) -> None:
+    def __init__(
+        self, density: Density, grid: Grid, tolerance: float, optimum: Optimum | None = None
+    ) -> None:
         self._density, self._grid, self._tolerance = density, grid, tolerance
+        self._optimum = optimum
 
     @property
     def log_evidence(self) -> float:
@@ -74,7 +77,7 @@ class GridPosterior(BayesianResult):
             return f"Converged: {text}."
         return (
             f"NOT CONVERGED: {text}, expected {self._tolerance:.1g}. The numbers are provisional: "
-            "use dahl_ident.sample, or give narrower priors."
+            "use method='mcmc', or give narrower priors."
         )
 
     def quantile(self, name: str, probabilities: ArrayLike) -> FloatArray:
@@ -158,22 +161,8 @@ class GridPosterior(BayesianResult):
         own = np.sqrt(self._grid.weights @ centred**2)
         return np.append(own, self._scale.std()) if self._density.has_scale else own
 
-    def expectation(self, function: Callable[..., Any]) -> float:
-        """Return the posterior mean of a function of the parameters.
-
-        Parameters
-        ----------
-        function : callable
-            Takes arrays of values by parameter name, the noise scale excepted, such as
-            ``lambda f_max, sigma: f_max / sigma``.
-
-        Returns
-        -------
-        float
-            The mean.
-        """
-        by_name = dict(zip(self.problem.names, self._values.T, strict=True))
-        return float(self._grid.weights @ np.asarray(function(**by_name)))
+    def _weighted(self) -> tuple[FloatArray, FloatArray]:
+        return self._values, self._grid.weights
 
     def summary(self) -> pd.DataFrame:
         """Return one row a parameter: ``mean, std, 2.5%, 16%, median, 84%, 97.5%, unit``."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.dahl import Dahl
 from dahl_ident.elements.element import Element
 from dahl_ident.elements.model import as_model
 
@@ -22,24 +22,35 @@ _Values = list[Sequence[FloatArray]]
 EPS = float(np.finfo(np.float64).eps)
 _ROUNDING = 8.0 * EPS  # of k - m omega^2 and its like, relative to the terms' sizes
 _LARGEST = 1e300  # stands for an amplitude without bound
-_DAHL = Dahl()  # evaluated at any values; its alpha is fixed, so that dN/dalpha is left out
+_REACH = 40  # decades of amplitude, m, to both sides, that are searched where N has no bounds
 _AT_REST = np.zeros(())
 
 
 @dataclass(frozen=True)
-class Friction:
+class Nonlinear:
     """The elements that depend on the amplitude, with one or many vectors of their parameters.
 
-    `values` has f_max, sigma and alpha of each element, all of shape () or all (vectors,).
+    `values` has those of each element, all of shape () or all (vectors,). `omega` likewise; it
+    is 0 where no element depends on it.
     """
 
+    elements: tuple[Element, ...]
     values: tuple[tuple[FloatArray, ...], ...]
+    omega: FloatArray
+    unique: bool
+    """Whether beside a passive linear part the amplitude is unique."""
+
+    @property
+    def shared(self) -> bool:
+        """Whether all points have one vector of parameters."""
+        return self.omega.ndim == 0 and all(v.ndim == 0 for own in self.values for v in own)
 
     def force(self, amplitude: FloatArray, vector: IntArray) -> ComplexArray:
         """Return A N, the force's fundamental; `vector` says whose parameters each row has."""
         force = np.zeros(amplitude.shape, dtype=np.complex128)
-        for values in self.values:
-            force += _DAHL.stiffness(_rows(values, vector), amplitude, _AT_REST)
+        (omega,) = _rows((self.omega,), vector)
+        for element, values in zip(self.elements, self.values, strict=True):
+            force += element.stiffness(_rows(values, vector), amplitude, omega)
         force *= amplitude
         return force
 
@@ -49,24 +60,29 @@ class Friction:
         """Return A N and its derivative by ln A."""
         force = np.zeros(amplitude.shape, dtype=np.complex128)
         slope = np.zeros(amplitude.shape, dtype=np.complex128)
-        for values in self.values:
-            Z = _DAHL.stiffness_gradient(_rows(values, vector), amplitude, _AT_REST)
-            force += amplitude * Z.value
-            slope += amplitude * (Z.value + amplitude * Z.by_amplitude)
+        (omega,) = _rows((self.omega,), vector)
+        for element, values in zip(self.elements, self.values, strict=True):
+            N, by_amplitude = element.stiffness_slope(_rows(values, vector), amplitude, omega)
+            force += amplitude * N
+            slope += amplitude * (N + amplitude * by_amplitude)
         return force, slope
 
+    @cached_property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Return what |N| and A |N| never exceed, for each vector.
-
-        The force is largest where the motion turns: there it is at most f_max and, since z^-alpha
-        is convex, at most sigma A. The fundamental of a wave of height 1 is at most 4/pi, that of
-        the square wave.
-        """
+        """What |N| and A |N| never exceed, for each vector; infinite where unknown."""
         steepest, largest = np.zeros(()), np.zeros(())
-        for f_max, sigma, _ in self.values:
-            steepest = steepest + 4.0 / np.pi * sigma
-            largest = largest + 4.0 / np.pi * f_max
+        for element, values in zip(self.elements, self.values, strict=True):
+            own = element.force_bounds(values)
+            steepest, largest = steepest + own[0], largest + own[1]
         return steepest, largest
+
+    def knees(self) -> tuple[FloatArray, FloatArray]:
+        """Return the lowest and the highest amplitude at which N changes, for each vector."""
+        low, high = zip(
+            *(e.knee(values) for e, values in zip(self.elements, self.values, strict=True)),
+            strict=True,
+        )
+        return np.minimum.reduce(low), np.maximum.reduce(high)
 
 
 @dataclass(frozen=True)
@@ -80,7 +96,7 @@ class Plant:
     rounding: FloatArray  # what rounding the terms of L leaves of it
     drive: FloatArray
     vector: IntArray
-    friction: Friction
+    friction: Nonlinear
     unit: FloatArray  # of amplitude, m
 
     def at(self, points: IntArray | slice) -> Plant:
@@ -100,16 +116,36 @@ class Plant:
 
     def largest_friction(self) -> FloatArray:
         """Return the friction force's fundamental in gross slip."""
-        return _rows((self.friction.bounds()[1],), self.vector)[0] + np.zeros(self.drive.shape)
+        return _rows((self.friction.bounds[1],), self.vector)[0] + np.zeros(self.drive.shape)
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Return amplitudes below and above every solution."""
-        steepest, largest = _rows(self.friction.bounds(), self.vector)
+        steepest, largest = _rows(self.friction.bounds, self.vector)
         stiffness = np.abs(self.linear)
         with np.errstate(divide="ignore", over="ignore"):
             low = 0.999 * self.drive / (stiffness + steepest)
             high = np.minimum(1.001 * (self.drive + largest) / stiffness, _LARGEST)
+        bounded = np.isfinite(steepest) & np.isfinite(largest)
+        unbounded = np.flatnonzero(~np.broadcast_to(bounded, stiffness.shape))
+        if unbounded.size:
+            least, most = self.at(unbounded)._reach()
+            low[unbounded] = np.maximum(low[unbounded], least)
+            high[unbounded] = np.minimum(high[unbounded], most)
         return low, high
+
+    def _reach(self) -> tuple[FloatArray, FloatArray]:
+        """Return amplitudes beyond which A |Z| is far from the drive, where N has no bounds."""
+        grid = 10.0 ** np.arange(-_REACH, _REACH, 0.25)
+        least, most = np.empty(self.drive.shape), np.empty(self.drive.shape)
+        for point in range(self.drive.size):
+            one = self.at(np.full(grid.size, point))
+            with np.errstate(all="ignore"):
+                ratio = np.abs(one.force(grid)) / one.drive
+            reached = ~(ratio < 0.1)  # true as well where A |Z| overflows
+            least[point] = grid[max(int(reached.argmax()) - 1, 0)] if reached.any() else grid[-1]
+            last = grid.size - 1 - int((ratio < 10.0)[::-1].argmax())
+            most[point] = grid[min(last + 1, grid.size - 1)]
+        return least, most
 
     def misfit(
         self, amplitude: FloatArray, force: ComplexArray, slope: ComplexArray
@@ -132,26 +168,31 @@ def flatten(
     """Return the plant at every point of the broadcast arguments, and their shape."""
     shape = np.broadcast_shapes(np.shape(omega), np.shape(drive), *(np.shape(v) for v in values))
     linear, size = np.zeros((), dtype=np.complex128), np.zeros(())
+    elements: list[Element] = []
     friction: _Values = []
-    first = 0
-    for element in as_model(model).elements:
-        own = values[first : first + len(element.parameters)]
-        first += len(element.parameters)
-        if isinstance(element, Dahl):
-            friction.append(own)
-        else:
+    for element, own in as_model(model).of(values):
+        if element.is_linear:
             part = element.stiffness(own, _AT_REST, omega)
             linear, size = linear + part, size + np.abs(part)
+        else:
+            elements.append(element)
+            friction.append(own)
+    rates = [] if all(e.rate_independent for e in elements) else [np.asarray(omega)]
     linear, friction = _without_overflow(linear, friction)
-    force, stiffness, friction = _units(friction)
-    batch = np.broadcast_shapes(*(np.shape(v) for own in friction for v in own))
+    force, stiffness, friction = _units(elements, friction)
+    batch = np.broadcast_shapes(*(np.shape(v) for own in (*friction, rates) for v in own))
     vectors = np.arange(np.prod(batch, dtype=np.intp)).reshape(batch)
     plant = Plant(
         _flat(linear / stiffness, shape),
         _flat(_ROUNDING * size / stiffness, shape),
         _flat(drive / force, shape),
         _flat(vectors, shape),
-        Friction(tuple(tuple(_flat_values(v, batch) for v in own) for own in friction)),
+        Nonlinear(
+            tuple(elements),
+            tuple(tuple(_flat_values(v, batch) for v in own) for own in friction),
+            _flat_values(rates[0], batch) if rates else np.zeros(()),
+            all(element.unique_response for element in elements),
+        ),
         _flat(force / stiffness, shape),
     )
     return plant, shape
@@ -168,16 +209,19 @@ def _without_overflow(linear: ComplexArray, friction: _Values) -> tuple[ComplexA
     ]
 
 
-def _units(friction: _Values) -> tuple[FloatArray, FloatArray, _Values]:
+def _units(
+    elements: Sequence[Element], friction: _Values
+) -> tuple[FloatArray, FloatArray, _Values]:
     """Return units of force and stiffness, and the friction in them.
 
-    In units of f_max and sigma one element of one exponent is the same for every vector.
+    In its own units one element may have the same numbers for every vector: Dahl friction of one
+    exponent, say.
     """
     one = np.ones(())
-    if len(friction) == 1:
-        f_max, sigma, alpha = friction[0]
-        if np.size(alpha) and np.all(alpha == np.ravel(alpha)[0]):
-            return f_max, sigma, [(one, one, np.ravel(alpha)[0])]
+    if len(friction) == 1 and elements[0].rate_independent:
+        force, stiffness, numbers = elements[0].normalised(friction[0])
+        if all(np.size(v) and np.all(v == np.ravel(v)[0]) for v in numbers):
+            return force, stiffness, [[np.asarray(np.ravel(v)[0]) for v in numbers]]
     return one, one, friction
 
 

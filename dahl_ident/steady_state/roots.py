@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.steady_state.plant import EPS, BoolArray, Friction, IntArray, Plant
+from dahl_ident.steady_state.plant import EPS, BoolArray, IntArray, Nonlinear, Plant
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
@@ -46,12 +46,12 @@ def find_roots(plant: Plant, per_decade: int = _SCAN_PER_DECADE) -> Roots:
     `per_decade` is the number of nodes a decade of amplitude in the search at active points.
     """
     resonant = np.abs(plant.linear) <= plant.rounding
-    if not plant.friction.values:
+    if not plant.friction.elements:
         with np.errstate(divide="ignore", over="ignore"):
             amplitude = np.where(resonant, np.nan, plant.drive / np.abs(plant.linear))
         return Roots(amplitude[:, None], (amplitude * plant.linear)[:, None])
     known = np.isfinite(plant.linear)
-    passive = known & (plant.linear.imag >= -plant.rounding)
+    passive = known & plant.friction.unique & (plant.linear.imag >= -plant.rounding)
     single = passive & ~(resonant & (plant.drive >= plant.largest_friction()))
     amplitude = np.full(plant.drive.shape, np.nan)
     force = np.full(plant.drive.shape, np.nan, dtype=np.complex128)
@@ -94,16 +94,16 @@ class _Table(NamedTuple):
     sure_step: float  # steps of ln A, times kappa, after which linear corrections are exact
 
 
-def _tabulate(friction: Friction, points: int) -> _Table:
+def _tabulate(friction: Nonlinear, points: int) -> _Table:
     """Return the friction force from deep microslip to deep slip of every element.
 
     A vector has about as many nodes as there are points to solve for it, within limits.
     """
-    knees = [np.atleast_1d(f_max / sigma) for f_max, sigma, _ in friction.values]
-    low = np.log10(np.min(knees, axis=0)) - 6.0
-    high = np.log10(np.max(knees, axis=0)) + 5.0
-    decades = np.max(high - low)
-    least = np.clip(points / low.size, *(decades * n for n in _NODES_PER_DECADE))
+    low, high = (np.atleast_1d(np.log10(knee)) for knee in friction.knees())
+    low, high = low - 6.0, high + 5.0
+    decades = float(np.max(high - low))
+    fewest, most = (decades * n for n in _NODES_PER_DECADE)
+    least = np.clip(points / low.size, fewest, most)
     nodes = 2 ** int(np.ceil(np.log2(least))) - 1
     amplitude = 10.0 ** np.linspace(low, high, nodes, axis=-1).ravel()
     vector = np.repeat(np.arange(low.size), nodes)
@@ -275,7 +275,7 @@ def _signs(plant: Plant, grid: FloatArray) -> tuple[BoolArray, BoolArray, BoolAr
 
     The last for every cell: whether A |Z| may reach u_0 from either of its ends.
     """
-    shared = all(v.ndim == 0 for values in plant.friction.values for v in values)
+    shared = plant.friction.shared
     vectors, which = np.unique(plant.vector, return_inverse=True)
     if shared:
         vectors, which = vectors[:1], np.zeros(1, dtype=np.intp)

@@ -70,7 +70,7 @@ def _friction(
     return Experiment(Dahl(_F_MAX, _SIGMA, alpha), steps, table=table)
 
 
-_PLANT = Dahl(_F_MAX, _SIGMA) + Mass(0.3) + Damper(0.24) + Spring(0.3)
+_PLANT = Dahl(_F_MAX, _SIGMA, 1.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
 _ONE_PERCENT = Table(force_std=0.01)
 _BOTH = ("f_max", "sigma")
 _ALL_OF_PLANT = ("f_max", "sigma", "mass", "damping", "stiffness")
@@ -103,7 +103,7 @@ DATA_SETS: dict[str, DataSet] = {
         DataSet(
             "gross_slip",
             Experiment(
-                Dahl(_F_MAX, 3e5),
+                Dahl(_F_MAX, 3e5, 1.0),
                 SteppedSine(_spread(3e-3, 3e-2, 30)),
                 table=Table(force_std=0.03),
             ),
@@ -137,7 +137,7 @@ DATA_SETS: dict[str, DataSet] = {
         DataSet(
             "unsettled",
             Experiment(
-                Dahl(_F_MAX, _SIGMA),
+                Dahl(_F_MAX, _SIGMA, 1.0),
                 SteppedSine(
                     tuple(float(f"{beta * _X_C:.3g}") for beta in (10.0, 2.0, 0.2, 0.02)),
                     (1.0, 2.0),
@@ -160,7 +160,7 @@ DATA_SETS: dict[str, DataSet] = {
         DataSet(
             "quantised",
             Experiment(
-                Dahl(_F_MAX, _SIGMA),
+                Dahl(_F_MAX, _SIGMA, 1.0),
                 SteppedSine(_spread(0.05, 5.0, 8, unit=_X_C), order="ascending", num_periods=4),
                 Acquisition(
                     sample_rate_hz=100.0,
@@ -184,7 +184,7 @@ DATA_SETS: dict[str, DataSet] = {
         DataSet(
             "delayed",
             Experiment(
-                Dahl(_F_MAX, _SIGMA),
+                Dahl(_F_MAX, _SIGMA, 1.0),
                 SteppedSine(_spread(0.1, 10.0, 10, unit=_X_C), (1.0, 5.0, 20.0)),
                 Acquisition(displacement=Channel(delay=2e-3), force=Channel(gain=1.2)),
                 _ONE_PERCENT,
@@ -198,7 +198,7 @@ DATA_SETS: dict[str, DataSet] = {
         DataSet(
             "plant_recording",
             Experiment(
-                Dahl(_F_MAX, _SIGMA) + Mass(0.3) + Damper(2.0) + Spring(0.3),
+                Dahl(_F_MAX, _SIGMA, 1.0) + Mass(0.3) + Damper(2.0) + Spring(0.3),
                 SteppedSine(
                     # high enough for the mass to filter the harmonics of friction
                     levels=(0.05, 0.15, 0.5, 1.0, 2.0),

@@ -1,4 +1,4 @@
-"""A model taken apart for the time domain: its Dahl elements, and everything linear as one."""
+"""A model taken apart for the time domain: its friction, and everything linear as one."""
 
 from __future__ import annotations
 
@@ -8,13 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data.quantities import DEFINITIONS
-from dahl_ident.elements import Dahl, Element, LinearSystem
-from dahl_ident.elements.hysteresis import force_history, margin_change
-from dahl_ident.elements.linear import Lumped
+from dahl_ident.elements import Element
 from dahl_ident.elements.model import as_model
 from dahl_ident.errors import ModelError
-from dahl_ident.synthetic.plant_motion import DahlValues, Progress, simulate_plant
+from dahl_ident.synthetic.plant_motion import Progress, simulate_plant
 from dahl_ident.synthetic.state_space import Rational
 from dahl_ident.synthetic.waveform import Waveform
 
@@ -24,10 +21,13 @@ Signal = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class Mechanism:
-    """Dahl elements in parallel with one linear dynamic stiffness Z(s) = n(s)/d(s)."""
+    """Friction in parallel with one linear dynamic stiffness Z(s) = n(s)/d(s)."""
 
-    friction: tuple[DahlValues, ...]
+    friction: tuple[Element, ...]
+    """Laws whose branches have a closed form."""
     linear: Rational
+    others: tuple[Element, ...] = ()
+    """Laws whose force is known for a given displacement alone."""
 
     @classmethod
     def of(cls, plant: Element) -> Mechanism:
@@ -39,21 +39,17 @@ class Mechanism:
             If a parameter has no value, or a linear system has no equation of motion.
         """
         plant.known_values()
-        friction = []
+        friction, others = [], []
         linear = Rational(np.zeros(1), np.ones(1))
         for element in as_model(plant).elements:
-            values = [float(v) for v in element.known_values()]
-            if isinstance(element, Dahl):
-                friction.append(DahlValues(*values))
-            elif isinstance(element, LinearSystem):
-                linear = linear + _stiffness_of(element)
-            elif isinstance(element, Lumped):
-                linear = linear + Rational(np.array(values), np.ones(1)).times_s(element.order)
+            rational = element.rational_stiffness()
+            if rational is not None:
+                linear = linear + Rational(*rational).trimmed()
+            elif element.branch(_values(element), 0.0, np.zeros(1)) is not None:
+                friction.append(element)
             else:
-                raise ModelError(
-                    f"{element!r} has no equation of motion; expected an element of dahl_ident"
-                )
-        return cls(tuple(friction), linear)
+                others.append(element)
+        return cls(tuple(friction), linear, tuple(others))
 
     def displacement_under(self, force: Waveform, progress: Progress | None = None) -> Signal:
         """Return x(t) for a force u(t), from rest.
@@ -63,6 +59,11 @@ class Mechanism:
         ModelError
             If nothing linear bounds the motion, or it grows beyond all bounds.
         """
+        if self.others:
+            raise ModelError(
+                f"the motion under a force is not available for {self.others[0]!r}; control the "
+                "displacement, or take Dahl friction of one limit"
+            )
         if not np.any(self.linear.numerator):
             raise ModelError(
                 "friction alone slides without bound under a force above f_max; give the plant a "
@@ -86,7 +87,8 @@ class Mechanism:
                 "prescribed displacement at most s^2, a mass, has a force"
             )
         q0, q1, q2 = [*polynomial[::-1].tolist(), 0.0, 0.0][:3]
-        parts: list[Signal] = [DahlForce(values, displacement) for values in self.friction]
+        parts: list[Signal] = [BranchForce(law, displacement) for law in self.friction]
+        parts += [LawForce(element, displacement) for element in self.others]
         if np.any(rest.numerator):
             parts.append(simulate_plant(rest.state_space(), (), displacement, progress))
 
@@ -100,37 +102,48 @@ class Mechanism:
         return force
 
 
-class DahlForce:
-    """The exact force of one Dahl element under a prescribed displacement, at any times.
+class BranchForce:
+    """The exact force of one law under a prescribed displacement, at any times.
 
-    The motion's turning points are found once; between them the force is Eqn. 3.
+    The motion's turning points are found once; between them the force has a closed form.
     """
 
-    def __init__(self, values: DahlValues, displacement: Waveform) -> None:
-        self._values = values
+    def __init__(self, element: Element, displacement: Waveform) -> None:
+        self._element, self._values = element, _values(element)
         self._displacement = displacement
         self._times = displacement.turning_times()
         self._x = displacement.value(self._times)
-        self._force = force_history(self._x, *values, 0.0)
+        self._force = element.force_history(self._values, self._x)
         heading = np.sign(np.diff(self._x, append=self._x[-1]))
         self._heading = np.where(heading == 0.0, 1.0, heading)
 
     def __call__(self, time: FloatArray) -> FloatArray:
         """Return the force at any times."""
-        f_max, sigma, alpha = self._values
         before = np.clip(
             np.searchsorted(self._times, time, side="right") - 1, 0, self._times.size - 1
         )
         heading = self._heading[before]
-        scaled = self._force[before] / f_max
-        path = np.abs(self._displacement.value(time) - self._x[before]) * (sigma / f_max)
-        change = margin_change(1.0 - heading * scaled, path, alpha)
-        return np.asarray(f_max * (scaled - heading * change))
+        path = np.abs(self._displacement.value(time) - self._x[before])
+        found = self._element.branch(self._values, heading * self._force[before], path)
+        assert found is not None
+        return np.asarray(heading * found[0])
 
 
-def _stiffness_of(element: LinearSystem) -> Rational:
-    """Return the dynamic stiffness of a linear system as polynomials in s."""
-    response = Rational(*element.polynomials()).trimmed()
-    definition = DEFINITIONS[element.quantity]
-    base = response if definition.exponent == 1 else response.inverse()
-    return base.times_s(definition.power_in_stiffness)
+class LawForce:
+    """The force of any law under a prescribed displacement, at any times after its start."""
+
+    def __init__(self, element: Element, displacement: Waveform) -> None:
+        self._element = element
+        self._displacement = displacement
+        self._turns = displacement.turning_times()
+
+    def __call__(self, time: FloatArray) -> FloatArray:
+        """Return the force at any times."""
+        every, back = np.unique(np.concatenate([self._turns, time]), return_inverse=True)
+        motion = self._displacement.motion(every)
+        force = self._element.force_history(_values(self._element), motion.value, motion.velocity)
+        return np.asarray(force[back[self._turns.size :]])
+
+
+def _values(element: Element) -> list[float]:
+    return [float(v) for v in element.known_values()]

@@ -14,7 +14,7 @@ reversal is located, not stepped over, and the next interval starts on the new b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +22,7 @@ from numpy.polynomial import chebyshev
 from scipy.optimize import brentq
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.hysteresis import margin_change
+from dahl_ident.elements import Element
 from dahl_ident.errors import ModelError
 from dahl_ident.synthetic.state_space import StateSpace
 from dahl_ident.synthetic.trajectory import (
@@ -47,17 +47,9 @@ _NOISE = 1e-13
 _BEYOND_BOUNDS = 1e100
 
 
-class DahlValues(NamedTuple):
-    """The parameters of one Dahl element."""
-
-    f_max: float
-    sigma: float
-    alpha: float
-
-
 def simulate_plant(
     system: StateSpace,
-    friction: Sequence[DahlValues],
+    friction: Sequence[Element],
     force: Waveform,
     progress: Progress | None = None,
 ) -> Trajectory:
@@ -67,8 +59,8 @@ def simulate_plant(
     ----------
     system : StateSpace
         Receptance of the linear part, displacement over force.
-    friction : sequence of DahlValues
-        Dahl elements in parallel to it; may be empty.
+    friction : sequence of Element
+        Laws in parallel to it, whose branches have a closed form; may be empty.
     force : Waveform
         u(t), N.
     progress : callable, optional
@@ -96,39 +88,35 @@ def simulate_plant(
 
 
 class _Friction:
-    """Dahl elements on one branch: the force as a function of displacement alone.
+    """Laws on one branch each: the force as a function of displacement alone."""
 
-    The force at the turning point is carried, not the margin, which would round small forces.
-    """
-
-    def __init__(self, elements: Sequence[DahlValues]) -> None:
-        self._elements = [(e.f_max, e.sigma / e.f_max, e.alpha) for e in elements]
-        self._scaled_forces = [0.0] * len(elements)
+    def __init__(self, elements: Sequence[Element]) -> None:
+        self._laws = [(e, [float(v) for v in e.known_values()]) for e in elements]
+        self._at_turn = [0.0] * len(elements)
         self._x_turn = 0.0
         self.direction = 1.0
 
     def force_and_slope(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the force and dF/dx at displacements on this branch, or on its continuation."""
         force, slope = np.zeros_like(x), np.zeros_like(x)
-        for (f_max, rate, alpha), at_turn in zip(self._elements, self._scaled_forces, strict=True):
-            change = self._change(x, rate, alpha, at_turn)
-            margin = (1.0 - self.direction * at_turn) + change
-            force += f_max * (at_turn - self.direction * change)
-            slope += f_max * rate * margin**alpha
+        for own, by_x in self._branches(x):
+            force += self.direction * own
+            slope += by_x
         return force, slope
 
     def turn(self, x: float) -> None:
         """Go on from `x` in the other direction."""
-        self._scaled_forces = [
-            at_turn - self.direction * float(self._change(np.asarray(x), rate, alpha, at_turn))
-            for (_, rate, alpha), at_turn in zip(self._elements, self._scaled_forces, strict=True)
-        ]
+        self._at_turn = [self.direction * float(own) for own, _ in self._branches(np.asarray(x))]
         self._x_turn = x
         self.direction = -self.direction
 
-    def _change(self, x: FloatArray, rate: float, alpha: float, at_turn: float) -> FloatArray:
-        start = np.asarray(1.0 - self.direction * at_turn)
-        return margin_change(start, self.direction * rate * (x - self._x_turn), alpha)
+    def _branches(self, x: FloatArray) -> Iterator[FloatArray]:
+        """Yield force and slope of each law, the force counted in the direction of motion."""
+        path = self.direction * (x - self._x_turn)
+        for (law, values), at_turn in zip(self._laws, self._at_turn, strict=True):
+            found = law.branch(values, self.direction * at_turn, path)
+            assert found is not None
+            yield found
 
 
 class _Operator(NamedTuple):

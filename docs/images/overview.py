@@ -45,7 +45,7 @@ def draw() -> plt.Figure:
         for level, alpha in ((0.95, 0.2), (0.68, 0.35)):
             f_max, sigma = centre + np.sqrt(-2.0 * np.log(1.0 - level)) * circle
             label = f"{level:.0%} region"
-            ellipse.fill(1e3 * f_max, sigma, color=style.SKY, alpha=alpha, lw=0, label=label)
+            ellipse.fill(1e3 * f_max, sigma, color=style.BLUE, alpha=alpha, lw=0, label=label)
         truth = data.provenance["truth"]
         ellipse.plot(
             1e3 * truth["f_max"], truth["sigma"], "*", color=style.VERMILION, markersize=12,

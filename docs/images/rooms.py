@@ -8,20 +8,21 @@ from pathlib import Path
 # Rooms side by side with what they do, and what the data have become when they leave the layer.
 LAYERS = (
     ((("cli", "commands"),), ""),
+    ((("campaigns", "many devices"),), "one table"),
     ((("reporting", "reports"),), "HTML, PDF, Markdown, JSON"),
     ((("results", "what users hold"),), "FitResult, Posterior"),
-    ((("plots", "pictures of plain numbers"),), ""),
     ((("diagnostics", "judge"),), "verdicts, intervals"),
     ((("fitting", "optimum"), ("bayes", "posterior")), "optimum, chain"),
     ((("problem", "residuals, likelihood"),), "Problem"),
     ((("noise", "weights"), ("sensors", "gains, delay")), ""),
     ((("extraction", "from waveforms"), ("synthetic", "simulated lab")), "FrequencyResponse"),
-    ((("steady_state", "plants"), ("control_interop", "loops")), ""),
+    ((("steady_state", "plants"), ("time_domain", "motion"), ("control_interop", "loops")), ""),
     ((("elements", "the model"),), ""),
     ((("data", "tables, records, readers"),), "Record, FrequencyResponse"),
     ((("units", "conversion at the edge"),), "file: numbers with units"),
+    ((("plots", "pictures of plain numbers"),), ""),
     ((("arrays", "checks"),), ""),
-    ((("errors", "what can go wrong"),), ""),
+    ((("errors", "what can go wrong"), ("version", "")), ""),
 )
 WIDTH, HEIGHT, GAP, LEFT, TOP = 420, 30, 8, 110, 20
 BLUE, VERMILION = "#0072b2", "#d55e00"

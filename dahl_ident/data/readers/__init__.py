@@ -3,29 +3,37 @@
 Formats are told by their content: text tables (CSV, TSV and kin, also packed with gzip, bzip2 or
 xz), Excel, Parquet, MATLAB, HDF5, universal files 58 and 58b, NI TDMS and LabVIEW LVM. What the
 file does not say, such as a unit or which column is the force, comes from a column map
-(:mod:`dahl_ident.data.columns`) or from keywords; what nobody says is an error. Every
+(:mod:`dahl_ident.data.column_map`) or from keywords; what nobody says is an error. Every
 assumption that is left, such as amplitudes being zero to peak, is noted in the result.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from dahl_ident.data.columns import column_map
+import numpy as np
+
+from dahl_ident.data.column_map import column_map
 from dahl_ident.data.frequency_response import FrequencyResponse
-from dahl_ident.data.readers.contents import FileContents, contents
+from dahl_ident.data.raw_columns import Source
 from dahl_ident.data.readers.file import File, open_file
+from dahl_ident.data.readers.inspection import FileContents, contents
 from dahl_ident.data.record import Record
-from dahl_ident.data.record_table import record_from
+from dahl_ident.data.record_table import record_from, record_size
 from dahl_ident.data.response_table import ResponseOptions, response_from
-from dahl_ident.data.source import Source
-from dahl_ident.data.table import plain
+from dahl_ident.data.storage import plain_data
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.units import Quantity
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from typing_extensions import TypeIs
 
 __all__ = ["FileContents", "inspect", "read_frequency_response", "read_record"]
 
@@ -34,7 +42,7 @@ Columns = Mapping[str, Any] | str | Path
 
 
 def read_frequency_response(
-    path: PathLike | Sequence[PathLike],
+    path: PathLike | Sequence[PathLike] | pd.DataFrame,
     *,
     columns: Columns | None = None,
     quantity: Quantity | None = None,
@@ -44,6 +52,7 @@ def read_frequency_response(
     drive_factor_uncertainty: float | None = None,
     level: str | float | None = None,
     level_from_name: str | None = None,
+    run: str | None = None,
     controlled: str | Mapping[str, str] | None = None,
     frequency_hz: tuple[float, float] | None = None,
     sheet: str | None = None,
@@ -53,8 +62,8 @@ def read_frequency_response(
 
     Parameters
     ----------
-    path : path, or sequence of paths
-        Files; ``"-"`` is standard input.
+    path : path, sequence of paths, or pandas.DataFrame
+        Files; ``"-"`` is standard input. A table in memory has its units in its column names.
     columns : mapping or path of a TOML file, optional
         Column map: which column is ``frequency``, ``amplitude``, ``drive``, ``gain``, ``phase``,
         ``real``, ``imag`` and so on, with unit, sign and factor where the file does not say
@@ -68,13 +77,17 @@ def read_frequency_response(
     drive_factor : str, optional
         Force for one unit of a drive in V or A, such as ``"12.5 N/V"``.
     drive_factor_uncertainty : float, optional
-        Its relative standard uncertainty; all rows share it, so it is noted and not added to
+        Its relative standard uncertainty; all rows share it, so the table carries it beside
         the covariance.
     level : str or float, optional
         Label for all rows.
     level_from_name : str, optional
         Regular expression on the file's name; its first group is the level. Together with
         ``drive="{level} N"`` it is the drive as well; a named group fills its own braces.
+    run : str, optional
+        Label of what was measured in one go, for all rows; braces are filled as in `drive`.
+        Without it a column ``run``, ``test``, ``file`` or ``day`` is taken, and of several files
+        each is a run under its own name.
     controlled : {"displacement", "force"} or mapping, optional
         What the laboratory held; a mapping gives a pattern of level labels for each.
     frequency_hz : (low, high), optional
@@ -115,7 +128,7 @@ def read_frequency_response(
     """
     if level is not None and level_from_name is not None:
         raise ValidationError("level and level_from_name are both given; leave out one of them")
-    paths = [path] if isinstance(path, (str, Path)) else list(path)
+    paths = [path] if isinstance(path, (str, Path)) or _is_frame(path) else [*path]
     if not paths:
         raise DataError("no file to read; expected at least one path")
     mapped = column_map(
@@ -132,6 +145,7 @@ def read_frequency_response(
             amplitude=_filled(amplitude, groups, one),
             drive=_filled(drive, groups, one),
             level=groups.get("level", level),
+            run=_filled(run, groups, one),
             frequency_hz=frequency_hz,
             passive=passive,
         )
@@ -143,9 +157,18 @@ def read_frequency_response(
             raise DataError(
                 f"{one}: level={level!r} is given, but the table has its own levels; leave it out"
             )
+        if run is not None and part.run is not None and any(v != options.run for v in part.run):
+            raise DataError(
+                f"{one}: run={run!r} is given, but the table has its own runs; leave it out"
+            )
         parts.append(part)
     if len(parts) == 1:
-        return parts[0]
+        return _as_saved(parts[0]) if _is_frame(paths[0]) else parts[0]
+    names = run_names(paths)
+    parts = [
+        part if part.run is not None else replace(part, run=np.full(part.n, name))
+        for part, name in zip(parts, names, strict=True)
+    ]
     try:
         return FrequencyResponse.concatenate(parts)
     except ValidationError as exc:
@@ -153,7 +176,7 @@ def read_frequency_response(
 
 
 def read_record(
-    path: PathLike,
+    path: PathLike | pd.DataFrame | Sequence[Mapping[str, Any]],
     *,
     columns: Columns | None = None,
     time: str | Mapping[str, Any] | None = None,
@@ -172,8 +195,10 @@ def read_record(
 
     Parameters
     ----------
-    path : path
-        File; ``"-"`` is standard input.
+    path : path, pandas.DataFrame, or list of dict
+        File; ``"-"`` is standard input. A table in memory has its units in its column names. A
+        list of dictionaries is SDyPy's time series: ``name``, ``data``, ``unit_str`` and ``fs``
+        or ``time`` for each channel.
     columns : mapping or path of a TOML file, optional
         Column map of the roles below.
     time, displacement, velocity, acceleration, force, drive : str or mapping, optional
@@ -211,10 +236,6 @@ def read_record(
     >>> read_record(run, displacement="LVDT").force
     array([2000., 3000.])
     """
-    if missing not in ("error", "drop"):
-        raise ValidationError(f"missing is {missing!r}; expected 'error' or 'drop'")
-    if time is not None and sample_rate is not None:
-        raise ValidationError("time and sample_rate are both given; leave out one of them")
     roles = {
         "time": time,
         "displacement": displacement,
@@ -226,8 +247,58 @@ def read_record(
         "drive_factor_uncertainty": drive_factor_uncertainty,
         "sample_rate": sample_rate,
     }
+    return next(record_pieces(path, None, columns=columns, sheet=sheet, missing=missing, **roles))
+
+
+def record_pieces(
+    path: PathLike | pd.DataFrame | Sequence[Mapping[str, Any]],
+    samples: int | None,
+    *,
+    columns: Columns | None = None,
+    sheet: str | None = None,
+    missing: Literal["error", "drop"] = "error",
+    **roles: Any,
+) -> Iterator[Record]:
+    """Yield a record in pieces of at most so many samples, each read when its turn comes.
+
+    The options are those of :func:`read_record`. The arrays of HDF5, TDMS, Parquet and npy stay in
+    the file until their piece is read.
+    """
+    if missing not in ("error", "drop"):
+        raise ValidationError(f"missing is {missing!r}; expected 'error' or 'drop'")
+    if roles.get("time") is not None and roles.get("sample_rate") is not None:
+        raise ValidationError("time and sample_rate are both given; leave out one of them")
     source = open_source(path, sheet, _given(columns=columns, sheet=sheet, **roles))
-    return record_from(source, column_map(columns, **roles), missing)
+    bound = column_map(columns, **roles)
+    n = 0 if samples is None else record_size(source, bound)
+    pieces = 1 if samples is None else max(1, -(-n // samples))
+    if pieces == 1:
+        yield record_from(source, bound, missing)
+        return
+    edges = [i * n // pieces for i in range(pieces + 1)]
+    for start, stop in pairwise(edges):
+        channels = (c.part(slice(start, stop)) if c.size == n else c for c in source.channels)
+        row_name = partial(_row_after, source.row_name, start)
+        part = replace(source, channels=tuple(channels), row_name=row_name)
+        record = record_from(part, bound, missing)
+        if bound.sample_rate is not None:
+            record = replace(record, time=record.time + start / bound.sample_rate)
+        yield record
+
+
+def _row_after(row_name: Callable[[int], str], start: int, row: int) -> str:
+    return row_name(start + row)
+
+
+def _as_saved(data: FrequencyResponse) -> FrequencyResponse:
+    """Return a table that never was in a file with the provenance that it had before."""
+    origin = (data.provenance or {}).get("origin")
+    return data if origin is None else replace(data, provenance=origin)
+
+
+def _is_frame(path: Any) -> TypeIs[pd.DataFrame]:
+    """Return whether this is a table in memory, without the import of pandas."""
+    return hasattr(path, "iloc")
 
 
 def inspect(path: PathLike, *, sheet: str | None = None) -> FileContents:
@@ -266,11 +337,21 @@ def inspect(path: PathLike, *, sheet: str | None = None) -> FileContents:
 
 
 def open_source(
-    path: PathLike, sheet: str | None = None, options: Mapping[str, Any] | None = None
+    path: PathLike | pd.DataFrame | Sequence[Mapping[str, Any]],
+    sheet: str | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> Source:
     """Return the channels of a file of any format, and beside them what the user said."""
+    if _is_frame(path):
+        from dahl_ident.data.readers.spreadsheets import frame_source
+
+        return replace(frame_source(path), options=options or {})
+    if not isinstance(path, (str, Path)):
+        from dahl_ident.data.readers.dictionaries import dictionary_source
+
+        return replace(dictionary_source(path), options=options or {})
     file = open_file(path)
-    if sheet is not None and file.format != "excel":
+    if sheet is not None and file.format not in ("excel", "ods"):
         raise DataError(f"{file.name}: sheet={sheet!r} is given, but the file is no workbook")
     return replace(_parsed(file, sheet), options=options or {})
 
@@ -278,48 +359,70 @@ def open_source(
 def _given(**options: Any) -> dict[str, Any]:
     """Return the options that differ from saying nothing, as JSON holds them."""
     return {
-        k: plain(v) for k, v in options.items() if v is not None and (k, v) != ("passive", True)
+        k: plain_data(v)
+        for k, v in options.items()
+        if v is not None and (k, v) != ("passive", True)
     }
 
 
 def _parsed(file: File, sheet: str | None) -> Source:
     """Hand a file to its reader; each is imported when first used."""
     match file.format:
-        case "excel":
-            from dahl_ident.data.readers.sheets import read_excel
+        case "excel" | "ods":
+            from dahl_ident.data.readers.spreadsheets import read_workbook
 
-            return read_excel(file, sheet)
+            return read_workbook(file, sheet)
         case "parquet":
-            from dahl_ident.data.readers.sheets import read_parquet
+            from dahl_ident.data.readers.spreadsheets import read_parquet
 
             return read_parquet(file)
         case "matlab":
-            from dahl_ident.data.readers.tree import read_matlab
+            from dahl_ident.data.readers.matlab import read_matlab
 
             return read_matlab(file)
         case "hdf5":
-            from dahl_ident.data.readers.tree import read_hdf5
+            from dahl_ident.data.readers.hdf5 import read_hdf5
 
             return read_hdf5(file)
-        case "uff" | "tdms" | "lvm":
+        case "json":
+            from dahl_ident.data.readers.dictionaries import read_json
+
+            return read_json(file)
+        case "npz" | "npy":
+            from dahl_ident.data.readers import array_trees
+
+            return {"npz": array_trees.read_npz, "npy": array_trees.read_npy}[file.format](file)
+        case "lvm":
+            from dahl_ident.data.readers.lvm import read_lvm
+
+            return read_lvm(file)
+        case "uff" | "tdms":
             from dahl_ident.data.readers import instruments
 
-            return {
-                "uff": instruments.read_uff,
-                "tdms": instruments.read_tdms,
-                "lvm": instruments.read_lvm,
-            }[file.format](file)
+            return {"uff": instruments.read_uff, "tdms": instruments.read_tdms}[file.format](file)
         case _:
-            from dahl_ident.data.readers.delimited import read_text_table
+            from dahl_ident.data.readers.text_table import read_text_table
 
             return read_text_table(file.data, file.name, file.sha256)
 
 
-def groups_in_name(path: PathLike, expression: str | None) -> dict[str, Any]:
+def run_names(paths: Sequence[PathLike | pd.DataFrame]) -> list[str]:
+    """Return a label for each of several files: its name, or its path where names are equal."""
+    if any(_is_frame(path) for path in paths):
+        return [str(i + 1) for i in range(len(paths))]
+    names = [Path(str(path)).name for path in paths]
+    stems = [Path(name).stem for name in names]
+    for labels in (stems, names):
+        if len(set(labels)) == len(paths):
+            return labels
+    return [str(path) for path in paths]
+
+
+def groups_in_name(path: PathLike | pd.DataFrame, expression: str | None) -> dict[str, Any]:
     """Return what the regular expression finds in a file's name, the level among it."""
     if expression is None:
         return {}
-    name = Path(path).name
+    name = Path(str(path)).name if not _is_frame(path) else "the table"
     try:
         pattern = re.compile(expression)
     except re.error as exc:
@@ -339,13 +442,17 @@ def groups_in_name(path: PathLike, expression: str | None) -> dict[str, Any]:
     return groups
 
 
-def _filled(text: str | None, groups: Mapping[str, Any], path: PathLike) -> str | None:
+def _filled(
+    text: str | None, groups: Mapping[str, Any], path: PathLike | pd.DataFrame
+) -> str | None:
     if text is None:
         return None
-    try:
-        return text.format(**groups)
-    except (KeyError, IndexError, ValueError) as exc:
+    # names only: a format string would also reach into attributes
+    parts = re.split(r"\{(\w+)\}", text)
+    absent = [name for name in parts[1::2] if name not in groups]
+    if absent or any(mark in part for part in parts[0::2] for mark in "{}"):
         raise DataError(
             f"{path}: {text!r} cannot be filled from the file's name: level_from_name gives "
             f"{sorted(groups) or 'nothing'}"
-        ) from exc
+        )
+    return "".join(str(groups[p]) if i % 2 else p for i, p in enumerate(parts))

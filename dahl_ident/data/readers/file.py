@@ -1,21 +1,35 @@
-"""A file's bytes, their hash, and which format they are in whatever the name says."""
+"""A file, its hash, and which format it is in whatever the name says; and how large it may be.
+
+What a file unpacks to, or says that it holds, is limited before memory is asked for it: a file
+of some kilobytes may claim exabytes, by damage or by design.
+"""
 
 from __future__ import annotations
 
 import bz2
 import gzip
 import hashlib
-import importlib
+import io
 import lzma
 import sys
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path, PurePath
 from typing import Any
 
-from dahl_ident.errors import DataError, MissingDependencyError
+from dahl_ident.errors import DataError
 
-_TEXT = ("text", "uff", "lvm")
+MOST_CHANNELS = 5000
+"""Columns, arrays or data sets of one file; a laboratory's file has some tens."""
+DEEPEST = 32
+"""Levels of groups, structs or lists in one another."""
+_UNPACKED_BYTES = 1 << 28
+_UNPACKED_RATIO = 8  # text and samples of a converter rarely pack better
+
+_TEXT = ("text", "uff", "lvm", "json")
 # Formats that may stand behind an extension; any, where it is not listed.
 _EXTENSIONS: dict[str, tuple[str, ...]] = {
     ".csv": ("text",),
@@ -24,8 +38,12 @@ _EXTENSIONS: dict[str, tuple[str, ...]] = {
     ".dat": _TEXT,
     ".asc": _TEXT,
     ".prn": ("text",),
+    ".json": ("json",),
     ".xlsx": ("excel",),
     ".xlsm": ("excel",),
+    ".ods": ("ods",),
+    ".npz": ("npz",),
+    ".npy": ("npy",),
     ".parquet": ("parquet",),
     ".pq": ("parquet",),
     ".mat": ("matlab", "hdf5"),
@@ -39,9 +57,13 @@ _EXTENSIONS: dict[str, tuple[str, ...]] = {
 }
 _NAMES = {
     "text": "a text table",
+    "json": "JSON",
     "excel": "an Excel workbook",
     "old excel": "an Excel 97 workbook",
+    "ods": "an Open Document sheet",
     "zip": "a ZIP archive",
+    "npz": "NumPy's .npz",
+    "npy": "NumPy's .npy",
     "parquet": "Parquet",
     "matlab": "MATLAB v5 or v7",
     "hdf5": "HDF5 or MATLAB v7.3",
@@ -55,30 +77,83 @@ _MAGIC: tuple[tuple[bytes, str], ...] = (
     (b"\x89HDF\r\n\x1a\n", "hdf5"),
     (b"PAR1", "parquet"),
     (b"TDSm", "tdms"),
+    (b"\x93NUMPY", "npy"),
     (b"PK\x03\x04", "zip"),
     (b"\xd0\xcf\x11\xe0", "old excel"),
     (b"LabVIEW Measurement", "lvm"),
 )
-_PACKED: tuple[tuple[bytes, Callable[[bytes], bytes], str], ...] = (
-    (b"\x1f\x8b", gzip.decompress, ".gz"),
-    (b"BZh", bz2.decompress, ".bz2"),
-    (b"\xfd7zXZ\x00", lzma.decompress, ".xz"),
+_PACKED: tuple[tuple[bytes, Callable[[Any], Any], str], ...] = (
+    (b"\x1f\x8b", lambda stream: gzip.GzipFile(fileobj=stream), ".gz"),
+    (b"BZh", bz2.BZ2File, ".bz2"),
+    (b"\xfd7zXZ\x00", lzma.LZMAFile, ".xz"),
 )
+
+
+_ZIP_ERRORS = (
+    zipfile.BadZipFile, OSError, EOFError, ValueError, KeyError, zlib.error, NotImplementedError,
+    RuntimeError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class File:
-    """Bytes of a file, unpacked, and what they are."""
+    """A file that is open to be read, and what it is.
+
+    `path` is the place of the bytes as they are, None where they came from standard input or had
+    to be unpacked; `size` is the number of bytes on the disk.
+    """
 
     path: Path | None
     name: str
-    data: bytes
+    size: int
     sha256: str
     format: str
+    content: bytes | None = None
+
+    @property
+    def head(self) -> bytes:
+        """The first bytes."""
+        if self.content is not None:
+            return self.content[:300]
+        assert self.path is not None  # either the bytes or their place is known
+        with self.path.open("rb") as stream:
+            return stream.read(300)
+
+    @cached_property
+    def data(self) -> bytes:
+        """All bytes, unpacked."""
+        if self.content is not None:
+            return self.content
+        assert self.path is not None  # either the bytes or their place is known
+        return self.path.read_bytes()
+
+    def stream(self) -> Any:
+        """Return what a library opens: the file's path, or its bytes."""
+        return self.path if self.content is None else io.BytesIO(self.content)
+
+    @property
+    def limit(self) -> int:
+        """Bytes that the content of the file may take in memory."""
+        return max(_UNPACKED_BYTES, _UNPACKED_RATIO * self.size)
+
+    def refuse_above_limit(self, claimed: int, what: str) -> None:
+        """Refuse what would take more memory than a file of this size may.
+
+        Raises
+        ------
+        DataError
+            Naming what it is.
+        """
+        if claimed > self.limit:
+            raise DataError(
+                f"{self.name}: {what} would take {_bytes(claimed)}, and the file has "
+                f"{_bytes(self.size)}; at most {_bytes(self.limit)} are read from it. The file is "
+                "damaged, or has to be unpacked or cut into parts first"
+            )
 
 
 def open_file(path: str | PurePath) -> File:
-    """Read a file, ``-`` being standard input.
+    """Look at a file, ``-`` being standard input.
 
     Raises
     ------
@@ -88,51 +163,98 @@ def open_file(path: str | PurePath) -> File:
     if str(path) == "-":
         if sys.stdin is None:
             raise DataError("standard input is closed; pipe the file into it, or name the file")
-        return _checked(None, "standard input", sys.stdin.buffer.read())
+        data = sys.stdin.buffer.read()
+        digest = hashlib.sha256(data).hexdigest()
+        return _checked(File(None, "standard input", len(data), digest, "", data), data[:300])
     place = Path(path)
     # names of files are bytes, and what is no UTF-8 in them could not be written into a report
     name = str(place).encode(errors="backslashreplace").decode()
     try:
-        return _checked(place, name, place.read_bytes())
+        with place.open("rb") as stream:
+            head = stream.read(300)
+            stream.seek(0)
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            size = stream.tell()
+        return _checked(File(place, name, size, digest, ""), head)
     except OSError as exc:
         raise DataError(f"{name}: the file cannot be read: {exc.strerror or exc}") from exc
 
 
-def _checked(path: Path | None, name: str, data: bytes) -> File:
-    digest = hashlib.sha256(data).hexdigest()
-    suffix = path.suffix.lower() if path else ""
-    for magic, unpack, packed in _PACKED:
-        if data.startswith(magic):
-            try:
-                data = unpack(data)
-            except (OSError, EOFError, ValueError, lzma.LZMAError) as exc:
-                raise DataError(f"{name}: the compressed file is damaged: {exc}") from exc
-            if path and suffix == packed:
+def _checked(file: File, head: bytes) -> File:
+    """Return the file with its format, unpacked where it is packed."""
+    suffix = file.path.suffix.lower() if file.path else ""
+    content, path = file.content, file.path
+    for magic, opener, ending in _PACKED:
+        if head.startswith(magic):
+            content = _unpacked(file, opener)
+            head = content[:300]
+            if path and suffix == ending:
                 suffix = path.with_suffix("").suffix.lower()
-    if not data or data.isspace():
-        raise DataError(f"{name}: the file is empty")
-    found = _sniff(data)
-    if found == "text" and suffix == ".mat" and b"\0" in data[:4]:
-        found = "matlab"  # version 4 has no signature
+    plain = File(path, file.name, file.size, file.sha256, "", content)
+    if not head or (head.isspace() and plain.data.isspace()):
+        raise DataError(f"{file.name}: the file is empty")
+    found = _format(plain, head, suffix)
     allowed = _EXTENSIONS.get(suffix, (found,))
     if found not in allowed:
         raise DataError(
-            f"{name}: the extension {suffix} says {_NAMES[allowed[0]]}, the content is "
+            f"{file.name}: the extension {suffix} says {_NAMES[allowed[0]]}, the content is "
             f"{_NAMES[found]}; rename the file to what it is"
         )
     if found in ("old excel", "zip"):
-        raise DataError(f"{name}: {_NAMES[found]} is not read; save it as .xlsx or .csv")
-    return File(path, name, data, digest, found)
+        raise DataError(f"{file.name}: {_NAMES[found]} is not read; save it as .xlsx or .csv")
+    return File(path, file.name, file.size, file.sha256, found, content)
 
 
-def _sniff(data: bytes) -> str:
+def _unpacked(file: File, opener: Callable[[Any], Any]) -> bytes:
+    """Return the unpacked bytes, of a file that unpacks to no more than its limit."""
+    try:
+        with opener(io.BytesIO(file.data)) as stream:
+            data: bytes = stream.read(file.limit + 1)
+    except (OSError, EOFError, ValueError, lzma.LZMAError, zlib.error) as exc:
+        raise DataError(f"{file.name}: the compressed file is damaged: {exc}") from exc
+    file.refuse_above_limit(len(data), "the content")
+    return data
+
+
+def _format(file: File, head: bytes, suffix: str) -> str:
     for magic, found in _MAGIC:
-        if data.startswith(magic):
-            return "excel" if found == "zip" and b"xl/workbook" in data else found
-    lines = data[:200].split(b"\n", 2)
+        if head.startswith(magic):
+            return _archive(file, suffix) if found == "zip" else found
+    if suffix == ".mat" and b"\0" in head[:4]:
+        return "matlab"  # version 4 has no signature
+    lines = head[:200].split(b"\n", 2)
     if lines[0].strip() == b"-1" and len(lines) > 1 and lines[1].strip()[:1].isdigit():
         return "uff"
+    start = head.lstrip(b"\xef\xbb\xbf \t\r\n")[:2]
+    if suffix == ".json" or start in (b'{"', b"[{", b"{\n", b"{\r"):
+        return "json"
     return "text"
+
+
+def _archive(file: File, suffix: str) -> str:
+    """Say what a ZIP archive is, once it holds no more than it may."""
+    try:
+        with zipfile.ZipFile(file.stream()) as archive:
+            members = archive.infolist()
+            names = archive.namelist()
+            file.refuse_above_limit(sum(m.file_size for m in members), "the content")
+            if "xl/workbook.xml" in names:
+                return "excel"
+            if "mimetype" in names and b"opendocument.spreadsheet" in archive.read("mimetype"):
+                return "ods"
+    except _ZIP_ERRORS:  # its reader will say how it is damaged
+        return {".ods": "ods", ".npz": "npz"}.get(suffix, "excel" if "xls" in suffix else "zip")
+    if names and all(name.endswith(".npy") for name in names):
+        return "npz"
+    return "zip"
+
+
+def _bytes(count: int) -> str:
+    for unit in ("bytes", "kB", "MB", "GB", "TB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000  # type: ignore[assignment]
+    return f"{count:.3g} PB"
 
 
 def utf8(data: bytes) -> bytes:
@@ -147,21 +269,3 @@ def utf8(data: bytes) -> bytes:
     except UnicodeDecodeError:
         return data.decode("cp1252", errors="replace").encode("utf-8")
     return data
-
-
-def library(module: str, extra: str | None = None) -> Any:
-    """Import a library that reads a format.
-
-    Raises
-    ------
-    MissingDependencyError
-        If it is not installed, with the command that installs it.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError as exc:
-        package = f"dahl_ident[{extra}]" if extra else module
-        raise MissingDependencyError(
-            f"{module} is needed to read this format and is not installed; install it with: "
-            f"pip install '{package}'"
-        ) from exc

@@ -1,23 +1,35 @@
-"""Files of analysers and loggers: universal files 58 and 58b, NI TDMS, LabVIEW LVM."""
+"""Files of analysers and loggers: universal files 58 and 58b, NI TDMS."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
+import logging
+import logging.handlers
+import struct
 import tempfile
-from collections.abc import Iterator, Sequence
+import warnings
+import weakref
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.readers.file import File, library, utf8
-from dahl_ident.data.source import Channel, Source, split_header
-from dahl_ident.errors import DataError
+from dahl_ident.data.column_names import split_header
+from dahl_ident.data.raw_columns import Channel, Source, Stored
+from dahl_ident.data.readers.file import File, utf8
+from dahl_ident.data.storage import library
+from dahl_ident.data.tabular import listed
+from dahl_ident.errors import DataError, DataWarning
 from dahl_ident.units import parse_unit
 
 _TIME_RESPONSE, _FRF = 1, 4
+_LEAD_IN = struct.Struct("<4sIIQQ")  # of a TDMS segment: tag, contents, version, and two sizes
+_LONGEST_METADATA = 1 << 24  # bytes of a segment that are looked at
+_LONGEST_SEGMENT = 1 << 48  # bytes; more means that the segment was never closed
 # Universal file 164, units code: length and force.
 _SYSTEMS = {
     1: ("m", "N"),
@@ -62,7 +74,7 @@ def read_uff(file: File) -> Source:
     for function in functions:
         _check_length(file, function)
         channels += _uff_channels(function, units, notes)
-    return _instrument(file, "universal file", _one_axis(channels), notes)
+    return instrument_source(file, "universal file", _one_axis(channels), notes)
 
 
 def _uff_sets(file: File, pyuff: Any) -> list[dict[str, Any]]:
@@ -168,39 +180,122 @@ def _one_axis(channels: list[Channel]) -> list[Channel]:
 
 
 def read_tdms(file: File) -> Source:
-    """Return the channels of a TDMS file; evenly sampled ones get a time channel."""
+    """Return the channels of a TDMS file; evenly sampled ones get a time channel.
+
+    Raises
+    ------
+    DataError
+        If the file is damaged: what the library only warns of, such as a last segment that is
+        cut off, is damage too.
+    """
     nptdms = library("nptdms", "tdms")
+    stream: Any = io.BytesIO(file.content) if file.content is not None else None
+    if stream is None:
+        assert file.path is not None  # either the bytes or their place is known
+        stream = file.path.open("rb")
+    with _damage_named(file):
+        content = nptdms.TdmsFile.open(stream)
+        weakref.finalize(content, stream.close)  # open as long as a channel waits to be read
+        channels = [c for group in content.groups() for c in _tdms_channels(file, content, group)]
+        begun = _begun_again(file.stream() if file.content is not None else file.path)
+    notes = []
+    if begun:
+        text = (
+            f"segments {listed([str(i) for i in begun], 5)} of the file state wf_increment again, "
+            "as a file that was appended does; time goes on as if no pause were between them. "
+            "Split the file where it holds several runs"
+        )
+        warnings.warn(f"{file.name}: {text}", DataWarning, stacklevel=3)
+        notes.append(text)
+    return instrument_source(file, "TDMS", channels, notes)
+
+
+def _begun_again(place: Any) -> list[int]:
+    """Return the numbers of later segments that state the sampling of a waveform again."""
+    found, number = [], 0
+    with contextlib.ExitStack() as stack:
+        stream = stack.enter_context(place.open("rb")) if isinstance(place, Path) else place
+        while len(lead := stream.read(_LEAD_IN.size)) == _LEAD_IN.size:
+            tag, _, _, following, metadata = _LEAD_IN.unpack(lead)
+            number += 1
+            if tag != b"TDSm" or following > _LONGEST_SEGMENT:
+                break
+            start = stream.tell()
+            if number > 1 and b"wf_increment" in stream.read(min(metadata, _LONGEST_METADATA)):
+                found.append(number)
+            stream.seek(start + following)
+    return found
+
+
+@contextlib.contextmanager
+def _damage_named(file: File) -> Iterator[None]:
+    """Turn the library's errors, and the warnings in its log, into errors of this package."""
+    log, said = logging.getLogger("nptdms"), logging.handlers.BufferingHandler(1 << 20)
+    said.setLevel(logging.WARNING)
+    names = [n for n in logging.root.manager.loggerDict if n.startswith("nptdms.")]
+    parts = [logging.getLogger(n) for n in names]
+    kept = [part.handlers for part in parts]
+    for part in parts:
+        part.handlers = []  # each writes to the terminal on its own
+    log.handlers, log.propagate = [said], False
     try:
-        content = nptdms.TdmsFile.read(io.BytesIO(file.data))
-        channels = [c for group in content.groups() for c in _tdms_channels(group)]
+        yield
+    except DataError:
+        raise
     except Exception as exc:  # npTDMS raises errors of many kinds on damaged files
         raise DataError(f"{file.name}: the TDMS file is damaged: {exc}") from exc
-    return _instrument(file, "TDMS", channels)
+    finally:
+        log.handlers, log.propagate = [], True
+        for part, handlers in zip(parts, kept, strict=True):
+            part.handlers = handlers
+    if said.buffer:
+        raise DataError(f"{file.name}: the TDMS file is damaged: {said.buffer[0].getMessage()}")
 
 
-def _tdms_channels(group: Any) -> Iterator[Channel]:
-    times = []
+def _tdms_channels(file: File, content: Any, group: Any) -> Iterator[Channel]:
+    times: dict[tuple[float, float, int], Stored] = {}
     for channel in group.channels():
-        values = np.asarray(channel[:])
         properties = channel.properties
         unit = properties.get("unit_string") or properties.get("NI_UnitDescription")
+        count = len(channel)
+        file.refuse_above_limit(8 * count, channel.path)
+        values: Any = Stored((count,), np.dtype(channel.dtype), _tdms_read(file, content, channel))
         if values.dtype.kind not in "fiubc":
-            values = values.astype(np.str_)
-        yield _named(f"{group.name}/", channel.name, values, unit)
+            values = values.array.astype(np.str_)
+        yield labelled_channel(f"{group.name}/", channel.name, values, unit)
         step = float(properties.get("wf_increment", 0.0))
         if step > 0.0:
             start = float(properties.get("wf_start_offset", 0.0))
-            times.append(start + step * np.arange(values.size))
-    yield from _times(times, f"{group.name}/")
+            read = functools.partial(_even_times, start, step, count)
+            times[start, step, count] = Stored((count,), np.dtype(np.float64), read)
+    for i, time in enumerate(times.values()):
+        name = "time" if len(times) == 1 else f"time {i + 1}"
+        yield Channel(f"{group.name}/{name}", time, "s", "time", name)
 
 
-def _named(prefix: str, label: str, values: NDArray[Any], unit: str | None) -> Channel:
+def _tdms_read(file: File, content: Any, channel: Any) -> Callable[[slice], NDArray[Any]]:
+    def read(rows: slice) -> NDArray[Any]:
+        with _damage_named(file):
+            found = np.asarray(channel[rows])
+            if content is None or found.size != len(range(*rows.indices(len(channel)))):
+                raise DataError(f"{file.name}: {channel.path} ends before its last sample")
+        return found
+
+    return read
+
+
+def _even_times(start: float, step: float, count: int, rows: slice) -> NDArray[Any]:
+    first, stop, stride = rows.indices(count)
+    return np.asarray(start + step * np.arange(first, stop, stride))
+
+
+def labelled_channel(prefix: str, label: str, values: Any, unit: str | None) -> Channel:
     """Return a channel; many loggers write its unit into the label, as in ``Force (N)``."""
     name, in_label = (label, unit) if unit else split_header(label)
     return Channel(prefix + name, values, in_label, short=name)
 
 
-def _times(times: Sequence[NDArray[Any]], prefix: str) -> Iterator[Channel]:
+def evenly_timed(times: Sequence[NDArray[Any]], prefix: str) -> Iterator[Channel]:
     """Yield the time axes of a group, equal ones once."""
     unique: list[NDArray[Any]] = []
     for time in times:
@@ -211,44 +306,16 @@ def _times(times: Sequence[NDArray[Any]], prefix: str) -> Iterator[Channel]:
         yield Channel(prefix + name, time, "s", "time", name)
 
 
-def read_lvm(file: File) -> Source:
-    """Return the channels of all segments of a LabVIEW measurement file."""
-    lvm_read = library("lvm_read", "lvm")
-    try:
-        content = lvm_read.read_str(utf8(file.data).decode("utf-8"))
-        segments = [content[i] for i in range(content["Segments"])]
-        channels = [
-            c
-            for i, segment in enumerate(segments)
-            for c in _lvm_channels(segment, f"segment {i}/" if len(segments) > 1 else "")
-        ]
-    except Exception as exc:  # lvm_read raises errors of many kinds on damaged files
-        raise DataError(f"{file.name}: the LVM file is damaged: {exc!r}") from exc
-    return _instrument(file, "LVM", channels)
-
-
-def _lvm_channels(segment: dict[str, Any], prefix: str) -> Iterator[Channel]:
-    """Yield the channels of a segment, and time: its x columns, or counted from their step."""
-    data = np.asarray(segment["data"], dtype=float)
-    labels = [str(name).strip() for name in segment["Channel names"]]
-    table = [pair for pair in zip(labels, data.T, strict=False) if pair[0] != "Comment"]
-    channels = [pair for pair in table if pair[0] != "X_Value"]
-    for i, (name, values) in enumerate(channels):
-        units = segment.get("Y_Unit_Label", [])
-        unit = str(units[i]).strip() if i < len(units) else ""
-        yield _named(prefix, name, values, unit)
-    if set(segment.get("X_Dimension", [])) - {"Time", ""}:
-        return
-    times = [values for name, values in table if name == "X_Value"]
-    if not times:
-        starts, steps = segment.get("X0", []), segment.get("Delta_X", [])
-        times = [a + d * np.arange(len(data)) for a, d in zip(starts, steps, strict=False) if d > 0]
-    yield from _times(times, prefix)
-
-
-def _instrument(
+def instrument_source(
     file: File, kind: str, channels: list[Channel], notes: list[str] | None = None
 ) -> Source:
+    """Return the channels of an instrument's file.
+
+    Raises
+    ------
+    DataError
+        If there are none.
+    """
     if not channels:
         raise DataError(f"{file.name}: the file holds no channels")
     return Source(

@@ -1,0 +1,125 @@
+"""Fits to records: against a loop with solve_ivp, and against finite differences; coverage."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+import dahl_ident as di
+from benchmarks.harness import Row, print_table, seconds
+from benchmarks.hysteresis import by_solver
+from dahl_ident.arrays import FloatArray
+from dahl_ident.problem.record_problem import RecordProblem
+from dahl_ident.time_domain import ForcedMotion, Plant, band_limited
+
+TITLE = "Records of any motion"
+SAMPLES, PEERS = 100_000, 300
+RATE = 750.0
+
+
+def run() -> list[Row]:
+    """Return the seconds of whole fits beside those of peers."""
+    return [_force_from_displacement(), _motion_from_force()]
+
+
+def _force_from_displacement() -> Row:
+    x = _displacement(SAMPLES, 0)
+    v = np.gradient(x, 1.0 / RATE)
+    force = di.Dahl(0.1, 30.0).force(x) + 5.0 * x + 0.1 * v
+    force += 1e-3 * np.random.default_rng(1).standard_normal(SAMPLES)
+    record = di.Record(np.arange(SAMPLES) / RATE, displacement=x, force=force)
+    model = di.Dahl() + di.Spring() + di.Damper()
+    fits = []
+
+    def work() -> None:
+        fits.append(di.fit(record, model))
+
+    ours = min(seconds(work) for _ in range(3))
+    one = seconds(partial(by_solver, x[:PEERS], 1.0)) / PEERS * SAMPLES
+    evaluations = fits[-1].nfev
+    return Row(
+        f"a fit of 4 parameters to {SAMPLES:,} samples ({ours:.2f} s; {evaluations} evaluations)",
+        ours,
+        one * evaluations,
+        "as many loops with solve_ivp",
+        30.0,
+        faster=True,
+    )
+
+
+def _motion_from_force() -> Row:
+    """Compare with the same integrator inside scipy's least squares by finite differences."""
+    samples = 4096
+    record = _driven(samples)
+    model = di.BoucWen() + di.Mass() + di.Damper() + di.Spring()
+    truth = {"sigma": 5e4, "q": -300.0, "p": 1900.0, "mass": 2.0, "damping": 10.0}
+    truth |= {"stiffness": 5e4}
+    start = {name: 1.1 * value for name, value in truth.items()}
+    ours = min(seconds(partial(di.fit, record, model, start=start)) for _ in range(3))
+    problem = RecordProblem([record], model)
+    size = np.array([*truth.values(), 1e-4, 1e-2, 1.0, 1e-5])
+
+    def residuals(scaled: FloatArray) -> FloatArray:
+        return np.concatenate(problem.split_residuals(scaled * size)) / 1e-6
+
+    begin = np.concatenate([np.full(6, 1.1), np.zeros(4)])
+    peer = seconds(partial(least_squares, residuals, begin, x_scale="jac"))
+    return Row(
+        f"a fit of 6 parameters and a state, {samples:,} driven samples ({ours:.2f} s)",
+        ours,
+        peer,
+        "least_squares with finite differences, the same integrator",
+        1.0,
+        faster=True,
+    )
+
+
+def _driven(samples: int) -> di.Record:
+    rng = np.random.default_rng(0)
+    lines = np.arange(5.0, 150.0, RATE / samples)
+    t = np.arange(samples) / RATE
+    phases = 2.0 * np.pi * rng.random(lines.size)
+    drive = np.sum(np.sin(2.0 * np.pi * lines[:, None] * t + phases[:, None]), axis=0)
+    drive *= 50.0 / drive.std()
+    model = di.BoucWen(5e4, -300.0, 1900.0) + di.Mass(2.0) + di.Damper(10.0) + di.Spring(5e4)
+    plant = Plant(model, "force")
+    forced = ForcedMotion(plant, band_limited(drive, 1.0 / RATE, 8), 1.0 / RATE)
+    x = forced.solve(np.zeros(0), np.zeros(3), np.zeros((samples, 3)))[:, 0]
+    x = x + 8e-6 * rng.standard_normal(samples)
+    return di.Record(t, displacement=x, force=drive)
+
+
+def _displacement(samples: int, seed: int) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    shaped = lfilter([1.0], np.poly([0.97, 0.97, 0.9]), rng.standard_normal(samples))
+    return np.asarray(1e-2 * shaped / np.abs(shaped).max())
+
+
+def coverage(runs: int = 200, pole: float = 0.9) -> dict[str, float]:
+    """Return the share of records whose 95 % intervals hold the truth, by parameter."""
+    x = _displacement(600, 2)
+    clean = di.Dahl(0.1, 30.0).force(x) + 5.0 * x
+    model = di.Dahl() + di.Spring()
+    truth = {"f_max": 0.1, "sigma": 30.0, "stiffness": 5.0}
+    inside = dict.fromkeys(truth, 0)
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        noise = lfilter([1.0], [1.0, -pole], rng.standard_normal(900))[300:]
+        force = clean + 1e-3 * np.sqrt(1.0 - pole**2) * noise
+        record = di.Record(np.arange(600) / RATE, displacement=x, force=force)
+        within = di.fit(record, model, start=truth).conf_interval()
+        for name, value in truth.items():
+            inside[name] += within[name][0] < value < within[name][1]
+    return {name: count / runs for name, count in inside.items()}
+
+
+if __name__ == "__main__":
+    if "coverage" in sys.argv:
+        for pole in (0.0, 0.9):
+            print(f"noise with a pole at {pole}:", coverage(500, pole))
+    else:
+        print_table(TITLE, run())

@@ -1,0 +1,310 @@
+"""Do stated uncertainties hold where the model or its noise is not quite right.
+
+``python -m benchmarks.uncertainty`` draws tables whose truth is known, fits each with the default
+model, and counts in how many of those with a usable status (trusted or approximate) the combined
+95.45 % intervals hold the truth. A cell holds where that is 91 to 99 %, or where at most 5 % of
+its tables are usable; every cell that was ordered is judged. Where the model is right, at least
+95 % of the tables must be trusted, and the intervals at most 1.5 times as long as from noise
+alone (median).
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dahl_ident import Dahl, FitResult, FrequencyResponse, fit
+from dahl_ident.arrays import ComplexArray, FloatArray
+
+F_MAX, SIGMA = 0.1, 30.0
+X_C = F_MAX / SIGMA
+SEED = 2027
+TABLES = 500
+ROWS = 12
+NOISE = 0.01
+RANGES = ((0.02, 0.5), (0.02, 1.0), (0.1, 10.0), (5.0, 100.0))
+COVERED = (0.91, 0.99)
+FEW_USABLE = 0.05
+SHARPEST = 1.5
+TRUSTED = 0.95
+DESTINATION = Path("docs/validation/uncertainty.md")
+
+Table = tuple[FrequencyResponse, tuple[float, float]]
+Draw = Callable[[np.random.Generator], Table]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One kind of departure, and how its tables are drawn."""
+
+    name: str
+    draw: Draw
+    right: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the tables of a cell gave, f_max and sigma."""
+
+    name: str
+    tables: int
+    usable: float
+    trusted: float
+    covered: tuple[float, float]
+    plain: tuple[float, float]
+    """Coverage of the profile intervals, which count noise alone, of all tables."""
+    sharpness: tuple[float, float]
+    right: bool
+
+    @property
+    def failures(self) -> list[str]:
+        """What does not hold."""
+        found = []
+        if self.usable > FEW_USABLE:
+            slack = 2.0 * (0.95 * 0.05 / max(self.usable * self.tables, 1.0)) ** 0.5
+            slack = slack if self.tables < TABLES else 0.0
+            for name, share in zip(("f_max", "sigma"), self.covered, strict=True):
+                if not COVERED[0] - slack <= share <= COVERED[1] + slack:
+                    found.append(f"{name} covered in {100.0 * share:.1f} %")
+        if self.right:
+            if self.trusted < TRUSTED - (0.05 if self.tables < TABLES else 0.0):
+                found.append(f"trusted in {100.0 * self.trusted:.1f} %")
+            if max(self.sharpness) > SHARPEST:
+                found.append(f"intervals {max(self.sharpness):.2f} times as long")
+        return found
+
+
+def _noise(rng: np.random.Generator, n: int, gain: float, phase: float) -> ComplexArray:
+    return np.exp(gain * rng.standard_normal(n) + 1j * phase * rng.standard_normal(n))
+
+
+def _amplitudes(low: float, high: float, n: int = ROWS) -> FloatArray:
+    return np.geomspace(low, high, n) * X_C
+
+
+def _friction(A: FloatArray, f_max: float = F_MAX, alpha: float = 1.0) -> ComplexArray:
+    return Dahl(f_max, SIGMA, alpha).describing_function(A)
+
+
+def wrong_exponent(alpha: float, low: float, high: float) -> Draw:
+    """Return tables of another exponent than the default's."""
+    A = _amplitudes(low, high)
+    N = _friction(A, alpha=alpha)
+
+    def draw(rng: np.random.Generator) -> Table:
+        N_measured = N * _noise(rng, ROWS, NOISE, NOISE)
+        return FrequencyResponse(np.ones(ROWS), N_measured, A), (F_MAX, SIGMA)
+
+    return draw
+
+
+def three_days(what: str, scatter: float) -> Draw:
+    """Return tables of three days whose gain, or f_max, differs; the truth is that of many days."""
+    A = _amplitudes(0.1, 10.0)
+
+    def draw(rng: np.random.Generator) -> Table:
+        factors = np.exp(scatter * rng.standard_normal(3))
+        parts = [
+            (f * _friction(A) if what == "gain" else _friction(A, F_MAX * f))
+            * _noise(rng, ROWS, NOISE, NOISE)
+            for f in factors
+        ]
+        run = np.repeat(["monday", "tuesday", "wednesday"], ROWS)
+        N = np.concatenate(parts)
+        data = FrequencyResponse(np.ones(3 * ROWS), N, np.tile(A, 3), run=run)
+        return data, (F_MAX, SIGMA)
+
+    return draw
+
+
+def shared_by_level(rng: np.random.Generator) -> Table:
+    """Return eight levels, four times each, with errors in common of three times the noise."""
+    A = np.repeat(_amplitudes(0.1, 10.0, 8), 4)
+    shared = np.repeat(_noise(rng, 8, 3.0 * NOISE, 3.0 * NOISE), 4)
+    N = _friction(A) * shared * _noise(rng, 32, NOISE, NOISE)
+    return FrequencyResponse(np.ones(32), N, A), (F_MAX, SIGMA)
+
+
+def altered(change: Callable[[np.random.Generator, FloatArray, ComplexArray], Table]) -> Draw:
+    """Return tables over two decades that `change` makes from exact ones."""
+    A = _amplitudes(0.1, 10.0)
+    N = _friction(A)
+    return lambda rng: change(rng, A, N)
+
+
+def _of(N: ComplexArray, A: FloatArray, frequency: FloatArray | None = None) -> Table:
+    f = np.ones(len(A)) if frequency is None else frequency
+    return FrequencyResponse(f, N, A), (F_MAX, SIGMA)
+
+
+def uneven(gain: float, phase: float) -> Draw:
+    """Return tables whose gain and phase have unlike noise."""
+    return altered(lambda rng, A, N: _of(N * _noise(rng, ROWS, gain, phase), A))
+
+
+def autocorrelated(rho: float) -> Draw:
+    """Return tables whose noise follows from that of the row before."""
+
+    def change(rng: np.random.Generator, A: FloatArray, N: ComplexArray) -> Table:
+        e = rng.standard_normal((ROWS, 2))
+        for row in range(1, ROWS):
+            e[row] = rho * e[row - 1] + (1.0 - rho**2) ** 0.5 * e[row]
+        return _of(N * np.exp(NOISE * e @ np.array([1.0, 1.0j])), A)
+
+    return altered(change)
+
+
+def additive(rng: np.random.Generator, A: FloatArray, N: ComplexArray) -> Table:
+    """Return a table whose noise does not shrink with the response."""
+    size = NOISE * np.abs(N).mean()
+    return _of(N + size * (rng.standard_normal((ROWS, 2)) @ np.array([1.0, 1.0j])), A)
+
+
+def outliers(rng: np.random.Generator, A: FloatArray, N: ComplexArray) -> Table:
+    """Return a table with a tenth of its rows off by 10 %."""
+    N = N * _noise(rng, ROWS, NOISE, NOISE)
+    N[rng.choice(ROWS, 1)] *= 1.0 + 0.1 * rng.choice([-1.0, 1.0])
+    return _of(N, A)
+
+
+def amplitude_error(shared: bool) -> Draw:
+    """Return tables whose amplitudes are off by 2 %, in the stiffness as well or not."""
+
+    def change(rng: np.random.Generator, A: FloatArray, N: ComplexArray) -> Table:
+        error = np.exp(0.02 * rng.standard_normal(ROWS))
+        N = N * _noise(rng, ROWS, NOISE, NOISE)
+        return _of(N / error if shared else N, A * error)
+
+    return altered(change)
+
+
+def unmodelled(part: str, share: float) -> Draw:
+    """Return tables at three frequencies with a mass or damper worth a share of sigma."""
+    f = np.tile([0.5, 1.0, 2.0], ROWS // 3)
+    extra = -((f / 2.0) ** 2) if part == "mass" else 1j * f / 2.0
+
+    def change(rng: np.random.Generator, A: FloatArray, N: ComplexArray) -> Table:
+        return _of((N + share * SIGMA * extra) * _noise(rng, ROWS, NOISE, NOISE), A, f)
+
+    return altered(change)
+
+
+def understated(rng: np.random.Generator, A: FloatArray, N: ComplexArray) -> Table:
+    """Return a table whose stated standard deviations are 1.4 times too small."""
+    N = N * _noise(rng, ROWS, 1.4 * NOISE, 1.4 * NOISE)
+    C = (NOISE * np.abs(N))[:, None, None] ** 2 * np.eye(2)
+    return FrequencyResponse(np.ones(ROWS), N, A, covariance=C), (F_MAX, SIGMA)
+
+
+def cells() -> list[Cell]:
+    """Return every cell that is judged."""
+    found = [Cell("the model is right", wrong_exponent(1.0, 0.1, 10.0), right=True)]
+    found += [
+        Cell(f"exponent {alpha}, beta {low} to {high}", wrong_exponent(alpha, low, high))
+        for alpha in (0.5, 0.8, 0.9, 1.3, 2.0)
+        for low, high in RANGES
+    ]
+    found += [
+        Cell(f"three days, {what} scatters by {100 * s:.0f} %", three_days(what, s))
+        for what in ("gain", "f_max")
+        for s in (0.01, 0.02, 0.05)
+    ]
+    found += [
+        Cell("8 levels x 4, errors in common", shared_by_level),
+        Cell("noise along the rows, 0.4", autocorrelated(0.4)),
+        Cell("noise along the rows, 0.7", autocorrelated(0.7)),
+        Cell("gain noise ten times phase noise", uneven(0.03, 0.003)),
+        Cell("phase noise ten times gain noise", uneven(0.003, 0.03)),
+        Cell("additive noise", altered(additive)),
+        Cell("amplitude off by 2 %, also in N", amplitude_error(shared=True)),
+        Cell("amplitude off by 2 %, not in N", amplitude_error(shared=False)),
+        Cell("10 % of the rows off by 10 %", altered(outliers)),
+        Cell("stated deviations 1.4 times too small", altered(understated)),
+    ]
+    found += [
+        Cell(f"{part} worth {100 * share:g} % of sigma", unmodelled(part, share))
+        for part in ("mass", "damper")
+        for share in (0.003, 0.01)
+    ]
+    return found
+
+
+def judge(cell: Cell, tables: int) -> Outcome:
+    """Return what `tables` tables of a cell give; each has its own stream of random numbers."""
+    usable, trusted = np.zeros(tables, dtype=bool), np.zeros(tables, dtype=bool)
+    covered, plain = np.zeros((tables, 2), dtype=bool), np.zeros((tables, 2), dtype=bool)
+    longer = np.full((tables, 2), np.nan)
+    stream = sum(map(ord, cell.name))
+    for index in range(tables):
+        data, truth = cell.draw(np.random.default_rng([SEED, stream, index]))
+        result = fit(data, Dahl(), throw=False)
+        usable[index] = result.status.usable
+        trusted[index] = result.trusted
+        for i, (name, value) in enumerate(zip(("f_max", "sigma"), truth, strict=True)):
+            own, noise = _interval(result, "combined", name), _interval(result, "profile", name)
+            covered[index, i] = own[0] <= value <= own[1]
+            plain[index, i] = noise[0] <= value <= noise[1]
+            with np.errstate(invalid="ignore"):
+                longer[index, i] = (own[1] - own[0]) / (noise[1] - noise[0])
+    share = covered[usable].mean(axis=0) if usable.any() else np.full(2, np.nan)
+    return Outcome(
+        cell.name,
+        tables,
+        float(usable.mean()),
+        float(trusted.mean()),
+        (float(share[0]), float(share[1])),
+        (float(plain[:, 0].mean()), float(plain[:, 1].mean())),
+        (float(np.nanmedian(longer[:, 0])), float(np.nanmedian(longer[:, 1]))),
+        cell.right,
+    )
+
+
+def _interval(result: FitResult, method: str, name: str) -> tuple[float, float]:
+    limits = result.conf_interval("profile" if method == "profile" else "combined")[name][1]
+    return limits.lower, limits.upper
+
+
+def as_markdown(outcomes: Sequence[Outcome]) -> str:
+    """Return the page: every cell, and which do not hold."""
+    lines = [
+        "# Stated uncertainties where the model or its noise is not quite right",
+        "",
+        __doc__.split("\n\n", 1)[1].strip() if __doc__ else "",
+        "",
+        "| cell | tables | usable | trusted | covered f_max, sigma | noise alone | length | |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for o in outcomes:
+        numbers = [", ".join(f"{100.0 * v:.1f}" for v in pair) for pair in (o.covered, o.plain)]
+        length = ", ".join(f"{v:.2f}" for v in o.sharpness)
+        lines.append(
+            f"| {o.name} | {o.tables} | {100.0 * o.usable:.1f} | {100.0 * o.trusted:.1f} | "
+            f"{numbers[0]} | {numbers[1]} | {length} | {'; '.join(o.failures) or 'holds'} |"
+        )
+    bad = sum(bool(o.failures) for o in outcomes)
+    lines += ["", f"{len(outcomes) - bad} of {len(outcomes)} cells hold. Numbers in percent.", ""]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Judge the cells and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--tables", type=int, default=TABLES)
+    parser.add_argument("--only", default="", help="part of the names of the cells to judge")
+    parser.add_argument("--write", type=Path, default=None, help="page to write")
+    arguments = parser.parse_args()
+    outcomes = []
+    for cell in cells():
+        if arguments.only in cell.name:
+            outcomes.append(judge(cell, arguments.tables))
+            print(as_markdown(outcomes[-1:]).splitlines()[-3], flush=True)
+    if arguments.write is not None:
+        arguments.write.write_text(as_markdown(outcomes))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,224 @@
+"""A campaign on paper: what the devices have in common, which stand out, and which failed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dahl_ident.campaigns.population import USABLE, Population, PopulationParameter
+from dahl_ident.reporting.document import (
+    Block,
+    Bullets,
+    Cell,
+    Document,
+    Paragraph,
+    Picture,
+    Section,
+    Table,
+    figure_of,
+    number,
+    words,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FORMATS = (".html", ".pdf")
+_LISTED = 200
+"""Devices whose rows are printed; all of them are in the table."""
+
+
+def write_campaign_report(
+    table: pd.DataFrame,
+    found: Population | None,
+    path: str | Path,
+    *,
+    title: str = "Campaign",
+    reports: Path | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write the report of a campaign.
+
+    Parameters
+    ----------
+    table : DataFrame
+        That of a campaign.
+    found : Population or None
+        What :func:`population` made of it; None where too few devices were usable.
+    path : path
+        Ending in ``.html`` or ``.pdf``.
+    title : str
+        First line.
+    reports : Path, optional
+        Folder of the reports of single fits, to which the devices link.
+    overwrite : bool, default False
+        Replace a report that is there already.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    ValidationError
+        If the ending is another one.
+    DataError
+        If a file is there already and `overwrite` is not set, or the place cannot be written to.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> import pandas as pd
+    >>> table = pd.DataFrame({"device": ["d1"], "status": ["failed"], "error": ["no such file"]})
+    >>> write_campaign_report(table, None, Path(mkdtemp()) / "campaign.html").name
+    'campaign.html'
+    """
+    from dahl_ident.data.storage import place_of, write_whole
+    from dahl_ident.reporting.html import html
+    from dahl_ident.reporting.pdf import pdf
+
+    place = place_of(path, "a campaign's report", FORMATS)
+    folder = "" if reports is None else os.path.relpath(reports, place.parent)
+    document = campaign_document(table, found, title, Path(folder).as_posix())
+    content = html(document) if place.suffix.lower() == ".html" else pdf(document)
+    write_whole(place, content, overwrite=overwrite)
+    return place
+
+
+def campaign_document(
+    table: pd.DataFrame, found: Population | None, title: str, reports: str = "reports"
+) -> Document:
+    """Return the report's content; `reports` is where those of the fits are, for links."""
+    statuses = table["status"].value_counts()
+    counted = ", ".join(f"{count} {status}" for status, count in statuses.items())
+    verdict = [f"{len(table)} fits of {table['device'].nunique()} devices: {counted}."]
+    sections = []
+    if found is not None:
+        verdict += [_sentence(p) for p in found.parameters.values()]
+        sections = [Section(f"Population: {p.name}", tuple(_blocks(p))) for p in
+                    found.parameters.values()]  # fmt: skip
+    else:
+        verdict.append("Fewer than three devices have usable results: there is no population.")
+    sections.append(Section("Fits that cannot be used", (_unusable(table),)))
+    sections.append(Section("All fits", tuple(_all(table, reports))))
+    status = "not determined"
+    if found is not None:
+        status = "trusted" if (table["status"] == "trusted").all() else "approximate"
+    facts = {"statuses": {str(k): int(v) for k, v in statuses.items()}}
+    return Document(title, status, tuple(verdict), tuple(sections), facts=facts)
+
+
+def _sentence(p: PopulationParameter) -> str:
+    mean, u = p.mean
+    relative = p.logarithmic
+    scatter = [
+        f"{100.0 * s[0]:.2g} %" if relative else f"{s[0]:.3g} {p.unit}"
+        for s in (p.between_devices, p.between_runs)
+    ]
+    text = f"{p.name}: mean {mean:.4g} {p.unit} (u = {u:.2g}), scatter between devices {scatter[0]}"
+    if p.between_runs[0]:
+        text += f", between runs {scatter[1]}"
+    if p.outlying:
+        text += f"; outside the population: {', '.join(p.outlying)}"
+    if p.out_of_control:
+        text += f"; {len(p.out_of_control)} fits outside the control limits"
+    return text + "."
+
+
+def _blocks(p: PopulationParameter) -> Iterator[Block]:
+    label = f"{p.name} [{p.unit}]" if p.unit else p.name
+    measured = f"ln {p.name}" if p.logarithmic else label
+    rows = [(words(key)[0], number(v), number(u, 2)) for key, (v, u) in p.coefficients.items()]
+    spread = [
+        (words("scatter between devices")[0], *(number(x, 3) for x in p.between_devices)),
+        *(
+            [(words("scatter between runs")[0], *(number(x, 3) for x in p.between_runs))]
+            if p.between_runs[0]
+            else []
+        ),
+    ]
+    yield Table(
+        f"{measured} at the mean of the covariates, and its change per unit of each",
+        ("", "value", "standard uncertainty"),
+        tuple(rows),
+    )
+    yield Table(f"Scatter of {measured}", ("", "median", "2.3 %", "97.7 %"), tuple(spread))
+
+    def devices() -> object:
+        from dahl_ident.plots import plot_devices
+
+        table = p.devices
+        return plot_devices(
+            list(table.index), table["own"].to_numpy(), table["u"].to_numpy(),
+            table["shrunken"].to_numpy(), p.mean[0], p.outlying, label=label,
+        )  # fmt: skip
+
+    def charts() -> object:
+        from dahl_ident.plots import plot_control_charts
+
+        fits = p.fits
+        return plot_control_charts(
+            fits["value"].to_numpy(), fits["ewma"].to_numpy(), float(fits["centre"].iloc[0]),
+            float(fits["limit"].iloc[0]), fits["ewma_limit"].to_numpy(), label=measured,
+        )  # fmt: skip
+
+    beyond = ", ".join(p.outlying) or "none"
+    yield Picture(
+        f"devices_{p.name}",
+        f"{p.name} of each device: own estimate, and drawn towards the population",
+        f"{len(p.devices)} devices around {p.mean[0]:.4g}; outside the population: {beyond}",
+        lambda: figure_of(devices()),
+    )
+    yield Picture(
+        f"charts_{p.name}",
+        "Individuals (limits: three standard deviations from moving ranges) and EWMA chart, "
+        "covariates taken out",
+        f"{len(p.out_of_control)} of {len(p.fits)} fits lie outside the limits",
+        lambda: figure_of(charts()),
+    )
+
+
+def _unusable(table: pd.DataFrame) -> Block:
+    bad = table[~table["status"].isin(USABLE)]
+    if bad.empty:
+        return Paragraph("None.")
+    reasons = bad["error"].fillna("") if "error" in bad else bad["status"]
+    if "statements" in bad:
+        reasons = reasons.where(reasons != "", bad["statements"].fillna(""))
+    return Bullets(
+        tuple(
+            f"{device}: {status}. {reason}"
+            for device, status, reason in zip(
+                bad["device"][:_LISTED], bad["status"], reasons, strict=False
+            )
+        )
+    )
+
+
+def _all(table: pd.DataFrame, folder: str) -> Iterator[Block]:
+    names = [str(c) for c in table if f"u_{c}" in table]
+    labels = [c for c in ("device", "run") if c in table]
+    rows = []
+    for _, row in table.head(_LISTED).iterrows():
+        cells: list[Cell] = [*words(*(str(row[c]) for c in labels), str(row["status"]))]
+        if "report" in table and isinstance(row["report"], str):
+            cells[0] = Cell(cells[0].text, link=f"{folder}/{row['report']}")
+        for name in names:
+            cells += [_cell(row[name], 5), _cell(row[f"u_{name}"], 2)]
+        rows.append(tuple(cells))
+    units = {c: f" [{table[f'unit_{c}'].dropna().iloc[0]}]" if f"unit_{c}" in table else ""
+             for c in names}  # fmt: skip
+    header = [h for c in names for h in (f"{c}{units[c]}", "u")]
+    yield Table("Estimates and combined standard uncertainties", (*labels, "status", *header),
+                tuple(rows))  # fmt: skip
+    if len(table) > _LISTED:
+        yield Paragraph(f"{len(table) - _LISTED} more fits are in the table of results.")
+
+
+def _cell(value: float, digits: int) -> Cell:
+    return number(value, digits) if np.isfinite(value) else words("-")[0]

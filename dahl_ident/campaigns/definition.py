@@ -1,0 +1,321 @@
+"""What a campaign measures: a declarative file, checked before anything runs.
+
+    [files]
+    pattern = "data/{device}/{run}_{tension}lb.csv"   # names in braces are read from the path
+    kind = "record"                # waveforms; "response" for tables of gain and phase
+    covariates = "devices.csv"     # optional table with a column device, and run where needed
+
+    [read]                         # options of read_record or read_frequency_response
+    [extract]                      # options of extract
+    [fit]                          # options of fit
+    [posterior]                    # options of posterior; left out: no posterior
+
+    [[model]]                      # one table an element
+    kind = "dahl"
+
+    [output]
+    folder = "results"
+    per = "device"                 # one fit a device; "run": one fit a file
+    reports = false                # a report for each fit
+
+Paths are relative to the file.
+"""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import inspect
+import json
+import re
+import tomllib
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dahl_ident.errors import DataError
+
+_TABLES = {"files", "read", "extract", "fit", "posterior", "model", "output"}
+_FILES = {"pattern", "kind", "covariates"}
+_OUTPUT = {"folder", "per", "reports"}
+_KINDS = ("record", "response")
+_UNITS = ("device", "run")
+_SET_BY_CAMPAIGN = {"data", "model", "path", "record", "run", "throw", "seed", "progress"}
+_FIELD = re.compile(r"\{([A-Za-z_][A-Za-z0-9_]*)\}")
+
+
+@dataclass(frozen=True)
+class Task:
+    """One fit of a campaign.
+
+    Attributes
+    ----------
+    device, run : str
+        Labels; `run` is empty where the fit takes all runs of the device.
+    files : tuple of Path
+        What is read, in the order of their names.
+    runs : tuple of str
+        Label of each file.
+    covariates : mapping of str to float or str
+        From the path and from the table of covariates.
+    """
+
+    device: str
+    run: str
+    files: tuple[Path, ...]
+    runs: tuple[str, ...]
+    covariates: Mapping[str, float | str]
+
+    @property
+    def name(self) -> str:
+        """Device and run, for messages and file names."""
+        return f"{self.device}_{self.run}" if self.run else self.device
+
+
+@dataclass(frozen=True)
+class Definition:
+    """A checked campaign: what to do with which files, and where the results go.
+
+    Attributes
+    ----------
+    source : str
+        Where it was read from, for messages.
+    options : mapping
+        Everything that a result depends on besides its files: kind, read, extract, fit,
+        posterior, model and per.
+    tasks : tuple of Task
+        In the order of their names.
+    folder : Path
+        Where results go.
+    reports : bool
+        Whether each fit gets a report.
+    """
+
+    source: str
+    options: Mapping[str, Any]
+    tasks: tuple[Task, ...]
+    folder: Path
+    reports: bool
+
+    def key(self, digests: Collection[str], version: str) -> str:
+        """Return the key of a result: a digest of files, options and version."""
+        content = [version, self.options, list(digests)]
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def read_definition(source: str | Path | Mapping[str, Any]) -> Definition:
+    """Return a checked campaign.
+
+    Parameters
+    ----------
+    source : path or mapping
+        A TOML file, or its content; paths of a mapping are relative to the working folder.
+
+    Returns
+    -------
+    Definition
+        With every file found and every covariate known.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, a table or option is unknown, the pattern finds no file or no
+        device, two files have the same device and run, or a covariate is missing.
+    ModelError
+        If an element of the model is unknown.
+    """
+    if isinstance(source, Mapping):
+        content, name, folder = dict(source), "the campaign", Path.cwd()
+    else:
+        path = Path(source)
+        try:
+            content = tomllib.loads(path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as exc:
+            raise DataError(f"{path}: cannot be read as a campaign in TOML: {exc}") from exc
+        name, folder = str(path), path.resolve().parent
+    _known(name, "tables", content, _TABLES)
+    files = _table(name, content, "files")
+    output = _table(name, content, "output")
+    _known(name, "options in [files]", files, _FILES)
+    _known(name, "options in [output]", output, _OUTPUT)
+    kind = _choice(name, "[files] kind", files.get("kind", "record"), _KINDS)
+    per = _choice(name, "[output] per", output.get("per", "device"), _UNITS)
+    options = {
+        "kind": kind,
+        "per": per,
+        "model": _model(name, content.get("model")),
+        **{table: _table(name, content, table) for table in ("read", "extract", "fit")},
+        "posterior": content.get("posterior"),
+    }
+    _check_options(name, options)
+    tasks = _tasks(name, folder, files, per)
+    place = folder / str(output.get("folder", "results"))
+    return Definition(name, options, tasks, place, bool(output.get("reports", False)))
+
+
+def _table(name: str, content: Mapping[str, Any], key: str) -> dict[str, Any]:
+    table = content.get(key, {})
+    if not isinstance(table, Mapping):
+        raise DataError(f"{name}: {key} is {table!r}; expected a table, [{key}]")
+    return dict(table)
+
+
+def _known(name: str, what: str, given: Collection[str], known: Collection[str]) -> None:
+    unknown = sorted(set(given) - set(known))
+    if unknown:
+        raise DataError(
+            f"{name}: unknown {what}: {', '.join(unknown)}; expected some of "
+            f"{', '.join(sorted(known))}"
+        )
+
+
+def _choice(name: str, what: str, given: Any, known: Collection[str]) -> str:
+    if given not in known:
+        raise DataError(f"{name}: {what} is {given!r}; expected {' or '.join(known)}")
+    return str(given)
+
+
+def _model(name: str, entries: Any) -> list[dict[str, Any]]:
+    from dahl_ident.elements.description import describe_model, model_from_description
+
+    if not isinstance(entries, list) or not entries:
+        raise DataError(f'{name}: there is no model; give [[model]] tables, such as kind = "dahl"')
+    return describe_model(model_from_description(entries))
+
+
+def _check_options(name: str, options: Mapping[str, Any]) -> None:
+    """Refuse options that the functions do not have, before any file is read."""
+    import dahl_ident as di
+
+    record = options["kind"] == "record"
+    functions: dict[str, Callable[..., Any]] = {
+        "read": di.read_record if record else di.read_frequency_response,
+        "fit": di.fit,
+    }
+    if record:
+        functions["extract"] = di.extract
+    elif options["extract"]:
+        raise DataError(f"{name}: [extract] is given, but tables of responses are not extracted")
+    if options["posterior"] is not None:
+        functions["posterior"] = di.posterior
+    for table, function in functions.items():
+        known = set(inspect.signature(function).parameters) - _SET_BY_CAMPAIGN
+        _known(name, f"options in [{table}]", options[table], known)
+
+
+def _tasks(name: str, folder: Path, files: Mapping[str, Any], per: str) -> tuple[Task, ...]:
+    pattern = files.get("pattern")
+    if not isinstance(pattern, str):
+        raise DataError(f"{name}: [files] has no pattern; give one, such as 'data/{{device}}.csv'")
+    found = _matches(name, folder, pattern)
+    table = _covariates(folder, files.get("covariates"))
+    groups: dict[tuple[str, str], list[tuple[str, Path, dict[str, float | str]]]] = {}
+    seen: dict[tuple[str, str], Path] = {}
+    for path, fields in found:
+        device = fields.pop("device")
+        run = fields.pop("run", path.stem)
+        if (device, run) in seen:
+            raise DataError(
+                f"{name}: {seen[device, run]} and {path} are both device {device!r}, run {run!r}; "
+                "add what distinguishes them to the pattern, as {run}"
+            )
+        seen[device, run] = path
+        values: dict[str, float | str] = {key: _value(text) for key, text in fields.items()}
+        values |= _looked_up(name, table, device, run)
+        groups.setdefault((device, run if per == "run" else ""), []).append((run, path, values))
+    return tuple(
+        Task(
+            device,
+            run,
+            tuple(path for _, path, _ in members),
+            tuple(label for label, _, _ in members),
+            _shared(members),
+        )
+        for (device, run), members in sorted(groups.items())
+    )
+
+
+def _matches(name: str, folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
+    """Return the files of the pattern with the fields that their paths hold."""
+    fields = _FIELD.findall(pattern)
+    if "device" not in fields:
+        raise DataError(
+            f"{name}: the pattern {pattern!r} has no {{device}}; put it where the path names it"
+        )
+    if len(set(fields)) < len(fields):
+        raise DataError(f"{name}: the pattern {pattern!r} names a field twice")
+    parts = _FIELD.split(pattern)
+    wild = "".join("*" if i % 2 else glob.escape(part) for i, part in enumerate(parts))
+    expression = re.compile(
+        "".join(f"(?P<{part}>[^/]+?)" if i % 2 else re.escape(part) for i, part in enumerate(parts))
+    )
+    found = []
+    for path in sorted(glob.glob(wild, root_dir=folder)):  # noqa: PTH207  # absolute patterns too
+        match = expression.fullmatch(Path(path).as_posix())
+        if match is not None:
+            found.append((folder / path, match.groupdict()))
+    if not found:
+        raise DataError(f"{name}: the pattern {pattern!r} finds no file below {folder}")
+    return found
+
+
+def _covariates(
+    folder: Path, given: Any
+) -> dict[tuple[str, str | None], dict[str, float | str]] | None:
+    """Return the rows of the table by device and run, None where there is no table."""
+    if given is None:
+        return None
+    import pandas as pd
+
+    path = folder / str(given)
+    try:
+        frame = pd.read_csv(path, dtype=str)
+    except (OSError, ValueError) as exc:
+        raise DataError(f"{path}: cannot be read as a CSV table of covariates: {exc}") from exc
+    if "device" not in frame:
+        raise DataError(
+            f"{path}: has the columns {', '.join(map(str, frame))}; expected one called device"
+        )
+    keys = [c for c in ("device", "run") if c in frame]
+    rows: dict[tuple[str, str | None], dict[str, float | str]] = {}
+    for number, row in enumerate(frame.to_dict("records"), start=2):
+        key = (str(row["device"]), str(row["run"]) if "run" in frame else None)
+        if key in rows:
+            raise DataError(f"{path}: line {number} repeats the {' and '.join(keys)} {key[0]!r}")
+        blank = [c for c in row if pd.isna(row[c])]
+        if blank:
+            raise DataError(f"{path}: line {number} has no value for {', '.join(map(str, blank))}")
+        rows[key] = {str(c): _value(str(v)) for c, v in row.items() if c not in keys}
+    return rows
+
+
+def _looked_up(
+    name: str,
+    table: Mapping[tuple[str, str | None], dict[str, float | str]] | None,
+    device: str,
+    run: str,
+) -> dict[str, float | str]:
+    if table is None:
+        return {}
+    for key in ((device, run), (device, None)):
+        if key in table:
+            return table[key]
+    raise DataError(
+        f"{name}: the table of covariates has no row for device {device!r}, run {run!r}; add one"
+    )
+
+
+def _shared(
+    members: list[tuple[str, Path, dict[str, float | str]]],
+) -> dict[str, float | str]:
+    """Return the covariates of a fit: of several files, those that all of them share."""
+    first = members[0][2]
+    return {k: v for k, v in first.items() if all(m[2].get(k) == v for m in members)}
+
+
+def _value(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text

@@ -1,0 +1,179 @@
+"""Results as they come: one line a fit, appended; the table is made from them.
+
+A line is whole or it is the last one and cut off by a crash; such a rest is dropped when the
+file is opened again. Only keys and places of lines are held in memory.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from dahl_ident.data.storage import library, put_in_place
+from dahl_ident.errors import DataError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_ROWS_AT_ONCE = 2000
+"""Rows of the table in memory; about 10 MB."""
+_FIRST = ("device", "run", "status", "error", "statements")
+
+
+class Journal:
+    """The lines of one campaign.
+
+    Attributes
+    ----------
+    places : dict of str to int
+        Where the line of each finished key begins.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.places, end = finished(path)
+        try:
+            self._file: IO[bytes] = path.open("r+b" if path.exists() else "w+b")
+            self._file.truncate(end)
+            self._file.seek(end)
+        except OSError as exc:
+            raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
+
+    def add(self, key: str, row: Mapping[str, Any]) -> None:
+        """Append one result; it is with the operating system when this returns."""
+        line = json.dumps({"key": key, **row}, ensure_ascii=False).encode() + b"\n"
+        self.places[key] = self._file.tell()
+        self._file.write(line)
+        self._file.flush()
+
+    def rows(self, keys: Iterable[str]) -> Iterator[dict[str, Any]]:
+        """Yield results by key, in the order asked for."""
+        with self._path.open("rb") as file:
+            for key in keys:
+                file.seek(self.places[key])
+                yield json.loads(file.readline())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def finished(path: Path) -> tuple[dict[str, int], int]:
+    """Return where the line of each finished key begins, and where the last whole line ends.
+
+    A fit whose process died is not finished: it is tried again.
+    """
+    places: dict[str, int] = {}
+    end = 0
+    if not path.exists():
+        return places, end
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            if not line.endswith(b"\n"):
+                break
+            try:
+                row = json.loads(line)
+                if not row.get("died"):
+                    places[row["key"]] = end
+            except (ValueError, KeyError, AttributeError):
+                raise DataError(
+                    f"{path}: line {number} is not a result of a campaign; move the file away to "
+                    "start anew"
+                ) from None
+            end += len(line)
+    return places, end
+
+
+def write_tables(rows: Callable[[], Iterator[dict[str, Any]]], folder: Path) -> list[Path]:
+    """Write ``results.csv`` and, where pyarrow is installed, ``results.parquet``, whole or not.
+
+    `rows` is called twice: once for the columns, once for the content.
+    """
+    columns: dict[str, type] = {}
+    for row in rows():
+        for name, value in _flat(row).items():
+            if value is not None:
+                columns[name] = str if columns.get(name, type(value)) is str else type(value)
+    rest = [c for c in columns if c not in _FIRST]
+    order = [*(c for c in _FIRST if c in columns), *sorted(rest)]
+    return [
+        _written(folder / "results.csv", rows, order, columns, _csv),
+        *(
+            [_written(folder / "results.parquet", rows, order, columns, _parquet)]
+            if _has_pyarrow()
+            else []
+        ),
+    ]
+
+
+def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return one row of the table: numbers and texts alone."""
+    flat: dict[str, Any] = {}
+    for name, value in row.items():
+        if isinstance(value, list):
+            flat[name] = " | ".join(map(str, value))
+        elif isinstance(value, int) and not isinstance(value, bool):
+            flat[name] = float(value)
+        else:
+            flat[name] = value
+    return flat
+
+
+def _frames(
+    rows: Callable[[], Iterator[dict[str, Any]]],
+    order: Sequence[str],
+    columns: Mapping[str, type],
+) -> Iterator[pd.DataFrame]:
+    import pandas as pd
+
+    def frame(block: list[dict[str, Any]]) -> pd.DataFrame:
+        table = pd.DataFrame.from_records(block, columns=list(order))
+        kinds = {c: "string" if columns[c] is str else "float64" for c in order}
+        return table.astype(kinds)
+
+    block: list[dict[str, Any]] = []
+    for row in rows():
+        block.append(_flat(row))
+        if len(block) == _ROWS_AT_ONCE:
+            yield frame(block)
+            block = []
+    yield frame(block)
+
+
+def _written(
+    path: Path,
+    rows: Callable[[], Iterator[dict[str, Any]]],
+    order: Sequence[str],
+    columns: Mapping[str, type],
+    write: Callable[[Path, Iterator[pd.DataFrame]], None],
+) -> Path:
+    try:
+        put_in_place(path, lambda part: write(part, _frames(rows, order, columns)))
+    except OSError as exc:
+        raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
+    return path
+
+
+def _csv(path: Path, frames: Iterator[pd.DataFrame]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        for number, frame in enumerate(frames):
+            frame.to_csv(file, index=False, header=number == 0, lineterminator="\n")
+
+
+def _parquet(path: Path, frames: Iterator[pd.DataFrame]) -> None:
+    pyarrow, parquet = library("pyarrow"), library("pyarrow.parquet")
+    writer = None
+    for frame in frames:
+        table = pyarrow.Table.from_pandas(frame, preserve_index=False)
+        writer = writer or parquet.ParquetWriter(path, table.schema)
+        writer.write_table(table)
+    if writer is not None:
+        writer.close()
+
+
+def _has_pyarrow() -> bool:
+    from importlib.util import find_spec
+
+    return find_spec("pyarrow") is not None

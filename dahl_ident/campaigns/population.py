@@ -1,0 +1,503 @@
+r"""What many devices have in common: mean, scatter, covariates, outlying devices, drift.
+
+The logarithm of a positive parameter (any other as it is) of fit i, device d(i):
+
+    y_i = x_i' b + t_d(i) + r_i + e_i,   t ~ N(0, tau^2),  r ~ N(0, omega^2),  e_i ~ N(0, u_i^2)
+
+u_i is the fit's combined standard uncertainty, tau the scatter between devices, omega that
+between runs of one device (only where some device has several fits). tau and omega have flat
+priors, and everything is averaged over their posterior on a grid, so that few devices give wide
+intervals; b is integrated in closed form. The REML estimate is the posterior's mode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, stats
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.errors import DataError, ValidationError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+USABLE = ("trusted", "approximate")
+"""Statuses whose numbers and uncertainties can be used."""
+_NODES = 31
+"""Of the grid in tau and in omega; twice as many change no interval by 1 %."""
+_GONE = 14.0
+"""Fall of the log-likelihood to a millionth, where the grid ends."""
+_MOST = 20.0
+"""Largest tau that REML tries, in standard deviations of the data."""
+_FALSE_ALARMS = 0.01
+"""Probability that any device is called outlying where none is."""
+EWMA_WEIGHT, EWMA_WIDTH = 0.2, 2.86
+"""Lucas and Saccucci (1990): one false alarm in 370 points, as three standard deviations have."""
+_MOVING_RANGE = 2.0 / np.sqrt(np.pi)
+"""Mean difference of two normal numbers, in standard deviations (1.128)."""
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """The data of one parameter, with devices numbered."""
+
+    y: FloatArray
+    u2: FloatArray
+    X: FloatArray
+    device: NDArray[np.intp]
+    devices: int
+
+    def without(self, device: int) -> _Sums:
+        """Return the same without one device."""
+        keep = self.device != device
+        number = self.device[keep] - (self.device[keep] > device)
+        return _Sums(self.y[keep], self.u2[keep], self.X[keep], number, self.devices - 1)
+
+    def weighted(self, tau: float, omega: float) -> tuple[FloatArray, FloatArray, float]:
+        """Return X' V^-1 X, X' V^-1 y and the restricted log-likelihood of (tau, omega)."""
+        w = 1.0 / (omega**2 + self.u2)
+        total = np.bincount(self.device, w, self.devices)
+        shrink = tau**2 / (1.0 + tau**2 * total)
+        columns = np.column_stack([self.X, self.y])
+        sums = np.stack([np.bincount(self.device, w * c, self.devices) for c in columns.T], axis=-1)
+        G = columns.T @ (w[:, None] * columns) - sums.T @ (shrink[:, None] * sums)
+        A, b, yy = G[:-1, :-1], G[:-1, -1], G[-1, -1]
+        log_det = -np.log(w).sum() + np.log1p(tau**2 * total).sum()
+        rest = yy - b @ np.linalg.solve(A, b)
+        return A, b, float(-0.5 * (log_det + np.linalg.slogdet(A)[1] + rest))
+
+
+@dataclass(frozen=True)
+class PopulationParameter:
+    """What the devices say about one parameter.
+
+    Attributes
+    ----------
+    name, unit : str
+        Of the parameter.
+    logarithmic : bool
+        Whether the model is that of its logarithm; scatter is relative then.
+    coefficients : mapping of str to (float, float)
+        Value and standard uncertainty of the mean (at the mean of the covariates) and of the
+        change per unit of each covariate.
+    between_devices, between_runs : (float, float, float)
+        Posterior median and limits (95.45 %) of tau and omega; omega is zero where every device
+        has one fit.
+    devices : DataFrame
+        Each device: own mean, estimate drawn towards the population (`shrunken`) with its
+        standard uncertainty, and `p`, the probability of so distant a device where it is none.
+    fits : DataFrame
+        Each fit in its order: individuals chart (`value`, its limits) and EWMA chart.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pandas as pd
+    >>> from dahl_ident.campaigns.population import population
+    >>> f_max = 0.1 * np.exp(0.05 * np.array([-1.2, -0.3, 0.1, 0.4, 1.0]))
+    >>> table = pd.DataFrame({"device": list("abcde"), "status": "trusted",
+    ...     "f_max": f_max, "u_f_max": 0.001})
+    >>> found = population(table)["f_max"]
+    >>> found.outlying, found.out_of_control
+    ((), ())
+    """
+
+    name: str
+    unit: str
+    logarithmic: bool
+    coefficients: Mapping[str, tuple[float, float]]
+    between_devices: tuple[float, float, float]
+    between_runs: tuple[float, float, float]
+    devices: pd.DataFrame
+    fits: pd.DataFrame
+
+    @cached_property
+    def mean(self) -> tuple[float, float]:
+        """Population mean (the median of a logarithmic one) and its standard uncertainty."""
+        value, u = self.coefficients["mean"]
+        return (float(np.exp(value)), float(np.exp(value) * u)) if self.logarithmic else (value, u)
+
+    @property
+    def outlying(self) -> tuple[str, ...]:
+        """Devices outside the population; false-alarm rate 1 % for all together."""
+        return tuple(self.devices.index[self.devices["outlying"]])
+
+    @property
+    def out_of_control(self) -> tuple[int, ...]:
+        """Rows of `fits` outside the limits of either control chart."""
+        beyond = (self.fits["value"] - self.fits["centre"]).abs() > self.fits["limit"]
+        drifted = (self.fits["ewma"] - self.fits["centre"]).abs() > self.fits["ewma_limit"]
+        return tuple(int(i) for i in np.flatnonzero(beyond | drifted))
+
+
+@dataclass(frozen=True)
+class Population:
+    """The parameters of a population; made by :func:`dahl_ident.population`.
+
+    Attributes
+    ----------
+    parameters : mapping of str to PopulationParameter
+        By name; the population itself is indexed by name as well.
+    used : int
+        Fits that counted.
+    left_out : mapping of str to int
+        Fits that did not, by status.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pandas as pd
+    >>> from dahl_ident.campaigns.population import population
+    >>> f_max = 0.1 * np.exp(0.05 * np.array([-1.2, -0.3, 0.1, 0.4, 1.0]))
+    >>> table = pd.DataFrame({"device": list("abcde"), "status": "trusted",
+    ...     "f_max": f_max, "u_f_max": 0.001})
+    >>> population(table).summary().index.tolist()
+    ['f_max']
+    """
+
+    parameters: Mapping[str, PopulationParameter]
+    used: int
+    left_out: Mapping[str, int]
+
+    def __getitem__(self, name: str) -> PopulationParameter:
+        """Return one parameter."""
+        return self.parameters[name]
+
+    def summary(self) -> pd.DataFrame:
+        """Return one row a parameter: mean, u, scatter between devices and runs, covariates."""
+        import pandas as pd
+
+        rows = {}
+        for name, p in self.parameters.items():
+            row: dict[str, Any] = {"mean": p.mean[0], "u": p.mean[1], "unit": p.unit}
+            row |= {"between_devices": p.between_devices[0], "between_runs": p.between_runs[0]}
+            for covariate, (value, u) in p.coefficients.items():
+                if covariate != "mean":
+                    row |= {f"per_{covariate}": value, f"u_per_{covariate}": u}
+            row["outlying"] = ", ".join(p.outlying)
+            rows[name] = row
+        return pd.DataFrame.from_dict(rows, orient="index")
+
+    def __str__(self) -> str:
+        left = ", ".join(f"{count} {status}" for status, count in self.left_out.items())
+        head = f"{self.used} fits used" + (f"; left out: {left}" if left else "")
+        return f"{head}\n{self.summary()}"
+
+
+def population(
+    table: pd.DataFrame,
+    parameters: Sequence[str] | None = None,
+    *,
+    covariates: Sequence[str] = (),
+    order: str | None = None,
+) -> Population:
+    """Estimate what devices have in common, by partial pooling of their results.
+
+    Parameters
+    ----------
+    table : DataFrame
+        That of a campaign: a row a fit, with `device`, `status`, and for each parameter ``p``
+        its value ``p`` and its combined standard uncertainty ``u_p``.
+    parameters : sequence of str, optional
+        By default every column that has an uncertainty.
+    covariates : sequence of str, optional
+        Columns on which the parameters may depend, linearly.
+    order : str, optional
+        Column that orders the fits in time, for the control charts; by default the table's order.
+
+    Returns
+    -------
+    Population
+        For each parameter the population's mean, scatter between devices and runs, coefficients
+        of covariates, estimates of each device drawn towards the mean, outlying devices, and
+        control charts.
+
+    Raises
+    ------
+    DataError
+        If a column is missing or not numeric, or fewer than three devices are usable.
+    ValidationError
+        If a covariate is the same in every fit, or follows from others.
+
+    Notes
+    -----
+    Fits whose status is neither trusted nor approximate are left out, and counted.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pandas as pd
+    >>> rng = np.random.default_rng(1)
+    >>> f_max = np.exp(rng.normal(np.log(0.1), 0.05, 40))
+    >>> table = pd.DataFrame({"device": [f"d{i}" for i in range(40)], "status": "trusted",
+    ...     "f_max": f_max * np.exp(rng.normal(0, 0.01, 40)), "u_f_max": 0.01 * f_max})
+    >>> found = population(table)["f_max"]
+    >>> round(found.mean[0], 2), round(found.between_devices[0], 2)
+    (0.1, 0.05)
+    """
+    names = _parameters(table, parameters)
+    _require(table, ["device", "status", *covariates, *([order] if order else [])])
+    usable = table["status"].isin(USABLE).to_numpy()
+    left_out = table.loc[~usable, "status"].value_counts().to_dict()
+    chosen = table.loc[usable]
+    if order is not None:
+        chosen = chosen.sort_values(order, kind="stable")
+    if chosen["device"].nunique() < 3:
+        raise DataError(
+            f"{chosen['device'].nunique()} devices have usable results; a population needs at "
+            "least three"
+        )
+    found = {name: _one(chosen, name, list(covariates)) for name in names}
+    return Population(found, len(chosen), {str(k): int(v) for k, v in left_out.items()})
+
+
+def _parameters(table: pd.DataFrame, given: Sequence[str] | None) -> list[str]:
+    if given is None:
+        names = [c for c in table if f"u_{c}" in table and not str(c).startswith("posterior_")]
+        if not names:
+            raise DataError("the table has no parameter with an uncertainty (columns p and u_p)")
+        return [str(name) for name in names]
+    _require(table, [column for name in given for column in (name, f"u_{name}")])
+    return list(given)
+
+
+def _require(table: pd.DataFrame, columns: Sequence[str]) -> None:
+    missing = [c for c in columns if c not in table]
+    if missing:
+        raise DataError(
+            f"the table has no column {', '.join(missing)}; it has {', '.join(map(str, table))}"
+        )
+
+
+def _one(table: pd.DataFrame, name: str, covariates: list[str]) -> PopulationParameter:
+    import pandas as pd
+
+    value, u = _numbers(table, name), _numbers(table, f"u_{name}")
+    if not (u > 0.0).all():
+        raise DataError(f"u_{name} of row {int(np.argmin(u))} is not above zero")
+    logarithmic = bool((value > 0.0).all())
+    y, u = (np.log(value), u / value) if logarithmic else (value, u)
+    labels, device = np.unique(table["device"].to_numpy(dtype=str), return_inverse=True)
+    given = np.array([_numbers(table, c) for c in covariates]).reshape(len(covariates), len(y))
+    centred = given - given.mean(axis=1, keepdims=True)
+    X = np.column_stack([np.ones(len(y)), *centred])
+    if np.linalg.matrix_rank(X / np.maximum(np.abs(X).max(axis=0), 1e-300)) < X.shape[1]:
+        raise ValidationError(
+            f"the covariates {', '.join(covariates)} are constant or follow from each other in "
+            "these fits; leave one out"
+        )
+    data = _Sums(y, u**2, X, device, len(labels))
+    repeated = len(y) > len(labels)
+    grid = _grid(data, repeated)
+    b, cov = grid.coefficients
+    coefficients = {
+        key: (float(b[i]), float(np.sqrt(cov[i, i]))) for i, key in enumerate(["mean", *covariates])
+    }
+    devices = pd.DataFrame({"own": grid.own, **grid.devices}, index=labels)
+    devices["p"], devices["outlying"] = _outlying(data, repeated)
+    if logarithmic:
+        devices["u"] *= np.exp(devices["shrunken"])
+        devices[["own", "shrunken"]] = np.exp(devices[["own", "shrunken"]])
+    return PopulationParameter(
+        name,
+        str(table[f"unit_{name}"].iloc[0]) if f"unit_{name}" in table else "",
+        logarithmic,
+        coefficients,
+        grid.quantiles(0),
+        grid.quantiles(1) if repeated else (0.0, 0.0, 0.0),
+        devices,
+        _charts(table, y - centred.T @ b[1:]),
+    )
+
+
+def _numbers(table: pd.DataFrame, column: str) -> FloatArray:
+    try:
+        values = table[column].to_numpy(dtype=float)
+    except (TypeError, ValueError):
+        raise DataError(f"the column {column} holds text; expected numbers") from None
+    if not np.isfinite(values).all():
+        row = int(np.argmin(np.isfinite(values)))
+        raise DataError(
+            f"{column} is {values[row]} for device {table['device'].iloc[row]}; expected a number"
+        )
+    return np.asarray(values, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """The posterior of (tau, omega) on a grid, and what follows from it."""
+
+    data: _Sums
+    nodes: tuple[FloatArray, FloatArray]
+    weights: FloatArray  # (tau, omega), sum 1
+
+    @cached_property
+    def coefficients(self) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of b, averaged over the grid."""
+        means, second = [], np.zeros((self.data.X.shape[1],) * 2)
+        flat = self.weights.ravel()
+        for tau, omega in self._points():
+            A, b, _ = self.data.weighted(tau, omega)
+            C = np.linalg.inv(A)
+            means.append(C @ b)
+            second = second + flat[len(means) - 1] * C
+        m = np.array(means)
+        mean = flat @ m
+        return mean, second + (flat[:, None] * (m - mean)).T @ (m - mean)
+
+    @cached_property
+    def own(self) -> FloatArray:
+        """Each device's own mean, weighted by the uncertainties of its fits."""
+        w = 1.0 / self.data.u2
+        n = self.data.devices
+        return np.asarray(
+            np.bincount(self.data.device, w * self.data.y, n) / np.bincount(self.data.device, w, n)
+        )
+
+    @cached_property
+    def devices(self) -> dict[str, FloatArray]:
+        """Each device's estimate drawn towards the population, and its uncertainty."""
+        d = self.data
+        mean, second = np.zeros(d.devices), np.zeros(d.devices)
+        first = np.zeros((d.devices, d.X.shape[1]))
+        np.add.at(first, d.device, d.X)
+        x = first / np.bincount(d.device, minlength=d.devices)[:, None]
+        for weight, (tau, omega) in zip(self.weights.ravel(), self._points(), strict=True):
+            w = 1.0 / (omega**2 + d.u2)
+            total = np.bincount(d.device, w, d.devices)
+            A, b, _ = d.weighted(tau, omega)
+            C = np.linalg.inv(A)
+            beta = C @ b
+            rest = np.bincount(d.device, w * (d.y - d.X @ beta), d.devices) / total
+            pull = tau**2 * total / (1.0 + tau**2 * total)
+            value = x @ beta + pull * rest
+            away = (1.0 - pull)[:, None] * x
+            variance = pull / total + np.einsum("ij,jk,ik->i", away, C, away)
+            mean += weight * value
+            second += weight * (variance + value**2)
+        return {"shrunken": mean, "u": np.sqrt(np.maximum(second - mean**2, 0.0))}
+
+    def quantiles(self, axis: int) -> tuple[float, float, float]:
+        """Return median and 95.45 % limits of tau (0) or omega (1)."""
+        marginal = self.weights.sum(axis=1 - axis)
+        cumulative = np.cumsum(marginal) - 0.5 * marginal
+        low, middle, high = np.interp([0.02275, 0.5, 0.97725], cumulative, self.nodes[axis])
+        return float(middle), float(low), float(high)
+
+    def _points(self) -> list[tuple[float, float]]:
+        return [(float(t), float(o)) for t in self.nodes[0] for o in self.nodes[1]]
+
+
+def _grid(data: _Sums, repeated: bool) -> _Grid:
+    """Return the posterior of the scatters under flat priors, on a grid around its bulk."""
+    mode = _reml(data, repeated)
+    nodes = (_nodes(data, mode, 0), _nodes(data, mode, 1) if repeated else np.zeros(1))
+    values = np.array([[data.weighted(float(t), float(o))[2] for o in nodes[1]] for t in nodes[0]])
+    widths = [np.gradient(n) if n.size > 1 else np.ones(1) for n in nodes]
+    weights = np.exp(values - values.max()) * widths[0][:, None] * widths[1]
+    return _Grid(data, nodes, weights / weights.sum())
+
+
+def _reml(data: _Sums, repeated: bool) -> tuple[float, float]:
+    """Return the restricted maximum-likelihood estimates of tau and omega, each 0 or more."""
+    spread = float(np.sqrt(np.var(data.y) + data.u2.min()))
+
+    def objective(x: FloatArray) -> float:
+        tau, omega = np.abs(x) * spread  # even in both, so that zero is an ordinary point
+        return -data.weighted(float(tau), float(omega) if repeated else 0.0)[2]
+
+    if not repeated:
+        best = optimize.minimize_scalar(
+            lambda t: objective(np.array([t, 0.0])), bounds=(0.0, _MOST), method="bounded"
+        )
+        return float(best.x) * spread, 0.0
+    starts = [np.array([a, b]) for a in (0.7, 0.05) for b in (0.7, 0.05)]
+    found = [optimize.minimize(objective, s, method="Nelder-Mead") for s in starts]
+    tau, omega = np.abs(min(found, key=lambda r: float(r.fun)).x) * spread
+    return float(tau), float(omega)
+
+
+def _nodes(data: _Sums, mode: tuple[float, float], axis: int) -> FloatArray:
+    """Return nodes from zero to where the likelihood is gone, finer near zero."""
+    point = list(mode)
+    top = data.weighted(*point)[2]
+    step = 0.1 * float(np.sqrt(np.median(data.u2)))
+    while top - data.weighted(*point)[2] < _GONE:
+        point[axis] = 1.3 * point[axis] + step
+    return np.asarray(point[axis] * np.linspace(0.0, 1.0, _NODES) ** 1.5)
+
+
+def _outlying(data: _Sums, repeated: bool) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return each device's p value against all others, and which are outlying.
+
+    Devices found outlying are taken out one by one, the most distant first, so that they do not
+    hide one another; half of them at most.
+    """
+    p, outlying = np.ones(data.devices), np.zeros(data.devices, dtype=bool)
+    kept, numbers = data, np.arange(data.devices)
+    for _ in range(data.devices // 2):
+        z = _standardised(kept, repeated)
+        worst = int(np.argmax(np.abs(z)))
+        own = kept.device == worst
+        others = kept.without(worst)
+        freedom = others.devices - others.X.shape[1]
+        if freedom < 1 or np.linalg.matrix_rank(others.X) < others.X.shape[1]:
+            break
+        tau, omega = _reml(others, repeated)
+        A, b, _ = others.weighted(tau, omega)
+        C = np.linalg.inv(A)
+        w = 1.0 / (omega**2 + kept.u2[own])
+        x = (w[:, None] * kept.X[own]).sum(axis=0) / w.sum()
+        rest = float((w * kept.y[own]).sum() / w.sum() - x @ C @ b)
+        distance = rest / np.sqrt(tau**2 + 1.0 / w.sum() + x @ C @ x)
+        # the most distant of all: Sidak's correction for the number of devices
+        alone = 2.0 * stats.t.sf(abs(distance), freedom)
+        p[numbers[worst]] = -np.expm1(kept.devices * np.log1p(-min(alone, 1.0 - 1e-16)))
+        if p[numbers[worst]] >= _FALSE_ALARMS:
+            break
+        outlying[numbers[worst]] = True
+        kept, numbers = others, np.delete(numbers, worst)
+    return p, outlying
+
+
+def _standardised(data: _Sums, repeated: bool) -> FloatArray:
+    """Return each device's distance from the population in its standard deviations."""
+    tau, omega = _reml(data, repeated)
+    A, b, _ = data.weighted(tau, omega)
+    w = 1.0 / (omega**2 + data.u2)
+    total = np.bincount(data.device, w, data.devices)
+    rest = w * (data.y - data.X @ np.linalg.solve(A, b))
+    mean = np.bincount(data.device, rest, data.devices) / total
+    return np.asarray(mean / np.sqrt(tau**2 + 1.0 / total))
+
+
+def _charts(table: pd.DataFrame, y: FloatArray) -> pd.DataFrame:
+    """Return the control charts of fits in their order, covariates taken out."""
+    import pandas as pd
+
+    centre = y.mean()
+    sigma = np.abs(np.diff(y)).mean() / _MOVING_RANGE
+    ewma = np.empty(y.size)
+    last = centre
+    for i, value in enumerate(y):
+        last = last + EWMA_WEIGHT * (value - last)
+        ewma[i] = last
+    steps = np.arange(1, y.size + 1)
+    grown = 1.0 - (1.0 - EWMA_WEIGHT) ** (2 * steps)
+    width = EWMA_WIDTH * sigma * np.sqrt(EWMA_WEIGHT / (2.0 - EWMA_WEIGHT) * grown)
+    return pd.DataFrame(
+        {
+            "device": table["device"].to_numpy(),
+            "value": y,
+            "centre": centre,
+            "limit": 3.0 * sigma,
+            "ewma": ewma,
+            "ewma_limit": width,
+        }
+    )

@@ -1,0 +1,313 @@
+"""The door: run what is missing of a campaign, and write its table."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dahl_ident.arrays import whole_number
+from dahl_ident.campaigns.definition import Definition, Task, read_definition
+from dahl_ident.campaigns.engine import default_workers, run_jobs
+from dahl_ident.campaigns.journal import Journal, finished, write_tables
+from dahl_ident.campaigns.work import Job, digest_of
+from dahl_ident.data.file_lock import locked
+from dahl_ident.data.storage import write_whole
+from dahl_ident.errors import DataError
+from dahl_ident.version import __version__
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_JOURNAL = "journal.jsonl"
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """What a campaign found, or, after a dry run, what it would do.
+
+    Attributes
+    ----------
+    folder : Path
+        Holds ``results.csv``, ``results.parquet`` (with pyarrow) and ``reports/``.
+    finished : tuple of str
+        Fits whose results were there already, by device and run.
+    to_do : tuple of str
+        Fits that were missing, or whose files had changed; done unless this was a dry run.
+    statuses : mapping of str to int
+        How many fits ended with each status, "failed" among them.
+
+    Examples
+    --------
+    >>> print(Campaign(Path("results"), ("d1",), ("d2", "d3"), {"trusted": 2, "failed": 1}))
+    1 fits finished before, 2 to do; 2 trusted, 1 failed
+    """
+
+    folder: Path
+    finished: tuple[str, ...]
+    to_do: tuple[str, ...]
+    statuses: Mapping[str, int]
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """The results, one row a fit."""
+        import pandas as pd
+
+        path = self.folder / "results.csv"
+        if not path.exists():
+            raise DataError(f"{path}: there is no table yet; run the campaign, not a dry run")
+        return pd.read_csv(path, dtype={"device": str, "run": str})
+
+    def report(
+        self,
+        path: str | Path,
+        *,
+        covariates: Sequence[str] = (),
+        order: str | None = None,
+        title: str = "Campaign",
+        overwrite: bool = False,
+    ) -> Path:
+        """Write a report on the devices: population, control charts, failures, all fits.
+
+        Parameters
+        ----------
+        path : path
+            Ending in ``.html`` or ``.pdf``.
+        covariates, order
+            As for :func:`dahl_ident.population`.
+        title : str
+            First line.
+        overwrite : bool, default False
+            Replace a report that is there already.
+
+        Returns
+        -------
+        Path
+            The file.
+
+        Raises
+        ------
+        ValidationError
+            If the ending is another one.
+        DataError
+            If there is no table yet, a column is missing, or the file is there already and
+            `overwrite` is not set.
+        """
+        from dahl_ident.campaigns.campaign_report import write_campaign_report
+        from dahl_ident.campaigns.population import USABLE, population
+
+        table = self.table
+        enough = table.loc[table["status"].isin(USABLE), "device"].nunique() >= 3
+        found = population(table, covariates=covariates, order=order) if enough else None
+        reports = self.folder / "reports"
+        return write_campaign_report(
+            table, found, path, title=title, reports=reports, overwrite=overwrite
+        )
+
+    def __str__(self) -> str:
+        counted = ", ".join(f"{count} {status}" for status, count in self.statuses.items())
+        return (
+            f"{len(self.finished)} fits finished before, {len(self.to_do)} to do"
+            f"{f'; {counted}' if counted else ''}"
+        )
+
+
+def campaign(
+    source: str | Path | Mapping[str, Any],
+    *,
+    jobs: int | None = None,
+    executor: Executor | None = None,
+    send_files: bool = False,
+    dry_run: bool = False,
+    redo: bool = False,
+    progress: Callable[[int, int, Mapping[str, Any]], None] | None = None,
+) -> Campaign:
+    """Read, extract and fit the files of many devices; one row of a table for each fit.
+
+    Results are keyed by what they depend on: the digests of the files, the options and the
+    version. Run again after an interruption, it does what is missing; after a file has changed,
+    what depends on that file.
+
+    Parameters
+    ----------
+    source : path or mapping
+        TOML file, or its content; see :mod:`dahl_ident.campaigns.definition`.
+    jobs : int, optional
+        Processes of this machine, with one numerical thread each; by default as many as there
+        are processors. 1 works in this process. With `executor`: how many fits it does at once.
+    executor : concurrent.futures.Executor, optional
+        Where fits are done instead, such as ``dask.distributed.Client(...).get_executor()``.
+    send_files : bool, default False
+        Send workers the content of the files, for those that cannot see the paths.
+    dry_run : bool, default False
+        Say what would be done, and do nothing.
+    redo : bool, default False
+        Allow options or version to differ from those of results that are there already; all is
+        done anew then.
+    progress : callable, optional
+        Called after each fit with the number done, the number to do and the new row.
+
+    Returns
+    -------
+    Campaign
+        Where the results are, and how many there are of each status. A device that fails is a
+        row with its error.
+
+    Raises
+    ------
+    DataError
+        If the definition is wrong in any part; if options changed and `redo` is not set; or if
+        another process runs the same campaign.
+    ValidationError
+        If `jobs` is no whole number of at least 1.
+
+    Notes
+    -----
+    Processes are started anew ("spawn"): a script that calls this has to do so below
+    ``if __name__ == "__main__":``.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> import dahl_ident as di
+    >>> from dahl_ident.synthetic import load_dataset
+    >>> folder = Path(mkdtemp())
+    >>> for name in ("clean", "noisy"):
+    ...     _ = load_dataset(name).save(folder / f"{name}.csv")
+    >>> definition = {
+    ...     "files": {"pattern": f"{folder.as_posix()}/{{device}}.csv", "kind": "response"},
+    ...     "model": [{"kind": "dahl"}],
+    ...     "output": {"folder": f"{folder}/results"},
+    ... }
+    >>> campaign(definition, jobs=1).table[["device", "sigma"]].round(1).to_dict("list")
+    {'device': ['clean', 'noisy'], 'sigma': [30.0, 30.0]}
+    """
+    workers = default_workers() if jobs is None else whole_number(jobs, "jobs", 1)
+    definition = read_definition(source)
+    folder = definition.folder
+    if dry_run:
+        keys = _keys(definition)
+        agree = _options_agree(definition, redo)
+        known = set(finished(folder / _JOURNAL)[0]) if agree else set()
+        return _split(definition, keys, known, {})
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as exc:
+        raise DataError(f"{folder}: cannot be made: {exc.strerror or exc}") from exc
+    with locked(folder / _JOURNAL, DataError):
+        if not _options_agree(definition, redo) or not (folder / "options.json").exists():
+            write_whole(folder / "options.json", _options(definition), overwrite=True)
+        keys = _keys(definition)
+        with closing(Journal(folder / _JOURNAL)) as journal:
+            outcome = _split(definition, keys, set(journal.places), {})
+            missing = [(key, task) for key, task in zip(keys, definition.tasks, strict=True)
+                       if key not in journal.places]  # fmt: skip
+            jobs_of = ((tag, _job(definition, tag[1], send_files)) for tag in missing)
+            done = run_jobs(jobs_of, workers, executor)
+            for number, ((key, _), row) in enumerate(done, start=1):
+                journal.add(key, row)
+                if progress is not None:
+                    progress(number, len(missing), row)
+            statuses: dict[str, int] = {}
+
+            def rows() -> Iterator[dict[str, Any]]:
+                for task, row in zip(definition.tasks, journal.rows(keys), strict=True):
+                    yield _whole(task, row)
+
+            for row in rows():
+                statuses[row["status"]] = statuses.get(row["status"], 0) + 1
+            write_tables(rows, folder)
+    return Campaign(folder, outcome.finished, outcome.to_do, statuses)
+
+
+def _whole(task: Task, row: dict[str, Any]) -> dict[str, Any]:
+    del row["key"]
+    own = {"device": task.device, **({"run": task.run} if task.run else {})}
+    return {**own, **task.covariates, **row, "version": __version__}
+
+
+def _split(
+    definition: Definition, keys: list[str], known: set[str], statuses: Mapping[str, int]
+) -> Campaign:
+    named = list(zip(keys, definition.tasks, strict=True))
+    return Campaign(
+        definition.folder,
+        tuple(task.name for key, task in named if key in known),
+        tuple(task.name for key, task in named if key not in known),
+        statuses,
+    )
+
+
+def _job(definition: Definition, task: Task, send_files: bool) -> Job:
+    contents: list[bytes | None] = [None] * len(task.files)
+    if send_files:
+        with suppress(OSError):  # the worker then says what is wrong with the path
+            contents = [path.read_bytes() for path in task.files]
+    files = tuple(zip(map(str, task.files), contents, strict=True))
+    report = definition.folder / "reports" / f"{task.name}.html" if definition.reports else None
+    return Job(task.name, files, task.runs, definition.options, str(report) if report else None)
+
+
+def _options(definition: Definition) -> bytes:
+    content = {"version": __version__, **definition.options}
+    return json.dumps(content, indent=2, sort_keys=True).encode()
+
+
+def _options_agree(definition: Definition, redo: bool) -> bool:
+    """Return whether results in the folder have these options; refuse others without `redo`."""
+    path = definition.folder / "options.json"
+    if not path.exists():
+        return True
+    try:
+        before = json.loads(path.read_bytes())
+    except (OSError, ValueError) as exc:
+        raise DataError(f"{path}: cannot be read: {exc}") from exc
+    now = json.loads(_options(definition))
+    changed = [
+        f"{name} was {json.dumps(before.get(name))}, now {json.dumps(now.get(name))}"
+        for name in sorted({*before, *now})
+        if before.get(name) != now.get(name)
+    ]
+    if changed and not redo:
+        raise DataError(
+            f"{definition.source}: {'; '.join(changed)}, but {definition.folder} holds results of "
+            "the former; give another folder, or do all of them anew with redo=True (on the "
+            "command line --redo)"
+        )
+    return not changed
+
+
+def _keys(definition: Definition) -> list[str]:
+    """Return the key of each task.
+
+    A file's digest is computed anew only where its size or time of change differs from what was
+    noted with the last digest.
+    """
+    cache_path = definition.folder / "digests.json"
+    try:
+        cache = json.loads(cache_path.read_bytes())
+    except (OSError, ValueError):
+        cache = {}
+    digests: dict[str, list[Any]] = {}
+    keys = []
+    for task in definition.tasks:
+        own = []
+        for path in task.files:
+            try:
+                state = path.stat()
+                known = cache.get(str(path))
+                if known is None or known[:2] != [state.st_size, state.st_mtime_ns]:
+                    known = [state.st_size, state.st_mtime_ns, digest_of(path)]
+                digests[str(path)] = known
+            except (OSError, DataError):
+                known = [0, 0, "unreadable"]  # a row that says so, until it can be read
+            own.append(known[2])
+        keys.append(definition.key([task.name, *task.runs, *own], __version__))
+    if definition.folder.is_dir() and digests != cache:
+        write_whole(cache_path, json.dumps(digests).encode(), overwrite=True)
+    return keys

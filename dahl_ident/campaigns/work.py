@@ -1,0 +1,191 @@
+"""One fit of a campaign, wherever it runs: files in, one row out.
+
+This module imports numerical libraries only inside functions, so that a new process can limit
+their threads before they are loaded.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+import time
+from collections.abc import Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dahl_ident.data import FrequencyResponse
+    from dahl_ident.results import FitResult
+
+Row = dict[str, Any]
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a process needs to do one fit; plain data.
+
+    Attributes
+    ----------
+    name : str
+        Device and run.
+    files : tuple of (str, bytes or None)
+        Paths, with the content where it travels with the job.
+    runs : tuple of str
+        Label of each file.
+    options : mapping
+        Of :class:`dahl_ident.campaigns.definition.Definition`.
+    report : str or None
+        Where the report goes.
+    """
+
+    name: str
+    files: tuple[tuple[str, bytes | None], ...]
+    runs: tuple[str, ...]
+    options: Mapping[str, Any]
+    report: str | None
+
+
+def one_thread() -> None:
+    """Let numerical libraries use one thread, and end with the process that started this one."""
+    import multiprocessing
+    import threading
+
+    for name in _THREADS:
+        os.environ[name] = "1"
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+
+        def end_with_parent() -> None:
+            parent.join()
+            os._exit(1)
+
+        threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def do(job: Job) -> Row:
+    """Return the row of one fit; a failure is a row that says why.
+
+    Returns
+    -------
+    dict
+        ``status``: that of the verdict, or "failed"; ``statements`` or ``error``; for each
+        parameter ``p`` its value, ``unit_p``, ``u_p`` (combined standard uncertainty), ``U_p``
+        and ``dof_p``, and ``u_p_<source>`` for each source of its budget; ``points``: rows of
+        the response; ``digests``: of what was read; ``seconds``.
+    """
+    began = time.perf_counter()
+    digests: list[str] = []
+    try:
+        row = _done(job, digests)
+    except Exception as exc:  # one device that fails, however, must not end the campaign
+        text = " ".join(str(exc).split())
+        row = {"status": "failed", "error": f"{type(exc).__name__}: {text}"}
+    return {**row, "digests": digests, "seconds": time.perf_counter() - began}
+
+
+def _done(job: Job, digests: list[str]) -> Row:
+    import dahl_ident as di
+    from dahl_ident.elements.description import model_from_description
+
+    options = job.options
+    with _on_disk(job, digests) as paths:
+        data = _response(paths, job.runs, options)
+    model = model_from_description(options["model"])
+    result = di.fit(data, model, throw=False, **options["fit"])
+    row = _row(result)
+    results: list[Any] = [result]
+    if options["posterior"] is not None:
+        posterior = di.posterior(data, model, seed=0, **options["posterior"])
+        results.append(posterior)
+        for name, estimate in posterior.params.items():
+            row[f"posterior_{name}"] = estimate.value
+            row[f"u_posterior_{name}"] = estimate.stderr
+    if job.report is not None:
+        place = Path(job.report)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        di.report(results, place, title=job.name, overwrite=True)
+        row["report"] = place.name
+    return row
+
+
+def _response(
+    paths: list[Path], runs: tuple[str, ...], options: Mapping[str, Any]
+) -> FrequencyResponse:
+    import dahl_ident as di
+
+    if options["kind"] == "response":
+        chosen: Any = paths if len(paths) > 1 else paths[0]
+        return di.read_frequency_response(chosen, **options["read"])
+    records = {
+        run: di.read_record(path, **options["read"]) for run, path in zip(runs, paths, strict=True)
+    }
+    return di.extract(records, **options["extract"])
+
+
+def _on_disk(job: Job, digests: list[str]) -> Any:
+    """Return a context that gives the paths of the files, and note what they hold."""
+    if all(content is None for _, content in job.files):
+        paths = [Path(name) for name, _ in job.files]
+        digests += [digest_of(path) for path in paths]
+        return nullcontext(paths)
+    return _Unpacked(job, digests)
+
+
+class _Unpacked:
+    """Files that came with their job, in a folder that lives as long as they are read."""
+
+    def __init__(self, job: Job, digests: list[str]) -> None:
+        self._job, self._digests = job, digests
+
+    def __enter__(self) -> list[Path]:
+        self._folder = tempfile.TemporaryDirectory(prefix="campaign_")
+        paths = []
+        for index, (name, content) in enumerate(self._job.files):
+            assert content is not None
+            self._digests.append(hashlib.sha256(content).hexdigest())
+            path = Path(self._folder.name) / str(index) / Path(name).name
+            path.parent.mkdir()
+            path.write_bytes(content)
+            paths.append(path)
+        return paths
+
+    def __exit__(self, *_: object) -> None:
+        self._folder.cleanup()
+
+
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 digest of a file, or why there is none."""
+    from dahl_ident.errors import DataError
+
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as exc:
+        raise DataError(f"{path}: cannot be read: {exc.strerror or exc}") from exc
+
+
+def _row(result: FitResult) -> Row:
+    from dahl_ident.errors import FitError
+
+    row: Row = {
+        "status": result.status.value,
+        "statements": list(result.statements),
+        "points": len(result.data.response),
+        "runs": len(result.data.runs or ()) or 1,
+    }
+    for name, estimate in result.params.items():
+        row[name] = estimate.value
+        row[f"unit_{name}"] = estimate.unit
+    try:
+        budget = result.budget()
+    except FitError:  # nothing finite to state; the statements say why
+        return row
+    for name, part in budget.items():
+        row |= {f"u_{name}": part.u, f"U_{name}": part.U, f"dof_{name}": part.dof}
+        for source in part.rows:
+            row[f"u_{name}_{source.source.replace(' ', '_')}"] = source.u
+    return row

@@ -1,0 +1,122 @@
+"""``dahl-ident campaign``: many devices, one table."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dahl_ident.cli import console
+from dahl_ident.errors import ValidationError
+
+
+def campaign(
+    definition: Annotated[Path, typer.Argument(help="TOML file that says what to do.")],
+    jobs: Annotated[
+        int | None, typer.Option(help="Processes; by default as many as processors.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler, tcp://host:port.")
+    ] = None,
+    send_files: Annotated[
+        bool, typer.Option("--send-files", help="Send workers the content of files, not paths.")
+    ] = False,
+    report: Annotated[
+        Path | None, typer.Option(help="Report on the whole campaign: .html or .pdf.")
+    ] = None,
+    covariate: Annotated[
+        list[str], typer.Option(help="Column on which parameters may depend; or several.")
+    ] = [],  # noqa: B006 - typer takes lists as lists
+    order: Annotated[
+        str | None, typer.Option(help="Column that orders fits in time, for control charts.")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would be done.")] = False,
+    redo: Annotated[
+        bool, typer.Option("--redo", help="Do all anew where options have changed.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a report that is there already.")
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+) -> None:
+    """Read, extract and fit the files of many devices; a table with one row for each.
+
+    An interrupted campaign goes on where it stopped; a changed file is done anew.
+
+    Example: dahl-ident campaign lab.toml --jobs 4 --report campaign.html
+    """
+    from dahl_ident.campaigns.campaign_report import FORMATS
+    from dahl_ident.campaigns.run import campaign as run_campaign
+    from dahl_ident.data.storage import place_of, refuse_existing
+
+    if report is not None:
+        place_of(report, "a campaign's report", FORMATS)
+        if not overwrite:
+            refuse_existing(report)
+    with ExitStack() as stack:
+        options: dict[str, Any] = {"jobs": jobs}
+        if scheduler is not None and not dry_run:
+            client = stack.enter_context(_client(scheduler))
+            workers = jobs or sum(client.ncores().values()) or 1
+            options = {"jobs": workers, "executor": client.get_executor()}
+        progress = stack.enter_context(_progress()) if sys.stderr.isatty() else None
+        done = run_campaign(
+            definition, **options, send_files=send_files, dry_run=dry_run, redo=redo,
+            progress=progress,
+        )  # fmt: skip
+    if report is not None and not dry_run:
+        place = done.report(
+            report,
+            covariates=covariate,
+            order=order,
+            title=definition.stem,
+            overwrite=overwrite,
+        )
+        console.write_error(f"report: {place}")
+    if json:
+        facts = {"finished": list(done.finished), "to_do": list(done.to_do)}
+        console.write_json({**facts, "statuses": dict(done.statuses), "folder": str(done.folder)})
+        return
+    if dry_run:
+        for name in done.to_do:
+            console.write(f"to do: {name}")
+    console.write(str(done))
+    if not dry_run:
+        console.write(f"table: {done.folder / 'results.csv'}")
+
+
+def _client(address: str) -> Any:
+    from dahl_ident.data.storage import library
+
+    distributed = library("distributed", "dask")
+    try:
+        return distributed.Client(address, timeout=10)
+    except (OSError, TimeoutError) as exc:
+        raise ValidationError(f"--scheduler {address}: no scheduler answers: {exc}") from exc
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[int, int, Mapping[str, Any]], None]]:
+    """Show a bar with rate and time left."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TaskProgressColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (BarColumn(), MofNCompleteColumn(), TaskProgressColumn(show_speed=True),
+               TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("fits", total=None)
+
+        def update(done: int, total: int, _: Mapping[str, Any]) -> None:
+            bar.update(task, completed=done, total=total)
+
+        yield update

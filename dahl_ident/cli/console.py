@@ -1,0 +1,179 @@
+"""What a command prints: results on standard output, warnings and errors on standard error."""
+
+from __future__ import annotations
+
+import ast
+import io
+import json
+import os
+import re
+import shlex
+import shutil
+import sys
+import textwrap
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from dahl_ident.cli.options import STANDARD
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+BAD_INPUT = 1
+WRONG_USE = 2
+NOT_TRUSTED = 3
+_NARROWEST = 40
+INTERRUPTED = 130
+
+
+@dataclass
+class _Session:
+    color: bool = True
+    typed: Sequence[str] = ()
+
+
+_session = _Session()
+
+
+def begin(typed: Sequence[str]) -> None:
+    """Remember what was typed, and show warnings as lines for people, without file and code."""
+
+    def show(message: Warning | str, *_: Any) -> None:
+        write_error(f"warning: {in_options(str(message))}")
+
+    _session.typed = typed
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # the name of a file, or a unit, may hold what the terminal's encoding does not
+        sys.stdout.reconfigure(errors="backslashreplace")
+    # setattr, because the signature here has no use for file and line
+    setattr(warnings, "showwarning", show)  # noqa: B010
+
+
+def in_options(message: str) -> str:
+    """Return a message of the library in the words of the command line.
+
+    ``give frequency=, or mode='sweep'`` becomes ``give --frequency, or --mode 'sweep'``, and
+    ``columns={'gain': 'K'}`` becomes ``--columns map.toml, a file with the line: gain = "K"``.
+    """
+
+    def option(found: re.Match[str]) -> str:
+        name, value = found.groups()
+        if value == "True":
+            return f"--{name.replace('_', '-')}"
+        return f"--{name.replace('_', '-')}{' ' if value else ''}{value}"
+
+    message = re.sub(r"columns=(\{(?:[^{}]|\{[^{}]*\})*\})", _column_map, message)
+    message = re.sub(r"(?<![\w.(-])([a-z]+(?:_[a-z]+)*)=(True\b|['\w]?)", option, message)
+    return message.replace("di.fit(record, model)", "dahl-ident fit")
+
+
+def _column_map(found: re.Match[str]) -> str:
+    """Return the option and the line of its file that say the same as a map in Python."""
+    try:
+        entries = ast.literal_eval(found[1])
+    except (SyntaxError, ValueError):
+        return found[0]
+    lines = []
+    for role, entry in entries.items():
+        if isinstance(entry, dict):
+            parts = ", ".join(f"{key} = {json.dumps(value)}" for key, value in entry.items())
+            lines.append(f"{role} = {{{parts}}}")
+        else:
+            lines.append(f"{role} = {json.dumps('...' if entry is ... else entry)}")
+    return f"--columns map.toml, a file with the line: {'; '.join(lines)}"
+
+
+def typed_command() -> str:
+    """Return the command of this run, as it would be typed again."""
+    command = shlex.join(["dahl-ident", *_session.typed])
+    command = command.encode(errors="backslashreplace").decode()  # as names of files are told
+    piped = STANDARD in _session.typed
+    return f"{command}  # its input came through standard input" if piped else command
+
+
+def use_color(color: bool) -> None:
+    """Turn colour on or off for all that follows."""
+    _session.color = color
+
+
+def _terminal() -> Console:
+    """Return where people read; colour and width follow the terminal."""
+    from rich.console import Console
+
+    terminal = sys.stdout.isatty()
+    return Console(
+        no_color=None if _session.color else True,
+        highlight=False,
+        soft_wrap=True,
+        width=None if terminal else 100,
+    )
+
+
+def write(text: str) -> None:
+    """Print one text as it is."""
+    sys.stdout.write(f"{text}\n")
+
+
+def write_wrapped(text: str) -> None:
+    """Print a text in the words of the command line, long lines wrapped with an indent."""
+    shown = sys.stdout.isatty() or "COLUMNS" in os.environ
+    width = max(_NARROWEST, shutil.get_terminal_size().columns) if shown else None
+    for line in in_options(text).splitlines():
+        indent = " " * (len(line) - len(line.lstrip()) + 4)
+        if width is None or len(line) <= width:
+            write(line)
+        else:
+            write(textwrap.fill(line, width, subsequent_indent=indent, break_on_hyphens=False))
+
+
+def write_error(text: str) -> None:
+    """Print one line on standard error."""
+    sys.stderr.write(f"{text}\n")
+
+
+def write_json(value: Any) -> None:
+    """Print one JSON document."""
+    from dahl_ident.data.storage import plain_data
+
+    known = plain_data(value, not_finite=lambda _: None)
+    write(json.dumps(known, indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table; text from files is not taken for markup."""
+    from rich import box
+    from rich.measure import Measurement
+    from rich.table import Table
+    from rich.text import Text
+
+    drawn = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+    cells = [list(row) for row in rows]
+    for i, name in enumerate(header):
+        # a number broken over two lines would be read as another
+        whole = not any(" " in row[i] for row in cells)
+        least = max(len(text) for text in [name, *(row[i] for row in cells)]) if whole else None
+        drawn.add_column(Text(name), overflow="fold", no_wrap=whole, min_width=least)
+    for row in cells:
+        drawn.add_row(*(Text(cell) for cell in row))
+    screen = _terminal()
+    wide = screen.options.update(max_width=10_000)
+    screen.width = max(screen.width, Measurement.get(screen, wide, drawn).minimum)
+    screen.print(drawn)
+
+
+def heading(text: str) -> None:
+    """Print the name of a step."""
+    from rich.text import Text
+
+    _terminal().print(Text(text, style="bold cyan"))
+
+
+def finish(trusted: bool, reason: str) -> None:
+    """End a command with the status that its result deserves."""
+    if not trusted:
+        write_error(f"not to be trusted: {reason}")
+        raise typer.Exit(NOT_TRUSTED)

@@ -1,0 +1,498 @@
+"""Column maps: what a laboratory calls time, displacement, force and drive.
+
+A laboratory describes its files once, in a small TOML file, and reuses it. Each role is the
+name of a column, or a table with the name, its unit where the header does not say it, a sign
+and a constant factor::
+
+    drive_factor = "12.5 N/V"
+    drive_factor_uncertainty = 0.01
+
+    time = "t"
+    [displacement]
+    column = "LVDT 2"
+    unit = "um"
+    sign = -1
+    [drive]
+    column = "amplifier"
+    unit = "V"
+
+In files with paths (MATLAB, HDF5) a ``*`` stands for any name or index, and every match becomes
+one level: ``column = "FRdata.*[*].frequency"``. Indices count from 0.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray, finite_number, non_negative_array, positive_number
+from dahl_ident.data.fields import CONTROLLED, one_of
+from dahl_ident.data.raw_columns import Channel, Source, plain
+from dahl_ident.data.tabular import listed
+from dahl_ident.errors import DataError, UnitError, ValidationError
+from dahl_ident.units import (
+    MECHANICAL_KINDS,
+    QUANTITIES,
+    Motion,
+    Quantity,
+    Unit,
+    kind_of,
+    parse_quantity,
+    parse_unit,
+    si_unit,
+)
+
+# Names under which a column is found without a map.
+RECORD_NAMES: dict[str, tuple[str, ...]] = {
+    "time": ("time", "t", "time_s"),
+    "displacement": ("displacement", "disp", "position", "x"),
+    "velocity": ("velocity", "vel", "v"),
+    "acceleration": ("acceleration", "accel", "acc", "a"),
+    "force": ("force", "f", "torque"),
+    "drive": ("drive", "voltage", "current"),
+}
+RESPONSE_NAMES: dict[str, tuple[str, ...]] = {
+    "frequency": ("frequency", "freq", "frequency_hz", "freq_hz"),
+    "amplitude": ("amplitude", "displacement_amplitude"),
+    "drive": ("drive", "force", "force_amplitude", "drive_amplitude", "torque"),
+    "level": ("level",),
+    "run": ("run", "test", "file", "day"),
+    "harmonic": ("harmonic",),
+    "controlled": ("controlled",),
+    "response": ("response", "frf"),
+    "real": ("real", "re", "real_part"),
+    "imag": ("imag", "im", "imaginary", "imag_part"),
+    "gain": ("gain", "magnitude", "mag"),
+    "gain_db": ("gain_db", "magnitude_db", "mag_db"),
+    "phase": ("phase", "phase_deg", "phase_rad"),
+    "std": ("std",),
+    "real_std": ("real_std",),
+    "imag_std": ("imag_std",),
+    "gain_std": ("gain_std",),
+    "phase_std": ("phase_std", "phase_std_deg", "phase_std_rad"),
+    "covariance_real_real": ("covariance_real_real",),
+    "covariance_real_imag": ("covariance_real_imag",),
+    "covariance_imag_imag": ("covariance_imag_imag",),
+    "dof": ("dof",),
+    "amplitude_std": ("amplitude_std",),
+    "covariance_amplitude_real": ("covariance_amplitude_real",),
+    "covariance_amplitude_imag": ("covariance_amplitude_imag",),
+}
+ROLES = tuple(dict.fromkeys((*RECORD_NAMES, *RESPONSE_NAMES)))
+
+
+@dataclass(frozen=True)
+class Column:
+    """Where a role is found and how its numbers count.
+
+    Parameters
+    ----------
+    column : str or None
+        Name or path; None where the usual name is meant.
+    unit : str or None
+        Overrides the file's unit.
+    sign : {1, -1}
+    factor : float
+        Constant factor, sign not included.
+    """
+
+    column: str | None = None
+    unit: str | None = None
+    sign: int = 1
+    factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class ColumnMap:
+    """Roles and what else a file does not say about itself.
+
+    Parameters
+    ----------
+    roles : mapping of str to Column
+    quantity : str, optional
+        What gain and phase, or real and imaginary part, are.
+    controlled : str or mapping, optional
+        ``"displacement"`` or ``"force"``; or patterns of level labels for each of the two.
+    sample_rate : float, optional
+        Hz, for records without a time column.
+    drive_factor : str, optional
+        Force for one unit of drive, such as ``"12.5 N/V"``.
+    drive_factor_uncertainty : float
+        Its relative standard uncertainty.
+    """
+
+    roles: Mapping[str, Column] = field(default_factory=dict)
+    quantity: Quantity | None = None
+    controlled: str | Mapping[str, str] | None = None
+    sample_rate: float | None = None
+    drive_factor: str | None = None
+    drive_factor_uncertainty: float = 0.0
+
+
+_SETTINGS = tuple(f.name for f in fields(ColumnMap) if f.name != "roles")
+
+
+def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -> ColumnMap:
+    """Read a column map.
+
+    Parameters
+    ----------
+    value : mapping, path of a TOML file, or None
+        As the module describes it.
+    **overrides
+        Entries that replace those of `value`; None counts as absent.
+
+    Returns
+    -------
+    ColumnMap
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, or an entry is unknown or of the wrong kind.
+
+    Examples
+    --------
+    >>> column_map({"force": {"column": "F", "unit": "kN"}}).roles["force"].unit
+    'kN'
+    """
+    if value is None or isinstance(value, Mapping):
+        name, entries = "columns", dict(value or {})
+    else:
+        name, entries = str(value), _toml(Path(value))
+    entries |= {key: entry for key, entry in overrides.items() if entry is not None}
+    try:
+        return _read(entries)
+    except ValidationError as exc:
+        raise DataError(f"{name}: {exc}") from exc
+
+
+def _read(entries: Mapping[str, Any]) -> ColumnMap:
+    roles: dict[str, Column] = {}
+    settings: dict[str, Any] = {}
+    for key, entry in entries.items():
+        if key == "controlled" and not _is_column(entry):
+            settings[key] = _controlled(entry)
+        elif key in ROLES:
+            roles[key] = _column(entry, key)
+        elif key in _SETTINGS:
+            settings[key] = _setting(key, entry)
+        else:
+            raise ValidationError(
+                f"unknown entry {key!r}; expected one of {', '.join((*ROLES, *_SETTINGS))}"
+            )
+    return ColumnMap(roles, **settings)
+
+
+def _toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as exc:
+        raise DataError(f"{path}: the column map cannot be read: {exc.strerror}") from exc
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as exc:
+        raise DataError(f"{path}: not a TOML file: {exc}") from exc
+
+
+def _is_column(entry: Any) -> bool:
+    return isinstance(entry, Mapping) and "column" in entry
+
+
+def _column(entry: Any, role: str) -> Column:
+    if isinstance(entry, str):
+        return Column(entry)
+    if not isinstance(entry, Mapping):
+        raise ValidationError(
+            f"{role} is {entry!r}; expected a column's name, or a table with column, unit, sign "
+            "and factor"
+        )
+    unknown = set(entry) - {"column", "unit", "sign", "factor"}
+    if unknown:
+        raise ValidationError(
+            f"{role}: unknown entry {sorted(unknown)[0]!r}; expected column, unit, sign or factor"
+        )
+    for key in ("column", "unit"):
+        if not isinstance(entry.get(key, ""), str):
+            raise ValidationError(f"{role}.{key} is {entry[key]!r}; expected text")
+    sign = entry.get("sign", 1)
+    if sign not in (1, -1):
+        raise ValidationError(f"{role}.sign is {sign!r}; expected 1 or -1")
+    factor = positive_number(entry.get("factor", 1.0), f"{role}.factor")
+    return Column(entry.get("column"), entry.get("unit"), int(sign), factor)
+
+
+def _controlled(entry: Any) -> str | dict[str, str]:
+    if isinstance(entry, str):
+        return one_of(entry, "controlled", CONTROLLED)
+    if isinstance(entry, Mapping) and all(isinstance(v, str) for v in entry.values()):
+        return {one_of(key, "controlled", CONTROLLED): entry[key] for key in entry}
+    raise ValidationError(
+        f"controlled is {entry!r}; expected 'displacement' or 'force', or a pattern of level "
+        "labels for each of them"
+    )
+
+
+def _setting(key: str, entry: Any) -> Any:
+    match key:
+        case "quantity":
+            return one_of(entry, key, QUANTITIES)
+        case "sample_rate":
+            return positive_number(entry, key)
+        case "drive_factor_uncertainty":
+            return finite_number(non_negative_array(entry, key), key)
+        case _:
+            if not isinstance(entry, str):
+                raise ValidationError(f"{key} is {entry!r}; expected text such as '12.5 N/V'")
+            return entry
+
+
+_EXAMPLES = {
+    "time": "s",
+    "frequency": "Hz",
+    "drive": "N",
+    "force": "N",
+    "gain": "N/m",
+    "gain_db": "N/m",
+    "real": "N/m",
+    "imag": "N/m",
+    "response": "N/m",
+    "phase": "deg",
+    "velocity": "mm/s",
+    "acceleration": "m/s^2",
+}
+
+
+@dataclass
+class Binding:
+    """Roles looked up in one source; what was found, and what had to be assumed.
+
+    `names` are the column names under which each role is found without a map.
+    """
+
+    source: Source
+    map: ColumnMap
+    names: Mapping[str, tuple[str, ...]]
+    motions: dict[str, Motion] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    used: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        if self.source.headerless and not self.map.roles:
+            raise DataError(
+                f"{self.source.name}: the table has no header line; expected names and units "
+                "above the numbers, such as 'frequency_hz, amplitude [um], gain [N/m], phase_deg'"
+            )
+
+    def channel(self, role: str) -> Channel | None:
+        """Return the channel of a role, or None where the file has none.
+
+        Raises
+        ------
+        DataError
+            If the map names a column that is not there, or several columns fit the role.
+        """
+        channel = self._find(role)
+        if channel is not None:
+            self.used.add(channel.name)
+        return channel
+
+    def _find(self, role: str) -> Channel | None:
+        spec = self.map.roles.get(role, Column())
+        if spec.column is not None:
+            return self.source.find(spec.column)
+        found = [
+            c
+            for c in self.source.channels
+            if c.role == role or (c.role is None and plain(c.short or c.name) in self.names[role])
+        ]
+        if role == "run":  # a table may say file, day and test; the first name that is there
+            found.sort(key=lambda c: self.names[role].index(plain(c.short or c.name)))
+            found = found[:1]
+        if len(found) > 1:
+            distinct = len({c.name for c in found}) == len(found)
+            way = f"say which one with columns={{{role!r}: {found[0].name!r}}}"
+            raise DataError(
+                f"{self.source.name}: {len(found)} columns may be the {role}: "
+                f"{listed([c.header for c in found])}; "
+                + (way if distinct else "rename them in the file")
+            )
+        if not found and role in self.map.roles:
+            raise DataError(
+                f"{self.source.name}: no column is called {' or '.join(self.names[role])}; name "
+                f"the column of the {role} too"
+            )
+        return found[0] if found else None
+
+    def has(self, role: str) -> bool:
+        """Return whether a role is present."""
+        return self.channel(role) is not None
+
+    def required(self, role: str) -> Channel:
+        """Return the channel of a role that must be there."""
+        channel = self.channel(role)
+        if channel is None:
+            raise DataError(
+                f"{self.source.name}: no column holds the {role}; there are "
+                f"{listed([c.header for c in self.source.channels], 20)}. Name it with "
+                f"columns={{{role!r}: ...}}"
+            )
+        return channel
+
+    def numbers(self, role: str, channel: Channel) -> FloatArray:
+        """Return finite numbers with the map's sign and factor, in the file's unit."""
+        spec = self.map.roles.get(role, Column())
+        return scaled(self.source.numbers(channel), spec.sign * spec.factor)
+
+    def unit(self, role: str, channel: Channel, default: str | None = None) -> Unit:
+        """Return the unit: the map's, the header's, the one in the name, or the default's.
+
+        Raises
+        ------
+        UnitError
+            If there is none, or it cannot be read.
+        """
+        text = self.map.roles.get(role, Column()).unit or channel.unit
+        if text is None and plain(channel.short or channel.name) in self.names[role]:
+            text = channel.unit_in_name
+        text = text or default
+        if text is None:
+            example = _EXAMPLES.get(role, "um")
+            raise UnitError(
+                f"{self.source.name}: column {channel.name!r} has no unit; write it in the "
+                f"header, such as '{channel.name} [{example}]', or give "
+                f"columns={{{role!r}: {{'column': {channel.name!r}, 'unit': {example!r}}}}}"
+            )
+        try:
+            return parse_unit(text)
+        except UnitError as exc:
+            raise UnitError(f"{self.source.name}: column {channel.name!r}: {exc}") from exc
+
+    def kind(self, role: str, unit: Unit, kinds: tuple[str, ...]) -> tuple[str, float]:
+        """Return which kind a unit is, and its factor; its motion is remembered."""
+        kind, motion, factor = kind_of(unit, kinds, f"{self.source.name}: the {role}")
+        if kind in MECHANICAL_KINDS:
+            self.motions[role] = motion
+        return kind, factor
+
+    def force_per(self, kind: str) -> tuple[float, float]:
+        """Return the force for one SI unit of a drive, and its relative uncertainty."""
+        if kind == "force":
+            return 1.0, 0.0
+        text = self.map.drive_factor
+        if text is None:
+            raise UnitError(
+                f"{self.source.name}: the drive is a {kind}; give drive_factor, such as "
+                f"'12.5 N/{si_unit(kind)}'"
+            )
+        value, _, motion = parse_quantity(text, (f"force_per_{kind}",), "drive_factor")
+        self.motions["drive_factor"] = motion
+        return positive_number(value, "drive_factor"), self.map.drive_factor_uncertainty
+
+    def refuse_idle_factor(self, kind: str | None) -> None:
+        """Refuse keywords on the drive's factor where they would count for nothing.
+
+        `kind` is that of the drive, None where there is none. A column map may serve other files
+        too, and is not refused.
+        """
+        names = ("drive_factor", "drive_factor_uncertainty")
+        given = [n for n in names if self.source.options.get(n) is not None]
+        if not given:
+            return
+        what = " and ".join(given)
+        if kind in (None, "force"):
+            channel = self.channel("drive")
+            column = "the drive" if channel is None else f"column {channel.header!r}"
+            found = "no column holds the drive" if kind is None else f"{column} is a force already"
+            raise DataError(
+                f"{self.source.name}: {what} is given, but {found}; expected a drive in V or A: "
+                "leave the factor out, or name the column with columns={'drive': ...}"
+            )
+        if self.map.drive_factor is None and "drive_factor" not in self.source.metadata:
+            raise DataError(f"{self.source.name}: {what} is given without drive_factor; give both")
+
+    def motion(self) -> Motion:
+        """Return translation or rotation, on which all units must agree."""
+        kinds = set(self.motions.values())
+        if len(kinds) > 1:
+            raise UnitError(
+                f"{self.source.name}: units disagree: "
+                + ", ".join(f"{role} is {motion}" for role, motion in self.motions.items())
+            )
+        return kinds.pop() if kinds else "translation"
+
+    def provenance(self) -> dict[str, Any]:
+        """Return where the data come from, and the assumptions made on the way."""
+        unused = [c.name for c in self.source.channels if c.name not in self.used]
+        notes = list(dict.fromkeys([*self.source.notes, *self.notes]))
+        if unused:
+            notes.append(f"columns not used: {listed(unused, 5)}")
+        found = {
+            "file": self.source.name,
+            "format": self.source.format,
+            "sha256": self.source.sha256,
+            "options": dict(self.source.options),
+            "notes": notes,
+            "origin": self.source.metadata.get("provenance"),
+        }
+        return {key: value for key, value in found.items() if value}
+
+    def note_peak(self, role: str, unit: Unit) -> None:
+        """Note the assumption that an unmarked amplitude rests on; our own files need none."""
+        if unit.marker is None and not self.source.metadata:
+            self.notes.append(f"{role} [{unit.text}] taken as zero to peak: the table does not say")
+
+    def same_length(self, roles: Mapping[str, Channel]) -> None:
+        """Refuse columns of different lengths."""
+        sizes = {role: channel.size for role, channel in roles.items()}
+        if len(set(sizes.values())) > 1:
+            raise DataError(
+                f"{self.source.name}: columns differ in length: "
+                + ", ".join(f"{role} {size}" for role, size in sizes.items())
+            )
+
+
+def scaled(values: FloatArray, factor: float) -> FloatArray:
+    """Return values times factor; long records are not copied for a factor of 1."""
+    return values if factor == 1.0 else values * factor
+
+
+def by_level(source: Source, columns: ColumnMap) -> dict[str | None, ColumnMap]:
+    """Resolve ``*`` in paths: one column map for each level, or the map itself.
+
+    Raises
+    ------
+    DataError
+        If the columns do not have the same levels.
+    """
+    starred = {r: c for r, c in columns.roles.items() if c.column and "*" in c.column}
+    if not starred:
+        return {None: columns}
+    found = {role: source.matching(str(spec.column)) for role, spec in starred.items()}
+    first = next(iter(found))
+    for role, matches in found.items():
+        if matches.keys() != found[first].keys():
+            odd = sorted(matches.keys() ^ found[first].keys())
+            raise DataError(
+                f"{source.name}: {starred[first].column!r} and {starred[role].column!r} do not "
+                f"match the same levels; only one of them has {listed(odd)}"
+            )
+    return {
+        label: replace(
+            columns,
+            roles={
+                **columns.roles,
+                **{r: replace(starred[r], column=found[r][label].name) for r in starred},
+            },
+        )
+        for label in found[first]
+    }
+
+
+def per_frequency(values: FloatArray, frequency_hz: FloatArray, kind: str) -> FloatArray:
+    """Return the displacement amplitude of a motion amplitude of any kind."""
+    power = {"displacement": 0, "velocity": 1, "acceleration": 2}[kind]
+    return np.asarray(values / (2.0 * np.pi * frequency_hz) ** power)

@@ -1,0 +1,209 @@
+"""Curves of a frequency response: over which axis, and which rows make one curve.
+
+:func:`draw` is the one look upwards: it uses the functions of the plotting room. The import
+happens when a picture is asked for, so that data stay light; the contract between the rooms
+names this exception.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.quantities import polar_std
+from dahl_ident.errors import ValidationError
+from dahl_ident.units import Motion, Quantity, engineering, si_unit
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_SAME_FREQUENCY = 5e-3  # relative
+_NOMINAL = 1.5  # factor within which a numeric level is the amplitude that was held
+
+
+class _Points(Protocol):
+    """What a frequency response must offer to be laid out in curves."""
+
+    @property
+    def n(self) -> int: ...
+    @property
+    def frequency_hz(self) -> FloatArray: ...
+    @property
+    def response(self) -> ComplexArray: ...
+    @property
+    def amplitude(self) -> FloatArray | None: ...
+    @property
+    def drive(self) -> FloatArray | None: ...
+    @property
+    def covariance(self) -> FloatArray | None: ...
+    @property
+    def level(self) -> NDArray[Any] | None: ...
+    @property
+    def levels(self) -> list[Any]: ...
+    @property
+    def controlled(self) -> NDArray[np.str_]: ...
+    @property
+    def quantity(self) -> Quantity: ...
+    @property
+    def motion(self) -> Motion: ...
+    @property
+    def unit(self) -> str: ...
+    def select(
+        self, *, level: Any = None, harmonic: int | None = None, rows: ArrayLike | None = None
+    ) -> Self: ...
+
+
+P = TypeVar("P", bound=_Points)
+Stds = tuple[FloatArray | None, FloatArray | None]
+
+
+def draw(
+    data: P,
+    ax: Any = None,
+    *,
+    stds: Callable[[P], Stds] | None = None,
+    fitted: Callable[[P, bool], Any] | None = None,
+) -> tuple[Any, Any]:
+    """Draw gain and phase of the fundamental, over amplitude or frequency as suits the table.
+
+    `stds` gives the standard deviations of gain and phase of some rows, by default those of
+    their covariance; `fitted` gives a curve through some rows, over frequency or not.
+    """
+    from dahl_ident.plots import plot_amplitude_response, plot_frequency_response
+
+    fundamental = data.select(harmonic=1)
+    errors = _stds if stds is None else stds
+    over_frequency = is_over_frequency(fundamental)
+    parts = curves(fundamental)
+    if over_frequency or len(parts) > 1:
+        return plot_frequency_response(
+            [(name, abscissa(part, over_frequency), part.response) for name, part in parts],
+            errors=[errors(part) for _, part in parts],
+            fitted=[] if fitted is None else [fitted(part, over_frequency) for _, part in parts],
+            gain_label=gain_label(data),
+            x_label=abscissa_label(fundamental),
+            marker="." if fitted is None else "",
+            ax=ax,
+        )
+    gain_std, phase_std = errors(fundamental)
+    return plot_amplitude_response(
+        held_amplitude(fundamental),
+        fundamental.response,
+        gain_std=gain_std,
+        phase_std=phase_std,
+        curve=None if fitted is None else fitted(fundamental, over_frequency),
+        amplitude_label=held_label(fundamental),
+        gain_label=gain_label(data),
+        ax=ax,
+    )
+
+
+def draw_waveforms(time: FloatArray, frame: pd.DataFrame, kind: str, ax: Any = None) -> Any:
+    """Draw waveforms or loops of a record's table; see :meth:`Record.plot`."""
+    from dahl_ident.plots import plot_recorded_loops, plot_waveforms
+
+    labels = [str(name) for name in frame.columns[1:]]
+    if kind == "waveforms":
+        return plot_waveforms(time, [(name, frame[name]) for name in labels], ax=ax)
+    if kind == "loops":
+        motion, force = labels[:2]
+        return plot_recorded_loops(
+            frame[motion], frame[force], displacement_label=motion, force_label=force, ax=ax
+        )
+    raise ValidationError(f"kind is {kind!r}; expected 'waveforms' or 'loops'")
+
+
+def _stds(data: _Points) -> Stds:
+    return (None, None) if data.covariance is None else polar_std(data.response, data.covariance)
+
+
+def is_force_controlled(data: _Points) -> bool:
+    """Return whether most rows were driven by force."""
+    return bool(np.mean(data.controlled == "force") > 0.5)
+
+
+def held_amplitude(data: _Points) -> FloatArray:
+    """Return the amplitude that the laboratory held, or the other one where that is unknown."""
+    held, other = data.amplitude, data.drive
+    if is_force_controlled(data):
+        held, other = other, held
+    found = other if held is None else held
+    assert found is not None  # a table has one of the two
+    return found
+
+
+def held_label(data: _Points) -> str:
+    """Return the axis label of that amplitude."""
+    kind = "force" if held_amplitude(data) is data.drive else "displacement"
+    return f"{kind} amplitude [{si_unit(kind, data.motion)}]"
+
+
+def gain_label(data: _Points) -> str:
+    """Return the axis label of the gain."""
+    return f"{data.quantity.replace('_', ' ')} [{data.unit}]"
+
+
+def is_over_frequency(data: _Points) -> bool:
+    """Return whether curves over frequency suit the table better than curves over amplitude."""
+    parts = [data.select(level=label) for label in data.levels] or [data]
+    return all(
+        2 * np.unique(_nominal_frequency(part.frequency_hz)).size > part.n > 1 for part in parts
+    )
+
+
+def curves(data: P) -> list[tuple[str, P]]:
+    """Return the parts of the table that make one curve each, with their labels.
+
+    One a level over frequency, or one a frequency over amplitude.
+    """
+    if is_over_frequency(data):
+        levels = [(label, data.select(level=label)) for label in data.levels]
+        return [(_level(label, part), part) for label, part in levels] or [("", data)]
+    nominal = _nominal_frequency(data.frequency_hz)
+    return [(f"{f:.4g} Hz", data.select(rows=nominal == f)) for f in np.unique(nominal)]
+
+
+def curve_of_row(data: _Points) -> FloatArray:
+    """Return for each row the frequency or the level's index that it shares with its curve."""
+    if not is_over_frequency(data):
+        return _nominal_frequency(data.frequency_hz)
+    if data.level is None:
+        return np.zeros(data.n)
+    return np.array([data.levels.index(label) for label in data.level.tolist()], dtype=float)
+
+
+def abscissa(part: _Points, over_frequency: bool) -> FloatArray:
+    """Return the places of some rows on the axis."""
+    return part.frequency_hz if over_frequency else held_amplitude(part)
+
+
+def abscissa_label(data: _Points) -> str:
+    """Return the label of the axis that suits the table."""
+    return "frequency [Hz]" if is_over_frequency(data) else held_label(data)
+
+
+def _level(label: Any, part: _Points) -> str:
+    """Return a level with a unit where it is the amplitude that was held, not just a name."""
+    if not isinstance(label, (int, float)):
+        return str(label)
+    held = float(np.median(held_amplitude(part)))
+    if not held / _NOMINAL < label < held * _NOMINAL:
+        return f"{label:g}"
+    kind = "force" if held_amplitude(part) is part.drive else "displacement"
+    return engineering(float(label), si_unit(kind, part.motion))
+
+
+def _nominal_frequency(f: FloatArray) -> FloatArray:
+    """Return frequencies that differ by measurement alone as one; those of a fine grid as given."""
+    order = np.argsort(f)
+    jump = np.diff(f[order], prepend=f[order][0]) > _SAME_FREQUENCY * f[order]
+    group = np.empty(f.size, dtype=int)
+    group[order] = np.cumsum(jump)
+    members = [f[group == g] for g in range(group.max() + 1)]
+    if any(np.ptp(m) > 2.0 * _SAME_FREQUENCY * m.min() for m in members):
+        return f
+    return np.array([np.median(m) for m in members])[group]

@@ -1,0 +1,277 @@
+"""What a file holds before anyone says what it means: named channels with their units."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import LARGEST, ComplexArray, FloatArray
+from dahl_ident.data.column_names import split_header
+from dahl_ident.data.tabular import listed
+from dahl_ident.errors import DataError
+
+_NUMBER = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\s*|[-+]?inf|nan", re.ASCII)
+_SUFFIXES = {"hz": "Hz", "deg": "deg", "rad": "rad", "s": "s"}
+_CODES = (999.0, 9999.0, 99999.0, 999999.0, 999.9, 9999.9, 999.99, 9999.99)
+_SMALLEST_OVERFLOW = 1e30  # instruments write 1e30, 9.9e37 and the like
+_CODE_RATIO = 5.0  # by which a mark stands off from all measured numbers
+_FEWEST_FOR_CODES = 4
+
+
+@dataclass(frozen=True)
+class Stored:
+    """An array that stays in its file until it is used.
+
+    `read` returns a part of it, given by a slice of its only axis.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    read: Callable[[slice], NDArray[Any]]
+
+    @cached_property
+    def array(self) -> NDArray[Any]:
+        """All of it, read once."""
+        return self.read(slice(None))
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One named array of a file.
+
+    `role` is set where the format itself says what the channel is (UFF does), in the words of
+    a column map; `short` is the last part of a path, by which a role is found without a map.
+    """
+
+    name: str
+    content: NDArray[Any] | Stored
+    unit: str | None = None
+    role: str | None = None
+    short: str | None = None
+
+    @property
+    def values(self) -> NDArray[Any]:
+        """The array, read from the file where it is still there."""
+        return self.content.array if isinstance(self.content, Stored) else self.content
+
+    @property
+    def size(self) -> int:
+        """Number of values; nothing is read."""
+        return math.prod(self.content.shape)
+
+    @property
+    def kind(self) -> str:
+        """Kind of numbers, as in ``dtype.kind``; nothing is read."""
+        return self.content.dtype.kind
+
+    def part(self, rows: slice) -> Channel:
+        """Return some of the values, and read no others."""
+        if isinstance(self.content, Stored):
+            return replace(self, content=self.content.read(rows))
+        return replace(self, content=self.content[rows])
+
+    @property
+    def unit_in_name(self) -> str | None:
+        """Unit that a name such as ``frequency_hz`` or ``phase_deg`` ends in."""
+        return _SUFFIXES.get(plain(self.short or self.name).rpartition("_")[2])
+
+    @property
+    def header(self) -> str:
+        """Name and unit as a table would print them."""
+        return self.name if self.unit is None else f"{self.name} [{self.unit}]"
+
+
+@dataclass(frozen=True)
+class Source:
+    """All channels of one file.
+
+    `row_name` turns the index of a value into the words that find it in the file. `decimal` is
+    the decimal mark of numbers in columns of text. `metadata` is what an earlier save of this
+    package left in the file, `options` what the user said. `runs` are the rows at which a header
+    that is repeated within the file begins another run.
+    """
+
+    name: str
+    format: str
+    channels: tuple[Channel, ...]
+    sha256: str | None = None
+    headerless: bool = False
+    decimal: str = "."
+    row_name: Callable[[int], str] = field(default=lambda i: f"row {i + 1}")
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    runs: tuple[int, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def rows(self, keep: NDArray[np.bool_]) -> Source:
+        """Return the rows to `keep` of every channel that has this length."""
+        kept = np.flatnonzero(keep)
+        channels = tuple(
+            replace(c, content=c.values[keep]) if c.content.shape == keep.shape else c
+            for c in self.channels
+        )
+        return replace(self, channels=channels, row_name=lambda i: self.row_name(int(kept[i])))
+
+    def where(self, channel: Channel, index: int) -> str:
+        """Return file, row and column of a value."""
+        return f"{self.name}, {self.row_name(index)}, column {channel.name!r}"
+
+    def find(self, text: str) -> Channel:
+        """Return the one channel that `text` names, with or without its unit in brackets.
+
+        Raises
+        ------
+        DataError
+            If there is none, or more than one.
+        """
+        exact = [c for c in self.channels if text in (c.name, c.header)]
+        loose = [c for c in self.channels if plain(c.name) == plain(text)]
+        for found in (exact, loose):
+            if len(found) > 1:
+                raise DataError(
+                    f"{self.name}: {len(found)} columns are called {text!r}; expected one. "
+                    "Rename them in the file"
+                )
+            if found:
+                return found[0]
+        name, unit = split_header(text)
+        if unit is not None:
+            channel = self.find(name)
+            return replace(channel, unit=unit)
+        names = [c.name for c in self.channels]
+        close = difflib.get_close_matches(text, names, 3) or names
+        raise DataError(f"{self.name}: no column is called {text!r}; there are {listed(close, 20)}")
+
+    def matching(self, pattern: str) -> dict[str, Channel]:
+        """Return the channels that a path with ``*`` matches, by the part that varies."""
+        start = re.search(r"[^./]*\*", pattern)
+        end = re.search(r"\*[^.*/]*(?=[./][^*]*$|$)", pattern)
+        assert start is not None  # callers pass patterns with a star in them
+        assert end is not None
+        parts = (pattern[: start.start()], pattern[start.start() : end.end()], pattern[end.end() :])
+        before, varying, after = (re.escape(part).replace(r"\*", r"[^.\[\]/]*") for part in parts)
+        expression = re.compile(f"{before}({varying}){after}")
+        found = {m[1]: c for c in self.channels if (m := expression.fullmatch(c.name))}
+        if not found:
+            raise DataError(
+                f"{self.name}: nothing matches {pattern!r}; there are "
+                f"{listed([c.name for c in self.channels], 20)}"
+            )
+        return found
+
+    def numbers(self, channel: Channel, *, infinite: bool = False) -> FloatArray:
+        """Return a channel's numbers, finite unless said, or name the cell that holds another.
+
+        Raises
+        ------
+        DataError
+            If a cell holds text, is empty, NaN or infinite.
+        """
+        values = channel.values
+        if values.dtype.kind == "c":
+            raise DataError(
+                f"{self.name}: column {channel.name!r} holds complex numbers; expected real ones"
+            )
+        if values.dtype.kind not in "fiu":
+            values = self._from_text(channel)
+        values = np.atleast_1d(values).astype(np.float64, copy=False)
+        limit = np.inf if infinite else LARGEST
+        if values.size and not (values.min() >= -limit and values.max() <= limit):
+            bad = np.flatnonzero(~(np.abs(values) <= limit))
+            i = int(bad[0])
+            what = "empty or NaN" if np.isnan(values[i]) else f"{values[i]:g}"
+            raise DataError(
+                f"{self.where(channel, i)}: the cell is {what} ({bad.size} such cells); expected "
+                "a measured number"
+            )
+        return values if infinite else self._without_codes(channel, values)
+
+    def _without_codes(self, channel: Channel, values: FloatArray) -> FloatArray:
+        """Refuse numbers that stand for a missing one: far from all others, and one of a few."""
+        if values.size < _FEWEST_FOR_CODES:
+            return values
+        for code in {float(values.min()), float(values.max())}:
+            if abs(code) not in _CODES and abs(code) < _SMALLEST_OVERFLOW:
+                continue
+            others = np.abs(values[values != code])
+            if others.size and others.max() < abs(code) / _CODE_RATIO:
+                bad = np.flatnonzero(values == code)
+                raise DataError(
+                    f"{self.where(channel, int(bad[0]))}: the cell is {code:g} ({bad.size} such "
+                    f"cells), and all others are below {others.max():.3g} in size: a mark of a "
+                    "missing value? Delete these rows, or leave the cells empty"
+                )
+        return values
+
+    def complex_numbers(self, channel: Channel) -> ComplexArray:
+        """Return a channel's complex numbers, also those written as text, such as ``5+1i``.
+
+        Raises
+        ------
+        DataError
+            If a cell holds something else.
+        """
+        values = np.atleast_1d(channel.values)
+        if values.dtype.kind == "U":
+            values = np.array([self._complex_cell(channel, i) for i in range(values.size)])
+        if values.dtype.kind != "c":
+            raise DataError(
+                f"{self.name}: column {channel.name!r} holds no complex numbers; name the columns "
+                "of real and imag, or of gain and phase"
+            )
+        self.require(np.abs(values) < LARGEST, channel, "finite numbers")
+        return values.astype(np.complex128)
+
+    def _complex_cell(self, channel: Channel, index: int) -> complex:
+        text = str(np.atleast_1d(channel.values)[index])
+        try:
+            return complex(text.replace(" ", "").replace("i", "j"))
+        except ValueError:
+            raise DataError(
+                f"{self.where(channel, index)}: {text[:40]!r} is not a complex number"
+            ) from None
+
+    def require(self, good: NDArray[np.bool_], channel: Channel, expected: str) -> None:
+        """Raise a DataError that names the first cell that is not `good`."""
+        bad = np.flatnonzero(~good)
+        if bad.size:
+            i = int(bad[0])
+            raise DataError(
+                f"{self.where(channel, i)}: found {channel.values.flat[i]} ({bad.size} such "
+                f"cells); expected {expected}"
+            )
+
+    def _from_text(self, channel: Channel) -> FloatArray:
+        numbers = np.empty(channel.values.size)
+        comma, thousands = self.decimal[0] == ",", self.decimal[1:]
+        swapped = str.maketrans(",.", ".,") if comma else {}
+        mark = " with a decimal comma" if comma else ""
+        group = rf"\s*[-+]?\d{{1,3}}(?:\{thousands}\d{{3}})+" if thousands else ""
+        grouped = re.compile(rf"{group}(?:\{self.decimal[0]}\d*)?\s*")
+        for i, cell in enumerate(channel.values.flat):
+            text = str(cell)
+            if thousands and grouped.fullmatch(text):
+                text = text.replace(thousands, "")
+            text = text.translate(swapped)
+            if not text.strip():
+                numbers[i] = np.nan
+                continue
+            if not _NUMBER.fullmatch(text):
+                raise DataError(
+                    f"{self.where(channel, i)}: {str(cell)[:40]!r} is not a number{mark}"
+                )
+            numbers[i] = float(text)
+        return numbers
+
+
+def plain(name: str) -> str:
+    """Return a name without case, and with any run of blanks, dots and hyphens as one _."""
+    return re.sub(r"[\s._-]+", "_", name.strip().casefold())

@@ -1,0 +1,217 @@
+"""HDF5, and MATLAB v7.3, which is HDF5 inside. Arrays stay in the file until they are used."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.data.raw_columns import Source, Stored
+from dahl_ident.data.readers.array_trees import Leaf, tree_source
+from dahl_ident.data.readers.file import DEEPEST, MOST_CHANNELS, File
+from dahl_ident.data.storage import library, read_metadata
+from dahl_ident.errors import DataError
+
+_SECONDS, _CPU_SECONDS = 60, 1  # a look at a good file takes some milliseconds
+_LOOKED_AT = 1 << 24  # bytes in all
+_DAMAGED = (
+    OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError,
+    AttributeError, NotImplementedError,
+)  # fmt: skip
+
+
+def read_hdf5(file: File) -> Source:
+    """Return the data sets of an HDF5 or MATLAB v7.3 file.
+
+    Raises
+    ------
+    DataError
+        If the file is damaged, or claims more than it can hold.
+    """
+    h5py = library("h5py")
+    _refuse_fatal(file, h5py)
+    try:
+        root = h5py.File(file.stream(), "r")  # open as long as an array of it waits to be read
+        matlab = root.userblock_size >= 512 and file.head.startswith(b"MATLAB")
+        tree = _Tree(file, root, h5py)
+        leaves = list(tree.matlab_group(root, "", 0) if matlab else tree.group(root, "", 0))
+        text = root.attrs.get("dahl_ident")
+        metadata = {} if text is None else read_metadata(text)
+        return tree_source(file, "MATLAB v7.3" if matlab else "HDF5", iter(leaves), metadata)
+    except _DAMAGED as exc:
+        if isinstance(exc, DataError):
+            raise
+        raise DataError(f"{file.name}: the file is damaged: {exc}") from exc
+
+
+def _refuse_fatal(file: File, h5py: Any) -> None:
+    """Look at everything in the file in a process of its own, which damage may end or hang.
+
+    The library trusts what a file says of its own structure. Systems without ``fork`` go without.
+    """
+    if not hasattr(os, "fork"):
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # other threads are not touched
+        process = os.fork()
+    if process == 0:  # pragma: no cover
+        with contextlib.suppress(BaseException):
+            _look(file, h5py)
+        os._exit(0)  # an error will be met again, and named, by the reader
+    deadline = time.monotonic() + _SECONDS
+    done, status = os.waitpid(process, os.WNOHANG)
+    while not done and time.monotonic() < deadline:
+        time.sleep(0.001)
+        done, status = os.waitpid(process, os.WNOHANG)
+    if not done:
+        os.kill(process, signal.SIGKILL)
+        os.waitpid(process, 0)
+    if status or not done:
+        raise DataError(
+            f"{file.name}: the file is damaged: the HDF5 library "
+            f"{'fails' if done else 'hangs'} on its structure"
+        )
+
+
+def _look(file: File, h5py: Any) -> None:  # pragma: no cover
+    """Visit every object, and read the data sets whose places the file has to look up."""
+    import resource
+
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CPU, (_CPU_SECONDS, _CPU_SECONDS))
+    with h5py.File(file.stream(), "r") as root:
+        dict(root.attrs)
+        left = _LOOKED_AT
+        for _, item in _Tree(file, root, h5py).all_items(root, 0):
+            with contextlib.suppress(*_DAMAGED):
+                dict(item.attrs)
+            if isinstance(item, h5py.Dataset) and item.chunks is not None:
+                with contextlib.suppress(*_DAMAGED):
+                    _ = item[()] if item.nbytes < left else (item[:1], item[-1:])
+                left -= min(item.nbytes, left)
+
+
+class _Tree:
+    """Walks through the groups of a file, each object once."""
+
+    def __init__(self, file: File, root: Any, h5py: Any) -> None:
+        self.file, self.root, self.h5py = file, root, h5py
+        self.seen: set[Any] = set()
+        self.count = 0
+
+    def members(self, group: Any, depth: int) -> Iterator[tuple[str, Any]]:
+        """Yield what a group holds itself; links to elsewhere are not followed."""
+        if depth > DEEPEST:
+            raise DataError(f"{self.file.name}: groups are nested deeper than {DEEPEST} levels")
+        for name in group:
+            self.count += 1
+            if self.count > 2 * MOST_CHANNELS:
+                raise DataError(
+                    f"{self.file.name}: the file holds more than {2 * MOST_CHANNELS} objects; save "
+                    "what is needed in a file of its own"
+                )
+            if not isinstance(group.get(name, getlink=True), self.h5py.HardLink):
+                continue
+            item = group[name]
+            key = self.h5py.h5o.get_info(item.id).addr
+            if key not in self.seen:
+                self.seen.add(key)
+                yield name, item
+
+    def all_items(self, group: Any, depth: int) -> Iterator[tuple[str, Any]]:
+        """Yield every object below a group."""
+        for name, item in self.members(group, depth):
+            yield name, item
+            if isinstance(item, self.h5py.Group):
+                yield from self.all_items(item, depth + 1)
+
+    def group(self, group: Any, path: str, depth: int) -> Iterator[Leaf]:
+        for name, item in self.members(group, depth):
+            where = f"{path}/{name}" if path else name
+            if isinstance(item, self.h5py.Group):
+                yield from self.group(item, where, depth + 1)
+            elif isinstance(item, self.h5py.Dataset):
+                yield from self.dataset(item, where)
+
+    def dataset(self, item: Any, path: str) -> Iterator[Leaf]:
+        if item.shape is None or (item.dtype.kind == "O" and item.ndim > 1):
+            return
+        unit = item.attrs.get("unit", item.attrs.get("units"))
+        unit = unit.decode() if isinstance(unit, bytes) else unit
+        unit = unit if isinstance(unit, str) and unit.strip() else None
+        if self.h5py.check_string_dtype(item.dtype) is not None:
+            self.refuse_large(item, path)
+            yield path, np.asarray(item.asstr()[()], dtype=np.str_), unit
+        elif item.dtype.names:
+            for name in item.dtype.names:
+                dtype = item.dtype[name]
+                yield f"{path}.{name}", self.stored(item, path, dtype, lambda a, n=name: a[n]), unit
+        else:
+            yield path, self.stored(item, path, item.dtype, lambda a: a), unit
+
+    def stored(
+        self, item: Any, path: str, dtype: Any, form: Any, *, turned: bool = False
+    ) -> Stored:
+        """Return an array that is read when it is used."""
+
+        def read(rows: slice) -> NDArray[Any]:
+            self.refuse_large(item, path)
+            try:
+                whole = rows == slice(None) or turned
+                array = form(item[()] if whole else item[rows])
+            except _DAMAGED as exc:
+                raise DataError(f"{self.file.name}: {path} cannot be read: {exc}") from exc
+            return np.asarray(array[rows] if turned else array)
+
+        shape = item.shape[::-1] if turned else item.shape
+        return Stored(tuple(int(n) for n in shape), np.dtype(dtype), read)
+
+    def refuse_large(self, item: Any, path: str) -> None:
+        self.file.refuse_above_limit(int(item.size) * max(item.dtype.itemsize, 1), path)
+
+    def matlab_group(self, group: Any, path: str, depth: int) -> Iterator[Leaf]:
+        """Walk through a v7.3 file, whose struct arrays are data sets of references."""
+        for name, item in self.members(group, depth):
+            if not name.startswith("#"):
+                where = f"{path}.{name}" if path else name
+                yield from self.matlab_item(item, where, path, name, depth)
+
+    def matlab_item(
+        self, item: Any, where: str, path: str, name: str, depth: int
+    ) -> Iterator[Leaf]:
+        if depth > DEEPEST:
+            raise DataError(f"{self.file.name}: {path} is nested deeper than {DEEPEST} levels")
+        if isinstance(item, self.h5py.Group):
+            yield from self.matlab_group(item, where, depth + 1)
+        elif not isinstance(item, self.h5py.Dataset) or item.shape is None:
+            return
+        elif self.h5py.check_ref_dtype(item.dtype) is not None:
+            self.refuse_large(item, where)
+            if item.size > MOST_CHANNELS:
+                raise DataError(f"{self.file.name}: {where} has {item.size} cells; too many")
+            cell = item.attrs.get("MATLAB_class") == b"cell"
+            # MATLAB stores its arrays transposed
+            for i, reference in enumerate(np.ravel(item[()].T)):
+                inner = f"{where}[{i}]" if cell else f"{path}[{i}].{name}"
+                if reference:  # a null reference is an empty cell
+                    yield from self.matlab_item(self.root[reference], inner, path, name, depth + 1)
+        elif "MATLAB_empty" not in item.attrs:
+            yield self.matlab_array(item, where)
+
+    def matlab_array(self, item: Any, where: str) -> Leaf:
+        if item.attrs.get("MATLAB_class") == b"char":
+            self.refuse_large(item, where)
+            codes = np.ravel(np.asarray(item[()]).T).tolist()
+            return where, np.asarray("".join(map(chr, codes))), None
+        if item.dtype.names == ("real", "imag"):
+            kind = np.dtype(np.complex128)
+            join = lambda a: a["real"].T + 1j * a["imag"].T  # noqa: E731
+            return where, self.stored(item, where, kind, join, turned=True), None
+        return where, self.stored(item, where, item.dtype, np.transpose, turned=True), None

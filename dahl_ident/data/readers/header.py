@@ -1,0 +1,160 @@
+"""Where in a sheet of cells the numbers begin, and what stands above them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.data.column_names import split_header
+from dahl_ident.data.raw_columns import Channel
+from dahl_ident.errors import DataError, UnitError
+from dahl_ident.units import parse_unit
+
+# Decimal mark, and behind it that of thousands where there is one.
+CELL = {
+    mark: re.compile(
+        r"\s*[-+]?(?:"
+        + (rf"\d{{1,3}}(?:\{mark[1]}\d{{3}})+(?:\{mark[0]}\d*)?|" if mark[1:] else "")
+        + rf"(?:\d+(?:\{mark[0]}\d*)?|\{mark[0]}\d+)(?:[eE][-+]?\d+)?|nan|inf(?:inity)?)\s*",
+        re.IGNORECASE | re.ASCII,
+    )
+    for mark in (".", ",", ".,", ",.")
+}
+_NUMBERED = "x-axis"  # before the numbers by which Keysight oscilloscopes call their channels
+
+
+@dataclass(frozen=True)
+class Run:
+    """Consecutive rows of one width, each with a number in it, and how numeric they are."""
+
+    start: int
+    width: int
+    score: int
+
+
+@dataclass(frozen=True)
+class Header:
+    """Names and units of the columns; no names for a table without a header.
+
+    `cells` is how many columns the header line has; rows may end in a delimiter besides.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str | None, ...]
+    cells: int
+
+
+def best_run(rows: Iterable[Sequence[str] | None], mark: str) -> Run | None:
+    """Return the run with the most numbers, half weighed against by cells of text.
+
+    None stands for a line to look past: blank, or a comment. A line of another width belongs
+    to the run that it breaks; it is for the parser to refuse.
+    """
+    best: Run | None = None
+    run: Run | None = None
+    for i, row in enumerate(rows):
+        if row is None:
+            continue
+        numbers = sum(CELL[mark].fullmatch(cell) is not None for cell in row)
+        if not numbers:
+            run = None
+            continue
+        if run is None:
+            run = Run(i, len(row), 0)
+        if len(row) == run.width > 1:
+            text = sum(bool(cell.strip()) for cell in row) - numbers
+            run = Run(run.start, run.width, run.score + 2 * numbers - text)
+        if best is None or run.score > best.score:
+            best = run
+    return best if best and best.score > 0 else None
+
+
+def header(above: Sequence[Sequence[str]], width: int, filled: int | None = None) -> Header:
+    """Return names and units from the lines directly above the numbers, the nearest last.
+
+    Rows of `width` cells may end in delimiters, so that only `filled` of them hold something.
+    """
+    least = width - 1 if filled is None else min(filled, width - 1)
+    lines: list[list[str]] = []
+    for row in reversed(above):
+        cells = _without_trailing(row)
+        fits = least <= len(cells) <= width and len(row) == len(above[-1])
+        numbered = bool(cells) and cells[0].casefold() == _NUMBERED
+        if not cells or not fits or (_holds_number(cells) and not numbered):
+            break
+        lines.insert(0, [*cells, *[""] * (width - len(cells))])
+    if not lines:
+        return Header((), (), 0)
+    k = next((k for k in range(len(lines) - 1, 0, -1) if _are_units(lines[k])), None)
+    if k is None:
+        split = [[split_header(cell) for cell in line] for line in reversed(lines)]
+        named = max(split, key=lambda cells: sum(unit is not None for _, unit in cells))
+        return _header([n for n, _ in named], [u for _, u in named])
+    named = [split_header(cell) for cell in lines[k - 1]]
+    units = [own or _bare(cell) for (_, own), cell in zip(named, lines[k], strict=True)]
+    return _header([n for n, _ in named], units)
+
+
+def _header(names: list[str], units: list[str | None]) -> Header:
+    return Header(tuple(names), tuple(units), len(_without_trailing(names)))
+
+
+def _without_trailing(row: Sequence[str]) -> list[str]:
+    cells = [cell.strip() for cell in row]
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _holds_number(cells: Sequence[str]) -> bool:
+    return any(CELL["."].fullmatch(cell) or CELL[","].fullmatch(cell) for cell in cells)
+
+
+def _bare(cell: str) -> str | None:
+    """Return the unit in a cell of a row of units; None for an empty one."""
+    text = re.sub(r"^[\[(]\s*(.*?)\s*[\])]$", r"\1", cell.strip())
+    return "1" if text == "-" else text or None
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    try:
+        found = [parse_unit(unit) for cell in cells if (unit := _bare(cell)) is not None]
+    except UnitError:
+        return False
+    return bool(found)
+
+
+def named_channels(
+    columns: Sequence[NDArray[Any]], named: Header, file: str
+) -> tuple[Channel, ...]:
+    """Return the columns with their names and units, blank ones without a name left out.
+
+    Raises
+    ------
+    DataError
+        If rows are longer than the header.
+    """
+    channels = []
+    for i, values in enumerate(columns):
+        label = named.names[i] if named.names else ""
+        if not label and _is_blank(values):
+            continue
+        if named.names and i >= named.cells:
+            raise DataError(
+                f"{file}: the header names {named.cells} columns, the rows have {len(columns)}; "
+                "expected a name for each"
+            )
+        unit = named.units[i] if named.names else None
+        channels.append(Channel(label or f"column {i + 1}", values, unit))
+    return tuple(channels)
+
+
+def _is_blank(values: NDArray[Any]) -> bool:
+    if values.dtype.kind == "U":
+        return not np.char.str_len(np.char.strip(values)).any()
+    return values.dtype.kind == "f" and bool(np.isnan(values).all())

@@ -1,0 +1,189 @@
+"""LabVIEW measurement files: text with a header for the file and one for each segment.
+
+Every line of a segment must have the fields of its column labels, and a segment the number of
+samples that its header says; a lost line would move all later samples in time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.data.raw_columns import Channel, Source
+from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
+from dahl_ident.data.readers.instruments import evenly_timed, instrument_source, labelled_channel
+from dahl_ident.errors import DataError
+
+_END = "***End_of_Header***"
+_SPECIAL = ("***Start_Special***", "***End_Special***")
+_SEPARATORS = {"tab": "\t", "comma": ",", "semicolon": ";"}
+_MOST_SEGMENTS = 1000
+Lines = list[tuple[int, str]]
+
+
+def read_lvm(file: File) -> Source:
+    """Return the channels of all segments of a LabVIEW measurement file.
+
+    Raises
+    ------
+    DataError
+        If a line or a sample is missing, or a cell holds no number.
+    """
+    text = utf8(file.data).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+    lines = [(i + 1, line) for i, line in enumerate(text.split("\n"))]
+    head, rest = _up_to_end(file, _without_special(lines), 0)
+    separator = _separator(head)
+    settings = dict(_entry(line, separator) for _, line in head)
+    mark = (settings.get("Decimal_Separator") or ["."])[0]
+    columns = (settings.get("X_Columns") or ["One"])[0].strip().casefold()
+    segments: list[dict[str, Any]] = []
+    while any(line.strip() for _, line in rest):
+        segment, rest = _segment(file, rest, separator, mark, columns)
+        segments.append(segment)
+        if len(segments) > _MOST_SEGMENTS:
+            raise DataError(f"{file.name}: the file has more than {_MOST_SEGMENTS} segments")
+    if not segments:
+        raise DataError(f"{file.name}: the LVM file is damaged: it holds no segment")
+    channels = [
+        channel
+        for i, segment in enumerate(segments)
+        for channel in _channels(segment, f"segment {i}/" if len(segments) > 1 else "", columns)
+    ]
+    return instrument_source(file, "LVM", channels)
+
+
+def _without_special(lines: Lines) -> Lines:
+    kept, inside = [], False
+    for number, line in lines:
+        mark = line.strip()
+        inside = (inside or mark.startswith(_SPECIAL[0])) and not mark.startswith(_SPECIAL[1])
+        if not inside and not mark.startswith(_SPECIAL[1]):
+            kept.append((number, line))
+    return kept
+
+
+def _up_to_end(file: File, lines: Lines, start: int) -> tuple[Lines, Lines]:
+    for i in range(start, len(lines)):
+        if lines[i][1].strip() == _END:
+            return [pair for pair in lines[start:i] if pair[1].strip()], lines[i + 1 :]
+    raise DataError(f"{file.name}: the LVM file is damaged: a header without {_END}")
+
+
+def _separator(head: Lines) -> str:
+    for _, line in head:
+        if line.startswith("Separator") and len(line) > 9:
+            word = line[10:].strip().casefold()
+            return _SEPARATORS.get(word, line[9])
+    return "\t"
+
+
+def _entry(line: str, separator: str) -> tuple[str, list[str]]:
+    key, *values = line.split(separator)
+    return key.strip(), values
+
+
+def _segment(
+    file: File, lines: Lines, separator: str, mark: str, columns: str
+) -> tuple[dict[str, Any], Lines]:
+    """Return header and numbers of a segment, and the lines behind it."""
+    head, rest = _up_to_end(file, lines, 0)
+    segment: dict[str, Any] = dict(_entry(line, separator) for _, line in head)
+    while rest and not rest[0][1].strip():
+        rest = rest[1:]
+    if not rest:
+        raise DataError(f"{file.name}: the LVM file is damaged: a segment without column labels")
+    labels = [label.strip() for label in rest[0][1].split(separator)]
+    if len(labels) > MOST_CHANNELS:
+        raise DataError(f"{file.name}: a segment has more than {MOST_CHANNELS} channels")
+    stop = next((i for i in range(1, len(rest)) if not rest[i][1].strip()), len(rest))
+    rows, rest = rest[1:stop], rest[stop:]
+    while labels and not labels[-1]:
+        labels.pop()
+    width = len(labels) - (labels[-1:] == ["Comment"])
+    first = 1 if columns == "no" else 0
+    data = np.empty((len(rows), width - first))
+    for i, (number, line) in enumerate(rows):
+        cells = line.split(separator)
+        extra = [cell for cell in cells[len(labels) :] if cell.strip()]
+        if len(cells) < width or extra:
+            raise DataError(
+                f"{file.name}, line {number}: {len(cells)} fields; expected the {width} of the "
+                "column labels"
+            )
+        for k, cell in enumerate(cells[first:width]):
+            data[i, k] = _number(file, number, cell, mark)
+    segment["labels"], segment["data"] = labels[first:width], data
+    _check_samples(file, segment, len(rows))
+    following = next((line for _, line in rest if line.strip()), "")
+    if following and "_" not in following and not following[0].isalpha():
+        number = next(n for n, line in rest if line.strip())
+        raise DataError(
+            f"{file.name}, line {number}: numbers behind a blank line, where a segment has ended; "
+            "expected its samples without blank lines between them"
+        )
+    return segment, rest
+
+
+def _number(file: File, line: int, cell: str, mark: str) -> float:
+    text = cell.strip()
+    if not text:
+        return np.nan
+    with contextlib.suppress(ValueError):
+        if "_" not in text and (mark == "." or "." not in text):
+            return float(text.replace(mark, "."))
+    raise DataError(f"{file.name}, line {line}: {text[:40]!r} is not a number")
+
+
+def _check_samples(file: File, segment: dict[str, Any], rows: int) -> None:
+    """Refuse a segment with fewer or more samples than its header says."""
+    for value in segment.get("Samples", []):
+        if value.strip().isdigit() and int(value) > rows:
+            raise DataError(
+                f"{file.name}: a segment has {rows} samples where its header says {value.strip()}; "
+                "the file looks cut off"
+            )
+    stated = [int(v) for v in segment.get("Samples", []) if v.strip().isdigit()]
+    if stated and max(stated) != rows:
+        raise DataError(
+            f"{file.name}: a segment has {rows} samples where its header says {max(stated)}; the "
+            "file is damaged"
+        )
+
+
+def _channels(segment: dict[str, Any], prefix: str, columns: str) -> Iterator[Channel]:
+    """Yield the channels of a segment, and time: its x columns, or counted from their step."""
+    data, labels = segment["data"], segment["labels"]
+    table = list(zip(labels, data.T, strict=True))
+    channels = [pair for pair in table if pair[0] != "X_Value"]
+    for i, (name, values) in enumerate(channels):
+        units = _of_channels(segment.get("Y_Unit_Label", []), len(channels), columns)
+        unit = units[i].strip() if i < len(units) else ""
+        yield labelled_channel(prefix, name, values, unit)
+    if {word.strip() for word in segment.get("X_Dimension", [])} - {"Time", ""}:
+        return
+    times: list[NDArray[Any]] = [values for name, values in table if name == "X_Value"]
+    if not times:
+        starts, steps = (_floats(segment.get(key, [])) for key in ("X0", "Delta_X"))
+        times = [a + d * np.arange(len(data)) for a, d in zip(starts, steps, strict=False) if d > 0]
+    yield from evenly_timed(times, prefix)
+
+
+def _of_channels(values: list[str], count: int, columns: str) -> list[str]:
+    """Return the values of the channels; with many x columns those between are blank."""
+    if columns == "multi" and len(values) > count and not any(v.strip() for v in values[1::2]):
+        return values[0::2]
+    return values
+
+
+def _floats(values: list[str]) -> list[float]:
+    found = []
+    for value in values:
+        try:
+            found.append(float(value.strip().replace(",", ".")))
+        except ValueError:
+            continue
+    return found

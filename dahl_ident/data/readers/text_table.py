@@ -1,0 +1,425 @@
+"""Text tables: any delimiter, decimal comma, comments, several header lines, a row of units.
+
+The layout is found from the numbers: the delimiter and decimal mark are those under which the
+longest run of lines reads as numbers; the lines above it with as many fields are the header,
+and its last line is a row of units where each of its cells is one. Lines further up are the
+instrument's own preamble.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.data.raw_columns import Channel, Source, plain
+from dahl_ident.data.readers.file import MOST_CHANNELS, utf8
+from dahl_ident.data.readers.header import CELL, Header, best_run, header, named_channels
+from dahl_ident.data.storage import METADATA_MARK, read_metadata
+from dahl_ident.data.tabular import listed
+from dahl_ident.errors import DataError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_COMMENT = re.compile(r"\s*(?:#|%|//|!)")
+_COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|%|//|!)[^\r\n]*", re.MULTILINE)
+_LINE_END = re.compile(rb"\r\n|\n|\r")
+_BEFORE_BRACKET = re.compile(r"(?<=[^\s\])])[ \t]+(?=[\[(])")  # "time [s]" is one field
+# what stands in brackets is bounded, so that a line of brackets takes linear time
+_BLANK_SEPARATED = re.compile(r"(?:\[[^\]]{0,60}\]|\([^)]{0,60}\)|\S)+")
+_HEAD_BYTES = 1 << 15
+_HEAD_LINES = 4  # of numbers, however wide
+_LONGEST_LINE = 1 << 18
+_MOST_COMMENTS = 20_000
+_MANY_LINES = 50  # from which decimals of one length are a format, not chance
+_FOOTER_LINES = 20
+_FOOTER = re.compile(r"\s*[\"']?[^\W\d_]{2}|\s*(?:\*\*|==|--)", re.UNICODE)
+_SUMMARIES = ("min", "max", "mean", "average", "avg", "std", "rms", "sum", "total", "median")
+_MISSING = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "n/a", "#N/A", "null", "1.#QNAN"]
+_DIALECTS = (
+    ("\t", "."), (";", "."), (",", "."), ("|", "."),
+    ("\t", ","), (";", ","), ("|", ","), (None, "."), (None, ","),
+    ("\t", ".,"), (";", ".,"), (",", ".,"), ("|", ".,"), (None, ".,"), ("\t", ",."), (";", ",."),
+    ("|", ",."),
+)  # fmt: skip
+_LAST_DIALECTS = ((":", "."), (":", ","))  # a colon also stands in times of day
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Delimiter (None: blanks), decimal mark, first line of numbers, fields in it, header.
+
+    `repeated` is the line above the numbers, by which a second header in the file is known.
+    """
+
+    delimiter: str | None
+    mark: str
+    line: int
+    offset: int
+    width: int
+    header: Header
+    repeated: bytes = b""
+
+
+def read_text_table(data: bytes, name: str, sha256: str | None = None) -> Source:
+    """Return the columns of a text table.
+
+    Raises
+    ------
+    DataError
+        If the bytes are no text, or no table of numbers is found, or lines differ in width.
+    """
+    data = utf8(data)
+    if b"\0" in data:
+        raise DataError(
+            f"{name}: the file is binary (byte {data.index(0)} is 0); expected a text table"
+        )
+    lines = _head(data, name)
+    layout = _layout(lines, name)
+    if layout.width > MOST_CHANNELS:
+        raise DataError(
+            f"{name}: line {layout.line} has {layout.width} fields; at most {MOST_CHANNELS} are "
+            "read"
+        )
+    metadata = _metadata(lines, name)
+    body, runs, notes = _body(data, layout, name)
+    _refuse_cut_end(body, layout, name)
+    columns = _parse(body, layout, metadata, name)
+    channels = named_channels(columns, layout.header, name)
+    if runs and all(plain(c.name) != "run" for c in channels):
+        labels = np.searchsorted(runs, np.arange(len(columns[0])), side="right") + 1
+        channels = (*channels, Channel("run", labels.astype(np.str_)))
+    return Source(
+        name,
+        "text table",
+        channels,
+        sha256,
+        headerless=not layout.header.names,
+        decimal=layout.mark,
+        row_name=lambda i: f"line {_line_of(body, layout.line, i)}",
+        metadata=metadata,
+        notes=tuple(notes),
+        runs=tuple(runs),
+    )
+
+
+def _head(data: bytes, name: str) -> list[tuple[int, str]]:
+    """Return offset and text of the first lines."""
+    lines: list[tuple[int, str]] = []
+    start = numbers = 0
+    for end in _LINE_END.finditer(data + b"\n" if len(data) < _HEAD_BYTES else data):
+        if end.start() - start > _LONGEST_LINE:
+            break
+        lines.append((start, data[start : end.start()].decode("utf-8", "replace")))
+        start = end.end()
+        if not numbers and _COMMENT.match(lines[-1][1]) is None:
+            numbers, first = start, len(lines)
+        if numbers and start > numbers + _HEAD_BYTES and len(lines) >= first + _HEAD_LINES:
+            break
+        if len(lines) > _MOST_COMMENTS:
+            break
+    else:
+        if len(data) - start > _LONGEST_LINE:
+            raise DataError(_too_long(name, len(lines) + 1))
+        if start < len(data):
+            lines.append((start, data[start:].decode("utf-8", "replace")))
+        return lines
+    if end.start() - start > _LONGEST_LINE:
+        raise DataError(_too_long(name, len(lines) + 1))
+    return lines
+
+
+def _too_long(name: str, line: int) -> str:
+    return (
+        f"{name}: line {line} has more than {_LONGEST_LINE} bytes; expected a table with a line "
+        "for each sample"
+    )
+
+
+def _split(line: str, delimiter: str | None) -> list[str]:
+    if delimiter is None:
+        return _BLANK_SEPARATED.findall(_BEFORE_BRACKET.sub("", line))
+    if '"' not in line:
+        return line.split(delimiter)
+    try:
+        return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
+    except csv.Error:
+        return [line]
+
+
+def _layout(lines: list[tuple[int, str]], name: str) -> _Layout:
+    """Find dialect and start of the numbers, and read the header above them."""
+    passed = [not text.strip() or _COMMENT.match(text) is not None for _, text in lines]
+    best: _Layout | None = None
+    for dialects in (_DIALECTS, _LAST_DIALECTS):
+        merit = (False, 0)  # a header that fits the columns tells more than another number
+        for delimiter, mark in dialects:
+            found = _in_dialect(lines, passed, delimiter, mark)
+            if found is not None and found[0] > merit:
+                merit, best = found
+        if best is not None:
+            break
+    if best is None:
+        raise DataError(
+            f"{name}: no table of numbers found; expected at least two columns of numbers under a "
+            "header line"
+        )
+    return best
+
+
+def _in_dialect(
+    lines: list[tuple[int, str]], passed: list[bool], delimiter: str | None, mark: str
+) -> tuple[tuple[bool, int], _Layout] | None:
+    """Return the layout in one dialect and its merit, if there are numbers in it."""
+    rows = [
+        None if skip else _split(text, delimiter)
+        for (_, text), skip in zip(lines, passed, strict=True)
+    ]
+    run = best_run(rows, mark)
+    if run is None or (mark[1:] and not _has_thousands(rows[run.start :], mark)):
+        return None
+    start, above = run.start, lines[run.start - 1][1] if run.start else ""
+    repeated = above.strip() if not passed[run.start - 1] and run.start else ""
+    if repeated:  # a header seen before: the numbers began there
+        first = next(i for i, (_, text) in enumerate(lines) if text.strip() == repeated)
+        later = next((i for i in range(first + 1, start + 1) if not passed[i]), start)
+        row = rows[later]
+        start = later if row is not None and len(row) == run.width else start
+    row = rows[start] or []
+    filled = max((i + 1 for i, cell in enumerate(row) if cell.strip()), default=run.width)
+    found = header([row for row in rows[:start] if row is not None], run.width, filled)
+    if not found.names:
+        found = header(_commented(lines[:start], delimiter), run.width, filled)
+        repeated = "" if found.names else repeated
+    layout = _Layout(
+        delimiter, mark, start + 1, lines[start][0], run.width, found,
+        repeated.encode() if found.names else b"",
+    )  # fmt: skip
+    return (bool(found.names), run.score), layout
+
+
+def _has_thousands(rows: list[list[str] | None], mark: str) -> bool:
+    """Return whether some cell can only be read with a mark of thousands, as 1,234.5 can."""
+    group = rf"\s*[-+]?\d{{1,3}}(?:\{mark[1]}\d{{3}})"
+    sure = re.compile(rf"{group}+\{mark[0]}\d*\s*|{group}{{2,}}\s*")
+    return any(sure.fullmatch(cell) for row in rows for cell in row or ())
+
+
+def _commented(lines: list[tuple[int, str]], delimiter: str | None) -> list[list[str]]:
+    """Return the cells of the comment lines, without their marks."""
+    texts = [text[m.end() :] for _, text in lines if (m := _COMMENT.match(text))]
+    return [_split(text, delimiter) for text in texts if METADATA_MARK not in text]
+
+
+def _metadata(lines: list[tuple[int, str]], name: str) -> Mapping[str, Any]:
+    """Return what an earlier save of this package wrote into a comment line."""
+    for i, (_, text) in enumerate(lines):
+        found = re.match(rf"\s*#\s*{METADATA_MARK}(.*)", text)
+        if found:
+            try:
+                return read_metadata(found[1])
+            except ValueError as exc:
+                raise DataError(
+                    f"{name}, line {i + 1}: the comment after '{METADATA_MARK}' is not what this "
+                    "package wrote; delete the line to read the table without it"
+                ) from exc
+    return {}
+
+
+def _body(data: bytes, layout: _Layout, name: str) -> tuple[bytes, list[int], list[str]]:
+    """Return the lines of numbers, all else blanked; rows at which a run begins; and notes."""
+    body = data[layout.offset :]
+    first_comment = _first_comment(data, layout)
+    if first_comment is not None:
+        raise DataError(_not_a_comment(name, *first_comment))
+    if any(body.find(mark) >= 0 for mark in (b"#", b"%", b"//", b"!")):
+        for found in _COMMENT_LINE.finditer(body):
+            if _looks_like_data(found[0].decode("utf-8", "replace"), layout):
+                line = layout.line + len(_LINE_END.findall(body, 0, found.start()))
+                raise DataError(_not_a_comment(name, line, found[0].decode("utf-8", "replace")))
+        body = _COMMENT_LINE.sub(b"", body)
+    body, footers = _without_footers(body, layout)
+    notes = [f"left out below the table: {text.strip()[:60]!r}" for text in footers]
+    body, runs = _without_repeated_headers(body, layout)
+    if runs:
+        rows = listed([i + 1 for i in runs])
+        notes.append(f"the header is repeated in the file: new runs begin at rows {rows}")
+    return body, runs, notes
+
+
+def _first_comment(data: bytes, layout: _Layout) -> tuple[int, str] | None:
+    """Return a line directly above the numbers that is a comment by its first sign alone."""
+    above = _LINE_END.split(data[: layout.offset])[:-1]
+    for i in range(len(above) - 1, -1, -1):
+        text = above[i].decode("utf-8", "replace")
+        if text.strip() and not _COMMENT.match(text):
+            return None
+        if _looks_like_data(text, layout):
+            return i + 1, text
+    return None
+
+
+def _looks_like_data(text: str, layout: _Layout) -> bool:
+    """Return whether a line that begins as a comment has numbers in all its other fields."""
+    cells = _split(text, layout.delimiter)
+    others = [cell for cell in cells[1:] if cell.strip()]
+    numeric = [CELL[layout.mark].fullmatch(cell) is not None for cell in others]
+    return len(cells) == layout.width and bool(numeric) and all(numeric)
+
+
+def _not_a_comment(name: str, line: int, text: str) -> str:
+    return (
+        f"{name}, line {line}: the line begins as a comment and has numbers in its other fields, "
+        f"{text.strip()[:40]!r}; expected a measured number in each. Delete the line, or put a "
+        "number there"
+    )
+
+
+def _without_footers(body: bytes, layout: _Layout) -> tuple[bytes, list[str]]:
+    """Blank the lines of words below the table: "End of data", "Mean,0.1,0.2"."""
+    footers: list[str] = []
+    end = len(body.rstrip())
+    for _ in range(_FOOTER_LINES):
+        start = max(body.rfind(b"\n", 0, end), body.rfind(b"\r", 0, end)) + 1
+        text = body[start:end].decode("utf-8", "replace")
+        if not start or not _is_footer(text, layout):
+            break
+        footers.insert(0, text)
+        end = len(body[:start].rstrip())
+    return (body[:end] + b"\n" if footers else body), footers
+
+
+def _is_footer(text: str, layout: _Layout) -> bool:
+    cells = _split(text, layout.delimiter)
+    if not _FOOTER.match(text) or cells[0].strip() in _MISSING:
+        return False
+    numbers = [cell for cell in cells if CELL[layout.mark].fullmatch(cell)]
+    return not numbers or cells[0].strip(" \"':.").casefold() in _SUMMARIES
+
+
+def _without_repeated_headers(body: bytes, layout: _Layout) -> tuple[bytes, list[int]]:
+    """Blank every later line that repeats the header, and name the rows behind them."""
+    if not layout.repeated or body.find(layout.repeated) < 0:
+        return body, []
+    lines = re.split(rb"(\r\n|\n|\r)", body)
+    runs: list[int] = []
+    rows = 0
+    for i in range(0, len(lines), 2):
+        if lines[i].strip() == layout.repeated:
+            runs.append(rows)
+            for k in range(i, -1, -2):  # and the lines of its header above it
+                cells = _split(lines[k].decode("utf-8", "replace"), layout.delimiter)
+                if k < i and any(CELL[layout.mark].fullmatch(cell) for cell in cells):
+                    break
+                rows -= k < i and _counts(lines[k])
+                lines[k] = b""
+            runs[-1] = rows
+        else:
+            rows += _counts(lines[i])
+    return b"".join(lines), runs
+
+
+def _refuse_cut_end(body: bytes, layout: _Layout, name: str) -> None:
+    """Refuse a last line with missing fields, or with missing digits and no line end."""
+    start = max(0, len(body) - _HEAD_BYTES)
+    start = max(body.rfind(b"\n", 0, start), body.rfind(b"\r", 0, start)) + 1
+    ends = _LINE_END.split(body[start:])
+    *before, last = [t.decode("utf-8", "replace") for t in ends if _counts(t)] or [""]
+    cells = _split(last, layout.delimiter)
+    if len(cells) < layout.width:
+        raise DataError(
+            f"{name}: the last line has {len(cells)} fields, {last[:40]!r}, where the others have "
+            f"{layout.width}; the file looks cut off"
+        )
+    if not ends[-1] or len(before) < _MANY_LINES:
+        return
+    found, usual = _decimals(last, layout), {_decimals(line, layout) for line in before[1:]}
+    if len(usual) == 1 and found < min(usual):
+        raise DataError(
+            f"{name}: the last number, {cells[-1]!r}, has {found} decimals and no line end, where "
+            f"all above have {min(usual)}; the file looks cut off"
+        )
+
+
+def _decimals(line: str, layout: _Layout) -> int:
+    """Return how much of the line's last number stands behind its decimal mark."""
+    return len(_split(line, layout.delimiter)[-1].strip().partition(layout.mark)[2])
+
+
+def _counts(line: bytes) -> bool:
+    """Return whether a line among the numbers is one, and not blank or a comment."""
+    return bool(line.strip()) and not _COMMENT_LINE.match(line)
+
+
+def _parse(
+    body: bytes, layout: _Layout, metadata: Mapping[str, Any], name: str
+) -> list[NDArray[Any]]:
+    import pandas as pd
+
+    # pandas 3.1 reads to the last digit by default, earlier ones have to be asked
+    exact = tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1)
+    precision: dict[str, Any] = {} if exact else {"float_precision": "round_trip"}
+    keys = [str(i) for i in range(layout.width)]
+    known = metadata.get("text", [])
+    if layout.mark[1:]:  # read strictly when they are used: 12,34 is not 1234
+        known = list(layout.header.names)
+    texts = {key for key, n in zip(keys, layout.header.names, strict=False) if n in known}
+
+    def read(in_parts: bool) -> pd.DataFrame:
+        frame: pd.DataFrame = pd.read_csv(
+            io.BytesIO(body),
+            sep=layout.delimiter or r"\s+",
+            decimal=layout.mark[0],
+            header=None,
+            names=keys,
+            skipinitialspace=True,
+            keep_default_na=False,
+            na_values={key: [""] if key in texts else _MISSING for key in keys},
+            dtype=dict.fromkeys(texts, str),
+            low_memory=in_parts,
+            encoding="utf-8",
+            **precision,
+        )
+        return frame
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.DtypeWarning)
+            try:
+                frame = read(in_parts=True)  # twice as fast, but each part guesses its own types
+            except pd.errors.DtypeWarning:
+                frame = read(in_parts=False)
+    except pd.errors.ParserError as exc:
+        raise DataError(f"{name}: {_where_ragged(str(exc), layout)}") from exc
+    except (ValueError, OverflowError) as exc:
+        raise DataError(f"{name}: the table cannot be read: {exc}") from exc
+    return [_plain(frame[key].to_numpy()) for key in keys]
+
+
+def _where_ragged(message: str, layout: _Layout) -> str:
+    found = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", message)
+    if found is None:
+        return f"the table cannot be read: {message.strip()}"
+    line = int(found[2]) + layout.line - 1
+    return f"line {line} has {found[3]} fields; expected {found[1]} as in the lines above"
+
+
+def _plain(values: NDArray[Any]) -> NDArray[Any]:
+    """Return numbers or truth values as they are, anything else as text, empty cells as ''."""
+    if values.dtype.kind in "fiub":
+        return values
+    return np.array(["" if v is None or v != v else str(v) for v in values], dtype=np.str_)
+
+
+def _line_of(body: bytes, first: int, row: int) -> int:
+    """Return the line number of a row, past blank lines and comments."""
+    kept = [i for i, text in enumerate(_LINE_END.split(body)) if _counts(text)]
+    return first + kept[row]

@@ -1,0 +1,314 @@
+"""The uncertainty budget of a fit: which source contributes how much, after JCGM 100 (GUM).
+
+Combined standard uncertainty u, effective degrees of freedom (Welch and Satterthwaite), coverage
+factor k of Student's t for a confidence of 95.45 %, expanded uncertainty U = k u.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy import special
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.error_model import ErrorModel, error_model
+from dahl_ident.diagnostics.error_sources import LEVELS, MODEL_ERROR, NOISE, RUNS
+from dahl_ident.diagnostics.formatting import listed, rounded, table
+from dahl_ident.errors import FitError
+from dahl_ident.fitting import Optimum
+
+CONFIDENCE = 0.9545
+_TYPE_A = (NOISE, MODEL_ERROR, RUNS, LEVELS)
+_CHANNELS = {
+    "force_gain": "force calibration",
+    "displacement_gain": "displacement calibration",
+    "delay": "delay between the channels",
+}
+
+
+@dataclass(frozen=True)
+class BudgetRow:
+    """One source's part in the uncertainty of one parameter.
+
+    Attributes
+    ----------
+    source : str
+        Such as "noise" or "exponent".
+    kind : {"A", "B"}
+        Evaluated from the data's scatter, or from knowledge beforehand.
+    u : float
+        Standard uncertainty that it makes, in the parameter's unit.
+    dof : float
+        Degrees of freedom of `u`.
+    share : float
+        Part of the squared combined uncertainty, 0 to 1.
+    """
+
+    source: str
+    kind: Literal["A", "B"]
+    u: float
+    dof: float
+    share: float
+
+
+@dataclass(frozen=True)
+class ParameterBudget:
+    """The budget of one parameter.
+
+    Attributes
+    ----------
+    name, unit : str
+        The parameter.
+    value : float
+        Its estimate.
+    rows : tuple of BudgetRow
+        One a source, the largest first.
+    u, dof, k, U : float
+        Combined standard uncertainty, its effective degrees of freedom, coverage factor for
+        95.45 %, expanded uncertainty k u.
+    """
+
+    name: str
+    unit: str
+    value: float
+    rows: tuple[BudgetRow, ...]
+    u: float
+    dof: float
+    k: float
+
+    @property
+    def U(self) -> float:
+        """Expanded uncertainty, k u."""
+        return self.k * self.u
+
+
+@dataclass(frozen=True)
+class Budget(Mapping[str, ParameterBudget]):
+    """Uncertainty budgets of every free parameter, by name; printed, a table.
+
+    Attributes
+    ----------
+    parameters : tuple of ParameterBudget
+        In the order of the fit.
+    covariance : ndarray, shape (P, P)
+        Combined, of the values.
+    exact : tuple of str
+        Calibrations and other inputs that nobody stated an uncertainty of: taken as exact.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> found = budget(di.fit(di.load_dataset("noisy"), di.Dahl()).optimum)
+    >>> [row.source for row in found["f_max"].rows][:2]
+    ['noise', 'exponent']
+    >>> round(sum(row.share for row in found["f_max"].rows), 9)
+    1.0
+    """
+
+    parameters: tuple[ParameterBudget, ...]
+    covariance: FloatArray
+    exact: tuple[str, ...]
+
+    def __getitem__(self, name: str) -> ParameterBudget:
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return parameter
+        known = ", ".join(p.name for p in self.parameters)
+        raise KeyError(f"{name} has no budget; there are {known}")
+
+    def __iter__(self) -> Iterator[str]:
+        return (p.name for p in self.parameters)
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    def __str__(self) -> str:
+        lines = [["", "source", "type", "u", "dof", "share", "k", "U"]]
+        for p in self.parameters:
+            value = " ".join([p.name, "=", rounded(p.value, p.u)[0], p.unit]).rstrip()
+            lines.append(
+                [
+                    value,
+                    "combined",
+                    "",
+                    f"{p.u:.2g}",
+                    _dof(p.dof),
+                    "100 %",
+                    f"{p.k:.2f}",
+                    f"{p.U:.2g}",
+                ]
+            )
+            lines += [
+                [
+                    "",
+                    r.source,
+                    r.kind,
+                    f"{r.u:.2g}",
+                    _dof(r.dof),
+                    f"{100.0 * r.share:.0f} %",
+                    "",
+                    "",
+                ]
+                for r in p.rows
+            ]
+        text = table(lines, left=(0, 1, 2))
+        return f"{text}\ntaken as exact: {listed(self.exact)}" if self.exact else text
+
+    def to_frame(self) -> Any:
+        """Return a pandas table: one row a parameter and source, the combined one last."""
+        import pandas as pd
+
+        return pd.DataFrame(
+            [
+                {"parameter": p.name, "unit": p.unit, **vars(row), "k": np.nan, "U": np.nan}
+                for p in self.parameters
+                for row in (*p.rows, BudgetRow("combined", "A", p.u, p.dof, 1.0))
+            ]
+        ).assign(
+            k=[v for p in self.parameters for v in (*[np.nan] * len(p.rows), p.k)],
+            U=[v for p in self.parameters for v in (*[np.nan] * len(p.rows), p.U)],
+            kind=[v for p in self.parameters for v in (*[r.kind for r in p.rows], "")],
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON; infinite degrees of freedom are None."""
+        return {
+            "confidence": CONFIDENCE,
+            "taken_as_exact": list(self.exact),
+            "parameters": {
+                p.name: {
+                    "value": p.value,
+                    "unit": p.unit,
+                    "u": p.u,
+                    "dof": _finite(p.dof),
+                    "k": p.k,
+                    "U": p.U,
+                    "sources": [{**vars(row), "dof": _finite(row.dof)} for row in p.rows],
+                }
+                for p in self.parameters
+            },
+        }
+
+    def numbers(self, library: Literal["uncertainties", "GTC"] = "uncertainties") -> dict[str, Any]:
+        """Return the parameters as correlated numbers of a library for uncertain numbers.
+
+        Parameters
+        ----------
+        library : {"uncertainties", "GTC"}, default "uncertainties"
+            Which must be installed.
+
+        Returns
+        -------
+        dict of str to number
+
+        Raises
+        ------
+        ValueError
+            If the library is unknown.
+        """
+        values = [p.value for p in self.parameters]
+        if library == "uncertainties":
+            from uncertainties import correlated_values  # type: ignore[import-untyped]
+
+            return dict(zip(self, correlated_values(values, self.covariance), strict=True))
+        if library != "GTC":
+            raise ValueError(f"library is {library!r}; expected uncertainties or GTC")
+        from GTC import (  # type: ignore[import-not-found]
+            multiple_ureal,
+            set_correlation,
+        )
+
+        u = np.sqrt(np.diagonal(self.covariance))
+        dof = [min(p.dof for p in self.parameters)] * len(values)
+        made = multiple_ureal(values, u.tolist(), dof, list(self))
+        for i in range(len(made)):
+            for j in range(i):
+                set_correlation(float(self.covariance[i, j] / (u[i] * u[j])), made[i], made[j])
+        return dict(zip(self, made, strict=True))
+
+
+def budget(optimum: Optimum, errors: ErrorModel | None = None) -> Budget:
+    """Return the uncertainty budget of every free parameter of a fit.
+
+    Parameters
+    ----------
+    optimum : Optimum
+        ``fit(...).optimum``.
+    errors : ErrorModel, optional
+        Its error model, where that is known already.
+
+    Returns
+    -------
+    Budget
+
+    Raises
+    ------
+    FitError
+        If a parameter is undetermined, or no residual is left to estimate an uncertainty from.
+    """
+    errors = errors or error_model(optimum)
+    if errors is None:
+        raise FitError(
+            "no uncertainty budget: a parameter is undetermined, or nothing is left to estimate "
+            f"the errors from ({optimum.message}); fix a parameter or measure more points"
+        )
+    problem = errors.problem
+    slopes = problem.value_slopes(errors.theta)
+    parameters = []
+    units = {p.name: p.unit for p in problem.parameters}
+    for i, name in enumerate(errors.names):
+        if name in errors.assumed:
+            continue
+        direction = np.zeros(len(errors.names))
+        direction[i] = abs(float(slopes[i]))
+        parameters.append(_parameter(errors, name, units[name], direction))
+    kept = [i for i, name in enumerate(errors.names) if name not in errors.assumed]
+    D = slopes[kept]
+    covariance = errors.covariance[np.ix_(kept, kept)] * np.outer(D, D)
+    return Budget(tuple(parameters), covariance, taken_as_exact(optimum))
+
+
+def coverage_factor(dof: float, confidence: float = CONFIDENCE) -> float:
+    """Return k of Student's t, of the normal distribution for infinite degrees of freedom.
+
+    Examples
+    --------
+    >>> round(coverage_factor(2.0), 2), round(coverage_factor(float("inf")), 2)
+    (4.53, 2.0)
+    """
+    upper = 0.5 * (1.0 + confidence)
+    return float(special.ndtri(upper) if np.isinf(dof) else special.stdtrit(dof, upper))
+
+
+def taken_as_exact(optimum: Optimum) -> tuple[str, ...]:
+    """Return the calibrations that nobody stated an uncertainty of."""
+    sensors, priors = optimum.problem.sensors, optimum.problem.priors
+    free = {p.name for p in sensors.parameters if p.free}
+    return tuple(
+        text for name, text in _CHANNELS.items() if name not in priors and name not in free
+    )
+
+
+def _parameter(errors: ErrorModel, name: str, unit: str, direction: FloatArray) -> ParameterBudget:
+    total = float(direction @ errors.covariance @ direction)
+    rows = []
+    for source, covariance in errors.contributions.items():
+        own = float(direction @ covariance @ direction)
+        kind: Literal["A", "B"] = "A" if source in _TYPE_A else "B"
+        dof = errors.dof(direction, [source]) if kind == "A" else np.inf
+        rows.append(BudgetRow(source, kind, own**0.5, dof, own / total if total > 0.0 else 0.0))
+    rows.sort(key=lambda row: -row.u)
+    dof = errors.dof(direction)
+    value = errors.values[name]
+    return ParameterBudget(name, unit, value, tuple(rows), total**0.5, dof, coverage_factor(dof))
+
+
+def _dof(dof: float) -> str:
+    return "inf" if np.isinf(dof) else f"{dof:.3g}"
+
+
+def _finite(dof: float) -> float | None:
+    return float(dof) if np.isfinite(dof) else None

@@ -1,0 +1,163 @@
+"""Covariance of an estimate from a record, whose residuals are correlated from sample to sample.
+
+Least squares is unbiased with such residuals, but (J'J)^-1 times their variance is not its
+covariance, often ten times too small. The residuals' spectrum is estimated by an autoregressive
+model, its order by Akaike's criterion, and their correlation matrix R put where it belongs:
+
+    covariance = (J'J)^-1 J'R J (J'J)^-1
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import fft
+from scipy.linalg import solve_toeplitz, toeplitz
+
+from dahl_ident.arrays import FloatArray
+
+_HIGHEST_ORDER = 60
+_SAMPLES_PER_ORDER = 20
+_CORRECTIONS = 4
+
+
+def sandwich(
+    jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]
+) -> tuple[FloatArray, float]:
+    """Return the covariance of a least-squares estimate, and the effective number of samples.
+
+    Parameters
+    ----------
+    jacobians : sequence of ndarray, shape (n_i, P)
+        Derivatives of each record's prediction by the P parameters.
+    residuals : sequence of ndarray, shape (n_i,)
+        Measured minus predicted.
+
+    Returns
+    -------
+    covariance : ndarray, shape (P, P)
+        Infinite where J'J is singular.
+    effective : float
+        Samples, divided by the mean ratio of a parameter's variance to what it would be if the
+        residuals were not correlated.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> J = np.column_stack([np.ones(1000), np.arange(1000.0)])
+    >>> covariance, effective = sandwich([J], [rng.standard_normal(1000)])
+    >>> bool(500 < effective < 2000)
+    True
+    """
+    P = jacobians[0].shape[1]
+    samples = sum(e.size for e in residuals)
+    total = sum(float(e @ e) for e in residuals)
+    variance = total / max(samples - P, 1)
+    size = np.sqrt(sum((J**2).sum(axis=0) for J in jacobians))
+    size = np.where(size > 0.0, size, 1.0)
+    normal = np.zeros((P, P))
+    middle = np.zeros((P, P))
+    for J, e in zip(jacobians, residuals, strict=True):
+        scaled = J / size
+        normal += scaled.T @ scaled
+        middle += _correlated(scaled, e)
+    lowest = np.linalg.eigvalsh(normal)[0]
+    if not lowest > 1e-15:
+        return np.full((P, P), np.inf), float(samples)
+    inverse = np.linalg.inv(normal)
+    white = inverse * variance
+    covariance = inverse @ middle @ inverse
+    ratio = float(np.mean(covariance.diagonal() / white.diagonal())) if variance > 0.0 else 1.0
+    return covariance / np.outer(size, size), samples / max(ratio, 1e-300)
+
+
+def autoregression(
+    residual: FloatArray, jacobian: FloatArray | None = None
+) -> tuple[FloatArray, float]:
+    """Return the coefficients of an autoregressive model and its innovations' variance.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n,)
+        Of mean zero, nearly.
+    jacobian : ndarray, shape (n, P), optional
+        Of the fit that left the residuals. A fit takes a part of the noise away, most of slow
+        noise; the autocovariances are corrected for what a fit of such noise would take.
+
+    Returns
+    -------
+    coefficients : ndarray, shape (order,)
+        a_k in e_t = sum a_k e_(t-k) + innovation; the order has the least criterion of Akaike.
+    variance : float
+    """
+    n = residual.size
+    highest = int(min(_HIGHEST_ORDER, n // _SAMPLES_PER_ORDER))
+    spectrum = np.abs(fft.rfft(residual, 2 * n)) ** 2
+    seen = fft.irfft(spectrum)[: highest + 1] / n
+    model = _chosen(seen, n)
+    if jacobian is None or seen[0] <= 0.0:
+        return model
+    basis = np.linalg.qr(jacobian)[0]
+    for _ in range(_CORRECTIONS):
+        taken = _taken_by_a_fit(basis, model, highest)
+        corrected = seen + taken
+        if np.linalg.eigvalsh(toeplitz(corrected))[0] <= 0.0:
+            break
+        model = _chosen(corrected, n)
+    return model
+
+
+def _chosen(covariance: FloatArray, n: int) -> tuple[FloatArray, float]:
+    """Return the autoregressive model of the order that Akaike's criterion prefers."""
+    best, chosen = np.inf, (np.zeros(0), float(covariance[0]))
+    if covariance[0] <= 0.0:
+        return chosen
+    for order in range(covariance.size):
+        if order:
+            a = solve_toeplitz(covariance[:order], covariance[1 : order + 1])
+            left = float(covariance[0] - a @ covariance[1 : order + 1])
+        else:
+            a, left = np.zeros(0), float(covariance[0])
+        criterion = n * np.log(max(left, 1e-300)) + 2.0 * order
+        if criterion < best:
+            best, chosen = criterion, (a, max(left, 1e-300))
+    return chosen
+
+
+def _taken_by_a_fit(basis: FloatArray, model: tuple[FloatArray, float], highest: int) -> FloatArray:
+    """Return by how much a projection lowers the mean autocovariances of such noise.
+
+    With Q an orthonormal basis of what was fitted, R the noise's covariance matrix and S_k the
+    shift by k: (2 tr(Q' R S_k Q) - tr(Q' S_k Q Q' R Q))/n, S_k made symmetric.
+    """
+    n = basis.shape[0]
+    m = fft.next_fast_len(2 * n, real=True)
+    waves = fft.rfft(basis, m, axis=0)
+    filtered = fft.irfft(waves * _spectrum(model, m)[:, None], m, axis=0)[:n]
+    inner = basis.T @ filtered
+    taken = np.empty(highest + 1)
+    for k in range(highest + 1):
+        ahead, behind = basis[k:], basis[: n - k]
+        crossed = np.sum(filtered[k:] * behind) + np.sum(filtered[: n - k] * ahead)
+        shifted = 0.5 * (ahead.T @ behind + behind.T @ ahead)
+        taken[k] = (crossed - np.sum(shifted * inner)) / n
+    return taken
+
+
+def _spectrum(model: tuple[FloatArray, float], m: int) -> FloatArray:
+    a, variance = model
+    return np.asarray(variance / np.abs(fft.rfft(np.concatenate([[1.0], -a]), m)) ** 2)
+
+
+def _correlated(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
+    """Return J'R J, R the residuals' covariance matrix from their spectrum."""
+    n = residual.size
+    m = fft.next_fast_len(2 * n, real=True)
+    spectrum = _spectrum(autoregression(residual, jacobian), m)
+    waves = fft.rfft(jacobian, m, axis=0)
+    weights = np.full(spectrum.size, 2.0)
+    weights[0] = 1.0
+    if m % 2 == 0:
+        weights[-1] = 1.0
+    return np.asarray(np.real(waves.conj().T @ (waves * (spectrum * weights)[:, None])) / m)

@@ -1,0 +1,123 @@
+r"""Do the bands hold? Each test is predicted from the others, and compared with what was measured.
+
+For the linear mixed model of :mod:`dahl_ident.diagnostics.error_model` the prediction of rows b
+from all others, parameters estimated without them, misses by
+
+    e_b = (P_bb)^-1 (P y)_b,    with the covariance (P_bb)^-1,
+
+P as in :mod:`dahl_ident.diagnostics.variance_components`; nothing is fitted again. Source:
+Dubrule, *Cross validation of kriging in a unique neighborhood*, Mathematical Geology 15 (1983) 687.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.budget import coverage_factor
+from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.error_sources import repeated_levels
+
+_FEWEST_TESTS = 3
+_CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Held-out gains and phases against their 95 % bands.
+
+    Attributes
+    ----------
+    tests : int
+        Runs, levels or rows that were left out, one at a time.
+    inside, count : int
+        Held-out gains and phases inside their bands, and all of them.
+    width : float
+        Root mean square of the bands' half widths, in ln gain and phase (rad).
+    misfit : float
+        Root mean square of the held-out deviations, in the same.
+    """
+
+    tests: int
+    inside: int
+    count: int
+    width: float
+    misfit: float
+
+    def __str__(self) -> str:
+        return (
+            f"leaving out each of {self.tests} tests in turn, {self.inside} of {self.count} "
+            f"held-out gains and phases are inside their 95 % bands (half width "
+            f"{100.0 * self.width:.2g} %)"
+        )
+
+
+def cross_validation(errors: ErrorModel) -> CrossValidation | None:
+    """Return how well bands hold for tests that were left out; None with fewer than three tests.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> from dahl_ident.diagnostics import error_model
+    >>> found = cross_validation(error_model(di.fit(di.load_dataset("noisy"), di.Dahl()).optimum))
+    >>> found.inside > 0.8 * found.count
+    True
+    """
+    problem = errors.problem
+    tests = tests_of(problem.data, errors)
+    if len(tests) < _FEWEST_TESTS:
+        return None
+    P, y = errors.full_projection()
+    Py = P @ y
+    k = _factor(errors)
+    deviations, widths = [], []
+    turn = errors.relative_units()
+    for rows in tests:
+        index = (2 * rows[:, None] + np.arange(2)).ravel()
+        block = P[np.ix_(index, index)]
+        try:
+            covariance = np.linalg.inv(block)
+        except np.linalg.LinAlgError:
+            continue
+        missed = (covariance @ Py[index]).reshape(-1, 2)
+        for place, row in enumerate(rows):
+            part = covariance[2 * place : 2 * place + 2, 2 * place : 2 * place + 2]
+            to_relative = turn[row]
+            own = to_relative @ part @ to_relative.T
+            deviations.append(to_relative @ missed[place])
+            widths.append(k * np.sqrt(np.maximum(np.diagonal(own), 0.0)))
+    found, width = np.array(deviations), np.array(widths)
+    known = np.isfinite(width) & (width < 1e6) & (width > 0.0)
+    if not known.any():
+        return None
+    return CrossValidation(
+        len(tests),
+        int((np.abs(found) <= width)[known].sum()),
+        int(known.sum()),
+        float(np.sqrt(np.mean(width[known] ** 2))),
+        float(np.sqrt(np.mean(found[known] ** 2))),
+    )
+
+
+def tests_of(data: FrequencyResponse, errors: ErrorModel) -> list[NDArray[np.intp]]:
+    """Return the rows of each test: runs, else labelled levels, else repeats of one level."""
+    for labels in (data.run, data.level):
+        if labels is not None:
+            names = np.unique(labels)
+            if _FEWEST_TESTS <= len(names) < data.n:
+                return [np.flatnonzero(np.asarray(labels) == name) for name in names]
+    view = errors.problem.stiffness_data
+    return repeated_levels(view.amplitude, view.omega)
+
+
+def _factor(errors: ErrorModel) -> float:
+    """Return the factor of a prediction's band, by the degrees of freedom of the variances."""
+    total = float(errors.variances.sum())
+    C = errors.components.covariance
+    spread = float(C.sum())
+    if not spread > 0.0 or errors.problem.scale_known:
+        return coverage_factor(np.inf, _CONFIDENCE)
+    return coverage_factor(max(2.0, 2.0 * total**2 / spread), _CONFIDENCE)

@@ -1,0 +1,383 @@
+r"""Where the errors of an estimate come from: one linear mixed model of all sources.
+
+Write each row's log response as
+
+    ln R_i = ln R(A_i, omega_i; theta) + run_i + level_i + d(ln A_i, ln omega_i) + e_i
+
+with noise e, scatter between runs and between repeats of a level, and a smooth model error d
+(:mod:`dahl_ident.diagnostics.error_sources`). Exponents that were assumed, not given, and
+calibrations with a stated uncertainty are parameters with a prior. Variances follow from
+restricted maximum likelihood (:mod:`dahl_ident.diagnostics.variance_components`). With V the sum
+of the covariances, priors included as rows of unit variance,
+
+    G = (J' V^-1 J)^-1 J' V^-1,
+
+the estimate is that of generalised least squares, iterated where the exponent moves, and its
+covariance is the sum of G V_k G' over the sources: the rows of an uncertainty budget
+(JCGM 100:2008). Source: Searle, Casella and McCulloch, *Variance Components*, 1992; Rasmussen and
+Williams, *Gaussian Processes*, 2006, section 2.7.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.error_sources import (
+    MODEL_ERROR,
+    NOISE,
+    Source,
+    additive,
+    gain_and_phase,
+    of_one_scale,
+    relative_scatter,
+    structured_sources,
+)
+from dahl_ident.diagnostics.variance_components import (
+    LinearModel,
+    Projection,
+    VarianceComponents,
+    variance_components,
+)
+from dahl_ident.fitting import Optimum
+from dahl_ident.problem import Problem
+
+EXPONENT = "exponent"
+DRIVE = "drive factor"
+_STEPS = 6
+_SETTLED = 0.02  # of a standard deviation that an iteration still moves an estimate
+_LONGEST_STEP = 0.7  # of a logarithm, in one iteration: the model is linearised
+_ASKED_FOR = {MODEL_ERROR: 0.2, NOISE: 0.3}  # rise of the log-likelihood that a source takes
+_SUPPORTED = 4.0  # the same for another kind of noise: 0.5 % of the tables, by chance
+_LEAST_DOF = 4  # residuals beyond the parameters, below which there is noise alone
+_FEW_ROWS = 100  # with more, rows are compressed to the directions that sources can change
+_CALIBRATIONS = {
+    "force_gain": "force calibration",
+    "displacement_gain": "displacement calibration",
+    "delay": "delay",
+}
+
+
+class Assumption(NamedTuple):
+    """A parameter held at a value that has an uncertainty: its source, and that of its log."""
+
+    source: str
+    std: float
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """An estimate that takes every source of error into account, and its covariance by source.
+
+    Attributes
+    ----------
+    optimum : Optimum
+        The least-squares fit that it started from.
+    problem : Problem
+        The same with the assumed exponents free; its `names` order every array here.
+    theta : ndarray, shape (Q,)
+        Generalised least squares, search coordinates.
+    sources : tuple of Source
+        Random errors of the rows, K of them.
+    variances : ndarray, shape (K,)
+        Of the sources.
+    contributions : mapping of str to ndarray, shape (Q, Q)
+        Covariance of theta by source, type A first.
+    assumed : tuple of str
+        Names of parameters that were assumed: exponents, the force gain for a drive factor.
+    """
+
+    optimum: Optimum
+    problem: Problem
+    theta: FloatArray
+    sources: tuple[Source, ...]
+    components: VarianceComponents
+    contributions: Mapping[str, FloatArray]
+    assumed: tuple[str, ...]
+    linear: LinearModel
+    projection: Projection
+
+    @property
+    def variances(self) -> FloatArray:
+        """Variance of each source."""
+        return self.components.variances
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Free parameters and assumed exponents."""
+        return self.problem.names
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Combined covariance of theta, shape (Q, Q)."""
+        return np.asarray(sum(self.contributions.values()))
+
+    @cached_property
+    def inverse(self) -> FloatArray:
+        """G, shape (Q, m)."""
+        return self.projection.generalised_inverse()
+
+    @cached_property
+    def values(self) -> Mapping[str, float]:
+        """The estimates by name."""
+        return dict(zip(self.names, self.problem.to_values(self.theta).tolist(), strict=True))
+
+    @cached_property
+    def stderr(self) -> Mapping[str, float]:
+        """Combined standard uncertainty of each value, by name."""
+        size = np.abs(self.problem.value_slopes(self.theta))
+        errors = size * np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0))
+        return dict(zip(self.names, errors.tolist(), strict=True))
+
+    def dof(self, direction: FloatArray, sources: Sequence[str] | None = None) -> float:
+        """Return the effective degrees of freedom of the uncertainty of direction . theta.
+
+        Satterthwaite's: 2 u^4 over the variance of u^2 that the variances' own errors make, no
+        less than 1. `sources` leaves only these; infinite where all variances are known.
+        """
+        lever = direction @ self.inverse
+        shares = np.zeros(len(self.sources))
+        for k, (source, part) in enumerate(zip(self.sources, self.linear.Z, strict=True)):
+            if sources is None or source.name in sources:
+                moved = lever * part if part.ndim == 1 else lever @ part
+                shares[k] = moved @ moved
+        spread = float(shares @ self.components.covariance @ shares)
+        if not spread > 0.0:
+            return np.inf
+        counted = self.contributions if sources is None else sources
+        total = sum(float(direction @ self.contributions[n] @ direction) for n in counted)
+        return max(1.0, 2.0 * total**2 / spread)
+
+    def full_projection(self) -> tuple[FloatArray, FloatArray]:
+        """Return P of the data's rows, compressed or not, and their residuals; (m, m) and (m,)."""
+        m = self.problem.n_residuals
+        residuals = self.problem.residuals(self.theta)[:m]
+        P, rotation = self.projection.P, self.linear.rotation
+        if rotation is None:
+            return P[:m, :m], residuals
+        r = rotation.shape[1]
+        outside = 1.0 / self.linear.outside_variance(self.variances)
+        inner = P[:r, :r] - outside * np.eye(r)
+        return outside * np.eye(m) + rotation @ inner @ rotation.T, residuals
+
+    def relative_units(self) -> FloatArray:
+        """Return what takes each row's residuals to ln gain and phase, shape (n, 2, 2)."""
+        return relative_units(self.problem, self.theta)
+
+    def share_of(self, name: str) -> float:
+        """Return the root mean square of a source's errors over the rows, in ln gain and phase."""
+        size = 0.0
+        for source, variance in zip(self.sources, self.variances, strict=True):
+            if source.name == name:
+                size += variance * source.mean_square
+        return float(np.sqrt(size))
+
+
+def relative_units(problem: Problem, theta: FloatArray) -> FloatArray:
+    """Return what takes each row's residuals to ln gain and phase, shape (n, 2, 2)."""
+    predicted = problem.predict(theta)
+    parts = [-problem.residual_change(theta, f * predicted) for f in (1.0, 1j)]
+    return np.linalg.pinv(np.stack([part.reshape(-1, 2) for part in parts], axis=-1))
+
+
+def error_model(optimum: Optimum) -> ErrorModel | None:
+    """Return the model of an optimum's errors; None where there is nothing to estimate it from.
+
+    Parameters
+    ----------
+    optimum : Optimum
+        From :func:`dahl_ident.fitting.solve`.
+
+    Returns
+    -------
+    ErrorModel or None
+        None where no finite optimum was found, a parameter is undetermined, the loss is robust,
+        residuals are rounding errors, or none is left beyond the parameters.
+    """
+    if optimum.loss != "linear":
+        return None  # its errors are those of the robust estimate, noise alone
+    if not optimum.success or optimum.is_exact or not np.isfinite(optimum.covariance).all():
+        return None
+    problem, assumed = _with_assumed(optimum.problem)
+    if problem.n_residuals - len(optimum.names) <= 0:
+        return None
+    try:
+        return _estimated(optimum, problem, assumed)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _with_assumed(given: Problem) -> tuple[Problem, dict[str, Assumption]]:
+    """Return the problem with what was assumed free: exponents, and the factor of the drive."""
+    assumed = {
+        p.name: Assumption(EXPONENT, float(np.log(p.prior[1] / p.prior[0]) / np.sqrt(12.0)))
+        for p in given.model.parameters
+        if p.assumed and not p.free and p.prior is not None
+    }
+    u = given.data.drive_factor_uncertainty
+    gain = next(p for p in given.sensors.parameters if p.name == "force_gain")
+    if u and not gain.free:
+        assumed[gain.name] = Assumption(DRIVE, float(u))
+    if not assumed:
+        return given, {}
+    free = Problem(given.data, given.model, noise=given.noise, sensors=given.sensors, free=assumed)
+    return free, assumed
+
+
+class _Rows:
+    """Residuals and Jacobian at a point, counted as the optimum counts them."""
+
+    def __init__(
+        self, optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumption]
+    ) -> None:
+        self._problem = problem
+        names, known = problem.names, dict(zip(optimum.names, optimum.theta, strict=True))
+        self.start = np.array(
+            [known.get(p.name, np.log(p.value or 1.0)) for p in problem.parameters]
+        )
+        self.m = problem.n_residuals
+        self._select = np.zeros((len(assumed), len(names)))
+        for row, (name, one) in enumerate(assumed.items()):
+            self._select[row, names.index(name)] = 1.0 / one.std
+
+    def at(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return residuals and Jacobian: data, priors of sensors, ranges of exponents."""
+        y, J = self._problem.residuals_and_jacobian(theta, tails=False)
+        weight = self._weight(y)
+        y = np.concatenate([y * weight, self._select @ (theta - self.start)])
+        return y, np.vstack([J * weight[:, None], self._select])
+
+    def _weight(self, y: FloatArray) -> FloatArray:
+        """Return the root of what a covariance of few degrees of freedom counts a row for."""
+        weight, m, problem = np.ones(len(y)), self.m, self._problem
+        dof = problem.data.dof
+        if not problem.gaussian and dof is not None:
+            nu = np.minimum(dof, 1e12)  # a covariance of few dof: the variance of Student's t
+            weight[:m] = np.repeat(np.sqrt((nu - 2.0) / nu), 2)
+        return weight
+
+
+def _estimated(optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumption]) -> ErrorModel:
+    rows = _Rows(optimum, problem, assumed)
+    theta, m = rows.start, rows.m
+    noise: tuple[Source, ...] | None = None
+    for step in range(_STEPS):
+        y, J = rows.at(theta)
+        level = float(y[:m] @ y[:m]) / max(m - J.shape[1], 1)
+        rest: tuple[Source, ...] = ()
+        if m - J.shape[1] + len(assumed) >= _LEAST_DOF:
+            rest = structured_sources(problem, theta, J[:m])
+        plain = (
+            (*of_one_scale(problem), *relative_scatter(problem, theta))
+            if rest and m <= 2 * _FEW_ROWS
+            else of_one_scale(problem)
+        )
+        sources, linear, found = _supported(problem, y, J, noise or plain, rest, level)
+        if noise is None and step == 1:
+            noise = plain
+            if rest and not problem.scale_known and m <= 2 * _FEW_ROWS:
+                noise, sources, linear, found = _kind_of_noise(
+                    problem, y, J, (sources, linear, found), level
+                )
+        projection = Projection(linear, found.variances)
+        G = projection.generalised_inverse()
+        move = -G @ linear.y
+        std = np.sqrt(np.diagonal(G @ linear.covariance(found.variances) @ G.T))
+        if step == _STEPS - 1 or (step > 1 and np.all(np.abs(move) < _SETTLED * std)):
+            break
+        theta = theta + move * min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
+    contributions = _by_source(problem, assumed, sources, linear, found, G)
+    return ErrorModel(
+        optimum, problem, theta, sources, found, contributions, tuple(assumed), linear, projection
+    )
+
+
+_Found = tuple[tuple[Source, ...], LinearModel, VarianceComponents]
+
+
+def _fitted(
+    problem: Problem, y: FloatArray, J: FloatArray, sources: tuple[Source, ...], level: float
+) -> _Found:
+    """Return the variances of these sources."""
+    m, extra = problem.n_residuals, len(y) - problem.n_residuals
+    known = np.concatenate([np.full(m, float(problem.scale_known)), np.ones(extra)])
+    Z = [np.concatenate([s.columns, np.zeros((extra, *s.columns.shape[1:]))]) for s in sources]
+    start = np.array(
+        [
+            level if s.name == NOISE and s.columns.ndim == 1 and not problem.scale_known else 0.0
+            for s in sources
+        ]
+    )
+    upper = np.array([s.largest for s in sources])
+    linear = LinearModel(y, J, known, Z)
+    if m > 2 * _FEW_ROWS:
+        linear = linear.compressed(m)
+    return sources, linear, variance_components(linear, start, upper)
+
+
+def _supported(
+    problem: Problem,
+    y: FloatArray,
+    J: FloatArray,
+    noise: tuple[Source, ...],
+    rest: tuple[Source, ...],
+    level: float,
+) -> _Found:
+    """Return the sources; model errors and noise of the amplitudes where the data ask for them."""
+    optional = [s for s in rest if s.name in (MODEL_ERROR, NOISE)]
+    always = [s for s in rest if s.name not in (MODEL_ERROR, NOISE)]
+    subsets = [c for k in range(len(optional) + 1) for c in combinations(optional, k)]
+    best, best_value = None, -np.inf
+    for subset in subsets:
+        found = _fitted(problem, y, J, (*noise, *subset, *always), level)
+        value = found[2].log_likelihood - sum(_ASKED_FOR[s.name] for s in subset)
+        if best is None or value > best_value:
+            best, best_value = found, value
+    assert best is not None
+    return best
+
+
+def _kind_of_noise(
+    problem: Problem, y: FloatArray, J: FloatArray, found: _Found, level: float
+) -> tuple[tuple[Source, ...], tuple[Source, ...], LinearModel, VarianceComponents]:
+    """Return the kind of noise that the residuals support, and the sources with it."""
+    best, kind = found, tuple(s for s in found[0] if s.name == NOISE and s.columns.ndim == 1)
+    rest = tuple(s for s in found[0] if not any(s is k for k in kind))
+    for trial in (gain_and_phase(problem), additive(problem)):
+        if not trial:
+            continue
+        other = _fitted(problem, y, J, (*trial, *rest), level)
+        if other[2].log_likelihood > best[2].log_likelihood + _SUPPORTED:
+            best, kind = other, trial
+    return (kind, *best)
+
+
+def _by_source(
+    problem: Problem,
+    assumed: Mapping[str, Assumption],
+    sources: tuple[Source, ...],
+    linear: LinearModel,
+    found: VarianceComponents,
+    G: FloatArray,
+) -> dict[str, FloatArray]:
+    """Return the covariance of theta that each source makes."""
+    result = {}
+    priors = [_CALIBRATIONS.get(name, name) for name in problem.priors]
+    known = [*priors, *(one.source for one in assumed.values())]
+    m = len(linear.y) - len(known)
+    if problem.scale_known:
+        result[NOISE] = G[:, :m] @ G[:, :m].T
+    for source, part, variance in zip(sources, linear.Z, found.variances.tolist(), strict=True):
+        lever = G * part if part.ndim == 1 else G @ part
+        own = variance * lever @ lever.T
+        result[source.name] = result[source.name] + own if source.name in result else own
+    for row, name in enumerate(known, start=m):
+        own = np.outer(G[:, row], G[:, row])
+        result[name] = result[name] + own if name in result else own
+    return result

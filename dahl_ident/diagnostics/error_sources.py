@@ -1,0 +1,295 @@
+r"""What makes residuals correlated or uneven: noise, scatter, and what the model misses.
+
+Each source is a set of columns: its errors are the columns times independent numbers of one
+variance. Departures are relative changes of the response, so that the same source serves every
+quantity and noise model. The model error is a Gaussian process with the correlation
+
+    exp(-(d ln A)^2/2 - (d ln omega)^2/2),
+
+a length of one in either logarithm, for gain and phase alike; beside it stands a force in
+proportion to displacement that varies smoothly with frequency alone, as a mass, damper or spring
+that the model lacks would make; what the model's own linear parts can do of it is theirs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.problem import Problem
+
+NOISE = "noise"
+MODEL_ERROR = "model error"
+RUNS = "scatter between runs"
+LEVELS = "scatter between repeated levels"
+
+_LENGTH = 1.0  # of the model error, in ln A and ln omega
+_SMOOTH = 1e-3  # eigenvalue of the correlation, over the largest, that no row notices
+_MOST_SHAPES = 24  # of its eigenvectors; a decade of both amplitude and frequency takes 15
+_SAME_LEVEL = 0.02  # of ln A and ln f, within which rows repeat each other
+_MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it leaves
+_STEP = 1e-5  # of ln A, for a slope
+_FEWEST = 2  # runs, or repeated levels, that show a scatter
+
+
+@dataclass(frozen=True)
+class Source:
+    """One source of random error.
+
+    Attributes
+    ----------
+    name : str
+        As a budget lists it; several sources may share one.
+    columns : ndarray, shape (m, q) or (m,)
+        Residuals at unit variance; one dimension stands for a diagonal matrix.
+    mean_square : float
+        Of ln gain and phase over the rows, at unit variance.
+    shapes : Shapes or None
+        What continues the source to other amplitudes and frequencies.
+    own : str
+        What another test has an own draw of: "gain", "phase", "both" or a parameter's name;
+        empty for noise and model error.
+    largest : float
+        Variance.
+    absorbed : ndarray, shape (Q, q), or None
+        Changes of theta that do the same as each column; taken out of the columns.
+    """
+
+    name: str
+    columns: FloatArray
+    mean_square: float
+    shapes: Shapes | None = None
+    own: str = ""
+    largest: float = np.inf
+    absorbed: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Eigenvectors of a smooth correlation between rows, continued to other places.
+
+    Attributes
+    ----------
+    places : ndarray, shape (n, 2)
+        ln A and ln omega of the rows.
+    parallel : bool
+        Whether it is a force beside the model, which depends on frequency alone.
+    unit : float
+        Stiffness at unit variance of such a force.
+    """
+
+    places: FloatArray
+    weights: FloatArray
+    parallel: bool
+    unit: float
+
+    @classmethod
+    def of(cls, places: FloatArray, *, parallel: bool, unit: float = 1.0) -> Shapes:
+        """Return the eigenvectors that rows notice."""
+        values, vectors = np.linalg.eigh(_correlation(places, places, parallel))
+        kept = np.flatnonzero(values > _SMOOTH * values[-1])[::-1][:_MOST_SHAPES]
+        return cls(places, vectors[:, kept] / np.sqrt(values[kept]), parallel, unit)
+
+    def at(self, places: FloatArray) -> FloatArray:
+        """Return the shapes at other places (k, 2), shape (k, q)."""
+        return np.asarray(_correlation(places, self.places, self.parallel) @ self.weights)
+
+    def changes(self, places: FloatArray, stiffness: ComplexArray) -> ComplexArray:
+        """Return relative changes of the response by each shape, gain and phase, (2 q, k)."""
+        shapes = self.at(places).T.astype(np.complex128)
+        if self.parallel:
+            # a response of zero has no relative change that an element could make
+            shapes = shapes * np.divide(
+                self.unit, stiffness, out=np.zeros_like(stiffness), where=stiffness != 0.0
+            )
+        return np.asarray(np.concatenate([shapes, 1j * shapes]))
+
+
+def places(amplitude: FloatArray, omega: FloatArray) -> FloatArray:
+    """Return ln A and ln omega, shape (n, 2)."""
+    return np.asarray(np.log(np.column_stack(np.broadcast_arrays(amplitude, omega))))
+
+
+def of_one_scale(problem: Problem) -> tuple[Source, ...]:
+    """Return noise of one scale: unknown, or beyond that of the data's covariance."""
+    return (Source(NOISE, np.ones(problem.n_residuals), _unit_noise(problem)),)
+
+
+def gain_and_phase(problem: Problem) -> tuple[Source, ...]:
+    """Return noise with a scale each for gain and phase; empty where residuals mix them."""
+    if problem.noise != "relative":
+        return ()
+    n = problem.n_residuals // 2
+    return tuple(Source(NOISE, np.tile(part, n), 0.5) for part in ([1.0, 0.0], [0.0, 1.0]))
+
+
+def additive(problem: Problem) -> tuple[Source, ...]:
+    """Return noise of constant size in the response, beside that in proportion to it."""
+    if problem.noise != "relative":
+        return ()
+    size = np.exp(np.log(np.abs(problem.data.response)).mean()) / np.abs(problem.data.response)
+    floor = Source(NOISE, np.repeat(size, 2), float(np.mean(size**2)))
+    return (*of_one_scale(problem), floor)
+
+
+def relative_scatter(problem: Problem, theta: FloatArray) -> tuple[Source, ...]:
+    """Return scatter of ln gain and phase alike, beside a stated covariance.
+
+    Harmonics have a scatter of their own: what a model misses of them is no error of the
+    fundamental.
+    """
+    if not problem.scale_known:
+        return ()
+    n, predicted = problem.n_residuals // 2, problem.predict(theta)
+    parts = [-problem.residual_change(theta, f * predicted).reshape(n, 2) for f in (1.0, 1j)]
+    first = problem.data.harmonic == 1
+    found = []
+    for own in (first, ~first):
+        if own.any():
+            blocks = np.zeros((n, 2, n, 2))
+            blocks[np.arange(n), :, np.arange(n), :] = np.stack(parts, axis=-1)
+            columns = blocks[:, :, own].reshape(2 * n, -1)
+            found.append(Source(NOISE, columns, float(own.mean())))
+    return tuple(found)
+
+
+def amplitude_noise(problem: Problem, theta: FloatArray) -> tuple[Source, ...]:
+    """Return noise of the amplitudes at which relative responses are said to have been measured.
+
+    It counts in slip, where the response changes with amplitude, and not in microslip.
+    """
+    data = problem.data
+    if data.amplitude is None or problem.scale_known or problem.noise != "relative":
+        return ()
+    moved = replace(data, amplitude=data.amplitude * np.exp(_STEP))
+    other = Problem(moved, problem.model, noise=problem.noise, sensors=problem.sensors)
+    change = (other.predict(theta) - problem.predict(theta)) / _STEP
+    n = data.n
+    columns = np.zeros((n, 2, n))
+    columns[np.arange(n), :, np.arange(n)] = -problem.residual_change(theta, change).reshape(n, 2)
+    square = 0.5 * float(np.mean(np.abs(change / problem.predict(theta)) ** 2))
+    return (Source(NOISE, columns.reshape(2 * n, n), square),)
+
+
+def structured_sources(problem: Problem, theta: FloatArray, J: FloatArray) -> tuple[Source, ...]:
+    """Return the sources that several rows share, at theta; `J` is the data's Jacobian there."""
+    view, data = problem.stiffness_data, problem.data
+    predicted = problem.predict(theta)
+    size = _sizes(problem, predicted)
+    where = places(view.amplitude, view.omega)
+    fundamental = view.harmonic == 1
+
+    def columns(changes: ComplexArray) -> FloatArray:
+        """Return residuals for relative changes (k, n), shape (m, k)."""
+        return -problem.residual_change(theta, changes * size).T
+
+    unit = float(np.abs(view.stiffness[fundamental]).max(initial=0.0)) or 1.0
+    stiffness = np.where(fundamental, view.stiffness, np.inf)
+    shapes = (Shapes.of(where, parallel=False), Shapes.of(where, parallel=True, unit=unit))
+    missed = np.abs(data.response / size - 1.0)[fundamental]
+    most = _MOST_DEPARTURE**2 * 0.5 * float(np.mean(missed**2))
+    found = []
+    for shape in shapes:
+        changes = shape.changes(where, stiffness)
+        square, made, absorbed = _mean_square(changes), columns(changes), None
+        if shape.parallel:
+            absorbed = _absorbed(problem, J, made)
+            made = made + J @ absorbed
+        largest = most / square
+        found.append(Source(MODEL_ERROR, made, square, shape, largest=largest, absorbed=absorbed))
+    if data.run is not None:
+        own = _indicators(np.asarray(data.run))
+        if len(own) >= _FEWEST:
+            share = own.astype(np.complex128)
+            found.append(Source(RUNS, columns(share), 0.5, own="gain"))
+            found.append(Source(RUNS, columns(1j * view.harmonic * share), 0.5, own="phase"))
+            found += [
+                Source(
+                    RUNS, np.repeat(own, 2, axis=1).T * J[:, i : i + 1], 0.0, own=problem.names[i]
+                )
+                for i in _scattering_parameters(problem)
+            ]
+    found += amplitude_noise(problem, theta)
+    repeats = _repeats(where, fundamental)
+    if len(repeats) >= _FEWEST:
+        changes = np.concatenate([repeats, 1j * repeats]).astype(np.complex128)
+        found.append(Source(LEVELS, columns(changes), 1.0, own="both"))
+    return tuple(found)
+
+
+def _sizes(problem: Problem, predicted: ComplexArray) -> ComplexArray:
+    """Return what a departure is relative to: the row's response, a harmonic's fundamental."""
+    data = problem.data
+    size = predicted.copy()
+    for row in np.flatnonzero(data.harmonic != 1):
+        same = (data.harmonic == 1) & (data.frequency_hz == data.frequency_hz[row])
+        if data.amplitude is not None:
+            same &= data.amplitude == data.amplitude[row]
+        if same.any():
+            phase = predicted[row] / (abs(predicted[row]) or 1.0)
+            size[row] = abs(predicted[same][0]) * phase
+    return size
+
+
+def _absorbed(problem: Problem, J: FloatArray, columns: FloatArray) -> FloatArray:
+    """Return what the model's own linear parts do of forces beside it, as changes of theta."""
+    names = {p.name for e in problem.model.elements if e.is_linear for p in e.parameters}
+    own = [i for i, name in enumerate(problem.names) if name in names]
+    found = np.zeros((J.shape[1], columns.shape[1]))
+    if own:
+        found[own] = -np.linalg.lstsq(J[:, own], columns, rcond=None)[0]
+    return found
+
+
+def _scattering_parameters(problem: Problem) -> list[int]:
+    """Return the columns of parameters that may differ from run to run, beside the gain."""
+    found = []
+    for element in problem.model.elements:
+        if element.is_linear:
+            continue
+        for label in element.scale_parameters[:-1]:  # all of them together are a gain
+            name = element.parameter(label).name
+            if name in problem.names:
+                found.append(problem.names.index(name))
+    return found
+
+
+def _repeats(where: FloatArray, fundamental: FloatArray) -> FloatArray:
+    """Return which rows belong to each level that was measured more than once, (levels, n)."""
+    key = np.round(where / _SAME_LEVEL)
+    _, which, count = np.unique(key[fundamental], axis=0, return_inverse=True, return_counts=True)
+    own = np.zeros((int((count > 1).sum()), len(where)))
+    own[:, fundamental] = np.flatnonzero(count > 1)[:, None] == which
+    return own
+
+
+def repeated_levels(amplitude: FloatArray, omega: FloatArray) -> list[NDArray[np.intp]]:
+    """Return the rows of each level, those of one amplitude and frequency together."""
+    key = np.round(places(amplitude, omega) / _SAME_LEVEL)
+    _, which = np.unique(key, axis=0, return_inverse=True)
+    return [np.flatnonzero(which == level) for level in range(int(which.max()) + 1)]
+
+
+def _indicators(labels: NDArray[np.str_]) -> FloatArray:
+    return np.asarray(np.unique(labels)[:, None] == labels, dtype=np.float64)
+
+
+def _correlation(one: FloatArray, other: FloatArray, parallel: bool) -> FloatArray:
+    apart = (one[:, None, :] - other[None, :, :]) / _LENGTH
+    if parallel:
+        apart = apart[..., 1:]
+    return np.asarray(np.exp(-0.5 * np.sum(apart**2, axis=-1)))
+
+
+def _mean_square(changes: ComplexArray) -> float:
+    """Return the mean square of ln gain and phase that changes of unit variance make."""
+    return 0.5 * float(np.sum(np.abs(changes) ** 2, axis=0).mean())
+
+
+def _unit_noise(problem: Problem) -> float:
+    """Return the mean square of ln gain and phase that residuals of unit variance are."""
+    weights = problem.stiffness_data.weights * np.abs(problem.stiffness_data.stiffness)
+    return float(np.mean(1.0 / np.maximum(weights, 1e-150) ** 2))

@@ -1,0 +1,146 @@
+"""What may mislead a fit that does not describe its data: a sign convention, or single rows.
+
+Both are tried on the same problem, model and noise, and named where they explain the data. The fit
+itself is left as it is: nothing is corrected, nothing dropped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import comb
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.trends import covariates
+from dahl_ident.errors import DahlIdentError
+from dahl_ident.fitting import Optimum, Status, solve
+from dahl_ident.fitting.global_start import starts
+from dahl_ident.problem import Problem
+
+EXPLAINS = 3.0  # times lower misfit
+_PROMISING = 1.5  # the same, at the start of a search
+_BY_CHANCE = 0.01
+_RANGE = 5  # values, of which the first and the last are ends
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A change of sign of the response's real and imaginary part, and what makes it."""
+
+    name: str
+    real: int
+    imaginary: int
+    check: str
+
+    def __call__(self, data: FrequencyResponse) -> FrequencyResponse:
+        """Return the data turned, their covariances with them."""
+        signs = np.array([self.real, self.imaginary])
+        covariance, cross = data.covariance, data.amplitude_covariance
+        return replace(
+            data,
+            response=self.real * data.response.real + 1j * self.imaginary * data.response.imag,
+            covariance=None if covariance is None else covariance * np.outer(signs, signs),
+            amplitude_covariance=None if cross is None else cross * signs,
+        )
+
+
+_PHASE = (
+    "check the sign of the phase, which is that of exp(+j omega t): the force leads the "
+    "displacement where friction dissipates"
+)
+_SIGN = "check that force and displacement are positive in the same direction"
+TURNS = (
+    Turn("conjugated", 1, -1, _PHASE),
+    Turn("negated", -1, -1, _SIGN),
+    Turn("negated and conjugated", -1, 1, f"{_PHASE}, and {_SIGN}"),
+)
+
+
+def rms_misfit(problem: Problem, theta: FloatArray) -> float:
+    """Return the root mean square of abs(measured - fitted)/abs(measured) of fundamentals."""
+    misfit = _misfit(problem, theta)
+    return float(np.sqrt(np.mean(misfit**2)))
+
+
+def sign_convention(optimum: Optimum, described: Callable[[Optimum], bool]) -> str:
+    """Return which sign of the response explains data that the fit does not; "" where none.
+
+    `described` says whether a fit's residuals look like noise: a missing mass or spring is met
+    better with a turned sign as well, but not to the noise.
+    """
+    before = rms_misfit(optimum.problem, optimum.theta)
+    middle = float(np.median(_misfit(optimum.problem, optimum.theta)))
+    found = []
+    for turn in TURNS:
+        try:
+            problem = _alike(optimum.problem, turn(optimum.problem.data))
+            # single rows near a resonance may miss at a start: the median is not bent by them
+            first = float(np.median(_misfit(problem, starts(problem)[0])))
+        except DahlIdentError:
+            continue
+        if first * _PROMISING < middle:
+            found.append((first, turn, problem))
+    if not found:
+        return ""
+    _, turn, problem = min(found, key=lambda each: each[0])
+    turned = solve(problem, loss=optimum.loss)
+    after = rms_misfit(problem, turned.theta)
+    if not after * EXPLAINS < before or not described(turned):
+        return ""
+    return (
+        f"With the response {turn.name} the misfit falls from {percent(before)} to "
+        f"{percent(after)} rms: {turn.check}"
+    )
+
+
+def set_aside(optimum: Optimum, rows: Sequence[int]) -> Optimum | None:
+    """Return the optimum of the other rows; None where they have none."""
+    data = optimum.problem.data
+    kept = np.ones(data.n, dtype=np.bool_)
+    kept[list(rows)] = False
+    try:
+        other = solve(_alike(optimum.problem, data.select(rows=kept)), loss=optimum.loss)
+    except DahlIdentError:
+        return None
+    return None if other.status is Status.NOT_CONVERGED else other
+
+
+def neighbourhood(optimum: Optimum, rows: Sequence[int]) -> str:
+    """Return where several rows lie closer together than rows at random do; "" if they do not."""
+    k, n = len(rows), optimum.problem.data.n
+    if k < 2:
+        return ""
+    for name, values, unit in covariates(optimum):
+        low, high = values[list(rows)].min(), values[list(rows)].max()
+        span = int(((values >= low) & (values <= high)).sum())
+        beyond = min(int((values >= low).sum()), int((values <= high).sum()))
+        within = sum((n - s + 1) * comb(s - 2, k - 2) for s in range(k, span + 1))
+        if min(within, 2 * comb(beyond, k)) < _BY_CHANCE * comb(n, k):
+            return f"{name} from {low:.3g} to {high:.3g} {unit}"
+    return ""
+
+
+def at_an_end(optimum: Optimum, rows: Sequence[int]) -> bool:
+    """Return whether a single row is the first or last of a covariate: the model may fail there."""
+    if len(rows) != 1:
+        return False
+    ranges = (values for _, values, _ in covariates(optimum) if np.unique(values).size >= _RANGE)
+    return any(values[rows[0]] in (values.min(), values.max()) for values in ranges)
+
+
+def percent(share: float) -> str:
+    """Return a share to two digits, such as "98 %"."""
+    return f"{float(f'{100.0 * share:.2g}'):g} %"
+
+
+def _misfit(problem: Problem, theta: FloatArray) -> FloatArray:
+    response, harmonic = problem.data.response, problem.data.harmonic
+    rows = (harmonic == harmonic.min()) & (response != 0.0)
+    return np.asarray(np.abs(1.0 - problem.predict(theta)[rows] / response[rows]))
+
+
+def _alike(problem: Problem, data: FrequencyResponse) -> Problem:
+    return Problem(data, problem.model, noise=problem.noise, sensors=problem.sensors)

@@ -1,0 +1,82 @@
+"""Which parameters records of any motion do not determine, why, and what motion would."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import Record
+from dahl_ident.elements import Model
+from dahl_ident.elements.recursion import stretches
+
+_UNCERTAIN = 0.3  # relative standard uncertainty of a parameter that is not determined
+_LONG_ENOUGH = 0.02  # share of samples near a reversal
+_ALIKE = 0.95  # correlation at which two parameters cannot be told apart
+
+
+def undetermined(
+    model: Model,
+    records: Sequence[Record],
+    stderr: Mapping[str, float],
+    covariance: FloatArray,
+    names: Sequence[str],
+) -> tuple[str, ...]:
+    """Return one sentence for each parameter that the records do not determine.
+
+    Parameters
+    ----------
+    model : Model
+        With the estimates put in.
+    records : sequence of Record
+        Those that were fitted.
+    stderr : mapping of str to float
+        Standard uncertainties of the model's free parameters.
+    covariance : ndarray, shape (P, P)
+        Of the parameters `names`.
+    names : sequence of str
+
+    Returns
+    -------
+    tuple of str
+    """
+    found = []
+    paths = [stretches(r.displacement) for r in records if r.displacement is not None]
+    farthest = max((float(p.path.max()) for p in paths), default=np.nan)
+    for element in model.elements:
+        values = [np.asarray(p.value if p.value is not None else 0.0) for p in element.parameters]
+        low, high = (
+            (float(k) for k in element.knee(values)) if element.has_memory else (np.nan,) * 2
+        )
+        near = np.mean(np.concatenate([p.path < 2.0 * low for p in paths])) if paths else np.nan
+        for parameter in element.parameters:
+            error = stderr.get(parameter.name)
+            if error is None or error <= _UNCERTAIN * abs(float(parameter.value or 0.0)):
+                continue
+            start = f"{parameter.name} is not determined (standard uncertainty {error:.2g} "
+            start += f"{parameter.unit})".replace(" )", ")")
+            if element.has_memory and farthest < 2.0 * low:
+                found.append(
+                    f"{start}: the motion moves no farther than {farthest:.2g} m after a "
+                    f"reversal, and slip needs {2.0 * high:.2g} m; move farther."
+                )
+            elif element.has_memory and near < _LONG_ENOUGH:
+                found.append(
+                    f"{start}: the motion never stays below x_c = {low:.2g} m long enough; add "
+                    "reversals and small motions of that size, sampled closely."
+                )
+            else:
+                found.append(f"{start}{_alike(parameter.name, covariance, names)}.")
+    return tuple(found)
+
+
+def _alike(name: str, covariance: FloatArray, names: Sequence[str]) -> str:
+    place = list(names).index(name)
+    with np.errstate(all="ignore"):
+        size = np.sqrt(covariance.diagonal())
+        correlation = covariance[place] / size / size[place]
+    others = [n for n, c in zip(names, correlation, strict=True) if n != name and abs(c) > _ALIKE]
+    if others:
+        return f": it cannot be distinguished from {', '.join(others)}; fix one of them"
+    return ": its effect is small compared with the residuals; fix it, or leave the element out"

@@ -1,0 +1,214 @@
+"""The verdict on a fit: its status, and one short sentence for each of three questions.
+
+Determined? Every parameter, or which combination. Described? How large the misfit is and of what
+kind. Assumed? What the result rests on and the data cannot test. Most serious first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
+
+from dahl_ident.diagnostics.budget import taken_as_exact
+from dahl_ident.diagnostics.cross_validation import CrossValidation
+from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.formatting import listed, with_unit
+from dahl_ident.diagnostics.goodness import Goodness
+from dahl_ident.diagnostics.verdict_status import VerdictStatus
+from dahl_ident.diagnostics.verdicts import Identifiability
+from dahl_ident.fitting import Optimum, solve
+
+_TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
+_FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
+_ENOUGH_HELD_OUT = 16  # values, of which 80 % in bands of 95 % happen once in 100 times
+_CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chance
+
+
+class Judged(Protocol):
+    """What a verdict is on."""
+
+    @property
+    def optimum(self) -> Optimum:
+        """The solver's result."""
+
+    @property
+    def goodness(self) -> Goodness:
+        """Tests of the residuals."""
+
+    @property
+    def identifiability(self) -> Identifiability:
+        """What the data determine."""
+
+    @property
+    def errors(self) -> ErrorModel | None:
+        """The sources of error."""
+
+    @property
+    def cross_validation(self) -> CrossValidation | None:
+        """The check of the bands."""
+
+
+def verdict_status(fit: Judged) -> VerdictStatus:
+    """Return whether a fit's numbers can be used."""
+    optimum, goodness = fit.optimum, fit.goodness
+    if goodness.sign:
+        return VerdictStatus.NOT_DESCRIBED
+    determined = optimum.success and optimum.dof > 0 and goodness.judged
+    if not determined or not fit.identifiability.complete:
+        return VerdictStatus.NOT_DETERMINED
+    if goodness.rms_misfit > _TOO_LARGE or _noise_of_no_sensor(goodness):
+        return VerdictStatus.NOT_DESCRIBED
+    if not any((goodness.objections, goodness.flagged, *_reservations(fit))):
+        return VerdictStatus.TRUSTED
+    if goodness.objections and (fit.errors is None or _stated_exponent_is_wrong(goodness, optimum)):
+        return VerdictStatus.NOT_DESCRIBED
+    return VerdictStatus.APPROXIMATE if _bands_hold(fit) else VerdictStatus.NOT_DESCRIBED
+
+
+def statements(fit: Judged) -> tuple[str, ...]:
+    """Return the verdict in its parts; the first is what to remember, the others say why."""
+    status = verdict_status(fit)
+    goodness, known = fit.goodness, fit.identifiability
+    if status is VerdictStatus.TRUSTED:
+        first = f"Trusted. {known.headline} {goodness.headline}"
+        return (first, *_assumptions(fit))
+    if status is VerdictStatus.APPROXIMATE:
+        found = list(goodness.statements)
+        if goodness.described in found and goodness.objections:
+            found.remove(goodness.described)
+            misfit = f"misfit of {100.0 * goodness.rms_misfit:.2g} % rms"
+            found.insert(0, f"The stated uncertainties include a {misfit}: {goodness.departures}.")
+        first, *others = (*found, *_reservations(fit), known.headline)
+        return (f"Approximate. {first}", *others, *_checked(fit), *_assumptions(fit))
+    first, *others = _objections(fit)
+    return (f"{status.capitalize()}. {first}", *others)
+
+
+def _noise_of_no_sensor(goodness: Goodness) -> bool:
+    return any("more than any sensor's noise" in objection for objection in goodness.objections)
+
+
+def _stated_exponent_is_wrong(goodness: Goodness, optimum: Optimum) -> bool:
+    """Return whether the data contradict an exponent that the user gave."""
+    exponent = goodness.exponent
+    if exponent is None or exponent.p_value > goodness.level:
+        return False
+    given = {p.name: p for p in optimum.problem.model.parameters}
+    return not given[exponent.name].assumed
+
+
+def _bands_hold(fit: Judged) -> bool:
+    check = fit.cross_validation
+    if check is None or check.count < _ENOUGH_HELD_OUT:
+        return True
+    return check.inside >= _FEWEST_INSIDE * check.count
+
+
+def _checked(fit: Judged) -> Iterator[str]:
+    check = fit.cross_validation
+    if check is not None:
+        text = str(check)
+        yield f"{text[0].upper()}{text[1:]}."
+
+
+def _reservations(fit: Judged) -> Iterator[str]:
+    """Yield what keeps a fit from being trusted although its residuals may look like noise."""
+    yield from _contradicted_priors(fit)
+    yield from _moved_by_outliers(fit)
+
+
+def _contradicted_priors(fit: Judged) -> Iterator[str]:
+    """Yield every prior whose parameter the data put elsewhere."""
+    optimum = fit.optimum
+    values = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
+    for name, prior in optimum.problem.priors.items():
+        mean, std = float(prior.mean()), float(prior.std())
+        apart = abs(values[name] - mean) / std
+        if apart > _CONTRADICTED:
+            yield (
+                f"The data contradict the prior of {name}: {values[name]:.4g} against "
+                f"{mean:g} +- {std:g}, {apart:.1f} standard deviations: check the calibration, or "
+                "the model."
+            )
+
+
+def _moved_by_outliers(fit: Judged) -> Iterator[str]:
+    """Yield parameters that a robust fit puts more than one standard uncertainty elsewhere."""
+    optimum, errors = fit.optimum, fit.errors
+    if not fit.goodness.suspicious or optimum.loss != "linear" or errors is None:
+        return
+    robust = solve(optimum.problem, loss="huber")
+    if not robust.success:
+        return
+    moved = [
+        name
+        for name, before, after in zip(
+            optimum.names, optimum.values.tolist(), robust.values.tolist(), strict=True
+        )
+        if abs(after - before) > errors.stderr[name]
+    ]
+    if moved:
+        rows = ", ".join(str(point.row) for point in fit.goodness.suspicious[:5])
+        yield (
+            f"A robust fit moves {listed(moved)} by more than one standard uncertainty: look at "
+            f'rows {rows}, or fit with loss="huber".'
+        )
+
+
+def _assumptions(fit: Judged) -> Iterator[str]:
+    """Yield what the result rests on and these data cannot test, in one sentence."""
+    optimum, errors = fit.optimum, fit.errors
+    parts = []
+    for parameter in optimum.problem.model.parameters:
+        if parameter.prior is None or parameter.free:
+            continue
+        low, high = parameter.prior
+        if parameter.assumed and errors is not None and parameter.name in errors.assumed:
+            found = with_unit(
+                errors.values[parameter.name], errors.stderr[parameter.name], parameter.unit
+            )
+            parts.append(f"{parameter.name} between {low:g} and {high:g} (here {found})")
+        elif parameter.value is not None:
+            parts.append(f"{parameter.name} = {parameter.value:g} exactly")
+    names = {p.name for p in optimum.problem.sensors.parameters if p.free}
+    if "delay" in names and "force_gain" not in names:
+        parts.append("force_gain = 1 exactly")
+    exact = taken_as_exact(optimum)
+    if exact:
+        parts.append(f"{listed(exact)} exact")
+    if len(optimum.problem.data.runs or ()) < 2:
+        parts.append("a single run")
+    if errors is None:
+        parts.append("no error but noise (stated uncertainties are from noise alone)")
+    if parts:
+        yield f"Assumed: {'; '.join(parts)}."
+
+
+def _objections(fit: Judged) -> Iterator[str]:
+    """Yield what speaks against a fit, a sentence or more each."""
+    optimum, goodness = fit.optimum, fit.goodness
+    if goodness.cause:
+        yield from goodness.statements
+    if goodness.sign:
+        return  # what the numbers leave undetermined says nothing of the mechanism
+    known = fit.identifiability
+    can_tell = optimum.scale_known or optimum.dof > 0
+    if can_tell and not known.complete:
+        yield known.headline
+        if known.combinations:
+            yield f"Determined: {'; '.join(map(str, known.combinations))}."
+    if not optimum.success:
+        yield optimum.status.value if optimum.status.at_infinity else optimum.message
+    if optimum.dof <= 0:
+        judged = "the model" if optimum.scale_known else "noise and model"
+        yield (
+            f"{optimum.problem.n_residuals} numbers and {len(optimum.names)} parameters leave no "
+            f"degree of freedom to judge {judged}: measure more points."
+        )
+    if can_tell and not known.complete:
+        yield from known.reasons
+    if not goodness.acceptable and not goodness.cause:
+        yield from goodness.statements
+    if not _bands_hold(fit):
+        yield from _checked(fit)
+    yield from _reservations(fit)

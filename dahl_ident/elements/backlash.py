@@ -1,0 +1,274 @@
+r"""A gap in the link to a friction element.
+
+The link carries no force while the gap is crossed. After a reversal the element unloads along its
+own curve to zero force, the gap is crossed there, then the curve goes on where it stopped. So the
+element moves with the amplitude A - gap/2, and of the path from one turning point to the next the
+part at zero force is the gap. Harmonics are integrals over the force,
+
+    c_k = 1/(j k pi) * (closed integral of) exp(-j k theta) dF,
+
+in which only theta knows of the gap (:mod:`dahl_ident.elements.steady_loop`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import force_curve
+from dahl_ident.elements.element import (
+    KINDS,
+    Asymptote,
+    Combination,
+    Element,
+    Mechanics,
+    StiffnessGradient,
+    prefixed,
+)
+from dahl_ident.elements.friction import Friction
+from dahl_ident.elements.parameter import Parameter
+from dahl_ident.elements.steady_loop import Branch, Loop, Rows
+from dahl_ident.errors import ModelError
+
+_CLOSED = 1e-9  # gap over the smallest amplitude that counts as none
+
+
+class Backlash(Friction):
+    """A gap in series with a rate-independent friction element, crossed at zero force.
+
+    Parameters
+    ----------
+    element : Friction
+        The law behind the gap, such as ``Dahl()``; its parameters and its name are kept.
+    gap : float, optional
+        The whole play between the two contacts, m (rad in rotation): twice the half-gap by which
+        the element's amplitude is smaller. Given: fixed; left out: free.
+
+    Raises
+    ------
+    ModelError
+        If `element` is no friction with one state, or depends on the rate.
+    ValidationError
+        If `gap` is not a number above zero.
+
+    Notes
+    -----
+    At amplitudes up to gap/2 there is no force at all. A history starts in the middle of the gap,
+    or in contact where it starts with a force. Behind the gap, linear Dahl has exact derivatives;
+    those of other laws are differences over 0.2 %, not meant for amplitudes that near to gap/2.
+
+    Examples
+    --------
+    >>> from dahl_ident import Backlash, Dahl
+    >>> law = Backlash(Dahl(f_max=1.0, sigma=3.0), gap=0.8)
+    >>> print(f"{law.describing_function(2.0):.7f}")
+    0.3901538+0.4032069j
+    >>> law.describing_function(0.3).real.item()
+    0.0
+    """
+
+    kind = "backlash"
+    equation = "F = F_element(y), y = x - play, abs(play) <= gap/2; the play moves at F = 0"
+
+    def __init__(self, element: Element, gap: float | None = None) -> None:
+        if not (isinstance(element, Friction) and element.rate_independent and element.one_state):
+            raise ModelError(
+                f"Backlash got {element!r}; expected rate-independent friction with one state, "
+                "such as Dahl()"
+            )
+        if isinstance(element, Backlash):
+            raise ModelError(f"Backlash got {element!r}, which has a gap already; widen that one")
+        self._element = element
+        self._name = element.name
+        self.equation = f"{element.equation}; {type(self).equation}"
+        self.scale_parameters = element.scale_parameters
+        self.parameters = (
+            *element.parameters,
+            Parameter(
+                prefixed(self._name, "gap"), "m", "play of the link", gap, lower=0.0,
+                transform="log",
+            ),
+        )  # fmt: skip
+
+    @property
+    def element(self) -> Friction:
+        """The law behind the gap, with its present parameters."""
+        return self._element.with_bound(self.parameters[:-1])
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        """Return dF/dx while the link is in contact."""
+        return self._element.slope(force, direction, velocity, values[: len(self.parameters) - 1])
+
+    def mechanics(
+        self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
+    ) -> Mechanics:
+        """Raise ModelError: the place in the gap is a second state."""
+        raise ModelError(
+            f"{self!r} remembers its place in the gap, so it cannot be driven by a force over "
+            "time; give records with measured displacement and force, and output='force'"
+        )
+
+    def stiffness(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> ComplexArray:
+        """Return F_k/X_1 of the steady loop, 0 up to half the gap, unchecked."""
+        known = self._closed(values, amplitude, omega, harmonic, derivatives=False)
+        if known is not None:
+            return known.value
+        moves = np.asarray(amplitude > 0.5 * np.asarray(values[-1]) * (1.0 + 1e-14))
+        A = np.where(moves, amplitude, 0.0)
+        return np.where(moves, super().stiffness(values, A, omega, harmonic), 0.0)
+
+    def stiffness_gradient(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> StiffnessGradient:
+        """Return F_k/X_1 with its derivatives, exactly for linear Dahl, else by differences."""
+        known = self._closed(values, amplitude, omega, harmonic)
+        return known or super().stiffness_gradient(values, amplitude, omega, harmonic)
+
+    def stiffness_slope(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Return F/X of the fundamental and its derivative by amplitude, unchecked."""
+        known = self._closed(values, amplitude, omega, 1)
+        if known is None:
+            return super().stiffness_slope(values, amplitude, omega)
+        return known.value, known.by_amplitude
+
+    def _closed(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int,
+        *,
+        derivatives: bool = True,
+    ) -> StiffnessGradient | None:
+        """Return the element's own integrals behind the gap, if it has any."""
+        A = np.asarray(amplitude, dtype=np.float64) + 0.0 * omega
+        return self.element.behind_gap(
+            values[:-1], A, values[-1], harmonic, derivatives=derivatives
+        )
+
+    def _loops(self, values: Sequence[FloatArray], A: FloatArray, rows: Rows) -> Loop:
+        gap = values[-1][rows] if values[-1].ndim else np.full(rows.size, float(values[-1]))
+        moved = A.copy()
+        moved[rows] -= 0.5 * gap
+        loop = super()._loops(values, moved, rows)
+        falling = None if loop.falling is None else _widened(loop.falling, gap)
+        return replace(loop, amplitude=A[rows], rising=_widened(loop.rising, gap), falling=falling)
+
+    def force_history(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
+        *,
+        acceleration: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return the force at every sample, unchecked."""
+        at = [np.asarray(v, dtype=np.float64) for v in values]
+        rising, falling = partial(self._rising, at), partial(self._falling, at)
+        return force_curve.force_history(
+            rising, falling, displacement, float(state), gap=float(values[-1])
+        )
+
+    def steady_force(
+        self, values: Sequence[FloatArray], path: FloatArray, cycles: int
+    ) -> FloatArray:
+        """Return the force of the element along the path that the play leaves."""
+        half = 0.5 * np.asarray(values[-1])
+        y, moved = np.zeros(path.shape[:-1]), np.empty(path.shape)
+        for _ in range(2):  # the play repeats itself after the first cycle
+            for i in range(path.shape[-1]):
+                moved[..., i] = y = np.clip(y, path[..., i] - half, path[..., i] + half)
+        return self._element.steady_force(values[:-1], y, cycles)
+
+    def rest_stiffness(self, values: Sequence[FloatArray]) -> FloatArray:
+        """Return 0: small motions do not cross the gap."""
+        return np.zeros(np.broadcast_shapes(*(np.shape(v) for v in values)))
+
+    def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return those of the element, which moves less."""
+        return self._element.force_bounds(values[:-1])
+
+    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return half the gap, and where the element behind it slips."""
+        low, high = self._element.knee(values[:-1])
+        half = 0.5 * np.asarray(values[-1])
+        return np.minimum(half, low), high + half
+
+    def transient_decay(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> FloatArray:
+        """Return the factor by which a deviation shrinks in one cycle: that of the element."""
+        moved = np.maximum(amplitude - 0.5 * np.asarray(values[-1]), 0.0)
+        return self._element.transient_decay(values[:-1], moved, omega)
+
+    def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
+        """Return those of the element, and a link without a gap."""
+        closed = Asymptote("no_gap", "no gap", {"gap": _CLOSED * low}, None, {"gap": 0.0})
+        return (*self.element.asymptotes(low, high), closed)
+
+    def combinations(self) -> tuple[Combination, ...]:
+        """Return those of the element."""
+        return self.element.combinations()
+
+    def physics(self, values: Sequence[float]) -> tuple[str, ...]:
+        """Return the objections of the element."""
+        return self.element.physics(values[:-1])
+
+    def describe(self) -> dict[str, Any]:
+        """Return the element and the gap as plain data."""
+        return {
+            "kind": self.kind,
+            "element": self.element.describe(),
+            "gap": self.parameters[-1].describe(),
+        }
+
+    @classmethod
+    def from_description(cls, rest: Mapping[str, Any], name: str | None) -> Element:
+        """Return the element that :meth:`describe` described."""
+        if set(rest) != {"element", "gap"} or rest["element"].get("kind") not in KINDS:
+            raise ModelError(
+                f"the backlash element has the keys {', '.join(rest)}; expected element, a table "
+                f"with a kind of {', '.join(KINDS)}, and gap"
+            )
+        inner = dict(rest["element"])
+        kind, inner_name = inner.pop("kind"), inner.pop("name", name)
+        element = KINDS[kind].from_description(inner, inner_name)
+        blank = cls(element)
+        gap = blank.parameters[-1].described(rest["gap"])
+        return blank.with_bound((*blank.parameters[:-1], gap))
+
+    def __repr__(self) -> str:
+        gap = self.parameters[-1]
+        value = "free" if gap.value is None else f"{gap.value:g}"
+        started = " free" if gap.free and gap.value is not None else ""
+        return f"Backlash({self.element!r}, gap={value}{started})"
+
+
+def _widened(branch: Branch, gap: FloatArray) -> Branch:
+    """Return a branch with the gap crossed at zero force."""
+    beyond = branch.force > 0.0
+    wide = gap[:, None]
+    return replace(
+        branch,
+        travelled=branch.travelled + np.where(beyond, wide, 0.0),
+        left=branch.left + np.where(beyond, 0.0, wide),
+        path=branch.path + gap,
+    )

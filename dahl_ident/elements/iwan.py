@@ -1,0 +1,202 @@
+r"""Segalman's four-parameter Iwan law of a bolted joint: from microslip to macroslip.
+
+The density of slip displacements is a power law up to the largest one, d_m, where a share slips
+at once:
+
+    rho(d) = R d^chi for d < d_m, and a step of stiffness S at d_m, S = ratio R d_m^g/g.
+
+with g = chi + 1. The backbone curve has the slope
+
+    V'(x) = sigma (1 - (x/d_m)^g/(1 + ratio)) for x < d_m, 0 beyond,
+    d_m = (f_max/sigma) (1 + ratio)/(ratio + g/(g + 1)).
+
+So N is that of a Jenkins element that slips at d_m, less
+
+    P = (2 j/(pi k)) Int_0^t (A u/d_m)^g sin(theta) exp(-j k theta) dtheta,   u = sin^2(theta/2),
+
+times sigma/(1 + ratio), with t = pi or, where A > d_m, arccos(1 - 2 d_m/A). In microslip P is a
+constant times (A/d_m)^g, the loss in a cycle rises with the amplitude to the power chi + 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements.element import StiffnessGradient
+from dahl_ident.elements.masing import Masing, jenkins
+from dahl_ident.elements.parameter import Parameter
+
+# Gauss points over s with theta = t s^3, which smooths theta^(2 g) at the lower end
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
+_S = 0.5 * (1.0 + _NODES)
+_PLACES, _SHARES = _S**3, 1.5 * _WEIGHTS * _S**2
+_REST = 1e-100
+_SOFTENED = 0.01
+_NARROWEST = 1e-6
+
+
+class Iwan(Masing):
+    """Four-parameter Iwan law of Segalman: stiffness falls as a power of amplitude, then slip.
+
+    Parameters
+    ----------
+    f_max : float, optional
+        Force of macroslip, N (N m in rotation), > 0. Given: fixed; left out: free.
+    sigma : float, optional
+        Tangent stiffness at zero force, N/m (N m/rad), > 0. Given: fixed; left out: free.
+    chi : float, optional
+        Exponent of the density of slip displacements, above -1, at most 3: in microslip the loss
+        in a cycle rises as A^(chi+3) and the stiffness falls as A^(chi+1). Bolted joints have
+        -1 < chi <= 0.
+    ratio : float, optional
+        Stiffness that slips at once at the onset of macroslip, over that which slips before
+        (Segalman's beta), > 0.
+    name : str, optional
+        Prefix of the parameters' names.
+
+    Raises
+    ------
+    ValidationError
+        If a value is outside its range.
+
+    Notes
+    -----
+    D. J. Segalman, A four-parameter Iwan model for lap-type joints, J. Appl. Mech. 72 (2005)
+    752-760. Amplitudes of microslip alone determine sigma (beside a spring: its sum with the
+    spring's), chi and one coefficient of the power law; f_max and ratio then are not determined.
+
+    Examples
+    --------
+    >>> joint = Iwan(f_max=100.0, sigma=1e7, chi=-0.5, ratio=1.0)
+    >>> print(f"{joint.onset:.3e} m, {joint.describing_function(1e-6):.5g}")
+    1.500e-05 m, 9.1233e+06+2.1917e+05j
+    >>> loss = joint.dissipated_energy([1e-6, 2e-6])
+    >>> print(f"{np.log2(loss[1] / loss[0]):.3f}")
+    2.500
+    """
+
+    kind = "iwan"
+    equation = (
+        "F = sum of Jenkins elements with the density of slip displacements R d^chi up to d_m, "
+        "and a step there"
+    )
+    scale_parameters = ("f_max", "sigma")
+    parameters = (
+        Parameter("f_max", "N", "force of macroslip", lower=0.0, transform="log"),
+        Parameter("sigma", "N/m", "tangent stiffness at zero force", lower=0.0, transform="log"),
+        Parameter(
+            "chi", "", "exponent of the slip density", lower=-1.0, upper=3.0,
+            scan=(-0.75, -0.5, -0.25, 0.0, 0.5), prior=(-0.95, 0.5),
+        ),
+        Parameter(
+            "ratio", "", "stiffness that slips at once over that before", lower=0.0,
+            transform="log", scan=(0.1, 1.0, 10.0), prior=(0.02, 50.0),
+        ),
+    )  # fmt: skip
+
+    @property
+    def onset(self) -> float:
+        """d_m, m: the displacement at which macroslip begins."""
+        return float(_onset(self.known_values()))
+
+    def backbone(self, values: Sequence[FloatArray], displacement: FloatArray) -> FloatArray:
+        """Return sigma x (1 - (x/d_m)^g/((1 + ratio) (g + 1))), f_max beyond d_m."""
+        f_max, sigma, chi, ratio = values
+        d = _onset(values)
+        x = np.minimum(displacement, d)
+        lost = (x / d) ** (chi + 1.0) / ((1.0 + ratio) * (chi + 2.0))
+        return np.asarray(np.where(displacement < d, sigma * x * (1.0 - lost), f_max))
+
+    def stiffness(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> ComplexArray:
+        """Return F_k/X_1; `omega` does not matter."""
+        _, sigma, _, ratio = values
+        A = np.asarray(amplitude, dtype=np.float64) + 0.0 * omega
+        m = _onset(values) / np.maximum(A, _REST)
+        lost = _lost(m, np.asarray(values[2]) + 1.0, harmonic, derivative=False)[0]
+        return np.asarray(sigma * (jenkins(m, harmonic)[0] - lost / (1.0 + ratio)))
+
+    def stiffness_gradient(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> StiffnessGradient:
+        """Return F_k/X_1 with its derivatives, exactly; one-sided at the onset of macroslip."""
+        f_max, sigma, chi, ratio = (np.asarray(v, dtype=np.float64) for v in values)
+        A = np.maximum(np.asarray(amplitude, dtype=np.float64), _REST) + 0.0 * omega
+        g, d = chi + 1.0, _onset(values)
+        m = d / A
+        stick, by_m = jenkins(m, harmonic)
+        lost, lost_by_g = _lost(m, g, harmonic, derivative=True)
+        G = stick - lost / (1.0 + ratio)
+        # by ln A at constant parameters: the ends of both integrals move alike
+        by_lnA = -(m * by_m * ratio + g * lost) / (1.0 + ratio)
+        share = g / (g + 1.0)
+        lnA_by_ratio = 1.0 / (ratio + share) - 1.0 / (1.0 + ratio)  # of A/d_m
+        lnA_by_g = 1.0 / ((g + 1.0) ** 2 * (ratio + share))
+        by = (
+            -sigma * by_lnA / f_max,
+            G + by_lnA,
+            sigma * (by_lnA * lnA_by_g - lost_by_g / (1.0 + ratio)),
+            sigma * (by_lnA * lnA_by_ratio + lost / (1.0 + ratio) ** 2),
+        )
+        return StiffnessGradient(sigma * G, sigma * by_lnA / A, by)
+
+    def rest_stiffness(self, values: Sequence[FloatArray]) -> FloatArray:
+        """Return sigma."""
+        return np.asarray(values[1], dtype=np.float64)
+
+    def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return f_max, for both directions."""
+        top = np.asarray(values[0], dtype=np.float64)
+        return top, top
+
+    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return where 1 % of the stiffness is gone, and the onset of macroslip."""
+        d = _onset(values)
+        softened = np.minimum(_SOFTENED * (1.0 + np.asarray(values[3])), 1.0)
+        with np.errstate(divide="ignore", over="ignore"):
+            share = softened ** (1.0 / (np.asarray(values[2]) + 1.0))
+        return d * np.maximum(share, _NARROWEST), d
+
+
+def _onset(values: Sequence[FloatArray]) -> FloatArray:
+    """Return d_m."""
+    f_max, sigma, chi, ratio = values
+    return np.asarray(f_max / sigma / (1.0 - 1.0 / ((1.0 + ratio) * (chi + 2.0))))
+
+
+def _lost(
+    m: FloatArray, g: FloatArray, harmonic: int, *, derivative: bool
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return P and, if wanted, its derivative by g at constant m = d_m/A."""
+    shape = np.broadcast_shapes(np.shape(m), np.shape(g))
+    if harmonic % 2 == 0:
+        zero = np.zeros(shape, dtype=np.complex128)
+        return zero, zero
+    t = 2.0 * np.arcsin(np.sqrt(np.minimum(m, 1.0)))[..., None]
+    theta = t * _PLACES
+    with np.errstate(under="ignore"):
+        log_u = 2.0 * np.log(np.sin(0.5 * theta)) - np.log(np.asarray(m))[..., None]
+        power = np.exp(np.asarray(g)[..., None] * log_u)
+    kernel = t * _SHARES * np.sin(theta)
+    kernel = kernel * power
+    real, imag = np.sin(harmonic * theta), np.cos(harmonic * theta)
+    factor = 2.0 / (np.pi * harmonic)
+
+    def total(weight: FloatArray) -> ComplexArray:
+        both = (weight * real).sum(axis=-1) + 1j * (weight * imag).sum(axis=-1)
+        return np.asarray(np.broadcast_to(factor * both, shape))
+
+    value = total(kernel)
+    return value, total(kernel * log_u) if derivative else value

@@ -1,0 +1,257 @@
+r"""Laws that are parallel elastoplastic (Jenkins) elements, and so follow Masing's rules.
+
+A Jenkins element of stiffness k slips at the displacement d. Loaded from rest, any sum of them has
+the force V(x) = sum of k min(x, d), the **backbone curve**. After a reversal each element needs
+twice its d to slip the other way, so that the force follows V at twice the scale,
+
+    F = F_r + 2 s V(s (x - x_r)/2),
+
+until the inner loop closes; from there the outer curve goes on as if it had never been left.
+Under x = A cos(theta) partial integration gives, for odd k,
+
+    N_k = F_k/A = (2 j/(pi k)) Int_0^pi V'(A sin^2(theta/2)) sin(theta) exp(-j k theta) dtheta.
+
+**Unique response.** A abs(L + N) rises with A for every passive L (Im L >= 0) where
+2 Im N + A Im N' >= A abs(N'). A Jenkins element has equality while it slips, both sides being
+4 k d/(pi A), and a sum of them keeps it: the left sides add, the right side is at most their sum.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements.element import Mechanics
+from dahl_ident.elements.friction import Friction
+from dahl_ident.elements.recursion import stretches
+from dahl_ident.errors import ModelError
+
+_SERIES = 0.1
+_BISECTIONS = 200
+
+
+class Masing(Friction):
+    """Parallel Jenkins elements, known by the force of a first loading; see the module."""
+
+    one_state = False
+    unique_response = True
+
+    @abstractmethod
+    def backbone(self, values: Sequence[FloatArray], displacement: FloatArray) -> FloatArray:
+        """Return V(x), the force when first loaded from rest to x >= 0, N."""
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        """Raise ModelError: the force alone does not tell the slope."""
+        raise ModelError(
+            f"{self!r} remembers more than its present force, so it has no slope dF/dx(F); use "
+            "a law with one state, such as Dahl or BoucWen"
+        )
+
+    def mechanics(
+        self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
+    ) -> Mechanics:
+        """Raise ModelError: an equation of motion needs one state for each element."""
+        raise ModelError(
+            f"{self!r} remembers more than its present force, so it cannot be driven by a force "
+            "over time; give records with measured displacement and force"
+        )
+
+    def force_history(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
+        *,
+        acceleration: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return the force at every sample by Masing's rules, exactly, unchecked.
+
+        The element comes from rest along the backbone curve to the force `state`.
+        """
+        at = [np.asarray(v, dtype=np.float64) for v in values]
+        if displacement.size < 2:
+            return np.full(displacement.shape, state)
+        start = np.sign(state) * self._loaded_to(at, abs(state))
+        u = displacement - displacement[0] + start
+        paths = _Paths(start)
+        cut = stretches(displacement)
+        ends = np.cumsum(cut.samples) - 1
+        first = 0
+        for heading, last in zip(cut.heading.tolist(), ends.tolist(), strict=True):
+            stop = min(last + 1, u.size - 1)
+            paths.follow(u[first + 1 : stop + 1], heading)
+            first = stop
+        force = paths.force(lambda x: self.backbone(at, x))
+        return np.concatenate([[state], force])
+
+    def _loaded_to(self, values: Sequence[FloatArray], force: float) -> float:
+        """Return where the backbone curve has a force, by bisection."""
+        if force == 0.0:
+            return 0.0
+        low, high = 0.0, force / float(self.rest_stiffness(values))
+        while float(self.backbone(values, np.asarray(high))) < force * (1.0 - 1e-15):
+            low, high = high, 2.0 * high
+            if high > 1e6 * force / float(self.rest_stiffness(values)):
+                break  # full slip, to rounding
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            if not low < middle < high:
+                break
+            below = float(self.backbone(values, np.asarray(middle))) < force
+            low, high = (middle, high) if below else (low, middle)
+        return high
+
+    def answers(self, harmonic: int) -> bool:
+        """Return whether the harmonic is odd: both directions are alike."""
+        return harmonic % 2 == 1
+
+    def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return the sum of all slip forces, for both directions."""
+        top = self.backbone(values, np.asarray(2.0 * self.knee(values)[1]))
+        return top, top
+
+    def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return the stiffness at rest, and 4/pi of the force limit.
+
+        A Jenkins element's abs(N) falls with the amplitude.
+        """
+        return self.rest_stiffness(values), 4.0 / np.pi * self.force_limits(values)[0]
+
+    def transient_decay(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> FloatArray:
+        """Return 0: the first full swing erases what was before."""
+        return np.zeros(np.broadcast_shapes(np.shape(amplitude), np.shape(omega)))
+
+    def steady_force(
+        self, values: Sequence[FloatArray], path: FloatArray, cycles: int
+    ) -> FloatArray:
+        """Return the force along closed paths of displacement, (..., n), loaded from rest."""
+        n = path.shape[-1]
+        rows = path.reshape(-1, n)
+        found = [self.force_history(values, np.append(0.0, np.tile(x, 2)))[n + 1 :] for x in rows]
+        return np.reshape(found, path.shape)
+
+    def _loop(self, values: Sequence[float], amplitude: float, theta: FloatArray) -> FloatArray:
+        at = [np.asarray(v, dtype=np.float64) for v in values]
+        back = theta <= np.pi
+        gone = amplitude * np.where(back, np.sin(theta / 2.0), np.cos(theta / 2.0)) ** 2
+        top = self.backbone(at, np.asarray(amplitude))
+        force = top - 2.0 * self.backbone(at, gone)
+        return np.asarray(np.where(back, force, -force))
+
+
+class _Paths:
+    """Masing's rules over displacements u, counted from where the backbone curve begins.
+
+    Each path begins at a reversal, or at the origin of the backbone curve; a reversal lies on the
+    path before it. Forces follow at the end, from the backbone curve at all places at once.
+    """
+
+    def __init__(self, start: float) -> None:
+        self._origin = [0.0]  # of each path
+        self._parent = [0]  # the path on which each path's origin lies
+        self._heading = [1.0]
+        self._open: list[int] = []  # paths that have been left and not yet closed, outermost first
+        self._on = 0
+        self._here = start
+        self._path_of: list[np.ndarray[Any, Any]] = []
+        self._places: list[FloatArray] = []
+
+    def follow(self, places: FloatArray, heading: float) -> None:
+        """Move on in one direction through some places."""
+        on_backbone = not self._open
+        if not (on_backbone and (self._here == 0.0 or heading * self._here > 0.0)) and (
+            on_backbone or heading != self._heading[self._open[-1]]
+        ):
+            self._origin.append(self._here)
+            self._parent.append(self._open[-1] if self._open else 0)
+            self._heading.append(heading)
+            self._open.append(len(self._origin) - 1)
+        path_of = np.zeros(places.size, dtype=np.intp)
+        begin = 0
+        while begin < places.size:
+            if not self._open:
+                break
+            # a path ends where the one before it began; the first one mirrors its own origin
+            own = self._open[-1]
+            limit = self._origin[self._open[-2]] if len(self._open) > 1 else -self._origin[own]
+            inside = int(np.searchsorted(heading * places, heading * limit, side="right"))
+            path_of[begin:inside] = own
+            begin = max(begin, inside)
+            if begin < places.size:
+                del self._open[-2:]
+        self._path_of.append(path_of)
+        self._places.append(places)
+        self._here = float(places[-1])
+
+    def force(self, backbone: Any) -> FloatArray:
+        """Return the force at all places."""
+        origin, parent = np.asarray(self._origin), np.asarray(self._parent)
+        heading = np.asarray(self._heading)
+
+        def beyond(place: FloatArray, path: Any) -> FloatArray:
+            first = path == 0
+            scale = np.where(first, 1.0, 2.0)
+            moved = place - origin[path]
+            sign = np.where(first, np.sign(moved), heading[path])
+            return np.asarray(scale * sign * backbone(np.abs(moved) / scale))
+
+        forces = beyond(origin, parent).tolist()
+        forces[0] = 0.0
+        for path in range(1, len(forces)):
+            if self._parent[path]:
+                forces[path] += forces[self._parent[path]]
+        path_of = np.concatenate(self._path_of)
+        return np.asarray(
+            np.asarray(forces)[path_of] + beyond(np.concatenate(self._places), path_of)
+        )
+
+
+def jenkins(ratio: FloatArray, harmonic: int) -> tuple[ComplexArray, ComplexArray]:
+    """Return N_k of a Jenkins element of unit stiffness, and its derivative.
+
+    Parameters
+    ----------
+    ratio : ndarray
+        m = d/A > 0, the slip displacement over the amplitude. At exactly 1, where N has a kink,
+        the derivative is that of the element that does not slip.
+    harmonic : int
+        k >= 0; even harmonics vanish.
+
+    Returns
+    -------
+    value, by_ratio : ndarray of complex
+        For k = 1, (t - sin t cos t)/pi + 4j m (1 - m)/pi with t = arccos(1 - 2 m) for m < 1.
+
+    Examples
+    --------
+    >>> print(f"{3.0 * jenkins(np.asarray(1.0 / 1.3), 1)[0]:.7f}")
+    2.4762675+0.6780566j
+    """
+    k, m = harmonic, np.asarray(ratio, dtype=np.float64)
+    if k % 2 == 0:
+        zero = np.zeros(m.shape, dtype=np.complex128)
+        return zero, zero
+    slips = m < 1.0
+    m = np.where(slips, m, 1.0)
+    t = 2.0 * np.arcsin(np.sqrt(m))
+    if k == 1:
+        y = 2.0 * t
+        z = np.minimum(y, 2.0 * _SERIES) ** 2
+        series = y**3 / 6.0 * (1.0 - z / 20.0 * (1.0 - z / 42.0 * (1.0 - z / 72.0)))
+        real = np.where(t < _SERIES, series, y - np.sin(y)) / (2.0 * np.pi)
+        value = real + 4j / np.pi * m * (1.0 - m)
+    else:
+        a, b = k - 1, k + 1
+        real = np.sin(b * t / 2.0) ** 2 / b - np.sin(a * t / 2.0) ** 2 / a
+        imag = 0.5 * (np.sin(b * t) / b - np.sin(a * t) / a)
+        value = 2j / (np.pi * k) * (real + 1j * imag)
+    by_ratio = 4j / (np.pi * k) * np.exp(-1j * k * t)
+    stuck = 1.0 if k == 1 else 0.0
+    return np.where(slips, value, stuck), np.where(slips, by_ratio, 0.0)

@@ -1,0 +1,157 @@
+"""Maxwell slip: a few parallel Jenkins elements, in closed form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from dahl_ident.arrays import ComplexArray, FloatArray, positive_array, whole_number
+from dahl_ident.elements.element import Element, StiffnessGradient, prefixed
+from dahl_ident.elements.masing import Masing, jenkins
+from dahl_ident.elements.parameter import Parameter
+from dahl_ident.errors import ValidationError
+
+
+class MaxwellSlip(Masing):
+    """n parallel springs, each of which slips at a displacement of its own.
+
+    F = sum of f_i, df_i/dx = stiffness_i, abs(f_i) <= stiffness_i slip_i. N is linear in the
+    stiffnesses.
+
+    Parameters
+    ----------
+    slips : int or array_like
+        Slip displacements, m (rad in rotation), each > 0 and rising: fixed. Or how many there
+        are: free, `slip_1` to `slip_n`.
+    stiffnesses : array_like, optional
+        Of the springs, N/m (N m/rad), > 0. Given: fixed; left out: free.
+    name : str, optional
+        Prefix of the parameters' names.
+
+    Raises
+    ------
+    ValidationError
+        If the slip displacements are not positive and rising, or there are not as many
+        stiffnesses.
+
+    Notes
+    -----
+    Many elements describe any symmetric rate-independent law without a memory of its own at full
+    slip (a Masing law). To find such a law from data, see
+    ``dahl_ident.diagnostics.slip_density.slip_density``. At an amplitude equal to a slip
+    displacement, where N has a kink, derivatives are those below it.
+
+    Examples
+    --------
+    >>> law = MaxwellSlip([1e-3, 4e-3], [2000.0, 500.0])
+    >>> law.force([0.0, 1e-3, 2e-3, 0.0]).tolist()
+    [0.0, 2.5, 3.0, -2.0]
+    >>> print(f"{law.describing_function(2e-3):.3f}")
+    1500.000+636.620j
+    """
+
+    kind = "maxwell_slip"
+    equation = "F = sum of f_i, df_i/dx = k_i, |f_i| <= k_i d_i"
+
+    def __init__(
+        self,
+        slips: int | Sequence[float] | FloatArray,
+        stiffnesses: Sequence[float] | FloatArray | None = None,
+        *,
+        name: str | None = None,
+    ) -> None:
+        given: FloatArray | None = None
+        if isinstance(slips, int):
+            n = whole_number(slips, "slips", 1)
+        else:
+            given = np.atleast_1d(positive_array(slips, "slips"))
+            n = given.size
+            if given.ndim != 1 or np.any(np.diff(given) <= 0.0):
+                raise ValidationError(f"slips are {list(slips)}; expected rising displacements")
+        stiff = None if stiffnesses is None else positive_array(stiffnesses, "stiffnesses")
+        if stiff is not None and stiff.shape != (n,):
+            raise ValidationError(
+                f"stiffnesses have shape {stiff.shape}; expected one for each of {n} slips"
+            )
+        self._name = name
+        self.parameters = tuple(
+            Parameter(
+                prefixed(name, f"{label}_{i + 1}"), unit, f"{meaning} {i + 1}",
+                None if values is None else float(values[i]), lower=0.0, transform="log",
+            )
+            for label, unit, meaning, values in (
+                ("stiffness", "N/m", "stiffness of Jenkins element", stiff),
+                ("slip", "m", "slip displacement of Jenkins element", given),
+            )
+            for i in range(n)
+        )  # fmt: skip
+        self.linear_parameters = self.scale_parameters = self.labels[:n]
+
+    @classmethod
+    def from_description(cls, rest: Mapping[str, Any], name: str | None) -> Element:
+        """Return the element that :meth:`describe` described."""
+        n = max(1, sum(str(label).startswith("slip_") for label in rest))
+        return cls(n, name=name)._described(rest)
+
+    def backbone(self, values: Sequence[FloatArray], displacement: FloatArray) -> FloatArray:
+        """Return the sum of k_i min(x, d_i)."""
+        stiffnesses, slips = self._split(values)
+        forces = [k * np.minimum(displacement, d) for k, d in zip(stiffnesses, slips, strict=True)]
+        return np.asarray(sum(forces))
+
+    def stiffness(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> ComplexArray:
+        """Return F_k/X_1 in closed form; `omega` does not matter."""
+        return self.stiffness_gradient(values, amplitude, omega, harmonic).value
+
+    def stiffness_gradient(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> StiffnessGradient:
+        """Return F_k/X_1 with its derivatives, exactly."""
+        shape = np.broadcast_shapes(*(np.shape(v) for v in (*values, amplitude, omega)))
+        A = np.asarray(amplitude, dtype=np.float64)
+        N = np.zeros(shape, dtype=np.complex128)
+        by_A, by_k, by_d = np.zeros_like(N), [], []
+        for k, d in zip(*self._split(values), strict=True):
+            with np.errstate(divide="ignore", over="ignore"):
+                unit, by_ratio = jenkins(np.asarray(d) / A, harmonic)
+            safe = np.where(A > 0.0, A, 1.0)
+            slope = k * by_ratio / safe
+            N += k * unit
+            by_A -= slope * (d / safe)
+            by_k.append(np.broadcast_to(unit, shape))
+            by_d.append(np.broadcast_to(slope, shape))
+        return StiffnessGradient(N, by_A, (*by_k, *by_d))
+
+    def rest_stiffness(self, values: Sequence[FloatArray]) -> FloatArray:
+        """Return the sum of all stiffnesses."""
+        return np.asarray(sum(np.asarray(k) for k in self._split(values)[0]))
+
+    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return the smallest and the largest slip displacement."""
+        slips = np.array(np.broadcast_arrays(*self._split(values)[1]))
+        return slips.min(axis=0), slips.max(axis=0)
+
+    def _split(
+        self, values: Sequence[FloatArray]
+    ) -> tuple[Sequence[FloatArray], Sequence[FloatArray]]:
+        n = len(values) // 2
+        return values[:n], values[n:]
+
+    def __repr__(self) -> str:
+        own = {
+            self.label(p): "free" if p.value is None else f"{p.value:g}" for p in self.parameters
+        }
+        name = f", name={self.name!r}" if self.name else ""
+        return f"MaxwellSlip({', '.join(f'{k}={v}' for k, v in own.items())}{name})"

@@ -1,0 +1,105 @@
+"""Histories with memory: stretches of one direction, and linear recursions over many steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg.lapack import dtbtrs
+
+from dahl_ident.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class Stretches:
+    """A displacement cut where its direction changes; m stretches of n samples.
+
+    Attributes
+    ----------
+    heading : ndarray, shape (m,)
+        +1 or -1.
+    length : ndarray, shape (m - 1,)
+        Path of every stretch but the last, m.
+    path : ndarray, shape (n,)
+        Path of every sample from the turning point before it, m.
+    samples : ndarray of int, shape (m,)
+        Samples of every stretch.
+    """
+
+    heading: FloatArray
+    length: FloatArray
+    path: FloatArray
+    samples: np.ndarray[tuple[int], np.dtype[np.intp]]
+
+    def spread(self, values: FloatArray) -> FloatArray:
+        """Return the values of stretches, (m, ...), at every sample, (n, ...)."""
+        return np.repeat(values, self.samples, axis=0)
+
+
+def stretches(displacement: FloatArray) -> Stretches:
+    """Return a displacement's stretches of one direction.
+
+    A step of 0 goes on as the motion before it. A turning point belongs to the stretch that it
+    begins.
+
+    Parameters
+    ----------
+    displacement : ndarray, shape (n,)
+        m.
+
+    Returns
+    -------
+    Stretches
+
+    Examples
+    --------
+    >>> cut = stretches(np.array([0.0, 1.0, 3.0, 2.0]))
+    >>> cut.heading.tolist(), cut.length.tolist(), cut.path.tolist()
+    ([1.0, -1.0], [3.0], [0.0, 1.0, 0.0, 1.0])
+    """
+    if displacement.size < 2:
+        return Stretches(np.ones(1), np.zeros(0), np.zeros(1), np.ones(1, dtype=np.intp))
+    steps = np.sign(np.diff(displacement))
+    moves = steps != 0.0
+    if not moves.all():
+        last = np.maximum.accumulate(np.where(moves, np.arange(steps.size), moves.argmax()))
+        steps = np.where(steps[last] < 0.0, -1.0, 1.0)
+    turns = np.concatenate(([0], np.flatnonzero(steps[1:] != steps[:-1]) + 1))
+    corner = displacement[turns]
+    samples = np.diff(turns, append=displacement.size)
+    path = np.abs(displacement - np.repeat(corner, samples))
+    return Stretches(steps[turns], np.abs(np.diff(corner)), path, samples)
+
+
+def linear_recursion(keep: FloatArray, term: FloatArray, first: FloatArray) -> FloatArray:
+    """Return y with y[0] = first and y[i + 1] = keep[i] y[i] + term[i].
+
+    Parameters
+    ----------
+    keep : ndarray, shape (n,)
+        Factors.
+    term : ndarray, shape (n, c)
+        c recursions with the same factors.
+    first : ndarray, shape (c,)
+        Their first values.
+
+    Returns
+    -------
+    ndarray, shape (n + 1, c)
+
+    Notes
+    -----
+    One forward substitution in a banded triangular matrix, by LAPACK.
+
+    Examples
+    --------
+    >>> linear_recursion(np.array([0.5, 0.5]), np.ones((2, 1)), np.zeros(1)).ravel().tolist()
+    [0.0, 1.0, 1.5]
+    """
+    band = np.empty((2, keep.size + 1), order="F")
+    band[0], band[1, -1] = 1.0, 0.0
+    np.negative(keep, out=band[1, :-1])
+    right = np.empty((keep.size + 1, first.size), order="F")
+    right[0], right[1:] = first, term
+    solution, _ = dtbtrs(band, right, uplo="L", diag="U", overwrite_b=1)
+    return np.asarray(solution)

@@ -1,0 +1,120 @@
+"""What a segment of samples shows about its own quality: steps, clipping, share of the sine.
+
+The describing function assumes a displacement that is one sine, seen by a sensor that is finer
+than the amplitude and wide enough for it. Each of these is measured here, for each segment.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.extraction.cycles import scattered
+from dahl_ident.extraction.sine_fit import HARMONICS, Segment, SineFit
+
+_UNROUNDED = 0.05  # residual, in steps, below which no rounding took place
+_DITHERED = np.sqrt(0.25 + 1.0 / 12.0)  # residual, in steps, of half a step of noise, rounded
+_LOOKED_AT = 20_000  # samples from which the sensor's step is found
+_FAR = 30.5  # steps, up to which a gap can be recognised as whole ones ...
+_ON_GRID = 0.1  # ... to within this
+_MOSTLY = 0.9  # of the gaps are not farther: else the step is too fine to matter
+_SAME = 1e-9  # of the range: values nearer than this are equal but for rounding
+_RAIL_RUN = 5  # samples in a row at an extreme value
+_CORNER = 3  # samples within which a clipped waveform is ...
+_AWAY = 1e-4  # ... this much of its span away from the rail
+_FITTED = 5  # offset, drift, a sine and its frequency
+
+
+def sensor_step(samples: FloatArray) -> float:
+    """Return the sensor's step, 0 where the values lie on no grid.
+
+    A sine sampled at the same phases in every cycle has few values too, but its gaps differ.
+    """
+    values = np.sort(scattered(samples, _LOOKED_AT))
+    gaps = np.diff(values)
+    gaps = gaps[gaps > _SAME * (values[-1] - values[0])]
+    if gaps.size == 0:
+        return 0.0
+    step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
+    in_steps = gaps / step
+    near = in_steps < _FAR
+    on_grid = np.abs(in_steps - np.round(in_steps)) < _ON_GRID
+    return step if near.mean() > _MOSTLY and on_grid[near].all() else 0.0
+
+
+def quantisation_errors(
+    amplitude: FloatArray, step: FloatArray, residual: FloatArray, samples_a_cycle: float
+) -> FloatArray:
+    """Return the error that rounding to sensor steps leaves in a phasor, for each channel.
+
+    Root mean square of its absolute value. Noise of more than half a step dithers: rounding then
+    averages out like noise, and shows in the scatter. Without it every cycle may be rounded
+    alike, so that only the samples of one cycle, step/sqrt(12) each, average out; and rounding
+    itself adds up to (2 step/pi) |J_1(2 pi A/step)|, at most about 0.2 step sqrt(step/A). Values
+    that follow a sine far more closely than the step were not rounded to it.
+    """
+    sampled = step**2 / 12.0 * 4.0 / samples_a_cycle
+    own = 0.04 * step**2 * step / np.maximum(np.maximum(amplitude, step), np.finfo(np.float64).tiny)
+    rounded = (residual > _UNROUNDED * step) & (residual <= _DITHERED * step)
+    return np.asarray(np.where(rounded, np.sqrt(sampled + own), 0.0))
+
+
+def clipped_share(samples: FloatArray, step: float, noise: float, crest: float) -> float:
+    """Return the share of samples that stand still at the highest or the lowest value.
+
+    They do so in runs that the waveform enters and leaves at a corner; one that saturates does
+    not enter so. Where the noise does not reach the sensor's step, a crest of `crest` samples
+    stands still as well.
+    """
+    highest, lowest = float(samples.max()), float(samples.min())
+    span = highest - lowest
+    tolerance = max(0.5 * step, _SAME * span)
+    longest = max(_RAIL_RUN, 1.5 * crest) if noise < 0.5 * step else _RAIL_RUN
+    stuck = 0
+    for rail, at_rail in (
+        (highest, samples > highest - tolerance),
+        (lowest, samples < lowest + tolerance),
+    ):
+        edges = np.flatnonzero(np.diff(at_rail, prepend=False, append=False))
+        starts, stops = edges[::2], edges[1::2]
+        before = samples[np.maximum(starts - _CORNER, 0)]
+        after = samples[np.minimum(stops + _CORNER - 1, samples.size - 1)]
+        corner = np.minimum(np.abs(before - rail), np.abs(after - rail)) > _AWAY * span
+        runs = (stops - starts)[corner]
+        stuck += int(runs[runs > longest].sum())
+    return stuck / samples.size
+
+
+def crest_samples(amplitude: float, step: float, sample_phase: float) -> float:
+    """Return how many samples of a sine lie within one sensor step of its crest."""
+    below = min(max(step / amplitude, _SAME), 2.0)
+    return float(2.0 * np.arccos(1.0 - below) / sample_phase) + 1.0
+
+
+def fundamental_share(fit: SineFit, segment: Segment, within: FloatArray) -> FloatArray:
+    """Return the fundamental's share of the power of each channel, offset and drift apart.
+
+    `fit` may be one of block means; the power is that of the samples themselves, and `within`
+    the part of it that the segment's own means do not show. What is left counts by its degrees
+    of freedom, for a sine fits any few samples well.
+    """
+    sine = 0.5 * np.abs(fit.phasors(1)) ** 2
+    drift = fit.coefficients[1] ** 2 / 3.0
+    left = np.maximum(np.var(segment.channels, axis=1) + within - drift - sine, 0.0)
+    n = segment.time.size * segment.block
+    left *= n / max(n - _FITTED, 1)
+    return np.asarray(sine / (sine + left))
+
+
+def distortion(fit: SineFit, integrations: int) -> float:
+    """Return the displacement's harmonics 2 to 9 over its fundamental, root of summed squares.
+
+    What the noise adds to their power is subtracted.
+    """
+    orders = np.arange(1, min(HARMONICS, fit.orders) + 1)
+    noise = float(fit.residual_variance[0])
+    power = np.array(
+        [abs(fit.phasors(k)[0]) ** 2 - noise * fit.phasor_variance(k) for k in orders.tolist()]
+    )
+    power /= orders.astype(np.float64) ** (2 * integrations)
+    return float(np.sqrt(max(power[1:].sum(), 0.0)) / abs(fit.phasors(1)[0]))

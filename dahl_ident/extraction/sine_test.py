@@ -1,0 +1,97 @@
+"""Whether a record is a sine test: one line in its spectrum, or cycles like their neighbours.
+
+Random motion, an earthquake, or point-to-point motion of a drive cross zero as well, and a few of
+their cycles look alike by chance. In a sine test (steady levels, steps, sweeps, an unsteady
+crank) almost every cycle is like the one before it. Cycles count by their energy, so noise during
+rests does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.extraction.cycles import Cycles
+
+ROUTE = (
+    "expected levels or a sweep of one sine; for any other motion fit the waveform itself: "
+    "di.fit(record, model)"
+)
+_PERIOD_CHANGE = 0.03  # from one cycle to the next, in half the energy: more is no sine test
+_AMPLITUDE_CHANGE = 0.1
+_FEWEST_PAIRS = 2  # of cycles, that show how alike they are
+_NOISY = 0.03  # of a cycle's log amplitude
+_SINE_IN_NOISE = 0.3  # of the power near the strongest line, where noise spoils the cycles
+_ONE_LINE = 0.8  # of the power, of one level whatever its cycles look like
+_BESIDE = 2  # lines on either side that a line leaks into
+_SPECTRUM_OF = 2**20  # samples at most
+
+
+def not_a_sine_test(motion: FloatArray, runs: Sequence[Cycles], covered: float) -> str:
+    """Return what shows that the motion is no sine test, empty where it may be one.
+
+    Parameters
+    ----------
+    motion : ndarray
+        Samples of the record.
+    runs : sequence of Cycles
+        Its cycles between crossings.
+    covered : float
+        Share of the moving time that the points found cover; chance makes some of any motion.
+    """
+    noise, period, amplitude, pairs = _neighbours(runs)
+    unlike = period > _PERIOD_CHANGE or amplitude > _AMPLITUDE_CHANGE
+    if pairs >= _FEWEST_PAIRS and not unlike:
+        return ""
+    line = _strongest_share(motion)
+    in_noise = pairs >= _FEWEST_PAIRS and (covered > 0.0 or noise > _NOISY)
+    if line > (_SINE_IN_NOISE if in_noise else _ONE_LINE):
+        return ""
+    power = f"its strongest line has {100.0 * line:.2g} % of the power"
+    if pairs < _FEWEST_PAIRS:
+        return f"not a sine test: the motion has no consecutive cycles, and {power}"
+    return (
+        f"not a sine test: neighbouring cycles of the motion differ by {100.0 * period:.2g} % in "
+        f"period and {100.0 * amplitude:.2g} % in amplitude (median), and {power}"
+    )
+
+
+def _neighbours(runs: Sequence[Cycles]) -> tuple[float, float, float, int]:
+    """Return medians by energy: noise of cycles, change of period and amplitude; and pairs."""
+    pairs = [
+        (
+            np.maximum(run.noise[1:], run.noise[:-1]),
+            np.abs(np.diff(np.log(run.stop - run.start))),
+            np.abs(np.diff(run.log_amplitude)),
+            2.0 * np.minimum(run.log_amplitude[1:], run.log_amplitude[:-1])
+            + np.log(run.stop[1:] - run.start[:-1]),
+        )
+        for run in runs
+        if len(run) > 1
+    ]
+    if not pairs:
+        return np.inf, np.inf, np.inf, 0
+    noise, period, amplitude, log_energy = (np.concatenate(c) for c in zip(*pairs, strict=True))
+    energy = np.exp(log_energy - log_energy.max())
+    return (
+        _median(noise, energy), _median(period, energy), _median(amplitude, energy), energy.size
+    )  # fmt: skip
+
+
+def _median(values: FloatArray, weights: FloatArray) -> float:
+    order = np.argsort(values)
+    below = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(below, 0.5 * below[-1])])
+
+
+def _strongest_share(motion: FloatArray) -> float:
+    """Return the share of the power near the strongest line of the middle of the record."""
+    start = max(0, (motion.size - _SPECTRUM_OF) // 2)
+    part = motion[start : start + _SPECTRUM_OF]
+    power = np.abs(np.fft.rfft(part - part.mean())[1:]) ** 2
+    total = float(power.sum())
+    strongest = int(np.argmax(power))
+    near = power[max(strongest - _BESIDE, 0) : strongest + _BESIDE + 1]
+    return float(near.sum()) / total if total else 1.0

@@ -1,0 +1,179 @@
+r"""The transient of friction: whether a segment has settled, and what is left where it has not.
+
+After a change of level the force departs from its steady loop. For Dahl friction the departure
+fades along the path s travelled, whatever the direction,
+
+    D(s) = D_0 exp(-beta s/A),     beta = sigma A/f_max;     exp(-4 beta) a cycle
+
+so settling takes cycles, not seconds, and the more of them the smaller the amplitude. In the
+response D barely shows from cycle to cycle. But it has one sign, so the force's mean shows it
+plainly, and there it is estimated: least squares of the force on harmonics, offset and
+exp(-beta s/A). What D then adds to each harmonic, as that was fitted, is the remaining bias.
+
+The rate is estimated as well, as far as the decay shows it. Where it does not (so slow that the
+mean seems to drift, or faded long ago) it leans on the beta at which Dahl friction alone has the
+measured phase. The noise of D_0 is taken from the lines below the fundamental, as 1/f noise: the
+less favourable case.
+
+Where the force is controlled its mean cannot drift; there the displacement's mean shows it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import Dahl
+from dahl_ident.extraction.line_noise import powers
+from dahl_ident.extraction.sine_fit import (
+    HARMONICS,
+    Segment,
+    SineFit,
+    columns,
+    resolvable_orders,
+    thinned,
+)
+
+SIGNIFICANT = 3.0  # standard deviations of D_0
+_RATES = np.geomspace(1e-3, 64.0, 29)  # 4 beta
+_REFINEMENTS = 5  # of the grid of rates, by 5 each
+_RATE_SPREAD = 1.0  # standard deviation of ln(rate) about what the phase says
+_FADED = 28.0  # decrements after which a departure of 1 is 1e-12
+_SLOW_LINES = 24  # from which the noise of D_0 is judged
+_TINY = np.finfo(np.float64).tiny
+MOST_CYCLES = 256  # that D_0 and the rate are estimated from
+
+
+@dataclass(frozen=True)
+class Transient:
+    """Departure of one channel from its steady loop: D_0 with its error, and 4 beta as `rate`.
+
+    D_0 is taken where the path of ``cos(theta + displacement_phase)`` is `start` amplitudes.
+    """
+
+    departure: float
+    departure_std: float
+    rate: float
+    displacement_phase: float
+    start: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether the departure stands out of the noise."""
+        return abs(self.departure) > SIGNIFICANT * self.departure_std
+
+    def waveform(self, segment: Segment) -> FloatArray:
+        """Return D at every sample of a segment that continues the phase."""
+        path = _path(segment.theta + self.displacement_phase) - self.start
+        return self.departure * np.exp(-0.25 * self.rate * path)
+
+    def phasors(self, fit: SineFit) -> ComplexArray:
+        """Return what D adds to the fitted phasors 0, 1, ... of its channel."""
+        part = self.lasting(fit.segment.theta)
+        return fit.phasors_of(self.waveform(fit.segment.part(part)))
+
+    def lasting(self, theta: FloatArray) -> slice:
+        """Return the samples before it has faded to 1e-12 of its size."""
+        faded = theta[0] + 2.0 * np.pi * _FADED / self.rate
+        return slice(0, max(2, int(np.searchsorted(theta, faded))))
+
+
+def estimate_transient(
+    fit: SineFit, channel: int, displacement_phase: float, response: complex
+) -> Transient:
+    """Estimate the departure that a segment starts with.
+
+    Parameters
+    ----------
+    fit : SineFit
+        Fit from where the amplitude became constant, over at most `MOST_CYCLES`.
+    channel : {0, 1}
+        Where to look: 1, the force, unless the force is controlled.
+    displacement_phase : float
+        Phase of the displacement's phasor, rad.
+    response : complex
+        Dynamic stiffness; its phase tells beta where the decay does not.
+
+    Returns
+    -------
+    Transient
+        Departure at the first sample, and rate.
+    """
+    drifting = fit.residual[channel] + fit.coefficients[1, channel] * fit.segment.tau
+    few = thinned(replace(fit.segment, channels=drifting[None]))
+    basis = columns(few.theta, few.tau, _orders(few))
+    steady = np.delete(basis, 1, axis=0)
+    steady = np.linalg.solve(np.linalg.cholesky(steady @ steady.T), steady)  # orthonormal
+    path = _path(few.theta + displacement_phase)
+    start = float(_path(fit.segment.theta[:1] + displacement_phase)[0])
+
+    slow = _SlowLines.of(few)
+    unsteady = few.channels[0] - steady.T @ (steady @ few.channels[0])
+    seen = slow.tones @ unsteady
+    rates = _RATES
+    centre = np.log(_friction_rate(response))
+    for _ in range(_REFINEMENTS):
+        decays = np.exp(-0.25 * rates[:, None] * (path - start))
+        decays -= decays @ steady.T @ steady
+        power = np.einsum("ij,ij->i", decays, decays)
+        sizes = decays @ few.channels[0] / power
+        gain = sizes**2 * power
+        best = int(np.argmax(gain))
+        variance = slow.variance(seen, sizes[best], decays[best])
+        i = int(np.argmin(((np.log(rates) - centre) / _RATE_SPREAD) ** 2 - gain / variance))
+        departure, std, rate = sizes[i], np.sqrt(variance / power[i]), rates[i]
+        rates = np.geomspace(rates[max(i - 1, 0)], rates[min(i + 1, rates.size - 1)], 11)
+    return Transient(float(departure), float(std), float(rate), displacement_phase, start)
+
+
+def _orders(segment: Segment) -> int:
+    """Return how many harmonics a departure is distinguished from."""
+    return min(HARMONICS, resolvable_orders(segment))
+
+
+def _path(theta: FloatArray) -> FloatArray:
+    """Return the path of cos(theta) from theta = 0 on, in amplitudes: 4 a cycle."""
+    strokes = np.floor(theta / np.pi)
+    return 2.0 * strokes + 1.0 - np.cos(theta - np.pi * strokes)
+
+
+@dataclass(frozen=True)
+class _SlowLines:
+    """The lines p/T below the fundamental, and their tones at the samples of a segment."""
+
+    p: FloatArray
+    tones: ComplexArray
+
+    @classmethod
+    def of(cls, segment: Segment) -> _SlowLines:
+        angle = segment.theta - segment.theta[0]
+        cycles = max(2, round(float(angle[-1]) / (2.0 * np.pi)))
+        p = np.arange(1.0, min(cycles, _SLOW_LINES + 1))
+        return cls(p, powers(np.exp(-1j / cycles * angle), p.size)[1:])
+
+    def variance(self, lines: ComplexArray, departure: float, decay: FloatArray) -> float:
+        """Return the variance of white noise that moves D_0 as much as the slow noise does.
+
+        `lines` are those of noise and departure together. They are taken as c/f; the decay sees
+        c times its own mean of 1/f.
+        """
+        decaying = self.tones @ decay
+        power = np.abs(decaying) ** 2
+        level = float(np.mean(self.p * np.abs(lines - departure * decaying) ** 2)) / decay.size
+        return max(level * float(np.sum(power / self.p) / np.sum(power)), _TINY)
+
+
+def _friction_rate(response: complex) -> float:
+    """Return 4 beta of the Dahl friction that has the phase of the response."""
+    rates, phases = _friction_phases()
+    return float(np.interp(np.angle(response), phases, rates))
+
+
+@cache
+def _friction_phases() -> tuple[FloatArray, FloatArray]:
+    beta = np.geomspace(_RATES[0] / 4.0, 1e3, 600)
+    phase = Dahl(f_max=1.0, sigma=1.0).phase(beta)
+    return 4.0 * beta, phase

@@ -1,0 +1,161 @@
+"""In which directions a law is nonlinear, and the scale that the data give to each.
+
+The force of most laws is proportional to some parameters. What is left are **directions** in
+which it is not: ratios of parameters that scale the force together, such as x_c = f_max/sigma,
+lengths, speeds and pure numbers. The dimension of a direction says what it is measured by: a
+length by the amplitudes of the data, a speed by amplitude times angular frequency.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements import Element, Parameter
+from dahl_ident.problem import Problem
+from dahl_ident.problem.stiffness import StiffnessData
+
+Dimension = tuple[int, int, int]
+_STIFFNESS: Dimension = (1, -1, 0)
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A parameter, or its ratio to another one of the element.
+
+    Attributes
+    ----------
+    parameter : Parameter
+        The free parameter.
+    over : Parameter or None
+        What it is divided by.
+    dimension : tuple of int
+        Powers of force, displacement and time.
+    """
+
+    parameter: Parameter
+    over: Parameter | None
+    dimension: Dimension
+
+    @property
+    def is_number(self) -> bool:
+        """Whether it has no unit."""
+        return not any(self.dimension)
+
+    def row(self, problem: Problem) -> tuple[FloatArray, float]:
+        """Return its logarithm as row times theta plus number."""
+        row, rest = np.zeros(len(problem.parameters)), 0.0
+        for parameter, sign in ((self.parameter, 1.0), (self.over, -1.0)):
+            if parameter is None:
+                continue
+            if parameter.free:
+                row[problem.names.index(parameter.name)] = sign
+            elif parameter.value is not None:
+                rest += sign * float(np.log(parameter.value))
+        return row, rest
+
+    def sizes(self, view: StiffnessData) -> FloatArray:
+        """Return the logarithm of what each row of data measures it by, (n,) or (S, n)."""
+        force, displacement, time = self.dimension
+        ln_size = displacement * np.log(view.amplitude)
+        if time:
+            ln_size = ln_size - time * np.log(np.maximum(view.omega, 1e-300))
+        if force:
+            stiffness = np.log(view.typical_stiffness)[..., None]
+            ln_size = ln_size + force * (stiffness + np.log(view.amplitude))
+        return np.asarray(ln_size)
+
+
+@dataclass(frozen=True)
+class Directions:
+    """How an element depends on its free parameters.
+
+    Attributes
+    ----------
+    element : Element
+    linear : tuple of Parameter
+        Free ones in which the force is linear.
+    scale : tuple of Parameter
+        Those that scale the rest of the force together.
+    reference : Parameter or None
+        The one of `scale` that the others are divided by.
+    nonlinear : tuple of Direction
+    """
+
+    element: Element
+    linear: tuple[Parameter, ...]
+    scale: tuple[Parameter, ...]
+    reference: Parameter | None
+    nonlinear: tuple[Direction, ...]
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the common scale of the force is free, so that it can be solved for."""
+        return bool(self.scale) and all(p.free for p in self.scale)
+
+    @cached_property
+    def length(self) -> Direction | None:
+        """The one direction with a unit, where it is a length and so scales the curve."""
+        with_unit = [d for d in self.nonlinear if not d.is_number]
+        if len(with_unit) != 1 or not self.element.rate_independent or not self.is_free:
+            return None
+        (one,) = with_unit
+        force, displacement, time = one.dimension
+        fixed = [
+            p
+            for p in self.element.parameters
+            if not p.free and p not in self.scale and any(p.dimension)
+        ]
+        is_length = not force and not time and abs(displacement) == 1
+        plain = is_positive(one.parameter) and not fixed and not self.linear
+        return one if is_length and plain else None
+
+
+@lru_cache(maxsize=256)
+def directions(element: Element) -> Directions:
+    """Return how an element depends on its free parameters."""
+    parameters = dict(zip(element.labels, element.parameters, strict=True))
+    linear = tuple(p for label, p in parameters.items() if label in element.linear_parameters)
+    scale = tuple(
+        p
+        for label, p in parameters.items()
+        if label in element.scale_parameters and p not in linear
+    )
+    reference = _reference(scale)
+    found = []
+    for parameter in element.parameters:
+        if not parameter.free or parameter in linear or parameter is reference:
+            continue
+        if element.is_linear:  # how its force depends on it is for nobody but the user to know
+            continue
+        over = reference if parameter in scale else None
+        own, other = parameter.dimension, (0, 0, 0) if over is None else over.dimension
+        dimension = own[0] - other[0], own[1] - other[1], own[2] - other[2]
+        found.append(Direction(parameter, over, dimension))
+    return Directions(element, tuple(p for p in linear if p.free), scale, reference, tuple(found))
+
+
+def is_positive(parameter: Parameter) -> bool:
+    """Return whether a parameter takes values above zero only."""
+    return parameter.transform == "log" or parameter.lower >= 0.0
+
+
+def _reference(scale: tuple[Parameter, ...]) -> Parameter | None:
+    """Return what the other scale parameters are divided by: a known one, or a stiffness."""
+    known = [p for p in scale if not p.free]
+    stiff = [p for p in scale if p.dimension == _STIFFNESS]
+    return next(iter((*known, *stiff, *scale)), None)
+
+
+def free_springs(problem: Problem) -> list[Parameter]:
+    """Return the free stiffnesses of linear springs that no bound keeps from any value."""
+    return [
+        p
+        for element in problem.model.elements
+        if element.is_linear and element.rate_independent
+        for p in directions(element).linear
+        if p.dimension == _STIFFNESS and np.isinf(p.lower)
+    ]

@@ -1,0 +1,645 @@
+r"""Where a search starts: variable projection, so that no user has to guess.
+
+The force of a friction law is proportional to some of its parameters, or to one factor on all of
+them; a describing function, for instance, is linear in sigma once x_c = f_max/sigma and alpha are
+given,
+
+    N = sigma h_alpha(A / x_c),
+
+and springs, dampers and masses are linear anyway. Least squares in dynamic stiffness, with
+amplitudes as measured and weights that the noise model has at the data, is therefore a search
+over the directions that are left (:mod:`dahl_ident.fitting.directions`): at each node of a grid of
+those, the linear parameters are solved exactly. Every local minimum over the grid is a start.
+
+A length has four nodes a decade from a hundredth of the smallest amplitude to a hundred times
+the largest, and one a decade beyond, down to 1e-8 and up to 1e6 times. Farther out the curve is
+its own limit to well below any noise; whether the optimum lies out there, at infinity, is for
+:mod:`dahl_ident.fitting.asymptotes` to decide. A pure number takes the values that its law
+declares. All nodes are combined while they are few; else points of a quasi-random sequence are.
+
+Where one length scales the curve of a rate-independent law, the curve is read from a table over
+ln(A/length) whose steps divide those of the grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
+from dahl_ident.elements import Element, Parameter
+from dahl_ident.errors import FitError
+from dahl_ident.fitting.directions import Direction, Directions, directions, is_positive
+from dahl_ident.problem import Problem
+from dahl_ident.problem.stiffness import StiffnessData
+
+IntArray = NDArray[np.intp]
+
+_STEP = 0.01
+_LOWEST, _NODES = -3200, 6400  # of ln(A/length) in a table, in steps
+_DECADE = np.log(10.0) / _STEP
+_FINE, _COARSE = 58, 230  # steps between nodes of the grid: four a decade, one a decade
+_FINE_ENDS = (6, 4)  # coarse nodes at either end
+_COMPUTED = 10  # steps between the amplitudes at which a table is computed; splines between
+_AROUND_KNEE = 1e3  # how far a table is computed beyond the knee; power laws beyond that
+_NUMBERS = {"log": (0.25, 0.5, 1.0, 2.0, 4.0), "linear": (-1.0, -0.5, 0.0, 0.5, 1.0)}
+_DEPENDENT = 1e-12  # of a column's length that others leave
+_MOST_COMBINATIONS = 4000
+_MOST_OF_ONE = 1000  # of one element whose curves have to be computed node by node
+_MOST_STARTS = 4
+_AROUND = np.array([-1, 0, 1])
+
+
+class Starts(NamedTuple):
+    """Starts of all tables: whose each is, (M,), and its search coordinates, (M, P)."""
+
+    table: IntArray
+    theta: FloatArray
+
+    def joined(self, other: Starts) -> Starts:
+        """Return these and others."""
+        return Starts(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+
+    def of(self, tables: IntArray) -> Starts:
+        """Return those of some tables, in rising order, which are numbered anew."""
+        chosen = np.isin(self.table, tables)
+        return Starts(np.searchsorted(tables, self.table[chosen]), self.theta[chosen])
+
+
+def starts(problem: Problem) -> FloatArray:
+    """Return the search coordinates of one table's best starts, best first, shape (starts, P).
+
+    Values that the user gave to free parameters make one more start, the last.
+    """
+    return own_starts(problem).theta
+
+
+def own_starts(problem: Problem, *, resistant: bool = False) -> Starts:
+    """Return the best starts of every table of a problem, best first.
+
+    `resistant` ones have an outlier rule some of them, but not all: by other weights as well. A
+    response far too large has no say where errors count relative to it, one far too small has
+    none where all count alike.
+    """
+    view = problem.stiffness_data
+    found = _starts(problem, view)
+    if not resistant:
+        return found
+    size = np.maximum(np.abs(view.stiffness), SMALLEST)
+    for weights in (1.0 / size, np.ones(size.shape)):
+        found = found.joined(_starts(problem, replace(view, weights=weights)))
+    return found
+
+
+def _starts(problem: Problem, view: StiffnessData) -> Starts:
+    grid = _grid(problem, view)
+    cost, coefficients = grid.solved()
+    best = _vertices(grid, cost, coefficients)
+    lead = cost.shape[:-1]
+    S, nodes = problem.n_tables, cost.shape[-1]
+    table, place = _local_minima(cost.reshape(S, *grid.shape))
+    one = grid.shape == (nodes,)
+    edges = ((place == 0) | (place == nodes - 1)).any()
+    if (
+        one and nodes > sum(_FINE_ENDS) and edges
+    ):  # an optimum far out may be kept from there by bounds
+        first = np.flatnonzero(np.diff(table, prepend=-1))
+        for edge, nearer in ((0, _FINE_ENDS[0]), (nodes - 1, nodes - 1 - _FINE_ENDS[1])):
+            there = first[place[first] == edge]
+            table = np.append(table, table[there])
+            place = np.append(place, np.full(there.size, nearer))
+        order = np.argsort(table, kind="stable")
+        table, place = table[order], place[order]
+    is_first = np.diff(table, prepend=-1) > 0
+    if lead:
+        theta = grid.of_tables(table).theta(coefficients[table], place[:, None])[:, 0]
+    else:
+        theta = grid.theta(coefficients, place)
+    theta[is_first] = best
+    found = Starts(table, theta)
+    if all(p.value is None for p in problem.parameters):
+        return found
+    values = problem.to_values(best).reshape(S, -1)
+    for index, parameter in enumerate(problem.parameters):
+        if parameter.value is not None:
+            values[:, index] = parameter.value
+    given = problem.to_search(values)
+    new = ~np.isclose(given, best, rtol=1e-12).all(axis=1)
+    more = Starts(np.flatnonzero(new), given[new])
+    found = found.joined(more)
+    order = np.argsort(found.table, kind="stable")
+    return Starts(found.table[order], found.theta[order])
+
+
+def best_starts(problem: Problem) -> FloatArray:
+    """Return the best start of each table of a problem, shape (S, P)."""
+    grid = _grid(problem, problem.stiffness_data)
+    return _vertices(grid, *grid.solved())
+
+
+def _vertices(grid: _Grid, cost: FloatArray, coefficients: FloatArray) -> FloatArray:
+    """Return the best node of each table, (S, P); between nodes where there is one grid."""
+    best = cost.argmin(axis=-1)[..., None]
+    nodes, P = cost.shape[-1], len(grid.problem.parameters)
+    if grid.shape != (nodes,) or nodes < 3:
+        return grid.theta(coefficients, best).reshape(-1, P)
+    around = np.clip(best, 1, nodes - 2) + _AROUND
+    theta = grid.theta(coefficients, around)
+    vertex = _vertex(np.take_along_axis(cost, around, axis=-1), theta)
+    vertex = np.where(best == 0, theta[..., 0, :], vertex)
+    return np.where(best == nodes - 1, theta[..., 2, :], vertex).reshape(-1, P)
+
+
+def grid_size(problem: Problem) -> int:
+    """Return the number of nodes of the grid where starts are searched."""
+    return len(_grid(problem, problem.stiffness_data).nodes)
+
+
+def edge_starts(problem: Problem) -> list[FloatArray]:
+    """Return the best nodes at both ends of each direction's grid, each (P,) or (S, P).
+
+    They are where searches for limits start.
+    """
+    grid = _grid(problem, problem.stiffness_data)
+    cost, coefficients = grid.solved()
+    found = []
+    for index, curves in enumerate(grid.curves):
+        for at in curves.edges:
+            there = np.where(at[grid.nodes[:, index]], cost, np.inf)
+            found.append(grid.theta(coefficients, there.argmin(axis=-1)[..., None])[..., 0, :])
+    return found
+
+
+def _vertex(cost: FloatArray, theta: FloatArray) -> FloatArray:
+    """Return theta at the vertex of the parabola through three nodes, (..., 3) and (..., 3, P)."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        left, middle, right = cost[..., 0], cost[..., 1], cost[..., 2]
+        u = 0.5 * (left - right) / (left - 2.0 * middle + right)
+    u = np.where(np.abs(u) <= 1.0, u, 0.0)[..., None]
+    left, middle, right = theta[..., 0, :], theta[..., 1, :], theta[..., 2, :]
+    return np.asarray(middle + 0.5 * u * (right - left + u * (right - 2.0 * middle + left)))
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A linear coefficient of one element: which parameters it multiplies, and its curve."""
+
+    parameters: tuple[Parameter, ...]
+    curve: ComplexArray  # at every row, (..., K, n)
+
+    @property
+    def is_positive(self) -> bool:
+        return any(is_positive(p) for p in self.parameters)
+
+
+@dataclass(frozen=True)
+class _Curves:
+    """One element at the K nodes of its own grid."""
+
+    values: dict[str, FloatArray]
+    """Nonlinear parameters, and those that a column multiplies at 1: (K,) or (S, K)."""
+    columns: list[_Column]
+    known: ComplexArray | None
+    """What does not depend on any coefficient, (..., K, n)."""
+    edges: list[NDArray[np.bool_]]
+    """For either end of each direction: which nodes lie there, (K,)."""
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Linear least squares at every combination of the elements' nodes."""
+
+    problem: Problem
+    curves: list[_Curves]
+    nodes: IntArray  # (C, elements with more than one node)
+    shape: tuple[int, ...]
+    target: ComplexArray  # weighted, (..., n)
+    weights: FloatArray  # (..., n)
+    common: list[_Column]  # the same at every node, curves of shape (..., n)
+
+    def solved(self) -> tuple[FloatArray, FloatArray]:
+        """Return the sum of squares, (..., C), and the linear coefficients, (..., C, Q)."""
+        one = len(self.curves) == 1 and len(self.curves[0].columns) == 1 and not self.common
+        if one and self.curves[0].known is None:
+            curve = self.curves[0].columns[0].curve
+            cost, coefficients = _solve_one(self.target, curve, self.weights)
+        else:
+            cost, coefficients = _solve_linear(*self._system())
+        own = coefficients[..., len(self.common) :]
+        positive = [c.is_positive for curves in self.curves for c in curves.columns]
+        allowed = ((own > 0.0) | ~np.array(positive, dtype=np.bool_)).all(axis=-1)
+        return np.where(allowed, cost, np.inf), coefficients
+
+    def _system(self) -> tuple[FloatArray, list[FloatArray], list[FloatArray]]:
+        """Return what is to be fitted, (..., C, 2 n), columns of every node, and of each."""
+        target = self.target[..., None, :]
+        columns = []
+        for index, curves in enumerate(self.curves):
+            chosen = self.nodes[:, index]
+            columns += [
+                _parts(column.curve[..., chosen, :] * self.weights[..., None, :])
+                for column in curves.columns
+            ]
+            if curves.known is not None:
+                target = target - curves.known[..., chosen, :] * self.weights[..., None, :]
+        shape = np.broadcast_shapes(target.shape, (len(self.nodes), 1))
+        common = [
+            _parts(np.broadcast_to(c.curve * self.weights, self.target.shape)) for c in self.common
+        ]
+        return _parts(np.broadcast_to(target, shape)), common, columns
+
+    def of_tables(self, tables: IntArray) -> _Grid:
+        """Return the grid for `theta` alone, of some tables of a batch."""
+        return replace(
+            self,
+            curves=[
+                replace(c, values={k: v[tables] if v.ndim > 1 else v for k, v in c.values.items()})
+                for c in self.curves
+            ],
+        )
+
+    def theta(self, coefficients: FloatArray, places: IntArray) -> FloatArray:
+        """Return the search coordinates at some combinations of nodes, (..., k) -> (..., k, P)."""
+        chosen = np.take_along_axis(coefficients, places[..., None], axis=-2)
+        found: dict[str, FloatArray] = {}
+        used = 0
+        for column in self.common:
+            _scaled(found, column, chosen[..., used])
+            used += 1
+        for index, curves in enumerate(self.curves):
+            node = self.nodes[places, index]
+            found.update({name: _taken(v, node) for name, v in curves.values.items()})
+            for column in curves.columns:
+                _scaled(found, column, chosen[..., used])
+                used += 1
+        theta = np.empty((*places.shape, len(self.problem.parameters)))
+        for index, parameter in enumerate(self.problem.parameters):
+            value = found.get(parameter.name, parameter.value)
+            assert value is not None
+            if parameter.transform == "log":
+                value = np.log(np.maximum(np.abs(value), 1e-300))
+            theta[..., index] = value
+        return theta
+
+
+def _scaled(values: dict[str, FloatArray], column: _Column, coefficient: FloatArray) -> None:
+    size = np.abs(coefficient) if column.is_positive else coefficient
+    for p in column.parameters:
+        values[p.name] = values.get(p.name, np.ones(())) * size
+
+
+def _grid(problem: Problem, view: StiffnessData) -> _Grid:
+    every = [directions(e) for e in problem.model.elements]
+    searched = [d for d in every if d.nonlinear]
+    each = _MOST_COMBINATIONS ** (1.0 / max(1, len(searched)))
+    curves = [_curves(d, view, each) for d in searched]
+    counts = [_size(c) for c in curves]
+    nodes = np.indices(counts).reshape(len(counts), int(np.prod(counts))).T
+    rest = np.zeros(view.stiffness.shape, dtype=np.complex128)
+    common: list[_Column] = []
+    for d in every:
+        if d.nonlinear:
+            continue
+        known, columns = _columns(d, {}, view)
+        rest = rest + (0.0 if known is None else known)
+        common += columns
+    return _Grid(
+        problem,
+        curves,
+        nodes,
+        tuple(counts),
+        (view.stiffness - rest) * view.weights,
+        view.weights,
+        common,
+    )
+
+
+def _size(curves: _Curves) -> int:
+    return int(next(iter(curves.values.values())).shape[-1])
+
+
+def _columns(
+    d: Directions, values: dict[str, FloatArray], view: StiffnessData
+) -> tuple[ComplexArray | None, list[_Column]]:
+    """Return what is known of an element's stiffness, and a column for each coefficient.
+
+    `values` are those of the directions, each (..., K).
+    """
+    linear = {p.name for p in d.linear}
+    scaled = {p.name for p in d.scale} if d.is_free else set()
+    missing = [
+        p.name
+        for p in d.element.parameters
+        if p.value is None and p.name not in {*linear, *scaled, *values}
+    ]
+    if missing:
+        raise FitError(
+            f"{', '.join(missing)} has no value to start from, and {d.element!r} does not say how "
+            "its force depends on it; give it a value and name it in free="
+        )
+
+    def at(one: Parameter | None, scale: float) -> ComplexArray:
+        numbers = []
+        for p in d.element.parameters:
+            value: FloatArray | float
+            if p.name in values:
+                value = values[p.name]
+            elif p.name in linear:
+                value = float(p is one)
+            elif p.name in scaled:
+                value = scale
+            else:
+                value = float("nan") if p.value is None else p.value
+            numbers.append(np.asarray(value, dtype=np.float64))
+        with np.errstate(all="ignore"):  # far out a law may overflow, and is no start there
+            return view.of(d.element, numbers, at_nodes=bool(values))
+
+    columns = []
+    if not d.linear:
+        return (None, [_Column(d.scale, at(None, 1.0))]) if scaled else (at(None, 1.0), [])
+    if all(p in d.linear for p in d.element.parameters):  # a linear element: nothing else acts
+        return None, [_Column((p,), at(p, 0.0)) for p in d.linear]
+    base = at(None, 1.0)
+    if scaled:
+        columns.append(_Column(d.scale, base))
+    columns += [_Column((p,), at(p, 1.0) - base) for p in d.linear]
+    return (None if scaled or not np.any(base) else base), columns
+
+
+def _curves(d: Directions, view: StiffnessData, most: float) -> _Curves:
+    """Return an element at its own grid, of at most about `most` nodes."""
+    if d.length is not None:
+        return _tabulated_curves(d, d.length, view, most)
+    most = min(most, _MOST_OF_ONE)
+    lengths = [x for x in d.nonlinear if not x.is_number]
+    numbers = [_numbers(x) for x in d.nonlinear if x.is_number]
+    combined = float(np.prod([n.size for n in numbers])) if numbers else 1.0
+    each = max(12.0, (most / combined) ** (1.0 / max(1, len(lengths))))
+    axes = [_axis(x, view, each) for x in lengths] + [n[None] for n in numbers]
+    ordered = lengths + [x for x in d.nonlinear if x.is_number]
+    counts = [a.shape[-1] for a in axes]
+    if np.prod(counts) <= 2.0 * most:
+        index = np.indices(counts).reshape(len(counts), -1)
+    else:
+        index = _quasi_random(tuple(counts), int(most))
+    lead = view.amplitude.shape[:-1]
+    ratios = [(a[..., i] if lead else a.reshape(-1)[i]) for a, i in zip(axes, index, strict=True)]
+    values: dict[str, FloatArray] = {}
+    for direction, ratio in zip(ordered, ratios, strict=True):
+        over = direction.over
+        known = 1.0 if over is None or over.free or over.value is None else over.value
+        values[direction.parameter.name] = np.asarray(ratio * known)
+    known_part, columns = _columns(d, values, view)
+    if d.is_free and d.reference is not None:
+        values[d.reference.name] = np.ones(index.shape[1])
+    edges = [i == end for i, n in zip(index, counts, strict=True) if n > 1 for end in (0, n - 1)]
+    return _Curves(values, columns, known_part, edges[: 2 * len(lengths)])
+
+
+def _numbers(direction: Direction) -> FloatArray:
+    """Return the values of a pure number that are tried."""
+    p = direction.parameter
+    values = np.array(p.scan or _NUMBERS[p.transform])
+    if not p.scan and np.isfinite([p.lower, p.upper]).all() and p.transform == "linear":
+        values = p.lower + (p.upper - p.lower) * np.linspace(0.1, 0.9, 5)
+    inside = values[(values >= p.lower) & (values <= p.upper)]
+    return np.asarray(inside if inside.size else np.clip(values[:1], p.lower, p.upper))
+
+
+def _axis(direction: Direction, view: StiffnessData, most: float) -> FloatArray:
+    """Return the values of a direction with a unit that are tried, (..., K)."""
+    position = np.rint(direction.sizes(view) / _STEP).astype(np.intp)
+    low = position.min(axis=-1)
+    span = int((position.max(axis=-1) - low).max())
+    signed = not is_positive(direction.parameter)
+    offsets = _offsets(span, max(6.0, most / (2.0 if signed else 1.0)))
+    values = np.exp((low[..., None] + offsets) * _STEP)
+    if signed:
+        values = np.concatenate([-values[..., ::-1], values], axis=-1)
+    return np.asarray(values)
+
+
+@lru_cache(maxsize=16)
+def _quasi_random(counts: tuple[int, ...], most: int) -> IntArray:
+    """Return `most` combinations of nodes, spread evenly, (directions, most)."""
+    from scipy.stats import qmc
+
+    points = qmc.Sobol(len(counts), scramble=False).random_base2(int(np.log2(most)))
+    return np.asarray((points * np.array(counts)).astype(np.intp).T)
+
+
+@lru_cache(maxsize=256)
+def _offsets(span: int, most: float) -> IntArray:
+    """Return the nodes of the logarithm of a direction in steps above the smallest size."""
+    decade = round(_DECADE)
+    fine = max(_FINE, int(np.ceil((span + 4 * decade) / (0.7 * most))))
+    below = np.arange(-8 * decade, -2 * decade, _COARSE)
+    inner = np.arange(-2 * decade, span + 2 * decade + fine, fine)
+    above = np.arange(inner[-1] + _COARSE, span + 6 * decade + 1, _COARSE)
+    return np.concatenate([below, inner, above])
+
+
+def _tabulated_curves(
+    d: Directions, length: Direction, view: StiffnessData, most: float
+) -> _Curves:
+    """Return an element whose curve one length scales: from tables over ln(A/length)."""
+    numbers = [x for x in d.nonlinear if x is not length]
+    axes = [_numbers(x) for x in numbers]
+    counts = [a.size for a in axes]
+    index = np.indices(counts).reshape(len(counts), -1) if counts else np.zeros((0, 1), np.intp)
+    if index.shape[1] > most / 6.0:
+        index = _quasi_random(tuple(counts), max(2, int(most / 6.0)))
+    chosen = [a[i] for a, i in zip(axes, index, strict=True)]
+    combinations = np.array(chosen).reshape(len(axes), index.shape[1]).T
+    position = np.rint(np.log(view.amplitude) / _STEP).astype(np.intp)
+    low = position.min(axis=-1)
+    span = int((position.max(axis=-1) - low).max())
+    offsets = _offsets(span, max(6.0, most / len(combinations)))
+    ln_length = low[..., None] + offsets
+    at = position[..., None, :] - (ln_length[..., None] + _LOWEST)
+    power = length.dimension[1]
+    curves = [_curve(d, length, tuple(c.tolist()), view, at) for c in combinations]
+    curve = curves[0] if len(curves) == 1 else np.concatenate(curves, axis=-2)
+    K = len(combinations)
+    ln_lengths = np.concatenate([ln_length] * K, axis=-1) * _STEP
+    values = {length.parameter.name: np.exp(ln_lengths * power)}
+    for column, direction in enumerate(numbers):
+        values[direction.parameter.name] = np.repeat(combinations[:, column], offsets.size)
+    assert d.reference is not None
+    values[d.reference.name] = np.ones(K * offsets.size)
+    node = np.tile(np.arange(offsets.size), K)
+    edges = [node == 0, node == offsets.size - 1]
+    # the curve at unit length is that of unit reference, whatever the reference's own dimension
+    shift = d.reference.dimension[1] + 1
+    if shift:
+        curve = curve / np.exp(ln_lengths[..., None] * shift)
+    return _Curves(values, [_Column(d.scale, curve)], None, edges)
+
+
+def _curve(
+    d: Directions, length: Direction, numbers: tuple[float, ...], view: StiffnessData, at: IntArray
+) -> ComplexArray:
+    """Return F_k/X_1 at unit scale and places `at` of the table, row by row's harmonic."""
+    if len(view.orders) == 1:
+        return _table(d, length, numbers, view.orders[0]).take(at, mode="clip")
+    curve = np.empty(at.shape, dtype=np.complex128)
+    for k in view.orders:
+        rows = view.harmonic == k
+        curve[..., rows] = _table(d, length, numbers, k).take(at[..., rows], mode="clip")
+    return curve
+
+
+_TABLES: dict[Hashable, ComplexArray] = {}
+_MOST_TABLES = 64
+
+
+def _table(
+    d: Directions, length: Direction, numbers: tuple[float, ...], harmonic: int
+) -> ComplexArray:
+    """Return F_k/X_1 over unit scale at ln(A/length) = -32, -31.99, ..., 32."""
+    element = d.element
+    values = _unit_values(d, length, numbers)
+    plain = set(vars(element)) <= {"_name", "parameters"}
+    key = (type(element), element.labels, tuple(float(v) for v in values), harmonic)
+    if not plain or key not in _TABLES:
+        table = _computed_table(element, values, harmonic)
+        if not plain:
+            return table
+        if len(_TABLES) >= _MOST_TABLES:
+            _TABLES.clear()
+        _TABLES[key] = table
+    return _TABLES[key]
+
+
+def _unit_values(d: Directions, length: Direction, numbers: tuple[float, ...]) -> list[FloatArray]:
+    """Return the element's values at unit scale and length."""
+    of_numbers = [x.parameter for x in d.nonlinear if x is not length]
+    given = dict(zip((p.name for p in of_numbers), numbers, strict=True))
+    values = []
+    for p in d.element.parameters:
+        value = given.get(p.name, 1.0 if p.free or p.value is None else p.value)
+        values.append(np.asarray(value, dtype=np.float64))
+    return values
+
+
+def _computed_table(element: Element, values: list[FloatArray], harmonic: int) -> ComplexArray:
+    """Return the table from amplitudes around the knee; power laws beyond."""
+    low, high = (float(np.asarray(v)) for v in element.knee(values))
+    if not 0.0 < low <= high < np.inf:
+        low = high = 1.0
+    first = int(np.log(low / _AROUND_KNEE) / _STEP) // _COMPUTED * _COMPUTED
+    last = int(np.log(high * _AROUND_KNEE) / _STEP)
+    coarse = np.arange(max(first, _LOWEST), min(last, _LOWEST + _NODES) + 1, _COMPUTED)
+    x = coarse * _STEP
+    Z = element.stiffness(values, np.exp(x), np.ones(()), harmonic)
+    fine = np.arange(_LOWEST, _LOWEST + _NODES + 1) * _STEP
+    parts = []
+    for y in (Z.real, Z.imag):
+        inside = CubicSpline(x, y)(np.clip(fine, x[0], x[-1]))
+        for end, near, side in ((0, 1, fine < x[0]), (-1, -2, fine > x[-1])):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                slope = np.log(y[end] / y[near]) / (x[end] - x[near])
+            if not np.isfinite(slope):
+                slope = 0.0
+            inside[side] = y[end] * np.exp(np.clip(slope, -3.0, 3.0) * (fine[side] - x[end]))
+        parts.append(inside)
+    return np.asarray(parts[0] + 1j * parts[1])
+
+
+def _solve_one(
+    target: ComplexArray, curve: ComplexArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return what `_solve_linear` does for the one column curve times weights, (..., K, n)."""
+    parts = curve.view(np.float64)
+    power = curve.real**2 + curve.imag**2
+    pulled = (target * weights).view(np.float64)
+    size = (target.real**2 + target.imag**2).sum(axis=-1)[..., None]
+    overlap = (parts @ pulled[..., None])[..., 0]
+    norm = (power @ (weights**2)[..., None])[..., 0]
+    coefficient = overlap / np.maximum(norm, 1e-300)
+    return size - coefficient * overlap, coefficient[..., None]
+
+
+def _solve_linear(
+    target: FloatArray, common: list[FloatArray], own: list[FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the least sum of squares of target - coefficients times columns, and those.
+
+    Columns in `common`, (..., 2 n), are the same at every node; they are projected out first,
+    because those in `own`, (..., C, 2 n), can be hard to tell from them.
+    """
+    Q, R = _factors(common, target)
+    rest = _projected(target, Q)
+    columns = (
+        np.stack(np.broadcast_arrays(*own), axis=-2) if own else rest[..., None, :][..., :0, :]
+    )
+    left = _projected(columns, Q[..., None, :, :])
+    norm = np.sqrt((left * left).sum(axis=-1))
+    left = left / np.where(norm > 0.0, norm, 1.0)[..., None]
+    gram = left @ left.swapaxes(-1, -2) + 1e-13 * np.eye(left.shape[-2])
+    scaled = np.linalg.solve(gram, left @ rest[..., None])
+    rest = rest - (scaled.swapaxes(-1, -2) @ left)[..., 0, :]
+    coefficients = scaled[..., 0] / np.where(norm > 0.0, norm, np.inf)
+    explained = target - (coefficients[..., None, :] @ columns)[..., 0, :]
+    base = np.linalg.solve(R[..., None, :, :], (explained @ Q)[..., None])[..., 0]
+    return (rest * rest).sum(axis=-1), np.concatenate([base, coefficients], axis=-1)
+
+
+def _factors(common: list[FloatArray], target: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return Q, (..., 2 n, L), and R of the common columns; dependent ones get no part."""
+    lead, m = target.shape[:-2], target.shape[-1]
+    X = np.zeros((*lead, m, len(common)))
+    for index, column in enumerate(common):
+        X[..., index] = column
+    size = np.sqrt((X * X).sum(axis=-2))
+    size = np.where(size > 0.0, size, 1.0)
+    Q, R = np.linalg.qr(X / size[..., None, :])
+    diagonal = np.abs(np.diagonal(R, axis1=-2, axis2=-1))
+    dependent = diagonal < _DEPENDENT
+    R = R * size[..., None, :] + np.where(dependent, size, 0.0)[..., None, :] * np.eye(len(common))
+    return np.where(dependent[..., None, :], 0.0, Q), R
+
+
+def _projected(rows: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return rows, (..., C, 2 n), less their part in the span of Q; twice, for the last digits."""
+    for _ in range(2):
+        rows = rows - (rows @ Q) @ Q.swapaxes(-1, -2)
+    return rows
+
+
+def _parts(values: ComplexArray) -> FloatArray:
+    """Return real and imaginary parts side by side in the last axis."""
+    return np.ascontiguousarray(values).view(np.float64)
+
+
+def _local_minima(cost: FloatArray) -> tuple[IntArray, IntArray]:
+    """Return each table's lowest local minima over its grid, (S, ...): table and flat index.
+
+    The lowest of a table comes first; a table without any has its first node.
+    """
+    S = len(cost)
+    lowest = cost < np.inf
+    for axis in range(1, cost.ndim):
+        rows, mask = cost.swapaxes(axis, 0), lowest.swapaxes(axis, 0)
+        mask[1:] &= rows[1:] <= rows[:-1]
+        mask[:-1] &= rows[:-1] < rows[1:]
+    flat, lowest = cost.reshape(S, -1), lowest.reshape(S, -1)
+    lowest[~lowest.any(axis=1), 0] = True
+    table, place = np.nonzero(lowest)
+    if table.size == S:
+        return table, place
+    order = np.lexsort((flat[table, place], table))
+    table, place = table[order], place[order]
+    rank = np.arange(table.size) - np.searchsorted(table, table)
+    return table[rank < _MOST_STARTS], place[rank < _MOST_STARTS]
+
+
+def _taken(values: FloatArray, node: IntArray) -> FloatArray:
+    """Return values, (K,) or (S, K), at nodes, (k,) or (S, k)."""
+    return values[node] if values.ndim == 1 else np.take_along_axis(values, node, axis=-1)

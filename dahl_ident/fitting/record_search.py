@@ -1,0 +1,228 @@
+"""Least squares for records of any motion: a start without a guess, then Gauss-Newton steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.errors import FitError, ModelError
+from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
+from dahl_ident.fitting.record_start import record_starts, started_at
+from dahl_ident.problem import Quadratic
+from dahl_ident.problem.record_noise import prediction_error_filter, share_in_band
+from dahl_ident.problem.record_problem import RecordProblem
+
+_STEPS = 60
+_SHORT = 8192  # samples with which a long record is begun
+_ROUGH = 15  # steps after which the noise is known well enough to say what a step is worth
+_WORTHLESS = 1e-5  # fall of the cost, in units of the noise's variance
+_GOOD = 0.01  # share of variance left at which no further start is tried
+_SLOW = 0.5  # correlation of neighbouring residuals that are weighted by their spectrum
+_DESCRIBED = 0.1  # share of variance left beyond which the model is wrong, not the drive noisy
+_EXACT = 1e-12  # share of variance left that is rounding
+_REPEATS = 12
+_SETTLED = 0.03  # change of the estimate in standard errors at which weighting ends
+_LOOSE = 1e4  # of the step at which a search of a long record has converged
+
+
+@dataclass(frozen=True)
+class RecordOptimum:
+    """Where the search ended.
+
+    Attributes
+    ----------
+    problem : RecordProblem
+    values : ndarray, shape (P,)
+        Estimates of the problem's parameters.
+    cost : float
+        Half the sum of squared residuals over the output's variance.
+    converged : bool
+    evaluations : int
+    """
+
+    problem: RecordProblem
+    values: FloatArray
+    cost: float
+    converged: bool
+    evaluations: int
+
+
+def solve_records(
+    problem: RecordProblem, *, start: Mapping[str, float] | None = None
+) -> RecordOptimum:
+    """Return the least-squares estimate.
+
+    Parameters
+    ----------
+    problem : RecordProblem
+        What to solve.
+    start : mapping of str to float, optional
+        Values that the search begins with; it then looks at no other start.
+
+    Returns
+    -------
+    RecordOptimum
+
+    Raises
+    ------
+    FitError
+        If there are fewer samples than parameters, or no start gives a finite motion.
+    ModelError
+        If `start` names a parameter that is not free.
+    """
+    if problem.n_residuals <= len(problem.parameters):
+        raise FitError(
+            f"{problem.n_residuals} samples are fewer than the {len(problem.parameters)} unknowns"
+        )
+    unknown = [name for name in start or () if name not in problem.names]
+    if unknown:
+        raise ModelError(
+            f"start names {', '.join(unknown)}; the unknowns are {', '.join(problem.names)}"
+        )
+    evaluations = 0
+    if start is not None and all(p.name in start for p in problem.free):
+        starts = started_at(problem, [start[p.name] for p in problem.free])[None]
+    elif problem.n_residuals > 2 * _SHORT:
+        part = problem.shortened(_SHORT)
+        first, evaluations = _best(part, _changed(record_starts(part), part, start))
+        values = part.values(first.theta[0])[: len(problem.free)]
+        starts = started_at(problem, values.tolist())[None]
+    else:
+        starts = record_starts(problem)
+    best, more = _best(problem, _changed(starts, problem, start))
+    found = RecordOptimum(
+        problem,
+        problem.values(best.theta[0]),
+        float(best.cost[0]),
+        bool(best.converged[0]),
+        evaluations + more,
+    )
+    return _weighted(found) if problem.output == "motion" else found
+
+
+def _weighted(plain: RecordOptimum) -> RecordOptimum:
+    """Return the estimate with residuals weighted by their spectrum, where they are slow.
+
+    Noise in the measured drive makes the plant wander, and plain least squares then takes up the
+    wandering by stiffness. The residuals' spectrum is estimated and the search repeated until
+    both agree. Kept only if it describes the motion at the drive's frequencies no worse: slow
+    residuals may also come from a wrong model, of which plain least squares leaves less.
+    """
+    problem = plain.problem
+    residuals = problem.split_residuals(plain.values)
+    slow = sum(float(e[1:] @ e[:-1]) for e in residuals) / sum(float(e @ e) for e in residuals)
+    share = 2.0 * plain.cost / problem.n_residuals
+    if not plain.converged or slow < _SLOW or not _EXACT < share < _DESCRIBED:
+        return plain
+    drives = [record.force_samples for record in problem.records]
+    before = share_in_band(drives, problem.measured, residuals)
+    theta, evaluations = problem.theta(plain.values)[None], plain.evaluations
+    for _ in range(_REPEATS):
+        problem = problem.weighted(prediction_error_filter(residuals))
+        end = _minimise(problem, theta, _WORTHLESS * share, _STEPS)
+        evaluations += int(end.evaluations[0])
+        if not end.converged[0]:
+            return plain
+        change = end.theta[0] - theta[0]
+        theta = end.theta
+        values = problem.values(theta[0])
+        residuals = problem.split_residuals(values)
+        noise = 2.0 * float(end.cost[0]) / problem.n_residuals
+        if change @ end.hessian[0] @ change < _SETTLED**2 * noise:
+            break
+    if share_in_band(drives, problem.measured, residuals) > before:
+        return plain
+    return RecordOptimum(problem, values, float(end.cost[0]), True, evaluations)
+
+
+def hold_model(problem: RecordProblem, values: FloatArray) -> FloatArray:
+    """Return all values of a problem, states and offsets fitted, its model's values held.
+
+    Parameters
+    ----------
+    problem : RecordProblem
+    values : ndarray
+        Of the model's free parameters.
+
+    Returns
+    -------
+    ndarray, shape (P,)
+
+    Raises
+    ------
+    FitError
+        If the model gives no finite motion.
+    """
+    full = started_at(problem, values.tolist())
+    held = values.size
+    theta = problem.theta(full)
+
+    def evaluate(at: FloatArray, _which: object) -> Quadratic:
+        whole = np.column_stack([np.tile(theta[:held], (len(at), 1)), at])
+        found = problem.quadratic(whole)
+        return Quadratic(found.cost, found.gradient[:, held:], found.hessian[:, held:, held:])
+
+    linear = np.zeros(theta.size - held, dtype=np.bool_)
+    end = minimise(
+        evaluate,
+        theta[None, held:],
+        linear,
+        problem.n_residuals,
+        tolerance_factor=_LOOSE,
+        steps=_STEPS,
+    )
+    if not np.isfinite(end.cost[0]):
+        raise FitError("at these parameters the motion grows beyond all bounds")
+    full[held:] = end.theta[0]
+    return full
+
+
+def _changed(
+    starts: FloatArray, problem: RecordProblem, start: Mapping[str, float] | None
+) -> FloatArray:
+    """Return starts with some of their values given."""
+    for name, value in (start or {}).items():
+        if name in problem.names:
+            starts[:, problem.names.index(name)] = value
+    return starts
+
+
+def _best(problem: RecordProblem, starts: FloatArray) -> tuple[Minima, int]:
+    """Return the best end of searches from the starts, in their order; few where one is good."""
+    evaluations, best = 0, None
+    for one in starts:
+        found = _descend(problem, problem.theta(one), _STEPS)
+        evaluations += int(found.evaluations[0])
+        if np.isfinite(found.cost[0]) and (best is None or found.cost[0] < best.cost[0]):
+            best = found
+        if best is not None and 2.0 * best.cost[0] < _GOOD * problem.n_residuals:
+            break
+    if best is None:
+        raise FitError(
+            "from no start does the model give a finite motion; give start=, or check the units"
+        )
+    return best, evaluations
+
+
+def _descend(problem: RecordProblem, theta: FloatArray, steps: int) -> Minima:
+    """Return the minimum near a start; first roughly, then to a small part of the noise."""
+    found = _minimise(problem, theta[None], 0.0, _ROUGH)
+    if bool(found.converged[0]) or not np.isfinite(found.cost[0]):
+        return found
+    noise = 2.0 * float(found.cost[0]) / problem.n_residuals
+    return _minimise(problem, found.theta, _WORTHLESS * noise, steps)
+
+
+def _minimise(problem: RecordProblem, begin: FloatArray, enough: float, most: int) -> Minima:
+    return minimise(
+        lambda at, _which: problem.quadratic(at),
+        begin,
+        problem.logarithmic,
+        problem.n_residuals,
+        tolerance_factor=_LOOSE,
+        enough=enough,
+        steps=most,
+    )

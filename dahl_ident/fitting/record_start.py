@@ -1,0 +1,306 @@
+"""Starts for records of any motion without a guess, by variable projection.
+
+Given the nonlinear parameters of its laws, a model's force is linear in mass, damping, stiffness
+and one scale for each law. So the nonlinear ones are scanned, and the linear ones solved for: from
+the measured force where that is the output; where the motion is, from the force balance with the
+measured motion, differentiated within the drive's band.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+from scipy.signal import butter, detrend, sosfiltfilt
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements import Element
+from dahl_ident.problem.record_problem import RecordProblem
+
+_LENGTHS = np.geomspace(1e-3, 10.0, 13)  # of the largest displacement
+_SIGNED = np.geomspace(0.03, 30.0, 7)  # rates over the inverse of the largest displacement
+_LONGEST = 8192  # samples that the scan looks at
+_COMBINATIONS = 600
+_STARTS = 4
+_APART = 0.05  # in the logarithm of the misfit, or the starts are one
+_DECAY = 1e-3  # of a decay's largest amplitude in its spectrum: below, it has none
+_BAND = 1e-5  # of the drive's largest power: below, it has none
+
+
+def record_starts(problem: RecordProblem) -> FloatArray:
+    """Return starts, best first, in the problem's values; shape (S, P).
+
+    Parameters
+    ----------
+    problem : RecordProblem
+        Its free parameters are started; values given to free parameters are kept.
+
+    Returns
+    -------
+    ndarray
+    """
+    with np.errstate(all="ignore"):  # laws far off may overflow; such combinations are left out
+        return _Scan(problem).starts()
+
+
+class _Scan:
+    def __init__(self, problem: RecordProblem) -> None:
+        self.problem = problem
+        self.histories = [self._histories(i) for i in range(len(problem.records))]
+        x = np.concatenate([h[0] - h[0].mean() for h in self.histories])
+        self.length = float(np.abs(x).max()) or 1.0
+        rate = float(np.sqrt(np.mean([np.var(h[1]) / np.var(h[0]) for h in self.histories])))
+        self.time = 1.0 / rate if rate > 0.0 else 1.0
+
+    def _histories(self, number: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return displacement, velocity, acceleration and force of a record's liveliest part."""
+        problem, record = self.problem, self.problem.records[number]
+        if problem.output == "force":
+            x, v, a = problem.motions[number]
+            if not v.size:
+                v = np.gradient(x, record.time)
+                a = np.gradient(v, record.time)
+            force = problem.measured[number]
+        else:
+            x, v, a = in_band(problem, number)
+            force = record.force_samples
+        n = min(x.size, _LONGEST)
+        energy = np.concatenate([[0.0], np.cumsum((v - v.mean()) ** 2)])
+        start = int(np.argmax(energy[n:] - energy[:-n])) if n < x.size else 0
+        part = slice(start, start + n)
+        return x[part], v[part], a[part], force[part]
+
+    def starts(self) -> FloatArray:
+        """Return the best starts of the scan."""
+        elements = self.problem.model.elements
+        choices = [list(self._choices(e)) for e in elements]
+        while np.prod([float(len(c)) for c in choices]) > _COMBINATIONS:
+            longest = int(np.argmax([len(c) for c in choices]))
+            choices[longest] = choices[longest][::2]
+        found: list[tuple[float, list[float]]] = []
+        columns: dict[tuple[int, int], list[FloatArray]] = {}
+        for places in product(*(range(len(c)) for c in choices)):
+            for e, place in enumerate(places):
+                if (e, place) not in columns:
+                    columns[e, place] = self._columns(elements[e], choices[e][place])
+            shapes = [choices[e][p] for e, p in enumerate(places)]
+            sets = [columns[e, p] for e, p in enumerate(places)]
+            solved = self._solve(elements, shapes, sets)
+            if solved is not None:
+                found.append(solved)
+        if not found:
+            values = [p.value if p.value is not None else 1.0 for p in self.problem.free]
+            found = [(0.0, values)]
+        found.sort(key=lambda f: f[0])
+        kept: list[tuple[float, list[float]]] = []
+        for misfit, values in found:
+            if all(self._apart(values, other) for _, other in kept):
+                kept.append((misfit, values))
+            if len(kept) == _STARTS:
+                break
+        return np.array([started_at(self.problem, values) for _, values in kept])
+
+    def _apart(self, one: list[float], other: list[float]) -> bool:
+        a, b = np.array(one), np.array(other)
+        return bool(np.max(np.abs(a - b) / (np.abs(a) + np.abs(b) + 1e-300)) > 0.3)
+
+    def _choices(self, element: Element) -> Iterator[tuple[float, ...]]:
+        """Yield values for an element's parameters at which its force is to be computed.
+
+        A parameter that scales the force is 1 in the first place; the others of it follow.
+        """
+        grids: list[list[float]] = []
+        scaled = False
+        for label, parameter in zip(element.labels, element.parameters, strict=True):
+            fixed = [] if parameter.value is None else [float(parameter.value)]
+            if label in element.linear_parameters:
+                grids.append([1.0] if parameter.free else fixed)
+                scaled = True
+            elif parameter.free and label in element.scale_parameters and not scaled:
+                grids.append([1.0])
+                scaled = True
+            elif fixed:
+                grids.append(fixed)
+            elif parameter.scan:
+                grids.append(list(parameter.scan))
+            else:
+                force, length, time = parameter.dimension
+                unit = self.length**length * self.time**time
+                if force:
+                    # beside a force of 1: a length in disguise
+                    size = 1.0 if scaled else self._force_size()
+                    grids.append([size**force * (self.length * s) ** length for s in _LENGTHS])
+                elif parameter.lower < 0.0:
+                    some = [unit * s for s in _SIGNED]
+                    grids.append([*(-v for v in some), 0.0, *some])
+                else:
+                    grids.append([unit * s for s in _LENGTHS])
+        yield from product(*grids)
+
+    def _force_size(self) -> float:
+        return max(float(np.std(h[3])) for h in self.histories)
+
+    def _columns(self, element: Element, values: tuple[float, ...]) -> list[FloatArray]:
+        return [
+            element.force_history(values, x, v, 0.0, acceleration=a)
+            for x, v, a, _ in self.histories
+        ]
+
+    def _solve(
+        self,
+        elements: tuple[Element, ...],
+        shapes: list[tuple[float, ...]],
+        sets: list[list[FloatArray]],
+    ) -> tuple[float, list[float]] | None:
+        """Return misfit and free values with the linear parameters solved for."""
+        scaled = [any(self._scales(e, p) for p in range(len(e.parameters))) for e in elements]
+        normal: FloatArray | None = None
+        for i, (_, _, _, force) in enumerate(self.histories):
+            rows = [self._weighed(i, c[i]) for c, s in zip(sets, scaled, strict=True) if s]
+            rest = force - sum(c[i] for c, s in zip(sets, scaled, strict=True) if not s)
+            rows.append(self._weighed(i, rest))
+            block = np.array(rows)
+            product_ = np.real(block.conj() @ block.T)
+            normal = product_ if normal is None else normal + product_
+        if normal is None or not np.isfinite(normal).all():
+            return None
+        size = np.sqrt(np.maximum(normal.diagonal()[:-1], 1e-300))
+        matrix = normal[:-1, :-1] / np.outer(size, size)
+        right = normal[:-1, -1] / size
+        solution = np.linalg.lstsq(matrix, right, rcond=1e-10)[0]
+        misfit = float(normal[-1, -1] - 2.0 * solution @ right + solution @ matrix @ solution)
+        factors = iter(solution / size)
+        values: list[float] = []
+        for element, shape, scales in zip(elements, shapes, scaled, strict=True):
+            factor = float(next(factors)) if scales else 1.0
+            for place, (parameter, value) in enumerate(zip(element.parameters, shape, strict=True)):
+                if not parameter.free:
+                    continue
+                label = element.labels[place]
+                jointly = label in element.scale_parameters and parameter.dimension[0]
+                new = value * factor if jointly and parameter.value is None else value
+                if parameter.value is not None:
+                    new = float(parameter.value)
+                if parameter.lower == 0.0 and new <= 0.0:
+                    return None
+                values.append(float(np.clip(new, parameter.lower, parameter.upper)))
+        return misfit, values
+
+    @staticmethod
+    def _scales(element: Element, place: int) -> bool:
+        """Whether a parameter is free, without a value, and scales the element's force."""
+        parameter, label = element.parameters[place], element.labels[place]
+        return bool(
+            parameter.free
+            and parameter.value is None
+            and (label in element.linear_parameters or label in element.scale_parameters)
+        )
+
+    def _weighed(self, number: int, force: FloatArray) -> FloatArray:
+        """Return a force as residuals are counted: as it is, or as motion within the band."""
+        if self.problem.output == "force":
+            t = np.linspace(-1.0, 1.0, force.size)
+            level, slope = force.mean(), (force @ t) / (t @ t)
+            return np.asarray(force - level - slope * t)
+        window = np.hanning(force.size)
+        spectrum = np.fft.rfft(window * (force - force.mean()))
+        return np.asarray(spectrum * self._weight(number))
+
+    def _weight(self, number: int) -> FloatArray:
+        """Return a smooth receptance, zero outside the band: forces weighed as displacements."""
+        x, _, _, force = self.histories[number]
+        window = np.hanning(x.size)
+        X, F = (np.abs(np.fft.rfft(window * (w - w.mean()))) for w in (x, force))
+        if not F.any():  # a free decay: the forces balance by themselves
+            return np.asarray(_DECAY * X.max() < X, dtype=np.float64)
+        smooth = max(3, x.size // 256)
+        kernel = np.ones(smooth) / smooth
+        X, F = (np.sqrt(np.convolve(s**2, kernel, "same")) for s in (X, F))
+        return np.where(_BAND * np.max(F**2) < F**2, X / np.maximum(F, 1e-300), 0.0)
+
+
+def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
+    """Return all values of a problem from those of its model: states and offsets are started.
+
+    Parameters
+    ----------
+    problem : RecordProblem
+    values : list of float
+        Of the model's free parameters.
+
+    Returns
+    -------
+    ndarray, shape (P,)
+    """
+    full = np.zeros(len(problem.parameters))
+    full[: len(values)] = values
+    at = problem.full_values(full)
+    for number, measured in enumerate(problem.measured):
+        own = problem.own(full, number)
+        if problem.output == "motion":
+            x, v, a = in_band(problem, number)
+            own[0], own[1] = x[0], v[0]
+            forces = [
+                e.force_history(element_values, x, v, 0.0, acceleration=a)
+                for e, element_values in problem.model.of(at)
+                if e.has_memory
+            ]
+            problem.set_guess(number, np.column_stack([x, v, *forces]))
+        else:
+            total = problem.predict(full, number, derivatives=False).output
+            own[-2] = float(np.mean(measured - total))
+    return full
+
+
+def in_band(problem: RecordProblem, number: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return displacement, velocity and acceleration of a record, within the drive's band.
+
+    Differentiated by Fourier transform of the record, its linear trend removed and mirrored at its
+    ends; integrated by the trapezoidal rule, and then freed of what is slower than the drive.
+
+    Parameters
+    ----------
+    problem : RecordProblem
+        Whose record it is.
+    number : int
+        Which one.
+
+    Returns
+    -------
+    tuple of three ndarray, shape (n,)
+    """
+    record = problem.records[number]
+    y, n = problem.measured[number], len(record)
+    drive = record.force_samples
+    line = np.linspace(y[0], y[-1], n)
+    rest = y - line
+    spectrum = np.fft.rfft(np.concatenate([rest, -rest[-2:0:-1]]))
+    m = 2 * n - 2
+    s = 2j * np.pi * np.fft.rfftfreq(m, 1.0 / record.sample_rate)
+    power = np.abs(np.fft.rfft(np.hanning(n) * (drive - drive.mean()))) ** 2
+    if not power.any():  # a free decay: what moves is the band
+        power = np.abs(np.fft.rfft(np.hanning(n) * (y - y.mean()))) ** 2
+    bins = np.flatnonzero(power >= 1e-4 * power.max())
+    highest = 1.25 * bins[-1] / power.size  # of half the sampling rate
+    lowest = 0.5 * bins[0] / power.size
+    place = np.arange(spectrum.size) / spectrum.size
+    spectrum[place > highest] = 0.0
+    order = ("displacement", "velocity", "acceleration").index(record.motion_channel)
+    found = []
+    for wanted in range(order, 3):
+        factor = s ** (wanted - order)
+        wave = np.fft.irfft(spectrum * factor, m)[:n]
+        if wanted == order:
+            wave = wave + line
+        elif wanted == order + 1:
+            wave = wave + (y[-1] - y[0]) / record.duration
+        found.append(wave)
+    if order:
+        cut = min(max(lowest, 1.0 / n), 0.5)
+        passed = butter(4, cut, "highpass", output="sos")
+        for _ in range(order):
+            wave = cumulative_trapezoid(found[0], dx=1.0 / record.sample_rate, initial=0)
+            found.insert(0, np.asarray(sosfiltfilt(passed, detrend(wave))))
+    return found[0], found[1], found[2]

@@ -1,0 +1,427 @@
+"""Least squares for one table or for many at once: one search.
+
+1. Starts by variable projection (:mod:`dahl_ident.fitting.global_start`); what the user gave is
+   one more.
+2. Levenberg and Marquardt's method from all of them together, exact Jacobian, search coordinates.
+   With ``method="scipy"``, `scipy.optimize.least_squares` from each of the same starts.
+3. Where a table's search has not converged, or leaves friction badly determined, the charts of
+   microslip and the limits at infinity are searched as well
+   (:mod:`dahl_ident.fitting.asymptotes`).
+4. Where there are bounds, or nothing has converged, `scipy.optimize.least_squares` goes on from
+   there.
+
+A robust loss, and a prior beside noise of unknown scale, make the optimum depend on the scale;
+it is then estimated and the search repeated until both agree. One table is a batch of one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.errors import FitError, ModelError, ValidationError
+from dahl_ident.fitting.asymptotes import (
+    Chart,
+    Limit,
+    Reach,
+    limits,
+    microslip_charts,
+    stiffness_charts,
+)
+from dahl_ident.fitting.convergence import Ends, optima
+from dahl_ident.fitting.global_start import Starts, edge_starts, grid_size, own_starts
+from dahl_ident.fitting.levenberg_marquardt import (
+    NEARLY,
+    IntArray,
+    Minima,
+    gauss_newton,
+    minimise,
+)
+from dahl_ident.fitting.losses import Loss, loss_named
+from dahl_ident.fitting.optimum import Optimum, OptimumBatch, scale_ratio
+from dahl_ident.fitting.scipy_least_squares import minimise_by_scipy
+from dahl_ident.problem import Problem, ProblemBatch, Quadratic
+
+DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm: limits may be as good
+_RESCALINGS = 100  # of the noise's scale; a handful is the rule
+_SAME_SCALE = 1e-9  # change of ln scale that ends them
+_LONGEST_SECANT = 20.0  # plain steps in one: where they shrink slowly, not where noise is all
+_STEPS = 80  # of a search; ten are the rule
+_FIRST_LOOK, _HOPELESS = 15, 3.0  # steps at a limit, and how much higher it may then still be
+_PATIENCE = 1000  # steps where friction is so faint that each takes little
+_AT_LIMIT = 1e4  # tolerance factor: so far out, large terms cancel
+_MANY = 30.0  # tolerance factor of fleets: steps of 3e-7 standard deviations end a search
+_TIE = 1e-12  # relative difference of costs at which a limit wins over a real optimum
+_SAME = 1e-5  # among limits, of which the one with fewest parameters is then taken
+_ROWS_AT_ONCE = 16384  # of data: their intermediate arrays stay in the processor's cache
+_CURVES_AT_ONCE = 2**20  # rows of data times nodes of the grid where starts are searched
+
+
+def solve(
+    problem: Problem,
+    *,
+    method: str = "lm",
+    loss: str = "linear",
+    start: Mapping[str, float] | None = None,
+) -> Optimum:
+    """Return the minimum of a problem's sum of squares, wherever it lies.
+
+    Parameters
+    ----------
+    problem : Problem
+        What to solve.
+    method : {"lm", "scipy"}, default "lm"
+        Levenberg and Marquardt's method from all starts together, or
+        `scipy.optimize.least_squares` on the same residuals and Jacobian from each of them.
+    loss : {"linear", "huber", "soft_l1", "student_t"}, default "linear"
+        See :mod:`dahl_ident.fitting.losses`.
+    start : mapping of str to float, optional
+        One more start: values of some or all free parameters; the others are completed.
+
+    Returns
+    -------
+    Optimum
+        Its `status` says how the search ended.
+
+    Raises
+    ------
+    FitError
+        If there are fewer residuals than parameters, or a parameter cannot be started.
+    ModelError
+        If `start` names a parameter that is not free.
+    ValidationError
+        If `method` or `loss` is unknown, or a prior is not normal.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dahl_ident import Dahl
+    >>> from dahl_ident.data import FrequencyResponse
+    >>> A = np.geomspace(1e-4, 1e-2, 5)
+    >>> N = Dahl(f_max=0.1, sigma=30.0).describing_function(A)
+    >>> optimum = solve(Problem(FrequencyResponse(np.ones(5), N, A), Dahl()))
+    >>> optimum.values.round(9).tolist()
+    [0.1, 30.0]
+    >>> optimum.status.name
+    'CONVERGED'
+    """
+    if method not in ("lm", "scipy"):
+        raise ValidationError(f"method is {method!r}; expected lm or scipy")
+    search = _Search(problem, loss_named(loss), method=method)
+    found = own_starts(problem, resistant=loss != "linear")
+    if start is not None:
+        given = _completed(problem, start, found.theta[0])
+        found = Starts(np.zeros(len(found.theta) + 1, dtype=np.intp), np.vstack([given, found[1]]))
+    return search.run(found)[0]
+
+
+def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> OptimumBatch:
+    """Return the optimum of every table of a batch.
+
+    Parameters
+    ----------
+    batch : ProblemBatch
+        What to solve.
+    start : array_like, shape (P,) or (S, P), optional
+        Search coordinates to start from, such as the optimum that replicates were drawn from;
+        left out, every table finds its own starts.
+
+    Returns
+    -------
+    OptimumBatch
+        A sequence of :class:`Optimum`, with their numbers side by side as well.
+
+    Raises
+    ------
+    FitError
+        If there are fewer residuals than parameters, or a parameter cannot be started.
+    ValidationError
+        If `start` has the wrong shape, or a prior is not normal.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dahl_ident import Dahl
+    >>> from dahl_ident.data import FrequencyResponse
+    >>> A = np.geomspace(1e-4, 1e-2, 5)
+    >>> tables = [
+    ...     FrequencyResponse(np.ones(5), Dahl(f, 30.0).describing_function(A), A)
+    ...     for f in (0.1, 0.2)
+    ... ]
+    >>> solve_many(ProblemBatch(tables, Dahl())).values.round(6).tolist()
+    [[0.1, 30.0], [0.2, 30.0]]
+    """
+    S, P = batch.n_tables, len(batch.parameters)
+    begin = None
+    if start is not None:
+        begin = np.asarray(start, dtype=np.float64)
+        if begin.shape not in ((P,), (S, P)):
+            raise ValidationError(
+                f"start has shape {begin.shape}; expected ({P},) or ({S}, {P}) for "
+                f"{', '.join(batch.names)}"
+            )
+        begin = np.broadcast_to(begin, (S, P))
+    rows = batch.n_residuals // 2
+    at_once = min(_ROWS_AT_ONCE, _CURVES_AT_ONCE // grid_size(batch.take(slice(0, 1)))) // rows
+    if batch.priors and not batch.scale_known:
+        at_once = 1  # each has a scale of its own to agree with
+    at_once = max(1, at_once)
+    parts = []
+    for first in range(0, S, at_once):
+        part = batch.take(slice(first, first + at_once))
+        search = _Search(part, None, tolerance=_MANY)
+        if begin is None:
+            parts.append(search.run(own_starts(part)))
+        else:
+            own = begin[first : first + at_once]
+            parts.append(search.run(Starts(np.arange(len(own)), own), given=True))
+    return OptimumBatch.joined(batch, parts)
+
+
+def _completed(problem: Problem, start: Mapping[str, float], theta: FloatArray) -> FloatArray:
+    """Return search coordinates of the values given, completed from `theta`."""
+    names = problem.names
+    if not isinstance(start, Mapping):
+        raise ValidationError(f"start is {start!r}; expected a mapping of names to numbers")
+    unknown = [name for name in start if name not in names]
+    if unknown:
+        raise ModelError(
+            f"start names {', '.join(unknown)}; the free parameters are {', '.join(names)}"
+        )
+    values = problem.to_values(theta)
+    return problem.to_search([start.get(n, v) for n, v in zip(names, values, strict=True)])
+
+
+class _Search:
+    """One search for all tables of a problem: what its steps share."""
+
+    def __init__(
+        self, problem: Problem, loss: Loss | None, method: str = "lm", tolerance: float = 1.0
+    ) -> None:
+        self.problem, self.loss, self.method, self.tolerance = problem, loss, method, tolerance
+        self.m = problem.n_residuals + len(problem.priors)
+        P = len(problem.parameters)
+        if self.m < P:
+            raise FitError(
+                f"{problem.n_residuals // 2} rows give {self.m} numbers, fewer than the {P} free "
+                f"parameters ({', '.join(problem.names)}); measure more points, or fix some"
+            )
+        self.logarithmic = np.array([p.transform == "log" for p in problem.parameters])
+        self.friction = problem.friction_columns
+        self.low, self.high = problem.bounds()
+        self.bounded = bool(np.isfinite([self.low, self.high]).any())
+        self.rescales = not problem.scale_known and bool(loss is not None or problem.priors)
+        self.given = False
+
+    @cached_property
+    def reach(self) -> Reach:
+        """Where a search is still at a finite optimum."""
+        return Reach(self.problem)
+
+    def run(self, begin: Starts, *, given: bool = False) -> OptimumBatch:
+        """Search, with the noise's scale adapted where the optimum depends on it."""
+        self.given, scale = given, 1.0
+        if self.bounded:
+            begin = Starts(begin.table, np.clip(begin.theta, self.low, self.high))
+        if self.rescales:
+            y, _ = self.problem.whitened(begin.theta, derivatives=False)
+            size = float(np.median(np.abs(y), axis=-1).min()) / np.sqrt(np.log(4.0))
+            scale = max(size, float(np.max(self.problem.rounding)))
+        ends = self._search(begin, scale)
+        evaluations = ends.minima.evaluations
+        step, last = 0.0, 0.0
+        for _ in range(_RESCALINGS if self.rescales else 0):
+            dof = self.m - ends.determined(0)
+            one = self.problem.table(0)
+            excess = np.log(scale_ratio(one, ends.minima.theta[0], scale, self.loss, dof))
+            if abs(excess) < _SAME_SCALE or not np.isfinite(excess):
+                break
+            # the secant's step where it goes the same way, else the plain one
+            factor = step / (last - excess) if last != excess else 1.0
+            step = excess * (factor if 0.0 < factor < _LONGEST_SECANT else 1.0)
+            last, scale = excess, scale * float(np.exp(step))
+            ends = self._search(Starts(np.zeros(1, np.intp), ends.minima.theta), scale)
+            evaluations = evaluations + ends.minima.evaluations
+        return optima(self.problem, ends, scale, self.loss, self.method, evaluations)
+
+    def _search(self, begin: Starts, scale: float) -> Ends:
+        ends = Ends(self._descend(begin, scale))
+        doubtful = ~ends.minima.converged | (self._friction_error(ends, scale) > DOUBTFUL)
+        if doubtful.any():
+            where = np.flatnonzero(doubtful)
+            part = self._of(where)
+            ends.put(where, part._look_wider(ends.take(where), begin.of(where), scale))
+        for table in np.flatnonzero(self.bounded | ~ends.minima.converged).tolist():
+            if table not in ends.limits:
+                ends.put_one(table, self._trust_region(table, ends, begin, scale))
+        return ends
+
+    def _of(self, tables: IntArray) -> _Search:
+        """Return the same search for some of the tables."""
+        if len(tables) == self.problem.n_tables:
+            return self
+        part = _Search(self.problem.take(tables), self.loss, self.method, self.tolerance)
+        part.given = self.given
+        return part
+
+    def _descend(
+        self,
+        begin: Starts,
+        scale: float,
+        chart: Chart | None = None,
+        *,
+        limit: bool = False,
+        steps: int = _STEPS,
+    ) -> Minima:
+        """Return the best end of each table's searches, by phi in a chart where one is given."""
+        problem, loss, S = self.problem, self.loss, self.problem.n_tables
+        each = len(begin.table) == S and bool((begin.table == np.arange(S)).all())
+
+        def tables(which: IntArray | None) -> IntArray | None:
+            if which is None:
+                return None if each else begin.table
+            return which if each else begin.table[which]
+
+        def evaluate(at: FloatArray, which: IntArray | None) -> Quadratic:
+            own = tables(which)
+            part = problem if own is None else problem.take(own)
+            if chart is None:
+                return part.quadratic(at, scale, loss)
+            shape = chart if own is None else chart.of(own)
+            theta = shape.theta(at)
+            return part.quadratic(theta, scale, loss, shape.derivative(theta))
+
+        logarithmic, phi = self.logarithmic, begin.theta
+        if chart is not None:
+            logarithmic = ~((chart.matrix != 0.0).T @ ~self.logarithmic)
+            phi = (chart if each else chart.of(begin.table)).phi(begin.theta)
+
+        def inside(at: FloatArray, which: IntArray | None) -> NDArray[np.bool_]:
+            own = tables(which)
+            if chart is not None:
+                at = (chart if own is None else chart.of(own)).theta(at)
+            return self.reach(at, own)
+
+        minima = None
+        if self.method == "scipy":
+            minima = self._by_scipy(begin, phi, scale, chart, None if limit else inside)
+        elif chart is None and loss is None and len(phi) == 1:
+            minima = gauss_newton(
+                lambda theta: _only(evaluate(theta[None], None)), phi[0], logarithmic, self.m
+            )
+        minima = minima or minimise(
+            evaluate,
+            phi,
+            logarithmic,
+            self.m,
+            inside=None if limit else inside,
+            tolerance_factor=_AT_LIMIT if limit else self.tolerance,
+            steps=steps,
+        )
+        if self.bounded:
+            theta = minima.theta if chart is None else chart.of(begin.table).theta(minima.theta)
+            minima.converged[:] &= ((theta >= self.low) & (theta <= self.high)).all(axis=1)
+        return minima if each else minima.best(begin.table, S)
+
+    def _by_scipy(
+        self,
+        begin: Starts,
+        phi: FloatArray,
+        scale: float,
+        chart: Chart | None,
+        inside: Callable[[FloatArray, IntArray | None], NDArray[np.bool_]] | None,
+    ) -> Minima:
+        """Return where `scipy.optimize.least_squares` ends from each start."""
+        parts = []
+        for index, table in enumerate(begin.table):
+            one = self.problem.table(int(table))
+            own = None if chart is None else chart.of(np.array([table])).one
+            found = minimise_by_scipy(one, phi[index], scale, self.loss, own)
+            if inside is not None and found.converged[0]:
+                found.converged[:] = inside(found.theta, np.array([index]))
+            parts.append(found)
+        return Minima.stacked(parts)
+
+    def _look_wider(self, ends: Ends, begin: Starts, scale: float) -> Ends:
+        """Return the best of `ends`, of searches in microslip's charts, and of the limits."""
+        problem, S = self.problem, self.problem.n_tables
+        end = ends.minima
+        every = np.arange(S)
+        if self.given:
+            begin = begin.joined(own_starts(problem))
+            end = end.better(self._descend(begin, scale))
+        begin = Starts(every, end.theta).joined(begin)
+        for chart in (*microslip_charts(problem), *stiffness_charts(problem)):
+            found = self._descend(begin, scale, chart)
+            theta = chart.theta(found.theta)
+            hessian = problem.quadratic(theta, scale, self.loss).hessian
+            end = end.better(Minima(theta, found.cost, hessian, found.converged, found.evaluations))
+        faint = np.flatnonzero(~end.converged & self.reach(end.theta))
+        if faint.size:
+            part = self._of(faint)
+            further = Starts(np.arange(faint.size), end.theta[faint])
+            end.put(faint, part._descend(further, scale, steps=_PATIENCE))
+        ends = Ends(end)
+        edges = Starts(every, end.theta)
+        for theta in edge_starts(problem):
+            edges = edges.joined(Starts(every, np.broadcast_to(theta, end.theta.shape)))
+        self._put_limits(ends, edges, scale)
+        return ends
+
+    def _put_limits(self, ends: Ends, edges: Starts, scale: float) -> None:
+        """Let the tables end at the best limit whose cost is no higher than where they are."""
+        end = ends.minima
+        found: list[tuple[Limit, Minima]] = []
+        for limit in sorted(limits(self.problem), key=lambda lim: lim.chart.matrix.shape[1]):
+            there = self._descend(edges, scale, limit.chart, limit=True, steps=_FIRST_LOOK)
+            further = np.flatnonzero(~there.converged & (there.cost < _HOPELESS * end.cost))
+            if further.size:
+                own = limit.chart.of(further)
+                begin = Starts(np.arange(further.size), own.theta(there.theta[further]))
+                there.put(further, self._of(further)._descend(begin, scale, own, limit=True))
+            found.append((limit, there))
+        if not found:
+            return
+        costs = np.array([np.where(m.converged, m.cost, np.inf) for _, m in found])
+        sizes = np.array([limit.chart.matrix.shape[1] for limit, _ in found])[:, None]
+        alike = (costs <= costs.min(axis=0) * (1.0 + _SAME)) & np.isfinite(costs)
+        fewest = np.where(alike, sizes, np.inf).min(axis=0)
+        chosen = np.where(alike & (sizes == fewest), costs, np.inf).argmin(axis=0)
+        real = end.converged & np.isfinite(self._friction_error(ends, scale))
+        ceiling = end.cost * (1.0 + np.where(real, _TIE, NEARLY))
+        for table in np.flatnonzero(costs.min(axis=0, initial=np.inf) < np.inf):
+            limit, there = found[chosen[table]]
+            if there.cost[table] <= ceiling[table]:
+                ends.at_limit(int(table), limit, there)
+
+    def _trust_region(self, table: int, ends: Ends, begin: Starts, scale: float) -> Minima:
+        """Return the best end of scipy's bounded searches for one table."""
+        problem, best = self.problem.table(table), ends.minima.take(np.array([table]))
+        starts = np.vstack([best.theta, begin.theta[begin.table == table]])
+        for start in np.clip(starts, self.low, self.high):
+            found = minimise_by_scipy(problem, start, scale, self.loss)
+            found.converged[:] &= Reach(problem)(found.theta)
+            if found.cost[0] < best.cost[0] or not best.converged[0]:
+                best = found
+        return best
+
+    def _friction_error(self, ends: Ends, scale: float) -> FloatArray:
+        """Return the largest standard deviation of the logarithm of a friction parameter."""
+        variance: FloatArray | float = 1.0
+        if not self.problem.scale_known and not self.rescales:
+            P = ends.minima.theta.shape[1]
+            variance = 2.0 * ends.minima.cost / max(self.m - P, 1)
+        covariance, _ = ends.inverse
+        spread = np.diagonal(covariance, axis1=1, axis2=2)[:, self.friction]
+        with np.errstate(invalid="ignore"):
+            largest = np.asarray(np.sqrt(variance * spread.max(axis=1, initial=0.0)))
+        return np.where(np.isnan(largest), np.inf, largest)
+
+
+def _only(at: Quadratic) -> Quadratic:
+    """Return the one entry of a batch of one."""
+    return Quadratic(at.cost[0], at.gradient[0], at.hessian[0])

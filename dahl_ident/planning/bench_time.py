@@ -1,0 +1,71 @@
+"""What a plan costs: settling in the order of the levels, measured cycles, change-over."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray
+
+LEAST_CYCLES = 2  # measured at a level: one does not show its own noise
+_LEAST_SETTLING = 1
+
+
+@dataclass(frozen=True)
+class BenchTime:
+    """The cost of visiting candidates.
+
+    A transient starts with the share abs(F - F')/F of the friction force F, F' being that of the
+    level before, and shrinks by `decay` a cycle; measuring starts when it is below `settled`.
+
+    Attributes
+    ----------
+    frequency_hz, decay, force : ndarray, shape (K,)
+        Frequency, factor by which a transient shrinks in a cycle, and friction force.
+    change_over : float
+        Seconds from one level to the next.
+    settled : float
+        Share of the friction force.
+    between_runs : float
+        Seconds that a run takes beside its levels.
+    """
+
+    frequency_hz: FloatArray
+    decay: FloatArray
+    force: FloatArray
+    change_over: float
+    settled: float
+    between_runs: float = 0.0
+
+    def order(self, levels: Sequence[int] | NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the levels by rising friction force.
+
+        Then no transient starts larger than the friction force itself, from rest on; a level that
+        follows a larger one starts with more than that.
+        """
+        chosen = np.asarray(levels, dtype=np.intp)
+        return chosen[np.lexsort((self.frequency_hz[chosen], self.force[chosen]))]
+
+    def settling_cycles(self, ordered: Sequence[int] | NDArray[np.intp]) -> FloatArray:
+        """Return the cycles before measuring at each of the levels, in this order; may be inf."""
+        chosen = np.asarray(ordered, dtype=np.intp)
+        force, decay = self.force[chosen], self.decay[chosen]
+        before = np.concatenate([[0.0], force[:-1]])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            start = np.where(force > 0.0, np.abs(force - before) / force, 0.0)
+            cycles = np.log(start / self.settled) / -np.log(decay)
+        cycles = np.where(start <= self.settled, 0.0, np.where(decay > 0.0, cycles, 0.0))
+        return np.asarray(np.maximum(np.ceil(cycles - 1e-9), _LEAST_SETTLING))
+
+    def fixed(self, levels: Sequence[int] | NDArray[np.intp]) -> float:
+        """Return the seconds of one run before anything is measured, in the best order."""
+        ordered = self.order(levels)
+        settling = self.settling_cycles(ordered) / self.frequency_hz[ordered]
+        return self.between_runs + float(settling.sum()) + self.change_over * len(ordered)
+
+    def seconds(self, levels: Sequence[int] | NDArray[np.intp], cycles: FloatArray) -> float:
+        """Return the seconds of one run."""
+        return self.fixed(levels) + float((cycles / self.frequency_hz[np.asarray(levels)]).sum())

@@ -1,0 +1,203 @@
+"""How much a set of levels tells: information matrices, criteria and their derivatives.
+
+A level measured for n cycles adds n J' J to the information, J being the derivatives of its
+whitened residuals. Errors of gain and phase that all rows of a run share, of standard deviation s,
+are further parameters of each run with the information 1/s^2; without them a run tells
+
+    S = M - B (C + I/s^2)^{-1} B'
+
+of the parameters, and R like runs R S. S is a concave function of the cycles (a Schur complement),
+and every criterion here is the mean over draws of the logarithm of a concave, homogeneous function
+of the information, so that the best design is a convex problem:
+
+- D: ln det(M)/P;
+- targets: -ln(sum_t (c_t' M^{-1} c_t / u_t^2)^q)/q; with one target c-optimality, with several
+  close to the largest ratio of variance to target.
+
+Source: Pukelsheim, *Optimal Design of Experiments*, 2006, chapters 3 and 5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray
+
+_POWER = 4.0  # q: 1 would add the targets' variances, infinity take the largest
+
+
+@dataclass(frozen=True)
+class LevelInformation:
+    """Information of one cycle at every candidate, for every draw of the parameters.
+
+    Attributes
+    ----------
+    packed : ndarray, shape (K, S Q Q)
+        Q = P, or P + 2 with the gain and the phase of the run behind the parameters.
+    draws, parameters : int
+        S and P.
+    scatter : float
+        s, standard deviation of a run's ln gain and phase; 0 where runs do not differ.
+    """
+
+    packed: FloatArray
+    draws: int
+    parameters: int
+    scatter: float
+
+    @classmethod
+    def of(cls, rows: FloatArray, offsets: FloatArray, scatter: float) -> LevelInformation:
+        """Return that of derivatives of whitened residuals, (S, K, m, P); of runs' (.., 2)."""
+        S, K, _, P = rows.shape
+        if scatter > 0.0:
+            rows = np.concatenate([rows, offsets], axis=-1)
+        products = rows.swapaxes(-1, -2) @ rows
+        packed = products.swapaxes(0, 1).reshape(K, -1)
+        return cls(np.ascontiguousarray(packed), S, P, scatter)
+
+    @property
+    def size(self) -> int:
+        """Q."""
+        return self.parameters + (2 if self.scatter > 0.0 else 0)
+
+    def only(self, candidates: NDArray[np.intp]) -> LevelInformation:
+        """Return the information of some candidates."""
+        return replace(self, packed=self.packed[candidates])
+
+    def thinned(self, draws: NDArray[np.intp]) -> LevelInformation:
+        """Return the information at some of the draws."""
+        kept = self.packed.reshape(-1, self.draws, self.size**2)[:, draws]
+        packed = np.ascontiguousarray(kept).reshape(len(self.packed), -1)
+        return replace(self, packed=packed, draws=len(draws))
+
+    def of_run(self, total: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return S of packed sums (..., S Q Q), and what takes dS back to them, (..., P, Q)."""
+        Q, P = self.size, self.parameters
+        M = total.reshape(*total.shape[:-1], self.draws, Q, Q)
+        if Q == P:
+            return M, np.broadcast_to(np.eye(P), M.shape)
+        C = M[..., P:, P:] + np.eye(2) / self.scatter**2
+        lever = -M[..., :P, P:] @ np.linalg.inv(C)
+        ahead = np.broadcast_to(np.eye(P), (*M.shape[:-2], P, P))
+        return (
+            M[..., :P, :P] + lever @ M[..., P:, :P],
+            np.concatenate([ahead, lever], axis=-1),
+        )
+
+
+@dataclass(frozen=True)
+class Term:
+    """One criterion on one model: D-optimal, or targets.
+
+    Attributes
+    ----------
+    levels : LevelInformation
+        Of the candidates.
+    known : ndarray, shape (S, P, P)
+        Information before the plan.
+    targets : ndarray, shape (S, P, T), or None
+        Directions over their wanted standard uncertainties; None: D-optimality.
+    weight : float
+        In the sum of the terms.
+    """
+
+    levels: LevelInformation
+    known: FloatArray
+    targets: FloatArray | None = None
+    weight: float = 1.0
+
+    def value_and_slope(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the mean over draws and its derivative by M times S; (...), (..., S, P, P)."""
+        inverse = np.linalg.inv(M)
+        if self.targets is None:
+            P = M.shape[-1]
+            return np.linalg.slogdet(M)[1].mean(axis=-1) / P, inverse / P
+        moved = inverse @ self.targets
+        h = np.einsum("...spt,spt->...st", moved, self.targets)
+        top = h.max(axis=-1, keepdims=True)
+        powers = (h / top) ** (_POWER - 1.0)
+        total = (powers * h / top).sum(axis=-1)
+        value = -(np.log(top[..., 0]) + np.log(total) / _POWER).mean(axis=-1)
+        share = powers / (total[..., None] * top)
+        return value, (moved * share[..., None, :]) @ moved.swapaxes(-1, -2)
+
+
+@dataclass(frozen=True)
+class Point:
+    """A criterion's value at a design, and its sensitivity for each term's packed rows."""
+
+    value: float
+    sensitivities: tuple[FloatArray, ...]
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The weighted sum of terms, as a function of the cycles of every candidate in one run.
+
+    Attributes
+    ----------
+    terms : tuple of Term
+        Of the same candidates.
+    runs : int
+        R, runs alike.
+    """
+
+    terms: tuple[Term, ...]
+    runs: int = 1
+
+    @property
+    def candidates(self) -> int:
+        """K."""
+        return len(self.terms[0].levels.packed)
+
+    def only(self, candidates: Sequence[int] | NDArray[np.intp]) -> Objective:
+        """Return the objective of some candidates."""
+        chosen = np.asarray(candidates, dtype=np.intp)
+        terms = tuple(replace(t, levels=t.levels.only(chosen)) for t in self.terms)
+        return replace(self, terms=terms)
+
+    def thinned(self, most: int) -> Objective:
+        """Return the objective averaged over at most so many of the draws."""
+        terms = []
+        for term in self.terms:
+            S = term.levels.draws
+            kept = np.unique(np.linspace(0, S - 1, min(S, most)).astype(np.intp))
+            targets = None if term.targets is None else term.targets[kept]
+            levels = term.levels.thinned(kept)
+            terms.append(replace(term, levels=levels, known=term.known[kept], targets=targets))
+        return replace(self, terms=tuple(terms))
+
+    def information(self, cycles: FloatArray) -> list[FloatArray]:
+        """Return the information of every term, shape (S, P, P) each."""
+        return [
+            t.known + self.runs * t.levels.of_run(cycles @ t.levels.packed)[0] for t in self.terms
+        ]
+
+    def values(self, totals: Sequence[FloatArray]) -> FloatArray:
+        """Return the criterion at packed sums of every term, (designs, S Q Q) each."""
+        result = np.zeros(len(totals[0]))
+        for term, total in zip(self.terms, totals, strict=True):
+            M = term.known + self.runs * term.levels.of_run(total)[0]
+            result = result + term.weight * term.value_and_slope(M)[0]
+        return result
+
+    def at(self, cycles: FloatArray) -> Point:
+        """Return value and sensitivities at the cycles of every candidate."""
+        value, found = 0.0, []
+        for term in self.terms:
+            S, back = term.levels.of_run(cycles @ term.levels.packed)
+            own, slope = term.value_and_slope(term.known + self.runs * S)
+            value += term.weight * float(own)
+            factor = term.weight * self.runs / term.levels.draws
+            found.append(factor * (back.swapaxes(-1, -2) @ slope @ back).ravel())
+        return Point(value, tuple(found))
+
+    def gradient(self, point: Point) -> FloatArray:
+        """Return the derivative by the cycles of each of this objective's candidates."""
+        return np.asarray(
+            sum(t.levels.packed @ s for t, s in zip(self.terms, point.sensitivities, strict=True))
+        )

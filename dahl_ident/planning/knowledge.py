@@ -1,0 +1,296 @@
+"""What is known before a plan, from a model with ranges, a fit, or a posterior.
+
+All in search coordinates: the logarithm of positive parameters, the number itself for others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray, finite_array
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.elements import Element, Model, Parameter
+from dahl_ident.elements.model import as_model
+from dahl_ident.errors import ValidationError
+from dahl_ident.problem import Problem
+from dahl_ident.sensors import Sensors
+from dahl_ident.units import Motion
+
+_NORMAL_RANGE = 2.0 * 1.959964  # standard deviations in a 95 % range
+
+Ranges = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """Draws of the free parameters and the information that earlier data hold on them.
+
+    Attributes
+    ----------
+    model, sensors, motion
+        What is measured, and through what.
+    parameters : tuple of Parameter
+        The free ones, P of them.
+    theta : ndarray, shape (S, P)
+        Draws, search coordinates.
+    information : ndarray, shape (S, P, P)
+        Of the data measured before, at each draw, and of assumed values such as the exponent of
+        ``Dahl()``, which are parameters here as they are in a fit's uncertainty.
+    prior : ndarray, shape (P, P)
+        Information of the ranges, each taken for no narrower than a factor of e to either side: a
+        search leans on it where nothing else is known, a predicted uncertainty does not.
+    assumed : tuple of str
+        Names of the assumed parameters.
+    row_noise : float or None
+        Standard deviation of ln gain and of phase of a row of earlier data.
+    row_cycles : float
+        Cycles that such a row averages, as far as the data say; else 1.
+    problem : Problem or None
+        Of the earlier data.
+    """
+
+    model: Model
+    sensors: Sensors | None
+    motion: Motion
+    parameters: tuple[Parameter, ...]
+    theta: FloatArray
+    information: FloatArray
+    prior: FloatArray
+    assumed: tuple[str, ...] = ()
+    row_noise: float | None = None
+    row_cycles: float = 1.0
+    problem: Problem | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+        return tuple(p.name for p in self.parameters)
+
+    @property
+    def values(self) -> FloatArray:
+        """Draws of the values, shape (S, P)."""
+        return to_values(self.theta, self.parameters)
+
+    def only(self, draws: NDArray[np.intp]) -> Knowledge:
+        """Return what is known at some of the draws."""
+        return replace(self, theta=self.theta[draws], information=self.information[draws])
+
+    def model_values(self) -> list[FloatArray]:
+        """Return every parameter of the model at every draw, shape (S, 1) each, or ()."""
+        drawn = dict(zip(self.names, self.values.T, strict=True))
+        return [
+            drawn[p.name][:, None] if p.free else np.asarray(p.value) for p in self.model.parameters
+        ]
+
+
+def to_values(theta: FloatArray, parameters: Sequence[Parameter]) -> FloatArray:
+    """Return values at search coordinates (..., P)."""
+    positive = np.array([p.transform == "log" for p in parameters])
+    return np.where(positive, np.exp(np.where(positive, theta, 0.0)), theta)
+
+
+def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowledge:
+    """Return what a model with ranges, a fit or a posterior says.
+
+    Raises
+    ------
+    ValidationError
+        If `source` is something else, or nothing bounds a parameter.
+    """
+    rng = np.random.default_rng(seed)
+    if isinstance(source, Element):
+        return _of_model(as_model(source), ranges or {}, draws, rng)
+    if hasattr(source, "draws") and hasattr(source, "problem"):
+        return _of_posterior(source, ranges or {}, draws, seed)
+    if hasattr(source, "optimum") and hasattr(source.optimum, "problem"):
+        if not isinstance(source.optimum.problem, Problem):
+            raise ValidationError(
+                "plan: the fit is one of a record; planning takes fits of frequency responses: "
+                "extract one from the record, or give the model with ranges="
+            )
+        return _of_fit(source.optimum, ranges or {}, draws, rng)
+    raise ValidationError(
+        f"plan: got a {type(source).__name__}; expected a model such as Dahl(), a fit, or a "
+        "posterior"
+    )
+
+
+def _of_model(model: Model, ranges: Ranges, draws: int, rng: np.random.Generator) -> Knowledge:
+    free = tuple(p for p in model.parameters if p.free)
+    if not free:
+        raise ValidationError(f"plan: {model!r} has no free parameter, so nothing is to be found")
+    centre, std = _moments(free, ranges)
+    missing = [p.name for p, s in zip(free, std, strict=True) if np.isinf(s)]
+    if missing:
+        wanted = ", ".join(f"{name!r}: (low, high)" for name in missing)
+        raise ValidationError(
+            f"plan: nothing is known of {', '.join(missing)}; give ranges={{{wanted}}} that hold "
+            "the values with 95 % probability"
+        )
+    theta = _within(centre + std * rng.standard_normal((draws, len(free))), free)
+    model, assumed = _with_assumed(model)
+    parameters = tuple(p for p in model.parameters if p.free)
+    names = [p.name for p in parameters]
+    own = [names.index(p.name) for p in free]
+    whole = np.array([np.log(p.value or 1.0) for p in parameters]) * np.ones((draws, 1))
+    whole[:, own] = theta
+    prior = np.zeros(len(names))
+    prior[own] = _leaned_on(free, centre, std)
+    known = np.broadcast_to(_of_assumed(names, assumed), (draws, len(names), len(names)))
+    return Knowledge(
+        model, None, "translation", parameters, whole, known, np.diag(prior), tuple(assumed)
+    )
+
+
+def _of_fit(optimum: Any, ranges: Ranges, draws: int, rng: np.random.Generator) -> Knowledge:
+    problem: Problem = optimum.problem
+    centre, std = _moments(problem.parameters, ranges)
+    theta = np.array(optimum.theta, dtype=np.float64)
+    finite = np.isfinite(theta) & np.isfinite(optimum.values)
+    for i in np.flatnonzero(~finite | ~np.isfinite(np.diagonal(optimum.covariance))):
+        name = problem.names[i]
+        if np.isinf(std[i]):
+            raise ValidationError(
+                f"plan: the fit does not determine {name}; give ranges={{{name!r}: (low, high)}}, "
+                "or plan from the model with ranges="
+            )
+    theta = np.where(finite, theta, centre)
+    scale = optimum.scale if np.isfinite(optimum.scale) else 1.0
+    covariance = np.linalg.inv(problem.information(theta, scale) + np.diag(1.0 / std**2))
+    # a range counts where the data are silent; its centre, where they are not, is the estimate
+    drawn = rng.multivariate_normal(theta, covariance, draws, method="eigh")
+    drawn = _within(drawn, problem.parameters)
+    prior = _leaned_on(problem.parameters, centre, std)
+    return _with_data(problem, np.vstack([drawn, theta]), scale, prior, at=draws)
+
+
+def _of_posterior(posterior: Any, ranges: Ranges, draws: int, seed: int) -> Knowledge:
+    problem: Problem = posterior.problem
+    P = len(problem.names)
+    values = np.asarray(posterior.draws(draws, seed))
+    scale = values[:, P] if values.shape[1] > P else np.ones(draws)
+    centre, std = _moments(problem.parameters, ranges)
+    prior = _leaned_on(problem.parameters, centre, std)
+    return _with_data(problem, problem.to_search(values[:, :P]), scale, prior)
+
+
+def _with_data(
+    given: Problem, drawn: FloatArray, scale: Any, leaned: FloatArray, at: int | None = None
+) -> Knowledge:
+    """Return draws with the information of their data, at each draw or at one of them."""
+    model, assumed = _with_assumed(given.model)
+    problem = given
+    if assumed:
+        problem = Problem(given.data, model, noise=given.noise, sensors=given.sensors)
+    own = [problem.names.index(name) for name in given.names]
+    theta = np.array([np.log(p.value or 1.0) for p in problem.parameters]) * np.ones(
+        (len(drawn), 1)
+    )
+    theta[:, own] = drawn
+    prior = np.zeros(len(problem.names))
+    prior[own] = leaned
+    noise, cycles = _row_noise(problem, float(np.median(scale)))
+    if at is not None:
+        one = problem.information(theta[at], scale)
+        theta = np.delete(theta, at, axis=0)
+        known = np.broadcast_to(one, (len(theta), *one.shape))
+    else:
+        known = problem.information(theta, scale)
+    known = known + _of_assumed(problem.names, assumed)
+    return Knowledge(
+        model, problem.sensors, problem.data.motion, problem.parameters, theta, known,
+        np.diag(prior), tuple(assumed), noise, cycles, problem,
+    )  # fmt: skip
+
+
+def _with_assumed(model: Model) -> tuple[Model, dict[str, float]]:
+    """Return the model with its assumed parameters free, and the information of each."""
+    assumed = {
+        p.name: 12.0 / np.log(p.prior[1] / p.prior[0]) ** 2
+        for p in model.parameters
+        if p.assumed and not p.free and p.prior is not None
+    }
+    return (model.with_free(assumed) if assumed else model), assumed
+
+
+def _of_assumed(names: Sequence[str], assumed: Mapping[str, float]) -> FloatArray:
+    return np.diag([assumed.get(name, 0.0) for name in names])
+
+
+def _leaned_on(parameters: Sequence[Parameter], centre: FloatArray, std: FloatArray) -> FloatArray:
+    """Return the information of ranges, each at least as wide as a factor of e to either side."""
+    least = [
+        1.0 if p.transform == "log" else abs(c) for p, c in zip(parameters, centre, strict=True)
+    ]
+    return np.asarray(1.0 / np.maximum(std, least) ** 2)
+
+
+def _moments(parameters: Sequence[Parameter], ranges: Ranges) -> tuple[FloatArray, FloatArray]:
+    """Return centre and standard deviation of each search coordinate; inf without a range."""
+    unknown = set(ranges) - {p.name for p in parameters}
+    if unknown:
+        raise ValidationError(
+            f"ranges names {', '.join(sorted(unknown))}; free are "
+            f"{', '.join(p.name for p in parameters)}"
+        )
+    centre, std = np.zeros(len(parameters)), np.full(len(parameters), np.inf)
+    for i, p in enumerate(parameters):
+        given = ranges.get(p.name, p.prior)
+        if given is None:
+            continue
+        ends = finite_array(given, f"ranges[{p.name!r}]")
+        if ends.shape != (2,) or not ends[0] < ends[1] or (p.transform == "log" and ends[0] <= 0):
+            above = " above zero" if p.transform == "log" else ""
+            raise ValidationError(
+                f"ranges[{p.name!r}] is {given!r}; expected two rising numbers{above}"
+            )
+        low, high = np.log(ends) if p.transform == "log" else ends
+        centre[i], std[i] = 0.5 * (low + high), (high - low) / _NORMAL_RANGE
+    return centre, std
+
+
+def _within(theta: FloatArray, parameters: Sequence[Parameter]) -> FloatArray:
+    """Return draws moved into the parameters' bounds."""
+    with np.errstate(divide="ignore"):
+        ends = [
+            (np.log(max(p.lower, 0.0)), np.log(p.upper)) if p.transform == "log"
+            else (p.lower, p.upper)
+            for p in parameters
+        ]  # fmt: skip
+    low, high = np.array(ends).T
+    return np.clip(theta, low, high)
+
+
+def _row_noise(problem: Problem, scale: float) -> tuple[float, float]:
+    """Return the relative noise of a row of the data, and the cycles that it averages."""
+    data, size = problem.data, np.abs(problem.data.response)
+    cycles = 1.0
+    if problem.noise == "relative":
+        return scale, cycles
+    if problem.noise == "absolute" or data.covariance is None:
+        return float(np.sqrt(np.median((scale / size) ** 2))), cycles
+    if data.dof is not None and np.isfinite(data.dof).all():
+        cycles = float(np.median(data.dof)) + 1.0
+    variance = 0.5 * np.trace(data.covariance, axis1=1, axis2=2) / size**2
+    return float(np.sqrt(np.median(variance))), cycles
+
+
+def placeholder(
+    levels: FloatArray,
+    frequency_hz: FloatArray,
+    controlled: str,
+    motion: Motion,
+    harmonic: int = 1,
+) -> FrequencyResponse:
+    """Return a table of candidates whose response is not yet measured."""
+    kind = "drive" if controlled == "force" else "amplitude"
+    where: dict[str, Any] = {kind: levels}
+    return FrequencyResponse(
+        frequency_hz, np.ones(len(levels)), controlled=controlled, motion=motion,
+        harmonic=harmonic, **where,
+    )  # fmt: skip

@@ -1,0 +1,330 @@
+"""A plan: levels in the order of the run, what they will tell, and what they will not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray, positive_number
+from dahl_ident.data.storage import place_of, plain_data, write_whole
+from dahl_ident.errors import ValidationError
+from dahl_ident.synthetic.waveform import Waveform, WaveformBuilder
+from dahl_ident.units import Motion, shown_unit
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from dahl_ident.plots import Axes
+
+_CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the plan's time, in the picture
+
+
+@dataclass(frozen=True)
+class Step:
+    """One level of a run.
+
+    Attributes
+    ----------
+    level : float
+        Amplitude of displacement (m) or drive (N), zero to peak.
+    frequency_hz : float
+        Hz.
+    settling_cycles, measured_cycles : int
+        Cycles before measuring, and measured.
+    seconds : float
+        Change-over, settling and measuring.
+    """
+
+    level: float
+    frequency_hz: float
+    settling_cycles: int
+    measured_cycles: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Predicted relative standard uncertainty of a quantity.
+
+    Attributes
+    ----------
+    value : float
+        Median over the draws.
+    before, after : float
+        Relative standard uncertainty by the data before, and with the plan's; inf where nothing
+        is known. Geometric mean over the draws.
+    low, high : float
+        Tenth and ninetieth percentile of `after` over the draws.
+    scatter_share : float
+        Share of the variance that scatter between runs makes.
+    """
+
+    value: float
+    before: float
+    after: float
+    low: float
+    high: float
+    scatter_share: float
+
+
+class _Planner(Protocol):
+    def solve(self, time: float, start: Sequence[int] = ()) -> Any: ...
+    def expected(self, levels: Any, cycles: FloatArray, runs: int) -> dict[str, Expected]: ...
+    def logarithmic_grid(self, time: float, levels: int = 10) -> Any: ...
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Which levels to measure, in which order, for how many cycles.
+
+    Made by :func:`dahl_ident.plan`.
+
+    Attributes
+    ----------
+    controlled : {"displacement", "force"}
+        What the levels are amplitudes of.
+    steps : tuple of Step
+        One run, in its order.
+    runs : int
+        Runs alike.
+    seconds : float
+        Time of everything.
+    expected : mapping of str to Expected
+        Predicted uncertainty of every parameter and target, without a range's help.
+    target : mapping of str to float
+        Relative standard uncertainties that were wanted; empty where time was given.
+    reached : bool
+        Whether all of them, and those of suspected parameters, are predicted to be reached.
+    undetermined : tuple of str
+        What the plan does not determine, and which limit prevents it.
+    assumptions : tuple of str
+        What the prediction rests on.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> fit = di.fit(di.load_dataset("noisy"), di.Dahl(alpha=1.0))
+    >>> plan = di.plan(fit, limits={"displacement": 0.03, "frequency_hz": 5.0, "time": 30.0})
+    >>> [step.measured_cycles > 10 for step in plan.steps], plan.seconds <= 30.0
+    ([True, True], True)
+    """
+
+    controlled: str
+    steps: tuple[Step, ...]
+    runs: int
+    seconds: float
+    expected: Mapping[str, Expected]
+    target: Mapping[str, float]
+    reached: bool
+    undetermined: tuple[str, ...]
+    assumptions: tuple[str, ...]
+    change_over: float
+    motion: Motion
+    planner: _Planner = field(repr=False, compare=False)
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return the table: level, frequency, settling and measured cycles, seconds.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row a level, in the order of the run.
+        """
+        import pandas as pd
+
+        return pd.DataFrame([vars_of(step) for step in self.steps])
+
+    def budget(self) -> pd.DataFrame:
+        """Return the predicted uncertainty of every parameter and target.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``value, before, after, low, high, scatter_share``; see `Expected`.
+        """
+        import pandas as pd
+
+        rows = {name: vars_of(one) for name, one in self.expected.items()}
+        return pd.DataFrame.from_dict(rows, orient="index").rename_axis("quantity")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the plan as plain data."""
+        return {
+            "controlled": self.controlled,
+            "runs": self.runs,
+            "seconds": self.seconds,
+            "steps": [vars_of(step) for step in self.steps],
+            "expected": {name: vars_of(one) for name, one in self.expected.items()},
+            "target": dict(self.target),
+            "reached": self.reached,
+            "undetermined": list(self.undetermined),
+            "assumptions": list(self.assumptions),
+        }
+
+    def waveform(self) -> Waveform:
+        """Return one run as a smooth waveform with its measured windows."""
+        run = WaveformBuilder(self.steps[0].frequency_hz)
+        for step in self.steps:
+            run.go_to(step.level, step.frequency_hz, self.change_over)
+            run.stay(step.settling_cycles / step.frequency_hz)
+            run.measure(step.measured_cycles / step.frequency_hz)
+        return run.finish()
+
+    def write_waveform(
+        self, path: str | Path, sample_rate: float, *, overwrite: bool = False
+    ) -> Path:
+        """Write one run for the exciter: time, value, step and whether it is measured.
+
+        Parameters
+        ----------
+        path : path
+            Ending in ``.csv``.
+        sample_rate : float
+            Samples a second; at least ten a cycle of the highest frequency.
+        overwrite : bool, default False
+            Replace a file that is there already.
+
+        Returns
+        -------
+        Path
+            The file. ``time [s]``, then the displacement (m) or the drive (N), then the number of
+            the step, from 1, and 1 where the sample is meant to be measured.
+
+        Raises
+        ------
+        ValidationError
+            If there are fewer than ten samples a cycle.
+        """
+        import pandas as pd
+
+        rate, wave = positive_number(sample_rate, "sample_rate"), self.waveform()
+        if rate < 10.0 * wave.highest_frequency_hz:
+            raise ValidationError(
+                f"sample_rate is {rate:g}; expected at least ten samples a cycle: "
+                f"{10.0 * wave.highest_frequency_hz:g}"
+            )
+        time = np.arange(int(np.floor(wave.duration * rate)) + 1) / rate
+        measured, step = np.zeros(time.size, dtype=int), np.ones(time.size, dtype=int)
+        for i, window in enumerate(wave.windows, start=1):
+            measured[(time >= window.start) & (time < window.stop)] = 1
+            step[time >= window.stop] = min(i + 1, len(wave.windows))
+        what = "drive" if self.controlled == "force" else "displacement"
+        frame = pd.DataFrame(
+            {
+                "time [s]": time,
+                f"{what} [{self._unit}]": wave.value(time),
+                "step": step,
+                "measured": measured,
+            }
+        )
+        place = place_of(path, "a waveform", (".csv",))
+        write_whole(place, frame.to_csv(index=False).encode(), overwrite=overwrite)
+        return place
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
+        """Write the plan as JSON.
+
+        Parameters
+        ----------
+        path : path
+            Ending in ``.json``.
+        overwrite : bool, default False
+            Replace a file that is there already.
+
+        Returns
+        -------
+        Path
+        """
+        place = place_of(path, "a plan", (".json",))
+        text = json.dumps(plain_data(self.to_dict()), indent=2, allow_nan=False)
+        write_whole(place, text.encode(), overwrite=overwrite)
+        return place
+
+    def curves(self) -> dict[str, tuple[FloatArray, FloatArray, FloatArray]]:
+        """Return time, uncertainty by plans and by a logarithmic grid, for each quantity.
+
+        The quantities are the targets, or all parameters where time was given. The grid has ten
+        levels with equal cycles; NaN where the time is too short.
+        """
+        names = list(self.target or self.expected)
+        times = self.seconds * np.array(_CURVE)
+        planned = {name: np.full(len(times), np.nan) for name in names}
+        even = {name: np.full(len(times), np.nan) for name in names}
+        for i, time in enumerate(times.tolist()):
+            found = self.planner.solve(time)
+            if found is not None:
+                selection = found.selection
+                told = self.planner.expected(selection.levels, selection.cycles, found.runs)
+                for name in names:
+                    planned[name][i] = told[name].after
+            grid = self.planner.logarithmic_grid(time)
+            if grid is not None:
+                told = self.planner.expected(*grid)
+                for name in names:
+                    even[name][i] = told[name].after
+        return {name: (times, planned[name], even[name]) for name in names}
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the predicted uncertainty against bench time, beside a logarithmic grid.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            New where left out.
+
+        Returns
+        -------
+        Axes
+        """
+        from dahl_ident.plots import plot_bench_time
+
+        return plot_bench_time(self.curves(), dict(self.target), ax=ax)
+
+    @property
+    def _unit(self) -> str:
+        return shown_unit("N" if self.controlled == "force" else "m", self.motion)
+
+    def __str__(self) -> str:
+        """Return the plan as text."""
+        lines = [_headline(self), ""]
+        lines.append(f"{'':4}{'level [' + self._unit + ']':>13}{'[Hz]':>10}{'settling':>10}"
+                     f"{'measured':>10}{'time [s]':>10}")  # fmt: skip
+        for i, s in enumerate(self.steps, start=1):
+            lines.append(
+                f"{i:<4}{s.level:>13.4g}{s.frequency_hz:>10.4g}{s.settling_cycles:>10d}"
+                f"{s.measured_cycles:>10d}{s.seconds:>10.1f}"
+            )
+        lines += ["", f"{'':24}{'value':>11}{'before':>11}{'after':>11}{'wanted':>11}"]
+        for name, e in self.expected.items():
+            wanted = _percent(self.target[name]) if name in self.target else ""
+            lines.append(
+                f"{name:24}{e.value:>11.4g}{_percent(e.before):>11}{_percent(e.after):>11}"
+                f"{wanted:>11}"
+            )
+        lines.append("Relative standard uncertainties.")
+        lines += [f"{text}." for text in self.undetermined]
+        lines.append(f"Assumed: {'; '.join(self.assumptions)}.")
+        return "\n".join(lines)
+
+
+def vars_of(one: Step | Expected) -> dict[str, Any]:
+    """Return the fields of a step or an expectation."""
+    return dict(vars(one))
+
+
+def _headline(plan: Plan) -> str:
+    levels = f"{len(plan.steps)} level{'s' if len(plan.steps) != 1 else ''}"
+    runs = f"{plan.runs} runs of {levels}" if plan.runs > 1 else levels
+    end = ""
+    if plan.target:
+        end = "; reaches what is wanted" if plan.reached else "; does NOT reach what is wanted"
+    return f"{runs} in {plan.seconds:.4g} s{end}."
+
+
+def _percent(u: float) -> str:
+    return f"{100.0 * u:.3g} %" if np.isfinite(u) else "-"

@@ -1,0 +1,244 @@
+"""Optimal designs: the continuous one by multiplication, the one with fixed costs by exchange.
+
+**Continuous.** Seconds t_k at each candidate, their sum given. With d_k the criterion's derivative
+by t_k and d the mean of d_k weighted by t_k, every t_k is multiplied by (d_k/d)^p; at the optimum
+d_k <= d everywhere (the equivalence theorem), with equality where t_k > 0. For D-optimality without
+earlier data d times the time is 1, so that the derivative of ln det never exceeds the number of
+parameters. Source: Silvey, Titterington and Torsney, *Commun. Stat. A* 7, 1379 (1978); Yu,
+*Ann. Stat.* 38, 1593 (2010).
+
+**With fixed costs** each visited level takes settling and change-over before it tells anything.
+Levels are added, exchanged and left out one at a time while that improves the criterion, the rest
+of the time being shared by multiplication; then the cycles are made whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
+from dahl_ident.planning.criteria import Objective
+
+_IMPROVES = 1e-4  # of a logarithm, by which a change of the levels must be better
+_ROUNDS = 12
+_TRIED = 3  # candidates whose times are optimised after a first look at all
+_MOST_LEVELS = 24
+_NEGLIGIBLE = 1e-6
+
+
+@dataclass(frozen=True)
+class ContinuousDesign:
+    """Seconds at each candidate.
+
+    Attributes
+    ----------
+    seconds : ndarray, shape (K,)
+        Their sum is the time given.
+    value : float
+        The criterion.
+    excess : float
+        Largest d_k/d - 1 over all candidates: 0 at the optimum.
+    """
+
+    seconds: FloatArray
+    value: float
+    excess: float
+
+
+def continuous_design(
+    objective: Objective,
+    frequency_hz: FloatArray,
+    time: float,
+    *,
+    tolerance: float = 0.01,
+    iterations: int = 400,
+) -> ContinuousDesign:
+    """Return the best seconds at each candidate, settling and change-over left out."""
+    K = objective.candidates
+    seconds = np.full(K, time / K)
+    active = np.arange(K)
+    excess = np.inf
+    for _ in range(30):
+        sub = objective.only(active)
+        seconds[active] = _shared(
+            sub, frequency_hz[active], time, seconds[active], iterations // 10, tolerance
+        )
+        point = sub.at(seconds[active] * frequency_hz[active])
+        rate = objective.gradient(point) * frequency_hz
+        mean = float(rate @ seconds) / time
+        excess = float(rate.max() / mean) - 1.0
+        if excess < tolerance:
+            break
+        # those that cannot matter rest; those that should be measured come back
+        resting = (seconds < 1e-4 * seconds.max()) & (rate < 0.9 * mean)
+        seconds[resting] = 0.0
+        missing = ~resting & (seconds == 0.0) & (rate > mean)
+        seconds[missing] = 1e-3 * time / max(int(missing.sum()), 1)
+        seconds *= time / seconds.sum()
+        active = np.flatnonzero(seconds)
+    return ContinuousDesign(seconds, point.value, excess)
+
+
+def _shared(
+    objective: Objective,
+    frequency_hz: FloatArray,
+    time: float,
+    start: FloatArray,
+    iterations: int,
+    tolerance: float,
+    least: FloatArray | float = 0.0,
+) -> FloatArray:
+    """Return seconds beyond `least` that share `time` best, by multiplication from `start`."""
+    seconds, power = start * (time / start.sum()), 1.0
+    point = objective.at((least + seconds) * frequency_hz)
+    for _ in range(iterations):
+        rate = objective.gradient(point) * frequency_hz
+        mean = float(rate @ seconds) / time
+        if not mean > 0.0 or rate.max() < (1.0 + tolerance) * mean:
+            break
+        while True:
+            moved = seconds * (rate / mean) ** power
+            moved *= time / moved.sum()
+            new = objective.at((least + moved) * frequency_hz)
+            if new.value >= point.value or power < 0.1:
+                break
+            power *= 0.5  # only D-optimality rises with full steps
+        seconds, point = moved, new
+    return np.asarray(seconds)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Levels in the order of the run, whole cycles at each, and the criterion."""
+
+    levels: NDArray[np.intp]
+    cycles: FloatArray
+    value: float
+
+
+class Exchange:
+    """The search for levels, with settling and change-over.
+
+    There are at least `fewest` levels where the time allows as many, so that a fit has residuals.
+    """
+
+    def __init__(
+        self, objective: Objective, bench: BenchTime, pool: NDArray[np.intp], fewest: int = 1
+    ) -> None:
+        self._objective, self._bench, self._pool = objective, bench, pool
+        self._fewest = fewest
+
+    def best(self, time: float, start: Sequence[int] = ()) -> Selection | None:
+        """Return the best levels for one run of `time` s; None where nothing can be measured."""
+        chosen, value = list(start), -np.inf
+        if chosen:
+            value = self._value(chosen, time)
+            if value == -np.inf:
+                chosen = []
+        for _ in range(_ROUNDS):
+            before = value if len(chosen) >= self._fewest else -np.inf
+            chosen, value = self._grow(chosen, value, time)
+            chosen, value = self._exchange(chosen, value, time)
+            if not value > before + _IMPROVES:
+                break
+        return self.whole(chosen, time) if chosen else None
+
+    def _grow(self, chosen: list[int], value: float, time: float) -> tuple[list[int], float]:
+        while len(chosen) < _MOST_LEVELS:
+            trials = [[*chosen, k] for k in self._promising(chosen, time)]
+            least = value if len(chosen) >= self._fewest else -np.inf
+            found = self._better(trials, least, time)
+            if found is None:
+                break
+            chosen, value = found
+        return chosen, value
+
+    def _exchange(self, chosen: list[int], value: float, time: float) -> tuple[list[int], float]:
+        for _ in range(_ROUNDS):
+            trials = []
+            for k in chosen:
+                rest = [j for j in chosen if j != k]
+                if len(rest) >= self._fewest:
+                    trials.append(rest)
+                trials += [[*rest, j] for j in self._promising(rest, time) if j != k]
+            found = self._better(trials, value, time)
+            if found is None:
+                break
+            chosen, value = found
+        return chosen, value
+
+    def _better(
+        self, trials: list[list[int]], value: float, time: float
+    ) -> tuple[list[int], float] | None:
+        values = [self._value(trial, time) for trial in trials]
+        best = int(np.argmax(values)) if values else -1
+        if best < 0 or not values[best] > value + (_IMPROVES if np.isfinite(value) else 0.0):
+            return None
+        return trials[best], values[best]
+
+    def _room(self, levels: Sequence[int], time: float) -> float:
+        """Return the seconds to share beyond the least cycles at every level."""
+        least = LEAST_CYCLES / self._bench.frequency_hz[list(levels)]
+        return time - self._bench.fixed(levels) - float(least.sum())
+
+    def _share(self, levels: Sequence[int], time: float, iterations: int) -> FloatArray | None:
+        room = self._room(levels, time)
+        if not room >= 0.0:
+            return None
+        f = self._bench.frequency_hz[list(levels)]
+        least = LEAST_CYCLES / f
+        if room == 0.0:
+            return np.asarray(least * f)
+        sub = self._objective.only(levels)
+        start = np.full(len(f), 1.0)
+        seconds = _shared(sub, f, room, start, iterations, 0.003, least)
+        return np.asarray((least + seconds) * f)
+
+    def _value(self, levels: Sequence[int], time: float) -> float:
+        cycles = self._share(levels, time, 15)
+        if cycles is None:
+            return -np.inf
+        return self._objective.only(levels).at(cycles).value
+
+    def _promising(self, chosen: list[int], time: float) -> list[int]:
+        """Return the candidates that look best beside the chosen ones, at equal shares."""
+        rest = np.setdiff1d(self._pool, chosen)
+        rooms = np.array([self._room([*chosen, k], time) for k in rest.tolist()])
+        possible = rest[rooms >= 0.0]
+        if not possible.size:
+            return []
+        rooms = rooms[rooms >= 0.0] / (len(chosen) + 1.0)
+        f = self._bench.frequency_hz
+        own = LEAST_CYCLES + rooms * f[possible]
+        totals = []
+        for term in self._objective.terms:
+            packed = term.levels.packed
+            total = own[:, None] * packed[possible]
+            if chosen:
+                others = LEAST_CYCLES + rooms[:, None] * f[chosen]
+                total = total + others @ packed[chosen]
+            totals.append(total)
+        values = self._objective.values(totals)
+        return [int(k) for k in possible[np.argsort(-values)[:_TRIED]]]
+
+    def whole(self, levels: Sequence[int], time: float) -> Selection:
+        """Return whole cycles at the levels, what is left of the time given where it helps most."""
+        ordered = self._bench.order(levels)
+        f = self._bench.frequency_hz[ordered]
+        shared = self._share(ordered.tolist(), time, 100)
+        assert shared is not None
+        cycles = np.maximum(np.floor(shared + 1e-9), float(LEAST_CYCLES))
+        sub = self._objective.only(ordered)
+        while True:
+            left = time - self._bench.seconds(ordered, cycles)
+            possible = 1.0 / f <= left + 1e-9
+            if not possible.any():
+                break
+            gain = np.where(possible, sub.gradient(sub.at(cycles)) * f, -np.inf)
+            cycles[int(np.argmax(gain))] += 1.0
+        return Selection(ordered, cycles, sub.at(cycles).value)

@@ -1,0 +1,246 @@
+"""Pictures that judge a fit: residuals, profiles, correlation, where the information is."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import ArrayLike, NDArray
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.plots import style
+
+_LARGEST_DISC = 250.0  # area, points squared
+_MOST_JOINED = 6  # curves, beyond which lines between points only confuse
+
+
+def plot_residuals(
+    x: ArrayLike,
+    first: ArrayLike,
+    second: ArrayLike,
+    *,
+    names: tuple[str, str] = ("real part", "imaginary part"),
+    x_label: str = "displacement amplitude [m]",
+    group: ArrayLike | None = None,
+    suspicious: ArrayLike = (),
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the two residuals of every point, in standard deviations.
+
+    Points of a group are joined where no two of them share a place, so that sequences of one sign
+    show; with many groups none is.
+
+    Parameters
+    ----------
+    x : array_like, shape (n,)
+        Amplitude or frequency.
+    first, second : array_like, shape (n,)
+        Residuals in units of the noise.
+    names : tuple of str
+        What the two residuals are.
+    x_label : str
+        Axis label with unit.
+    group : array_like, shape (n,), optional
+        To which curve each point belongs; one curve where left out.
+    suspicious : array_like of int
+        Indices to ring.
+    ax : Axes, optional
+        New where left out.
+
+    Returns
+    -------
+    Axes
+        Residuals over `x`.
+
+    Examples
+    --------
+    >>> plot_residuals([1.0, 2.0], [0.1, -0.2], [1.0, 0.3]).get_ylabel()
+    'residual [standard deviations]'
+    """
+    with style.house_style():
+        axis = style.axes(ax)
+        where = np.asarray(x)
+        axis.axhspan(-2.0, 2.0, color=style.GREY, alpha=0.12, lw=0)
+        axis.axhline(0.0, color=style.GREY, lw=0.8)
+        for y, name, colour, marker in zip(
+            (first, second), names, style.SERIES, style.MARKERS, strict=False
+        ):
+            axis.plot(where, y, marker, color=colour, label=name)
+            for part in _curves(where, group):
+                axis.plot(where[part], np.asarray(y)[part], lw=0.6, color=colour)
+        for index in np.asarray(suspicious, dtype=int):
+            for y in (first, second):
+                axis.plot(
+                    where[index], np.asarray(y)[index], "o", mfc="none", mec=style.PURPLE, ms=10
+                )
+        if where.min() > 0.0 and where.max() > 5.0 * where.min():
+            axis.set_xscale("log")
+            style.readable_log_ticks(axis)
+        axis.set(xlabel=x_label, ylabel="residual [standard deviations]")
+        style.legend_above(axis)
+        return axis
+
+
+def _curves(x: FloatArray, group: ArrayLike | None) -> Iterator[NDArray[np.intp]]:
+    """Yield the rows of each group in order of their place, where no two share one."""
+    of = np.zeros(x.size) if group is None else np.asarray(group)
+    names = np.unique(of)
+    for name in names[: names.size if names.size <= _MOST_JOINED else 0]:
+        rows = np.flatnonzero(of == name)
+        if np.unique(x[rows]).size == rows.size:
+            yield rows[np.argsort(x[rows])]
+
+
+def plot_profile(
+    value: ArrayLike,
+    deviance: ArrayLike,
+    *,
+    best: float,
+    limits: Mapping[str, float],
+    label: str,
+    log: bool = False,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the profile of the deviance over one parameter, with the levels of its intervals.
+
+    Parameters
+    ----------
+    value, deviance : array_like, shape (n,)
+        Fixed values of the parameter, and the rise of -2 ln likelihood (or of F) there.
+    best : float
+        The estimate.
+    limits : mapping of str to float
+        Height of each confidence level, by its label.
+    label : str
+        The parameter with its unit.
+    log : bool, default False
+        Logarithmic axis, for a positive parameter.
+    ax : Axes, optional
+        New where left out.
+
+    Returns
+    -------
+    Axes
+        Deviance over the parameter.
+
+    Examples
+    --------
+    >>> axis = plot_profile([1, 2, 3], [4, 0, 4], best=2, limits={"95 %": 3.84}, label="k [N/m]")
+    >>> axis.get_xlabel()
+    'k [N/m]'
+    """
+    with style.house_style():
+        axis = style.axes(ax)
+        axis.plot(value, deviance, color=style.BLUE, marker=".", lw=1.2)
+        axis.axvline(best, color=style.FIT, lw=0.8)
+        for name, height in limits.items():
+            axis.axhline(height, color=style.GREY, lw=0.8, ls="--")
+            axis.annotate(
+                name, (1.02, height), xycoords=("axes fraction", "data"), va="center", fontsize=7,
+                color=style.GREY, annotation_clip=False,
+            )  # fmt: skip
+        top = 1.2 * max(limits.values())
+        axis.set(xlabel=label, ylabel="rise of deviance", ylim=(-0.02 * top, top))
+        axis.set_xscale("log" if log else "linear")
+        style.few_plain_ticks(axis.xaxis)
+        return axis
+
+
+def plot_correlation(
+    names: Sequence[str], correlation: ArrayLike, *, ax: Axes | None = None
+) -> Axes:
+    """Draw a correlation matrix, with its numbers.
+
+    Parameters
+    ----------
+    names : sequence of str
+        The parameters.
+    correlation : array_like, shape (p, p)
+        Between -1 and 1.
+    ax : Axes, optional
+        New where left out.
+
+    Returns
+    -------
+    Axes
+        The matrix.
+
+    Examples
+    --------
+    >>> axis = plot_correlation(["f_max", "sigma"], [[1.0, -0.3], [-0.3, 1.0]])
+    >>> len(axis.texts)
+    4
+    """
+    with style.house_style():
+        axis = style.axes(ax, size=(3.6, 3.2))
+        matrix = np.asarray(correlation)
+        axis.imshow(matrix, cmap="PuOr", vmin=-1.0, vmax=1.0)
+        for (i, j), value in np.ndenumerate(matrix):
+            axis.text(
+                j, i, f"{value:.2f}", ha="center", va="center", fontsize=8,
+                color="white" if abs(value) > 0.6 else "black",
+            )  # fmt: skip
+        axis.set_xticks(range(len(names)), names, rotation=30, ha="right")
+        axis.set_yticks(range(len(names)), names)
+        axis.grid(visible=False)
+        return axis
+
+
+def plot_information(
+    x: ArrayLike,
+    shares: Mapping[str, ArrayLike],
+    *,
+    x_label: str = "displacement amplitude [m]",
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw how much each point says about each parameter (the identifiability map).
+
+    Parameters
+    ----------
+    x : array_like, shape (n,)
+        Amplitude of each point.
+    shares : mapping of str to array_like, shape (n,)
+        For each parameter, each point's share of the information, summing to 1; NaN where
+        there is none.
+    x_label : str
+        Axis label with unit.
+    ax : Axes, optional
+        New where left out.
+
+    Returns
+    -------
+    Axes
+        A line for each parameter; discs' areas go with the shares, the largest one's is written.
+
+    Examples
+    --------
+    >>> axis = plot_information([1.0, 2.0], {"f_max": [0.2, 0.8]})
+    >>> [label.get_text() for label in axis.get_yticklabels()], axis.texts[0].get_text()
+    (['f_max'], '80 %')
+    """
+    with style.house_style():
+        axis = style.axes(ax, size=(4.6, 1.2 + 0.5 * len(shares)))
+        where = np.asarray(x, dtype=float)
+        parts = [np.nan_to_num(np.asarray(share, dtype=float)) for share in shares.values()]
+        area = _LARGEST_DISC / (max(float(part.max()) for part in parts) or 1.0)
+        for line, (part, colour) in enumerate(
+            zip(parts, itertools.cycle(style.SERIES), strict=False)
+        ):
+            axis.scatter(
+                where, np.full(where.size, line), s=area * part, color=colour, alpha=0.6,
+                edgecolor=style.BLACK, lw=0.5, zorder=3,
+            )  # fmt: skip
+            largest = int(np.argmax(part))
+            if part[largest] > 0.0:
+                axis.annotate(
+                    f"{100.0 * part[largest]:.0f} %", (where[largest], line), (0, 10),
+                    textcoords="offset points", ha="center", fontsize=7,
+                )  # fmt: skip
+        axis.set(xlabel=x_label, xscale="log", ylim=(len(shares) - 0.4, -0.8))
+        axis.set_title("share of the information, by area", fontsize=8, loc="left")
+        axis.set_yticks(range(len(shares)), list(shares))
+        axis.margins(x=0.08)
+        style.readable_log_ticks(axis)
+        return axis

@@ -1,0 +1,99 @@
+"""Noise in records: the spectrum of residuals, and what the drive holds outside its band."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray
+
+_HIGHEST_ORDER = 60
+_SAMPLES_PER_ORDER = 20
+_BAND = 1e-4  # of the drive's largest power: below, the drive is not in its band
+_OUTSIDE = 0.1  # share of frequencies outside the band that tells the noise there
+
+
+def prediction_error_filter(residuals: Sequence[FloatArray]) -> FloatArray:
+    """Return a filter that makes correlated residuals white, or [1] where none does.
+
+    An autoregressive model e_t = sum a_k e_(t-k) + innovation is fitted by least squares, which
+    also holds where slow noise is a thousand times larger than fast; the order has the least
+    criterion of Akaike.
+
+    Parameters
+    ----------
+    residuals : sequence of ndarray, shape (n_i,)
+        Of one noise, record by record.
+
+    Returns
+    -------
+    ndarray, shape (order + 1,)
+        1, -a_1, -a_2, ...
+
+    Examples
+    --------
+    >>> from scipy.signal import lfilter
+    >>> e = lfilter([1.0], [1.0, -0.9], np.random.default_rng(0).standard_normal(20_000))
+    >>> bool(abs(prediction_error_filter([e])[1] + 0.9) < 0.02)
+    True
+    """
+    shortest = min(e.size for e in residuals)
+    highest = min(_HIGHEST_ORDER, shortest // _SAMPLES_PER_ORDER)
+    lags = [np.lib.stride_tricks.sliding_window_view(e, highest + 1)[:, ::-1] for e in residuals]
+    n = sum(len(rows) for rows in lags)
+    products = np.zeros((highest + 1, highest + 1))
+    for rows in lags:
+        products += rows.T @ rows
+    try:
+        lower = np.linalg.cholesky(products[1:, 1:])
+    except np.linalg.LinAlgError:
+        return np.ones(1)
+    explained = np.linalg.solve(lower, products[1:, 0]) ** 2
+    left = (products[0, 0] - np.concatenate([[0.0], np.cumsum(explained)])) / n
+    if not left[-1] > 0.0:
+        return np.ones(1)
+    order = int(np.argmin(n * np.log(left) + 2.0 * np.arange(highest + 1)))
+    inner = products[1 : order + 1, 1 : order + 1]
+    return np.concatenate([[1.0], -np.linalg.solve(inner, products[1 : order + 1, 0])])
+
+
+def share_in_band(
+    drives: Sequence[FloatArray], outputs: Sequence[FloatArray], residuals: Sequence[FloatArray]
+) -> float:
+    """Return the residuals' power over the output's, at frequencies where the drive has power."""
+    above, below = 0.0, 0.0
+    for drive, output, residual in zip(drives, outputs, residuals, strict=True):
+        band = excited(drive)
+        above += float(_power(residual)[band].sum()) / residual.size
+        below += float(_power(output)[band].sum()) / output.size
+    return above / below if below > 0.0 else 0.0
+
+
+def drive_noise(drives: Sequence[FloatArray]) -> float | None:
+    """Return the power of a drive's noise over that of the drive, both within its band.
+
+    The noise is taken as white, of the median power outside the band. None where less than a
+    tenth of the frequencies lie outside, so that nothing is known of it.
+    """
+    noise, signal = 0.0, 0.0
+    for drive in drives:
+        band, power = excited(drive), _power(drive)
+        if np.mean(~band) < _OUTSIDE:
+            return None
+        noise += float(np.median(power[~band])) / np.log(2.0) * band.sum() / drive.size
+        signal += float(power[band].sum()) / drive.size
+    return noise / signal if signal > 0.0 else None
+
+
+def excited(drive: FloatArray) -> NDArray[np.bool_]:
+    """Return at which frequencies of its Fourier transform a drive has power; all if none."""
+    power = _power(drive)
+    if not power.any():
+        return np.ones(power.size, dtype=np.bool_)
+    return np.asarray(power >= _BAND * power.max())
+
+
+def _power(wave: FloatArray) -> FloatArray:
+    return np.asarray(np.abs(np.fft.rfft(np.hanning(wave.size) * (wave - wave.mean()))) ** 2)

@@ -1,0 +1,394 @@
+"""Records of any motion: residuals sample by sample, with exact derivatives.
+
+Two kinds. Where the force is the output, the measured displacement goes into the elements, and
+their forces are added. Where the motion is the output, the measured force or base motion drives
+the plant's equation of motion. Every record adds unknowns of its own: the state at its first
+sample, an offset and, for forces, a drift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from scipy.signal import lfilter
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import Record
+from dahl_ident.elements import Element, Parameter
+from dahl_ident.elements.model import as_model
+from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
+from dahl_ident.problem.problem import Quadratic
+from dahl_ident.time_domain import (
+    Excitation,
+    ForcedMotion,
+    Plant,
+    band_limited,
+    differentiated,
+)
+
+Output = Literal["force", "motion"]
+_SHORTEST = 16
+_SUBSTEP = 0.4  # rad of the fastest motion in a step of integration
+_POWER = 0.999  # share of the drive's power below its band's end
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a record's samples should be.
+
+    Attributes
+    ----------
+    output : ndarray, shape (n,)
+        Predicted samples.
+    by : ndarray, shape (n, P)
+        Derivatives by the problem's values; P = 0 where they were not asked for.
+    """
+
+    output: FloatArray
+    by: FloatArray
+
+
+class RecordProblem:
+    """Records of one device and a model: residuals, Jacobian and cost.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Each a run. Evenly sampled where anything is integrated or differentiated.
+    model : Element
+        One element or a sum.
+    output : {"force", "motion"}, optional
+        What is predicted. Left out: "motion" where the model has inertia, else "force".
+    excitation : {"force", "base"}, default "force"
+        For the output "motion", what the records' force channel is: a force, or the acceleration
+        of the base, m/s^2, the motion being relative to it.
+    substeps : int, optional
+        Steps of integration in each sampling interval; left out, from the rates.
+
+    Raises
+    ------
+    DataError
+        If a record lacks a channel, is too short, or is not evenly sampled where it has to be.
+    ModelError
+        If the model cannot predict the output, or nothing is free.
+
+    Examples
+    --------
+    >>> from dahl_ident import Dahl
+    >>> x = np.sin(np.arange(40.0))
+    >>> force = Dahl(1.0, 3.0).force(x)
+    >>> problem = RecordProblem([Record(np.arange(40.0), displacement=x, force=force)], Dahl())
+    >>> problem.names
+    ['f_max', 'sigma', 'initial_force', 'offset', 'drift']
+    """
+
+    def __init__(
+        self,
+        records: Sequence[Record],
+        model: Element,
+        *,
+        output: Output | None = None,
+        excitation: Excitation = "force",
+        substeps: int | None = None,
+    ) -> None:
+        self.records = tuple(records)
+        if not self.records:
+            raise DataError("there is no record; give one or more")
+        for record in self.records:
+            if not isinstance(record, Record):
+                raise ValidationError(
+                    f"data holds a {type(record).__name__}; expected a FrequencyResponse, a Record "
+                    "or several records"
+                )
+        self.model = as_model(model)
+        self.excitation = excitation
+        self.substeps = substeps
+        inertial = any(p.dimension == (1, -1, 2) for p in self.model.parameters)
+        self.output: Output = output or ("motion" if inertial else "force")
+        if self.output not in ("force", "motion"):
+            raise ValidationError(f"output is {output!r}; expected force or motion")
+        self.free = [p for p in self.model.parameters if p.free]
+        if not self.free:
+            raise ModelError(f"nothing is free in {self.model!r}; leave a parameter out")
+        self.with_memory = [e for e in self.model.elements if e.has_memory]
+        for number, record in enumerate(self.records, 1):
+            self._check(record, f"record {number}" if len(self.records) > 1 else "the record")
+        self.parameters = (*self.free, *self._nuisance())
+        self.names = [p.name for p in self.parameters]
+        self.logarithmic = np.array([p.transform == "log" for p in self.parameters])
+        self.whitening = np.ones(1)
+        """Filter of the residuals; see :func:`~.record_noise.prediction_error_filter`."""
+        self._guesses: list[FloatArray | None] = [None] * len(self.records)
+
+    def _check(self, record: Record, which: str) -> None:
+        if len(record) < _SHORTEST:
+            raise DataError(f"{which} has {len(record)} samples; expected at least {_SHORTEST}")
+        if self.output == "force" and record.displacement is None:
+            raise DataError(
+                f"{which} has {record.motion_channel} but no displacement, from which the force "
+                "would follow; integrate it, or add Mass() to fit the motion"
+            )
+        integrates = self.output == "motion" or any(
+            not e.rate_independent for e in self.model.elements
+        )
+        if integrates and not record.uniform:
+            raise DataError(
+                f"{which} is not evenly sampled ({len(record.gaps)} gaps); give its longest part "
+                "without gaps, or resample it"
+            )
+        if self.output == "motion":
+            _ = record.force_samples
+
+    def _nuisance(self) -> list[Parameter]:
+        found = []
+        channel = self.records[0].motion_channel
+        unit = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}[channel]
+        for number in range(len(self.records)):
+            tail = f"_{number + 1}" if len(self.records) > 1 else ""
+            if self.output == "motion":
+                found.append(Parameter(f"initial_displacement{tail}", "m", "at the first sample"))
+                found.append(Parameter(f"initial_velocity{tail}", "m/s", "at the first sample"))
+            for element in self.with_memory:
+                name = f"{element.name}_" if element.name else ""
+                found.append(
+                    Parameter(f"{name}initial_force{tail}", "N", "friction at the first sample")
+                )
+            if self.output == "force":
+                found.append(Parameter(f"offset{tail}", "N", "constant in the measured force"))
+                found.append(Parameter(f"drift{tail}", "N/s", "slope of the measured force"))
+            else:
+                found.append(Parameter(f"offset{tail}", unit, "constant in the measured motion"))
+        return found
+
+    def shortened(self, samples: int) -> RecordProblem:
+        """Return the problem with the liveliest part of each record, `samples` in all."""
+        parts = []
+        for record, y in zip(self.records, self.measured, strict=True):
+            n = max(_SHORTEST, samples * len(record) // self.n_residuals)
+            energy = np.concatenate([[0.0], np.cumsum((y - y.mean()) ** 2)])
+            start = int(np.argmax(energy[n:] - energy[:-n]))
+            parts.append(_cut(record, slice(start, start + n)))
+        return RecordProblem(
+            parts,
+            self.model,
+            output=self.output,
+            excitation=self.excitation,
+            substeps=self.substeps,
+        )
+
+    def weighted(self, whitening: FloatArray) -> RecordProblem:
+        """Return the same problem with filtered residuals."""
+        other = copy(self)
+        other.whitening = whitening
+        return other
+
+    def filtered(self, waves: FloatArray) -> FloatArray:
+        """Return residuals or derivatives, (n, ...), filtered; the first `order` are left out."""
+        if self.whitening.size == 1:
+            return waves
+        return np.asarray(lfilter(self.whitening, [1.0], waves, axis=0)[self.whitening.size - 1 :])
+
+    @property
+    def per_record(self) -> int:
+        """Unknowns that each record adds."""
+        return (len(self.parameters) - len(self.free)) // len(self.records)
+
+    @property
+    def n_residuals(self) -> int:
+        """Samples of all records."""
+        return sum(len(record) for record in self.records)
+
+    @cached_property
+    def measured(self) -> tuple[FloatArray, ...]:
+        """The output of each record."""
+        if self.output == "force":
+            return tuple(record.force_samples for record in self.records)
+        return tuple(record.motion_samples for record in self.records)
+
+    @cached_property
+    def motions(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], ...]:
+        """Displacement, velocity and acceleration of each record, for the output "force"."""
+        found = []
+        for record in self.records:
+            x = np.asarray(record.displacement)
+            if all(e.rate_independent for e in self.model.elements):
+                found.append((x, np.zeros(0), np.zeros(0)))
+            else:
+                found.append((x, *differentiated(x, 1.0 / record.sample_rate)))
+        return tuple(found)
+
+    @cached_property
+    def _plant(self) -> Plant:
+        return Plant(self.model, self.excitation)
+
+    @cached_property
+    def forced(self) -> tuple[ForcedMotion, ...]:
+        """The driven plant of each record, for the output "motion"."""
+        found = []
+        for record in self.records:
+            rate, wave = record.sample_rate, record.force_samples
+            substeps = self.substeps or self.substeps_for(record)
+            drive = band_limited(wave, 1.0 / rate, substeps)
+            found.append(ForcedMotion(self._plant, drive, 1.0 / rate))
+        return tuple(found)
+
+    @staticmethod
+    def substeps_for(record: Record) -> int:
+        """Return the steps of integration that the band of drive and motion asks for."""
+        highest = 0.0
+        for wave in (record.force_samples, record.motion_samples):
+            power = np.abs(np.fft.rfft(wave - wave.mean())) ** 2
+            if power.any():
+                share = np.cumsum(power) / power.sum()
+                highest = max(highest, float(np.searchsorted(share, _POWER)) / power.size)
+        return int(np.clip(np.ceil(np.pi * highest / _SUBSTEP), 1, 8))
+
+    def values(self, theta: FloatArray) -> FloatArray:
+        """Return the parameters' values from search coordinates."""
+        return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, theta, 0.0)), theta)
+
+    def theta(self, values: FloatArray) -> FloatArray:
+        """Return search coordinates from the parameters' values."""
+        safe = np.where(self.logarithmic, np.maximum(values, 1e-300), 1.0)
+        return np.where(self.logarithmic, np.log(safe), values)
+
+    def full_values(self, values: FloatArray) -> list[float]:
+        """Return the value of every parameter of the model, fixed ones included."""
+        found = dict(zip(self.names, values.tolist(), strict=True))
+        return [float(found.get(p.name, p.value or 0.0)) for p in self.model.parameters]
+
+    def own(self, values: FloatArray, number: int) -> FloatArray:
+        """Return the values that belong to one record alone."""
+        start = len(self.free) + number * self.per_record
+        return values[start : start + self.per_record]
+
+    def predict(self, values: FloatArray, number: int, *, derivatives: bool = True) -> Prediction:
+        """Return what the samples of record `number` should be."""
+        if self.output == "force":
+            return self._force(values, number, derivatives=derivatives)
+        return self._motion(values, number, derivatives=derivatives)
+
+    def _force(self, values: FloatArray, number: int, *, derivatives: bool) -> Prediction:
+        x, v, a = self.motions[number]
+        record = self.records[number]
+        own = self.own(values, number)
+        time = record.time - record.time[0]
+        *states, offset, drift = own.tolist()
+        total = offset + drift * time
+        by = np.zeros((x.size, len(self.parameters) if derivatives else 0))
+        memory, column = 0, 0
+        first = len(self.free) + number * self.per_record
+        for element, at in self.model.of(self.full_values(values)):
+            state = states[memory] if element.has_memory else 0.0
+            if derivatives:
+                found = element.force_history_gradient(at, x, v, state, acceleration=a)
+                total = total + found.value
+                for parameter, slope in zip(element.parameters, found.by_parameter, strict=True):
+                    if parameter.free:
+                        by[:, column] = slope
+                        column += 1
+                if element.has_memory:
+                    by[:, first + memory] = found.by_state
+            else:
+                total = total + element.force_history(at, x, v, state, acceleration=a)
+            memory += element.has_memory
+        if derivatives:
+            by[:, first + memory] = 1.0
+            by[:, first + memory + 1] = time
+        return Prediction(total, by)
+
+    def _motion(self, values: FloatArray, number: int, *, derivatives: bool) -> Prediction:
+        forced, own = self.forced[number], self.own(values, number)
+        order, free = self._plant.order, values[: len(self.free)]
+        guess = self._guesses[number]
+        if guess is None:
+            guess = np.tile(own[:order], (len(self.records[number]), 1))
+        motion = forced.solve(free, own[:order], guess)
+        self._guesses[number] = motion
+        channel = ("displacement", "velocity", "acceleration").index(
+            self.records[number].motion_channel
+        )
+        sensitivities = forced.sensitivities(free, motion) if derivatives else None
+        if channel < 2:
+            output = motion[:, channel]
+            slopes = None if sensitivities is None else sensitivities[:, channel]
+        else:
+            output, slopes = forced.accelerations(
+                free, motion, self.records[number].force_samples, sensitivities
+            )
+        by = np.zeros((output.size, len(self.parameters) if derivatives else 0))
+        if slopes is not None:
+            first = len(self.free) + number * self.per_record
+            by[:, : len(self.free)] = slopes[:, order:]
+            by[:, first : first + order] = slopes[:, :order]
+            by[:, first + order] = 1.0
+        return Prediction(output + own[order], by)
+
+    def set_guess(self, number: int, motion: FloatArray) -> None:
+        """Give a guess of the motion, (n, order), from which the next solution starts."""
+        self._guesses[number] = motion
+
+    def split_residuals(self, values: FloatArray) -> list[FloatArray]:
+        """Return measured minus predicted output of each record."""
+        return [
+            y - self.predict(values, i, derivatives=False).output
+            for i, y in enumerate(self.measured)
+        ]
+
+    def quadratic(self, theta: FloatArray) -> Quadratic:
+        """Return cost, gradient and Hessian at search coordinates, (S, P) or (P,).
+
+        The cost is half the sum of squared residuals over the measured output's variance; where
+        the motion cannot be found it is infinite.
+        """
+        if theta.ndim == 2:
+            parts = [self.quadratic(row) for row in theta]
+            return Quadratic(*(np.stack(column) for column in zip(*parts, strict=True)))
+        P = theta.size
+        cost, gradient, hessian = 0.0, np.zeros(P), np.zeros((P, P))
+        values = self.values(theta)
+        chain = np.where(self.logarithmic, values, 1.0)
+        if not np.isfinite(values).all():
+            return Quadratic(np.asarray(np.inf), gradient, np.eye(P))
+        for number, (y, size) in enumerate(zip(self.measured, self.sizes, strict=True)):
+            try:
+                found = self.predict(values, number)
+            except FitError:
+                return Quadratic(np.asarray(np.inf), gradient, np.eye(P))
+            residual = self.filtered((y - found.output) / size)
+            jacobian = self.filtered(found.by * (chain / size))
+            cost += 0.5 * float(residual @ residual)
+            gradient -= jacobian.T @ residual
+            hessian += jacobian.T @ jacobian
+        return Quadratic(np.asarray(cost), gradient, hessian)
+
+    @cached_property
+    def sizes(self) -> tuple[float, ...]:
+        """Standard deviation of all records' output: one unit for every residual."""
+        size = float(np.std(np.concatenate([y - y.mean() for y in self.measured])))
+        if size == 0.0:
+            raise DataError("the output of the records is constant; nothing can be fitted to it")
+        return (size,) * len(self.records)
+
+
+def _cut(record: Record, part: slice) -> Record:
+    """Return some of a record's samples."""
+    channels = {
+        name: None if samples is None else samples[part]
+        for name in ("displacement", "velocity", "acceleration", "force", "drive")
+        for samples in (getattr(record, name),)
+    }
+    return Record(
+        record.time[part],
+        **channels,
+        drive_unit=record.drive_unit,
+        drive_factor=record.drive_factor,
+        drive_factor_uncertainty=record.drive_factor_uncertainty,
+        motion=record.motion,
+        provenance=record.provenance,
+    )

@@ -1,0 +1,127 @@
+"""The command that repeats a result that was made in Python, where there is one."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from dahl_ident.reporting.provenance import parts
+from dahl_ident.reporting.tables import prior_text
+from dahl_ident.results import ChainPosterior, FitResult
+
+if TYPE_CHECKING:
+    from dahl_ident.data import FrequencyResponse
+    from dahl_ident.elements import Parameter
+    from dahl_ident.problem import Problem
+
+_ON_COMMAND_LINE = {"dahl", "mass", "damper", "spring"}
+_USUAL = {"alpha": 1.0, "force_gain": 1.0, "displacement_gain": 1.0, "delay": 0.0}
+
+
+def equivalent_command(results: Sequence[FitResult | ChainPosterior]) -> str | None:
+    """Return the commands, a line each; None where no options describe data or model."""
+    source = _source(results[0].data)
+    if source is None or not all(_is_plain(result.problem) for result in results):
+        return None
+    before, files = source
+    lines = []
+    for result in results:
+        words = _fit(result) if isinstance(result, FitResult) else _sample(result)
+        lines.append(
+            " | ".join([*before, shlex.join(["dahl-ident", words[0], *files, *words[1:]])])
+        )
+    return "\n".join(lines)
+
+
+def _source(data: FrequencyResponse) -> tuple[list[str], list[str]] | None:
+    """Return the commands that come before, and the files with the options of reading them."""
+    all_parts = parts(data)
+    first = all_parts[0]
+    options, made = _options_of(first), _extraction_of(first)
+    alike = all((_options_of(p), _extraction_of(p)) == (options, made) for p in all_parts)
+    if not alike or "file" not in first:
+        return None
+    files = [str(part["file"]) for part in all_parts]
+    before = []
+    if "generator" in first:  # a shipped data set, which has no place of its own
+        before.append(f"dahl-ident datasets {first['name']} -o -")
+        files = ["-"]
+    if not made:
+        return before, [*files, *_words(options)]
+    words = ["extract", *files, *_words(options), *_words(made)]
+    words += ["--controlled", str(data.controlled[0])]
+    if (data.quality["verdict"] == "good").all():
+        words.append("--good-only")
+    return [*before, shlex.join(["dahl-ident", *words, "-o", "-"])], ["-"]
+
+
+def _options_of(part: Mapping[str, Any]) -> Mapping[str, Any]:
+    options = part.get("options")
+    return options if isinstance(options, Mapping) else {}
+
+
+def _extraction_of(part: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of an extraction as they are typed; none where there was none."""
+    made = part.get("extraction")
+    if not isinstance(made, Mapping):
+        return {}
+    harmonics = ",".join(map(str, made["harmonics"]))
+    return {k: v for k, v in made.items() if k != "refused"} | {"harmonics": harmonics}
+
+
+def _words(given: Mapping[str, Any]) -> list[str]:
+    pairs = ((f"--{k.replace('_', '-')}", v) for k, v in given.items() if v is not None)
+    return [word for name, value in pairs for word in (name, str(value))]
+
+
+def _is_plain(problem: Problem) -> bool:
+    """Return whether the command line has the model: one Dahl element, others at most once."""
+    kinds = [element.kind for element in problem.model.elements]
+    labels = {p.name for p in problem.model.parameters} == {
+        element.label(p) for element in problem.model.elements for p in element.parameters
+    }
+    single = len(set(kinds)) == len(kinds) and "dahl" in kinds
+    return single and set(kinds) <= _ON_COMMAND_LINE and labels
+
+
+def _fit(fit: FitResult) -> list[str]:
+    return [
+        "fit", *_model(fit.problem), "--noise", fit.noise,
+        *_changed(method=(fit.method, "lm"), loss=(fit.optimum.loss, "linear")),
+    ]  # fmt: skip
+
+
+def _sample(posterior: ChainPosterior) -> list[str]:
+    priors = [f"{name}={prior_text(given)}" for name, given in posterior.given_priors.items()]
+    return [
+        "sample", *_model(posterior.problem), "--noise", posterior.problem.noise,
+        "--seed", str(posterior.seed), "--steps", str(posterior.steps),
+        *_changed(likelihood=(posterior.likelihood, "gaussian")),
+        *(word for prior in priors for word in ("--prior", prior)),
+    ]  # fmt: skip
+
+
+def _model(problem: Problem) -> list[str]:
+    """Return the options of elements and sensors that differ from the usual ones."""
+    parameters = (*problem.model.parameters, *problem.sensors.parameters)
+    return [word for parameter in parameters for word in _parameter(parameter, problem)]
+
+
+def _parameter(parameter: Parameter, problem: Problem) -> Iterator[str]:
+    name = parameter.name
+    value = "free"
+    if name in problem.priors:
+        value = prior_text(problem.priors[name])
+    elif name not in problem.names:
+        value = repr(parameter.value)
+        if parameter.value == _USUAL.get(name):
+            return
+    elif name in ("f_max", "sigma"):
+        return
+    yield from (f"--{name.replace('_', '-')}", value)
+
+
+def _changed(**given: tuple[str, str]) -> list[str]:
+    changed = {name: value for name, (value, usual) in given.items() if value != usual}
+    return _words(changed)

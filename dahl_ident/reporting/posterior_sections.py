@@ -1,0 +1,108 @@
+"""What a report says about a posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dahl_ident.diagnostics.formatting import rounded
+from dahl_ident.reporting.document import (
+    Block,
+    Bullets,
+    Cell,
+    Paragraph,
+    Picture,
+    Section,
+    Table,
+    number,
+)
+from dahl_ident.results.chain_posterior import ChainPosterior
+from dahl_ident.results.posterior_base import QUANTILES
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def sections(posterior: ChainPosterior) -> Iterator[Section]:
+    """Yield numbers and pictures of a posterior."""
+    yield Section("Posterior", tuple(_numbers(posterior)), details=True)
+    pictures = (_corner(posterior), _trace(posterior))
+    yield Section("Pictures of the posterior", pictures, details=True)
+
+
+def verdict(posterior: ChainPosterior) -> list[str]:
+    """Return whether to use it, what the prior decides, and what does not fit."""
+    return [f"Posterior: {posterior.message}", *posterior.findings]
+
+
+def answer(posterior: ChainPosterior) -> Iterator[Block]:
+    """Yield the summary of a posterior and its priors; the numbers are struck if not trusted."""
+    yield _summary(posterior)
+    yield Bullets(tuple(f"Prior of {name}: {text}" for name, text in posterior.priors.items()))
+
+
+def _summary(posterior: ChainPosterior) -> Table:
+    columns = ["mean", "std", *QUANTILES, "mcse", "ess", "r_hat"]
+    rows = tuple(
+        (Cell(str(name)), Cell(str(row["unit"]) or "-"), *_row(row))
+        for name, row in posterior.summary().iterrows()
+    )
+    if not posterior.trusted:
+        rows = tuple((*row[:2], *(replace(cell, struck=True) for cell in row[2:])) for row in rows)
+    return Table("Posterior of each parameter", ("parameter", "unit", *columns), rows)
+
+
+def _numbers(posterior: ChainPosterior) -> Iterator[Block]:
+    yield Paragraph(posterior.message)
+    yield _summary(posterior)
+    yield Paragraph(
+        "mcse is the Monte Carlo standard error of the mean, ess the effective number of draws, "
+        "r_hat compares independent ensembles and is 1 where they agree."
+    )
+    yield Paragraph(f"Priors (likelihood: {posterior.likelihood.replace('_', ' ')}):")
+    yield Bullets(tuple(f"{name}: {text}" for name, text in posterior.priors.items()))
+    if posterior.findings:
+        yield Bullets(posterior.findings)
+    yield Paragraph(f"Seed {posterior.seed}; the same seed gives the same chain.")
+
+
+def _row(row: pd.Series[Any]) -> Iterator[Cell]:
+    """Yield the numbers of one parameter, no finer than its standard deviation."""
+    std = float(row["std"])
+    for name in ("mean", *QUANTILES):
+        value, error = rounded(float(row[name]), std)
+        yield Cell(value, float(row[name]))
+        if name == "mean":
+            yield Cell(error, std)
+    for name, digits in (("mcse", 2), ("ess", 4), ("r_hat", 5)):
+        yield number(row[name], digits) if np.isfinite(row[name]) else Cell("-")
+
+
+def _corner(posterior: ChainPosterior) -> Picture:
+    correlation = np.corrcoef(posterior.values.T).reshape(len(posterior.names), -1)
+    i, j = np.unravel_index(np.argmax(np.abs(np.triu(correlation, 1))), correlation.shape)
+    finding = (
+        f"The strongest correlation is {correlation[i, j]:.2f}, between {posterior.names[i]} and "
+        f"{posterior.names[j]}."
+        if len(posterior.names) > 1
+        else f"One parameter, {posterior.names[0]}."
+    )
+    return Picture(
+        "corner",
+        "Posterior density of each parameter (dashed: 16, 50 and 84 %) and of each pair.",
+        finding,
+        lambda: posterior.plot_corner()[0, 0].figure,
+    )
+
+
+def _trace(posterior: ChainPosterior) -> Picture:
+    return Picture(
+        "trace",
+        "Paths of the walkers; the shaded warm-up is left out of every number.",
+        f"{posterior.steps} steps, of which the first {posterior.warm_up} are warm-up. "
+        f"{'The chain has converged' if posterior.converged else 'The chain has NOT converged'}.",
+        lambda: posterior.plot_trace()[0].figure,
+    )

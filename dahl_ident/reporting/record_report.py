@@ -1,0 +1,197 @@
+"""What a report says on a fit to records: answer, budget, assumptions, pictures, goodness."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dahl_ident.diagnostics.formatting import interval, rounded
+from dahl_ident.diagnostics.verdict_status import VerdictStatus
+from dahl_ident.reporting import provenance, tables
+from dahl_ident.reporting.document import (
+    MARKS,
+    Block,
+    Bullets,
+    Cell,
+    Document,
+    Listing,
+    Paragraph,
+    Picture,
+    Section,
+    Table,
+    figure_of,
+    words,
+)
+from dahl_ident.reporting.figures import budget_picture
+from dahl_ident.reporting.metadata import Metadata
+from dahl_ident.results import RecordFit
+from dahl_ident.version import __version__
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_OUTPUTS = {
+    "force": "The force is computed from the measured displacement, sample by sample.",
+    "motion": "The equation of motion is integrated under the measured drive.",
+}
+
+
+def record_document(
+    fits: Sequence[RecordFit],
+    *,
+    title: str | None = None,
+    command: str | None = None,
+    metadata: Metadata | None = None,
+) -> Document:
+    """Return the report on one or several fits to records."""
+    given = metadata or Metadata()
+    several = len(fits) > 1
+    front: list[Section] = []
+    details: list[Section] = []
+    for number, fit in enumerate(fits):
+        of = f": {fit.problem.model!r}" if several else ""
+        front += [Section(f"Result{of}", (_answer(fit),))]
+        if fit.status is not VerdictStatus.NOT_DESCRIBED and np.isfinite(fit.covar).all():
+            found = fit.budget()
+            front.append(
+                Section(f"Uncertainty budget{of}", (tables.budget(found), budget_picture(found)))
+            )
+        front.append(Section(f"What was assumed{of}", (Bullets(tuple(_assumed(fit))),)))
+        front.append(Section(f"Pictures{of}", tuple(_pictures(fit, number))))
+        lines = (*fit.goodness.lines, *(f"Derived: {quantity}" for quantity in fit.derived()))
+        details.append(Section(f"Goodness of fit{of}", (Bullets(lines),), details=True))
+    first = fits[0]
+    files = [
+        {"file": str(p["file"]), "sha256": str(p.get("sha256", "")), "read": True}
+        for p in (record.provenance or {} for record in first.records)
+        if "file" in p
+    ]
+    named = [f"{file['file']}, SHA-256 {file['sha256'] or 'unknown'}" for file in files]
+    origin: list[Block] = [
+        Paragraph(f"Made on {provenance.today()}."),
+        *([Listing(command)] if command else []),
+    ]
+    name = files[0]["file"] if files else f"{len(first.records)} records"
+    header = dict(given.header()) | {
+        "Model": tuple(_model(first)),
+        "Data": (f"{len(first.records)} records, {first.problem.n_residuals} samples", *named),
+        "Date of report": (provenance.today(),),
+        "Software": (f"dahl_ident {__version__}",),
+    }
+    used = tuple(words(name, version) for name, version in provenance.versions().items())
+    origin.append(Table("Versions", ("package", "version"), used))
+    order = list(MARKS)
+    return Document(
+        title=title or given.title or f"Friction identified from {name}",
+        status=max((str(fit.status) for fit in fits), key=order.index),
+        verdict=tuple(
+            f"{fit.problem.model!r}: {line}" if several and i == 0 else line
+            for fit in fits
+            for i, line in enumerate(fit.statements)
+        ),
+        header=tuple(header.items()),
+        sections=(*front, *details, Section("Origin", tuple(origin), details=True)),
+        facts={
+            "fits": [],
+            "posteriors": [],
+            "record_fits": [_facts(fit) for fit in fits],
+            "files": files,
+            "metadata": vars(given),
+            "versions": provenance.versions(),
+            "date": provenance.today(),
+            "command": command,
+        },
+    )
+
+
+def _model(fit: RecordFit) -> Iterator[str]:
+    yield repr(fit.problem.model)
+    for element in fit.problem.model.elements:
+        if element.equation:
+            yield f"{element.kind.replace('_', ' ')}: {element.equation}"
+
+
+def _answer(fit: RecordFit) -> Table:
+    limits = fit.conf_interval()
+    unusable = not fit.status.usable
+    rows = []
+    for parameter in fit.problem.free:
+        found = fit.params[parameter.name]
+        value, error = rounded(found.value, found.stderr)
+        rows.append(
+            (
+                Cell(found.name),
+                Cell(value, found.value, unusable),
+                Cell(error, found.stderr, unusable),
+                Cell(interval(*limits[found.name], ""), struck=unusable),
+                Cell(found.unit or "-"),
+                Cell(found.description),
+            )
+        )
+    header = (
+        "parameter", "estimate", "standard uncertainty u", "95 % interval", "unit", "description"
+    )  # fmt: skip
+    hint = ". Numbers that are crossed out must not be used" if unusable else ""
+    return Table(f"Estimates with their standard uncertainties{hint}", header, tuple(rows))
+
+
+def _assumed(fit: RecordFit) -> Iterator[str]:
+    yield _OUTPUTS[fit.problem.output]
+    fixed = [f"{p.name} = {p.value:g} {p.unit}".rstrip() for p in fit.params.values() if not p.vary]
+    if fixed:
+        yield f"Held fixed: {', '.join(fixed)}."
+    yield f"Taken as exact: {', '.join(fit.errors.exact)}."
+    if fit.weighted:
+        yield "Residuals are weighted by their spectrum, because slow noise prevails in them."
+
+
+def _pictures(fit: RecordFit, number: int) -> Iterator[Picture]:
+    worst = fit.goodness.worst_record - 1
+    of = f" of record {worst + 1}, which is described worst" if len(fit.records) > 1 else ""
+    left = f"{100.0 * fit.goodness.share_left**0.5:.2g} % rms of the measured signal is left"
+    shown = [
+        ("time", f"Measured and fitted {fit.problem.output}{of}"),
+        ("residuals", f"Residuals over time{of}"),
+    ]
+    if fit.records[worst].displacement is not None:
+        shown.append(("loop", f"Force over displacement{of}"))
+        shown.append(("residuals_displacement", f"Residuals over displacement{of}"))
+    for kind, caption in shown:
+        yield Picture(
+            f"record_{kind}_{number + 1}",
+            f"{caption}.",
+            f"{caption}: {left}.",
+            partial(_drawn, fit, kind, worst),
+        )
+
+
+def _drawn(fit: RecordFit, kind: str, record: int) -> Figure:
+    return figure_of(fit.plot(kind, record=record))
+
+
+def _facts(fit: RecordFit) -> dict[str, Any]:
+    limits = fit.conf_interval()
+    return {
+        "model": repr(fit.problem.model),
+        "equations": list(_model(fit)),
+        "status": str(fit.status),
+        "trusted": fit.trusted,
+        "verdict": fit.verdict,
+        "records": len(fit.records),
+        "samples": fit.problem.n_residuals,
+        "share_of_variance_left": fit.goodness.share_left,
+        "parameters": {
+            name: {
+                "value": e.value,
+                "stderr": e.stderr,
+                "unit": e.unit,
+                "fixed": not e.vary,
+                "interval_95": list(limits[name]) if e.vary else None,
+            }
+            for name, e in fit.params.items()
+        },
+        "budget": fit.budget().to_dict(),
+    }

@@ -1,0 +1,341 @@
+"""What a report says, in this order: answer, budget, what was assumed, pictures, details."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.diagnostics.budget import taken_as_exact
+from dahl_ident.diagnostics.comparison import compare_models
+from dahl_ident.diagnostics.formatting import listed
+from dahl_ident.diagnostics.verdict_status import VerdictStatus
+from dahl_ident.reporting import posterior_sections, provenance, tables
+from dahl_ident.reporting.document import (
+    MARKS,
+    Block,
+    Bullets,
+    Document,
+    Listing,
+    Paragraph,
+    Picture,
+    Section,
+    Table,
+    words,
+)
+from dahl_ident.reporting.equivalent_command import equivalent_command
+from dahl_ident.reporting.figures import budget_picture, pictures_of_fit
+from dahl_ident.reporting.metadata import Metadata
+from dahl_ident.reporting.settling import settling
+from dahl_ident.results import ChainPosterior, FitResult
+from dahl_ident.version import __version__
+
+Result = FitResult | ChainPosterior
+
+NOISE = {
+    "measured": "The covariance of every point is known from the measurement; residuals are in "
+    "its units.",
+    "relative": "The noise has the same relative size at every point: constant variance of the "
+    "logarithm of the gain and of the phase. Its size was estimated from the residuals.",
+    "absolute": "The noise has the same size at every point: constant variance of real and "
+    "imaginary part. Its size was estimated from the residuals.",
+}
+_FRONT = ("response", "residuals")  # pictures before the details
+
+
+def document(
+    results: Sequence[Result],
+    *,
+    title: str | None = None,
+    command: str | None = None,
+    record: Record | None = None,
+    metadata: Metadata | None = None,
+) -> Document:
+    """Return the report on fits and posteriors of the same data."""
+    fits = [result for result in results if isinstance(result, FitResult)]
+    drawn = [result for result in results if isinstance(result, ChainPosterior)]
+    data = results[0].data
+    given = metadata or Metadata()
+    repeated = command or equivalent_command(results)
+    front, details = [], []
+    for fit in fits:
+        of = f": {fit.problem.model!r}" if len(fits) > 1 else ""
+        pictures = list(pictures_of_fit(fit))
+        front += list(_answer(fit, of))
+        front.append(Section(f"Uncertainty budget{of}", tuple(_budget(fit))))
+        front.append(Section(f"What was assumed{of}", tuple(_assumed(fit))))
+        shown = tuple(picture for picture in pictures if picture.name in _FRONT)
+        front.append(Section(f"Pictures{of}", shown))
+        details += list(_details(fit, drawn, pictures, of))
+    if not fits:
+        front += [Section("Result", tuple(posterior_sections.answer(one))) for one in drawn]
+    details += [section for one in drawn for section in posterior_sections.sections(one)]
+    return Document(
+        title=title or given.title or title_of(data),
+        status=worst_status(results),
+        verdict=(
+            *(line for fit in fits for line in _verdict(fit, len(fits) > 1)),
+            *(line for one in drawn for line in posterior_sections.verdict(one)),
+        ),
+        header=header(results[0], given),
+        sections=(
+            *(section for section in front if section.blocks),
+            *details,
+            *_extraction(data, record),
+            Section("Data", tuple(_data(data)), details=True),
+            Section(
+                "Origin", tuple(_origin(data, repeated, typed=command is not None)), details=True
+            ),
+        ),
+        facts={
+            "fits": [fit_facts(fit) for fit in fits],
+            "posteriors": [one.to_dict() for one in drawn],
+            "metadata": vars(given),
+            **origin_facts(data),
+            "command": repeated,
+        },
+    )
+
+
+def origin_facts(data: FrequencyResponse) -> dict[str, Any]:
+    """Return files, versions and date for machines."""
+    return {
+        "files": [vars(source) for source in provenance.sources(data)],
+        "versions": provenance.versions(),
+        "date": provenance.today(),
+    }
+
+
+def title_of(data: FrequencyResponse) -> str:
+    """Return a title that names the file, where there is one."""
+    files = [str(part["file"]) for part in provenance.parts(data) if "file" in part]
+    return (
+        f"Friction identified from {Path(files[0]).name}"
+        if len(files) == 1
+        else "Friction identified"
+    )
+
+
+def worst_status(results: Sequence[Result]) -> str:
+    """Return the status of the result that is farthest from being trusted."""
+    order = list(MARKS)
+    return max((str(result.status) for result in results), key=order.index)
+
+
+def header(result: Result, given: Metadata) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    """Return specimen, model, data, instruments, operator, dates and software."""
+    data = result.data
+    of_laboratory = dict(given.header())
+    specimen = {"Specimen": of_laboratory.pop("Specimen")}
+    first = {
+        name: of_laboratory.pop(name)
+        for name in ("Laboratory", "Customer")
+        if name in of_laboratory
+    }
+    files = []
+    for source in provenance.sources(data):
+        before = "" if source.read else "made from "
+        files.append(f"{before}{source.file}, SHA-256 {source.sha256 or 'unknown'}")
+    made_of = {
+        "Model": tuple(_model(result)),
+        "Data": (f"{data.n} rows", *files),
+    }
+    software = {
+        "Date of report": (provenance.today(),),
+        "Software": (f"dahl_ident {__version__}",),
+    }
+    return tuple((first | specimen | made_of | of_laboratory | software).items())
+
+
+def _model(result: Result) -> Iterator[str]:
+    """Yield the model in words, then an equation for each of its elements."""
+    elements = result.problem.model.elements
+    kinds = [element.kind.replace("_", " ") or type(element).__name__ for element in elements]
+    names = [
+        f"{kind[0].upper()}{kind[1:]} friction" if element.has_memory else kind
+        for kind, element in zip(kinds, elements, strict=True)
+    ]
+    yield " + ".join(names)
+    for name, element in zip(names, elements, strict=True):
+        if element.equation:
+            yield f"{name}: {element.equation}"
+
+
+def _verdict(fit: FitResult, several: bool) -> list[str]:
+    """Return a fit's statements; among others its model and whether to trust it go first."""
+    warnings = [f"Warning: {text}" for text in fit.goodness.warnings]
+    first, *others = fit.statements
+    if several:
+        first = f"{fit.problem.model!r}: {first}"
+    else:
+        first = first.removeprefix(f"{fit.status.capitalize()}. ")
+    return [first, *others, *warnings]
+
+
+def _answer(fit: FitResult, of: str) -> Iterator[Section]:
+    known = fit.identifiability
+    described = fit.status.usable or fit.goodness.acceptable
+    determined = tuple(f"Determined: {c}" for c in known.combinations)
+    yield Section(
+        f"Result{of}",
+        (
+            tables.answer(fit, described=described),
+            Bullets(determined),
+        ),
+    )
+
+
+def _budget(fit: FitResult) -> Iterator[Block]:
+    """Yield where the uncertainty comes from; nothing where none can be stated."""
+    if fit.status != VerdictStatus.NOT_DESCRIBED and fit.errors is not None:
+        found = fit.budget()
+        yield tables.budget(found)
+        yield budget_picture(found)
+
+
+def _assumed(fit: FitResult) -> Iterator[Block]:
+    """Yield what the result rests on and these data do not test."""
+    fixed = [_value(p.name, p.value, p.unit) for p in fit.params.values() if not p.vary]
+    exact = taken_as_exact(fit.optimum)
+    lines = [f"Held fixed: {listed(fixed)}."] if fixed else []
+    if exact:
+        lines.append(f"Taken as exact: {listed(exact)}.")
+    lines += [f"Prior of {name}: {given}." for name, given in tables.priors(fit).items()]
+    lines.append(NOISE[fit.noise])
+    lines += [f"{note[0].upper()}{note[1:]}." for note in provenance.notes(fit.data)]
+    lines.append(f"Search: {fit.method}, loss {fit.optimum.loss}.")
+    yield Bullets(tuple(lines))
+
+
+def _value(name: str, value: float, unit: str) -> str:
+    return f"{name} = {value:g} {unit}".rstrip()
+
+
+def _details(
+    fit: FitResult, drawn: Sequence[ChainPosterior], pictures: Sequence[Picture], of: str
+) -> Iterator[Section]:
+    yield Section(f"Parameters{of}", tuple(_parameters(fit, drawn)), details=True)
+    known = fit.identifiability
+    yield Section(
+        f"What the data determine{of}",
+        (Paragraph(known.headline), Bullets(tuple(p.text for p in known.parameters.values()))),
+        details=True,
+    )
+    yield Section(f"Noise and goodness of fit{of}", tuple(_goodness(fit)), details=True)
+    linearization = tables.linearization(fit)
+    if linearization is not None:
+        yield Section(f"Stiffness and damping over amplitude{of}", (linearization,), details=True)
+    others = tuple(picture for picture in pictures if picture.name not in _FRONT)
+    yield Section(f"More pictures{of}", others, details=True)
+
+
+def _parameters(fit: FitResult, drawn: Sequence[ChainPosterior]) -> Iterator[Block]:
+    for method in ("wald", "profile"):
+        fit.conf_interval(method)
+    intervals = fit.intervals_run(tables.LEVEL)
+    yield tables.parameters(fit, intervals, drawn)
+    by_note: dict[str, list[str]] = {}
+    for found in intervals:
+        by_note.setdefault(found.note, []).append(tables.method_name(found))
+    notes = [f"Intervals by {listed(names)}: {note}" for note, names in by_note.items()]
+    yield Bullets((*notes, *(f"Derived: {quantity}" for quantity in fit.derived())))
+
+
+def _goodness(fit: FitResult) -> Iterator[Block]:
+    left = fit.goodness
+    yield Bullets(tuple(left.details))
+    yield tables.goodness(fit)
+    if not left.acceptable:
+        compared = compare_models(fit)
+        yield Paragraph(f"Other models, for comparison. {compared.headline}")
+        yield tables.comparison(compared)
+
+
+def _extraction(data: FrequencyResponse, record: Record | None) -> Iterator[Section]:
+    """Yield how the points were measured, where they come from waveforms."""
+    seen = () if record is None else (settling(data, record),)
+    if "num_periods" not in data.quality:
+        return
+    verdicts = data.select(harmonic=1).quality["verdict"]
+    bad = int((verdicts != "good").sum())
+    says = f"{bad} of them not good" if bad else "all good"
+    yield Section(
+        "Extraction",
+        (
+            Paragraph(
+                f"Points measured from waveforms: {verdicts.size}, {says}. Leading cycles are left "
+                "out where friction had not yet settled after the previous step; the bias is an "
+                "upper bound of what remains of the transient in the cycles used."
+            ),
+            tables.extraction(data),
+            *seen,
+        ),
+        details=True,
+    )
+
+
+def _data(data: FrequencyResponse) -> Iterator[Block]:
+    yield tables.measured(data)
+
+
+def _origin(data: FrequencyResponse, command: str | None, *, typed: bool) -> Iterator[Block]:
+    files = list(provenance.sources(data))
+    if files:
+        rows = tuple(
+            words(s.file, "read" if s.read else "origin of the file above", s.sha256) for s in files
+        )
+        yield Table("Files", ("file", "what it is", "SHA-256"), rows)
+    made = provenance.options(data)
+    if made:
+        yield Table("Options", ("option", "value"), tuple(words(*pair) for pair in made))
+    used = tuple(words(name, version) for name, version in provenance.versions().items())
+    yield Table("Versions", ("package", "version"), used)
+    when = f"Made on {provenance.today()}"
+    if command is None:
+        yield Paragraph(f"{when}, in Python; no command describes this model and these data.")
+        return
+    how = (
+        ". This command repeats it:"
+        if typed
+        else ", in Python. With all rows of the files, this command gives the same result:"
+    )
+    yield Paragraph(when + how)
+    yield Listing(command)
+
+
+def fit_facts(fit: FitResult) -> dict[str, Any]:
+    """Return a fit for machines."""
+    known, left = fit.identifiability, fit.goodness
+    intervals = fit.conf_interval().at(tables.LEVEL)
+    return {
+        "model": repr(fit.problem.model),
+        "equations": list(_model(fit)),
+        "status": str(fit.status),
+        "trusted": fit.trusted,
+        "verdict": fit.verdict,
+        "search": fit.optimum.status.name.lower().replace("_", " "),
+        "noise": fit.noise,
+        "scale": fit.scale,
+        "scale_known": fit.scale_known,
+        "parameters": {
+            name: {
+                "value": e.value,
+                "stderr": e.stderr,
+                "unit": e.unit,
+                "fixed": not e.vary,
+                "interval_95.45": list(intervals[name][1:]) if e.vary else None,
+                "verdict": known.parameters[name].verdict.value if e.vary else None,
+            }
+            for name, e in fit.params.items()
+        },
+        "budget": None if fit.errors is None else fit.budget().to_dict(),
+        "priors": tables.priors(fit),
+        "determined": [str(c) for c in known.combinations],
+        "suspicious": [str(point) for point in left.suspicious],
+        "warnings": list(left.warnings),
+        "rms_misfit": left.rms_misfit,
+        "redchi": fit.redchi,
+        "aic": fit.aic,
+        "bic": fit.bic,
+    }

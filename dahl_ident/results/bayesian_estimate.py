@@ -1,0 +1,354 @@
+"""Bayesian estimates: the posterior by Markov chain, or by quadrature for few parameters."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import Literal, overload
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray, positive_number, whole_number
+from dahl_ident.bayes.chain import Chain, Pool, Settings, run
+from dahl_ident.bayes.checkpoint import Stored, identity, open_chain
+from dahl_ident.bayes.conditional_modes import ConditionalModes
+from dahl_ident.bayes.convergence import Convergence
+from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.priors import PriorLike, joint_prior
+from dahl_ident.bayes.quadrature import integrate
+from dahl_ident.bayes.walker_start import centre_and_covariance, optimum_of, starting_points
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.elements import Element
+from dahl_ident.errors import ModelError, SamplingError, ValidationError
+from dahl_ident.fitting import Optimum
+from dahl_ident.problem import Problem
+from dahl_ident.results.chain_posterior import ChainPosterior, refuse_unusable
+from dahl_ident.results.fit_result import FitResult
+from dahl_ident.results.grid_posterior import GridPosterior
+from dahl_ident.results.progress import progress_bar
+from dahl_ident.sensors import Sensors
+
+_LEAST_STEPS = 20
+_MOST_AXES = 3
+METHODS = ("mcmc", "grid")
+
+
+@overload
+def posterior(
+    data: FrequencyResponse | FitResult,
+    model: Element | None = None,
+    *,
+    method: Literal["mcmc"] = "mcmc",
+    priors: Mapping[str, PriorLike] | None = None,
+    free: Iterable[str] = (),
+    fixed: Mapping[str, float] | None = None,
+    noise: str | None = None,
+    sensors: Sensors | None = None,
+    likelihood: str = "gaussian",
+    seed: int | None = None,
+    steps: int | None = None,
+    max_steps: int = 20000,
+    ess: float = 2000.0,
+    walkers: int | None = None,
+    ensembles: int = 4,
+    resume: str | os.PathLike[str] | None = None,
+    pool: Pool | None = None,
+    progress: bool = False,
+) -> ChainPosterior: ...
+
+
+@overload
+def posterior(
+    data: FrequencyResponse | FitResult,
+    model: Element | None = None,
+    *,
+    method: Literal["grid"],
+    priors: Mapping[str, PriorLike] | None = None,
+    free: Iterable[str] = (),
+    fixed: Mapping[str, float] | None = None,
+    noise: str | None = None,
+    sensors: Sensors | None = None,
+    likelihood: str = "gaussian",
+    seed: int | None = None,
+    progress: bool = False,
+    tolerance: float = 1e-4,
+) -> GridPosterior: ...
+
+
+def posterior(
+    data: FrequencyResponse | FitResult,
+    model: Element | None = None,
+    *,
+    method: str = "mcmc",
+    priors: Mapping[str, PriorLike] | None = None,
+    free: Iterable[str] = (),
+    fixed: Mapping[str, float] | None = None,
+    noise: str | None = None,
+    sensors: Sensors | None = None,
+    likelihood: str = "gaussian",
+    seed: int | None = None,
+    steps: int | None = None,
+    max_steps: int = 20000,
+    ess: float = 2000.0,
+    walkers: int | None = None,
+    ensembles: int = 4,
+    resume: str | os.PathLike[str] | None = None,
+    pool: Pool | None = None,
+    progress: bool = False,
+    tolerance: float = 1e-4,
+) -> ChainPosterior | GridPosterior:
+    """Return the posterior of a model's parameters, by Markov chain or by quadrature.
+
+    Parameters
+    ----------
+    data : FrequencyResponse or FitResult
+        What was measured; or a fit, whose data, model, noise and sensors are taken over.
+    model : Element, optional
+        One element or a sum, such as ``Dahl() + Mass(0.3)``; left out with a FitResult.
+    method : {"mcmc", "grid"}, default "mcmc"
+        "mcmc" samples with emcee. "grid" integrates over up to three free parameters: no chain,
+        no Monte Carlo error, and the evidence. An unknown noise scale is integrated analytically
+        there and does not count among the three.
+    priors : mapping of str to distribution or (low, high), optional
+        By parameter: a frozen distribution of scipy.stats over the value, or bounds, between
+        which positive parameters are log-uniform and the others uniform. Parameters left out
+        get wide bounds from the size of the data, which the report states.
+    free, fixed, noise, sensors
+        As for :func:`dahl_ident.fit`. Sensors may have any prior here.
+    likelihood : {"gaussian", "student_t", "none"}, default "gaussian"
+        "student_t" makes outliers count less (4 degrees of freedom; on a grid it needs noise of
+        known scale); "none" gives the prior.
+    seed : int, optional
+        The same seed gives the same chain. Left out, one is drawn, and reported. A grid needs
+        none.
+    steps : int, optional
+        Total number of steps, warm-up included. Left out, the chain runs until it has
+        converged: 50 autocorrelation times after warm-up, R-hat below 1.01, and `ess`.
+    max_steps : int, default 20000
+        Where to stop a chain that does not converge.
+    ess : float, default 2000
+        Effective number of draws wanted for every parameter.
+    walkers : int, optional
+        In all ensembles together. Default: 32 an ensemble, or more for many parameters.
+    ensembles : int, default 4
+        Groups of walkers that are independent of each other.
+    resume : path, optional
+        HDF5 file that keeps the chain: begun where there is none, continued to the *total*
+        number of steps where there is. It is whole at every moment, also after a crash, and the
+        resulting chain is the same however often it was interrupted.
+    pool : object with map, optional
+        Spreads the likelihood over processes. Left out, one process computes all walkers at
+        once, which is faster unless a single likelihood takes milliseconds.
+    progress : bool, default False
+        Show a bar on the terminal, with the time that is left.
+    tolerance : float, default 1e-4
+        With "grid": error of the total probability to be reached.
+
+    Returns
+    -------
+    ChainPosterior or GridPosterior
+        Both are a ``Posterior``; its first line says where it has not
+        converged.
+
+    Raises
+    ------
+    SamplingError
+        If no place of finite density is found, the scale of the noise cannot be estimated, the
+        chain never moved (it is in the error's `posterior`), `resume` names a file that is
+        damaged, in use, or of another run, or more than three parameters are free on a grid.
+    ModelError
+        If nothing is free, or a name is unknown.
+    DataError
+        If the rows lack what their model or noise needs.
+    ValidationError
+        If an option or a prior is not as described, or belongs to the other method.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import dahl_ident as di
+    >>> A = np.geomspace(1e-3, 1e-2, 9)
+    >>> N = di.Dahl(f_max=0.1, sigma=30.0).describing_function(A)
+    >>> noise = np.random.default_rng(1).normal(scale=0.02, size=(2, 9))
+    >>> data = di.FrequencyResponse(np.ones(9), N * np.exp(noise[0] + 1j * noise[1]), A)
+    >>> chain = di.posterior(data, di.Dahl(), seed=1)
+    >>> chain.converged, chain.names
+    (True, ('f_max', 'sigma', 'noise_scale'))
+    >>> grid = di.posterior(data, di.Dahl(), method="grid")
+    >>> grid.converged, round(float(grid.quantile("f_max", 0.5)), 2)
+    (True, 0.1)
+    """
+    if method not in METHODS:
+        raise ValidationError(f"method is {method!r}; expected {' or '.join(METHODS)}")
+    if not isinstance(data, FrequencyResponse | FitResult):
+        raise ValidationError(
+            f"a posterior of a {type(data).__name__} is not available; use dahl_ident.fit for "
+            "records of any motion, or the posterior of dahl_ident.extract(record) where the "
+            "record holds settled sines"
+        )
+    for_chain = {
+        "steps": steps is not None, "max_steps": max_steps != 20000, "ess": ess != 2000.0,
+        "walkers": walkers is not None, "ensembles": ensembles != 4, "resume": resume is not None,
+        "pool": pool is not None,
+    }  # fmt: skip
+    _refuse_other_methods(method, for_chain, {"tolerance": tolerance != 1e-4})
+    if pool is not None and not callable(getattr(pool, "map", None)):
+        raise ValidationError(f"pool is {pool!r}; expected an object with map, such as a Pool")
+    problem, optimum = _problem(data, model, noise, sensors, free, fixed)
+    if method == "grid":
+        return _grid(problem, optimum, priors, likelihood, tolerance)
+    density = Density(problem, joint_prior(problem, priors, _estimate(optimum)), likelihood)
+    settings = _settings(density, seed, steps, max_steps, ess, walkers, ensembles)
+    chain, verdict, settings = _chain(density, optimum, settings, seed, resume, pool, progress)
+    return refuse_unusable(ChainPosterior(density, chain, verdict, settings, optimum))
+
+
+def _refuse_other_methods(
+    method: str, for_chain: Mapping[str, bool], for_grid: Mapping[str, bool]
+) -> None:
+    """Refuse options that only the other method has."""
+    other = for_grid if method == "mcmc" else for_chain
+    given = [name for name, is_given in other.items() if is_given]
+    if given:
+        raise ValidationError(
+            f"{', '.join(given)} given with method={method!r}, which has no such option; leave "
+            f"it out, or use method={next(m for m in METHODS if m != method)!r}"
+        )
+
+
+def _grid(
+    problem: Problem,
+    optimum: Optimum | None,
+    priors: Mapping[str, PriorLike] | None,
+    likelihood: str,
+    tolerance: float,
+) -> GridPosterior:
+    """Integrate the posterior of up to three parameters."""
+    if len(problem.names) > _MOST_AXES:
+        raise SamplingError(
+            f"{len(problem.names)} parameters are free ({', '.join(problem.names)}); a grid takes "
+            f"up to {_MOST_AXES}: fix some, or use method='mcmc'"
+        )
+    tolerance = positive_number(tolerance, "tolerance")
+    density = Density(problem, joint_prior(problem, priors, _estimate(optimum)), likelihood)
+    centre, covariance = centre_and_covariance(density, optimum, np.random.default_rng(0))
+    slicers = [ConditionalModes(density, axis, centre) for axis in range(len(centre))]
+    grid = integrate(
+        density.marginal,
+        density.prior.limits,
+        slicers,
+        centre,
+        np.sqrt(np.diagonal(covariance)),
+        tolerance=tolerance,
+    )
+    return GridPosterior(density, grid, tolerance, optimum)
+
+
+def _chain(
+    density: Density,
+    optimum: Optimum | None,
+    settings: Settings,
+    seed: int | None,
+    resume: str | os.PathLike[str] | None,
+    pool: Pool | None,
+    progress: bool,
+) -> tuple[Chain, Convergence, Settings]:
+    """Run the chain, from its file and into it where there is one."""
+    with ExitStack() as stack:
+        listeners = [stack.enter_context(progress_bar(settings))] if progress else []
+        stored: Stored | None = None
+        if resume is not None:
+            of = identity(density, settings.walkers, settings.ensembles)
+            file = stack.enter_context(open_chain(resume, of))
+            stored = file.load()
+            settings = _with_seed_of(stored, settings, seed, resume)
+            file.begin(settings.seed)
+            listeners.append(file)
+        if stored is None:
+            random = np.random.default_rng(settings.seed)
+            start = starting_points(density, optimum, settings.walkers, random)
+            chain = Chain.at(start, settings.seed)
+        else:
+            chain = stored.chain
+
+        def tell(chain: Chain, verdict: Convergence | None) -> None:
+            for listener in listeners:
+                listener(chain, verdict)
+
+        chain, verdict = run(density, chain, settings, pool=pool, listener=tell)
+    return chain, verdict, settings
+
+
+def _with_seed_of(
+    stored: Stored | None, settings: Settings, seed: int | None, path: str | os.PathLike[str]
+) -> Settings:
+    """Return the settings with the seed of the file; a seed that differs from it is refused."""
+    if stored is None:
+        return settings
+    if seed is not None and seed != stored.seed:
+        raise SamplingError(
+            f"{os.fspath(path)} was begun with seed {stored.seed}, but seed is {seed}; leave it "
+            "out to resume, or give another file"
+        )
+    return replace(settings, seed=stored.seed)
+
+
+def _problem(
+    data: FrequencyResponse | FitResult,
+    model: Element | None,
+    noise: str | None,
+    sensors: Sensors | None,
+    free: Iterable[str],
+    fixed: Mapping[str, float] | None,
+) -> tuple[Problem, Optimum | None]:
+    if isinstance(data, FitResult):
+        given = {"model": model, "noise": noise, "sensors": sensors, "fixed": fixed}
+        extra = [name for name, value in given.items() if value is not None]
+        if extra or tuple(free):
+            raise ValidationError(
+                f"{', '.join([*extra, *(['free'] if tuple(free) else [])])} is given beside a "
+                "FitResult, which has its own; pass the data instead"
+            )
+        return data.problem, data.optimum
+    if model is None:
+        raise ModelError("there is no model; give one, such as Dahl(), or pass a FitResult")
+    problem = Problem(data, model, noise=noise, sensors=sensors, free=free, fixed=fixed)
+    return problem, optimum_of(problem)
+
+
+def _estimate(optimum: Optimum | None) -> FloatArray | None:
+    return None if optimum is None else optimum.values
+
+
+def _settings(
+    density: Density,
+    seed: int | None,
+    steps: int | None,
+    max_steps: int,
+    ess: float,
+    walkers: int | None,
+    ensembles: int,
+) -> Settings:
+    dims = len(density.names)
+    ensembles = whole_number(ensembles, "ensembles", 2)
+    if walkers is None:
+        walkers = ensembles * max(32, 6 * dims)
+    least = ensembles * max(8, 4 * dims)
+    whole_number(walkers, "walkers", least)
+    if walkers % (2 * ensembles):
+        raise ValidationError(
+            f"walkers is {walkers}; expected a multiple of {2 * ensembles}, because each of "
+            f"{ensembles} ensembles moves in halves"
+        )
+    if seed is None:
+        seed = int(np.random.SeedSequence().generate_state(1)[0])
+    return Settings(
+        walkers,
+        ensembles,
+        whole_number(seed, "seed", 0),
+        None if steps is None else whole_number(steps, "steps", _LEAST_STEPS),
+        whole_number(max_steps, "max_steps", _LEAST_STEPS),
+        positive_number(ess, "ess"),
+    )

@@ -1,0 +1,97 @@
+"""Pictures of a fit: what to draw is decided here, how it looks in :mod:`dahl_ident.plots`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse, curves
+from dahl_ident.data.quantities import polar_std
+from dahl_ident.errors import ValidationError
+from dahl_ident.plots import (
+    Axes,
+    Curve,
+    plot_residuals,
+)
+from dahl_ident.units import si_unit
+
+if TYPE_CHECKING:
+    from dahl_ident.results.fit_result import FitResult
+
+_POINTS = 200
+
+
+def draw_fit(fit: FitResult, ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:
+    """Draw data with error bars and fit with its band, over amplitude or over frequency."""
+    return curves.draw(
+        fit.data,
+        ax,
+        stds=lambda part: _stds(fit, part),
+        fitted=lambda part, over_frequency: _curve(fit, part, over_frequency),
+    )
+
+
+def draw_residuals(fit: FitResult, against: str | None, ax: Axes | None) -> Axes:
+    """Draw both residuals of every row over a quantity, by default the one that suits the table."""
+    data = fit.data
+    if against is None:
+        over_frequency = curves.is_over_frequency(data.select(harmonic=1))
+        against = "frequency" if over_frequency else "amplitude"
+    amplitude = fit.problem.stiffness_data.amplitude
+    units = {kind: si_unit(kind, data.motion) for kind in ("displacement", "velocity")}
+    places = {
+        "amplitude": (amplitude, f"displacement amplitude [{units['displacement']}]"),
+        "frequency": (data.frequency_hz, "frequency [Hz]"),
+        "velocity": (
+            2.0 * np.pi * data.frequency_hz * amplitude,
+            f"velocity amplitude [{units['velocity']}]",
+        ),
+    }
+    if against not in places:
+        raise ValidationError(f"against is {against!r}; expected one of {', '.join(places)}")
+    x, label = places[against]
+    of_curve = np.stack([curves.curve_of_row(data), data.harmonic])
+    residuals = fit.residual[: fit.ndata] / (fit.scale if fit.scale > 0.0 else 1.0)
+    return plot_residuals(
+        x,
+        residuals[0::2],
+        residuals[1::2],
+        names=("ln gain", "phase") if fit.noise == "relative" else ("real part", "imaginary part"),
+        x_label=label,
+        group=np.unique(of_curve, axis=1, return_inverse=True)[1],
+        suspicious=[point.row for point in fit.goodness.suspicious],
+        ax=ax,
+    )
+
+
+def _stds(fit: FitResult, data: FrequencyResponse) -> tuple[FloatArray | None, FloatArray | None]:
+    """Return the standard deviations of gain and phase that the noise model has."""
+    gain = data.gain
+    if fit.noise == "relative":
+        return fit.scale * gain, np.full(gain.shape, fit.scale)
+    if fit.noise == "absolute":
+        return np.full(gain.shape, fit.scale), fit.scale / gain
+    return (None, None) if data.covariance is None else polar_std(data.response, data.covariance)
+
+
+def _curve(fit: FitResult, part: FrequencyResponse, over_frequency: bool) -> Curve:
+    """Return the fitted response between some rows, what was held interpolated between them."""
+    x = curves.abscissa(part, over_frequency)
+    order = np.argsort(x)
+    grid = np.geomspace(x[order[0]], x[order[-1]], _POINTS)
+
+    def between(values: FloatArray) -> FloatArray:
+        return np.exp(np.interp(np.log(grid), np.log(x[order]), np.log(values[order])))
+
+    if over_frequency:
+        frequency, held = grid, between(curves.held_amplitude(part))
+    else:
+        frequency, held = between(part.frequency_hz), grid
+    forced = curves.is_force_controlled(part)
+    band = fit.predict(
+        frequency, drive=held if forced else None, amplitude=None if forced else held
+    )
+    return Curve(grid, band.response, band.gain(), band.phase())

@@ -1,0 +1,150 @@
+"""A fit in words: the verdict first, then every number with its error and where that is from."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from dahl_ident.diagnostics.comparison import compare_models
+from dahl_ident.diagnostics.confidence_levels import percent
+from dahl_ident.diagnostics.formatting import interval, rounded, table, with_unit
+from dahl_ident.diagnostics.intervals import ConfidenceIntervals
+
+if TYPE_CHECKING:
+    from dahl_ident.results.fit_result import FitResult
+
+_CORRELATED = 0.1
+_BRIEF = 15  # lines that a reader takes in at a glance
+_NOISE = {
+    "measured": "measured: the data's covariance, scale known",
+    "relative": "relative: constant variance of (ln gain, phase)",
+    "absolute": "absolute: constant variance of (real, imaginary part)",
+}
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading with its lines."""
+
+    title: str
+    lines: list[str]
+
+
+def fit_report(fit: FitResult, intervals: ConfidenceIntervals, *, details: bool = True) -> str:
+    """Return the whole report as text, or verdict and parameters on at most 15 lines."""
+    sections = _all(fit, intervals)
+    if details:
+        return "\n".join(_lines(sections))
+    verdict, parameters = next(sections), next(sections)
+    numbers = list(_lines([parameters]))[: _BRIEF - 2]
+    room = _BRIEF - 1 - len(numbers)
+    if len(verdict.lines) > room:
+        left = len(verdict.lines) - room + 1
+        verdict = Section(verdict.title, [*verdict.lines[: room - 1], f"({left} more statements)"])
+    return "\n".join([*_lines([verdict]), *numbers])
+
+
+def _lines(sections: Iterable[Section]) -> Iterator[str]:
+    for section in sections:
+        yield section.title
+        yield from (f"    {line}" for line in section.lines)
+
+
+def as_html(fit: FitResult, intervals: ConfidenceIntervals) -> str:
+    """Return the whole report as HTML."""
+    parts = []
+    for section in _all(fit, intervals):
+        body = html.escape("\n".join(section.lines))
+        parts.append(f"<h4>{html.escape(section.title)}</h4><pre>{body}</pre>")
+    return f"<div>{''.join(parts)}</div>"
+
+
+def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[Section]:
+    yield Section("Verdict", list(fit.statements))
+    yield Section("Parameters", _parameters(fit, intervals))
+    combined = [str(c) for c in fit.identifiability.combinations]
+    if combined:
+        yield Section("Determined combinations", combined)
+    derived = [str(q) for q in fit.derived()]
+    if derived:
+        yield Section("Derived", derived)
+    if fit.errors is not None:
+        yield Section("Uncertainty budget", str(fit.budget()).splitlines())
+    correlations = _correlations(fit)
+    if correlations:
+        yield Section("Correlations", correlations)
+    yield Section("Noise", _noise(fit))
+    yield Section("Goodness of fit", fit.goodness.details or ["no test applies"])
+    if not fit.goodness.acceptable:
+        yield Section("Other models, for comparison", str(compare_models(fit)).splitlines())
+    yield Section("Solver", _solver(fit))
+
+
+def _parameters(fit: FitResult, intervals: ConfidenceIntervals) -> list[str]:
+    level = float(intervals.levels[-1])
+    rows = [["", "value", "stderr", "unit", f"{percent(level)} ({intervals.method})", ""]]
+    for name, p in fit.params.items():
+        if fit.errors is not None and name in fit.errors.assumed:
+            value, error = rounded(fit.errors.values[name], fit.errors.stderr[name])
+            rows.append([name, value, error, p.unit, "", "assumed"])
+            continue
+        if not p.vary:
+            rows.append([name, f"{p.value:g}", "", p.unit, "", "fixed"])
+            continue
+        value, error = rounded(p.value, p.stderr)
+        if math.isfinite(p.value) and p.stderr == math.inf and fit.nfree > 0:
+            value = "?"  # any other would do as well
+        limits = intervals[name][-1]
+        positive = p.min == 0.0
+        lower = -math.inf if positive and limits.lower == 0.0 else limits.lower
+        within = interval(lower, limits.upper, "")
+        word = fit.identifiability.parameters[name].verdict.value
+        rows.append([name, value, error, p.unit, within, word])
+    return [*table(rows, left=(0, 3, 4, 5)).splitlines(), f"({intervals.note})"]
+
+
+def _correlations(fit: FitResult) -> list[str]:
+    pairs = [
+        (a, b, c)
+        for i, a in enumerate(fit.var_names)
+        for b, c in fit.correl[a].items()
+        if b in fit.var_names[i + 1 :] and abs(c) >= _CORRELATED
+    ]
+    pairs.sort(key=lambda pair: -abs(pair[2]))
+    return [f"{a}, {b}: {c:+.3f}" for a, b, c in pairs]
+
+
+def _noise(fit: FitResult) -> list[str]:
+    lines = [_NOISE[fit.noise]]
+    if not fit.scale_known:
+        error = fit.scale / math.sqrt(2.0 * fit.nfree) if fit.nfree > 0 else None
+        unit = fit.data.unit if fit.noise == "absolute" else ""
+        size = with_unit(fit.scale, error, unit)
+        made = "the limit of rounding; the residuals are smaller"
+        if not fit.optimum.is_exact:
+            made = f"estimated with {fit.nfree} degrees of freedom"
+        lines.append(f"scale {size}, {made}")
+    loss = fit.optimum.loss
+    if loss != "linear":
+        lines.append(f"robust loss: {loss}")
+    for name, prior in fit.problem.priors.items():
+        lines.append(f"prior of {name}: {float(prior.mean()):g} +- {float(prior.std()):g}")
+    return lines
+
+
+def _counted(fit: FitResult) -> str:
+    """Return how residuals enter the sum, where that is not by their squares alone."""
+    if fit.optimum.loss != "linear":
+        return " (robust)"
+    return "" if fit.problem.gaussian else " (after Student's t)"
+
+
+def _solver(fit: FitResult) -> list[str]:
+    return [
+        f"{fit.method}, {fit.nfev} evaluations; {fit.ndata} numbers, {fit.nvarys} parameters",
+        f"{fit.optimum.status.outcome}; AIC {fit.aic:.2f}, BIC {fit.bic:.2f}",
+        f"sum of squares{_counted(fit)} {fit.chisqr:.5g}, over degrees of freedom {fit.redchi:.5g}",
+    ]

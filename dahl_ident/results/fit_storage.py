@@ -1,0 +1,218 @@
+"""Fits as JSON: data, model, noise, sensors and optimum, so that all of it can be judged again.
+
+The file says its schema and version. What is stored are facts that do not change with the
+package: the table, the model as plain data, the estimate with its covariance. Residuals,
+intervals and verdicts are computed when asked for, by whatever version loads the file.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.data.storage import digest, plain_data
+from dahl_ident.elements.description import describe_model, model_from_description
+from dahl_ident.errors import DataError
+from dahl_ident.fitting.optimum import Combination, Optimum
+from dahl_ident.fitting.status import Status
+from dahl_ident.problem import Problem
+from dahl_ident.sensors import EXACT, Sensors
+
+SCHEMA = "dahl_ident.fit_result"
+VERSION = 2
+_FIRST_WITH_DIGEST = 2
+
+_COLUMNS = (
+    "frequency_hz", "amplitude", "drive", "covariance", "dof", "amplitude_std",
+    "amplitude_covariance", "level", "run", "controlled", "harmonic",
+)  # fmt: skip
+_SENSORS = ("force_gain", "displacement_gain", "delay")
+
+
+def to_dict(optimum: Optimum, first_order: bool) -> dict[str, Any]:
+    """Return a fit as plain data, numbers that JSON does not know as text, such as "inf"."""
+    problem = optimum.problem
+    facts = {
+        "schema": SCHEMA,
+        "schema_version": VERSION,
+        "dahl_ident_version": version("dahl_ident"),
+        "data": _describe_data(problem.data),
+        "model": describe_model(problem.model),
+        "noise": problem.noise,
+        "sensors": {name: _describe_channel(getattr(problem.sensors, name)) for name in _SENSORS},
+        "optimum": {
+            "names": list(problem.names),
+            "theta": optimum.theta,
+            "values": optimum.values,
+            "covariance": optimum.covariance,
+            "scale": optimum.scale,
+            "dof": optimum.dof,
+            "cost": optimum.cost,
+            "nfev": optimum.nfev,
+            "status": optimum.status.name,
+            "message": optimum.message,
+            "method": optimum.method,
+            "loss": optimum.loss,
+            "first_order": first_order,
+            "combinations": [
+                {"expression": c.expression, "value": c.value, "stderr": c.stderr}
+                for c in optimum.combinations
+            ],
+        },
+    }
+    content = plain_data(facts, not_finite=str)
+    return {**content, "digest": digest(content)}
+
+
+def from_dict(content: Mapping[str, Any], source: str = "the content") -> tuple[Optimum, bool]:
+    """Return the fit that :func:`to_dict` described, and whether only first order holds."""
+    _check_schema(content, source)
+    _check_digest(content, source)
+    try:
+        return _optimum(content), content["optimum"]["first_order"]
+    except (KeyError, TypeError) as exc:
+        raise DataError(
+            f"{source} says {SCHEMA}, version {content['schema_version']}, but lacks or garbles "
+            f"{exc}; it may have been edited or cut short"
+        ) from exc
+
+
+def to_json(optimum: Optimum, first_order: bool) -> str:
+    """Return a fit as JSON text."""
+    return json.dumps(to_dict(optimum, first_order), allow_nan=False, indent=1)
+
+
+def from_json(text: str, source: str = "the text") -> tuple[Optimum, bool]:
+    """Return the fit that JSON text holds."""
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError as exc:
+        raise DataError(f"{source} is no JSON: {exc}; expected a saved fit") from exc
+    return from_dict(content, source)
+
+
+def load(path: str | Path) -> tuple[Optimum, bool]:
+    """Return the fit that a file holds."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as exc:
+        why = exc.strerror if isinstance(exc, OSError) else "it is no text"
+        raise DataError(f"{path}: the file cannot be read: {why}") from exc
+    return from_json(text, str(path))
+
+
+def _check_schema(content: Any, source: str) -> None:
+    schema = content.get("schema") if isinstance(content, Mapping) else None
+    if schema != SCHEMA:
+        raise DataError(f"{source} has the schema {schema!r}; expected {SCHEMA!r}, a saved fit")
+    found = content.get("schema_version")
+    if not isinstance(found, int) or not 1 <= found <= VERSION:
+        raise DataError(
+            f"{source} has schema version {found!r}; this version of dahl_ident reads 1 to "
+            f"{VERSION}: upgrade dahl_ident"
+        )
+
+
+def _check_digest(content: Mapping[str, Any], source: str) -> None:
+    """Refuse content that is not as it was written: nobody can answer for such numbers."""
+    facts = {key: value for key, value in content.items() if key != "digest"}
+    if content["schema_version"] < _FIRST_WITH_DIGEST:
+        return
+    if content.get("digest") != digest(facts):
+        raise DataError(
+            f"{source} was changed after the fit was saved: its data, model and estimate do not "
+            "match its digest; take the file as it was written, or repeat the fit"
+        )
+
+
+def _optimum(content: Mapping[str, Any]) -> Optimum:
+    sensors = {name: _channel(content["sensors"][name]) for name in _SENSORS}
+    known = Sensors(**sensors)
+    problem = Problem(
+        _data(content["data"]),
+        model_from_description(content["model"]),
+        noise=content["noise"],
+        sensors=EXACT if known.are_exact else known,
+    )
+    stored = content["optimum"]
+    if list(problem.names) != stored["names"]:
+        raise KeyError(f"the free parameters {stored['names']}, found {list(problem.names)}")
+    return Optimum(
+        problem=problem,
+        theta=_floats(stored["theta"]),
+        values=_floats(stored["values"]),
+        covariance=_floats(stored["covariance"]),
+        scale=float(stored["scale"]),
+        scale_known=problem.scale_known,
+        dof=stored["dof"],
+        cost=float(stored["cost"]),
+        nfev=stored["nfev"],
+        status=Status[stored["status"]],
+        message=stored["message"],
+        method=stored["method"],
+        loss=stored["loss"],
+        combinations=tuple(
+            Combination(c["expression"], float(c["value"]), float(c["stderr"]))
+            for c in stored["combinations"]
+        ),
+    )
+
+
+def _describe_data(data: FrequencyResponse) -> dict[str, Any]:
+    columns = {name: getattr(data, name) for name in _COLUMNS}
+    return {
+        "quantity": data.quantity,
+        "motion": data.motion,
+        "drive_factor_uncertainty": data.drive_factor_uncertainty,
+        "real": data.response.real,
+        "imag": data.response.imag,
+        **{name: column for name, column in columns.items() if column is not None},
+        "quality": data.quality,
+        "provenance": data.provenance,
+    }
+
+
+def _data(content: Mapping[str, Any]) -> FrequencyResponse:
+    columns = {name: content[name] for name in _COLUMNS if name in content}
+    for name in ("covariance", "dof", "amplitude_std", "amplitude_covariance"):
+        if name in columns:
+            columns[name] = _floats(columns[name])
+    return FrequencyResponse(
+        columns.pop("frequency_hz"),
+        _floats(content["real"]) + 1j * _floats(content["imag"]),
+        quantity=content["quantity"],
+        motion=content["motion"],
+        drive_factor_uncertainty=content.get("drive_factor_uncertainty", 0.0),
+        quality=content["quality"],
+        provenance=content["provenance"],
+        **columns,
+    )
+
+
+def _describe_channel(given: Any) -> Any:
+    if given is None or isinstance(given, float):
+        return given
+    kind = getattr(getattr(given, "dist", None), "name", type(given).__name__)
+    if kind != "norm":
+        raise DataError(f"a prior of kind {kind} cannot be written to a file; only norm can")
+    return {"norm": [float(given.mean()), float(given.std())]}
+
+
+def _channel(content: Any) -> Any:
+    if not isinstance(content, Mapping):
+        return content
+    from scipy import stats
+
+    mean, std = content["norm"]
+    return stats.norm(mean, std)
+
+
+def _floats(values: Any) -> FloatArray:
+    return np.array(values, dtype=np.float64) if values else np.zeros(0)

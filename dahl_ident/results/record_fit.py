@@ -1,0 +1,517 @@
+"""The result of a fit to records of any motion."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from scipy.stats import t as student_t
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import Record
+from dahl_ident.diagnostics.bands import DerivedQuantity
+from dahl_ident.diagnostics.budget import Budget
+from dahl_ident.diagnostics.formatting import listed, rounded, table
+from dahl_ident.diagnostics.record_errors import (
+    NOISE,
+    RecordErrors,
+    record_budget,
+    record_derived,
+    record_errors,
+)
+from dahl_ident.diagnostics.record_goodness import RecordGoodness, record_goodness
+from dahl_ident.diagnostics.record_identifiability import undetermined
+from dahl_ident.diagnostics.verdict_status import VerdictStatus
+from dahl_ident.elements import Element, Model
+from dahl_ident.elements.description import describe_model, model_from_description
+from dahl_ident.errors import DataError, FitError, ValidationError
+from dahl_ident.fitting.record_search import RecordOptimum, hold_model, solve_records
+from dahl_ident.problem.record_noise import share_in_band
+from dahl_ident.problem.record_problem import RecordProblem
+from dahl_ident.results.fit_numbers import Estimate
+from dahl_ident.results.result import Result
+
+if TYPE_CHECKING:
+    from dahl_ident.plots import Axes
+
+SCHEMA = "dahl_ident.record_fit"
+_SCHEMA_VERSION = 1
+_CHANNELS = ("displacement", "velocity", "acceleration", "force", "drive")
+_WELL = 1e-3  # share of variance left at which structure in the residuals does not matter
+_FAIRLY = 0.1  # share of variance left beyond which the model does not describe the records
+_STRUCTURED = 0.5  # correlation of neighbouring residuals
+
+
+@dataclass(frozen=True)
+class RecordBand:
+    """Predicted samples of a record with their uncertainty.
+
+    Attributes
+    ----------
+    time : ndarray, shape (n,)
+        s.
+    output : ndarray, shape (n,)
+        Predicted force or motion.
+    stderr : ndarray, shape (n,)
+        Standard uncertainty from the parameters.
+    lower, upper : ndarray, shape (n,)
+        95 % band of what would be measured, the residuals' scatter included.
+    measured : ndarray, shape (n,)
+        What the record holds.
+    """
+
+    time: FloatArray
+    output: FloatArray
+    stderr: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    measured: FloatArray
+
+    @property
+    def rms_error(self) -> float:
+        """Root mean square of measured minus predicted."""
+        return float(np.sqrt(np.mean((self.measured - self.output) ** 2)))
+
+    @property
+    def rms_share(self) -> float:
+        """The same over the measured samples' standard deviation."""
+        return self.rms_error / float(np.std(self.measured))
+
+
+class RecordFit(Result):
+    """What a fit to records found; made by :func:`dahl_ident.fit`.
+
+    Attributes
+    ----------
+    params : mapping of str to Estimate
+        Every parameter of the model, and what each record adds: states, offsets, drifts.
+    covar : ndarray
+        Covariance of the free values, with the residuals' correlation.
+    trusted, status, verdict, statements
+        Whether the numbers hold, and why.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> x = 1e-3 * np.cumsum(np.random.default_rng(0).standard_normal(500))
+    >>> force = di.Dahl(0.1, 30.0).force(x) + 1e-3 * np.random.default_rng(1).standard_normal(500)
+    >>> fit = di.fit(di.Record(np.arange(500) / 100.0, displacement=x, force=force), di.Dahl())
+    >>> fit.trusted, round(fit.params["f_max"].value, 2)
+    (True, 0.1)
+    """
+
+    _called = "a fit"
+
+    def __init__(self, optimum: RecordOptimum) -> None:
+        self._optimum = optimum
+
+    @property
+    def optimum(self) -> RecordOptimum:
+        """The search's plain result."""
+        return self._optimum
+
+    @property
+    def problem(self) -> RecordProblem:
+        """Records and model as they were fitted."""
+        return self._optimum.problem
+
+    @property
+    def records(self) -> tuple[Record, ...]:
+        """The records that were fitted."""
+        return self.problem.records
+
+    @property
+    def var_names(self) -> list[str]:
+        """Names of the free parameters; they order `covar`."""
+        return list(self.problem.names)
+
+    @property
+    def nfev(self) -> int:
+        """Evaluations of the search."""
+        return self._optimum.evaluations
+
+    @property
+    def success(self) -> bool:
+        """Whether the search converged."""
+        return self._optimum.converged
+
+    @property
+    def message(self) -> str:
+        """How the search ended, in words."""
+        return "Converged." if self.success else "Not converged: the numbers are not an optimum."
+
+    @cached_property
+    def model(self) -> Model:
+        """The model with the estimates put in, fixed."""
+        found = dict(zip(self.var_names, self._optimum.values.tolist(), strict=True))
+        return self.problem.model.with_fixed({p.name: found[p.name] for p in self.problem.free})
+
+    @cached_property
+    def _evaluated(self) -> tuple[list[FloatArray], list[FloatArray]]:
+        found = [self.problem.predict(self._optimum.values, i) for i in range(len(self.records))]
+        residuals = [y - p.output for y, p in zip(self.problem.measured, found, strict=True)]
+        return [p.by for p in found], residuals
+
+    @property
+    def residuals(self) -> tuple[FloatArray, ...]:
+        """Measured minus predicted, record by record."""
+        return tuple(self._evaluated[1])
+
+    @cached_property
+    def errors(self) -> RecordErrors:
+        """The estimate's uncertainty, source by source."""
+        return record_errors(self.problem, self._optimum.values, *self._evaluated)
+
+    @property
+    def covar(self) -> FloatArray:
+        """Covariance of the free values, every source together."""
+        return self.errors.covariance
+
+    @property
+    def stderr_noise(self) -> Mapping[str, float]:
+        """Standard error of every free value from the residuals' noise alone."""
+        sizes = np.sqrt(self.errors.contributions[NOISE].diagonal()).tolist()
+        return MappingProxyType(dict(zip(self.var_names, sizes, strict=True)))
+
+    def budget(self) -> Budget:
+        """Return the uncertainty budget: each parameter's sources, combined and expanded."""
+        return record_budget(self.problem, self._optimum.values, self.errors)
+
+    @property
+    def effective_samples(self) -> float:
+        """Samples of white noise that would tell as much as the residuals."""
+        return self.errors.effective
+
+    @property
+    def weighted(self) -> bool:
+        """Whether residuals were weighted by their spectrum, because slow noise prevails."""
+        return self.problem.whitening.size > 1
+
+    @cached_property
+    def params(self) -> Mapping[str, Estimate]:
+        """Every parameter by name."""
+        stderr = dict(zip(self.var_names, np.sqrt(np.diagonal(self.covar)), strict=True))
+        found = dict(zip(self.var_names, self._optimum.values.tolist(), strict=True))
+        fixed = [p for p in self.problem.model.parameters if not p.free]
+        return MappingProxyType(
+            {
+                p.name: Estimate(
+                    p.name, p.unit, p.description,
+                    float(found.get(p.name, p.value or 0.0)),
+                    float(stderr[p.name]) if p.name in stderr else None,
+                    p.value, p.lower, p.upper, p.name in stderr,
+                )
+                for p in (*self.problem.free, *fixed, *self.problem.parameters)
+            }
+        )  # fmt: skip
+
+    @cached_property
+    def goodness(self) -> RecordGoodness:
+        """What the model leaves of the records."""
+        return record_goodness(self.records, self.problem.measured, self.residuals)
+
+    @cached_property
+    def _share_left(self) -> float:
+        """Share of variance left; where residuals are weighted, at the drive's frequencies."""
+        if not self.weighted:
+            return self.goodness.share_left
+        drives = [record.force_samples for record in self.records]
+        return share_in_band(drives, self.problem.measured, self.residuals)
+
+    @cached_property
+    def findings(self) -> tuple[str, ...]:
+        """What is not determined and why, in words; empty where everything is."""
+        stderr = {p.name: self.params[p.name].stderr or 0.0 for p in self.problem.free}
+        return undetermined(self.model, self.records, stderr, self.covar, self.var_names)
+
+    @property
+    def status(self) -> VerdictStatus:
+        """Trusted, approximate, not determined or not described."""
+        if not self.success or self._share_left > _FAIRLY:
+            return VerdictStatus.NOT_DESCRIBED
+        if self.findings:
+            return VerdictStatus.NOT_DETERMINED
+        if self.goodness.correlation > _STRUCTURED and self._share_left > _WELL:
+            return VerdictStatus.APPROXIMATE
+        return VerdictStatus.TRUSTED
+
+    @cached_property
+    def statements(self) -> tuple[str, ...]:
+        """The verdict in its parts, most serious first."""
+        left, within = (
+            100.0 * np.sqrt(share) for share in (self.goodness.share_left, self._share_left)
+        )
+        first = {
+            VerdictStatus.TRUSTED: "Trusted.",
+            VerdictStatus.APPROXIMATE: "Approximate. The model misses more than noise.",
+            VerdictStatus.NOT_DETERMINED: "Not determined. Not every parameter is determined.",
+            VerdictStatus.NOT_DESCRIBED: "Not described. The model misses the records.",
+        }[self.status]
+        described = f"The residuals are {left:.2g} % rms of the measured {self.problem.output}"
+        objections = [o for e, v in self.model.of([p.value or 0.0 for p in self.model.parameters])
+                      for o in e.physics(v)]  # fmt: skip
+        return (
+            first,
+            *(() if self.success else (self.message,)),
+            *self.findings,
+            f"{described}; {self.goodness.worst_text}.",
+            *(
+                (
+                    f"Most of that is slow, as noise in the drive makes it: {within:.2g} % rms is "
+                    "left at the drive's frequencies, and residuals are weighted by their "
+                    "spectrum.",
+                )
+                if self.weighted
+                else ()
+            ),
+            *(f"Physically doubtful: {o}." for o in objections),
+            f"Error bars take the residuals' correlation into account: {self.effective_samples:.0f}"
+            f" effective of {self.problem.n_residuals} samples.",
+            f"Assumed: {listed(self.errors.exact)} exact.",
+        )
+
+    @cached_property
+    def coverage_factor(self) -> float:
+        """Half-width of a 95 % interval in standard errors: Student's t, effective samples."""
+        return float(student_t.ppf(0.975, self.errors.dof))
+
+    def conf_interval(self) -> Mapping[str, tuple[float, float]]:
+        """Return the 95 % interval of every free parameter."""
+        found = {}
+        for name in self.var_names:
+            p = self.params[name]
+            half = self.coverage_factor * (p.stderr or 0.0)
+            found[name] = (p.value - half, p.value + half)
+        return MappingProxyType(found)
+
+    def summary(self) -> Any:
+        """Return a pandas table: one row a parameter."""
+        import pandas as pd
+
+        within = self.conf_interval()
+        rows = []
+        for p in self.params.values():
+            lower, upper = within.get(p.name, (None, None))
+            rows.append(
+                {
+                    "name": p.name, "value": p.value, "stderr": p.stderr, "unit": p.unit,
+                    "lower": lower, "upper": upper, "free": p.vary,
+                }
+            )  # fmt: skip
+        return pd.DataFrame(rows).set_index("name")
+
+    def fit_report(self) -> str:
+        """Return the whole report as text, the verdict first."""
+        rows = [["", "value", "stderr", "unit"]]
+        for name, p in self.params.items():
+            value, error = (f"{p.value:g}", "fixed") if not p.vary else rounded(p.value, p.stderr)
+            rows.append([name, value, error, p.unit])
+        parts = [("Verdict", self.statements), ("Parameters", table(rows, (0, 3)).splitlines())]
+        parts.append(("Uncertainty budget", str(self.budget()).splitlines()))
+        parts.append(("Goodness of fit", self.goodness.lines))
+        return "\n".join(
+            f"{title}\n" + "\n".join(f"    {line}" for line in lines) for title, lines in parts
+        )
+
+    def __str__(self) -> str:
+        return self.fit_report()
+
+    def __repr__(self) -> str:
+        estimates = ", ".join(str(self.params[p.name]) for p in self.problem.free)
+        return f"<RecordFit: {estimates}; {self.status.value}>"
+
+    # What follows
+
+    def predict(
+        self, record: Any, *, initial: Literal["fitted", "rest"] = "fitted", **other: Any
+    ) -> RecordBand:
+        """Return what another record of the same device should show.
+
+        Parameters
+        ----------
+        record : Record
+            With the same channels as those fitted.
+        initial : {"fitted", "rest"}
+            Whether the state at its first sample and the offset are fitted to the record, the
+            model's parameters held, or taken as zero.
+
+        Returns
+        -------
+        RecordBand
+
+        Raises
+        ------
+        DataError
+            If the record lacks a channel.
+        FitError
+            If the motion grows beyond all bounds.
+        ValidationError
+            If something else than a record is to be predicted.
+        """
+        if other or not isinstance(record, Record):
+            raise ValidationError(
+                "a fit of records predicts a Record; for settled sines ask its model: "
+                "fit.model.dynamic_stiffness(amplitude, frequency_hz)"
+            )
+        own = self.problem
+        problem = RecordProblem(
+            [record], own.model, output=own.output, excitation=own.excitation,
+            substeps=own.substeps,
+        )  # fmt: skip
+        count = len(own.free)
+        values = self._optimum.values[:count]
+        if initial == "fitted":
+            full = hold_model(problem, values)
+        elif initial == "rest":
+            full = np.zeros(len(problem.parameters))
+            full[:count] = values
+        else:
+            raise ValidationError(f"initial is {initial!r}; expected fitted or rest")
+        found = problem.predict(full, 0)
+        by = found.by[:, :count]
+        covariance = self.covar[:count, :count]
+        variance = np.einsum("ij,jk,ik->i", by, covariance, by)
+        scatter = float(np.mean(np.concatenate(self.residuals) ** 2))
+        half = self.coverage_factor * np.sqrt(variance + scatter)
+        return RecordBand(
+            record.time, found.output, np.sqrt(variance), found.output - half,
+            found.output + half, problem.measured[0],
+        )  # fmt: skip
+
+    def simulate(self, record: Record) -> FloatArray:
+        """Return the output for a record's input, from rest; its measured output is not used."""
+        return self.predict(record, initial="rest").output
+
+    def derived(
+        self, amplitudes: Sequence[float] = (), frequency_hz: float | None = None
+    ) -> tuple[DerivedQuantity, ...]:
+        """Return x_c, energy per cycle, equivalent stiffness and damping, with their errors."""
+        values = self._optimum.values
+        return record_derived(self.problem, values, self.covar, amplitudes, frequency_hz)
+
+    def plot(self, kind: str | None = None, ax: Any = None, *, record: int = 0) -> Axes:
+        """Draw measured and predicted samples, the loop, or the residuals of one record.
+
+        Parameters
+        ----------
+        kind : {"time", "loop", "residuals", "residuals_displacement"}, default "time"
+            "residuals" are drawn over time, "residuals_displacement" against displacement.
+        ax : matplotlib Axes, optional
+            To draw into, for residuals.
+        record : int, default 0
+            Which one.
+
+        Returns
+        -------
+        matplotlib Axes
+        """
+        from dahl_ident.plots.record_fit import draw_record_fit
+
+        return draw_record_fit(self, kind or "time", record, ax)
+
+    # Storage
+
+    def to_json(self) -> str:
+        """Return the fit as JSON: records, model and estimate."""
+        problem = self.problem
+        records = [
+            {
+                "time": r.time.tolist(),
+                **{c: getattr(r, c).tolist() for c in _CHANNELS if getattr(r, c) is not None},
+                "drive_unit": r.drive_unit,
+                "drive_factor": r.drive_factor,
+                "motion": r.motion,
+            }
+            for r in self.records
+        ]
+        return json.dumps(
+            {
+                "schema": SCHEMA,
+                "schema_version": _SCHEMA_VERSION,
+                "dahl_ident_version": version("dahl_ident"),
+                "records": records,
+                "model": describe_model(problem.model),
+                "output": problem.output,
+                "excitation": problem.excitation,
+                "substeps": problem.substeps,
+                "whitening": problem.whitening.tolist(),
+                "names": self.var_names,
+                "values": self._optimum.values.tolist(),
+                "cost": self._optimum.cost,
+                "converged": self._optimum.converged,
+                "evaluations": self._optimum.evaluations,
+            }
+        )
+
+    @classmethod
+    def from_json(cls, text: str) -> RecordFit:
+        """Return the fit that :meth:`to_json` wrote.
+
+        Raises
+        ------
+        DataError
+            If the text holds no such fit.
+        """
+        try:
+            held = json.loads(text)
+            if held["schema"] != SCHEMA or held["schema_version"] > _SCHEMA_VERSION:
+                raise DataError(
+                    f"the schema is {held['schema']!r} version {held['schema_version']}; expected "
+                    f"{SCHEMA!r} up to version {_SCHEMA_VERSION}"
+                )
+            records = [Record(r.pop("time"), **r) for r in held["records"]]
+            problem = RecordProblem(
+                records, model_from_description(held["model"]), output=held["output"],
+                excitation=held["excitation"], substeps=held["substeps"],
+            )  # fmt: skip
+            problem = problem.weighted(np.asarray(held["whitening"], dtype=np.float64))
+            values = np.asarray(held["values"], dtype=np.float64)
+            return cls(
+                RecordOptimum(problem, values, held["cost"], held["converged"], held["evaluations"])
+            )
+        except (KeyError, TypeError, ValueError) as exc:
+            raise DataError(f"the text holds no fit of records: {exc!r}") from exc
+
+    @classmethod
+    def load(cls, path: str | Path) -> RecordFit:
+        """Return the fit that ``save`` wrote."""
+        return cls.from_json(Path(path).read_text(encoding="utf-8"))
+
+
+def fit_records(
+    records: Sequence[Record], model: Element, *, throw: bool = True, **how: Any
+) -> RecordFit:
+    """Return the fit of a model to records of any motion; see :func:`dahl_ident.fit`.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Each a run of one device.
+    model : Element
+        One element or a sum.
+    throw : bool, default True
+        Raise where the search does not converge.
+    **how
+        `start`; and `output`, `excitation` and `substeps` of
+        :class:`dahl_ident.problem.record_problem.RecordProblem`.
+
+    Returns
+    -------
+    RecordFit
+    """
+    start = how.pop("start", None)
+    optimum = solve_records(RecordProblem(records, model, **how), start=start)
+    if throw and not optimum.converged:
+        raise FitError(
+            "not converged: the search stopped before it found a minimum; give start=, or fix a "
+            "parameter",
+            RecordFit(optimum),
+        )
+    return RecordFit(optimum)

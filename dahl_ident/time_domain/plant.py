@@ -1,0 +1,145 @@
+"""A model as an equation of motion, driven by a force or by the motion of its base.
+
+    (m_1 + m_2 + ...) dv/dt = drive - sum of the elements' forces,    dx/dt = v,
+    dF_i/dt = slope_i(F_i, sgn v, v) v    for every element with memory
+
+Base motion: x is the displacement relative to the base, and the drive is -m times the base's
+acceleration. The state is x, v and one force for each element with memory.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import cached_property
+from typing import Literal
+
+import casadi as ca
+
+from dahl_ident.elements import Model
+from dahl_ident.errors import ModelError
+from dahl_ident.time_domain.runge_kutta import step
+from dahl_ident.time_domain.switches import on_one_branch
+from dahl_ident.time_domain.vectorised import Evaluator, vectorised
+
+Excitation = Literal["force", "base"]
+
+
+class Plant:
+    """The equation of motion of a model, and one step of its integration on whole arrays.
+
+    Parameters
+    ----------
+    model : Model
+        Elements in parallel, at least one of them a mass.
+    excitation : {"force", "base"}
+        What the drive is: a force, N, or the acceleration of the base, m/s^2.
+
+    Raises
+    ------
+    ModelError
+        If nothing has inertia, or an element has no equation of motion.
+
+    Examples
+    --------
+    >>> from dahl_ident import Dahl, Mass
+    >>> Plant(Dahl() + Mass(1.0), "force").order
+    3
+    """
+
+    def __init__(self, model: Model, excitation: Excitation) -> None:
+        self.model = model
+        self.excitation = excitation
+        self.with_memory = tuple(e for e in model.elements if e.has_memory)
+        self.order = 2 + len(self.with_memory)
+        self._state = [ca.SX.sym(f"y{i}") for i in range(self.order)]
+        # fixed values as numbers, so that what follows from them is worked out once
+        self._values = [
+            ca.SX.sym(p.name) if p.free else ca.SX(float(p.value or 0.0)) for p in model.parameters
+        ]
+        self.free = [p.name for p in model.parameters if p.free]
+        self._free = [v for v, p in zip(self._values, model.parameters, strict=True) if p.free]
+        self._drive, self._direction = ca.SX.sym("u"), ca.SX.sym("s")
+        inputs = [*self._state, self._drive, self._direction, *self._free]
+        with warnings.catch_warnings():
+            # laws in plain arithmetic may use numpy's names; casadi answers to them, and says so
+            warnings.simplefilter("ignore", FutureWarning)
+            rates = self._rates()
+        self._held, self._switches, self._sides = on_one_branch(inputs, rates)
+        self.n_switches = len(self._switches)
+        """How many switching functions the laws have; see :mod:`~.switches`."""
+
+    def _rates(self) -> ca.SX:
+        x, v, *forces = self._state
+        inertia, total, slopes = ca.SX(0.0), ca.SX(0.0), []
+        waiting = iter(forces)
+        has_inertia = False
+        for element, values in self.model.of(self._values):
+            own = next(waiting) if element.has_memory else None
+            part = element.mechanics(values, x, v, self._direction, own)
+            has_inertia = has_inertia or isinstance(part.inertia, ca.SX)
+            inertia, total = inertia + part.inertia, total + part.force
+            if own is not None:
+                slopes.append(part.rate)
+        if not has_inertia:
+            raise ModelError(
+                f"{self.model!r} has no mass, so a force does not determine its motion; add "
+                "Mass(), or give records with measured displacement and force"
+            )
+        push = self._drive if self.excitation == "force" else -inertia * self._drive
+        return ca.vertcat(v, (push - total) / inertia, *slopes)
+
+    def _function(self, output: Callable[[ca.SX], ca.SX]) -> Evaluator:
+        """Return an array function of state, drives, length, direction, sides, free values."""
+        drives = [ca.SX.sym(f"u{i}") for i in range(6)]
+        length = ca.SX.sym("h")
+        state = ca.vertcat(*self._state)
+        constant = [self._direction, *self._sides, *self._free]
+        rates = ca.Function("rates", [state, self._drive, *constant], [self._held])
+        after = step(lambda at, drive: rates(at, drive, *constant), state, drives, length)
+        return vectorised([*self._state, *drives, length, *constant], output(after))
+
+    @cached_property
+    def advance(self) -> Evaluator:
+        """The state after a step."""
+        return self._function(lambda after: after)
+
+    @cached_property
+    def advance_by_state(self) -> Evaluator:
+        """The state after a step, then its derivatives by the state, column by column."""
+        state = ca.vertcat(*self._state)
+        return self._function(lambda after: ca.vertcat(after, ca.vec(ca.jacobian(after, state))))
+
+    @cached_property
+    def advance_by_all(self) -> Evaluator:
+        """As :attr:`advance_by_state`, then the derivatives by the parameters."""
+        at = ca.vertcat(*self._state, *self._free)
+        return self._function(lambda after: ca.vertcat(after, ca.vec(ca.jacobian(after, at))))
+
+    @cached_property
+    def push(self) -> Evaluator:
+        """The acceleration, of state, drive, direction, sides and free values."""
+        return self._at_a_moment([self._held[1]])
+
+    @cached_property
+    def switches(self) -> Evaluator:
+        """The velocity and the switching functions, then their rates of change.
+
+        Of state, drive, direction, sides and free values.
+        """
+        functions = ca.vertcat(self._state[1], *self._switches)
+        rates = ca.jacobian(functions, ca.vertcat(*self._state)) @ self._held
+        return self._at_a_moment([functions, rates])
+
+    @cached_property
+    def acceleration(self) -> Evaluator:
+        """The acceleration, then its derivatives by the state and the free parameters.
+
+        Of state, drive, direction, sides and free values.
+        """
+        at = ca.vertcat(*self._state, *self._free)
+        return self._at_a_moment([self._held[1], ca.vec(ca.jacobian(self._held[1], at))])
+
+    def _at_a_moment(self, outputs: list[ca.SX]) -> Evaluator:
+        inputs = [*self._state, self._drive, self._direction, *self._sides, *self._free]
+        return vectorised(inputs, ca.vertcat(*outputs))

@@ -1,0 +1,92 @@
+"""Kinks of a law, found in its own expression.
+
+A law in plain arithmetic has kinks where it takes an absolute value, a sign or a comparison. Their
+arguments are the switching functions: where one passes through zero, the law changes its branch.
+An integration that locates those places, and keeps to one branch in between, sees smooth
+functions alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+
+_SIGNED = (ca.OP_FABS, ca.OP_SIGN)
+_COMPARED = (ca.OP_FMIN, ca.OP_FMAX, ca.OP_LT, ca.OP_LE)
+
+
+def on_one_branch(
+    inputs: Sequence[ca.SX], outputs: ca.SX
+) -> tuple[ca.SX, list[ca.SX], list[ca.SX]]:
+    """Return an expression with every switch held, its switching functions and their sides.
+
+    Parameters
+    ----------
+    inputs : sequence of SX
+        Scalar symbols on which the switches may depend.
+    outputs : SX
+        A vector.
+
+    Returns
+    -------
+    held : SX
+        The vector, each switch replaced by a symbol for its side.
+    functions : list of SX
+        What passes through zero where the branch changes.
+    sides : list of SX
+        Symbols: +1 where the function is positive, -1 where it is negative.
+
+    Examples
+    --------
+    >>> x = ca.SX.sym("x")
+    >>> on_one_branch([x], abs(x - 1) * x)
+    (SX(((side0*(x-1))*x)), [SX((x-1))], [SX(side0)])
+    """
+    function = ca.Function("f", list(inputs), [ca.densify(outputs)])
+    work: dict[int, ca.SX] = {}
+    functions: list[ca.SX] = []
+    sides: list[ca.SX] = []
+    held = [ca.SX(0.0)] * function.nnz_out(0)
+
+    def side_of(argument: ca.SX) -> ca.SX:
+        for known, side in zip(functions, sides, strict=True):
+            if ca.is_equal(known, argument, 20):
+                return side
+            if ca.is_equal(known, -argument, 20):
+                return -side
+        functions.append(argument)
+        sides.append(ca.SX.sym(f"side{len(sides)}"))
+        return sides[-1]
+
+    for k in range(function.n_instructions()):
+        code = function.instruction_id(k)
+        target, source = function.instruction_output(k), function.instruction_input(k)
+        if code == ca.OP_CONST:
+            work[target[0]] = ca.SX(function.instruction_constant(k))
+        elif code == ca.OP_INPUT:
+            work[target[0]] = inputs[source[0]]
+        elif code == ca.OP_OUTPUT:
+            held[target[1]] = work[source[0]]
+        else:
+            a = [work[i] for i in source]
+            if code in _SIGNED:
+                side = side_of(a[0])
+                work[target[0]] = side * a[0] if code == ca.OP_FABS else side
+            elif code in _COMPARED:
+                side = side_of(a[0] - a[1])
+                larger, smaller = (1.0 + side) / 2.0, (1.0 - side) / 2.0
+                if code in (ca.OP_LT, ca.OP_LE):
+                    work[target[0]] = smaller
+                else:
+                    first, second = (larger, smaller) if code == ca.OP_FMAX else (smaller, larger)
+                    work[target[0]] = first * a[0] + second * a[1]
+            elif code == ca.OP_IF_ELSE_ZERO:
+                work[target[0]] = a[0] * a[1]
+            elif code == ca.OP_NOT:
+                work[target[0]] = 1.0 - a[0]
+            elif len(a) == 1:
+                work[target[0]] = ca.SX.unary(code, a[0])
+            else:
+                work[target[0]] = ca.SX.binary(code, a[0], a[1])
+    return ca.vertcat(*held), functions, sides

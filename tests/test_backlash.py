@@ -1,0 +1,165 @@
+"""A gap in the link to a friction element."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from dahl_ident import (
+    Backlash,
+    Dahl,
+    Damper,
+    Element,
+    Friction,
+    Mass,
+    PowerDamper,
+    Spring,
+    response,
+)
+from dahl_ident.arrays import ComplexArray
+from dahl_ident.elements.description import describe_model, model_from_description
+from dahl_ident.elements.model import as_model
+from dahl_ident.errors import ModelError
+from tests.test_generic_friction import Jenkins
+from tests.test_response_of_any_law import all_amplitudes
+
+AT_REST = np.zeros(())
+
+
+def by_path(f_max: float, sigma: float, b: float, A: float, k: int) -> complex:
+    """Return F_k/A of linear Dahl behind a half-gap b, from the force over the path."""
+    x_c = f_max / sigma
+    f0 = np.tanh(sigma * (A - b) / f_max)
+    first = x_c * np.log1p(f0)
+
+    def force(path: np.ndarray) -> np.ndarray:
+        moved = np.where(path < first, path, path - 2.0 * b)
+        inside = (path >= first) & (path <= first + 2.0 * b)
+        return np.where(inside, 0.0, f_max * (-1.0 + (1.0 + f0) * np.exp(-moved / x_c)))
+
+    stops = [0.0, *np.arccos(1.0 - np.array([first, first + 2.0 * b]) / A), np.pi]
+    nodes, weights = np.polynomial.legendre.leggauss(80)
+    total = 0.0 + 0.0j
+    for low, high in pairwise(stops):
+        theta = low + 0.5 * (high - low) * (1.0 + nodes)
+        values = force(A * (1.0 - np.cos(theta))) * np.exp(-1j * k * theta)
+        total += 0.5 * (high - low) * np.sum(weights * values)
+    return complex(2.0 / np.pi * total / A)
+
+
+@pytest.mark.parametrize(
+    ("law", "A", "first", "third"),
+    [
+        (Backlash(Dahl(1.0, 3.0), 0.8), 2.0, 0.3901538 + 0.4032069j, 0.0288864 - 0.0183396j),
+        (Backlash(Dahl(1.0, 1.0), 0.6), 1.0, 0.5368324 + 0.1217627j, 0.0781530 + 0.0417040j),
+    ],
+)
+def test_the_check_values(law: Backlash, A: float, first: complex, third: complex) -> None:
+    assert complex(law.dynamic_stiffness(A)) == pytest.approx(first, abs=1e-7)
+    assert complex(law.dynamic_stiffness(A, harmonic=3)) == pytest.approx(third, abs=1e-7)
+
+
+def test_harmonics_against_the_force_over_the_path() -> None:
+    rng = np.random.default_rng(7)
+    for _ in range(60):
+        f_max, sigma = 10.0 ** rng.uniform(-2.0, 2.0, 2)
+        b = f_max / sigma * 10.0 ** rng.uniform(-2.0, 1.0)
+        A = b + f_max / sigma * 10.0 ** rng.uniform(-1.5, 1.2)
+        law = Backlash(Dahl(f_max, sigma), 2.0 * b)
+        size = abs(by_path(f_max, sigma, b, A, 1))
+        for k in (1, 3, 5, 7):
+            ours = complex(law.dynamic_stiffness(A, harmonic=k))
+            assert abs(ours - by_path(f_max, sigma, b, A, k)) < 1e-8 * size
+        assert abs(law.dynamic_stiffness(A, harmonic=2)) == 0.0
+
+
+def test_a_closed_gap_is_none_and_a_wide_one_carries_no_force() -> None:
+    A = np.geomspace(0.01, 10.0, 20)
+    tight = Backlash(Dahl(1.0, 3.0, 2.0), 1e-12).describing_function(A)
+    np.testing.assert_allclose(tight, Dahl(1.0, 3.0, 2.0).describing_function(A), rtol=1e-6)
+    wide = Backlash(Dahl(1.0, 3.0), 2.0)
+    assert wide.describing_function([0.0, 0.5, 1.0]).tolist() == [0.0, 0.0, 0.0]
+    assert wide.force([0.0, 0.9, -0.9, 0.9]).tolist() == [0.0, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        Backlash(Dahl(1.0, 3.0), 0.5),
+        Backlash(Dahl(1.0, 3.0, 2.0, asymmetry=0.3), 0.5),
+        Backlash(Jenkins(3.0, 0.3), 0.5),
+    ],
+)
+def test_a_settled_force_has_the_harmonics(law: Backlash) -> None:
+    n, A = 4096, 1.0
+    theta = 2.0 * np.pi * np.arange(40 * n) / n
+    force = law.force(A * np.cos(theta))[-n:]
+    spectrum: ComplexArray = 2.0 / n * np.fft.rfft(force) / A
+    size = abs(complex(law.dynamic_stiffness(A)))
+    for k in range(6):
+        expected = complex(law.dynamic_stiffness(A, harmonic=k)) * (2.0 if k == 0 else 1.0)
+        assert abs(spectrum[k] - expected) < 2e-6 * size
+    _, loop = law.loop(A, points=n + 1)
+    np.testing.assert_allclose(loop[:-1], force, atol=1e-6)
+
+
+def test_the_force_steps_through_the_gap() -> None:
+    law = Backlash(Jenkins(2.0, 0.5), 0.4)
+    x = [0.0, 0.2, 0.5, 1.0, 0.9, 0.5, 0.2, 0.1, 0.0, 0.1, 0.4]
+    # contact at 0.2; slip at 1 N; zero force at 0.5; the gap is crossed to 0.1
+    expected = [0.0, 0.0, 0.6, 1.0, 0.8, 0.0, 0.0, 0.0, -0.2, 0.0, 0.0]
+    np.testing.assert_allclose(law.force(x), expected, atol=1e-9)
+
+
+def test_derivatives_are_differences_of_the_values() -> None:
+    law = as_model(Backlash(Dahl(1.0, 3.0), 0.8)).with_free(["f_max", "sigma", "gap"])
+    A, values = np.array([0.7, 2.0, 5.0]), law.known_values()
+    found = law.stiffness_gradient(values, A, AT_REST)
+    for i, b in ((3, 0.4),):
+        slope = [(by_path(1.0, 3.0, b + 5e-7, a, 1) - by_path(1.0, 3.0, b - 5e-7, a, 1)) for a in A]
+        np.testing.assert_allclose(found.by_parameter[i], np.array(slope) / 2e-6, rtol=1e-4)
+
+
+def test_derivatives_of_linear_dahl_are_exact() -> None:
+    rng = np.random.default_rng(11)
+    places, weights = np.array([1.0, -1.0, 2.0, -2.0]), np.array([8.0, -8.0, -1.0, 1.0]) / 12e-5
+    law = as_model(Backlash(Dahl(1.0, 3.0), 0.8)).with_free(["f_max", "sigma", "gap"])
+    for i in range(24):
+        f_max, sigma = 10.0 ** rng.uniform(-2.0, 2.0, 2)
+        b = f_max / sigma * 10.0 ** rng.uniform(-2.0, 1.0)
+        A, k = b + f_max / sigma * 10.0 ** rng.uniform(-1.0, 1.2), (1, 3, 5)[i % 3]
+        at = [np.asarray(v) for v in (f_max, sigma, 1.0, 2.0 * b, A)]
+        found = law.stiffness_gradient(at[:4], at[4], AT_REST, k)
+        size = abs(by_path(f_max, sigma, b, A, 1))
+        for j in (0, 1, 3, 4):
+            moved = [*at[:j], at[j] * (1.0 + 1e-5 * places), *at[j + 1 :]]
+            rows = np.broadcast(*moved)
+            values = [by_path(f, s, 0.5 * g, a, k) for f, s, _, g, a in rows]
+            slope = (*found.by_parameter, found.by_amplitude)[j]
+            assert abs(complex(slope) * float(at[j]) - weights @ values) < 1e-6 * size * (
+                A / (A - b)
+            )
+
+
+def test_response_behind_a_gap() -> None:
+    plant = Backlash(Dahl(0.1, 30.0), 0.01) + Mass(0.3) + Damper(0.24) + Spring(3.0)
+    for drive in (0.005, 0.02, 0.1, 0.5):
+        ours = response(plant, 0.4, drive, all_roots=True)
+        np.testing.assert_allclose(
+            np.ravel(ours.amplitude), all_amplitudes(plant, 0.4, drive), rtol=1e-7
+        )
+
+
+def test_description_and_refusals() -> None:
+    for law in (Backlash(Dahl(1.0, None, name="pivot"), 0.1), Backlash(Dahl(asymmetry=None))):
+        (again,) = model_from_description(json.loads(json.dumps(describe_model(law)))).elements
+        assert again.parameters == law.parameters
+        assert repr(again) == repr(law)
+    wrong: list[Element] = [Spring(1.0), PowerDamper(1.0, 0.5), Backlash(Dahl(), 0.1)]
+    for element in wrong:
+        with pytest.raises(ModelError, match="Backlash got"):
+            Backlash(element, 0.1)
+    assert isinstance(Backlash(Dahl()).element, Friction)

@@ -1,0 +1,413 @@
+"""Campaigns: one row a device whatever happens, resumed without loss, and their population."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import dahl_ident as di
+from dahl_ident.campaigns.campaign_report import write_campaign_report
+from dahl_ident.campaigns.definition import read_definition
+from dahl_ident.campaigns.engine import run_jobs
+from dahl_ident.campaigns.population import population
+from dahl_ident.campaigns.work import Job
+from dahl_ident.errors import DahlIdentError, DataError, ValidationError
+from tests.command_line import Runner
+
+SECONDS = ["seconds"]
+
+
+def make_tables(folder: Path, devices: int, runs: int = 1, seed: int = 0) -> pd.DataFrame:
+    """Write response tables of devices whose f_max grows with temperature; return the truth."""
+    rng = np.random.default_rng(seed)
+    amplitude = np.geomspace(1e-4, 3e-2, 9)
+    truth = []
+    for device in range(devices):
+        temperature = float(rng.uniform(10.0, 30.0))
+        f_max = 0.1 * np.exp(rng.normal(0.01 * (temperature - 20.0), 0.04))
+        truth.append({"device": f"d{device:03}", "temperature": temperature, "f_max": f_max})
+        for run in range(runs):
+            N = di.Dahl(f_max, 30.0).describing_function(amplitude)
+            noise = rng.normal(0.0, 0.003, (2, amplitude.size))
+            N = N * np.exp(noise[0] + 1j * noise[1])
+            table = di.FrequencyResponse(np.ones(amplitude.size), N, amplitude)
+            table.save(folder / f"d{device:03}_r{run}.csv")
+    frame = pd.DataFrame(truth)
+    frame[["device", "temperature"]].to_csv(folder / "devices.csv", index=False)
+    return frame
+
+
+def definition(folder: Path, **changes: Any) -> dict[str, Any]:
+    content: dict[str, Any] = {
+        "files": {
+            "pattern": f"{folder.as_posix()}/{{device}}_{{run}}.csv",
+            "kind": "response",
+            "covariates": str(folder / "devices.csv"),
+        },
+        "model": [{"kind": "dahl"}],
+        "output": {"folder": str(folder / "results")},
+    }
+    for name, value in changes.items():
+        table, key = name.split("__")
+        content.setdefault(table, {})[key] = value
+    return content
+
+
+def as_toml(folder: Path) -> Path:
+    path = folder / "lab.toml"
+    path.write_text(
+        '[files]\npattern = "{device}_{run}.csv"\nkind = "response"\n'
+        'covariates = "devices.csv"\n[[model]]\nkind = "dahl"\n'
+    )
+    return path
+
+
+def test_each_device_is_a_row_and_a_failure_is_one_too(tmp_path: Path) -> None:
+    truth = make_tables(tmp_path, 5, runs=2)
+    (tmp_path / "d001_r1.csv").write_text("nothing that can be read\n")
+    done = di.campaign(definition(tmp_path), jobs=1)
+    table = done.table
+    assert table["device"].tolist() == truth["device"].tolist()
+    assert dict(done.statuses)["failed"] == 1
+    bad = table.set_index("device").loc["d001"]
+    assert bad["status"] == "failed"
+    assert "d001_r1.csv" in bad["error"]
+    good = table[table["status"] != "failed"]
+    expected = truth.set_index("device").loc[good["device"], "f_max"].to_numpy()
+    assert np.all(np.abs(good["f_max"] - expected) < 5.0 * good["u_f_max"])
+    assert good["temperature"].tolist() == pytest.approx(
+        truth.set_index("device").loc[good["device"], "temperature"].tolist()
+    )
+    assert (table["seconds"] > 0).all()
+
+
+def test_one_fit_a_run(tmp_path: Path) -> None:
+    make_tables(tmp_path, 2, runs=3)
+    table = di.campaign(definition(tmp_path, output__per="run"), jobs=1).table
+    assert table["run"].tolist() == ["r0", "r1", "r2"] * 2
+
+
+def test_a_second_run_does_only_what_is_missing_or_changed(tmp_path: Path) -> None:
+    make_tables(tmp_path, 4)
+    first = di.campaign(definition(tmp_path), jobs=1)
+    before = first.table
+    again = di.campaign(definition(tmp_path), jobs=1)
+    assert (len(again.finished), again.to_do) == (4, ())
+    pd.testing.assert_frame_equal(again.table, before)
+    other = di.load_dataset("noisy")
+    other.save(tmp_path / "d002_r0.csv", overwrite=True)
+    planned = di.campaign(definition(tmp_path), jobs=1, dry_run=True)
+    assert planned.to_do == ("d002",)
+    third = di.campaign(definition(tmp_path), jobs=1)
+    assert third.to_do == ("d002",)
+    changed = third.table["f_max"] != before["f_max"]
+    assert third.table["device"][changed].tolist() == ["d002"]
+
+
+def test_a_line_cut_off_by_a_crash_is_done_again(tmp_path: Path) -> None:
+    make_tables(tmp_path, 3)
+    before = di.campaign(definition(tmp_path), jobs=1).table
+    journal = tmp_path / "results" / "journal.jsonl"
+    journal.write_bytes(journal.read_bytes()[:-20])
+    again = di.campaign(definition(tmp_path), jobs=1)
+    assert len(again.to_do) == 1
+    pd.testing.assert_frame_equal(again.table.drop(columns=SECONDS), before.drop(columns=SECONDS))
+
+
+def test_changed_options_are_named_before_anything_runs(tmp_path: Path) -> None:
+    make_tables(tmp_path, 2)
+    di.campaign(definition(tmp_path), jobs=1)
+    with pytest.raises(DataError, match=r'fit was \{\}, now \{"noise": "absolute"\}'):
+        di.campaign(definition(tmp_path, fit__noise="absolute"), jobs=1)
+    redone = di.campaign(definition(tmp_path, fit__noise="absolute"), jobs=1, redo=True)
+    assert len(redone.to_do) == 2
+
+
+WRONG: Mapping[str, tuple[dict[str, Any], str]] = {
+    "no file": ({"files__pattern": "nowhere/{device}.csv"}, "finds no file"),
+    "no device": ({"files__pattern": "{name}.csv"}, r"has no \{device\}"),
+    "twice": ({"files__pattern": "{device}_{device}.csv"}, "names a field twice"),
+    "kind": ({"files__kind": "sheet"}, "expected record or response"),
+    "option": ({"fit__nose": "relative"}, r"unknown options in \[fit\]: nose"),
+    "table": ({"fitt__noise": "relative"}, "unknown tables: fitt"),
+    "extract": ({"extract__mode": "steps"}, "are not extracted"),
+    "covariates": ({"files__covariates": "none.csv"}, "cannot be read"),
+    "per": ({"output__per": "day"}, "expected device or run"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_definition_is_named_before_anything_runs(tmp_path: Path, case: str) -> None:
+    make_tables(tmp_path, 2)
+    changes, message = WRONG[case]
+    with pytest.raises(DataError, match=message):
+        di.campaign(definition(tmp_path, **changes), jobs=1)
+    assert not (tmp_path / "results").exists()
+
+
+def test_duplicates_and_missing_covariates_are_named(tmp_path: Path) -> None:
+    make_tables(tmp_path, 2)
+    (tmp_path / "x").mkdir()
+    (tmp_path / "x" / "d000_r0.csv").write_bytes((tmp_path / "d000_r0.csv").read_bytes())
+    (tmp_path / "y").mkdir()
+    (tmp_path / "y" / "d000_r0.csv").write_bytes((tmp_path / "d000_r0.csv").read_bytes())
+    both = {"pattern": f"{tmp_path.as_posix()}/{{day}}/{{device}}_{{run}}.csv", "kind": "response"}
+    with pytest.raises(DataError, match=r"both device 'd000', run 'r0'"):
+        di.campaign({"files": both, "model": [{"kind": "dahl"}]}, jobs=1)
+    rows = (tmp_path / "devices.csv").read_text().splitlines()
+    (tmp_path / "devices.csv").write_text("\n".join(rows[:2]) + "\n")
+    with pytest.raises(DataError, match="no row for device 'd001'"):
+        di.campaign(definition(tmp_path), jobs=1)
+    (tmp_path / "devices.csv").write_text("\n".join([*rows, rows[1]]) + "\n")
+    with pytest.raises(DataError, match="line 4 repeats"):
+        di.campaign(definition(tmp_path), jobs=1)
+
+
+def test_waveforms_with_content_sent_along_and_any_executor(tmp_path: Path) -> None:
+    record = di.load_dataset("plant_recording")
+    record.save(tmp_path / "p1.csv")
+    content = {
+        "files": {"pattern": f"{tmp_path.as_posix()}/{{device}}.csv"},
+        "extract": {"controlled": "force"},
+        "model": [{"kind": k} for k in ("dahl", "mass", "damper", "spring")],
+        "output": {"folder": str(tmp_path / "results"), "reports": True},
+    }
+    with ThreadPoolExecutor(1) as pool:
+        table = di.campaign(content, jobs=1, executor=pool, send_files=True).table
+    assert table["mass"].iloc[0] == pytest.approx(0.3, rel=2e-3)
+    assert (tmp_path / "results" / "reports" / table["report"].iloc[0]).stat().st_size > 1000
+
+
+def test_a_job_that_kills_its_process_is_a_row_and_costs_no_other(tmp_path: Path) -> None:
+    make_tables(tmp_path, 3)
+    tasks = read_definition(definition(tmp_path)).tasks
+    options = read_definition(definition(tmp_path)).options
+    jobs = [
+        (task.name, Job(task.name, tuple((str(p), None) for p in task.files), task.runs, options,
+                        None))
+        for task in tasks
+    ]  # fmt: skip
+    deadly = Job("deadly", _Deadly(), ("r",), options, None)
+    rows = dict(run_jobs([jobs[0], ("deadly", deadly), *jobs[1:]], 2))
+    assert rows["deadly"]["status"] == "failed"
+    assert "died" in rows["deadly"]["error"]
+    assert {rows[task.name]["status"] for task in tasks} == {"trusted"}
+
+
+class _Deadly(tuple[Any, ...]):
+    """Files that end the process that looks at them."""
+
+    def __iter__(self) -> Any:
+        os._exit(9)
+
+
+def test_a_killed_driver_loses_nothing(tmp_path: Path) -> None:
+    make_tables(tmp_path, 12)
+    undisturbed = di.campaign(definition(tmp_path, output__folder=str(tmp_path / "a")), jobs=1)
+    path = as_toml(tmp_path)
+    program = str(Path(sys.executable).with_name("dahl-ident"))
+    command = [program, "campaign", str(path), "--jobs", "2"]
+    journal = tmp_path / "results" / "journal.jsonl"
+    seen = 0
+    for _ in range(2):
+        run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        until = time.monotonic() + 60.0
+        while run.poll() is None and time.monotonic() < until:
+            now = len(journal.read_bytes().splitlines()) if journal.exists() else 0
+            if now > seen:
+                run.send_signal(signal.SIGKILL)
+                seen = now
+                break
+            time.sleep(0.02)
+        run.wait(timeout=60)
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, timeout=120)
+    table = pd.read_csv(tmp_path / "results" / "results.csv", dtype={"device": str})
+    expected = undisturbed.table.drop(columns=SECONDS)
+    pd.testing.assert_frame_equal(table.drop(columns=SECONDS), expected)
+    keys = [json.loads(line)["key"] for line in journal.read_bytes().splitlines()]
+    assert len(keys) == len(set(keys)) == 12, "what was finished is not repeated"
+
+
+CLUSTER = """
+from distributed import LocalCluster
+
+if __name__ == "__main__":
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+    ) as cluster:
+        print(cluster.scheduler_address, flush=True)
+        input()
+"""
+
+
+def test_a_dask_scheduler_reached_over_tcp_gives_the_serial_table(tmp_path: Path) -> None:
+    make_tables(tmp_path, 3)
+    serial = di.campaign(definition(tmp_path, output__folder=str(tmp_path / "a")), jobs=1)
+    (tmp_path / "cluster.py").write_text(CLUSTER)
+    path = as_toml(tmp_path)
+    program = str(Path(sys.executable).with_name("dahl-ident"))
+    with subprocess.Popen(
+        [sys.executable, str(tmp_path / "cluster.py")], text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+    ) as cluster:  # fmt: skip
+        assert cluster.stdout is not None
+        address = cluster.stdout.readline().strip()
+        assert address.startswith("tcp://127.0.0.1:")
+        command = [program, "campaign", str(path), "--scheduler", address, "--send-files"]
+        subprocess.run(command, check=True, capture_output=True, timeout=120)
+        cluster.communicate("\n", timeout=60)
+    table = pd.read_csv(tmp_path / "results" / "results.csv", dtype={"device": str})
+    expected = serial.table.drop(columns=SECONDS)
+    pd.testing.assert_frame_equal(table.drop(columns=SECONDS), expected)
+
+
+def test_command_line(tmp_path: Path, run: Runner) -> None:
+    make_tables(tmp_path, 4)
+    path = as_toml(tmp_path)
+    plan = run("campaign", str(path), "--dry-run")
+    assert "to do: d003" in plan.out
+    report = tmp_path / "campaign.html"
+    done = run("campaign", str(path), "--jobs", "1", "--report", str(report), "--json")
+    assert json.loads(done.out)["to_do"] == ["d000", "d001", "d002", "d003"]
+    assert b"Population: f_max" in report.read_bytes()
+
+
+# Population
+
+
+def simulated(seed: int, devices: int, runs: int, **truth: float) -> tuple[pd.DataFrame, Any]:
+    rng = np.random.default_rng(seed)
+    t = rng.uniform(-1.0, 1.0, devices)
+    level = np.log(0.1) + truth["slope"] * t + rng.normal(0.0, truth["tau"], devices)
+    y = np.repeat(level, runs) + rng.normal(0.0, truth["omega"], devices * runs)
+    y = y + rng.normal(0.0, truth["u"], y.size)
+    names = [f"d{i:03}" for i in range(devices)]
+    table = pd.DataFrame(
+        {
+            "device": np.repeat(names, runs), "status": "trusted", "unit_f_max": "N",
+            "f_max": np.exp(y), "u_f_max": truth["u"] * np.exp(y), "t": np.repeat(t, runs),
+        }
+    )  # fmt: skip
+    return table, (level, np.log(0.1) + truth["slope"] * t.mean())
+
+
+def test_population_covers_mean_scatter_and_slope_and_shrinks_errors() -> None:
+    truth = {"slope": 0.1, "tau": 0.05, "omega": 0.0, "u": 0.04}
+    sets, hits, errors = 100, np.zeros(3), np.zeros(2)
+    for seed in range(sets):
+        table, (level, mean) = simulated(seed, 15, 1, **truth)
+        found = population(table, covariates=["t"])["f_max"]
+        value, u = found.coefficients["mean"]
+        slope, u_slope = found.coefficients["t"]
+        _, low, high = found.between_devices
+        hits += [abs(value - mean) < 2 * u, abs(slope - 0.1) < 2 * u_slope, low < 0.05 < high]
+        errors += [
+            np.sum((np.log(found.devices[c].to_numpy()) - level) ** 2) for c in ("shrunken", "own")
+        ]
+    # 95.45 % of 100: fewer than 89 once in 250
+    assert (hits >= 89).all(), hits
+    assert errors[0] < 0.85 * errors[1]
+
+
+def test_scatter_between_runs_is_distinguished_from_that_between_devices() -> None:
+    table, _ = simulated(3, 40, 4, slope=0.0, tau=0.05, omega=0.02, u=0.005)
+    found = population(table)["f_max"]
+    assert found.between_devices[1] < 0.05 < found.between_devices[2]
+    assert found.between_runs[1] < 0.02 < found.between_runs[2]
+    assert found.between_runs[2] < 0.03
+
+
+def test_outlying_devices_are_found_and_false_alarms_are_rare() -> None:
+    alarms = 0
+    for seed in range(100):
+        table, _ = simulated(seed, 12, 1, slope=0.0, tau=0.03, omega=0.0, u=0.01)
+        alarms += bool(population(table)["f_max"].outlying)
+    assert alarms <= 5  # 1 % of 100: more than 5 once in 2,000
+    table, _ = simulated(7, 30, 1, slope=0.0, tau=0.03, omega=0.0, u=0.01)
+    table.loc[[4, 9], "f_max"] *= [1.4, 0.7]
+    assert population(table)["f_max"].outlying == ("d004", "d009")
+
+
+def test_control_charts_alarm_at_a_drift_and_seldom_without() -> None:
+    alarms = caught = 0
+    for seed in range(50):
+        table, _ = simulated(seed, 60, 1, slope=0.0, tau=0.02, omega=0.0, u=0.005)
+        alarms += len(population(table)["f_max"].out_of_control)
+        table.loc[50:, "f_max"] *= 1.05  # for 10 fits, two and a half standard deviations
+        caught += any(i >= 50 for i in population(table)["f_max"].out_of_control)
+    # limits from moving ranges of 60 fits and two charts: about 1 alarm in 120
+    assert alarms <= 45
+    assert caught >= 45
+
+
+def test_a_moving_range_chart_by_hand() -> None:
+    table, _ = simulated(1, 3, 1, slope=0.0, tau=0.02, omega=0.0, u=0.005)
+    table["f_max"] = np.exp([1.0, 1.2, 0.9])
+    fits = population(table)["f_max"].fits
+    sigma = 0.5 * (0.2 + 0.3) / 1.128379
+    assert fits["limit"].iloc[0] == pytest.approx(3.0 * sigma, rel=1e-6)
+    mean = 3.1 / 3.0
+    first = mean + 0.2 * (1.0 - mean)
+    assert fits["ewma"].tolist()[:2] == pytest.approx([first, first + 0.2 * (1.2 - first)])
+    assert fits["ewma_limit"].iloc[0] == pytest.approx(2.86 * sigma * 0.2)
+
+
+def test_population_matches_a_direct_likelihood() -> None:
+    """The sums per device give the restricted likelihood of the full covariance matrix."""
+    from dahl_ident.campaigns.population import _Sums
+
+    rng = np.random.default_rng(0)
+    device = np.array([0, 0, 1, 2, 2, 2, 3])
+    X = np.column_stack([np.ones(7), rng.normal(size=7)])
+    y, u2 = rng.normal(size=7), rng.uniform(0.1, 0.4, 7)
+    tau, omega = 0.7, 0.3
+    V = np.diag(u2 + omega**2) + tau**2 * (device[:, None] == device)
+    W = np.linalg.inv(V)
+    A, b = X.T @ W @ X, X.T @ W @ y
+    rest = y @ W @ y - b @ np.linalg.solve(A, b)
+    direct = -0.5 * (np.linalg.slogdet(V)[1] + np.linalg.slogdet(A)[1] + rest)
+    found = _Sums(y, u2, X, device, 4).weighted(tau, omega)
+    np.testing.assert_allclose(found[0], A, rtol=1e-12)
+    np.testing.assert_allclose(found[1], b, rtol=1e-12)
+    assert found[2] == pytest.approx(direct, rel=1e-12)
+
+
+def test_wrong_tables_are_named() -> None:
+    table, _ = simulated(0, 5, 1, slope=0.0, tau=0.02, omega=0.0, u=0.01)
+    cases: list[tuple[pd.DataFrame, dict[str, Any], type[DahlIdentError], str]] = [
+        (table.drop(columns="u_f_max"), {}, DataError, "no parameter with an uncertainty"),
+        (table.drop(columns="device"), {}, DataError, "no column device"),
+        (table, {"covariates": ["heat"]}, DataError, "no column heat"),
+        (table.assign(t=1.0), {"covariates": ["t"]}, ValidationError, "constant"),
+        (table.assign(status="failed"), {}, DataError, "0 devices have usable"),
+        (table.assign(u_f_max=0.0), {}, DataError, "not above zero"),
+        (table.assign(f_max=np.nan), {}, DataError, "expected a number"),
+    ]
+    for frame, how, error, message in cases:
+        with pytest.raises(error, match=message):
+            population(frame, **how)
+
+
+def test_report_of_a_campaign(tmp_path: Path) -> None:
+    table, _ = simulated(2, 10, 1, slope=0.1, tau=0.05, omega=0.0, u=0.01)
+    table.loc[3, "status"] = "not determined"
+    found = population(table, covariates=["t"])
+    table["report"] = table["device"] + ".html"
+    folder = tmp_path / "results" / "reports"
+    page = write_campaign_report(table, found, tmp_path / "c.html", reports=folder).read_text()
+    assert '<a href="results/reports/d002.html">d002</a>' in page
+    assert "Population: f_max" in page
+    assert "d003: not determined" in page
+    assert write_campaign_report(table, None, tmp_path / "c.pdf").read_bytes().startswith(b"%PDF")

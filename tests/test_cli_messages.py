@@ -1,0 +1,32 @@
+"""Messages of the library reach the command line in the words of its options."""
+
+from __future__ import annotations
+
+import pytest
+
+from dahl_ident.cli.console import in_options
+
+
+@pytest.mark.parametrize(
+    ("message", "shown"),
+    [
+        (
+            "record longer, give frequency=, or mode='sweep'",
+            "record longer, give --frequency, or --mode 'sweep'",
+        ),
+        ("or lower min_share= if it is noise", "or lower --min-share if it is noise"),
+        ("give frequency=1.25, or leave it out", "give --frequency 1.25, or leave it out"),
+        ("it: di.fit(record, model)", "it: dahl-ident fit"),
+        ("a = b, x=", "a = b, --x"),
+        (
+            "Name it with columns={'gain': ...}",
+            'Name it with --columns map.toml, a file with the line: gain = "..."',
+        ),
+        (
+            "or give columns={'gain': {'column': 'K', 'unit': 'N/m'}}",
+            'or give --columns map.toml, a file with the line: gain = {column = "K", unit = "N/m"}',
+        ),
+    ],
+)
+def test_arguments_become_options(message: str, shown: str) -> None:
+    assert in_options(message) == shown

@@ -1,0 +1,68 @@
+"""``dahl-ident plan``: the same numbers as in Python, and files that can be used."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dahl_ident as di
+from tests.command_line import Runner
+
+BENCH = ("--frequency-hz", "5", "--displacement", "3e-4,3e-2", "--noise", "0.02")
+RANGES = ("--ranges", "f_max=0.09,0.11", "--ranges", "sigma=27,33")
+
+
+def test_a_plan_from_ranges_is_that_of_python(run: Runner) -> None:
+    outcome = run("plan", *BENCH, *RANGES, "--target", "f_max=0.01", "--alpha", "1", "--json")
+    assert outcome.status == 0, outcome.err
+    plan = di.plan(
+        di.Dahl(alpha=1.0),
+        ranges={"f_max": (0.09, 0.11), "sigma": (27.0, 33.0)},
+        limits={"frequency_hz": 5.0, "displacement": (3e-4, 3e-2)},
+        noise=0.02,
+        target={"f_max": 0.01},
+    )
+    told = json.loads(outcome.out)
+    assert told["seconds"] == plan.seconds
+    assert told["steps"][0]["level"] == plan.steps[0].level
+
+
+def test_a_saved_fit_is_continued_and_files_are_written(run: Runner) -> None:
+    table = run("datasets", "noisy", "-o", "-").out
+    assert run("fit", "-", "--alpha", "1", "--save", "fit.json", stdin=table).status == 0
+    outcome = run(
+        "plan", "fit.json", "--frequency-hz", "5", "--displacement", "3e-4,3e-2", "--time", "20",
+        "--table", "levels.csv", "--waveform", "exciter.csv", "--sample-rate", "100",
+    )  # fmt: skip
+    assert outcome.status == 0, outcome.err
+    assert outcome.out.startswith("2 levels in 20 s.")
+    assert np.loadtxt("exciter.csv", delimiter=",", skiprows=1).shape == (2001, 4)
+    assert len(Path("levels.csv").read_text().splitlines()) == 3
+
+
+def test_a_target_out_of_reach_ends_with_3(run: Runner) -> None:
+    outcome = run("plan", *BENCH, *RANGES, "--target", "f_max=1e-5", "--time", "20")
+    assert outcome.status == 3
+    assert "does NOT reach what is wanted" in outcome.out
+    assert "the limit of time prevents it" in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--time", "9"), "nothing is known of f_max, sigma; give --ranges"),
+        ((*RANGES, "--target", "f_max=a"), "f_max is 'a'; expected a number"),
+        ((*RANGES, "--target", "f_max=1", "--target", "sigma"), "with and without a number"),
+        ((*RANGES, "--waveform", "w.csv"), "--waveform and --sample-rate go together"),
+        (("nothing.json", "--mass", "1"), "a saved fit has its model and sensors"),
+    ],
+)
+def test_bad_input_says_what_was_expected(
+    run: Runner, options: tuple[str, ...], message: str
+) -> None:
+    outcome = run("plan", *BENCH, *options)
+    assert outcome.status == 1
+    assert message in outcome.err

@@ -1,0 +1,146 @@
+"""Where the uncertainty of a parameter comes from: variances, budget, coverage factor."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from dahl_ident import Dahl, FrequencyResponse, Sensors, Spring, fit
+from dahl_ident.diagnostics import ErrorModel, budget, error_model
+from dahl_ident.diagnostics.budget import coverage_factor
+from dahl_ident.diagnostics.variance_components import LinearModel, variance_components
+from dahl_ident.errors import FitError
+from tests.friction_tables import FRICTION, X_C, relative_noise, table
+
+
+def modelled(data: FrequencyResponse, model: Dahl | None = None) -> ErrorModel:
+    found = error_model(fit(data, Dahl() if model is None else model).optimum)
+    assert found is not None
+    return found
+
+
+def three_days(scatter: float, seed: int) -> FrequencyResponse:
+    """Return twelve levels on each of three days whose gain differs."""
+    rng = np.random.default_rng(seed)
+    A = np.tile(np.geomspace(0.1, 10.0, 12) * X_C, 3)
+    gain = np.repeat(np.exp(scatter * rng.standard_normal(3)), 12)
+    N = FRICTION.describing_function(A) * gain * relative_noise(36, 0.01, seed + 1)
+    return FrequencyResponse(np.ones(36), N, A, run=np.repeat(["mon", "tue", "wed"], 12))
+
+
+class TestVariances:
+    @staticmethod
+    def model(seed: int = 2, rows: int = 30) -> LinearModel:
+        rng = np.random.default_rng(seed)
+        day = np.repeat(np.eye(rows // 5), 5, axis=0)
+        J = np.column_stack([np.ones(rows), np.linspace(-1.0, 1.0, rows)])
+        y = 2.0 * day @ rng.standard_normal(rows // 5) + rng.standard_normal(rows)
+        return LinearModel(y, J, np.zeros(rows), [np.ones(rows), day])
+
+    def test_the_restricted_likelihood_is_highest(self) -> None:
+        """Against a general minimiser on the density of contrasts that J cannot change."""
+        model = self.model()
+        contrasts = np.linalg.svd(model.J, full_matrices=True)[0][:, 2:]
+
+        def minus_log_density(log_s: np.ndarray) -> float:
+            V = np.exp(log_s[0]) * np.eye(30) + np.exp(log_s[1]) * model.Z[1] @ model.Z[1].T
+            law = stats.multivariate_normal(np.zeros(28), contrasts.T @ V @ contrasts)
+            return -float(law.logpdf(contrasts.T @ model.y))
+
+        best = optimize.minimize(minus_log_density, np.zeros(2), method="Nelder-Mead")
+        found = variance_components(model, np.array([1.0, 0.0]))
+        np.testing.assert_allclose(found.variances, np.exp(best.x), rtol=0.02)
+
+    def test_a_source_that_is_not_there_has_no_variance(self) -> None:
+        model = self.model()
+        calm = LinearModel(
+            model.y - model.Z[1] @ (model.Z[1].T @ model.y) / 5.0, model.J, model.known, model.Z
+        )
+        assert variance_components(calm, np.array([1.0, 0.0])).variances[1] == 0.0
+
+    def test_compressed_rows_have_the_same_likelihood(self) -> None:
+        model, start = self.model(rows=60), np.array([1.0, 0.0])
+        whole, less = (variance_components(m, start) for m in (model, model.compressed(60)))
+        np.testing.assert_allclose(less.variances, whole.variances, rtol=1e-6)
+        np.testing.assert_allclose(less.covariance, whole.covariance, rtol=1e-6)
+
+
+class TestBudget:
+    def test_shares_add_up_and_name_their_type(self) -> None:
+        for row in (found := budget(fit(table(n=12), Dahl()).optimum)).parameters:
+            assert sum(r.share for r in row.rows) == pytest.approx(1.0)
+            assert row.u**2 == pytest.approx(sum(r.u**2 for r in row.rows))
+            assert pytest.approx(row.k * row.u) == row.U
+        kinds = {r.source: r.kind for r in found["f_max"].rows}
+        assert kinds["noise"] == "A"
+        assert kinds["exponent"] == "B"
+        assert found.exact[0] == "force calibration"
+
+    def test_an_exponent_that_was_given_is_no_source(self) -> None:
+        found = budget(fit(table(n=12), Dahl(alpha=1.0)).optimum)
+        assert "exponent" not in {r.source for r in found["f_max"].rows}
+
+    def test_an_exponent_that_was_not_given_widens_what_depends_on_it(self) -> None:
+        """In microslip f_max follows from alpha sigma^2/f_max: its logarithm is alpha's.
+
+        These data tell a little of the exponent, so that less than its whole range is left.
+        """
+        data = table(beta=(0.01, 0.1), n=60, noise=3e-3)
+        found = budget(fit(data, Dahl()).optimum)["f_max"]
+        exponent = next(r for r in found.rows if r.source == "exponent")
+        assert exponent.u / found.value == pytest.approx(np.log(4.0) / np.sqrt(12.0), rel=0.2)
+
+    def test_three_days_take_student_with_two_degrees_of_freedom(self) -> None:
+        scatter = []
+        for seed in range(8):
+            found = budget(fit(three_days(0.05, 100 + seed), Dahl()).optimum)["sigma"]
+            rows = {r.source: r for r in found.rows}
+            scatter.append(rows["scatter between runs"].u / found.value)
+            assert found.k > 3.0
+        assert np.sqrt(np.mean(np.square(scatter))) == pytest.approx(0.05 / np.sqrt(3.0), rel=0.4)
+
+    def test_a_stated_calibration_is_a_type_b_source(self) -> None:
+        sensors = Sensors(force_gain=stats.norm(1.0, 0.02))
+        found = budget(fit(table(n=12), Dahl(alpha=1.0), sensors=sensors).optimum)
+        row = next(r for r in found["f_max"].rows if r.source == "force calibration")
+        assert row.kind == "B"
+        assert row.u / found["f_max"].value == pytest.approx(0.02, rel=0.05)
+        assert "force calibration" not in found.exact
+
+    def test_forms(self) -> None:
+        found = budget(fit(table(n=12), Dahl()).optimum)
+        assert "combined" in str(found)
+        assert json.loads(json.dumps(found.to_dict()))["parameters"]["f_max"]["u"] > 0.0
+        frame = found.to_frame()
+        assert set(frame["source"]) >= {"noise", "combined"}
+        number = found.numbers()["f_max"]
+        assert number.std_dev == pytest.approx(found["f_max"].u)
+
+    def test_no_budget_of_what_is_undetermined(self) -> None:
+        result = fit(table(beta=(1e-3, 1e-2), seed=3), Dahl() + Spring(), throw=False)
+        with pytest.raises(FitError, match="no uncertainty budget"):
+            budget(result.optimum)
+
+    def test_coverage_factor(self) -> None:
+        assert coverage_factor(2.0, 0.95) == pytest.approx(stats.t(2).ppf(0.975))
+        assert coverage_factor(np.inf) == pytest.approx(2.0, abs=1e-3)
+
+
+class TestEstimate:
+    def test_a_wrong_exponent_is_found_under_its_range(self) -> None:
+        data = table(model=Dahl(0.1, 30.0, alpha=1.3), n=12, noise=0.01)
+        found = modelled(data)
+        for name, truth in (("f_max", 0.1), ("sigma", 30.0), ("alpha", 1.3)):
+            assert found.values[name] == pytest.approx(truth, abs=3.0 * found.stderr[name])
+        plain = fit(data, Dahl(alpha=1.0)).optimum
+        assert abs(plain.values[0] - 0.1) > 5.0 * plain.stderr["f_max"]
+
+    def test_large_tables_give_what_small_ones_give(self) -> None:
+        data = table(n=240, noise=0.01)
+        whole = modelled(data)
+        assert whole.linear.outside[1] > 0
+        few = modelled(data.select(rows=np.arange(240) % 2 == 0))
+        assert whole.stderr["sigma"] * 2.0**0.5 == pytest.approx(few.stderr["sigma"], rel=0.25)

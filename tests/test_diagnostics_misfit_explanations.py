@@ -1,0 +1,183 @@
+"""What misled a fit: wrong signs and single rows are named, and only where they are the cause."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit, load_dataset
+from dahl_ident.diagnostics.misfit_explanations import TURNS, Turn, neighbourhood
+from dahl_ident.elements import Element
+from dahl_ident.errors import FitError
+from tests.friction_tables import FRICTION, X_C, plant_table, relative_noise, table
+
+MODEL = Dahl() + Mass(0.3) + Damper() + Spring()
+CONJUGATED, NEGATED, BOTH = TURNS
+
+
+def scaled(data: FrequencyResponse, rows: list[int], factors: list[float]) -> FrequencyResponse:
+    R = data.response.copy()
+    R[rows] *= factors
+    return replace(data, response=R)
+
+
+def noisy() -> FrequencyResponse:
+    data = load_dataset("noisy")
+    assert isinstance(data, FrequencyResponse)
+    return data
+
+
+def test_a_sign_is_named_where_there_is_no_finite_optimum() -> None:
+    data = CONJUGATED(noisy())
+    with pytest.raises(FitError, match=r"^With the response conjugated .* No finite optimum"):
+        fit(data, Dahl())
+
+
+class TestRows:
+    def test_lead_the_verdict_where_they_alone_are_the_cause(self) -> None:
+        data = load_dataset("outliers")
+        assert isinstance(data, FrequencyResponse)
+        found = fit(data, Dahl())
+        kept = ~np.isin(np.arange(30), [18, 19, 27])  # as the data set was made
+        alone = fit(data.select(rows=kept), Dahl()).goodness.rms_misfit
+        first = found.statements[0]
+        assert "Only 3 of 30 rows (27, 19, 18) contradict" in first
+        assert (
+            f"the residuals are consistent with noise ({100.0 * alone:.2g} % rms misfit)" in first
+        )
+        assert 'a robust loss that down-weights them (loss="huber")' in first
+        assert "not linear Dahl" not in found.verdict
+        assert found.ndata == 60  # none is dropped
+        assert fit(data, Dahl(), loss="huber").trusted
+
+    def test_a_single_row(self) -> None:
+        first = fit(scaled(table(), [7], [2.0]), Dahl()).statements[0]
+        assert "Only row 7 contradicts the model" in first
+        assert "without it the residuals are consistent with noise" in first
+
+    @pytest.mark.parametrize(("fall", "explains"), [(2.0, False), (4.5, True)])
+    def test_explain_only_where_the_misfit_falls_to_a_third(
+        self, fall: float, explains: bool
+    ) -> None:
+        # n rows with errors s in gain and phase have a mean square misfit of 2 s^2, to which one
+        # that misses by d adds d^2/n; measured by its own size it is off by d/(1 - d)
+        n, s = 60, 0.01
+        missed = s * np.sqrt(2.0 * n * (fall**2 - 1.0))
+        off = missed / (1.0 - missed)
+        data = table(n=n, noise=s)
+        C = np.eye(2) * (s * np.abs(data.response))[:, None, None] ** 2
+        found = fit(scaled(replace(data, covariance=C), [31], [1.0 + off]), Dahl(), throw=False)
+        alone = fit(replace(data, covariance=C), Dahl()).goodness.rms_misfit
+        assert found.goodness.rms_misfit == pytest.approx(fall * alone, rel=0.25)
+        assert ("Only row 31 contradicts" in found.verdict) == explains
+
+    def test_do_not_lead_where_a_departure_is_left_without_them(self) -> None:
+        data = scaled(table(model=Dahl(0.1, 30.0, alpha=1.5)), [7, 19], [3.0, 0.3])
+        found = fit(data, Dahl())
+        assert {point.row for point in found.goodness.suspicious} >= {7, 19}
+        assert found.goodness.cause == ""
+        assert "The stated uncertainties include a misfit of" in found.statements[0]
+
+    def test_do_not_lead_where_they_lie_side_by_side(self) -> None:
+        """As where a stop is hit: the model may fail there, and a robust loss would hide it."""
+        found = fit(scaled(table(), [27, 28, 29], [1.3, 1.5, 1.8]), Dahl())
+        assert found.goodness.cause == ""
+        assert "The stated uncertainties include a misfit of" in found.verdict
+        assert "they are neighbours, amplitude from 0.0243 to 0.0333 m" in found.verdict
+
+    def test_rows_at_random_seldom_lie_side_by_side(self) -> None:
+        optimum, rng = fit(table(), Dahl()).optimum, np.random.default_rng(1)
+        for k in (2, 3):
+            rows = [rng.choice(30, k, replace=False).tolist() for _ in range(400)]
+            assert np.mean([neighbourhood(optimum, some) != "" for some in rows]) < 0.02
+        assert neighbourhood(optimum, [28, 29]).startswith("amplitude from")
+        assert neighbourhood(optimum, [3]) == ""
+
+
+class TestSign:
+    @pytest.mark.parametrize(
+        ("turn", "data", "model"),
+        [
+            *((turn, data, Dahl()) for turn in TURNS for data in (table(), noisy())),
+            (CONJUGATED, plant_table(), MODEL),
+        ],
+    )
+    def test_is_named_with_its_misfit(
+        self, turn: Turn, data: FrequencyResponse, model: Element
+    ) -> None:
+        right = fit(data, model).goodness
+        wrong = fit(turn(data), model, throw=False)
+        assert f"With the response {turn.name} the misfit falls from " in wrong.statements[0]
+        assert f"to {100.0 * right.rms_misfit:.2g} % rms: check " in wrong.statements[0]
+        assert "Do not use the numbers of this fit" in wrong.statements[0]
+        assert wrong.goodness.warnings[-1] == wrong.goodness.sign
+        assert not wrong.trusted
+        assert right.sign == ""
+
+    def test_the_data_s_covariances_turn_with_it(self) -> None:
+        """Turned by hand, from draws of amplitude, real and imaginary part."""
+        draws = np.random.default_rng(1).multivariate_normal(
+            np.zeros(3), [[1.0, 0.3, 0.2], [0.3, 2.0, 0.5], [0.2, 0.5, 1.0]], 50
+        )
+        for turn, signs in ((CONJUGATED, (1, -1)), (NEGATED, (-1, -1)), (BOTH, (-1, 1))):
+            before = np.cov(draws.T)
+            after = np.cov((draws * [1, *signs]).T)
+            data = FrequencyResponse(
+                [1.0],
+                [100.0 + 50.0j],
+                [10.0],
+                covariance=before[None, 1:, 1:],
+                amplitude_std=[np.sqrt(before[0, 0])],
+                amplitude_covariance=before[None, 0, 1:],
+            )
+            turned = turn(data)
+            assert turned.response[0] == complex(100.0 * signs[0], 50.0 * signs[1])
+            assert turned.covariance is not None
+            assert turned.amplitude_covariance is not None
+            np.testing.assert_allclose(turned.covariance[0], after[1:, 1:], rtol=1e-12)
+            np.testing.assert_allclose(turned.amplitude_covariance[0], after[0, 1:], rtol=1e-12)
+
+    def test_is_not_blamed_for_another_departure(self) -> None:
+        stiff = table(model=FRICTION + Spring(20.0))
+        lossless = table(beta=(1e-6, 1e-5))
+        for data in (table(model=Dahl(0.1, 30.0, alpha=2.0)), stiff, lossless):
+            assert fit(data, Dahl(), throw=False).goodness.sign == ""
+
+
+def test_the_error_of_an_exponent_asked_for_follows_the_scatter() -> None:
+    """A covariance that claims a third of the noise narrows the error no more."""
+    data = table(model=Dahl(0.1, 30.0, alpha=1.2), noise=0.03)
+    C = (0.03 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
+    told = [
+        fit(replace(data, covariance=C / 3.0**k), Dahl()).goodness.exponent for k in (0, 2)
+    ]  # fmt: skip
+    honest, claimed = told
+    assert honest is not None
+    assert claimed is not None
+    assert claimed.stderr == pytest.approx(honest.stderr, rel=0.4)
+    assert claimed.widened == pytest.approx(3.0, rel=0.4)
+    assert "(error widened " in str(claimed)
+
+
+class TestNoCause:
+    def test_a_missing_mass_is_no_wrong_sign(self) -> None:
+        """Far above resonance the response has the sign of the mass, and its loss that of all."""
+        A = np.geomspace(0.1, 10.0, 30) * X_C
+        Z = (FRICTION + Mass(1.0)).dynamic_stiffness(A, 4.0 * np.pi) * relative_noise(30, 0.01, 1)
+        found = fit(FrequencyResponse(np.full(30, 2.0), Z, A), Dahl(), throw=False).goodness
+        assert found.objections
+        assert found.cause == ""
+
+    def test_a_missing_mass_is_no_single_bad_row(self) -> None:
+        A, f = np.tile(np.geomspace(0.1, 10.0, 5) * X_C, 2), np.repeat([1.0, 4.0], 5)
+        Z = (FRICTION + Mass(0.01)).dynamic_stiffness(A, 2.0 * np.pi * f)
+        found = fit(FrequencyResponse(f, Z * relative_noise(10, 0.01, 0), A), Dahl())
+        assert found.goodness.suspicious
+        assert found.goodness.cause == ""
+
+    def test_the_last_row_may_be_where_the_model_ends(self) -> None:
+        found = fit(scaled(table(), [29], [1.5]), Dahl())
+        assert [point.row for point in found.goodness.suspicious] == [29]
+        assert found.goodness.cause == ""

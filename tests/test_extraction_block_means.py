@@ -1,0 +1,104 @@
+"""Block means of a densely sampled record: no bias, no loss, and single samples still judged."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import Record
+from dahl_ident.elements import Dahl
+from dahl_ident.errors import ExtractionError
+from dahl_ident.extraction import extract
+from dahl_ident.extraction.block_means import Samples
+from dahl_ident.extraction.sine_fit import sine_fit, steady_segment
+
+RATE, FREQUENCY, CYCLES = 10_000.0, 5.0, 12
+FRICTION = Dahl(f_max=0.1, sigma=30.0)
+
+
+def dense(noise: float = 0.0, seed: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return time, displacement and force at 2000 samples a cycle."""
+    t = np.arange(int(CYCLES * RATE / FREQUENCY)) / RATE
+    draws = noise * np.random.default_rng(seed).standard_normal((2, t.size))
+    x = 4e-3 * np.sin(2.0 * np.pi * FREQUENCY * t)
+    return t, x + 1e-3 * draws[0], FRICTION.force(x) + draws[1]
+
+
+def test_the_fit_of_block_means_is_exact_for_every_harmonic() -> None:
+    t, _, _ = dense()
+    theta = 2.0 * np.pi * FREQUENCY * t
+    true = [np.array([1.0 / k + 0.3j, 0.2 - 2.0j / k]) for k in range(1, 10)]
+    waves = sum(
+        np.real(y[:, None] * np.exp(1j * (k + 1) * (theta - theta[-1] / 2.0)))
+        for k, y in enumerate(true)
+    )
+    samples = Samples(t, *waves)
+    size = samples.block_size(FREQUENCY)
+    assert size == 7
+    segment = steady_segment(*samples.means(size), 2.0 * np.pi * FREQUENCY, size)
+    fit = sine_fit(segment)
+    turn = 2.0 * np.pi * FREQUENCY * (segment.centre - t[-1] / 2.0)
+    for k, y in enumerate(true):
+        np.testing.assert_allclose(
+            fit.phasors(k + 1), y * np.exp(1j * (k + 1) * turn), rtol=1e-9, atol=1e-10
+        )
+
+
+def test_points_are_those_of_least_squares_on_the_samples() -> None:
+    t, x, force = dense(1e-3)
+    data = extract(Record(t, displacement=x, force=force), frequency=FREQUENCY, settling_periods=2)
+    kept = t >= 2.0 / FREQUENCY
+    theta = 2.0 * np.pi * FREQUENCY * t[kept]
+    k = np.arange(1, 41)[:, None]
+    basis = np.vstack([np.ones(theta.size), theta, np.cos(k * theta), np.sin(k * theta)])
+    c = np.linalg.lstsq(basis.T, np.array([x[kept], force[kept]]).T, rcond=None)[0]
+    X, F = np.vstack([c[2:42] - 1j * c[42:]]).T
+    assert data.covariance is not None
+    for row, order in enumerate(data.harmonic.tolist()):
+        expected = F[order - 1] * (abs(X[0]) / X[0]) ** order / abs(X[0])
+        error = np.sqrt(0.5 * np.trace(data.covariance[row]))
+        assert abs(data.response[row] - expected) < 0.15 * error
+    assert data.quality["num_periods"][0] == CYCLES
+    assert data.quality["start_time"][0] == pytest.approx(0.4, abs=1e-3)
+
+
+@pytest.mark.parametrize("harmonic", [1, 9])
+def test_stated_errors_hold(harmonic: int) -> None:
+    """The scatter of 60 records over the stated variance, by chi-square bounds of 1 in 1000."""
+    errors, stated = [], []
+    exact = complex(*FRICTION.fourier_coefficients(4e-3, harmonic)) / 4e-3
+    for seed in range(60):
+        t, x, force = dense(1e-3, seed)
+        data = extract(
+            Record(t, displacement=x, force=force),
+            frequency=FREQUENCY, harmonics=[harmonic], settling_periods=2,
+        )  # fmt: skip
+        assert data.covariance is not None
+        errors.append(data.response[0] - exact.conjugate())
+        stated.append(np.trace(data.covariance[0]))
+    ratio = np.mean(np.abs(errors) ** 2) / np.mean(stated)
+    assert 0.63 < ratio < 1.52  # chi-square of 120 over 120, with 2 % for the stated variance
+
+
+def test_single_samples_are_judged() -> None:
+    t, x, force = dense(1e-5)
+    rounded = Record(t, displacement=np.round(x / 5e-4) * 5e-4, force=force)
+    assert extract(rounded).quality["displacement_steps"][0] == pytest.approx(8.0, rel=0.02)
+    clipped = Record(t, displacement=x, force=np.clip(force, -0.08, 0.08))
+    assert "force clipped" in extract(clipped).quality["verdict"][0]
+    buried = force + 0.2 * np.random.default_rng(1).standard_normal(t.size)
+    with pytest.raises(
+        ExtractionError, match=r"force .* the fundamental has 9\.\d* % of the power"
+    ):
+        extract(Record(t, displacement=x, force=buried))
+
+
+def test_uneven_samples_are_taken_as_they_are() -> None:
+    t, x, force = dense()
+    samples = Samples(t, x, force)
+    jitter = 0.2 / RATE * np.random.default_rng(0).standard_normal(t.size)
+    gap = np.delete(np.arange(t.size), slice(400, 700))
+    assert samples.block_size(30.0) == 1
+    assert Samples(t + jitter, x, force).block_size(FREQUENCY) == 1
+    assert Samples(t[gap], x[gap], force[gap]).block_size(FREQUENCY) == 1

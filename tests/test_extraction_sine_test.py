@@ -1,0 +1,97 @@
+"""Motion that is no sine test is refused, and the route for any motion named; sines are not."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import Record
+from dahl_ident.elements import Dahl
+from dahl_ident.errors import ExtractionError
+from dahl_ident.extraction import extract
+from dahl_ident.extraction.cycles import scattered
+from dahl_ident.extraction.segment_quality import sensor_step
+
+FRICTION = Dahl(f_max=20.0, sigma=2e4)
+RATE = 200.0
+
+
+def record(x: FloatArray, rate: float = RATE, start: float = 0.0) -> Record:
+    time = start + np.arange(x.size) / rate
+    noise = np.random.default_rng(0).standard_normal(x.size)
+    return Record(time, displacement=x, force=FRICTION.force(x) + 0.1 * noise)
+
+
+def random_motion(seed: int, low: float, high: float) -> FloatArray:
+    n = 12_000
+    spectrum = np.fft.rfft(np.random.default_rng(seed).standard_normal(n))
+    frequency = np.fft.rfftfreq(n, 1.0 / RATE)
+    spectrum[(frequency < low) | (frequency > high)] = 0.0
+    x = np.fft.irfft(spectrum, n)
+    return np.asarray(1e-3 * x / x.std())
+
+
+def strokes(seed: int) -> FloatArray:
+    """Return point-to-point motion: trapezoids of velocity, of strokes that differ, with rests."""
+    rng = np.random.default_rng(seed)
+    velocity = [np.zeros(50)]
+    for i in range(30):
+        stroke, top, rise = rng.uniform(0.05, 0.25), rng.uniform(0.1, 0.3), 0.2
+        length = round((stroke / top + rise) * RATE)
+        t = np.arange(length) / RATE
+        shape = np.clip(np.minimum(t, t[-1] - t) / rise, 0.0, 1.0)
+        velocity += [(-1) ** i * top * shape, np.zeros(rng.integers(10, 60))]
+    return np.cumsum(np.concatenate(velocity)) / RATE
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("kind", ["wide", "narrow", "strokes"])
+def test_any_other_motion_is_refused_and_the_route_named(kind: str, seed: int) -> None:
+    x = {
+        "wide": lambda: random_motion(seed, 1.0, 5.0),
+        "narrow": lambda: random_motion(seed, 2.0, 3.0),
+        "strokes": lambda: strokes(seed),
+    }[kind]()
+    with pytest.raises(ExtractionError, match=r"^not a sine test: ") as refused:
+        extract(record(x))
+    assert str(refused.value).endswith("fit the waveform itself: di.fit(record, model)")
+    assert "min_share" not in str(refused.value)
+
+
+def test_levels_far_apart_sweeps_and_a_sine_in_noise_are_sine_tests() -> None:
+    t = np.arange(12_000) / RATE
+    rng = np.random.default_rng(1)
+    levels = np.repeat(1e-3 * 0.5 ** np.arange(6), 2000) * np.sin(2.0 * np.pi * t)
+    sweep = 1e-3 * np.sin(2.0 * np.pi * (0.5 + 0.02 * t) * t)
+    hidden = 1e-3 * (np.sin(2.0 * np.pi * 1.7 * t) + 0.5 * rng.standard_normal(t.size))
+    for x in (levels, sweep, hidden):
+        force = 3e3 * x + 1e-3 * rng.standard_normal(t.size)
+        assert extract(Record(t, displacement=x, force=force), harmonics=[1]).n >= 1
+    with pytest.raises(ExtractionError, match=r"^force around .* the fundamental has"):
+        extract(Record(t, displacement=hidden, force=rng.standard_normal(t.size)))
+
+
+def test_times_in_messages_count_from_the_start_of_the_record() -> None:
+    t = np.arange(4000) / RATE
+    rest = 1e-6 * np.sin(2.0 * np.pi * 31.0 * t[:1000])
+    x = np.concatenate([np.sin(2.0 * np.pi * t), rest, 0.5 * np.sin(2.0 * np.pi * t)])
+    force = np.concatenate([3.0 * x[:5000], np.random.default_rng(0).standard_normal(4000)])
+    with pytest.warns(UserWarning, match=r"left out: force around") as said:
+        data = extract(Record(1.7e9 + np.arange(9000) / RATE, displacement=x, force=force))
+    found = re.search(r"around t = ([0-9.]+) s", str(said[0].message))
+    assert found is not None
+    assert 30.0 < float(found[1]) < 40.0
+    assert data.quality["start_time"][0] == pytest.approx(1.7e9, abs=2.0)
+
+
+@pytest.mark.parametrize("samples_a_cycle", [200, 400, 1000])
+def test_a_look_at_some_samples_sees_all_phases_of_a_period(samples_a_cycle: int) -> None:
+    """A plain stride of 50 would see 4, 8 and 20 phases, and take them for steps of a sensor."""
+    x = 1e-3 * np.sin(2.0 * np.pi * np.arange(1_000_000) / samples_a_cycle)
+    seen = scattered(x, 20_000)
+    assert seen.size == 20_000
+    assert np.unique(np.round(seen, 9)).size == np.unique(np.round(x, 9)).size
+    assert sensor_step(x) == 0.0

@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.extraction_validation import (
+    FRICTION,
+    Noise,
+    descending,
+    one_over_f,
+    settling,
+    steady,
+    white,
+)
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.extraction import extract
+from dahl_ident.extraction.sine_fit import SineFit, sine_fit, steady_segment
+from dahl_ident.extraction.transient import Transient, estimate_transient
+
+PER_CYCLE = 200
+
+
+def departing(
+    beta: float, cycles: int, start_force: float, noise: float = 0.0
+) -> tuple[SineFit, complex]:
+    """Fit a segment that starts with some force, and return the exact response too."""
+    theta: FloatArray = 1.1 + 2.0 * np.pi / PER_CYCLE * np.arange(cycles * PER_CYCLE, dtype=float)
+    turns = np.pi * np.arange(1.0, np.ceil(theta[-1] / np.pi))
+    order = np.argsort(np.concatenate([theta, turns]), kind="stable")
+    x = beta * np.cos(np.concatenate([theta, turns])[order])
+    force = np.empty(order.size)
+    force[order] = FRICTION.force(x, start_force)
+    rng = np.random.default_rng(1)
+    measured = force[: theta.size] + noise * rng.standard_normal(theta.size)
+    channels = np.stack([beta * np.cos(theta), measured])
+    time = np.arange(theta.size) / PER_CYCLE
+    return sine_fit(steady_segment(time, channels, 2.0 * np.pi)), complex(
+        FRICTION.describing_function(beta)
+    )
+
+
+def estimated(fit: SineFit) -> tuple[Transient, complex]:
+    X, force = fit.phasors(1)
+    transient = estimate_transient(fit, 1, float(np.angle(X)), complex(force / X))
+    return transient, complex(transient.phasors(fit)[1] / X)
+
+
+@pytest.mark.parametrize("cycles", [3, 10, 40])
+@pytest.mark.parametrize("beta", [0.02, 0.1, 0.3, 1.0])
+def test_departure_and_rate_are_found_in_the_mean_of_the_force(beta: float, cycles: int) -> None:
+    fit, _ = departing(beta, cycles, 0.9, noise=1e-5)
+    loop_force = steady(beta, np.array([1.1, 1.2]))[1][0]
+    transient, _ = estimated(fit)
+    assert transient.significant
+    assert transient.rate == pytest.approx(4.0 * beta, rel=0.05)
+    assert transient.departure == pytest.approx(0.9 - loop_force, rel=0.05)
+
+
+@pytest.mark.parametrize("cycles", [3, 10, 40])
+@pytest.mark.parametrize("beta", [0.02, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0])
+def test_bias_of_the_response_is_predicted(beta: float, cycles: int) -> None:
+    fit, exact = departing(beta, cycles, 0.9, noise=1e-6)
+    X, force = fit.phasors(1)
+    bias = force / X - exact
+    _, predicted = estimated(fit)
+    assert abs(bias) > 1e-4 * abs(exact)
+    assert abs(predicted - bias) < 0.25 * abs(bias)
+
+
+def test_a_settled_stretch_has_no_departure() -> None:
+    rng = np.random.default_rng(3)
+    found = 0
+    for beta in (0.05, 0.3, 3.0, 30.0):
+        for _ in range(25):
+            n = 10 * PER_CYCLE
+            x, force = steady(beta, 0.3 + 2.0 * np.pi / PER_CYCLE * np.arange(n, dtype=np.float64))
+            channels = np.stack([x, force + 0.01 * rng.standard_normal(n)])
+            fit = sine_fit(steady_segment(np.arange(n) / PER_CYCLE, channels, 2.0 * np.pi))
+            found += estimated(fit)[0].significant
+    assert found <= 4
+
+
+def test_a_drifting_sensor_is_no_memory_where_friction_forgets_fast() -> None:
+    n = 20 * PER_CYCLE
+    time = np.arange(n, dtype=np.float64) / PER_CYCLE
+    x, force = steady(3.0, 2.0 * np.pi * time)
+    rng = np.random.default_rng(0)
+    drifting = force + 0.005 * time + 1e-3 * rng.standard_normal(n)
+    data = extract(Record(time, displacement=x, force=drifting), harmonics=(1,))
+    assert data.quality["settled"].tolist() == [True]
+    assert data.response[0] == pytest.approx(FRICTION.describing_function(3.0), rel=1e-3)
+
+
+@pytest.mark.parametrize("noise", [white, one_over_f])
+@pytest.mark.parametrize("fixed", [True, False])
+def test_verdicts_on_descending_levels_with_too_few_cycles(noise: Noise, fixed: bool) -> None:
+    result = settling(8, seed=11, noise=noise, fixed=fixed)
+    assert result.found > 0.95
+    assert result.biased > 0
+    assert result.caught >= 0.95
+    assert result.flagged <= 0.05
+
+
+def test_more_periods_is_what_was_missing() -> None:
+    levels = np.array([1.0, 0.05])
+    rng = np.random.default_rng(8)
+
+    def extracted(cycles: int, left_out: int) -> FrequencyResponse:
+        t, x, force = descending(levels, cycles, 100)
+        noisy = force + 1e-5 * rng.standard_normal(t.size)
+        record = Record(t, displacement=x, force=noisy)
+        return extract(record, harmonics=(1,), settling_periods=left_out)
+
+    early = extracted(8, 1)
+    more = int(early.quality["more_periods"][1])
+    assert not early.quality["settled"][1]
+    assert more > 5
+    assert early.quality["verdict"][1] == f"not settled, {more} more periods"
+    assert extracted(11 + more, 4 + more).quality["settled"][1]
+    assert not extracted(8 + more // 2, 1 + more // 2).quality["settled"][1]
+
+
+def test_settling_periods_are_left_out_by_themselves() -> None:
+    t, x, force = descending(np.array([1.0, 0.3, 0.03]), 60, 100)
+    rng = np.random.default_rng(2)
+    noisy = force + 1e-4 * rng.standard_normal(t.size)
+    data = extract(Record(t, displacement=x, force=noisy), harmonics=(1,))
+    left_out = data.quality["settling_periods"]
+    assert data.quality["settled"].all()
+    assert left_out[2] > left_out[1] > 0
+    assert data.amplitude is not None
+    assert data.covariance is not None
+    errors = np.abs(data.response - FRICTION.describing_function(data.amplitude))
+    assert (errors < 4.0 * np.sqrt(np.trace(data.covariance, axis1=1, axis2=2))).all()

@@ -1,0 +1,216 @@
+"""A law that is written in ten lines is estimated like any other: no guess, every method."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import optimize
+
+import dahl_ident as di
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import Element
+from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.fitting import Optimum, Status, solve, solve_many
+from dahl_ident.fitting.ipopt import solve_ipopt
+from dahl_ident.problem import Problem, ProblemBatch
+
+
+def positive(name: str, unit: str) -> di.Parameter:
+    return di.Parameter(name, unit, name, lower=0.0, transform="log")
+
+
+class ByForce(di.Friction):
+    """The elastoplastic element by its stiffness and its limit."""
+
+    parameters = (positive("stiff", "N/m"), positive("f_max", "N"))
+    scale_parameters = ("stiff", "f_max")
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        stiff, f_max = values
+        return stiff * (direction * force < f_max)
+
+
+class BySlip(di.Friction):
+    """The same by its stiffness and the displacement at which it slips."""
+
+    parameters = (positive("stiff", "N/m"), positive("delta", "m"))
+    scale_parameters = ("stiff",)
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        stiff, delta = values
+        return stiff * (direction * force < stiff * delta)
+
+
+class OneWay(di.Friction):
+    """Saturates on the rising side only at twice the force."""
+
+    parameters = (positive("stiff", "N/m"), positive("f_max", "N"))
+    scale_parameters = ("stiff", "f_max")
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        stiff, f_max = values
+        return stiff * (1.0 - direction * force / (f_max * (1.5 + 0.5 * direction)))
+
+
+def jenkins(amplitude: FloatArray, stiff: float, delta: float) -> ComplexArray:
+    """Return N of the elastoplastic element, in closed form."""
+    m = np.minimum(delta / amplitude, 1.0)
+    t = np.arccos(1.0 - 2.0 * m)
+    real = stiff / np.pi * (t - np.sin(t) * np.cos(t))
+    return np.asarray(real + 4j * stiff / np.pi * m * (1.0 - m))
+
+
+STIFF, DELTA = 30.0, 3e-3
+MASS, DAMPING, SPRING = 0.3, 0.24, 0.5
+TRUTH = {"stiff": STIFF, "delta": DELTA, "f_max": STIFF * DELTA}
+TRUTH |= {"mass": MASS, "damping": DAMPING, "stiffness": SPRING}
+
+
+def noisy(values: FloatArray | ComplexArray, level: float = 0.005, seed: int = 1) -> ComplexArray:
+    rng = np.random.default_rng(seed)
+    return np.asarray(
+        values
+        * np.exp(level * (rng.normal(size=values.shape) + 1j * rng.normal(size=values.shape)))
+    )
+
+
+def alone() -> di.FrequencyResponse:
+    A = np.geomspace(3e-4, 1e-1, 30)
+    return di.FrequencyResponse(np.ones(30), noisy(jenkins(A, STIFF, DELTA)), A)
+
+
+def plant(controlled: str) -> di.FrequencyResponse:
+    A = np.tile(np.geomspace(1e-3, 3e-2, 5), 4)
+    f = np.repeat(np.geomspace(0.3, 3.0, 4), 5)
+    omega = 2.0 * np.pi * f
+    Z = jenkins(A, STIFF, DELTA) + SPRING - MASS * omega**2 + 1j * DAMPING * omega
+    if controlled == "displacement":
+        return di.FrequencyResponse(f, noisy(Z), A)
+    return di.FrequencyResponse(
+        f, noisy(1.0 / Z), drive=A * np.abs(Z), controlled="force", quantity="receptance"
+    )
+
+
+def assert_truth(found: Optimum) -> None:
+    assert found.status is Status.CONVERGED
+    expected = np.array([TRUTH[name] for name in found.names])
+    spread = np.sqrt(np.diagonal(found.values_covariance))
+    assert np.all(np.abs(found.values - expected) < 5.0 * spread)
+    assert np.all(spread < 0.1 * np.abs(expected))
+
+
+@pytest.mark.parametrize(
+    ("law", "data"),
+    [(ByForce, "alone"), (BySlip, "alone"), (BySlip, "displacement"), (ByForce, "force")],
+)
+def test_a_law_of_ten_lines_is_found_without_a_guess_by_every_method(
+    law: type[di.Friction], data: str
+) -> None:
+    table = alone() if data == "alone" else plant(data)
+    model: Element = law() if data == "alone" else law() + di.Mass() + di.Damper() + di.Spring()
+    problem = Problem(table, model)
+    by_lm = solve(problem)
+    assert_truth(by_lm)
+    assert by_lm.method == "lm"
+    others = {"ipopt": solve_ipopt(problem), "scipy": solve(problem, method="scipy")}
+    for method, other in others.items():
+        assert other.method == method
+        assert_truth(other)
+        assert other.cost == pytest.approx(by_lm.cost, rel=1e-6)
+        np.testing.assert_allclose(other.values, by_lm.values, rtol=1e-4)
+
+
+def test_random_problems_over_twelve_decades_are_recovered() -> None:
+    rng = np.random.default_rng(5)
+    for index in range(12):
+        stiff, delta = 10.0 ** rng.uniform(-6.0, 6.0, 2)
+        n = int(rng.integers(8, 30))
+        A = delta * 10.0 ** np.sort(rng.uniform(-0.3, rng.uniform(0.5, 2.0), n))
+        data = di.FrequencyResponse(np.ones(n), noisy(jenkins(A, stiff, delta), 1e-3, index), A)
+        law = (ByForce, BySlip)[index % 2]()
+        found = solve(Problem(data, law))
+        truth = np.array([stiff, delta if index % 2 else stiff * delta])
+        assert found.success
+        spread = np.sqrt(np.diagonal(found.covariance))
+        assert np.all(np.abs(np.log(found.values / truth)) < 6.0 * spread + 1e-4)
+
+
+@pytest.mark.parametrize("law", [ByForce, BySlip])
+def test_a_law_that_never_slips_says_which_parameter_runs_away(law: type[di.Friction]) -> None:
+    A = np.geomspace(1e-7, 1e-5, 20)
+    data = di.FrequencyResponse(np.ones(20), noisy(jenkins(A, STIFF, DELTA)), A)
+    found = solve(Problem(data, law(), noise="absolute"))
+    assert found.status is Status.RUNS_AWAY
+    lost = found.names[1]
+    assert found.values[1] == np.inf
+    assert f"{lost} without bound" in found.message
+    (kept,) = found.combinations
+    assert kept.expression == "stiff"
+    assert kept.value == pytest.approx(STIFF, abs=5.0 * kept.stderr)
+
+
+def test_a_law_that_always_slips_determines_its_force() -> None:
+    A = np.geomspace(1e5, 1e7, 20) * DELTA
+    Z = 1j * np.exp(0.01j) * 4.0 / np.pi * STIFF * DELTA / A  # a stiffness a little below zero
+    for law, expression in ((ByForce, "f_max"), (BySlip, "stiff delta")):
+        found = solve(Problem(di.FrequencyResponse(np.ones(20), Z, A), law(), noise="relative"))
+        assert found.status is Status.RUNS_AWAY
+        (kept,) = found.combinations
+        assert kept.expression == expression
+        assert kept.value == pytest.approx(STIFF * DELTA, rel=0.01)
+
+
+def test_like_elements_of_any_law_are_ordered_by_their_knees() -> None:
+    A = np.geomspace(1e-4, 1e-1, 24)
+    Z = jenkins(A, 20.0, 1e-2) + jenkins(A, 30.0, 8e-4)
+    data = di.FrequencyResponse(np.ones(24), noisy(Z, 1e-3), A)
+    found = solve(Problem(data, BySlip(name="first") + BySlip(name="second")))
+    assert found.names[1::2] == ("first_delta", "second_delta")
+    np.testing.assert_allclose(found.values, [30.0, 8e-4, 20.0, 1e-2], rtol=0.03)
+
+
+def test_a_batch_of_a_law_equals_its_tables_one_by_one() -> None:
+    A = np.geomspace(3e-4, 1e-1, 20)
+    tables = [
+        di.FrequencyResponse(np.ones(20), noisy(jenkins(A, STIFF, d), seed=i), A)
+        for i, d in enumerate((1e-3, 3e-3, 1e-2))
+    ]
+    together = solve_many(ProblemBatch(tables, BySlip()))
+    for one, table in zip(together, tables, strict=True):
+        np.testing.assert_allclose(one.values, solve(Problem(table, BySlip())).values, rtol=1e-5)
+
+
+def test_method_names_what_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    original = optimize.least_squares
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        calls.append(options["x_scale"])
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(optimize, "least_squares", counted)
+    A = np.geomspace(1e-4, 1e-1, 20)
+    data = di.FrequencyResponse(np.ones(20), noisy(di.Dahl(0.1, 30.0).describing_function(A)), A)
+    by_lm = di.fit(data, di.Dahl())
+    assert (by_lm.method, len(calls)) == ("lm", 0)
+    by_scipy = di.fit(data, di.Dahl(), method="scipy")
+    assert by_scipy.method == "scipy"
+    assert len(calls) >= 1
+    np.testing.assert_allclose(by_scipy.optimum.values, by_lm.optimum.values, rtol=1e-6)
+    with pytest.raises(ValidationError, match="method is 'newton'; expected lm or scipy"):
+        solve(Problem(data, di.Dahl()), method="newton")
+
+
+def test_even_harmonics_take_part_where_a_law_has_them() -> None:
+    law = OneWay(30.0, 0.1)
+    A = np.geomspace(1e-3, 1e-1, 12)
+    Z = [law.dynamic_stiffness(a, harmonic=k) for a in A for k in (1, 2)]
+    both = di.FrequencyResponse(np.ones(24), Z, np.repeat(A, 2), harmonic=np.tile([1, 2], 12))
+    found = solve(Problem(both, OneWay(), noise="absolute"))
+    np.testing.assert_allclose(found.values, [30.0, 0.1], rtol=1e-6)
+    even = di.FrequencyResponse(np.ones(12), Z[1::2], A, harmonic=np.full(12, 2))
+    assert solve(Problem(even, OneWay(), noise="absolute")).success
+    with pytest.raises(DataError, match=r"harmonics 2, and no element of ByForce.* has any"):
+        Problem(even, ByForce(), noise="absolute")

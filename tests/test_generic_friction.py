@@ -1,0 +1,245 @@
+"""A law written in ten lines has everything that an element has, from its slope alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import mpmath
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp, trapezoid
+
+from dahl_ident import Dahl, Friction, Parameter
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements.model import as_model
+from dahl_ident.errors import ModelError
+
+
+class Jenkins(Friction):
+    """An elastoplastic element: stiff up to its limit, then full slip."""
+
+    kind = "jenkins"
+    parameters = (
+        Parameter("stiffness", "N/m", "elastic stiffness", lower=0.0, transform="log"),
+        Parameter("slip", "m", "displacement at which it slips", lower=0.0, transform="log"),
+    )
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        stiffness, slip = values
+        return stiffness * (direction * force < stiffness * slip)
+
+
+class SlopeOfDahl(Friction):
+    """Dahl's law without its closed forms."""
+
+    parameters = Dahl.parameters
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        f_max, sigma, alpha = values
+        margin = 1.0 - direction * force / f_max
+        return sigma * np.sign(margin) * np.abs(margin) ** alpha
+
+
+class BoucWen(Friction):
+    """Exponent 1: loading and unloading have different rates."""
+
+    parameters = tuple(Parameter(name, "", name) for name in "abc")
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        a, b, c = values
+        return a - np.abs(force) * (b * np.sign(direction * force) + c)
+
+
+class Asymmetric(Friction):
+    """Linear Dahl with two limits."""
+
+    parameters = tuple(Parameter(name, "", name) for name in ("up", "down", "sigma"))
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        up, down, sigma = values
+        return sigma * (1.0 - direction * force / np.where(np.asarray(direction) > 0.0, up, down))
+
+
+def jenkins(k: float, slip: float, A: FloatArray) -> ComplexArray:
+    """Return the closed form of the describing function."""
+    m = np.minimum(slip / A, 1.0)
+    t = np.arccos(1.0 - 2.0 * m)
+    slipping = k / np.pi * (t - np.sin(t) * np.cos(t)) + 4j * k / np.pi * m * (1.0 - m)
+    return np.where(slip >= A, k + 0j, slipping)
+
+
+def test_an_elastoplastic_law_has_its_closed_form() -> None:
+    A = np.concatenate([np.geomspace(0.01, 0.999, 15), [1.0], 1.0 + np.geomspace(1e-8, 1e4, 40)])
+    N = Jenkins(3.0, 1.0).describing_function(A)
+    exact = jenkins(3.0, 1.0, A)
+    assert np.max(np.abs(N - exact) / np.abs(exact)) < 1e-8
+    assert complex(Jenkins(3.0, 1.0).describing_function(1.3)) == pytest.approx(
+        2.4762675 + 0.6780566j, abs=1e-7
+    )
+
+
+@pytest.mark.parametrize(("alpha", "within"), [(1.0, 1e-9), (2.0, 1e-9), (0.5, 1e-5)])
+def test_dahl_from_its_slope_agrees_with_its_closed_forms(alpha: float, within: float) -> None:
+    values = [np.asarray(v) for v in (1.3, 7.0, alpha)]
+    A = np.geomspace(1e-5, 1e4, 181) * 1.3 / 7.0
+    at_rest = np.zeros(())
+    size = np.abs(Dahl(1.3, 7.0, alpha).describing_function(A))
+    for k in range(8):
+        ours = SlopeOfDahl(1.3, 7.0, alpha).stiffness(values, A, at_rest, k)
+        exact = Dahl(1.3, 7.0, alpha).stiffness(values, A, at_rest, k)
+        assert np.max(np.abs(ours - exact) / size) < within * (1.0 if k < 4 else 3.0)
+
+
+def test_batches_of_parameters_and_rest() -> None:
+    law = SlopeOfDahl()
+    values = [np.array([[1.0], [2.0]]), np.array([[3.0], [5.0]]), np.array(2.0)]
+    A = np.array([0.0, 1e-6, 0.3, 4.0])
+    ours = law.stiffness(values, A, np.zeros(()))
+    np.testing.assert_allclose(ours, Dahl().stiffness(values, A, np.zeros(())), rtol=1e-9)
+    assert ours[:, 0].tolist() == [3.0, 5.0]
+
+
+def test_derivatives_agree_with_those_of_the_closed_forms() -> None:
+    law = as_model(SlopeOfDahl(1.3, 7.0, 2.0)).with_free(["f_max", "sigma", "alpha"])
+    exact = as_model(Dahl(1.3, 7.0, 2.0)).with_free(["f_max", "sigma", "alpha"])
+    A = np.geomspace(1e-2, 1e2, 13)
+    for k in (1, 3):
+        ours = law.stiffness_gradient(law.known_values(), A, np.zeros(()), k)
+        theirs = exact.stiffness_gradient(exact.known_values(), A, np.zeros(()), k)
+        pairs = zip(
+            (ours.by_amplitude * A, *ours.by_parameter),
+            (theirs.by_amplitude * A, *theirs.by_parameter),
+            strict=True,
+        )
+        for one, other in pairs:
+            assert np.max(np.abs(one - other)) < 1e-8 * np.max(np.abs(other)) + 1e-9
+
+
+def test_derivatives_of_the_elastoplastic_law_against_its_closed_form() -> None:
+    law = as_model(Jenkins(3.0, 1.0)).with_free(["stiffness", "slip"])
+    A = np.array([0.5, 1.3, 5.0, 40.0])
+    ours = law.stiffness_gradient(law.known_values(), A, np.zeros(()))
+    h = 1e-5
+    by_slip = (jenkins(3.0, 1.0 + h, A) - jenkins(3.0, 1.0 - h, A)) / (2.0 * h)
+    np.testing.assert_allclose(ours.by_parameter[0], jenkins(3.0, 1.0, A) / 3.0, atol=1e-7)
+    np.testing.assert_allclose(ours.by_parameter[1], by_slip, atol=1e-6)
+
+
+def test_bouc_wen_with_exponent_1() -> None:
+    law, A = BoucWen(3.0, 0.9, 0.4), np.asarray(2.0)
+    c1, c3 = (complex(A * law.dynamic_stiffness(A, harmonic=k)) for k in (1, 3))
+    assert c1 == pytest.approx(1.9961234 + 1.6865922j, abs=1e-7)
+    assert c3 == pytest.approx(0.3071339 - 0.3003915j, abs=1e-7)
+
+
+def test_two_limits_give_a_mean_and_even_harmonics() -> None:
+    law, A = Asymmetric(1.2, 0.8, 2000.0), 1e-3
+    c = [complex(A * law.dynamic_stiffness(A, harmonic=k)) for k in range(4)]
+    assert 2.0 * c[0].real == pytest.approx(0.2361383317, abs=1e-9)
+    assert [v.real for v in c[1:]] == pytest.approx(
+        [0.8331869096, 0.0389112359, 0.1180527595], abs=1e-9
+    )
+
+
+@pytest.mark.parametrize("alpha", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("scale", [1e-3, 0.1, 1.0, 30.0])
+def test_the_force_over_time_agrees_with_the_exact_one(alpha: float, scale: float) -> None:
+    t = np.linspace(0.0, 10.0, 1500)
+    x = scale * (np.sin(3.0 * t) + 0.6 * np.sin(7.3 * t))
+    ours = SlopeOfDahl(1.0, 1.0, alpha).force(x, 0.1 * min(scale, 1.0))
+    exact = Dahl(1.0, 1.0, alpha).force(x, 0.1 * min(scale, 1.0))
+    assert np.max(np.abs(ours - exact)) < 2e-7 * np.max(np.abs(exact))
+
+
+def test_the_elastoplastic_force_over_time() -> None:
+    t = np.linspace(0.0, 10.0, 1500)
+    x = 3.0 * (np.sin(3.0 * t) + 0.6 * np.sin(7.3 * t))
+    force = [0.0]
+    for step in np.diff(x):
+        force.append(float(np.clip(force[-1] + 3.0 * step, -3.0, 3.0)))
+    np.testing.assert_allclose(Jenkins(3.0, 1.0).force(x), force, atol=1e-12)
+
+
+def test_facts_follow_from_the_slope() -> None:
+    values = [np.asarray(v) for v in (1.3, 7.0, 2.0)]
+    law = SlopeOfDahl(1.3, 7.0, 2.0)
+    assert [float(v) for v in law.knee(values)] == pytest.approx([1.3 / 7.0] * 2)
+    A = np.geomspace(1e-3, 1e3, 25)
+    steepest, largest = law.force_bounds(values)
+    N = np.abs(law.describing_function(A))
+    assert np.all(steepest >= N)
+    assert np.all(largest >= A * N)
+    ours = law.transient_decay(values, A, np.zeros(()))
+    np.testing.assert_allclose(
+        ours, Dahl().transient_decay(values, A, np.zeros(())), rtol=1e-7, atol=1e-12
+    )
+    x, force = law.loop(0.4)
+    assert law.dissipated_energy(0.4) == pytest.approx(float(-trapezoid(x, force)), rel=1e-4)
+    with mpmath.workdps(20):
+        assert float(law.rest_stiffness(values)) == 7.0
+
+
+class SlopeOfLuGre(Friction):
+    """Dahl's law with a Stribeck limit, by its slope alone."""
+
+    rate_independent = False
+    parameters = tuple(Parameter(name, "", name) for name in ("f_max", "sigma", "ratio", "speed"))
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        f_max, sigma, ratio, speed = values
+        level = f_max * (1.0 + (ratio - 1.0) * np.exp(-((velocity / speed) ** 2)))
+        return sigma * (1.0 - direction * force / level)
+
+
+class NonlinearRated(SlopeOfLuGre):
+    """The same with the exponent 2."""
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        margin = super().slope(force, direction, velocity, values) / values[1]
+        return values[1] * margin * np.abs(margin)
+
+
+@pytest.mark.parametrize(
+    "law", [SlopeOfLuGre(1.0, 3.0, 1.5, 0.7), NonlinearRated(1.0, 3.0, 1.5, 0.7)]
+)
+@pytest.mark.parametrize("A", [0.2, 3.0])
+def test_a_velocity_dependent_law_against_direct_integration(law: Friction, A: float) -> None:
+    omega = 0.8
+    values = [float(v) for v in law.known_values()]
+
+    def rate(theta: float, force: FloatArray) -> FloatArray:
+        v = -A * omega * np.sin(theta)
+        return np.asarray(law.slope(force, np.sign(v), v, values) * v / omega)
+
+    ends, force = np.pi * np.arange(25), np.zeros(1)
+    total = np.zeros(4, dtype=np.complex128)
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    for low, high in pairwise(ends.tolist()):
+        found = solve_ivp(rate, (low, high), force, "DOP853", rtol=1e-11, atol=1e-13,
+                          dense_output=True)  # fmt: skip
+        force = found.y[:, -1]
+        assert found.sol is not None
+        if low >= ends[-3] - 1e-9:
+            theta = low + 0.5 * (high - low) * (1.0 + nodes)
+            wave = np.exp(-1j * np.outer(np.arange(4), theta)) * weights * 0.5 * (high - low)
+            total += wave @ found.sol(theta)[0] / (np.pi * A)
+    size = abs(total[1])
+    for k in (1, 2, 3):
+        assert abs(complex(law.dynamic_stiffness(A, omega, harmonic=k)) - total[k]) < 1e-8 * size
+    t = np.linspace(0.0, 12.0 * 2.0 * np.pi / omega, 9601)
+    x, v = A * np.cos(omega * t), -A * omega * np.sin(omega * t)
+    settled = law.force(x, velocity=v)[-801:-1]
+    fundamental = 2.0 / 800.0 * np.sum(settled * np.exp(-1j * omega * t[-801:-1])) / A
+    assert abs(fundamental - total[1]) < 1e-4 * size
+
+
+def test_use_of_the_velocity_must_be_declared() -> None:
+    class Forgot(SlopeOfLuGre):
+        rate_independent = True
+
+    with pytest.raises(ModelError, match="must declare rate_independent = False"):
+        Forgot(1.0, 3.0, 1.5, 0.7).describing_function(1.0)
+    with pytest.raises(ModelError, match="give the frequency"):
+        SlopeOfLuGre(1.0, 3.0, 1.5, 0.7).describing_function(1.0)

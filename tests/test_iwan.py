@@ -1,0 +1,109 @@
+"""The four-parameter Iwan law against high precision, sums of Jenkins elements, and time."""
+
+from __future__ import annotations
+
+import mpmath
+import numpy as np
+import pytest
+
+from dahl_ident import Damper, Iwan, Mass, MaxwellSlip, Spring, response
+from dahl_ident.errors import ValidationError
+from tests.test_response_of_any_law import all_amplitudes
+
+AT_REST = np.zeros(())
+
+
+def exact(law: Iwan, A: float, k: int) -> complex:
+    """Return N_k by integration of the stiffness along the backbone curve, to 25 digits."""
+    _, sigma, chi, ratio = (mpmath.mpf(float(v)) for v in law.known_values())
+    r, g = mpmath.mpf(A) / mpmath.mpf(law.onset), chi + 1
+    end = mpmath.acos(1 - 2 * min(1 / r, mpmath.mpf(1)))
+
+    def integrand(t: mpmath.mpf) -> mpmath.mpc:
+        stiff = 1 - (r * mpmath.sin(t / 2) ** 2) ** g / (1 + ratio)
+        return stiff * mpmath.sin(t) * mpmath.expjpi(-k * t / mpmath.pi)
+
+    places = [0, *(end * mpmath.mpf(10) ** -j for j in range(12, 0, -2)), end / 2, end]
+    return complex(2j * sigma / (mpmath.pi * k) * mpmath.quad(integrand, places))
+
+
+def random_laws(n: int, seed: int) -> list[tuple[Iwan, float]]:
+    rng = np.random.default_rng(seed)
+    laws = [
+        Iwan(*10.0 ** rng.uniform(-2.0, 3.0, 2), rng.uniform(-0.99, 1.0), 10 ** rng.uniform(-2, 2))
+        for _ in range(n)
+    ]
+    return [(law, law.onset * 10.0 ** rng.uniform(-4.0, 2.0)) for law in laws]
+
+
+def test_harmonics_to_high_precision() -> None:
+    with mpmath.workdps(25):
+        for i, (law, A) in enumerate(random_laws(24, 3)):
+            k = (1, 3, 5, 7)[i % 4]
+            size = abs(complex(law.dynamic_stiffness(A)))
+            assert abs(complex(law.dynamic_stiffness(A, harmonic=k)) - exact(law, A, k)) < (
+                1e-12 * size
+            )
+            assert law.dynamic_stiffness(A, harmonic=2) == 0.0
+
+
+def test_derivatives_are_differences() -> None:
+    places, weights = np.array([1.0, -1.0, 2.0, -2.0]), np.array([8.0, -8.0, -1.0, 1.0]) / 12e-4
+    for i, (law, A) in enumerate(random_laws(200, 4)):
+        k, at = (1, 3, 5)[i % 3], [*law.known_values(), np.asarray(A)]
+        if abs(A / law.onset - 1.0) < 0.01:
+            continue
+        found = law.stiffness_gradient(at[:4], at[4], AT_REST, k)
+        size = abs(complex(law.dynamic_stiffness(A)))
+        for j, slope in enumerate((*found.by_parameter, found.by_amplitude)):
+            unit = float(at[j]) + (1.0 if j == 2 else 0.0)  # 1 + chi
+            moved = [*at[:j], at[j] + 1e-4 * unit * places, *at[j + 1 :]]
+            difference = weights @ law.stiffness(moved[:4], moved[4], AT_REST, k)
+            assert abs(complex(slope) * unit - difference) < 1e-8 * size
+
+
+@pytest.mark.parametrize("chi", [-0.6, 0.0, 0.5])
+def test_it_is_a_sum_of_many_jenkins_elements(chi: float) -> None:
+    law, n = Iwan(2.0, 5.0, chi, 0.6), 3000
+    edges = law.onset * np.linspace(0.0, 1.0, n + 1)
+    slips = 0.5 * (edges[1:] + edges[:-1])
+    shares = np.diff((edges / law.onset) ** (chi + 1.0))
+    stiff = np.append(5.0 / 1.6 * shares, 5.0 * 0.6 / 1.6)
+    total = MaxwellSlip(np.append(slips, law.onset), stiff)
+    A = law.onset * np.array([0.1, 0.7, 1.0, 1.5, 20.0])
+    for k in (1, 3):
+        ours, theirs = (e.dynamic_stiffness(A, harmonic=k) for e in (law, total))
+        np.testing.assert_allclose(ours, theirs, rtol=2e-3)
+    x = law.onset * np.cumsum(np.random.default_rng(1).normal(size=200)) * 0.4
+    np.testing.assert_allclose(law.force(x), total.force(x), atol=2e-4)
+
+
+def test_the_settled_force_has_the_harmonics() -> None:
+    law, n = Iwan(100.0, 1e7, -0.5, 1.0), 4096
+    theta = 2.0 * np.pi * np.arange(3 * n) / n
+    for A, within in ((3e-6, 1e-12), (law.onset, 1e-12), (4e-5, 2e-7)):
+        spectrum = 2.0 / n * np.fft.rfft(law.force(A * np.cos(theta))[-n:]) / A
+        for k in (1, 3, 5):
+            assert abs(spectrum[k] - complex(law.dynamic_stiffness(A, harmonic=k))) < (
+                within * abs(spectrum[1])
+            )
+
+
+def test_microslip_is_a_power_law_and_macroslip_is_coulomb_friction() -> None:
+    law = Iwan(100.0, 1e7, -0.4, 1.0)
+    loss = law.dissipated_energy(law.onset * np.array([1e-4, 1e-3]))
+    assert np.log10(loss[1] / loss[0]) == pytest.approx(2.6, abs=1e-9)
+    far = complex(law.describing_function(1e6 * law.onset)) * 1e6 * law.onset
+    assert far.imag == pytest.approx(400.0 / np.pi, rel=1e-5)
+    assert law.force([0.0, 3.0 * law.onset])[1] == 100.0
+    with pytest.raises(ValidationError, match="chi"):
+        Iwan(chi=-1.5)
+
+
+def test_response_beside_a_plant() -> None:
+    plant = Iwan(0.1, 30.0, -0.5, 1.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
+    for drive in (0.01, 0.1, 0.5):
+        ours = response(plant, 0.6, drive, all_roots=True)
+        np.testing.assert_allclose(
+            np.ravel(ours.amplitude), all_amplitudes(plant, 0.6, drive), rtol=1e-8
+        )

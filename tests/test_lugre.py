@@ -1,0 +1,74 @@
+"""LuGre friction: settled sines, motion in time, and when it cannot be told from Dahl."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+
+from dahl_ident import Dahl, Damper, LuGre, Mass, Spring, response
+from dahl_ident.errors import ModelError, ValidationError
+
+LAW = LuGre(1.0, 300.0, 1.6, 0.02, 0.4, 0.3)
+
+
+@pytest.mark.parametrize("A", [3e-3, 0.1, 3.0])
+@pytest.mark.parametrize("omega", [1e-3, 1.0, 50.0])
+def test_the_settled_force_has_the_harmonics(A: float, omega: float) -> None:
+    """Against exponential steps over samples that are dense where the motion turns round."""
+    fine = np.concatenate([np.geomspace(1e-6, 0.05, 1500), np.linspace(0.05, np.pi / 2, 6001)[1:]])
+    quarter = np.concatenate([[0.0], fine])
+    half = np.concatenate([quarter, np.pi - quarter[-2::-1]])
+    cycle = np.concatenate([half, np.pi + half[1:]])
+    cycles = 1 + int(np.ceil(20.0 / (4.0 * 300.0 * A)))
+    theta = np.concatenate([2.0 * np.pi * i + cycle[:-1] for i in range(cycles)] + [[0.0]])[:-1]
+    force = LAW.force(A * np.cos(theta), velocity=-A * omega * np.sin(theta))
+    last, place = force[-(cycle.size - 1) :], cycle[:-1]
+    last, place = np.append(last, last[0]), np.append(place, 2.0 * np.pi)
+    size = abs(complex(LAW.dynamic_stiffness(A, omega)))
+    for k in (1, 3, 5):
+        found = trapezoid(last * np.exp(-1j * k * place), place) / (np.pi * A)
+        assert abs(complex(LAW.dynamic_stiffness(A, omega, harmonic=k)) - found) < 2e-5 * size
+    assert LAW.dynamic_stiffness(A, omega, harmonic=2) == pytest.approx(0.0, abs=1e-9 * size)
+
+
+def test_without_stribeck_effect_it_is_linear_dahl_with_a_damper() -> None:
+    A, w = np.geomspace(1e-5, 10.0, 13)[:, None], np.array([0.1, 10.0])
+    plain = LuGre(2.0, 50.0, 1.0, 0.1, 0.0, 0.7).dynamic_stiffness(A, w)
+    dahl = (Dahl(2.0, 50.0) + Damper(0.7)).dynamic_stiffness(A, w)
+    np.testing.assert_allclose(plain, dahl, rtol=1e-8)
+    slow = LuGre(2.0, 50.0, 1.5, 1e9).dynamic_stiffness(A, w)
+    np.testing.assert_allclose(slow, Dahl(3.0, 50.0).dynamic_stiffness(A, w), rtol=1e-8)
+    three = LuGre(2.0, 50.0, 1.0, 0.1).dynamic_stiffness(A, w, harmonic=3)
+    np.testing.assert_allclose(three, Dahl(2.0, 50.0).dynamic_stiffness(A, w, harmonic=3),
+                               atol=1e-8 * np.abs(dahl).max())  # fmt: skip
+
+
+def test_the_distance_from_dahl_says_when_sines_show_a_difference() -> None:
+    A = np.geomspace(1e-3, 0.3, 10)
+    law = LuGre(1.0, 300.0, 1.5, 0.02)
+    assert law.distance_from_dahl(A, np.asarray(1e-4)) < 1e-4  # all speeds below Stribeck's
+    assert law.distance_from_dahl(A, np.asarray(1e4)) < 1e-3  # all far above
+    assert law.distance_from_dahl(A, np.asarray(1.0)) > 0.02
+
+
+def test_facts_and_refusals() -> None:
+    with pytest.raises(ModelError, match="depends on the rate"):
+        LAW.describing_function(1.0)
+    with pytest.raises(ModelError, match="depends on the rate"):
+        LAW.loop(1.0)
+    with pytest.raises(ValidationError, match="needs velocity"):
+        LAW.force([0.0, 1.0])
+    with pytest.raises(ValidationError, match="static_ratio"):
+        LuGre(static_ratio=0.5)
+    values = [np.asarray(v) for v in LAW.known_values()]
+    assert [float(v) for v in LAW.force_limits(values)] == pytest.approx([1.6, 1.6])
+
+
+def test_response_beside_a_plant() -> None:
+    plant = LuGre(0.1, 30.0, 1.5, 0.1) + Mass(0.3) + Damper(0.24) + Spring(0.3)
+    for drive in (0.02, 0.5):
+        ours = response(plant, 0.6, drive, all_roots=True)
+        A = np.ravel(ours.amplitude)
+        force = np.abs(A * plant.dynamic_stiffness(A, 2.0 * np.pi * 0.6))
+        np.testing.assert_allclose(force, drive, rtol=1e-8)

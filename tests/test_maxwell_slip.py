@@ -1,0 +1,181 @@
+"""Parallel Jenkins elements: closed forms, Masing's rules, and the density found from data."""
+
+from __future__ import annotations
+
+import mpmath
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+from scipy.optimize import lsq_linear
+
+from dahl_ident import (
+    Backlash,
+    Dahl,
+    Damper,
+    FrequencyResponse,
+    Mass,
+    MaxwellSlip,
+    Spring,
+    fit,
+    response,
+)
+from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.slip_density import slip_density
+from dahl_ident.elements import Element
+from dahl_ident.elements.masing import jenkins
+from dahl_ident.errors import DataError, ModelError, ValidationError
+from dahl_ident.plots.slip_displacements import plot_slip_density
+from tests.test_generic_friction import Jenkins
+from tests.test_response_of_any_law import all_amplitudes
+
+SLIPS, STIFF = np.array([0.1, 0.3, 1.0]), np.array([3.0, 2.0, 1.0])
+LAW = MaxwellSlip(SLIPS, STIFF)
+
+
+def sliders(x: FloatArray, start: FloatArray) -> FloatArray:
+    """Return the force of the three elements, each clipped at its limit, step by step."""
+    f, total = start, [float(start.sum())]
+    for step in np.diff(x):
+        f = np.clip(f + STIFF * step, -STIFF * SLIPS, STIFF * SLIPS)
+        total.append(float(f.sum()))
+    return np.array(total)
+
+
+@pytest.mark.parametrize("k", [1, 3, 5, 7])
+def test_a_jenkins_element_against_an_integral(k: int) -> None:
+    m = [1e-9, 1e-4, 0.3, 0.77, 0.999, 1.0, 1.3]
+    ours, _ = jenkins(np.array(m), k)
+    for ratio, found in zip(m, ours.tolist(), strict=True):
+        with mpmath.workdps(30):
+            d = mpmath.mpf(ratio)
+            slips = mpmath.acos(1 - 2 * min(d, mpmath.mpf(1)))
+            stick = mpmath.quad(
+                lambda t: mpmath.sin(t) * mpmath.expjpi(-k * t / mpmath.pi), [0, slips]
+            )
+            exact = complex(2j / (mpmath.pi * k) * stick)
+        size = 1.0 if ratio >= 1.0 else 4.0 / np.pi * ratio
+        assert abs(found - exact) < 1e-11 * size
+
+
+def test_derivatives_are_exact_and_one_sided_at_a_kink() -> None:
+    A = np.array([0.05, 0.1, 0.2, 0.7, 3.0])
+    values = [np.asarray(v) for v in (*STIFF, *SLIPS)]
+    for k in (1, 3):
+        found = LAW.stiffness_gradient(values, A, np.zeros(()), k)
+        for i in range(6):
+            h = 1e-6 * float(values[i])
+            moved = [LAW.stiffness([*values[:i], values[i] + s * h, *values[i + 1 :]], A,
+                                   np.zeros(()), k) for s in (1.0, 0.0, -1.0)]  # fmt: skip
+            smooth = np.abs(A - SLIPS[i - 3]) > 0.01 if i >= 3 else np.full(5, True)
+            difference = (moved[0] - moved[2]) / (2.0 * h)
+            np.testing.assert_allclose(found.by_parameter[i][smooth], difference[smooth], atol=1e-7)
+            # at A = d: the element still sticks, so a longer d changes nothing
+            upward = (moved[0] - moved[1]) / h
+            np.testing.assert_allclose(found.by_parameter[i], upward, atol=2e-4)
+        h = 1e-7
+        up, down = (LAW.stiffness(values, A * (1.0 + s * h), np.zeros(()), k) for s in (1, -1))
+        smooth = np.abs(A - 0.1) > 0.01
+        np.testing.assert_allclose(
+            (found.by_amplitude * A)[smooth], ((up - down) / (2.0 * h))[smooth], atol=1e-6
+        )
+
+
+def test_the_force_over_time_is_that_of_the_sliders() -> None:
+    rng = np.random.default_rng(0)
+    for trial in range(60):
+        x = np.cumsum(rng.normal(size=rng.integers(3, 300)) * 10.0 ** rng.uniform(-2.0, 0.0))
+        if trial % 3 == 0:
+            x = np.round(x, 1)  # loops that close exactly, and pauses
+        u = float(rng.choice([0.0, 0.2, -0.7]))
+        start = np.clip(STIFF * u, -STIFF * SLIPS, STIFF * SLIPS)
+        np.testing.assert_allclose(LAW.force(x, float(start.sum())), sliders(x, start), atol=1e-11)
+
+
+def test_facts_and_refusals() -> None:
+    values = [np.asarray(v) for v in (*STIFF, *SLIPS)]
+    assert [float(v) for v in LAW.force_limits(values)] == pytest.approx([1.9, 1.9])
+    assert [float(v) for v in LAW.knee(values)] == [0.1, 1.0]
+    assert LAW.describing_function(0.0) == 6.0
+    x, force = LAW.loop(0.5, points=4001)
+    assert LAW.dissipated_energy(0.5) == pytest.approx(float(-trapezoid(x, force)), rel=1e-5)
+    # each element that slips loses 4 k d (A - d) in a cycle
+    assert LAW.dissipated_energy(0.5) == pytest.approx(4 * (0.3 * 0.4 + 0.6 * 0.2))
+    with pytest.raises(ModelError, match="remembers more than its present force"):
+        LAW.slope(0.0, 1.0, None, values)
+    with pytest.raises(ModelError, match="Backlash got"):
+        Backlash(LAW, 0.1)
+    with pytest.raises(ValidationError, match="rising"):
+        MaxwellSlip([0.2, 0.1])
+    with pytest.raises(ValidationError, match="one for each of 2"):
+        MaxwellSlip([0.1, 0.2], [1.0])
+    with pytest.raises(ValidationError, match="initial_force"):
+        LAW.force([0.0, 1.0], 2.0)
+
+
+def test_response_beside_a_plant() -> None:
+    plant = LAW + Mass(0.3) + Damper(0.1) + Spring(1.0)
+    for drive in (0.05, 0.5, 3.0):
+        ours = response(plant, 0.6, drive, all_roots=True)
+        np.testing.assert_allclose(
+            np.ravel(ours.amplitude), all_amplitudes(plant, 0.6, drive), rtol=1e-8
+        )
+
+
+def table(law: Element, *, noise: float = 0.0, seed: int = 1) -> FrequencyResponse:
+    A, f = np.geomspace(3e-2, 3.0, 24), np.tile([0.5, 1.0], 12)
+    rng = np.random.default_rng(seed)
+    Z = law.dynamic_stiffness(A, 2.0 * np.pi * f)
+    Z = Z * (1.0 + noise * (rng.normal(size=24) + 1j * rng.normal(size=24)) / np.sqrt(2.0))
+    return FrequencyResponse(f, Z, A)
+
+
+def test_stiffnesses_are_estimated_at_given_and_at_free_slips() -> None:
+    found = fit(table(LAW, noise=0.003), MaxwellSlip(SLIPS))
+    for name, true in zip(("stiffness_1", "stiffness_2", "stiffness_3"), STIFF, strict=True):
+        estimate = found.params[name]
+        assert abs(estimate.value - true) < 4.0 * (estimate.stderr or 0.0) < 0.2
+    two = MaxwellSlip([0.1, 1.0], [3.0, 1.0])
+    free = fit(table(two, noise=0.001), MaxwellSlip(2))
+    slips = sorted(free.params[f"slip_{i}"].value for i in (1, 2))
+    assert slips == pytest.approx([0.1, 1.0], rel=0.02)
+
+
+def test_the_least_misfit_is_least() -> None:
+    data = table(LAW + Mass(0.1) + Damper(0.2), noise=0.01)
+    found = slip_density(data, Mass(0.1) + Damper())
+    assert 0.003 < found.least_misfit < 0.0101
+    assert found.least_misfit <= found.misfit <= 1.05 * found.least_misfit
+    assert found.stiffness.sum() + found.spring == pytest.approx(6.0, rel=0.05)
+    assert found.beside["damping"] == pytest.approx(0.2, rel=0.2)
+    # another solver over the same laws, and random laws, leave no less
+    A, Z = np.asarray(data.amplitude), data.response + 0.1 * data.omega**2
+    columns = np.column_stack([jenkins(found.slip / A[:, None], 1)[0], 1.0 + 0j * A,
+                               1j * data.omega])  # fmt: skip
+    weights = 1.0 / np.abs(data.response)[:, None]
+    matrix, right = columns * weights, Z * weights[:, 0]
+    other = lsq_linear(
+        np.concatenate([matrix.real, matrix.imag]), np.concatenate([right.real, right.imag]),
+        bounds=(0.0, np.inf), tol=1e-12,
+    )  # fmt: skip
+    assert np.sqrt(2.0 * other.cost / 24) == pytest.approx(found.least_misfit, rel=1e-3)
+    assert "leaves less than" in found.statement
+    law = found.law() + Mass(0.1) + Damper(found.beside["damping"])
+    left = np.abs(1.0 - law.dynamic_stiffness(A, data.omega) / data.response)
+    assert np.sqrt(np.mean(left**2)) == pytest.approx(found.misfit, rel=1e-9)
+
+
+def test_loops_of_dahl_and_of_a_gap_are_no_sum_of_jenkins_elements() -> None:
+    assert slip_density(table(Dahl(1.0, 6.0))).least_misfit > 0.05
+    assert slip_density(table(Backlash(Jenkins(3.0, 0.3), 0.05))).least_misfit > 0.1
+    assert slip_density(table(LAW)).least_misfit < 0.003
+
+
+def test_the_density_is_refused_and_drawn() -> None:
+    data = table(LAW)
+    with pytest.raises(ModelError, match="expected linear elements"):
+        slip_density(data, Dahl())
+    with pytest.raises(DataError, match="at least three"):
+        slip_density(data.select(rows=np.arange(24) < 2))
+    found = slip_density(data)
+    axis = plot_slip_density(found.slip, found.stiffness)
+    assert axis.get_ylabel() == "stiffness [% of sum]"

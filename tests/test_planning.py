@@ -1,0 +1,422 @@
+"""Plans of measurements: optimal, as good as they say, and within every limit."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import dahl_ident as di
+from benchmarks import planning
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.errors import ValidationError
+from dahl_ident.fitting import solve_many
+from dahl_ident.planning import Plan
+from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
+from dahl_ident.planning.criteria import LevelInformation, Objective, Term
+from dahl_ident.planning.optimal_design import Exchange, continuous_design
+from dahl_ident.problem import ProblemBatch
+
+F_MAX, SIGMA = 0.1, 30.0
+X_C = F_MAX / SIGMA
+TRUTH = {"f_max": F_MAX, "sigma": SIGMA}
+LINEAR = di.Model(di.Dahl(alpha=1.0))
+NEAR = {"f_max": (0.099, 0.101), "sigma": (29.7, 30.3)}
+KNEE = {"displacement": (0.1 * X_C, 10.0 * X_C), "frequency_hz": 5.0}
+
+
+def _objective(
+    seed: int, K: int, P: int, *, targets: int = 0, scatter: float = 0.0, draws: int = 3
+) -> Objective:
+    rng = np.random.default_rng(seed)
+    rows = rng.standard_normal((draws, K, 2, P)) * rng.lognormal(0.0, 1.0, (1, K, 1, 1))
+    offsets = np.broadcast_to(np.eye(2), (draws, K, 2, 2))
+    levels = LevelInformation.of(rows, offsets, scatter)
+    known = np.broadcast_to(1e-9 * np.eye(P), (draws, P, P))
+    wanted = rng.standard_normal((draws, P, targets)) if targets else None
+    return Objective((Term(levels, known, wanted),))
+
+
+def _bench(seed: int, K: int) -> BenchTime:
+    rng = np.random.default_rng(seed)
+    return BenchTime(
+        rng.uniform(1.0, 4.0, K), rng.uniform(0.05, 0.7, K), rng.uniform(0.1, 1.0, K), 0.5, 0.01
+    )
+
+
+class TestContinuousDesign:
+    @pytest.mark.parametrize("P", [2, 3, 4])
+    def test_the_derivative_of_ln_det_never_exceeds_the_number_of_parameters(self, P: int) -> None:
+        objective, time = _objective(P, 200, P, draws=1), 7.0
+        f = np.random.default_rng(P).uniform(1.0, 5.0, 200)
+        design = continuous_design(objective, f, time, tolerance=1e-3, iterations=4000)
+        term = objective.terms[0]
+        # by the matrices themselves, not by the derivative that the search used
+        packed = term.levels.packed.reshape(200, P, P)
+        M = np.einsum("k,kij->ij", design.seconds * f, packed)
+        rate = np.einsum("ij,kji->k", np.linalg.inv(M), packed) * f * time
+        assert rate.max() <= P * 1.0011
+        assert np.all(rate[design.seconds > 0.05 * time] > 0.98 * P)
+        assert design.seconds.sum() == pytest.approx(time)
+
+    @pytest.mark.parametrize(("targets", "scatter"), [(0, 0.3), (1, 0.0), (1, 0.3), (3, 0.3)])
+    def test_no_other_design_is_better(self, targets: int, scatter: float) -> None:
+        objective = _objective(5, 40, 3, targets=targets, scatter=scatter)
+        f, rng = np.ones(40), np.random.default_rng(0)
+        design = continuous_design(objective, f, 10.0, tolerance=1e-3, iterations=8000)
+        assert design.excess < 1e-2
+        for _ in range(200):
+            other = design.seconds * rng.lognormal(0.0, 0.5, 40) + rng.exponential(0.02, 40)
+            assert objective.at(other * (10.0 / other.sum())).value <= design.value + 1e-4
+
+    def test_the_gradient_is_that_of_the_value(self) -> None:
+        objective = _objective(3, 6, 3, targets=2, scatter=0.2)
+        cycles = np.random.default_rng(1).uniform(1.0, 9.0, 6)
+        gradient = objective.gradient(objective.at(cycles))
+        for k in range(6):
+            step = np.where(np.arange(6) == k, 1e-5, 0.0)
+            up, down = objective.at(cycles + step).value, objective.at(cycles - step).value
+            assert gradient[k] == pytest.approx((up - down) / 2e-5, rel=1e-5)
+
+    def test_scatter_of_a_run_is_two_more_parameters(self) -> None:
+        rng = np.random.default_rng(8)
+        rows = rng.standard_normal((1, 5, 2, 3))
+        levels = LevelInformation.of(rows, np.broadcast_to(np.eye(2), (1, 5, 2, 2)), 0.4)
+        cycles = rng.uniform(1.0, 5.0, 5)
+        found, _ = levels.of_run(cycles @ levels.packed)
+        # generalised least squares with the covariance of all rows written out
+        J = rows[0].reshape(10, 3)
+        shared = np.tile(np.eye(2), (5, 1))
+        V = np.diag(np.repeat(1.0 / cycles, 2)) + 0.4**2 * shared @ shared.T
+        assert found[0] == pytest.approx(J.T @ np.linalg.inv(V) @ J, rel=1e-9)
+
+
+class TestLevelsWithFixedCosts:
+    @pytest.mark.parametrize("seed", range(8))
+    def test_exchange_finds_what_brute_force_finds(self, seed: int) -> None:
+        objective, bench, time = _objective(seed, 5, 2), _bench(seed, 5), 16.0
+        found = Exchange(objective, bench, np.arange(5)).best(time)
+        assert found is not None
+        assert bench.seconds(found.levels, found.cycles) <= time + 1e-9
+        best = _brute_force(objective, bench, time, most=3)
+        assert found.value >= best - 0.01
+
+    @pytest.mark.parametrize("seed", range(6))
+    def test_rising_force_is_the_cheapest_order(self, seed: int) -> None:
+        beta = np.random.default_rng(seed).uniform(0.05, 3.0, 5)
+        bench = BenchTime(np.ones(5), np.exp(-4.0 * beta), np.tanh(beta), 0.0, 0.01)
+        least = min(
+            bench.settling_cycles(np.array(order)).sum()
+            for order in itertools.permutations(range(5))
+        )
+        assert bench.settling_cycles(bench.order(range(5))).sum() <= least + 1  # rounding
+
+    def test_settling_follows_the_transient(self) -> None:
+        beta = 0.1
+        bench = BenchTime(np.ones(1), np.array([np.exp(-4.0 * beta)]), np.ones(1), 0.0, 0.01)
+        (cycles,) = bench.settling_cycles([0])
+        # Dahl's force along cycles of a sine at beta, a step at a time, from two starts
+        path = np.diff(beta * np.sin(np.linspace(0.0, 2.0 * np.pi, 2001)))
+
+        def after(count: int, force: float) -> float:
+            for dx in np.tile(path, count):
+                force = np.sign(dx) + (force - np.sign(dx)) * np.exp(-abs(dx))
+            return float(force)
+
+        settled, tip = after(60, 0.0), np.tanh(beta)
+        left = [abs(after(int(cycles) - k, settled + tip) - settled) / tip for k in (0, 1)]
+        assert left[0] <= 0.01 < left[1]
+
+
+def _brute_force(objective: Objective, bench: BenchTime, time: float, most: int) -> float:
+    """Return the best criterion over all sets of levels and whole cycles that use the time."""
+    best = -np.inf
+    for size in range(1, most + 1):
+        for levels in itertools.combinations(range(objective.candidates), size):
+            ordered = bench.order(levels)
+            f, room = bench.frequency_hz[ordered], time - bench.fixed(ordered)
+            sub = objective.only(ordered)
+            ranges = [range(LEAST_CYCLES, max(int(room * x), 1) + 1) for x in f[:-1]]
+            designs = []
+            for some in itertools.product(*ranges):
+                left = room - float((np.array(some) / f[:-1]).sum())
+                last = int(np.floor(left * f[-1] + 1e-9))
+                if last >= LEAST_CYCLES:
+                    designs.append([*some, last])
+            if designs:
+                packed = sub.terms[0].levels.packed
+                best = max(best, float(sub.values([np.array(designs) @ packed]).max()))
+    return best
+
+
+class TestPlan:
+    def test_prediction_is_the_covariance_of_the_fit(self) -> None:
+        plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 30}, noise=0.02)
+        errors = _errors(plan, LINEAR.with_values(TRUTH), 0.02, 200)
+        achieved = errors.std(axis=0)
+        predicted = [plan.expected[name].after for name in ("f_max", "sigma")]
+        # 200 fits give a standard deviation within 5 %: three of these
+        assert achieved == pytest.approx(predicted, rel=0.15)
+
+    def test_it_beats_a_logarithmic_grid(self) -> None:
+        plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 25}, noise=0.02, target="f_max")
+        even = plan.planner.expected(*plan.planner.logarithmic_grid(25.0))
+        assert even["f_max"].after > 1.5 * plan.expected["f_max"].after
+
+    def test_a_target_is_reached_in_the_least_time(self) -> None:
+        target = {"f_max": 0.004, "f_max/sigma": 0.006}
+        common: dict[str, Any] = {"ranges": NEAR, "noise": 0.02, "draws": 20}
+        plan = di.plan(LINEAR, limits=KNEE, target=target, **common)
+        assert plan.reached
+        assert all(plan.expected[name].after <= u for name, u in target.items())
+        less = di.plan(
+            LINEAR, limits={**KNEE, "time": 0.93 * plan.seconds}, target=target, **common
+        )
+        assert not less.reached
+        assert less.seconds <= 0.93 * plan.seconds
+
+    def test_earlier_data_shorten_it(self) -> None:
+        rng = np.random.default_rng(2)
+        A = np.geomspace(0.01, 0.3, 12) * X_C
+        clean = di.Dahl(F_MAX, SIGMA).describing_function(A)
+        noise = np.exp(0.01 * rng.standard_normal((2, 12)).T @ [1.0, 1.0j])
+        fit = di.fit(FrequencyResponse(np.ones(12), clean * noise, A), LINEAR)
+        target = {"f_max": 0.005, "sigma": 0.005}
+        after = di.plan(fit, limits=KNEE, target=target, noise=0.02)
+        before = di.plan(LINEAR, ranges=NEAR, limits=KNEE, target=target, noise=0.02)
+        assert after.seconds < before.seconds
+        assert after.expected["sigma"].before == pytest.approx(
+            fit.optimum.stderr["sigma"] / fit.params["sigma"].value, rel=0.05
+        )
+        # what is missing is f_max: the plan goes where it shows
+        assert max(step.level for step in after.steps) > 2.0 * X_C
+
+    def test_every_limit_is_kept_and_the_one_that_prevents_is_named(self) -> None:
+        limits = {"displacement": (1e-4 * X_C, 1e-3 * X_C), "frequency_hz": (1, 5), "time": 600}
+        plan = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01)
+        assert all(step.level <= 1.0001e-3 * X_C for step in plan.steps)
+        (text,) = plan.undetermined
+        assert text.startswith("f_max stays undetermined")
+        assert "the limit of displacement prevents it" in text
+        fast = di.plan(
+            LINEAR, ranges=NEAR, noise=0.01, target="f_max",
+            limits={**KNEE, "speed": 0.05, "force": 0.08, "time": 60},
+        )  # fmt: skip
+        for step in fast.steps:
+            assert 2.0 * np.pi * step.frequency_hz * step.level <= 0.0501
+            N = abs(di.Dahl(F_MAX, SIGMA).describing_function(step.level))
+            assert step.level * N <= 0.08 * 1.02
+
+    def test_a_suspected_exponent_is_seen(self) -> None:
+        limits = {**KNEE, "time": 60}
+        plain = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="f_max")
+        careful = di.plan(
+            LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="f_max",
+            suspects={"alpha": 0.02},
+        )  # fmt: skip
+        assert _exponent_error(careful) <= 0.02 < _exponent_error(plain)
+        assert careful.reached
+
+    def test_an_assumed_exponent_counts_as_in_a_fit(self) -> None:
+        plan = di.plan(di.Dahl(), ranges=NEAR, limits={**KNEE, "time": 60}, noise=0.02)
+        assert plan.expected["alpha"].before == pytest.approx(np.log(4.0) / np.sqrt(12.0))
+        A = np.array([step.level for step in plan.steps])
+        std = 0.02 / np.sqrt([step.measured_cycles for step in plan.steps])
+        exact = di.Dahl(F_MAX, SIGMA).describing_function(A)
+        noise = np.random.default_rng(1).standard_normal((2, len(A)))
+        response = exact * np.exp(std * (noise.T @ [1.0, 1.0j]))
+        covariance = (std * np.abs(response))[:, None, None] ** 2 * np.eye(2)
+        data = FrequencyResponse(np.ones(len(A)), response, A, covariance=covariance)
+        fit = di.fit(data, di.Dahl())
+        for name in ("f_max", "sigma"):
+            found = fit.params[name]
+            assert found.stderr is not None
+            assert found.stderr / found.value == pytest.approx(plan.expected[name].after, rel=0.25)
+
+    def test_a_suspected_lack_of_symmetry_needs_even_harmonics(self) -> None:
+        plan = di.plan(
+            LINEAR, ranges=NEAR, limits={**KNEE, "time": 60}, noise=0.01,
+            larger=di.Dahl(asymmetry=0.05),
+            suspects={"asymmetry": 0.02}, candidates=40, draws=20,
+        )  # fmt: skip
+        assert plan.reached
+
+    def test_parameters_of_either_sign_are_planned(self) -> None:
+        plan = di.plan(
+            di.BoucWen(), ranges={"sigma": (29.0, 31.0), "q": (200.0, 400.0), "p": (-100.0, 300.0)},
+            limits={**KNEE, "time": 60}, noise=0.01, draws=20, candidates=40,
+        )  # fmt: skip
+        assert all(e.after < 0.25 for e in plan.expected.values())
+
+    def test_a_suspected_gap_is_seen(self) -> None:
+        plan = di.plan(
+            LINEAR, ranges=NEAR, limits={**KNEE, "time": 60}, noise=0.01, draws=20,
+            larger=di.Backlash(di.Dahl(alpha=1.0), gap=0.5 * X_C), suspects={"gap": 0.02},
+            candidates=40,
+        )  # fmt: skip
+        assert plan.reached
+        assert sum(step.level > 0.25 * X_C for step in plan.steps) > 1
+
+    def test_scatter_asks_for_more_runs(self) -> None:
+        limits = {**KNEE, "time": 300}
+        one = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="sigma")
+        many = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="sigma", scatter=0.02)
+        assert (one.runs, many.runs > 3) == (1, True)
+        assert many.expected["sigma"].scatter_share > 0.5
+        assert many.seconds <= 300.0
+
+    def test_least_time_with_scatter_takes_as_few_runs_as_needed(self) -> None:
+        # 2 % between runs leaves 1 % only with more than four
+        plan = di.plan(
+            LINEAR, ranges=NEAR, limits={**KNEE, "time": 3000}, noise=0.01, scatter=0.02,
+            between_runs=60.0, target={"f_max": 0.01}, draws=20, candidates=60,
+        )  # fmt: skip
+        assert (plan.reached, plan.runs) == (True, 5)
+        assert plan.seconds < 320.0
+
+    def test_a_driven_plant_is_planned_by_its_drive(self) -> None:
+        plant = LINEAR + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
+        plan = di.plan(
+            plant, ranges=NEAR, controlled="force", noise=0.01, draws=30, candidates=100,
+            limits={"force": (0.02, 2.0), "frequency_hz": (0.1, 3.0), "time": 400},
+        )  # fmt: skip
+        errors = _errors(plan, plant.with_values(TRUTH), 0.01, 100)
+        predicted = [plan.expected[name].after for name in ("f_max", "sigma")]
+        assert errors.std(axis=0) == pytest.approx(predicted, rel=0.22)
+        assert all(0.02 <= step.level <= 2.0 for step in plan.steps)
+
+    def test_points_with_several_amplitudes_are_avoided(self) -> None:
+        plant = LINEAR + di.Mass(0.3) + di.Damper(-0.24) + di.Spring(3.0)
+        drive, f = np.geomspace(0.05, 1.0, 12), np.full(12, 0.5)
+        known = plant.with_values(TRUTH)
+        count = di.response(known, f, drive, all_roots=True).number_of_solutions
+        assert 0 < (count > 1).sum() < 12
+        plan = di.plan(
+            plant, ranges=NEAR, controlled="force", noise=0.01, draws=20, candidates=[
+                *zip(drive.tolist(), f.tolist(), strict=True)
+            ],
+            limits={"force": 1.0, "frequency_hz": 1.0, "time": 400},
+        )  # fmt: skip
+        single = drive[count == 1]
+        assert all(np.isclose(single, step.level).any() for step in plan.steps)
+
+    def test_the_waveform_holds_the_plan(self, tmp_path: Path) -> None:
+        plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 20}, noise=0.02)
+        place = plan.write_waveform(tmp_path / "exciter.csv", 200.0)
+        table = np.loadtxt(place, delimiter=",", skiprows=1)
+        assert place.read_text().startswith("time [s],displacement [m],step,measured\n")
+        assert table[-1, 0] == pytest.approx(plan.seconds, abs=0.01)
+        for i, step in enumerate(plan.steps, start=1):
+            part = table[(table[:, 2] == i) & (table[:, 3] == 1)]
+            assert len(part) == pytest.approx(200.0 * step.measured_cycles / 5.0, abs=1)
+            assert np.abs(part[:, 1]).max() == pytest.approx(step.level, rel=0.01)
+        with pytest.raises(ValidationError, match="at least ten samples a cycle: 50"):
+            plan.write_waveform(tmp_path / "coarse.csv", 10.0)
+
+    def test_text_picture_and_data(self) -> None:
+        plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 20}, noise=0.02, draws=10)
+        assert f"{len(plan.steps)} levels in" in str(plan)
+        assert plan.to_frame()["seconds"].sum() == pytest.approx(plan.seconds)
+        assert list(plan.budget().index) == ["f_max", "sigma"]
+        axis = plan.plot()
+        assert len(axis.lines) == 4
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"ranges": {}}, "nothing is known of f_max, sigma; give ranges="),
+            ({"limits": {"time": 3}}, "limits has no frequency_hz"),
+            ({"limits": KNEE}, "without a wanted uncertainty the time is needed"),
+            ({"limits": {**KNEE, "time": 0.5}}, "the quickest level takes"),
+            ({"limits": {**KNEE, "time": 9, "force": 1e-9}}, "force refuses"),
+            ({"noise": None}, "the noise is unknown before any data"),
+            ({"noise": {"relativ": 1}}, "noise has relativ; expected relative"),
+            ({"target": {"mass": 0.1}}, "target names 'mass'; free are f_max, sigma"),
+            ({"target": {"f_max+1": 0.1}}, "expected a parameter, or a product of powers"),
+            ({"suspects": {"gap": 0.1}}, "suspects names gap"),
+            ({"ranges": {**NEAR, "c": (1, 2)}}, "ranges names c"),
+        ],
+    )
+    def test_bad_input_says_what_to_do(self, options: dict[str, Any], message: str) -> None:
+        good: dict[str, Any] = {
+            "ranges": NEAR,
+            "limits": {**KNEE, "time": 30},
+            "noise": 0.01,
+            "draws": 10,
+        }
+        with pytest.raises(ValidationError, match=message.replace("+", r"\+")):
+            di.plan(di.Dahl(), **{**good, **options})
+
+
+class TestProof:
+    """Small versions of ``python -m benchmarks.planning``, which has the numbers at full size."""
+
+    @pytest.mark.parametrize("index", [0, 1])
+    def test_intervals_are_narrower_than_a_grid_makes_them(self, index: int) -> None:
+        for row in planning.compare(planning.scenarios()[index], 150, 100 + index):
+            # of 150 tables the error of a standard deviation is 5.8 %
+            assert row.agreement == pytest.approx(1.0, abs=0.18)
+            if row.aim == row.name:
+                assert row.gain > planning.GAIN
+
+    @pytest.mark.parametrize("off", [30.0, 1.0 / 30.0])
+    def test_a_sequence_recovers_from_a_poor_guess(self, off: float) -> None:
+        spent, oracle = planning.sequence(off, seed=0)
+        assert spent <= planning.SEQUENCE * oracle
+
+    def test_whole_waveforms_give_what_was_predicted(self) -> None:
+        _, told, got = planning.waveforms(30)
+        # of 30 records the error of a standard deviation is 13 %
+        assert got == pytest.approx(told, rel=0.4)
+
+
+def _errors(plan: Plan, truth: di.Model, noise: float, count: int) -> FloatArray:
+    """Return relative errors of f_max and sigma in fits to tables measured as the plan says."""
+    rng = np.random.default_rng(3)
+    steps = [step for step in plan.steps for _ in range(plan.runs)]
+    level = np.array([step.level for step in steps])
+    f = np.array([step.frequency_hz for step in steps])
+    std = noise / np.sqrt([step.measured_cycles for step in steps])
+    if plan.controlled == "force":
+        exact = di.response(truth, f, level).dynamic_stiffness
+    else:
+        exact = truth.dynamic_stiffness(level, 2.0 * np.pi * f)
+    model = truth.with_free(["f_max", "sigma"])
+    tables = []
+    for _ in range(count):
+        response = exact * np.exp(std * (rng.standard_normal((2, len(f))).T @ [1.0, 1.0j]))
+        covariance = (std * np.abs(response))[:, None, None] ** 2 * np.eye(2)
+        where: dict[str, Any] = {"drive" if plan.controlled == "force" else "amplitude": level}
+        tables.append(
+            FrequencyResponse(
+                f, response, covariance=covariance, controlled=plan.controlled, **where
+            )
+        )
+    batch = ProblemBatch(tables, model, noise="measured")
+    found = solve_many(batch).values
+    own = [batch.names.index(name) for name in ("f_max", "sigma")]
+    return np.asarray(found[:, own] / [F_MAX, SIGMA] - 1.0)
+
+
+def _exponent_error(plan: Plan) -> float:
+    """Return the standard uncertainty of ln alpha when the plan is fitted with it free."""
+    A = np.array([step.level for step in plan.steps])
+    std = 0.01 / np.sqrt([step.measured_cycles for step in plan.steps])
+    steps = {"f_max": 1e-4, "sigma": 1e-4, "alpha": 1e-4}
+    at = {"f_max": F_MAX, "sigma": SIGMA, "alpha": 1.0}
+    columns = []
+    for name, h in steps.items():
+        up, down = (
+            np.log(di.Dahl(**{**at, name: at[name] * np.exp(s)}).describing_function(A))
+            for s in (h, -h)
+        )
+        slope = (up - down) / (2.0 * h)
+        columns.append(np.concatenate([slope.real / std, slope.imag / std]))
+    J = np.array(columns).T
+    if np.linalg.matrix_rank(J, tol=1e-6 * np.abs(J).max()) < 3:
+        return float("inf")
+    return float(np.sqrt(np.linalg.inv(J.T @ J)[2, 2]))

@@ -1,0 +1,101 @@
+"""A damper with a power of the speed."""
+
+from __future__ import annotations
+
+import json
+
+import mpmath
+import numpy as np
+import pytest
+
+from dahl_ident import Dahl, Damper, Mass, PowerDamper, Spring, response
+from dahl_ident.elements.description import describe_model, model_from_description
+from dahl_ident.elements.model import as_model
+from dahl_ident.errors import ValidationError
+from tests.test_response_of_any_law import all_amplitudes
+
+
+def exactly(c: float, p: float, A: float, omega: float, k: int) -> complex:
+    with mpmath.workdps(25):
+        height = mpmath.mpf(c) * (mpmath.mpf(A) * omega) ** p
+        share = mpmath.quad(
+            lambda t: mpmath.sin(t) ** p * mpmath.sin(k * t), [0, mpmath.pi / 2, mpmath.pi]
+        )
+        return complex(1j * height / A * 2 / mpmath.pi * share)
+
+
+@pytest.mark.parametrize("p", [0.1, 0.5, 1.0, 1.7, 2.0, 3.0])
+def test_harmonics_against_quadrature(p: float) -> None:
+    law = PowerDamper(2.0, p)
+    for k in (1, 3, 5, 7):
+        ours = complex(law.dynamic_stiffness(0.3, 7.0, harmonic=k))
+        expected = exactly(2.0, p, 0.3, 7.0, k)
+        size = abs(exactly(2.0, p, 0.3, 7.0, 1))
+        assert abs(ours - expected) < 1e-11 * size
+        assert complex(law.dynamic_stiffness(0.3, 7.0, harmonic=k - 1)) == 0.0
+
+
+def test_its_special_cases() -> None:
+    A, omega = np.array([0.01, 0.1, 1.0]), 3.0
+    np.testing.assert_allclose(
+        PowerDamper(2.0, 1.0).dynamic_stiffness(A, omega),
+        Damper(2.0).dynamic_stiffness(A, omega),
+        rtol=1e-13,
+    )
+    coulomb = PowerDamper(2.0, 1e-9).dynamic_stiffness(A, omega)
+    np.testing.assert_allclose(A * coulomb, 8j / np.pi, rtol=1e-7)
+    slow = PowerDamper(2.0, 0.5, reference_speed=0.01).dynamic_stiffness(A, omega)
+    np.testing.assert_allclose(slow, 10.0 * PowerDamper(2.0, 0.5).dynamic_stiffness(A, omega))
+    assert PowerDamper(2.0, 0.5).dynamic_stiffness(0.1, 0.0) == 0.0
+
+
+@pytest.mark.parametrize("p", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("k", [1, 3])
+def test_derivatives_against_high_precision(p: float, k: int) -> None:
+    law = as_model(PowerDamper(2.0, p)).with_free(["coefficient", "exponent", "reference_speed"])
+    A, omega, h = 0.3, 7.0, 1e-5
+    found = law.stiffness_gradient(law.known_values(), np.asarray(A), np.asarray(omega), k)
+    size = abs(exactly(2.0, p, A, omega, 1))
+    by_A = (exactly(2.0, p, A + h, omega, k) - exactly(2.0, p, A - h, omega, k)) / (2.0 * h)
+    by_p = (exactly(2.0, p + h, A, omega, k) - exactly(2.0, p - h, A, omega, k)) / (2.0 * h)
+    value = exactly(2.0, p, A, omega, k)
+    assert abs(complex(found.by_amplitude) - by_A) < 1e-7 * size
+    assert abs(complex(found.by_parameter[0]) - value / 2.0) < 1e-11 * size
+    assert abs(complex(found.by_parameter[1]) - by_p) < 1e-7 * size
+    assert abs(complex(found.by_parameter[2]) + p * value) < 1e-11 * size
+
+
+@pytest.mark.parametrize("p", [0.3, 0.7, 2.0])
+def test_response_beside_it(p: float) -> None:
+    plant = PowerDamper(0.4, p) + Dahl(0.1, 30.0) + Mass(0.3) + Spring(3.0)
+    for frequency in (0.3, 0.5, 3.0):
+        for drive in (0.02, 0.2, 2.0):
+            ours = response(plant, frequency, drive, all_roots=True)
+            np.testing.assert_allclose(
+                np.ravel(ours.amplitude), all_amplitudes(plant, frequency, drive), rtol=1e-8
+            )
+
+
+def test_casadi_says_the_same() -> None:
+    ca = pytest.importorskip("casadi")
+    law = PowerDamper(2.0, 0.5)
+    p, A, w = ca.SX.sym("p"), ca.SX.sym("A"), ca.SX.sym("w")
+    for k in (1, 3, 5):
+        real, imag = law.casadi_stiffness([ca.SX(2.0), p, ca.SX(1.0)], A, w, k)
+        function = ca.Function("N", [p, A, w], [real, imag])
+        for exponent in (0.2, 0.5, 1.7, 3.0):
+            expected = exactly(2.0, exponent, 0.3, 7.0, k)
+            size = abs(exactly(2.0, exponent, 0.3, 7.0, 1))
+            assert abs(float(function(exponent, 0.3, 7.0)[1]) - expected.imag) < 1e-11 * size
+
+
+def test_force_description_and_refusals() -> None:
+    law = PowerDamper(2.0, 0.5, name="oil")
+    assert law.force([0.0, 0.0], velocity=[0.25, -4.0]).tolist() == [1.0, -4.0]
+    (again,) = model_from_description(json.loads(json.dumps(describe_model(law)))).elements
+    assert again.parameters == law.parameters
+    assert [p.dimension for p in law.parameters] == [(1, 0, 0), (0, 0, 0), (0, 1, -1)]
+    with pytest.raises(ValidationError, match="needs velocity"):
+        law.force([0.0, 1.0])
+    with pytest.raises(ValidationError, match="exponent is"):
+        PowerDamper(1.0, 3.5)

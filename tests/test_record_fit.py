@@ -1,0 +1,358 @@
+"""Fits to records of any motion: recovery, error bars, verdicts, prediction, storage, refusals."""
+
+from __future__ import annotations
+
+import json
+import os
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import binom
+
+import dahl_ident as di
+from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.correlated_residuals import autoregression, sandwich
+from dahl_ident.elements import Element, Model
+from dahl_ident.errors import DataError, ModelError, ValidationError
+from dahl_ident.problem.record_noise import drive_noise, excited, prediction_error_filter
+from dahl_ident.results import RecordFit
+from dahl_ident.time_domain import ForcedMotion, Plant, band_limited, differentiated
+
+MEASURED = os.environ.get("DAHL_IDENT_MEASURED_DATA")
+needs_measured = pytest.mark.skipif(not MEASURED, reason="DAHL_IDENT_MEASURED_DATA is not set")
+RATE = 500.0
+DAHL = di.Dahl(f_max=0.1, sigma=30.0)
+BOUC_WEN = di.BoucWen(sigma=30.0, q=200.0, p=500.0)
+
+
+def trajectory(kind: str, samples: int, seed: int = 0) -> FloatArray:
+    """Return a displacement of about 10 mm, sampled at 500 Hz."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(samples) / RATE
+    if kind == "random":
+        shaped = lfilter([1.0], np.poly([0.97, 0.97, 0.9]), rng.standard_normal(samples))
+        return np.asarray(8e-3 * shaped / np.abs(shaped).max())
+    if kind == "multisine":
+        waves = [np.sin(2 * np.pi * (k * t + rng.random())) for k in (1.0, 2.2, 3.7)]
+        return np.asarray(3e-3 * np.sum(waves, axis=0))
+    lengths = rng.uniform(-1.0, 1.0, samples // 100 + 2)  # stop and go
+    return np.asarray(8e-3 * np.interp(t * RATE / 100.0, np.arange(lengths.size), lengths))
+
+
+def recorded(model: Element, kind: str, samples: int, noise: float, seed: int = 0) -> di.Record:
+    """Return a record of the displacement and its noisy force."""
+    x = trajectory(kind, samples, seed)
+    v, _ = differentiated(x, 1.0 / RATE)
+    force = np.zeros(samples)
+    for element in Model(model).elements:
+        values = [float(v) for v in element.known_values()]
+        force += element.force_history(values, x, v, 0.02 if element.has_memory else 0.0)
+    rng = np.random.default_rng(seed + 1000)
+    time = np.arange(samples) / RATE
+    return di.Record(time, displacement=x, force=force + noise * rng.standard_normal(samples))
+
+
+def driven(
+    seed: int, noise: float, samples: int = 2048, channel: str = "displacement"
+) -> di.Record:
+    """Return a record of a plant with Dahl friction under a multisine force."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(samples) / RATE
+    lines = np.arange(3, 60) * RATE / samples * 2.0
+    drive = 0.03 * np.sum([np.sin(2 * np.pi * (f * t + rng.random())) for f in lines], axis=0)
+    model = Model(di.Dahl(0.1, 300.0) + di.Mass(0.3) + di.Damper(0.5) + di.Spring(50.0))
+    forced = ForcedMotion(Plant(model, "force"), band_limited(drive, 1 / RATE, 8), 1 / RATE)
+    none = np.zeros(0)
+    motion = forced.solve(none, np.array([1e-4, 0.0, 0.0]), np.zeros((samples, 3)))
+    if channel == "acceleration":
+        y, _ = forced.accelerations(none, motion, drive, None)
+    else:
+        y = motion[:, ("displacement", "velocity").index(channel)]
+    y = y + noise * y.std() * rng.standard_normal(samples)
+    return di.Record(t, force=drive, **{channel: y})
+
+
+@pytest.mark.parametrize("kind", ["random", "multisine", "trapezoid"])
+@pytest.mark.parametrize(
+    ("truth", "model"),
+    [
+        (DAHL, di.Dahl()),
+        (BOUC_WEN, di.BoucWen()),
+        (DAHL + di.Spring(5.0) + di.Damper(0.3), di.Dahl() + di.Spring() + di.Damper()),
+        (di.Dahl(0.1, 30.0, alpha=1.7), di.Dahl(alpha=None)),
+    ],
+)
+def test_force_from_displacement(kind: str, truth: Element, model: Element) -> None:
+    fit = di.fit(recorded(truth, kind, 1500, 1e-3), model)
+    assert fit.trusted, fit.verdict
+    for parameter in truth.parameters:
+        found = fit.params[parameter.name]
+        if found.vary and found.stderr is not None:
+            assert abs(found.value - float(parameter.value or 0)) < 4.5 * found.stderr
+            assert found.stderr < 0.2 * found.value
+
+
+def test_exact_where_there_is_no_noise() -> None:
+    fit = di.fit(recorded(BOUC_WEN, "random", 1500, 0.0), di.BoucWen())
+    assert fit.params["q"].value == pytest.approx(200.0, rel=1e-7)
+    assert fit.params["initial_force"].value == pytest.approx(0.02, rel=1e-6)
+
+
+@pytest.mark.parametrize("channel", ["displacement", "velocity", "acceleration"])
+def test_motion_from_force(channel: str) -> None:
+    model = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
+    truth = {"f_max": 0.1, "sigma": 300.0, "mass": 0.3, "damping": 0.5, "stiffness": 50.0}
+    fit = di.fit(driven(1, 0.01, channel=channel), model)
+    assert fit.trusted, fit.verdict
+    for name, value in truth.items():
+        found = fit.params[name]
+        assert found.stderr is not None
+        assert abs(found.value - value) < 4.5 * found.stderr, fit
+        assert found.stderr < 0.2 * value
+
+
+def test_ring_down() -> None:
+    samples = 500
+    t = np.arange(samples) / RATE
+    truth = Model(di.Dahl(0.1, 300.0) + di.Mass(0.3) + di.Damper(0.5) + di.Spring(50.0))
+    drive = np.zeros(samples)
+    forced = ForcedMotion(Plant(truth, "force"), band_limited(drive, 1 / RATE, 8), 1 / RATE)
+    x = forced.solve(np.zeros(0), np.array([2e-2, 0.0, 0.1]), np.zeros((samples, 3)))[:, 0]
+    x = x + 1e-5 * np.random.default_rng(0).standard_normal(samples)
+    record = di.Record(t, displacement=x, force=drive)
+    model = di.Dahl() + di.Mass(0.3) + di.Damper() + di.Spring()
+    fit = di.fit(record, model, substeps=2)
+    for name, value in {"f_max": 0.1, "sigma": 300.0, "stiffness": 50.0}.items():
+        found = fit.params[name]
+        assert found.stderr is not None
+        assert abs(found.value - value) < 4.5 * found.stderr
+
+
+def test_runs_are_fitted_together() -> None:
+    runs = [recorded(DAHL, "random", 600, 1e-3, seed) for seed in (1, 2, 3)]
+    fit = di.fit(runs, di.Dahl())
+    single = di.fit(runs[0], di.Dahl())
+    one, three = single.params["sigma"].stderr, fit.params["sigma"].stderr
+    assert one is not None
+    assert three is not None
+    assert three < 0.8 * one
+    assert {"initial_force_1", "offset_3"} <= set(fit.params)
+    assert fit.predict(recorded(DAHL, "multisine", 600, 0.0)).rms_error < 1e-3
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.9])
+def test_error_bars_cover(pole: float) -> None:
+    runs, inside = 24, 0
+    clean = recorded(DAHL, "random", 400, 0.0)
+    model = di.Dahl()
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        noise = lfilter([1.0], [1.0, -pole], rng.standard_normal(600))[200:]
+        force = clean.force_samples + 2e-3 * np.sqrt(1.0 - pole**2) * noise
+        record = di.Record(clean.time, displacement=clean.displacement, force=force)
+        fit = di.fit(record, model, start={"f_max": 0.1, "sigma": 30.0})
+        low, high = fit.conf_interval()["f_max"]
+        inside += low < 0.1 < high
+    assert binom.ppf(1e-4, runs, 0.95) <= inside, inside
+
+
+def test_noise_in_the_drive_does_not_pass_for_stiffness() -> None:
+    # a plant that nearly floats: slow noise in the measured force moves the model, not the plant
+    rng = np.random.default_rng(3)
+    samples = 4000
+    t = np.arange(samples) / 200.0
+    level = np.interp(t % 5.0, [0.0, 1.0, 2.5, 4.0, 5.0], [0.0, 1.5, 0.3, 0.6, 0.0])
+    drive = level * np.sin(2 * np.pi * (2.0 + t // 5.0) * t)
+    truth = {"f_max": 0.1, "sigma": 30.0, "mass": 0.3, "damping": 2.0, "stiffness": 3.0}
+    model = di.Dahl(0.1, 30.0) + di.Mass(0.3) + di.Damper(2.0) + di.Spring(3.0)
+    forced = ForcedMotion(Plant(Model(model), "force"), band_limited(drive, 5e-3, 2), 5e-3)
+    x = forced.solve(np.zeros(0), np.zeros(3), np.zeros((samples, 3)))[:, 0]
+    x = x + 3e-5 * rng.standard_normal(samples)
+    slow = lfilter([1.0], [1.0, -0.999], rng.standard_normal(samples))
+    measured = drive + 1e-2 * rng.standard_normal(samples) + 5e-5 * slow
+    record = di.Record(t, displacement=x, force=measured)
+    fit = di.fit(record, di.Dahl() + di.Mass() + di.Damper() + di.Spring(), start=truth)
+    assert fit.weighted
+    assert fit.trusted, fit.verdict
+    for name, value in truth.items():
+        found = fit.params[name]
+        assert found.stderr is not None
+        assert abs(found.value - value) < 4.0 * found.stderr, fit
+    assert (fit.params["stiffness"].stderr or 0.0) < 0.6
+    assert fit.budget()["mass"].rows[0].source == "noise"
+    assert {"noise", "noise in the drive"} == {r.source for r in fit.budget()["mass"].rows}
+
+
+def test_prediction_error_filter_of_a_known_process() -> None:
+    e = lfilter([1.0], [1.0, -1.2, 0.5], np.random.default_rng(1).standard_normal(40_000))
+    found = prediction_error_filter([np.asarray(e)])
+    np.testing.assert_allclose(found[:3], [1.0, -1.2, 0.5], atol=0.03)
+    assert prediction_error_filter([np.zeros(100)]).tolist() == [1.0]
+
+
+def test_noise_of_a_drive_from_outside_its_band() -> None:
+    t = np.arange(20_000) / 500.0
+    rng = np.random.default_rng(0)
+    wave = np.sin(2 * np.pi * 7.0 * t)
+    noise = 0.01 * rng.standard_normal(t.size)
+    band = excited(wave + noise)
+    inside = float(np.mean(band)) * 1e-4  # white: its variance times the band's share
+    assert drive_noise([wave + noise]) == pytest.approx(inside / 0.5, rel=0.1)
+    assert drive_noise([noise]) is None
+
+
+def test_sandwich_of_white_residuals_is_the_usual_covariance() -> None:
+    rng = np.random.default_rng(0)
+    J, e = rng.standard_normal((5000, 3)), rng.standard_normal(5000)
+    covariance, effective = sandwich([J], [e])
+    usual = np.linalg.inv(J.T @ J) * (e @ e) / 4997
+    np.testing.assert_allclose(covariance, usual, atol=0.15 * usual.max())
+    assert effective == pytest.approx(5000, rel=0.15)
+
+
+def test_autoregression_finds_a_known_one() -> None:
+    e = lfilter([1.0], [1.0, -1.2, 0.5], np.random.default_rng(1).standard_normal(40_000))
+    a, variance = autoregression(np.asarray(e))
+    np.testing.assert_allclose(a[:2], [1.2, -0.5], atol=0.03)
+    assert variance == pytest.approx(1.0, rel=0.03)
+
+
+def test_what_is_not_determined_is_said_with_the_motion_that_would() -> None:
+    small = recorded(di.Dahl(0.1, 30.0), "random", 800, 1e-4)
+    assert small.displacement is not None
+    x = small.displacement * 0.01  # far below x_c
+    noise = 3e-4 * np.random.default_rng(0).standard_normal(800)
+    force = DAHL.force(x) + noise
+    fit = di.fit(di.Record(small.time, displacement=x, force=force), di.Dahl(), throw=False)
+    assert not fit.trusted
+    assert "f_max is not determined" in fit.verdict
+    assert "move farther" in fit.verdict
+
+
+def test_a_wrong_model_is_not_trusted() -> None:
+    fit = di.fit(recorded(di.Spring(10.0) + DAHL, "random", 800, 1e-4), di.Dahl(), throw=False)
+    assert not fit.trusted
+
+
+def test_stored_and_read_again(tmp_path: Path) -> None:
+    fit = di.fit(recorded(BOUC_WEN, "random", 500, 1e-3), di.BoucWen())
+    again = RecordFit.load(fit.save(tmp_path / "fit.json"))
+    assert {n: str(p) for n, p in again.params.items()} == {
+        n: str(p) for n, p in fit.params.items()
+    }
+    assert again.verdict == fit.verdict
+    with pytest.raises(DataError, match="holds no fit"):
+        RecordFit.from_json("{}")
+    table = fit.summary()
+    assert list(table.index[:3]) == ["sigma", "q", "p"]
+    assert again.budget().to_dict() == fit.budget().to_dict()
+    for kind in ("time", "loop", "residuals", "residuals_displacement"):
+        assert fit.plot(kind).get_ylabel()
+
+
+def test_prediction_of_another_record() -> None:
+    model = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
+    fit = di.fit(driven(1, 0.001), model)
+    band = fit.predict(driven(2, 0.0))
+    assert band.rms_share < 0.01
+    inside = (band.measured >= band.lower) & (band.measured <= band.upper)
+    assert inside.mean() > 0.9
+    assert fit.simulate(driven(2, 0.0)).shape == (2048,)
+
+
+def test_refusals() -> None:
+    record = recorded(DAHL, "random", 100, 1e-3)
+    t = np.arange(100.0)
+    with pytest.raises(DataError, match="no displacement"):
+        di.fit(di.Record(t, velocity=np.sin(t), force=t), di.Dahl())
+    with pytest.raises(DataError, match="not evenly sampled"):
+        di.fit(di.Record(t**1.5, displacement=t, force=np.sin(t)), di.Dahl() + di.Damper())
+    with pytest.raises(DataError, match="expected at least 16"):
+        di.fit(recorded(DAHL, "random", 12, 0.0), di.Dahl())
+    with pytest.raises(DataError, match="no record"):
+        di.fit([], di.Dahl())
+    with pytest.raises(ModelError, match="nothing is free"):
+        di.fit(record, DAHL)
+    with pytest.raises(ModelError, match="start names nothing"):
+        di.fit(record, di.Dahl(), start={"nothing": 1.0})
+    with pytest.raises(ValidationError, match="noise given"):
+        di.fit(record, di.Dahl(), noise="relative")  # type: ignore[call-overload]
+    with pytest.raises(ValidationError, match="data holds a str"):
+        di.fit("run.csv", di.Dahl())  # type: ignore[arg-type]
+
+
+@needs_measured
+def test_earthquake_on_friction_isolators() -> None:
+    place = Path(str(MEASURED)) / "base_isolation"
+    floors = [np.loadtxt(place / f"ICA100_a{i}.txt") for i in range(1, 7)]
+    x = np.loadtxt(place / "ICA100_d1.txt")
+    n = min(len(x), *map(len, floors))
+    force = -np.mean([a[:n] for a in floors], axis=0)
+    record = di.Record(np.arange(n) / 200.0, displacement=x[:n], force=force)
+    fit = di.fit(record, di.Dahl() + di.Spring() + di.Damper())
+    assert fit.goodness.share_left < 0.1**2
+    assert fit.status.value == "approximate"
+
+
+def test_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dahl_ident.cli import main
+
+    place = tmp_path / "run.csv"
+    recorded(DAHL, "random", 500, 1e-3).to_frame().to_csv(place, index=False)
+    monkeypatch.setattr(
+        "sys.argv",
+        ["dahl-ident", "fit", str(place), "--record", "--report", str(tmp_path / "a.md")],
+    )
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code in (0, None)
+    assert (tmp_path / "a_pictures" / "record_loop_1.png").exists()
+    assert "Trusted." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("ending", ["json", "html"])
+def test_report(tmp_path: Path, ending: str) -> None:
+    fit = di.fit(recorded(BOUC_WEN, "random", 500, 1e-3), di.BoucWen())
+    place = di.report(fit, tmp_path / f"report.{ending}", metadata={"specimen": "joint 7"})
+    text = place.read_text("utf-8")
+    assert "joint 7" in text
+    if ending == "json":
+        jsonschema = pytest.importorskip("jsonschema")
+        schema = files("dahl_ident.reporting") / "report.schema.json"
+        facts = json.loads(text)
+        jsonschema.validate(facts, json.loads(schema.read_text("utf-8")))
+        assert facts["record_fits"][0]["parameters"]["q"]["value"] == fit.params["q"].value
+    else:
+        for caption in ("Measured and fitted force", "Residuals over displacement"):
+            assert caption in text
+    with pytest.raises(ValidationError, match="by themselves"):
+        di.report([fit, di.fit(di.load_dataset("noisy"), di.Dahl())], tmp_path / "other.html")
+
+
+def test_what_records_cannot_do_is_refused_by_name() -> None:
+    fit = di.fit(recorded(DAHL, "random", 500, 1e-3), di.Dahl())
+    with pytest.raises(ValidationError, match="posterior of a Record is not available"):
+        di.posterior(fit.records[0], di.Dahl())  # type: ignore[call-overload]
+    with pytest.raises(ValidationError, match="predicts a Record"):
+        fit.predict(2.0, amplitude=1e-3)
+    with pytest.raises(ModelError, match="cannot be driven by a force"):
+        di.fit(driven(1, 0.01, 64), di.Backlash(di.Dahl()) + di.Mass())
+
+
+def test_derived_quantities_follow_from_the_estimate() -> None:
+    fit = di.fit(recorded(DAHL, "random", 500, 1e-3), di.Dahl())
+    f_max, sigma = fit.params["f_max"].value, fit.params["sigma"].value
+    x_c, energy, stiffness, damping = fit.derived([2e-3], 5.0)
+    N = di.Dahl(f_max, sigma).describing_function(2e-3).item()
+    assert x_c.value == pytest.approx(f_max / sigma)
+    gradient = np.zeros(len(fit.var_names))
+    gradient[:2] = 1.0 / sigma, -f_max / sigma**2
+    assert x_c.stderr == pytest.approx(float(gradient @ fit.covar @ gradient) ** 0.5, rel=1e-4)
+    assert energy.value == pytest.approx(np.pi * 4e-6 * N.imag)
+    assert stiffness.value == pytest.approx(N.real)
+    assert damping.value == pytest.approx(N.imag / (10.0 * np.pi))

@@ -1,0 +1,120 @@
+"""The command in a report repeats its result: it is run, and the numbers are compared."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import dahl_ident as di
+from dahl_ident.reporting.equivalent_command import equivalent_command
+from dahl_ident.synthetic.shipped import datasets_directory
+from tests.command_line import Runner
+
+A = np.geomspace(3e-4, 3e-2, 12)
+NOISE = 0.01 * np.random.default_rng(3).standard_normal((2, 12))
+
+
+def table(friction: di.Dahl) -> di.FrequencyResponse:
+    response = friction.describing_function(A) * np.exp(NOISE[0] + 1j * NOISE[1])
+    return di.FrequencyResponse(np.full(12, 2.0), response, A)
+
+
+def shipped(name: str) -> di.FrequencyResponse:
+    data = di.load_dataset(name)
+    assert isinstance(data, di.FrequencyResponse)
+    return data
+
+
+def check_repeated(run: Runner, fit: di.FitResult) -> str:
+    command = equivalent_command([fit])
+    assert command is not None
+    told: dict[str, Any] = json.loads(run.line(command, "--json").out)["params"]
+    assert set(told) == set(fit.params)
+    for name, estimate in fit.params.items():
+        assert told[name]["vary"] == estimate.vary
+        assert told[name]["value"] == pytest.approx(estimate.value, rel=1e-7)
+        if estimate.stderr is not None:
+            assert told[name]["stderr"] == pytest.approx(estimate.stderr, rel=1e-5)
+    return command
+
+
+def test_of_files_with_options(run: Runner) -> None:
+    text = "frequency_hz,gain [N/m],phase_deg\n"
+    for level in ("my 1.csv", "2.csv"):
+        rows = table(di.Dahl(0.1, 30.0))
+        half = rows.select(rows=(np.arange(12) < 6) == (level == "2.csv"))
+        text_rows = [
+            f"{f},{g},{p}" for f, g, p in zip(half.frequency_hz, half.gain, np.degrees(half.phase),
+                                              strict=True)
+        ]  # fmt: skip
+        Path(level).write_text(text + "\n".join(text_rows) + "\n", encoding="utf-8")
+    data = di.read_frequency_response(["my 1.csv", "2.csv"], amplitude="2 mm rms")
+    fit = di.fit(data, di.Dahl() + di.Spring(0.5), noise="absolute", throw=False)
+    command = check_repeated(run, fit)
+    assert "'my 1.csv' 2.csv --amplitude '2 mm rms'" in command
+
+
+def test_of_sensors_priors_and_solver(run: Runner) -> None:
+    table(di.Dahl(0.1, 30.0, 1.3)).save("t.csv")
+    sensors = di.Sensors(force_gain=stats.norm(1.0, scale=0.02), delay=-1e-3)
+    fit = di.fit(
+        di.read_frequency_response("t.csv"), di.Dahl(), free=["alpha"], sensors=sensors,
+        loss="huber", throw=False,
+    )  # fmt: skip
+    command = check_repeated(run, fit)
+    assert "--force-gain 'norm(1.0, scale=0.02)'" in command
+    fit = di.fit(di.read_frequency_response("t.csv"), di.Dahl(alpha=1.3), method="ipopt")
+    assert "--alpha 1.3 --noise relative --method ipopt" in check_repeated(run, fit)
+
+
+def test_of_a_shipped_table(run: Runner) -> None:
+    command = check_repeated(run, di.fit(shipped("noisy"), di.Dahl()))
+    assert command.startswith("dahl-ident datasets noisy -o - | dahl-ident fit - ")
+
+
+def test_of_waveforms(run: Runner) -> None:
+    record = di.read_record(datasets_directory() / "plant_recording.csv.gz")
+    data = di.extract(record, controlled="force", harmonics=[1], num_periods=8)
+    data = data.select(rows=data.quality["verdict"] == "good")
+    plant = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
+    command = check_repeated(run, di.fit(data, plant, throw=False))
+    assert "--num-periods 8" in command
+
+
+def test_of_a_posterior(run: Runner) -> None:
+    table(di.Dahl(0.1, 30.0)).save("t.csv")
+    data = di.read_frequency_response("t.csv")
+    priors: dict[str, Any] = {"f_max": stats.lognorm(s=0.5, scale=0.1), "sigma": (1.0, 100.0)}
+    posterior = di.posterior(data, di.Dahl(), priors=priors, seed=4, steps=40)
+    command = equivalent_command([posterior])
+    assert command is not None
+    told = json.loads(run.line(command, "--json").out)
+    assert told["summary"]["sigma"]["mean"] == posterior.summary().loc["sigma", "mean"]
+
+
+def test_of_what_the_command_line_wrote(run: Runner) -> None:
+    table(di.Dahl(0.1, 30.0)).save("t.csv")
+    run("report", "t.csv", "--stiffness", "free", "-o", "r.html", "-o", "one.json")
+    page = Path("r.html").read_text(encoding="utf-8")
+    found = re.search(r"<pre tabindex=\"0\">(dahl-ident [^<]*)</pre>", page)
+    assert found is not None
+    first = Path("one.json").read_bytes()
+    run.line(found[1], "--overwrite")
+    one, two = (json.loads(text)["fits"] for text in (first, Path("one.json").read_bytes()))
+    assert one == two
+
+
+def test_what_no_command_describes_is_said_so(tmp_path: Path) -> None:
+    data = table(di.Dahl(0.1, 30.0))
+    fit = di.fit(data, di.Dahl())
+    assert equivalent_command([fit]) is None, "these data come from no file"
+    named = di.fit(shipped("noisy"), di.Dahl(name="pivot"))
+    assert equivalent_command([named]) is None, "the command line gives no names"
+    text = di.report(fit, tmp_path / "r.md").read_text(encoding="utf-8")
+    assert "in Python; no command describes this model and these data" in text

@@ -1,0 +1,290 @@
+"""Reports as a laboratory signs them: header, order, what is crossed out, comparison, schema."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import re
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import dahl_ident as di
+from dahl_ident import report
+from dahl_ident.diagnostics.formatting import listed
+from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.reporting.markdown import markdown
+from dahl_ident.reporting.metadata import metadata_of
+from dahl_ident.reporting.sections import document
+from tests.browser import CHROMIUM, Page, chromium
+
+METADATA: dict[str, Any] = {
+    "specimen": "Flex pivot 12",
+    "operator": "A. Smith",
+    "measured": "2026-11-20",
+    "ambient": {"temperature": "22.1 °C"},
+    "instruments": [
+        {"name": "Force sensor", "serial": "4711", "calibration": "2026-03-01",
+         "uncertainty": "0.5 %"},
+        {"name": "LVDT"},
+    ],
+}  # fmt: skip
+SCHEMA = json.loads((files("dahl_ident.reporting") / "report.schema.json").read_text("utf-8"))
+
+
+def measured(
+    f_max: float, seed: int, *, amplitudes: tuple[float, float] = (3e-4, 3e-2), file: str = ""
+) -> di.FrequencyResponse:
+    A = np.geomspace(*amplitudes, 20)
+    scatter = 0.01 * np.random.default_rng(seed).standard_normal((2, 20))
+    response = di.Dahl(f_max, 30.0).describing_function(A) * np.exp(scatter[0] + 1j * scatter[1])
+    provenance = {"file": file, "sha256": "ab" * 32} if file else None
+    return di.FrequencyResponse(np.ones(20), response, A, provenance=provenance)
+
+
+def text_of(*results: di.FitResult, metadata: Any = None) -> str:
+    """Return a report as text, without the pictures and without escapes."""
+    whole = document(results, metadata=metadata_of(metadata)).numbered()
+    return markdown(whole, "pictures").decode().replace("\\", "")
+
+
+@pytest.fixture(scope="module")
+def fit() -> di.FitResult:
+    return di.fit(measured(0.1, 1, file="pivot.csv"), di.Dahl())
+
+
+@pytest.fixture(scope="module")
+def microslip() -> di.FitResult:
+    return di.fit(measured(0.1, 1, amplitudes=(1e-7, 1e-6)), di.Dahl(), throw=False)
+
+
+def test_the_header_states_what_was_measured_and_with_what(
+    fit: di.FitResult,
+) -> None:
+    text = text_of(fit, metadata=METADATA)
+    head = text.split("\n## ")[0]
+    for row in (
+        "| Specimen | Flex pivot 12 |",
+        "| Model | Dahl friction; Dahl friction: dF/dx = sigma",
+        "SHA-256 " + "ab" * 32,
+        "| Instruments | Force sensor, serial 4711, calibrated: 2026-03-01, uncertainty 0.5 %; "
+        "LVDT, calibration not stated, uncertainty not stated |",
+        "| Ambient conditions | temperature 22.1 °C |",
+        "| Operator | A. Smith |",
+        f"| Software | dahl_ident {di.__version__} |",
+    ):
+        assert row in head
+    assert "____" not in head
+
+
+def test_what_nobody_stated_is_a_line_to_fill_in(fit: di.FitResult, tmp_path: Path) -> None:
+    head = text_of(fit).split("\n## ")[0]
+    blank = re.findall(r"^\| ([\w ]+) \| _+ \|$", head, re.MULTILINE)
+    assert blank == [
+        "Specimen", "Instruments", "Ambient conditions", "Date of measurement", "Operator"
+    ]  # fmt: skip
+    page = report(fit, tmp_path / "r.html").read_text("utf-8")
+    assert page.count('class="blank"') == len(blank) + 3, "and date, name, signature"
+
+
+def test_metadata_from_a_file(fit: di.FitResult, tmp_path: Path) -> None:
+    place = tmp_path / "lab.toml"
+    place.write_text('specimen = "S 1"\nmeasured = 2026-11-20\n[ambient]\nhumidity = "41 %"\n')
+    facts = json.loads(report(fit, tmp_path / "r.json", metadata=place).read_text("utf-8"))
+    assert facts["metadata"]["specimen"] == "S 1"
+    assert facts["metadata"]["measured"] == "2026-11-20"
+    assert facts["metadata"]["ambient"] == ["humidity 41 %"]
+    place.write_text("specimen = ")
+    with pytest.raises(DataError, match=r"lab\.toml: is not a TOML file"):
+        report(fit, tmp_path / "s.json", metadata=place)
+    with pytest.raises(DataError, match=r"absent\.toml: cannot be read"):
+        report(fit, tmp_path / "s.json", metadata=tmp_path / "absent.toml")
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"speciman": "x"}, "metadata has the field 'speciman'; expected any of title, lab"),
+        ({"operator": ["x"]}, r"operator is \['x'\]; expected a text"),
+        ({"instruments": "x"}, "instruments is 'x'; expected a list"),
+        ({"instruments": [{"nmae": "x"}]}, r"instruments\[0\] has the field 'nmae'"),
+    ],
+)
+def test_metadata_of_another_kind_is_refused(
+    fit: di.FitResult, tmp_path: Path, given: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValidationError, match=message):
+        report(fit, tmp_path / "r.json", metadata=given)
+
+
+def test_the_hash_is_that_of_the_file_that_was_read(tmp_path: Path) -> None:
+    """Also where the file is a copy that carries the hash of what it was made from."""
+    from dahl_ident.cli.files import write_data
+    from dahl_ident.synthetic import load_dataset
+
+    place = tmp_path / "noisy.csv"
+    write_data(load_dataset("noisy"), str(place), overwrite=False)
+    again = di.fit(di.read_frequency_response(place), di.Dahl())
+    facts = json.loads(report(again, tmp_path / "r.json").read_text("utf-8"))
+    read = [one for one in facts["files"] if one["read"]]
+    assert [Path(one["file"]).name for one in read] == ["noisy.csv"]
+    assert read[0]["sha256"] == hashlib.sha256(place.read_bytes()).hexdigest()
+    assert len(facts["files"]) == 2, "the shipped file it was made from stands after it"
+
+
+def test_the_order_is_answer_assumed_pictures_details(fit: di.FitResult, tmp_path: Path) -> None:
+    text = text_of(fit)
+    sections = re.findall(r"^## (.*)$", text, re.MULTILINE)
+    assert sections[:6] == [
+        "Result", "Uncertainty budget", "What was assumed", "Pictures", "Signature", "Parameters"
+    ]  # fmt: skip
+    assumed = text.split("## What was assumed")[1].split("## ")[0]
+    assert "Held fixed: alpha = 1." in assumed
+    assert f"Taken as exact: {listed(fit.budget().exact)}." in assumed
+    budget = text.split("## Uncertainty budget")[1].split("## ")[0]
+    for row in fit.budget()["f_max"].rows:
+        assert f"| f_max | {row.source} | {row.kind} | {row.u:.2g} |" in budget
+    for kind in ("Figure", "Table"):
+        numbers = [int(n) for n in re.findall(rf"[*]{kind} (\d+)\.", text)]
+        assert numbers == list(range(1, len(numbers) + 1))
+
+
+def test_what_must_not_be_used_is_crossed_out_with_its_reason(
+    fit: di.FitResult, microslip: di.FitResult, tmp_path: Path
+) -> None:
+    rows = _result_rows(text_of(microslip))
+    assert rows["f_max"][1].startswith("~~")
+    assert "not determined, because no amplitude" in rows["f_max"][-1]
+    assert not any("~~" in cell for cell in rows["sigma"])
+    not_dahl = measured(0.1, 1)
+    bent = di.FrequencyResponse(
+        np.ones(20), not_dahl.response * (1 + 2 * (np.arange(20) % 2)), not_dahl.amplitude
+    )
+    rows = _result_rows(text_of(di.fit(bent, di.Dahl(), throw=False)))
+    for cells in rows.values():
+        assert all(cell.startswith("~~") for cell in cells[1:4])
+    assert "does not describe the data" in rows["sigma"][-1]
+    assert "~~" not in text_of(fit)
+    page = report(microslip, tmp_path / "a.html").read_text("utf-8")
+    assert re.search(r"<s>[0-9.e+-]+</s>", page)
+
+
+def _result_rows(text: str) -> dict[str, list[str]]:
+    table = text.split("## Result")[1].split("\n## ")[0]
+    rows = [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("|")]
+    return {row[0]: row for row in rows[2:]}
+
+
+def test_two_devices_are_overlaid_and_their_changes_judged(
+    fit: di.FitResult, tmp_path: Path
+) -> None:
+    later = di.fit(measured(0.11, 2, file="later.csv"), di.Dahl())
+    facts = json.loads(report([fit, later], tmp_path / "r.json").read_text("utf-8"))
+    changes = {change["parameter"]: change for change in facts["changes"]}
+    assert changes["f_max"]["significant"]
+    assert not changes["sigma"]["significant"]
+    for name, change in changes.items():
+        one, other = fit.params[name], later.params[name]
+        assert one.stderr is not None
+        assert other.stderr is not None
+        u = (one.stderr**2 + other.stderr**2) ** 0.5
+        z = (other.value - one.value) / u
+        assert change["u"] == pytest.approx(u)
+        assert change["p"] == pytest.approx(2.0 * (1.0 - stats.norm.cdf(abs(z))), abs=1e-12)
+    assert [file["file"] for file in facts["files"]] == ["pivot.csv", "later.csv"]
+    text = report([fit, later], tmp_path / "r.md").read_text("utf-8").replace("\\", "")
+    assert "f_max changes from pivot to later:" in text
+    assert (tmp_path / "r_pictures" / "overlay.png").exists()
+
+
+def test_a_change_of_what_is_not_determined_is_not_judged(
+    fit: di.FitResult, microslip: di.FitResult, tmp_path: Path
+) -> None:
+    facts = json.loads(report([fit, microslip], tmp_path / "r.json").read_text("utf-8"))
+    changes = {change["parameter"]: change for change in facts["changes"]}
+    assert (changes["f_max"]["p"], changes["f_max"]["significant"]) == (None, False)
+    assert changes["sigma"]["p"] is not None
+
+
+def test_equal_devices_seldom_change_significantly() -> None:
+    """At 5 %, 2 parameters of 60 pairs: more than 14 significant ones have probability 0.1 %."""
+    from dahl_ident.reporting.overlay import _changes
+
+    fits = [di.fit(measured(0.1, seed), di.Dahl()) for seed in range(120)]
+    found = [
+        change["significant"]
+        for a, b in zip(fits[::2], fits[1::2], strict=True)
+        for change in _changes("a", a, "b", b)
+    ]
+    assert len(found) == 120
+    assert stats.binom.sf(sum(found) - 1, 120, 0.05) > 1e-3
+
+
+def test_json_follows_the_published_schema(
+    fit: di.FitResult, microslip: di.FitResult, tmp_path: Path
+) -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    chain = di.posterior(fit.data, di.Dahl(), seed=1, steps=60)
+    cases: tuple[list[Any], ...] = ([fit], [microslip], [fit, chain], [chain], [fit, microslip])
+    for i, results in enumerate(cases):
+        facts = json.loads(report(results, tmp_path / f"{i}.json").read_text("utf-8"))
+        jsonschema.validate(facts, SCHEMA)
+    facts["fits"][0]["status"] = "fine"
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(facts, SCHEMA)
+
+
+def _computed(page: Page, selector: str, property_name: str) -> set[str]:
+    every = f"[...document.querySelectorAll('{selector}')]"
+    return set(page.value(f"{every}.map(e => getComputedStyle(e).{property_name})"))
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+def test_the_page_on_a4(fit: di.FitResult, microslip: di.FitResult, tmp_path: Path) -> None:
+    """At most two pages before the details; tables keep headings, nothing is split or lost."""
+    pypdf = pytest.importorskip("pypdf")
+    with chromium(tmp_path / "profile") as page:
+        for name, result in (("good", fit), ("bad", microslip)):
+            place = report(result, tmp_path / f"{name}.html", metadata=METADATA)
+            page.open(place, 1400)
+            page.call("Emulation.setEmulatedMedia", media="print")
+            for what in ("figure", "tr", ".verdict", ".signature"):
+                assert _computed(page, what, "breakInside") == {"avoid"}, what
+            assert _computed(page, "h2, .bar", "breakAfter") == {"avoid"}
+            assert _computed(page, "nav, .copy", "display") == {"none"}
+            printed = [
+                sheet.extract_text()
+                for sheet in pypdf.PdfReader(io.BytesIO(page.print_to_pdf())).pages
+            ]
+            page.call("Emulation.setEmulatedMedia", media="screen")
+            sizes = {len(text.strip()) > 30 for text in printed}
+            assert sizes == {True}, "no page is blank"
+            (signed,) = (i for i, text in enumerate(printed) if "Signature" in text)
+            (details,) = (i for i, text in enumerate(printed) if "Estimates and intervals" in text)
+            assert signed <= 1
+            assert details == signed + 1
+            for i, text in enumerate(printed):
+                assert f"Page {i + 1} of {len(printed)}" in text
+            rows = [
+                i for i, t in enumerate(printed) if re.search(r"^1 +[0-9.e-]+ ", t, re.MULTILINE)
+            ]
+            assert rows
+            assert all("frequency [Hz]" in printed[i] for i in rows), "the heading is repeated"
+
+
+def test_pdf_marks_its_headings_for_reading_aloud(fit: di.FitResult, tmp_path: Path) -> None:
+    pypdf = pytest.importorskip("pypdf")
+    reader = pypdf.PdfReader(report(fit, tmp_path / "r.pdf"))
+    tree = reader.trailer["/Root"]["/StructTreeRoot"]["/K"][0].get_object()["/K"]
+    tags = [element.get_object()["/S"] for element in tree]
+    assert tags.count("/H1") == 1
+    assert tags.count("/H2") >= 6
+    assert tags.count("/Figure") >= 5
+    front = [page.extract_text() for page in reader.pages]
+    (signed,) = (i for i, text in enumerate(front) if "Signature" in text)
+    assert signed <= 1
