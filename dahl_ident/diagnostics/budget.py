@@ -21,6 +21,10 @@ from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 
 CONFIDENCE = 0.9545
+# What rounding leaves where a source has no part: variances relative to the combined one.
+_ROUNDING = 1e-18
+# Student's t with more degrees of freedom is normal to all digits that a budget shows.
+_MANY = 1e6
 _TYPE_A = (NOISE, MODEL_ERROR, RUNS, LEVELS)
 _CHANNELS = {
     "force_gain": "force calibration",
@@ -297,11 +301,13 @@ def _parameter(errors: ErrorModel, name: str, unit: str, direction: FloatArray) 
     rows = []
     for source, covariance in errors.contributions.items():
         own = float(direction @ covariance @ direction)
+        own = own if own > _ROUNDING * total else 0.0
         kind: Literal["A", "B"] = "A" if source in _TYPE_A else "B"
-        dof = errors.dof(direction, [source]) if kind == "A" else np.inf
+        dof = errors.dof(direction, [source]) if kind == "A" and own else np.inf
         rows.append(BudgetRow(source, kind, own**0.5, dof, own / total if total > 0.0 else 0.0))
     rows.sort(key=lambda row: -row.u)
     dof = errors.dof(direction)
+    dof = dof if dof < _MANY else np.inf
     value = errors.values[name]
     return ParameterBudget(name, unit, value, tuple(rows), total**0.5, dof, coverage_factor(dof))
 

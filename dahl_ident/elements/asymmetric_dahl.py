@@ -61,8 +61,8 @@ def stiffness(
     Examples
     --------
     >>> one = np.ones(())
-    >>> stiffness(1e-3 * one, one, 2000.0 * one, 0.2 * one, 2).round(4)
-    np.complex128(38.9112+47.5316j)
+    >>> complex(stiffness(1e-3 * one, one, 2000.0 * one, 0.2 * one, 2).round(4))
+    (38.9112+47.5316j)
     """
     at = _Loop(amplitude, f_max, sigma, asymmetry)
     up, down = (_integral(b, harmonic)[0] for b in at.b)

@@ -40,7 +40,7 @@ def on_one_branch(
     Examples
     --------
     >>> x = ca.SX.sym("x")
-    >>> on_one_branch([x], abs(x - 1) * x)
+    >>> on_one_branch([x], ca.fabs(x - 1) * x)
     (SX(((side0*(x-1))*x)), [SX((x-1))], [SX(side0)])
     """
     function = ca.Function("f", list(inputs), [ca.densify(outputs)])
