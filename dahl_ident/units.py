@@ -102,6 +102,32 @@ _SPELLINGS = {
     "VAC": "V",
 }
 _AMBIGUOUS = {"grad": "a degree in German and a gon elsewhere; write deg or gon"}
+# Units of nearly every file, read without pint, whose definitions take most of a second to load.
+_FORCE = (("kilogram", 1.0), ("meter", 1.0), ("second", -2.0))
+_VOLT = (("ampere", -1.0), ("kilogram", 1.0), ("meter", 2.0), ("second", -3.0))
+_COMMON: dict[str, tuple[float, Dimension]] = {
+    "1": (1.0, ()),
+    "deg": (math.pi / 180.0, (("radian", 1.0),)),
+    "\N{DEGREE SIGN}": (math.pi / 180.0, (("radian", 1.0),)),
+    "cm": (1e-2, (("meter", 1.0),)),
+    "kg": (1.0, (("kilogram", 1.0),)),
+    "kHz": (1e3, (("second", -1.0),)),
+    "Hz": (1.0, (("second", -1.0),)),
+} | {
+    prefix + symbol: (factor, dimension)
+    for prefix, factor in {"u": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3}.items()
+    for symbol, dimension in {
+        "A": (("ampere", 1.0),),
+        "N": _FORCE,
+        "V": _VOLT,
+        "m": (("meter", 1.0),),
+        "rad": (("radian", 1.0),),
+        "s": (("second", 1.0),),
+    }.items()
+}
+_COMMON_PART = re.compile(
+    r"(\s*[*/]\s*|\s+|)(?:\(([^()]+)\)|([A-Za-z]+|\N{DEGREE SIGN}|1\b))(?:\^(-?\d))?"
+)
 _TOKEN = re.compile(r"[A-Za-zµμ°%Ω_]\w*|\b1\b|(?<![\d(])\^-?\d(?!\d)|[*/() ]")
 _LONGEST = 60
 
@@ -329,6 +355,25 @@ def _normalised(text: str, written: str) -> str:
     return out
 
 
+def _common(text: str) -> tuple[float, Dimension] | None:
+    """Read a product or quotient of common units; None for any other text."""
+    text = text.strip()
+    factor, powers, at = 1.0, dict[str, float](), 0
+    while at < len(text):
+        found = _COMMON_PART.match(text, at)
+        if found is None or bool(found[1]) != bool(at):
+            return None
+        part = _common(found[2]) if found[2] else _COMMON.get(found[3])
+        if part is None:
+            return None
+        power = int(found[4] or 1) * (-1 if "/" in found[1] else 1)
+        factor *= part[0] ** power
+        for name, exponent in part[1]:
+            powers[name] = powers.get(name, 0.0) + power * exponent
+        at = found.end()
+    return factor, tuple(sorted((name, p) for name, p in powers.items() if p))
+
+
 @cache
 def _registry() -> pint.UnitRegistry[Any]:
     import pint
@@ -341,6 +386,9 @@ def _registry() -> pint.UnitRegistry[Any]:
 @cache
 def _root(text: str, written: str) -> tuple[float, Dimension]:
     """Factor to SI base units and their exponents."""
+    common = _common(text)
+    if common is not None:
+        return common
     registry = _registry()
     try:
         base: Any = registry.Quantity(1.0, registry.parse_units(text)).to_base_units()

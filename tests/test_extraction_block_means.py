@@ -94,6 +94,23 @@ def test_single_samples_are_judged() -> None:
         extract(Record(t, displacement=x, force=buried))
 
 
+def test_a_look_at_some_samples_says_whether_noise_dithers(monkeypatch: pytest.MonkeyPatch) -> None:
+    t, x, force = dense(1e-4)
+    noise, step = np.random.default_rng(3).standard_normal(t.size), 2e-4
+    errors = []
+    for steps in (0.48, 0.52):  # of noise; more than half a step dithers
+        rounded = np.round((x + steps * step * noise) / step) * step
+        record = Record(t, displacement=rounded, force=force)
+        some = extract(record).amplitude_std
+        with monkeypatch.context() as patch:
+            patch.setattr("dahl_ident.extraction.point._LOOKED_AT", t.size)
+            every = extract(record).amplitude_std
+        np.testing.assert_array_equal(some, every)
+        assert every is not None
+        errors.append(every[0])
+    assert errors[0] > 3.0 * errors[1]
+
+
 def test_uneven_samples_are_taken_as_they_are() -> None:
     t, x, force = dense()
     samples = Samples(t, x, force)

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import math
+import subprocess
+import sys
+from typing import Any
 
 import numpy as np
+import pint
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -224,3 +228,35 @@ def test_quantities_in_words() -> None:
     for text in ("N", "0.2", "0,2 N", "a lot"):
         with pytest.raises(UnitError, match="expected a number and its unit, such as"):
             parse_quantity(text, DRIVE_KINDS, "drive")
+
+
+COMMON = ("A", "Hz", "N", "V", "m", "rad", "s", "um", "mm", "cm", "kN", "mV", "kg", "kHz", "deg")
+REGISTRY: Any = pint.UnitRegistry()
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["*", "/", " "]), st.sampled_from(COMMON), st.integers(-2, 3)),
+        min_size=1,
+        max_size=4,
+    ),
+    st.booleans(),
+)
+def test_common_units_are_read_as_pint_reads_them(
+    parts: list[tuple[str, str, int]], bracket: bool
+) -> None:
+    text = "".join(f"{sign}{name}{f'^{p}' if p not in (0, 1) else ''}" for sign, name, p in parts)
+    text = f"m/({text[1:]})" if bracket else text[1:]
+    expected = REGISTRY.Quantity(1.0, REGISTRY.parse_units(text)).to_base_units()
+    found = parse_unit(text)
+    assert found.factor == pytest.approx(expected.magnitude, rel=1e-13)
+    assert dict(found.dimension) == {k: float(v) for k, v in expected.unit_items()}
+
+
+def test_common_units_are_read_without_loading_pint() -> None:
+    code = (
+        "import sys; from dahl_ident.units import *; kind_of(parse_unit('mm'), MOTION_KINDS, '');"
+        "kind_of(parse_unit('kN/mm'), QUANTITIES, ''); print('pint' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout == "False\n"

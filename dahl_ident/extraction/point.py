@@ -63,7 +63,7 @@ _BEYOND_NOISE = 5.0  # standard errors of a drift in white noise
 _TINY = np.finfo(np.float64).tiny
 _ROUNDING = 1e-9  # of the response
 _ALIASED = 0.01  # of the fundamental, above which aliases are reported
-_LOOKED_AT = 50_000  # samples from which their residual is taken
+_LOOKED_AT = 10_000  # samples from which their residual is taken
 _FEW_STEPS = 10.0  # amplitude over sensor step below which the step matters
 
 
@@ -168,6 +168,8 @@ class _Phasors:
     @cached_property
     def rounding(self) -> FloatArray:
         """Root mean square error of a phasor of the motion channel and the force by rounding."""
+        if not self.steps.any():
+            return np.zeros(2)
         return quantisation_errors(
             np.abs(self.fit.phasors(1)),
             self.steps,

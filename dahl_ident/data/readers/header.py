@@ -55,22 +55,23 @@ def best_run(rows: Iterable[Sequence[str] | None], mark: str) -> Run | None:
     None stands for a line to look past: blank, or a comment. A line of another width belongs
     to the run that it breaks; it is for the parser to refuse.
     """
+    is_number = CELL[mark].fullmatch
     best: Run | None = None
-    run: Run | None = None
+    start = width = score = 0
     for i, row in enumerate(rows):
         if row is None:
             continue
-        numbers = sum(CELL[mark].fullmatch(cell) is not None for cell in row)
+        numbers = len([cell for cell in row if is_number(cell)])
         if not numbers:
-            run = None
+            width = 0
             continue
-        if run is None:
-            run = Run(i, len(row), 0)
-        if len(row) == run.width > 1:
-            text = sum(bool(cell.strip()) for cell in row) - numbers
-            run = Run(run.start, run.width, run.score + 2 * numbers - text)
-        if best is None or run.score > best.score:
-            best = run
+        if not width:
+            start, width, score = i, len(row), 0
+        if len(row) == width > 1:
+            filled = len(row) if numbers == len(row) else len([c for c in row if c.strip()])
+            score += 3 * numbers - filled
+        if best is None or score > best.score:
+            best = Run(start, width, score)
     return best if best and best.score > 0 else None
 
 

@@ -12,7 +12,7 @@ import csv
 import io
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -159,9 +159,10 @@ def _layout(lines: list[tuple[int, str]], name: str) -> _Layout:
     """Find dialect and start of the numbers, and read the header above them."""
     passed = [not text.strip() or _COMMENT.match(text) is not None for _, text in lines]
     best: _Layout | None = None
+    texts = [text for (_, text), skip in zip(lines, passed, strict=True) if not skip]
     for dialects in (_DIALECTS, _LAST_DIALECTS):
         merit = (False, 0)  # a header that fits the columns tells more than another number
-        for delimiter, mark in dialects:
+        for delimiter, mark in _possible(dialects, texts):
             found = _in_dialect(lines, passed, delimiter, mark)
             if found is not None and found[0] > merit:
                 merit, best = found
@@ -173,6 +174,19 @@ def _layout(lines: list[tuple[int, str]], name: str) -> _Layout:
             "header line"
         )
     return best
+
+
+def _possible(
+    dialects: Iterable[tuple[str | None, str]], texts: list[str]
+) -> Iterator[tuple[str | None, str]]:
+    """Yield the dialects whose delimiter, and a comma where it is a mark, occur in the lines."""
+    text = "\n".join(texts)
+    blanks = any(len(_BEFORE_BRACKET.sub("", line).split(None, 1)) > 1 for line in texts)
+    for delimiter, mark in dialects:
+        split = blanks if delimiter is None else delimiter in text
+        quoted = delimiter != mark[1:] or '"' in text
+        if split and quoted and ("," not in mark or "," in text):
+            yield delimiter, mark
 
 
 def _in_dialect(
