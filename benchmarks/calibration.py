@@ -32,6 +32,10 @@ LEVEL = 0.01
 _DRAWS = RANKS - 1
 _SIMULATED = 4000
 _OUT = Path("docs/validation")
+_ALT = (
+    "Empirical minus uniform distribution of the ranks against rank, one line for each parameter "
+    "of the {} data, with the band of an exact sampler"
+)
 
 
 @dataclass(frozen=True)
@@ -147,8 +151,9 @@ def report(results: dict[str, tuple[FloatArray, int]], folder: Path) -> str:
     lines = [
         "# Calibration of posteriors",
         "",
-        "Made by `python -m benchmarks.calibration`. An exact sampler keeps the ECDF of all",
-        f"parameters inside the band with probability {1.0 - LEVEL:.0%}.",
+        "Made by `python -m benchmarks.calibration`. For each parameter, the ranks of the true",
+        "value among draws of the posterior must be uniform. For an exact sampler their empirical",
+        f"distribution is inside the band for all parameters with probability {1.0 - LEVEL:.0%}.",
         "",
         "| data | tables | not converged | parameter | extremity | critical | inside |",
         "|---|---|---|---|---|---|---|",
@@ -164,7 +169,7 @@ def report(results: dict[str, tuple[FloatArray, int]], folder: Path) -> str:
                 f"| {'yes' if value >= limit else 'NO'} |"
             )
         _draw(name, names, found, limit, folder)
-    pictures = [f"![ranks of {name}](calibration_{name}.svg)" for name in results]
+    pictures = [f"![{_ALT.format(name)}](calibration_{name}.svg)" for name in results]
     return "\n".join([*lines, "", *pictures, ""])
 
 

@@ -307,14 +307,15 @@ def as_markdown(table: Sequence[Row]) -> str:
     lines = [
         "# Coverage of the intervals, and verdicts",
         "",
-        "Made by `python -m benchmarks.coverage`. Each scenario is measured many times on the "
-        "computer and fitted each time; the bootstrap is run on a part of these data sets. "
-        "`bound` is the Cramer-Rao bound of the parameter's logarithm; intervals are judged where "
-        "it is below 0.25, verdicts where it is below 0.25 or above 1. Coverage in percent, of "
-        "68.27 and 95.45 % intervals; what lies outside binomial error (corrected for the number "
-        'of coverages) is marked (!). "Not clear": exact data leave another explanation within '
-        "4.3 standard deviations, so that the local bound does not decide; no RMSE is given, since "
-        "in some data sets the optimum itself lies there, at infinity.",
+        "Made by `python -m benchmarks.coverage`. Each scenario is simulated many times, and each "
+        "data set is fitted; a part of the data sets is also bootstrapped. `bound` is the "
+        "Cramer-Rao bound of the parameter's logarithm. Intervals are judged where it is below "
+        "0.25, verdicts where it is below 0.25 or above 1; other cells are empty. Wald, profile "
+        "and bootstrap: coverage in percent of 68.27 and 95.45 % intervals; values outside the "
+        'binomial error (corrected for the number of coverages) are marked (!). "Not clear": even '
+        "without noise the data leave another explanation within 4.3 standard deviations, so that "
+        "the local bound does not decide and the verdict is not judged; no RMSE is given, because "
+        "in some data sets the optimum itself is there, at infinity.",
         "",
         "| scenario | parameter | data sets (bootstrap) | bound | RMSE / bound | Wald | profile | "
         "bootstrap | verdict right |",
@@ -334,11 +335,14 @@ def as_markdown(table: Sequence[Row]) -> str:
     left_out = sum(not _covers(row, method) for row in table for method in METHODS)
     left_out += sum(row.verdict_right is None or not row.clear for row in table)
     holds = (
-        "Everything ordered holds."
+        "Every ordered cell was judged and meets its requirement."
         if not left_out
-        else (f"Every judged cell holds; {left_out} of {ordered} ordered cells were not judged.")
+        else (
+            f"{left_out} of {ordered} ordered cells were not judged; all others meet their "
+            "requirement."
+        )
     )
-    lines += ["", holds if not failures else "Does not hold:", *failures]
+    lines += ["", holds if not failures else "Requirements that are not met:", *failures]
     return "\n".join(lines) + "\n"
 
 

@@ -45,13 +45,14 @@ def one_over_f(rng: np.random.Generator, n: int) -> FloatArray:
 
 
 NOISES = {"white": white, "1/f": one_over_f}
-PAGE = """# Extraction of records whose truth is known
+PAGE = """# Extraction of records with known truth
 
-Made by `python -m benchmarks.extraction_validation`. `bias/se` is the mean error in its own
-standard errors, `rms/bound` the error over the Cramer-Rao bound for white noise of the same
-density at 1 Hz (harmonics under 1/f noise may lie below it), `coverage` how often the stated
-95 % region holds the truth. Levels run in descending order with 4 to 15 cycles each; `caught`
-are those whose true bias exceeds 3 standard errors, `flagged` those below 1.
+Made by `python -m benchmarks.extraction_validation`. `bias/se` is the mean error in units of its
+standard error, `rms/bound` the rms error over the Cramer-Rao bound for white noise of the same
+density at 1 Hz (harmonics under 1/f noise may be below it), `coverage` the fraction of records
+whose stated 95 % region contains the true value. In the second table, levels run in descending
+order with 4 to 15 cycles each; `caught` is the fraction of the levels with a true bias above 3
+standard errors that were called unsettled, `flagged` the same for those with a bias below 1.
 
 """
 

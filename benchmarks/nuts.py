@@ -78,9 +78,10 @@ def main() -> None:
     lines = [
         "# An independent sampler",
         "",
-        f"Made by `make nuts`, with numpyro {version('numpyro')}: the model written anew in JAX,",
-        "sampled by NUTS, on 30 points with 1 % noise of unknown scale. Differences are in Monte",
-        "Carlo standard errors of both samplers; beyond 4 the posteriors would not be the same.",
+        f"Made by `make nuts`, with numpyro {version('numpyro')}: the model written again in JAX",
+        "and sampled by NUTS, on 30 points with 1 % noise of unknown scale. Differences are in "
+        "units",
+        "of the combined Monte Carlo standard error; beyond 4 the posteriors would differ.",
         "",
         "| | dahl_ident.posterior | NUTS | difference |",
         "|---|---|---|---|",

@@ -281,13 +281,14 @@ def as_markdown(
     lines = [
         "# Plans against logarithmic grids",
         "",
-        "Made by `python -m benchmarks.planning`. A grid of the scenario's levels takes two cycles "
-        f"at each; plans get its bench time. {count} tables each, root-mean-square relative "
-        "errors of the fits. Gain is the grid's error over the plan's; agreement is predicted over "
-        f"achieved. Wanted: a gain of {GAIN:g} for the parameter that the plan is for, and "
-        f"agreement within {100 * CLOSE:g} %. What does not hold is marked (!). The "
-        "longer the time, the less settling counts: against eight levels in 200 s at 1 Hz a plan "
-        "for all parameters gains about 1.2 for f_max and 1.1 for sigma.",
+        "Made by `python -m benchmarks.planning`. A grid measures two cycles at each level of the "
+        f"scenario; a plan gets the same bench time. {count} tables of each are simulated and "
+        "fitted; the errors are relative, root mean square. Gain is the grid's error over the "
+        "plan's; agreement is the predicted error over the achieved one. Required: a gain of "
+        f"{GAIN:g} for the parameter that the plan is for, and agreement within {100 * CLOSE:g} %. "
+        "Values that do not meet this are marked (!). The longer the bench time, the smaller the "
+        "effect of settling: against eight levels in 200 s at 1 Hz a plan for all parameters gains "
+        "about 1.2 for f_max and 1.1 for sigma.",
         "",
         "| scenario | plan for | parameter | time [s] | levels | predicted | achieved | grid "
         "| gain | agreement |",
@@ -304,12 +305,18 @@ def as_markdown(
         plan, told, got = records
         lines += [
             "",
-            f"Whole waveforms ({len(plan.steps)} levels in {plan.seconds:.0f} s, moved from rest, "
-            f"extracted and fitted): predicted over achieved {told[0] / got[0]:.2f} for f_max, "
-            f"{told[1] / got[1]:.2f} for sigma.",
+            f"Whole waveforms ({len(plan.steps)} levels in {plan.seconds:.0f} s, started from "
+            f"rest, extracted and fitted): predicted over achieved error {told[0] / got[0]:.2f} "
+            f"for f_max, {told[1] / got[1]:.2f} for sigma.",
         ]
     if times:
-        lines += ["", "| x_c believed / true | sequence [s] | oracle [s] | ratio |"]
+        lines += [
+            "",
+            "Sequences that start from a wrong x_c and plan again after each measurement, against "
+            "one plan from the true parameters (oracle). Required: a ratio of at most "
+            f"{SEQUENCE:g}; values above it are marked (!).",
+        ]
+        lines += ["", "| first x_c / true x_c | sequence [s] | oracle [s] | ratio |"]
         lines += ["|---|---|---|---|"]
         for off, spent, oracle in times:
             bad = " (!)" if spent > SEQUENCE * oracle else ""

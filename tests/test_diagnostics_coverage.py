@@ -56,5 +56,7 @@ def test_what_does_not_hold_is_said() -> None:
         "| one | f_max | 100 (10) | 0.01 | 1.200 | 68.27, 95.45 | 60.00 (!), 95.45 | 68.27, 95.45 |"
         in page
     )
-    assert "Does not hold:" in page
-    assert "Everything ordered holds." in as_markdown([row(0.68, 1.0, 1.0)])
+    assert "Requirements that are not met:" in page
+    assert "Every ordered cell was judged and meets its requirement." in as_markdown(
+        [row(0.68, 1.0, 1.0)]
+    )
