@@ -1,7 +1,7 @@
 """Identify friction from measurements: parameters, their uncertainty, and what is not determined.
 
-``import dahl_ident as di`` gives what a user types first; each name is loaded when first used, so
-that the import itself stays light. The rest is in rooms of its own: ``di.control`` (friction in
+``import dahl_ident as di`` provides the names that are used most; each is loaded when first used,
+so that the import itself stays fast. The others are in subpackages: ``di.control`` (friction in
 control loops), ``di.synthetic`` (data with known truth) and ``di.errors``.
 """
 

@@ -1,4 +1,4 @@
-"""Array types, and the checks that every public function makes on what it is given."""
+"""Array types, and the checks that every public function applies to its arguments."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 SMALLEST, LARGEST = 1e-90, 1e90
-"""Sizes that a number may have, so that their squares, products and ratios stay representable."""
+"""Allowed magnitudes: squares, products and ratios of such numbers remain representable."""
 
 
 def real_array(value: ArrayLike, name: str) -> FloatArray:
-    """Return `value` as a float array, or say what else it is.
+    """Return `value` as a float array, or raise an error that says what it is.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ def real_array(value: ArrayLike, name: str) -> FloatArray:
     Returns
     -------
     ndarray of float
-        A new array, or `value` itself where it already was one.
+        A new array, or `value` itself if it already was one.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def whole_number(value: Any, name: str, minimum: int) -> int:
 
 
 def broadcast_shape(**named: NDArray[Any]) -> tuple[int, ...]:
-    """Return the common shape of the named arrays, or say which shapes do not go together."""
+    """Return the common shape of the named arrays, or raise an error that names their shapes."""
     try:
         return np.broadcast_shapes(*(a.shape for a in named.values()))
     except ValueError:

@@ -1,6 +1,6 @@
-"""Every failure that a user can meet, by name.
+"""The errors and warnings of this package.
 
-All derive from :class:`DahlIdentError`, so one ``except`` catches the toolkit's own errors
+All errors derive from :class:`DahlIdentError`, so one ``except`` catches the errors of this package
 and nothing else. A message says what was found, what was expected and what to do.
 """
 
@@ -38,7 +38,7 @@ class DahlIdentError(Exception):
 
 
 class ValidationError(DahlIdentError, ValueError):
-    """An argument has a value, type or shape that gives no meaningful number.
+    """An argument has an invalid value, type or shape.
 
     Examples
     --------
@@ -136,7 +136,7 @@ class FitError(DahlIdentError, RuntimeError):
     message : str
         What happened, and what to do.
     result : FitResult, optional
-        What was found all the same: status, and the combinations that are determined.
+        What was nevertheless found: status, and the combinations that are determined.
 
     Examples
     --------
@@ -161,7 +161,7 @@ class SamplingError(DahlIdentError, RuntimeError):
     message : str
         What happened, and what to do.
     posterior : ChainPosterior, optional
-        The chain all the same, where there is one.
+        The chain so far, where there is one.
 
     Examples
     --------
@@ -189,11 +189,11 @@ class MissingDependencyError(DahlIdentError, ImportError):
 
 
 class MultipleSolutionsWarning(UserWarning):
-    """A plant with negative damping has several steady amplitudes, and one was chosen.
+    """A plant with negative damping has several steady amplitudes, of which one was chosen.
 
     Examples
     --------
-    Ask for all of them, and there is no choice to warn of:
+    With ``all_roots=True`` all of them are returned, without a warning:
 
     >>> import dahl_ident as di
     >>> plant = di.Dahl(0.1, 30.0) + di.Mass(0.3) + di.Damper(-0.05) + di.Spring(0.3)

@@ -1,7 +1,7 @@
-r"""Noise models: what turns measured minus predicted response into residuals of unit variance.
+r"""Noise models, which scale measured minus predicted responses to residuals of unit variance.
 
-Each row of data is one complex number R, so it gives two residuals, kept together here as the
-real and imaginary part of one complex residual y. Three models:
+Each row of data is one complex number R and gives two residuals, stored as the real and imaginary
+part of one complex residual y. There are three models:
 
 ``measured``
     The data's covariance C of (Re R, Im R), row by row: ``y = L^-1 (R - R_model)``, C = L L'.
@@ -15,31 +15,31 @@ real and imaginary part of one complex residual y. Three models:
 ``absolute``
     Constant unknown variance of (Re R, Im R), in the data's own quantity: ``y = R - R_model``.
 
-**Estimated covariances.** Rows whose error was estimated too small by chance must not rule the
-fit: with nu = 6, weights 1/C give 95 % intervals that cover 60 to 75 %. With W = nu C and r the
-residual, the loss a ln(1 + r' W^-1 r) has the score a (W + r r')^-1 r, and W + r r' is a Wishart
-matrix of nu + 1 degrees of freedom in which r is one of nu + 1 like terms. Hence, whatever the
-true covariance V, the score's variance is a^2 V^-1/((nu + 1)(nu - 2)) and its mean derivative
-a V^-1/(nu + 1). The two agree, as they do for a likelihood, for a = nu - 2: then curvature,
-likelihood ratios and stated covariances are right, for rows of different nu as well. (The density
-of Student's t that Jeffreys' prior of V leads to has a = nu + 1, and states variances
-(nu + 1)/(nu - 2) times too small.) V^-1 is estimated without bias by (nu - 2) (W + r r')^-1,
-so that the information of a row is (nu - 2)^2/(nu + 1) J' (W + r r')^-1 J. A row of one part, the
-mean force (k = 0), which is real and has no error of its imaginary part, counts nu - 1 for nu - 2.
+**Estimated covariances.** Rows whose error was by chance estimated too small must not dominate the
+fit: with nu = 6, weights 1/C give 95 % intervals with a coverage of 60 to 75 %. With W = nu C and r
+the residual, the loss a ln(1 + r' W^-1 r) has the score a (W + r r')^-1 r, and W + r r' is a
+Wishart matrix of nu + 1 degrees of freedom in which r is one of nu + 1 equivalent terms. Hence, for
+any true covariance V, the score's variance is a^2 V^-1/((nu + 1)(nu - 2)) and its mean derivative a
+V^-1/(nu + 1). The two agree, as they do for a likelihood, if a = nu - 2: then curvature, likelihood
+ratios and stated covariances are correct, also for rows of different nu. (The density of Student's
+t that Jeffreys' prior of V leads to has a = nu + 1, and states variances (nu + 1)/(nu
+- 2) times too small.) An unbiased estimate of V^-1 is (nu - 2) (W + r r')^-1, so the information of
+  a row is (nu - 2)^2/(nu + 1) J' (W + r r')^-1 J. A row with one part, the mean force (k = 0),
+  which is real and has no imaginary part, has nu - 1 instead of nu - 2.
 
 **Noise in the measured amplitude** (``measured`` only). The true ln A of a row is unknown; its
 measured value has a known error, correlated with that of R because R is a quotient with the
-displacement. Given the parameters, the best true amplitude minimises the joint chi-square of
-both, and what is left of it is
+displacement. Given the parameters, the best true amplitude minimises the joint chi-square of both;
+the minimum is
 
     |y|^2 = r' V^-1 r,    r = R - R_model - e d,    V = C - c d' - d c' + s^2 d d',
 
 with d = dR_model/dln A at the best amplitude, s and c the standard deviation of ln A and its
-covariance with R, and e = (c - s^2 d)' V^-1 r the error found. This is the likelihood with the
-true amplitudes profiled out, or, the same, integrated under their Jeffreys prior. V depends on
-the parameters and yet no ln det V belongs into the sum: with it, or with weights held fixed and
-the model taken at the measured amplitudes, estimates would be biased towards a flatter curve
-however many rows there are (the attenuation of errors-in-variables regression).
+covariance with R, and e = (c - s^2 d)' V^-1 r the estimated error. This is the likelihood with the
+true amplitudes profiled out, which is the same as integrating under their Jeffreys prior. Although
+V depends on the parameters, the sum must not include ln det V: with it, or with fixed weights and
+the model evaluated at the measured amplitudes, estimates would be biased towards a flatter curve
+for any number of rows (the attenuation of errors-in-variables regression).
 """
 
 from __future__ import annotations
@@ -61,14 +61,14 @@ Rho = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
 
 NOISE_MODELS = ("measured", "relative", "absolute")
 
-_ROUNDING = 2.0**-46  # of a response, after the arithmetic that leads to a residual
+_ROUNDING = 2.0**-46  # relative rounding error of a response when its residual is computed
 _GAUSSIAN = 1e15  # degrees of freedom at which the loss is z to rounding
 _AMPLITUDE_STEPS = 40
 _AMPLITUDE_TOLERANCE = 1e-10  # of the amplitude's standard deviation
 
 
 class Noise(ABC):
-    """How residuals follow from the predicted response; one object holds one table's rows."""
+    """The computation of residuals from the predicted response, for the rows of one table."""
 
     name: str
     scale_known: bool
@@ -119,7 +119,7 @@ class Relative(Noise):
 
     @property
     def rounding(self) -> FloatArray:
-        """That of a logarithm."""
+        """Rounding error of a logarithm."""
         return np.asarray(_ROUNDING)
 
     def residual(self, predicted: ComplexArray) -> ComplexArray:
@@ -163,7 +163,7 @@ class Absolute(Noise):
 
     @property
     def rounding(self) -> FloatArray:
-        """That of the responses' root mean square."""
+        """Rounding error of the responses' root mean square."""
         return np.asarray(_ROUNDING * np.sqrt(np.mean(np.abs(self.response) ** 2, axis=-1)))
 
     def residual(self, predicted: ComplexArray) -> ComplexArray:
@@ -260,7 +260,7 @@ class Whitening(NamedTuple):
         return np.asarray(self.a * x + 1j * (self.b * x + self.c * y))
 
     def inverse(self, whitened: ComplexArray) -> ComplexArray:
-        """Return the number of which this is the whitened one."""
+        """Return the number that whitens to these parts."""
         x = whitened.real / self.a
         y = (whitened.imag - self.b * x) / np.where(self.c == 0.0, np.inf, self.c)
         return np.asarray(x + 1j * y)
@@ -290,7 +290,7 @@ class AmplitudeError(NamedTuple):
 
 
 def _logarithm(ratio: ComplexArray) -> ComplexArray:
-    """Return ln(ratio), to absolute rounding; numpy's takes pains, and time, near ratio = 1."""
+    """Return ln(ratio) to absolute rounding; numpy's is more accurate near 1, but slower."""
     result = np.empty_like(ratio)
     result.real = 0.5 * np.log(ratio.real**2 + ratio.imag**2)
     result.imag = np.arctan2(ratio.imag, ratio.real)
@@ -298,7 +298,7 @@ def _logarithm(ratio: ComplexArray) -> ComplexArray:
 
 
 class Corrected(NamedTuple):
-    """Residuals at the best true amplitudes, and what the prediction was there."""
+    """Residuals at the best true amplitudes, and the prediction there."""
 
     residual: ComplexArray
     whitening: Whitening
@@ -336,7 +336,7 @@ class Student:
 
     dof: FloatArray
     parts: FloatArray | float = 2.0
-    """p, how many numbers a row has: real and imaginary part, or the real part alone."""
+    """p, the number of parts of a row: real and imaginary part, or the real part alone."""
 
     def __call__(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return rho and its first two derivatives."""
@@ -370,7 +370,7 @@ def bend(
 def noise_for(rows: Rows, kind: str | None) -> Noise:
     """Return the noise model `kind` for `rows`.
 
-    None stands for ``measured`` where the data have a covariance, else ``relative``.
+    None means ``measured`` if the data have a covariance, else ``relative``.
     """
     if kind is None:
         kind = "relative" if rows.covariance is None else "measured"
@@ -413,8 +413,8 @@ def _fundamental(rows: Rows, size: FloatArray) -> FloatArray:
     lost = harmonic & ~same.any(axis=-1)
     if lost.any():
         raise DataError(
-            f"row {_first(lost)} holds a harmonic, but no row holds the fundamental of the same "
-            "frequency and amplitude, to which relative noise refers; add it, or take "
+            f"row {_first(lost)} is a harmonic, but no row holds the fundamental of the same "
+            "frequency and amplitude, to which relative noise refers; add it, or use "
             "noise='absolute'"
         )
     partner = np.take_along_axis(size, same.argmax(axis=-1), axis=-1)
@@ -459,7 +459,7 @@ def _check_dof(dof: FloatArray) -> None:
 
 
 def _amplitude_error(rows: Rows) -> AmplitudeError | None:
-    """Return the error of ln A in rows whose model takes the measured amplitude, if any."""
+    """Return the error of ln A in rows whose model uses the measured amplitude, if any."""
     if rows.amplitude_std is None or rows.amplitude is None:
         return None
     relative = np.where(rows.forced, 0.0, 1.0 / rows.amplitude)

@@ -1,6 +1,6 @@
-r"""What the sensors do between the mechanism and the table.
+r"""Errors of the measurement channels: gains and delay.
 
-A measured response is not the mechanism's own where a channel has a gain error, or where one
+A measured response differs from that of the mechanism if a channel has a gain error, or if one
 channel lags the other. With F and X the true phasors,
 
     measured F = force_gain F
@@ -8,10 +8,10 @@ channel lags the other. With F and X the true phasors,
 
 so the measured dynamic stiffness of harmonic k is
 ``(force_gain / displacement_gain) exp(+j k omega delay) Z_k``, because the phase of F_k is
-referred to k times the displacement's phase. All six quantities follow from it. A gain acts on
-the amplitudes of a table as well: the mechanism moved by the measured amplitude over
-`displacement_gain`, and was driven by the measured drive over `force_gain`. An unknown force
-gain therefore leaves only x_c of friction alone, and an unknown displacement gain only f_max.
+referred to k times the displacement's phase. All six quantities follow from it. A gain also affects
+the amplitudes of a table: the true amplitude is the measured one divided by `displacement_gain`,
+and the true drive is the measured one divided by `force_gain`. For friction alone, an unknown force
+gain therefore leaves only x_c determined, and an unknown displacement gain only f_max.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Sensors:
 
     @cached_property
     def are_exact(self) -> bool:
-        """Whether the channels are taken as they are: both gains 1, no delay."""
+        """Whether the channels are taken as exact: both gains 1, no delay."""
         return (self.force_gain, self.displacement_gain, self.delay) == (1.0, 1.0, 0.0)
 
     def with_free(self, names: Sequence[str]) -> Sensors:
@@ -135,7 +135,8 @@ def _parameter(
     value = given if given is None or isinstance(given, float) else float(given.mean())
     if value is not None and positive and value <= 0.0:
         raise ValidationError(
-            f"{name} is {value!r}; expected a number > 0 (turn a channel's sign when reading it)"
+            f"{name} is {value!r}; expected a number > 0 (change the sign of a channel when "
+            "reading it)"
         )
     return Parameter(
         name,

@@ -1,10 +1,10 @@
-"""Units at the edge: what a file or a user writes, brought to SI.
+"""Units of files and user input, and their conversion to SI.
 
-Everything inside the package is SI: m or rad, N or N m, s, Hz, zero-to-peak amplitudes. Text
-such as ``"um rms"``, ``"kip"``, ``"lbf-in"`` or ``"dB (m/s^2)/N"`` meets this module first.
-A unit says more than a factor: whether a motion is a displacement, a velocity or an
-acceleration, whether it is translation or rotation, and which of the six standard quantities a
-response is. A missing or misfitting unit is an error, never a guess.
+Inside the package all quantities are SI: m or rad, N or N m, s, Hz, zero-to-peak amplitudes. This
+module converts texts such as ``"um rms"``, ``"kip"``, ``"lbf-in"`` or ``"dB (m/s^2)/N"``. Besides
+the factor, a unit shows whether a motion is a displacement, a velocity or an acceleration, whether
+it is translation or rotation, and which of the six standard quantities a response is. A missing or
+inconsistent unit is an error; units are never guessed.
 """
 
 from __future__ import annotations
@@ -134,20 +134,21 @@ _LONGEST = 60
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A unit as text, read.
+    """A unit that was read from text.
 
     Parameters
     ----------
     text : str
         As it was written.
     factor : float
-        SI value of one of it, its marker not yet counted.
+        Its value in SI units, without the marker.
     dimension : tuple of (str, float)
         Exponents of the SI base units, the radian among them, sorted by name.
     marker : {"zero to peak", "rms", "peak to peak"} or None
-        How an amplitude in this unit counts; None where the text does not say.
+        Whether an amplitude in this unit is rms or peak to peak, say; None where the text does not
+        say.
     decibel : bool
-        Whether numbers in it are decibels relative to it.
+        Whether numbers are in decibels relative to this unit.
     """
 
     text: str
@@ -158,7 +159,7 @@ class Unit:
 
     @property
     def to_peak(self) -> float:
-        """Zero-to-peak amplitude for one of this unit's amplitudes; 1 where it does not say."""
+        """Factor from amplitudes in this unit to zero-to-peak; 1 where the text does not say."""
         return _TO_PEAK[self.marker or "zero to peak"]
 
 
@@ -180,7 +181,7 @@ def parse_unit(text: str) -> Unit:
     Raises
     ------
     UnitError
-        If the text is no unit.
+        If the text is not a unit.
 
     Examples
     --------
@@ -217,7 +218,7 @@ def kind_of(unit: Unit, kinds: tuple[str, ...], what: str) -> tuple[str, Motion,
     kinds : tuple of str
         The kinds that are possible here, keys of `SI_UNITS`.
     what : str
-        What carries the unit, for the message.
+        What has the unit, for the message.
 
     Returns
     -------
@@ -229,7 +230,7 @@ def kind_of(unit: Unit, kinds: tuple[str, ...], what: str) -> tuple[str, Motion,
     Raises
     ------
     UnitError
-        If its dimension is none of theirs.
+        If its dimension matches none of them.
 
     Examples
     --------
@@ -318,7 +319,7 @@ def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float,
     Raises
     ------
     UnitError
-        If the text is no number with a unit of one of `kinds`.
+        If the text is not a number with a unit of one of `kinds`.
 
     Examples
     --------
@@ -336,7 +337,7 @@ def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float,
 
 
 def _normalised(text: str, written: str) -> str:
-    """Bring what laboratories write to what pint reads, and nothing dangerous."""
+    """Translate units as laboratories write them into a form that pint can read safely."""
     superscripts = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
     text = text.replace("º", "°")
     out = re.sub(r"[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+", lambda m: "^" + m[0].translate(superscripts), text.strip())

@@ -211,5 +211,5 @@ def test_refusals() -> None:
         di.posterior(data, di.Dahl(), pool=pool)
     exact = FRICTION.describing_function(np.array([1e-3, 2e-3, 4e-3]))
     perfect = di.FrequencyResponse(np.ones(3), exact, np.array([1e-3, 2e-3, 4e-3]))
-    with pytest.raises(SamplingError, match="leaves no noise whose scale could be estimated"):
+    with pytest.raises(SamplingError, match="there is no noise whose scale could be estimated"):
         di.posterior(perfect, di.Dahl())

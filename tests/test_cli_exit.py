@@ -228,8 +228,8 @@ def test_a_chain_on_a_full_disk_is_one_line_and_leaves_the_old_file(
     outcome = run(*options, "120")
     assert (outcome.status, outcome.out) == (1, "")
     assert outcome.err == (
-        "error: chain.h5: the chain cannot be written: No space left on device; what the file "
-        "held before is as it was\n"
+        "error: chain.h5: the chain cannot be written: No space left on device; the previous "
+        "content of the file is unchanged\n"
     )
     assert Path("chain.h5").read_bytes() == before
     assert sorted(p.name for p in Path().iterdir()) == ["chain.h5", "levels.csv"]

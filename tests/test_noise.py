@@ -180,7 +180,7 @@ def test_bend_keeps_direction_and_squares_to_the_loss() -> None:
         ({"covariance": COVARIANCE * 0.0}, None, r"covariance\[0\] is singular"),
         ({"covariance": COVARIANCE, "dof": 2.0}, None, r"dof\[0\] is 2; .* more than 2 degrees"),
         ({"response": TRUE * (A < 0.05)}, None, r"response\[7\] is 0, which has no logarithm"),
-        ({"harmonic": [1] * 7 + [3]}, None, r"row \[7\] holds a harmonic, but no row holds"),
+        ({"harmonic": [1] * 7 + [3]}, None, r"row \[7\] is a harmonic, but no row holds"),
     ],
 )
 def test_data_that_the_noise_model_cannot_weigh(

@@ -351,8 +351,8 @@ def test_refusals() -> None:
         di.posterior(data, di.Dahl(), likelihood="student_t", method="grid")
     exact = FRICTION.describing_function(np.array([1e-3, 2e-3, 4e-3]))
     perfect = di.FrequencyResponse(np.ones(3), exact, np.array([1e-3, 2e-3, 4e-3]))
-    with pytest.raises(SamplingError, match="leaves no noise whose scale could be estimated"):
+    with pytest.raises(SamplingError, match="there is no noise whose scale could be estimated"):
         di.posterior(perfect, di.Dahl(), method="grid")
     two = friction_table(rows=1)
-    with pytest.raises(SamplingError, match="2 residuals cannot tell 2 parameters and the scale"):
+    with pytest.raises(SamplingError, match="2 residuals cannot determine 2 parameters"):
         di.posterior(two, di.Dahl(), method="grid")

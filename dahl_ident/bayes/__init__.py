@@ -1,5 +1,5 @@
 """Bayesian estimation: priors, the posterior density, Markov chains and exact quadrature.
 
 Everything here works on a :class:`~dahl_ident.problem.Problem` and returns plain numbers;
-:mod:`dahl_ident.results` gives them to users.
+:mod:`dahl_ident.results` presents them to users.
 """

@@ -1,8 +1,8 @@
-"""Markov chains with emcee: run until they have converged, stopped and resumed at will.
+"""Markov chains with emcee, which run until they converge and can be stopped and resumed.
 
-The chain depends on the density, the seed and the settings alone. Walkers and the state of the
-random numbers are carried from step to step, so it does not matter in how many pieces it is run;
-whether it has converged is looked at after fixed numbers of steps.
+The chain depends only on the density, the seed and the settings. Walkers and the state of the
+random generator are carried from step to step, so the number of pieces in which the chain is run
+does not matter; convergence is checked after fixed numbers of steps.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _FIRST_CHECK = 200
 _GROWTH = 1.25
 _ROUND = 50
 _PIECE = 50  # steps between two calls of the listener, at least
-_PIECES = 20  # part of the chain that one piece may add
+_PIECES = 20  # one piece adds at most this fraction of the chain
 
 RandomState = tuple[Any, ...]
 """As numpy.random.RandomState.get_state returns it."""
@@ -53,7 +53,7 @@ class Settings:
     most_steps : int
         Where to stop without convergence.
     wanted : float
-        Effective draws of every parameter at which a chain is long enough.
+        Effective draws of every parameter that are required of a chain.
     """
 
     walkers: int
@@ -66,7 +66,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Chain:
-    """All steps so far, and what is needed to go on.
+    """All steps so far, and the state needed to continue.
 
     Attributes
     ----------
@@ -75,9 +75,9 @@ class Chain:
     log_density : ndarray, shape (steps, walkers)
         Log-posterior there.
     start : ndarray, shape (walkers, D)
-        Where the walkers were before the first step.
+        Positions of the walkers before the first step.
     random_state : tuple
-        State of the random numbers after the last step.
+        State of the random generator after the last step.
     """
 
     points: FloatArray
@@ -87,7 +87,7 @@ class Chain:
 
     @classmethod
     def at(cls, start: FloatArray, seed: int) -> Chain:
-        """Return the chain of no steps."""
+        """Return an empty chain."""
         walkers, dims = start.shape
         bits = np.random.MT19937(np.random.SeedSequence(seed))
         state = np.random.RandomState(bits).get_state()
@@ -100,7 +100,7 @@ class Chain:
 
 
 Listener = Callable[[Chain, Convergence | None], None]
-"""Called after each piece, with the last verdict."""
+"""Called after each piece with the last convergence verdict."""
 
 
 def run(
@@ -111,7 +111,7 @@ def run(
     pool: Pool | None = None,
     listener: Listener | None = None,
 ) -> tuple[Chain, Convergence]:
-    """Return the chain, continued until its total length is enough, and the verdict on it."""
+    """Return the chain, continued until it is long enough, and its convergence verdict."""
     verdict: Convergence | None = None
     sampler = _sampler(density, settings, pool)
     end = settings.most_steps if settings.steps is None else settings.steps
@@ -124,7 +124,7 @@ def run(
         verdict = judge(chain.points, settings.ensembles, settings.wanted)
         if chain.steps >= end or verdict.reached:
             return chain, verdict
-        # the next check lies beyond this one
+        # the next check must come after this one
         chain = _continued(sampler, chain, min(_PIECE, end - chain.steps))
 
 
@@ -177,7 +177,7 @@ def _continued(sampler: Any, chain: Chain, steps: int) -> Chain:
 
 @dataclass(frozen=True)
 class _Mapped:
-    """A density whose points are spread over a pool."""
+    """A density whose points are distributed over a pool."""
 
     density: Density
     pool: Pool

@@ -1,13 +1,13 @@
 """Chains on disk that survive a crash.
 
-One HDF5 file holds all steps and the state of the random numbers. It is written to a neighbour
-first, flushed to the disk and put in place by renaming, so that the file is whole at every
-moment, whatever happens to the process. A run spends at most about a twentieth of its time
-writing. While it lasts, it holds a lock on a second neighbour, ``<file>.lock``; a second run on
-the same file is refused. (On Windows there is no such lock: keep runs apart yourself.)
+One HDF5 file holds all steps and the state of the random numbers. It is first written to a
+temporary file in the same folder, flushed to the disk and renamed, so that the file is complete at
+every moment, whatever happens to the process. A run spends at most about a twentieth of its time
+writing. While it runs, it holds a lock on ``<file>.lock``; a second run on the same file is
+refused. (On Windows there is no such lock: do not start two runs on one file.)
 
-A file is resumed only if it belongs to the same data, model, priors and settings, and if its
-content is as it was written; any other file is refused and left as it is.
+A file is resumed only if it belongs to the same data, model, priors and settings, and if its digest
+shows that it is unchanged; any other file is refused and not modified.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from dahl_ident.errors import ModelError, SamplingError
 
 FORMAT = "dahl_ident chain"
 VERSION = 1
-_SHARE = 20.0  # times as long sampling as writing
+_SHARE = 20.0  # ratio of the time spent sampling to the time spent writing
 
 Identity = Mapping[str, str]
-"""What a chain depends on, part by part, as text or digest."""
+"""Everything a chain depends on, part by part, as text or digest."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Stored:
 
 
 def identity(density: Density, walkers: int, ensembles: int) -> Identity:
-    """Return what a chain depends on besides its seed, part by part."""
+    """Return everything a chain depends on except its seed, part by part."""
     problem = density.problem
     try:
         model = json.dumps(describe_model(problem.model), sort_keys=True, default=str)
@@ -79,7 +79,7 @@ def identity(density: Density, walkers: int, ensembles: int) -> Identity:
 class ChainFile:
     """The file of one run; made by :func:`open_chain`, which holds the lock.
 
-    As a listener of :func:`dahl_ident.bayes.chain.run` it writes whenever that is cheap.
+    As a listener of :func:`dahl_ident.bayes.chain.run` it writes at intervals, to limit the cost.
     """
 
     def __init__(self, path: Path, identity: Identity) -> None:
@@ -95,7 +95,7 @@ class ChainFile:
         Raises
         ------
         SamplingError
-            If the file is not a whole chain of this identity.
+            If the file is not a complete chain with this identity.
         """
         if not self.path.exists():
             return None
@@ -104,24 +104,24 @@ class ChainFile:
         if differing:
             raise SamplingError(
                 f"{self.path} holds a chain of another run: it differs in "
-                f"{', '.join(differing)}. Resume with what it was begun with, or give another "
-                "file; this one is left as it is"
+                f"{', '.join(differing)}. Resume with the original settings, or give another "
+                "file; this one was not changed"
             )
         self._written = self._latest = stored.chain
         return stored
 
     def begin(self, seed: int) -> None:
-        """Take over the seed to be written."""
+        """Set the seed to be written."""
         self._seed = seed
 
     def __call__(self, chain: Chain, verdict: Convergence | None) -> None:
-        """Take over the chain, and write it if the last time is long enough ago."""
+        """Keep the chain, and write it if the last write is long enough ago."""
         self._latest = chain
         if time.monotonic() >= self._due:
             self.flush()
 
     def flush(self) -> None:
-        """Write the latest chain, unless it is in the file already."""
+        """Write the latest chain, unless the file already holds it."""
         if self._latest is None or self._latest is self._written:
             return
         began = time.monotonic()
@@ -133,12 +133,13 @@ class ChainFile:
 
 @contextmanager
 def open_chain(path: str | os.PathLike[str], identity: Identity) -> Iterator[ChainFile]:
-    """Lock a chain's file for the duration of a run; write what is left at its end.
+    """Lock a chain's file for the duration of a run; write the last steps at its end.
 
     Raises
     ------
     SamplingError
-        If the path names a folder, lies in none or cannot be written, or another run holds it.
+        If the path is a folder, its folder does not exist, it cannot be written, or another run
+        holds the lock.
     """
     file = Path(path)
     if file.is_dir():
@@ -172,7 +173,8 @@ def _write(path: Path, chain: Chain, seed: int, identity: Identity) -> None:
     except (OSError, RuntimeError) as exc:  # h5py raises either, with the library's own words
         why = os.strerror(exc.errno) if isinstance(exc, OSError) and exc.errno else str(exc)
         raise SamplingError(
-            f"{path}: the chain cannot be written: {why}; what the file held before is as it was"
+            f"{path}: the chain cannot be written: {why}; the previous content of the file is "
+            "unchanged"
         ) from exc
 
 

@@ -1,12 +1,12 @@
-r"""Where a posterior is large at a given value of one parameter: conditional modes and spreads.
+r"""Conditional modes and spreads of a posterior at given values of one parameter.
 
-Modes are found by damped Gauss-Newton steps for many values at once. Each starts from the nearest
-value already solved, along the slope of the mode there, so that a ridge is walked along from the
-posterior's centre outwards. A mode need not be exact: the lattice that is laid around it counts
-what is there, whatever its middle.
+Modes are found by damped Gauss-Newton steps for many values at once. Each search starts from the
+nearest value already solved, along the slope of the mode there, so that a ridge is followed from
+the centre of the posterior outwards. A mode need not be exact, because the lattice around it covers
+the density wherever its centre is.
 
-Parameters of springs, dampers and masses follow friction along curves; they are held as phi of
-:mod:`dahl_ident.bayes.decorrelation`, in which the curves are straight.
+Parameters of springs, dampers and masses depend on friction along curves; they are represented by
+phi of :mod:`dahl_ident.bayes.decorrelation`, in which these curves are straight.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _STEPS = 25
 _NEAR = 0.1  # length of a step, in standard deviations, at which the mode is near enough
 _DAMPING = (1e-3, 0.2, 8.0)  # first; factors after a success and after a failure
 _SLOPE = 1e-4  # of a search coordinate, for slopes of the decorrelation
-_RIDGE = 1e-13  # keeps what the data leave open solvable
+_RIDGE = 1e-13  # regularisation of directions that the data do not determine
 
 
 class _Fit(NamedTuple):
@@ -47,7 +47,7 @@ class ConditionalModes:
     outer : int
         The axis held.
     centre : ndarray, shape (P,)
-        A point near the posterior's middle, where walking begins.
+        A point near the centre of the posterior, where the search begins.
     """
 
     def __init__(self, density: Density, outer: int, centre: FloatArray) -> None:
@@ -66,11 +66,11 @@ class ConditionalModes:
 
     @property
     def inner(self) -> tuple[int, ...]:
-        """The other axes, those that follow friction last."""
+        """The other axes; linear parameters that depend on friction come last."""
         return tuple(self._inner)
 
     def charts(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return conditional modes and spreads, in phi where axes follow."""
+        """Return conditional modes and spreads, in phi for axes that depend on friction."""
         modes, fit = self._solved(self._original(self._starts(values)))
         phi, slopes = self._known
         self._known = (
@@ -81,7 +81,7 @@ class ConditionalModes:
         return modes, _roots_of_inverse(fit.hessian[free])
 
     def follow(self, theta: FloatArray) -> FloatArray:
-        """Return where the followers are, for given friction."""
+        """Return the values of the dependent axes for given friction."""
         if self._decorrelation is None:
             return theta[:, :0]
         return np.negative(self._decorrelation.shift(theta))
@@ -121,7 +121,7 @@ class ConditionalModes:
         return theta, best
 
     def _model(self, theta: FloatArray) -> _Fit:
-        """Return minus the log-posterior, up to a constant, as least squares see it."""
+        """Return minus the log-posterior in its least-squares form, up to a constant."""
         density, problem = self._density, self._problem
         offset = (theta - self._prior_mean) * self._pull
         value = 0.5 * (offset**2 * self._prior_precision).sum(axis=1)
@@ -189,7 +189,7 @@ def _step(fit: _Fit, inner: list[int], damping: FloatArray) -> tuple[FloatArray,
 
 
 def _solve(H: FloatArray, g: FloatArray) -> FloatArray:
-    """Return H^-1 g, rows and columns of H brought to one size first."""
+    """Return H^-1 g, after scaling the rows and columns of H."""
     size = 1.0 / np.sqrt(np.einsum("sii->si", H))
     scaled = H * size[:, :, None] * size[:, None]
     solved = np.linalg.solve(scaled + _RIDGE * np.eye(H.shape[-1]), (g * size)[..., None])[..., 0]
@@ -219,7 +219,7 @@ def _without(decorrelation: Decorrelation | None, outer: int) -> Decorrelation |
 
 
 def _without_priors(problem: Problem) -> Problem:
-    """Return the problem with priors of the sensors left out, which are counted apart."""
+    """Return the problem without the priors of the sensors, which are counted separately."""
     if not problem.priors:
         return problem
     given = {p.name: getattr(problem.sensors, p.name) for p in problem.sensors.parameters}
@@ -228,7 +228,7 @@ def _without_priors(problem: Problem) -> Problem:
 
 
 def _priors(density: Density) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return means and precisions of the priors as normal ones, and which pull: bounds do not."""
+    """Return means and precisions of normal priors, and which apply: bounds do not."""
     parts = density.prior.priors
     mean = np.array([float(part.quantile(np.array([0.5]))[0]) for part in parts])
     pulls = np.array([part.distribution is not None for part in parts])

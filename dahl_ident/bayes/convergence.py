@@ -1,10 +1,10 @@
-"""Whether a chain has run long enough, and how much it then says.
+"""Whether a chain has converged, and its effective number of draws.
 
-The integrated autocorrelation time tau is that of single walkers' paths, averaged over walkers;
-the window is Sokal's, the smallest M with M >= 5 tau(M) (as in emcee). N steps of W walkers then
-count as N W/tau independent draws. R-hat compares ensembles, which are independent, and not
-walkers, which are not: split in halves, so that a drift shows as well (Gelman et al., Bayesian
-Data Analysis, 2013, section 11.4).
+The integrated autocorrelation time tau is computed from the paths of single walkers and averaged
+over walkers; the window is Sokal's, the smallest M with M >= 5 tau(M) (as in emcee). N steps of W
+walkers then count as N W/tau independent draws. R-hat compares ensembles, which are independent,
+rather than walkers, which are not; each is split in halves, so that drifts are detected as well
+(Gelman et al., Bayesian Data Analysis, 2013, section 11.4).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 
 WINDOW = 5.0
-WARM_UP = 10.0  # autocorrelation times before the chain has forgotten its start
-LENGTH = 50.0  # autocorrelation times for tau itself to be known
+WARM_UP = 10.0  # autocorrelation times until the chain is independent of its start
+LENGTH = 50.0  # autocorrelation times needed for a reliable estimate of tau
 R_HAT = 1.01
 
 
@@ -55,7 +55,7 @@ class Convergence:
 
     @property
     def lacks(self) -> list[str]:
-        """What is missing, in words; empty for a converged chain."""
+        """The criteria that are not met, in words; empty for a converged chain."""
         if not self.usable:
             return ["some walkers never moved"]
         kept = self.steps - self.discard
@@ -73,7 +73,7 @@ class Convergence:
 
     @property
     def reached(self) -> bool:
-        """Whether nothing is missing."""
+        """Whether all criteria are met."""
         return not self.lacks
 
 

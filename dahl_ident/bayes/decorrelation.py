@@ -1,15 +1,15 @@
-r"""Decorrelated coordinates, in which the ridges of plants are straight.
+r"""Decorrelated coordinates, in which the posterior ridges of plants are straight.
 
-A spring beside friction is known by their sum: where the data leave f_max and sigma open, the
-stiffness follows them along a curve, and straight steps leave it. Weighted least squares of
-friction's describing function N(p), whatever its law and parameters p, by the columns of spring,
-damper and mass, at the amplitudes and with the weights of the data, say how far their
-parameters l follow:
+The data determine the sum of the stiffnesses of a spring and of friction in parallel. Where they do
+not determine f_max and sigma, the stiffness depends on these along a curve, which straight steps
+leave. The dependence of the linear parameters l on friction is estimated by weighted least squares
+of the describing function N(p), of any law with parameters p, on the columns of spring, damper and
+mass, at the amplitudes and with the weights of the data:
 
     phi = l + W N(p),    W = (G' w^2 G)^-1 G' w^2.
 
-phi is what the data see of l. For given friction it is a shift, so that volumes stay as they are
-and a density over phi is the density over l.
+phi is the combination that the data determine. For given friction it is a shift of l, so volumes
+are preserved and the density over phi equals the density over l.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element
 from dahl_ident.problem import Problem
 
-_FARTHEST = 1e300  # stands for a shift that is no number; no prior reaches it
+_FARTHEST = 1e300  # replaces a shift that is not finite; no prior reaches it
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class Decorrelation:
     projection: FloatArray
 
     def decorrelated(self, x: FloatArray) -> FloatArray:
-        """Return points with phi in the place of l."""
+        """Return points with phi instead of l."""
         return self._moved(x, 1.0)
 
     def original(self, x: FloatArray) -> FloatArray:
-        """Return points with l in the place of phi."""
+        """Return points with l instead of phi."""
         return self._moved(x, -1.0)
 
     def shift(self, x: FloatArray) -> FloatArray:

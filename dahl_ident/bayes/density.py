@@ -65,8 +65,8 @@ class Density:
             )
         if self.has_scale and problem.n_residuals <= len(problem.names):
             raise SamplingError(
-                f"{problem.n_residuals} residuals cannot tell {len(problem.names)} parameters and "
-                "the scale of the noise; give the data a covariance, or fix parameters"
+                f"{problem.n_residuals} residuals cannot determine {len(problem.names)} parameters "
+                "and the scale of the noise; give the data a covariance, or fix parameters"
             )
 
     @property
@@ -105,7 +105,7 @@ class Density:
         """Return the log-density, (S, D) -> (S,); -inf outside the prior's support."""
         P = len(self.problem.names)
         result = self.log_prior(x[:, :P])
-        if self.has_scale:  # where the scale would overflow, the likelihood is nil
+        if self.has_scale:  # where the scale would overflow, the likelihood is zero
             result[np.abs(x[:, P]) > _FARTHEST] = -np.inf
         if self.likelihood == "none":
             return result
@@ -125,7 +125,7 @@ class Density:
             )
         if self.likelihood == "student_t":
             return self(theta)
-        # for an unknown scale the integral over s is a constant times the highest over s
+        # for an unknown scale the integral over s is a constant times the maximum over s
         return self.highest(theta) + self._integral_constant
 
     def highest(self, theta: FloatArray) -> FloatArray:
@@ -170,7 +170,7 @@ class Density:
 
     @cached_property
     def _integral_constant(self) -> float:
-        """Log of the integral over ln s less ln of the highest: both go as S^-n."""
+        """Log of the integral over ln s minus log of the maximum: both vary as S^-n."""
         if not self.has_scale:
             return 0.0
         n = self.problem.n_residuals / 2.0

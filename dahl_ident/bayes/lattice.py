@@ -1,20 +1,20 @@
-r"""Integrals over all parameters but one, at many values of that one at once.
+r"""Integrals over all parameters except one, at many values of that one at once.
 
 At each value of the outer parameter the others have a conditional mode c and a spread L, lower
 triangular. A lattice of step h in u covers them,
 
     theta = c + L t,    t = sinh(K u')/K,
 
-the sinh bringing heavy tails near. The trapezoidal rule on such a lattice converges exponentially
+where the sinh covers heavy tails. The trapezoidal rule on such a lattice converges exponentially
 in 1/h for a smooth density that dies away (Trefethen and Weideman, SIAM Review 56, 2014). Far from
-the prior's walls u' is u. Towards walls, seen at u' = a and b, it is bent smoothly, so that they
-are reached at infinity only:
+the bounds of the prior u' = u. Near bounds at u' = a and b the map is bent smoothly, so that they
+are reached only at infinity:
 
     u' = a + ln(1 + exp(u - a)) - ln(1 + exp(u - b)).
 
-The lattice grows from the mode, block by block, wherever a block counts. What changes when every
-second point is left out, and of those every second again, tells the error: e(h) is about
-e(2 h)^2/e(4 h) or smaller, for the exponential law as for a power law.
+The lattice grows from the mode, block by block, as long as blocks contribute. The error is
+estimated from the changes when every second point is left out, and every second of the rest again:
+e(h) is about e(2 h)^2/e(4 h) or smaller, for exponential as well as power-law convergence.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ _STRETCH = 0.3  # K
 _FIRST = 3.5  # radius in u of what is computed at once
 _REACH = 30.0  # of the lattice in u
 _SIDE = {1: 8, 2: 2}  # points along each axis of a block, by the number of axes
-_LITTLE = 1e-7  # of the highest point, below which a block does not count
+_LITTLE = 1e-7  # of the highest point, below which a block is negligible
 _NOTHING = 45.0  # below the peak's logarithm at the mode
 _BLOCK = 4096  # points to a call of the density
 
 
 class Slicer(Protocol):
-    """Where the density is large at a given value of one parameter, the outer one."""
+    """Conditional modes and spreads of the density at given values of the outer parameter."""
 
     @property
     def outer(self) -> int:
@@ -55,13 +55,13 @@ class Slicer(Protocol):
 
     @property
     def followers(self) -> int:
-        """How many of the last inner axes follow the others along a curve."""
+        """How many of the last inner axes depend on the others along a curve."""
 
     def charts(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return modes, (S, D), and spreads of the inner axes, (S, d, d), at S values."""
 
     def follow(self, theta: FloatArray) -> FloatArray:
-        """Return where the followers are for given other axes, up to a constant, (N, followers)."""
+        """Return the dependent axes for given other axes, up to a constant, (N, followers)."""
 
 
 class Sums(NamedTuple):
@@ -69,8 +69,7 @@ class Sums(NamedTuple):
 
     log_value: FloatArray
     errors: FloatArray
-    """What leaving out points along each axis changes, relative: every second, and three of
-    four; (2, d, S)."""
+    """Relative change without every second, and three of four, points; (2, d, S)."""
     ids: NDArray[np.intp]
     """Under which the points of each value are kept."""
 
@@ -119,7 +118,7 @@ class Lattice:
     def _grown(
         self, modes: FloatArray, roots: FloatArray, ids: NDArray[np.intp]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return ln of the integrals and their relative errors, adding blocks while they count."""
+        """Return ln of the integrals and relative errors, adding blocks while they contribute."""
         S, d = len(modes), len(self._step)
         done, within = self._blocks(S), _corners(d)
         side = _SIDE[d]
@@ -184,7 +183,7 @@ class Lattice:
         return theta, log_volume
 
     def _curve(self, theta: FloatArray, modes: FloatArray) -> FloatArray:
-        """Return how far the followers are from where they are at the mode, (S, L, followers)."""
+        """Return the dependent axes minus their values at the mode, (S, L, followers)."""
         S, L, D = theta.shape
         there = self._slicer.follow(theta.reshape(-1, D)).reshape(S, L, -1)
         return np.asarray(there - self._slicer.follow(modes)[:, None])

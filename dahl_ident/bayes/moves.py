@@ -1,8 +1,8 @@
-"""Proposals for several ensembles that know nothing of each other, all evaluated in one call.
+"""Proposals for several independent ensembles, all evaluated in one call.
 
-Each ensemble of walkers is split in halves at random; one half moves with the other as its
-guide, then they change places (as in emcee, whose sampler runs these moves). A density that takes
-many points at once costs least when the halves of all ensembles go into one call.
+Each ensemble of walkers is split at random into halves; one half moves with the other as its guide,
+then they exchange roles (as in emcee, whose sampler runs these moves). A density that takes many
+points at once costs least when the halves of all ensembles go into one call.
 
 - `differential_evolution`: a walker moves along the difference of two of the other half, by
   2.38/(2 D)^(1/2) of it, now and then by all of it, which leads from mode to mode (ter Braak,
@@ -10,8 +10,8 @@ many points at once costs least when the halves of all ensembles go into one cal
 - `snooker`: along the line to a walker of the other half, by the projected difference of two more
   (ter Braak and Vrugt, Statistics and Computing 18, 2008).
 - `independent`: to a draw from Student's t around the mean of the other half, shaped by its
-  covariance; in few dimensions many draws are accepted, old places are forgotten at once, and
-  heavy tails are reached from the middle.
+  covariance; in few dimensions many draws are accepted, successive positions are nearly
+  independent, and heavy tails are reached from the centre.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _SNOOKER = 1.7
 class EnsembleMove:
     """One kind of proposal, applied to every ensemble by itself; a move of emcee's sampler.
 
-    With a decorrelation, places are proposed where ridges are straight.
+    With a decorrelation, positions are proposed in coordinates in which ridges are straight.
     """
 
     proposal: Proposal
@@ -47,7 +47,7 @@ class EnsembleMove:
     decorrelation: Decorrelation | None = None
 
     def propose(self, model: Any, state: Any) -> tuple[Any, Any]:
-        """Return the state after every walker was asked to move once, and who accepted."""
+        """Return the state after one proposal to every walker, and which were accepted."""
         walkers, dims = state.coords.shape
         each = walkers // self.ensembles
         random = model.random
@@ -104,7 +104,7 @@ def snooker(half: FloatArray, guide: FloatArray, random: Random) -> tuple[FloatA
     origin, first, second = _partners(half, guide, random, 3)
     line = half - origin
     length2 = np.sum(line**2, axis=-1)
-    # on top of its partner, a walker has no line to move along and stays
+    # a walker at the position of its partner has no direction to move in and stays
     along = np.sum(line * (second - first), axis=-1) / np.where(length2 > 0.0, length2, 1.0)
     places = half + _SNOOKER * along[..., None] * line
     with np.errstate(divide="ignore", invalid="ignore"):

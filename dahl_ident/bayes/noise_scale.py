@@ -14,7 +14,7 @@ from scipy.special import gammaincc, gammainccinv, gammaln
 
 from dahl_ident.arrays import FloatArray
 
-_ATOMS = 256  # groups of like S that stand for all points in quantiles
+_ATOMS = 256  # groups of similar S that represent all points in quantiles
 _BISECTIONS = 50
 
 
@@ -65,7 +65,7 @@ class ScalePosterior:
 
     @cached_property
     def _atoms(self) -> tuple[FloatArray, FloatArray]:
-        """Return groups of points whose S is nearly alike."""
+        """Return groups of points with nearly equal S."""
         order = np.argsort(self.squares)
         weights, squares = self.weights[order], self.squares[order]
         group = np.minimum(np.cumsum(weights) * _ATOMS, _ATOMS - 1).astype(np.intp)

@@ -1,12 +1,12 @@
-"""What is believed before the data: one distribution for each free parameter.
+"""Priors: one distribution for each free parameter.
 
 A prior is a frozen distribution of scipy.stats over the parameter's value, such as
 ``scipy.stats.norm(1.0, 0.005)`` for a gain from a calibration sheet, or a pair of bounds. Bounds
 mean a log-uniform prior for a positive parameter (every decade is as likely as the next) and a
-uniform one for the others. Where the user says nothing, bounds come from the size of the data,
-wide enough to say little and proper all the same:
+uniform one for the others. Where the user gives none, bounds are derived from the size of the data.
+They are proper and wide enough to have little influence:
 
-- positive parameters: the data give every unit a size in each row, made of its force, its
+- positive parameters: each row of the data gives every unit a size, from its force, its
   displacement amplitude and its angular frequency. Bounds reach from 1e-5 times the smallest to
   1e5 times the largest, because a law's knee can lie decades away from the data;
 - parameters of either sign, such as stiffness, damping and mass: up to a thousand times the
@@ -14,7 +14,7 @@ wide enough to say little and proper all the same:
 - parameters that declare a range of their own, such as an exponent: five times wider than that;
 - gains: from 0.1 to 10; delay: half a period of the highest frequency either way.
 
-They are part of the result, and reports print them. The unknown scale s of the noise has the
+The priors are part of the result, and reports print them. The unknown scale s of the noise has the
 prior 1/s.
 """
 
@@ -35,12 +35,12 @@ from dahl_ident.problem import Problem
 _DECADES = 1e5
 _WIDER = 10.0
 _BEYOND = 5.0  # times a declared range that a default prior reaches beyond it
-_RESONANCE = 1e3  # by which the parts of a plant may exceed what is left of them
+_RESONANCE = 1e3  # factor by which the parts of a plant may exceed their sum
 _TAIL = 1e-10  # of a distribution of unbounded support that lies beyond its `limits`
 
 
 class Distribution(Protocol):
-    """What a prior needs of a frozen distribution of scipy.stats."""
+    """The methods of a frozen scipy.stats distribution that a prior needs."""
 
     def logpdf(self, x: Any) -> Any:
         """Return the logarithm of the density at x."""
@@ -66,10 +66,10 @@ class ParameterPrior:
     given : Distribution or tuple of float
         A distribution of the value, or the ends of a log-uniform or uniform one.
     source : {"given", "sensors", "default"}
-        Where it comes from; a default follows the size of the data.
+        Its origin; a default is derived from the size of the data.
     estimate : float
         The least-squares value, not finite where unknown. `limits` reach beyond it, because data
-        can outweigh a prior in whose far tail they lie.
+        can outweigh a prior even in its far tail.
     """
 
     parameter: Parameter
@@ -89,7 +89,7 @@ class ParameterPrior:
 
     @cached_property
     def limits(self) -> tuple[float, float]:
-        """Ends of theta, beyond which there is no, or next to no, posterior probability."""
+        """Ends of theta beyond which the posterior probability is zero or negligible."""
         if isinstance(self.given, tuple):
             return self._theta(self.given[0]), self._theta(self.given[1])
         low, high = self.bulk
@@ -102,7 +102,7 @@ class ParameterPrior:
 
     @cached_property
     def bulk(self) -> tuple[float, float]:
-        """Ends of theta, beyond which there is no, or next to no, prior probability."""
+        """Ends of theta beyond which the prior probability is zero or negligible."""
         if isinstance(self.given, tuple):
             return self.limits
         low, high = (self._theta(float(self.given.ppf(q))) for q in (_TAIL, 1.0 - _TAIL))
@@ -172,7 +172,7 @@ class JointPrior:
 
     @cached_property
     def bulk(self) -> tuple[FloatArray, FloatArray]:
-        """Ends of every theta, beyond which there is next to no prior probability."""
+        """Ends of every theta beyond which the prior probability is negligible."""
         low, high = np.array([part.bulk for part in self.priors]).T
         return low, high
 
@@ -220,12 +220,12 @@ def joint_prior(
     Parameters
     ----------
     problem : Problem
-        Priors of its sensors are taken over.
+        Priors of its sensors are used as they are.
     priors : mapping of str to distribution or (low, high), optional
-        By parameter name; the rest gets the default.
+        By parameter name; the other parameters get the default.
     estimate : ndarray, shape (P,), optional
-        Least-squares values, which defaults of plant parameters include; infinite where there
-        is no finite optimum.
+        Least-squares values, which the default bounds of plant parameters include; infinite where
+        there is no finite optimum.
 
     Raises
     ------
@@ -291,13 +291,13 @@ def _check_support(parameter: Parameter, given: Distribution) -> None:
         median = float(given.ppf(0.5))
     if np.isnan([outside, median]).any():
         raise ValidationError(
-            f"the prior of {parameter.name}, {_name(given)}, has no probabilities: its own "
-            "parameters are not numbers that it allows, such as a standard deviation of 0"
+            f"the prior of {parameter.name}, {_name(given)}, is not defined: its own "
+            "parameters are outside its allowed range, such as a standard deviation of 0"
         )
     if outside > 1e-3:
         raise ValidationError(
             f"the prior of {parameter.name}, {_described(given)}, has {outside:.2g} of its "
-            f"probability outside {parameter.lower:g} to {parameter.upper:g}; take one that lives "
+            f"probability outside {parameter.lower:g} to {parameter.upper:g}; use one that lies "
             "inside, such as scipy.stats.lognorm for a positive parameter"
         )
 
@@ -356,7 +356,7 @@ def _without_default(parameter: Parameter) -> ValidationError:
 
 
 def _log_density(distribution: Distribution, value: FloatArray) -> FloatArray:
-    """Return logpdf; a normal one directly, because scipy takes fifty times as long."""
+    """Return logpdf; of normal distributions directly, because scipy takes fifty times as long."""
     if _name(distribution) == "norm":
         mean, std = _moments(distribution)
         with np.errstate(over="ignore"):

@@ -1,19 +1,19 @@
 r"""Exact posteriors of up to three parameters: adaptive quadrature over the whole prior.
 
-Each parameter in turn is the outer one. At a value of it the others are integrated on a lattice
-laid around their conditional mode (:mod:`dahl_ident.bayes.lattice`), so that ridges, however
-narrow and curved, are followed and not searched for. What is left is the marginal density of the
-outer parameter, integrated from wall to wall of its prior in panels: around the posterior's
-centre they are as wide as its spread, outwards they grow until the prior ends or nothing is left.
-A panel has the 9 nodes of Clenshaw and Curtis; its error is told from the last two coefficients of
-the Chebyshev series through them, which cannot vanish by chance as a difference of two integrals
-can. Panels of largest error are halved until the errors add up to less than the tolerance.
+Each parameter in turn is the outer one. At each of its values the others are integrated on a
+lattice around their conditional mode (:mod:`dahl_ident.bayes.lattice`), so that even narrow and
+curved ridges are followed without a search. The result is the marginal density of the outer
+parameter, which is integrated over the range of its prior in panels: around the centre of the
+posterior they are as wide as its spread, and further out they grow until the prior ends or the
+density is negligible. A panel has the 9 nodes of Clenshaw and Curtis; its error is estimated from
+the last two coefficients of the Chebyshev series through them, which cannot vanish by chance,
+unlike a difference of two integrals. The panels with the largest errors are halved until the errors
+add up to less than the tolerance.
 
-The evidence comes out once for each parameter, from points that have nothing in common. As far as
-they disagree, that is error as well. Where they contradict each other while panels are still few,
-lattices miss part of the posterior, and nothing more is refined. What lies apart from the ridges
-that start at the least-squares optimum, a second mode behind a valley e^-40 deep, is not looked
-for.
+The evidence is obtained once for each parameter, from disjoint sets of points. Their disagreement
+counts as error as well. If they contradict each other while there are still few panels, the
+lattices miss part of the posterior, and refinement stops. What lies apart from the ridges that
+start at the least-squares optimum, a second mode behind a valley e^-40 deep, is not looked for.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _STEP = {0: 1.0, 1: 0.5, 2: 0.75}  # of the lattice, by its axes
 _FINER, _REFINEMENTS = 0.6, 5  # by which an axis is refined until its error is small enough
 _LATTICE_SHARE = 0.3  # of the tolerance
 _ROUGH = 1e-3  # error at which the parameters' evidences are compared
-_CONTRADICTION = 10.0  # times the errors seen, by which evidences may differ
+_CONTRADICTION = 10.0  # times the estimated errors, by which evidences may differ
 _PART = 0.125  # of the last two Chebyshev coefficients that the integral of what follows is
 
 
@@ -178,7 +178,7 @@ class Grid:
 
     @cached_property
     def best(self) -> Marginal:
-        """The marginal of smallest error, whose points stand for the posterior."""
+        """The marginal with the smallest error, whose points represent the posterior."""
         return min(self.marginals, key=lambda m: np.inf if np.isnan(m.error) else m.error)
 
     @property
@@ -242,9 +242,9 @@ def integrate(
     tolerance : float
         Relative error to be reached.
     most : int
-        Evaluations for one parameter at which refinement ends all the same.
+        Evaluations for one parameter at which refinement ends in any case.
     """
-    # a lattice laid far amiss overflows; its error is infinite then, and said
+    # a badly placed lattice overflows; its error is then reported as infinite
     with np.errstate(over="ignore", invalid="ignore"):
         works = [_Work(log_density, box, slicer, centre, spread, most) for slicer in slicers]
         rough = max(_ROUGH, tolerance)
@@ -257,7 +257,7 @@ def integrate(
 
 
 class _Work:
-    """One marginal in the making: panels, and the lattice that fills them."""
+    """One marginal under construction: panels, and the lattice that fills them."""
 
     def __init__(
         self,
@@ -275,7 +275,7 @@ class _Work:
         self._lay(np.full(self._inner, _STEP[self._inner]))
 
     def _lay(self, step: FloatArray) -> None:
-        """Begin with a lattice of some step."""
+        """Start with a lattice of a given step."""
         axis = self._slicer.outer
         ends = float(self._box[0][axis]), float(self._box[1][axis])
         self._step = step
@@ -309,7 +309,7 @@ class _Work:
             self._errors = _errors(self._panels)
 
     def complete(self, tolerance: float) -> None:
-        """Refine panels and lattice until both are fine enough, or would cost too much."""
+        """Refine panels and lattice until the tolerance or the limit of evaluations is reached."""
         self.halve_panels(tolerance)
         for _ in range(_REFINEMENTS - 1):
             coarse = self._errors.inner > _LATTICE_SHARE * tolerance / max(1, self._inner)
@@ -321,12 +321,12 @@ class _Work:
             self.halve_panels(tolerance)
 
     def marginal(self) -> Marginal:
-        """Return the marginal as it is."""
+        """Return the marginal in its present state."""
         return _finished(self._panels, self._lattice, self.error, self.evaluations)
 
 
 def _contradict(works: Sequence[_Work], rough: float) -> bool:
-    """Return whether evidences differ by far more than the errors seen explain."""
+    """Return whether evidences differ by far more than the estimated errors explain."""
     each = [work.log_evidence for work in works]
     stated = max(rough, *(work.error for work in works))
     return bool(np.expm1(np.ptp(each)) > _CONTRADICTION * stated)
@@ -392,7 +392,7 @@ def _errors(panels: Panels) -> _Errors:
 
 
 def _largest(errors: FloatArray, rest: float) -> NDArray[np.bool_]:
-    """Return the fewest panels without which the errors add up to less than `rest`."""
+    """Return the smallest set of panels without which the errors add up to less than `rest`."""
     order = np.argsort(errors)
     chosen = np.zeros(len(errors), dtype=bool)
     chosen[order[np.cumsum(errors[order]) > rest]] = True

@@ -1,4 +1,4 @@
-"""Where the walkers start: around the least-squares optimum, wider than the posterior.
+"""Start of the walkers: around the least-squares optimum, wider than the posterior.
 
 The optimum is moved inside the prior's support. Its covariance is the inverse of the Fisher
 information plus the prior's own precision, so that directions that the data leave undetermined
@@ -26,7 +26,7 @@ _EXACT = 1e-13  # relative noise below which a fit is exact to rounding
 
 
 def optimum_of(problem: Problem) -> Optimum | None:
-    """Return the least-squares optimum, None where there are too few data for one."""
+    """Return the least-squares optimum; None if there are too few data."""
     try:
         return solve(_with_normal_priors(problem))
     except FitError:
@@ -61,9 +61,9 @@ def starting_points(
             return points
         spread[missing] *= 0.8
     raise SamplingError(
-        f"{missing.size} of {walkers} walkers found no place of finite density around "
+        f"{missing.size} of {walkers} walkers found no point of finite density around "
         f"{dict(zip(density.names, density.to_values(centre).tolist(), strict=True))}; check that "
-        "the priors leave room there"
+        "the priors allow values there"
     )
 
 
@@ -118,10 +118,10 @@ def _inside(density: Density, optimum: Optimum | None, random: np.random.Generat
 
 
 def _moved_inside(density: Density, optimum: Optimum) -> FloatArray:
-    """Return the optimum; where it is outside the prior's bulk, the likeliest of what is near.
+    """Return the optimum, or if it is outside the bulk of the prior, the likeliest point nearby.
 
-    That may be the optimum all the same, or has its first culprit inside: in microslip, say,
-    sigma and the spring have to follow an f_max that cannot be infinite.
+    That may still be the optimum, or a point with the offending parameter moved inside the prior:
+    in microslip, for example, sigma and the spring have to follow an f_max that cannot be infinite.
     """
     problem = density.problem
     low, high = _narrowed(*density.prior.bulk)
@@ -163,7 +163,7 @@ def _scale(density: Density, theta: FloatArray) -> float:
     scale = float(np.sqrt(squares / density.problem.n_residuals))
     if not scale > _EXACT:
         raise SamplingError(
-            f"the model fits the data to {scale:.1e} of their size, which leaves no noise whose "
+            f"the model fits the data to {scale:.1e} of their size, so there is no noise whose "
             "scale could be estimated; data without noise need a covariance for sampling"
         )
     return scale
