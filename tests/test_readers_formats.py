@@ -95,6 +95,17 @@ class TestExcel:
         with pytest.raises(DataError, match="the workbook is damaged"):
             read_record(path)
 
+    def test_a_changed_digit(self, tmp_path: Path) -> None:
+        path, plain = self.book(tmp_path / "run.xlsx"), tmp_path / "plain.xlsx"
+        with zipfile.ZipFile(path) as packed, zipfile.ZipFile(plain, "w") as stored:
+            for name in packed.namelist():
+                stored.writestr(name, packed.read(name))
+        data = plain.read_bytes()
+        plain.write_bytes(data.replace(b"<v>0.0", b"<v>0.1", 1))
+        assert plain.read_bytes() != data
+        with pytest.raises(DataError, match=r"the check sum of xl/worksheets/sheet\d.xml differs"):
+            read_record(plain)
+
 
 class TestParquet:
     def test_columns(self, tmp_path: Path) -> None:
@@ -472,6 +483,13 @@ class TestTdms:
         path = self.write(tmp_path / "run.tdms")
         path.write_bytes(path.read_bytes()[:60])
         with pytest.raises(DataError, match=r"the TDMS file is damaged|holds no channels"):
+            read_record(path)
+
+    def test_bytes_between_the_samples(self, tmp_path: Path) -> None:
+        path = self.write(tmp_path / "run.tdms")
+        data = path.read_bytes()
+        path.write_bytes(data[:-100] + bytes(8) + data[-100:])
+        with pytest.raises(DataError, match=rf"bytes behind segment \d, from byte {len(data)} on"):
             read_record(path)
 
 

@@ -26,6 +26,11 @@ MOST_CHANNELS = 5000
 """Columns, arrays or data sets of one file; a laboratory's file has some tens."""
 DEEPEST = 32
 """Levels of groups, structs or lists in one another."""
+ZIP_ERRORS = (
+    zipfile.BadZipFile, OSError, EOFError, ValueError, KeyError, zlib.error, NotImplementedError,
+    RuntimeError,
+)  # fmt: skip
+"""What Python's reader of archives raises on damaged ones."""
 _UNPACKED_BYTES = 1 << 28
 _UNPACKED_RATIO = 8  # text and samples of a converter rarely pack better
 
@@ -87,12 +92,6 @@ _PACKED: tuple[tuple[bytes, Callable[[Any], Any], str], ...] = (
     (b"BZh", bz2.BZ2File, ".bz2"),
     (b"\xfd7zXZ\x00", lzma.LZMAFile, ".xz"),
 )
-
-
-_ZIP_ERRORS = (
-    zipfile.BadZipFile, OSError, EOFError, ValueError, KeyError, zlib.error, NotImplementedError,
-    RuntimeError,
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -242,7 +241,7 @@ def _archive(file: File, suffix: str) -> str:
                 return "excel"
             if "mimetype" in names and b"opendocument.spreadsheet" in archive.read("mimetype"):
                 return "ods"
-    except _ZIP_ERRORS:  # its reader will say how it is damaged
+    except ZIP_ERRORS:  # its reader will say how it is damaged
         return {".ods": "ods", ".npz": "npz"}.get(suffix, "excel" if "xls" in suffix else "zip")
     if names and all(name.endswith(".npy") for name in names):
         return "npz"

@@ -197,7 +197,7 @@ def read_tdms(file: File) -> Source:
         content = nptdms.TdmsFile.open(stream)
         weakref.finalize(content, stream.close)  # open as long as a channel waits to be read
         channels = [c for group in content.groups() for c in _tdms_channels(file, content, group)]
-        begun = _begun_again(file.stream() if file.content is not None else file.path)
+        begun = _begun_again(file)
     notes = []
     if begun:
         text = (
@@ -210,15 +210,27 @@ def read_tdms(file: File) -> Source:
     return instrument_source(file, "TDMS", channels, notes)
 
 
-def _begun_again(place: Any) -> list[int]:
-    """Return the numbers of later segments that state the sampling of a waveform again."""
+def _begun_again(file: File) -> list[int]:
+    """Return the numbers of later segments that state the sampling of a waveform again.
+
+    Raises
+    ------
+    DataError
+        If bytes are left behind the last segment: some were added, and shifted the samples.
+    """
     found, number = [], 0
     with contextlib.ExitStack() as stack:
+        place = file.stream()
         stream = stack.enter_context(place.open("rb")) if isinstance(place, Path) else place
-        while len(lead := stream.read(_LEAD_IN.size)) == _LEAD_IN.size:
-            tag, _, _, following, metadata = _LEAD_IN.unpack(lead)
+        while lead := stream.read(_LEAD_IN.size):
+            if len(lead) < _LEAD_IN.size or not lead.startswith(b"TDSm"):
+                raise DataError(
+                    f"{file.name}: the TDMS file is damaged: bytes behind segment {number}, from "
+                    f"byte {stream.tell() - len(lead)} on, belong to none; were some added?"
+                )
+            _, _, _, following, metadata = _LEAD_IN.unpack(lead)
             number += 1
-            if tag != b"TDSm" or following > _LONGEST_SEGMENT:
+            if following > _LONGEST_SEGMENT:
                 break
             start = stream.tell()
             if number > 1 and b"wf_increment" in stream.read(min(metadata, _LONGEST_METADATA)):

@@ -8,6 +8,7 @@ import marshal
 import subprocess
 import sys
 import tempfile
+import zipfile
 from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from dahl_ident.data.column_names import split_header
 from dahl_ident.data.raw_columns import Channel, Source, Stored
 from dahl_ident.data.readers import sheet_process
-from dahl_ident.data.readers.file import MOST_CHANNELS, File
+from dahl_ident.data.readers.file import MOST_CHANNELS, ZIP_ERRORS, File
 from dahl_ident.data.readers.header import best_run, header, named_channels
 from dahl_ident.data.storage import library, read_metadata
 from dahl_ident.data.tabular import listed
@@ -63,6 +64,11 @@ def read_workbook(file: File, sheet: str | None = None) -> Source:
 
 def _cells(file: File) -> dict[str, list[list[Any]]]:
     """Return the cells of every sheet, read in a process of its own."""
+    broken = None
+    with contextlib.suppress(*ZIP_ERRORS), zipfile.ZipFile(file.stream()) as archive:
+        broken = archive.testzip()
+    if broken is not None:
+        raise DataError(f"{file.name}: the workbook is damaged: the check sum of {broken} differs")
     with contextlib.ExitStack() as stack:
         path = file.path if file.content is None else None
         if path is None:
