@@ -281,7 +281,16 @@ def test_pdf_marks_its_headings_for_reading_aloud(fit: di.FitResult, tmp_path: P
     pypdf = pytest.importorskip("pypdf")
     reader = pypdf.PdfReader(report(fit, tmp_path / "r.pdf"))
     tree = reader.trailer["/Root"]["/StructTreeRoot"]["/K"][0].get_object()["/K"]
-    tags = [element.get_object()["/S"] for element in tree]
+    elements = [element.get_object() for element in tree]
+    tags = [element["/S"] for element in elements]
+    for table in (element for element in elements if element["/S"] == "/Table"):
+        kinds = [
+            [cell.get_object()["/S"] for cell in row.get_object()["/K"]] for row in table["/K"]
+        ]
+        assert set(kinds[0]) == {"/TH"}
+        assert {kind for row in kinds[1:] for kind in row} == {"/TD"}
+        assert {len(row) for row in kinds} == {len(kinds[0])}
+    assert tags.count("/Table") >= 4
     assert tags.count("/H1") == 1
     assert tags.count("/H2") >= 6
     assert tags.count("/Figure") >= 5

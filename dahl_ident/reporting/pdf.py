@@ -6,14 +6,17 @@ Letters come from the DejaVu fonts that matplotlib brings along, so Greek and ac
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 from fpdf import FPDF
+from fpdf import table as fpdf_table
 from fpdf.fonts import FontFace
-from fpdf.syntax import Name
+from fpdf.structure_tree import StructElem, StructureTreeBuilder
+from fpdf.syntax import Name, PDFArray, PDFObject
 
 from dahl_ident.reporting.document import (
     Block,
@@ -93,6 +96,7 @@ def _page(document: Document) -> FPDF:
             self.cell(0, 4, f"Page {self.page_no()} of {{nb}}", align="R")
 
     page = Page(format="A4")
+    page.struct_builder = _Structure()
     page.set_margins(16, 16, 16)
     page.set_auto_page_break(True, 16)
     page.set_title(document.title)
@@ -207,18 +211,76 @@ def _table(page: FPDF, table: Table) -> None:
     page.set_font(_FONT, "", 7.5)
     texts = [tuple(cell.text for cell in row) for row in table.rows]
     widths = [_width(name, own) for name, *own in zip(table.header, *texts, strict=True)]
-    with page.table(
+    drawn = _TaggedTable(
+        page,
         col_widths=widths,
         text_align="LEFT",
         line_height=4,
         padding=0.8,
         borders_layout="HORIZONTAL_LINES",
-    ) as drawn:
-        for row in (words(*table.header), *table.rows):
-            line = drawn.row()
-            for cell in row:
-                line.cell(cell.text, style=_STRUCK if cell.struck else None)
+    )
+    for row in (words(*table.header), *table.rows):
+        line = drawn.row()
+        for cell in row:
+            line.cell(cell.text, style=_STRUCK if cell.struck else None)
+    drawn.render()
     page.ln(2)
+
+
+class _TaggedTable(fpdf_table.Table):
+    """A table whose cells are marked for programs that read the page aloud."""
+
+    def render(self) -> None:
+        self._marked: set[tuple[int, int]] = set()
+        self._structure: _Structure = self._fpdf.struct_builder
+        self._structure.tables.append([[] for _ in self.rows])
+        super().render()
+
+    def _render_table_cell(
+        self, i: int, j: int, cell: Any, row_height: float, *args: Any, **kwargs: Any
+    ) -> Any:
+        draw = super()._render_table_cell
+        measured_only = kwargs.get("cell_height_info") is None
+        if measured_only or (i, j) in self._marked:  # headings are repeated on the next page
+            return draw(i, j, cell, row_height, *args, **kwargs)
+        self._marked.add((i, j))
+        with self._fpdf._marked_sequence() as element:
+            element.s = Name("TD" if i else "TH")
+            self._structure.tables[-1][i].append(element)
+            return draw(i, j, cell, row_height, *args, **kwargs)
+
+
+class _Structure(StructureTreeBuilder):
+    """What stands on the pages, with cells in rows and rows in tables; fpdf2 keeps a flat list."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tables: list[list[list[StructElem]]] = []
+
+    def __iter__(self) -> Iterator[PDFObject]:
+        document = StructElem("/Document", self.struct_tree_root, [])
+        self.struct_tree_root.k = PDFArray([document])
+        groups, first, inside = [document], {}, set()
+        for rows in self.tables:
+            table = StructElem("/Table", document, [])
+            groups.append(table)
+            first[id(rows[0][0])] = table
+            for cells in rows:
+                row = StructElem("/TR", table, [])
+                groups.append(row)
+                table.k.append(row)
+                for cell in cells:
+                    inside.add(id(cell))
+                    cell.p = row
+                    row.k.append(cell)
+        for element in self.doc_struct_elem.k:
+            if id(element) in first:
+                document.k.append(first[id(element)])
+            if id(element) not in inside:
+                element.p = document
+                document.k.append(element)
+        yield from (self.struct_tree_root, *groups, self.struct_tree_root.parent_tree)
+        yield from self.doc_struct_elem.k
 
 
 def _width(name: str, texts: Sequence[str]) -> float:
