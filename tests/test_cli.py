@@ -197,6 +197,23 @@ def test_a_record_is_simulated_inspected_and_extracted(run: Runner) -> None:
     assert Path("points.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_proposed_column_map_is_written_and_read(run: Runner) -> None:
+    Path("own.csv").write_text(
+        "Freq (Hz),Disp [um],Gain [N/um],Phase [deg]\n"
+        "2,20,0.038,9.7\n2,200,0.011,59\n2,900,0.003,75\n"
+    )
+    refused = run("fit", "own.csv")
+    assert refused.status == 1
+    assert "(inspect proposes a column map)" in refused.err
+    assert run("inspect", "own.csv", "-o", "map.toml").status == 0
+    assert run("inspect", "own.csv", "-o", "map.toml").status == 1, "nothing is overwritten"
+    assert run("fit", "own.csv", "--columns", "map.toml").status in (0, 3)
+    Path("other.csv").write_text("f [Hz],A [m],gain [N/m],phase [deg]\n2,2e-5,0.038,9.7\n")
+    different = run("inspect", "own.csv", "other.csv", "-o", "both.toml")
+    assert different.status == 2
+    assert "own.csv and other.csv need different column maps" in different.err
+
+
 def test_extraction_of_several_files_names_levels_and_files(run: Runner) -> None:
     for level in ("2e-3", "8e-3"):
         run("simulate", "--f-max", "0.1", "--sigma", "30", "--record", "--levels", level,

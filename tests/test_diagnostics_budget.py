@@ -54,6 +54,16 @@ class TestVariances:
         found = variance_components(model, np.array([1.0, 0.0]))
         np.testing.assert_allclose(found.variances, np.exp(best.x), rtol=0.02)
 
+    def test_variances_many_decades_apart_keep_their_own_errors(self) -> None:
+        """Two days apart by much more than the noise: one degree of freedom, 2 s^4 its variance."""
+        rng = np.random.default_rng(3)
+        day = np.repeat(np.eye(2), 20, axis=0)
+        y = day @ [-1e6, 1e6] + rng.standard_normal(40)
+        model = LinearModel(y, np.ones((40, 1)), np.zeros(40), [1e4 * np.ones(40), 1e6 * day])
+        found = variance_components(model, np.array([1e-8, 0.0]))
+        assert found.variances[1] == pytest.approx(2.0, rel=0.01)
+        assert found.covariance[1, 1] == pytest.approx(2.0 * 2.0**2, rel=0.02)
+
     def test_a_source_that_is_not_there_has_no_variance(self) -> None:
         model = self.model()
         calm = LinearModel(

@@ -67,7 +67,7 @@ def in_options(message: str) -> str:
         return f"--{name.replace('_', '-')}{' ' if value else ''}{value}"
 
     message = re.sub(r"columns=(\{(?:[^{}]|\{[^{}]*\})*\})", _column_map, message)
-    message = re.sub(r"(?<![\w.(-])([a-z]+(?:_[a-z]+)*)=(True\b|['\w]?)", option, message)
+    message = re.sub(r"(?<![\w.(-])([a-z]+(?:_[a-z]+)*)=(True\b|['\"\w]?)", option, message)
     return message.replace("di.fit(record, model)", "dahl-ident fit")
 
 

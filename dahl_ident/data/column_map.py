@@ -338,7 +338,7 @@ class Binding:
             raise DataError(
                 f"{self.source.name}: no column holds the {role}; there are "
                 f"{listed([c.header for c in self.source.channels], 20)}. Name it with "
-                f"columns={{{role!r}: ...}}"
+                f"columns={{{role!r}: ...}} (inspect proposes a column map)"
             )
         return channel
 

@@ -106,8 +106,9 @@ class _Table:
         if amplitude is None and drive is None:
             raise DataError(
                 f"{source.name}: neither an amplitude nor a drive is given; friction answers "
-                "every amplitude differently. Name a column, or give drive='0.2 N' or "
-                "amplitude='5 um' for the whole file"
+                "every amplitude differently. Name a column with columns={'amplitude': ...} "
+                "(inspect proposes a column map), or give drive='0.2 N' or amplitude='5 um' for "
+                "the whole file"
             )
         quantity, response = self._response(frequency_hz, amplitude, drive)
         harmonic = self._whole_numbers("harmonic")

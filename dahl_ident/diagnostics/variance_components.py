@@ -186,7 +186,8 @@ def variance_components(
     covariance = np.zeros_like(information)
     inside = np.flatnonzero(s > 0.0)
     part = np.ix_(inside, inside)
-    covariance[part] = np.linalg.pinv(information[part])
+    scaled, size = _scaled(information[part])
+    covariance[part] = np.linalg.pinv(scaled) * np.outer(size, size)
     return VarianceComponents(s, covariance, state.log_likelihood)
 
 
@@ -199,12 +200,22 @@ def _projected(
     while active.any():
         part = np.ix_(active, active)
         step[:] = 0.0
-        step[active] = np.linalg.lstsq(information[part], gradient[active], rcond=None)[0]
+        scaled, size = _scaled(information[part])
+        step[active] = size * np.linalg.lstsq(scaled, size * gradient[active], rcond=None)[0]
         leaving = active & (((s == 0.0) & (step <= 0.0)) | (largest & (step > 0.0)))
         if not leaving.any():
             break
         active &= ~leaving
     return step
+
+
+def _scaled(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the information of variances in units of their own size, and these units.
+
+    Variances of runs and of noise may lie many decades apart.
+    """
+    size = 1.0 / np.sqrt(np.maximum(np.diagonal(information), np.finfo(float).tiny))
+    return information * np.outer(size, size), size
 
 
 def _along(

@@ -232,7 +232,9 @@ class _TaggedTable(fpdf_table.Table):
 
     def render(self) -> None:
         self._marked: set[tuple[int, int]] = set()
-        self._structure: _Structure = self._fpdf.struct_builder
+        structure = self._fpdf.struct_builder
+        assert isinstance(structure, _Structure)
+        self._structure = structure
         self._structure.tables.append([[] for _ in self.rows])
         super().render()
 
