@@ -336,8 +336,14 @@ def test_report(tmp_path: Path, ending: str) -> None:
 
 def test_what_records_cannot_do_is_refused_by_name() -> None:
     fit = di.fit(recorded(DAHL, "random", 500, 1e-3), di.Dahl())
-    with pytest.raises(ValidationError, match="posterior of a Record is not available"):
-        di.posterior(fit.records[0], di.Dahl())  # type: ignore[call-overload]
+    with pytest.raises(ValidationError, match="method given; a posterior of records takes none"):
+        di.posterior(fit.records[0], di.Dahl(), method="grid")  # type: ignore[call-overload]
+    with pytest.raises(ValidationError, match="beside a RecordFit"):
+        di.posterior(fit, di.Dahl())
+    with pytest.raises(ModelError, match="there is no model"):
+        di.posterior(fit.records[0])
+    with pytest.raises(ModelError, match="a prior for drift"):
+        di.posterior(fit, priors={"drift": (0.0, 1.0)})
     with pytest.raises(ValidationError, match="predicts a Record"):
         fit.predict(2.0, amplitude=1e-3)
     with pytest.raises(ModelError, match="cannot be driven by a force"):

@@ -15,9 +15,9 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.convergence import Convergence, judge
-from dahl_ident.bayes.decorrelation import decorrelation_of
-from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.decorrelation import Decorrelation
 from dahl_ident.bayes.moves import moves_for
+from dahl_ident.bayes.priors import JointPrior
 
 _FIRST_CHECK = 200
 _GROWTH = 1.25
@@ -27,6 +27,40 @@ _PIECES = 20  # one piece adds at most this fraction of the chain
 
 RandomState = tuple[Any, ...]
 """As numpy.random.RandomState.get_state returns it."""
+
+
+class LogDensity(Protocol):
+    """A log-posterior over search coordinates, (S, D) -> (S,)."""
+
+    @property
+    def prior(self) -> JointPrior:
+        """Of the model's coordinates."""
+
+    @property
+    def likelihood(self) -> str:
+        """How the data count; "none" for the prior alone."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coordinates' values."""
+
+    @property
+    def logarithmic(self) -> tuple[bool, ...]:
+        """Which coordinates are logarithms."""
+
+    @property
+    def priors(self) -> dict[str, str]:
+        """Every prior in words."""
+
+    @property
+    def decorrelation(self) -> Decorrelation | None:
+        """Coordinates in which ridges are straight, where there are some."""
+
+    def to_values(self, x: FloatArray) -> FloatArray:
+        """Return values at points."""
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        """Return the log-density; -inf outside the prior's support."""
 
 
 class Pool(Protocol):
@@ -104,7 +138,7 @@ Listener = Callable[[Chain, Convergence | None], None]
 
 
 def run(
-    density: Density,
+    density: LogDensity,
     chain: Chain,
     settings: Settings,
     *,
@@ -140,7 +174,7 @@ def next_check(steps: int, end: int) -> int:
     return min(check, end)
 
 
-def _sampler(density: Density, settings: Settings, pool: Pool | None) -> Any:
+def _sampler(density: LogDensity, settings: Settings, pool: Pool | None) -> Any:
     from emcee import EnsembleSampler
 
     function = density if pool is None else _Mapped(density, pool)
@@ -148,7 +182,7 @@ def _sampler(density: Density, settings: Settings, pool: Pool | None) -> Any:
         settings.walkers,
         len(density.names),
         function,
-        moves=moves_for(settings.ensembles, decorrelation_of(density.problem)),
+        moves=moves_for(settings.ensembles, density.decorrelation),
         vectorize=True,
     )
     # emcee's wrapper prints points and traceback on standard output when a run is interrupted
@@ -179,7 +213,7 @@ def _continued(sampler: Any, chain: Chain, steps: int) -> Chain:
 class _Mapped:
     """A density whose points are distributed over a pool."""
 
-    density: Density
+    density: LogDensity
     pool: Pool
     parts: int = 8
 

@@ -27,6 +27,7 @@ import numpy as np
 from dahl_ident.bayes.chain import Chain, RandomState
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.record_density import RecordDensity
 from dahl_ident.data.file_lock import locked
 from dahl_ident.data.storage import library, plain_data, put_in_place
 from dahl_ident.elements.description import describe_model
@@ -48,31 +49,35 @@ class Stored:
     seed: int
 
 
-def identity(density: Density, walkers: int, ensembles: int) -> Identity:
+def identity(density: Density | RecordDensity, walkers: int, ensembles: int) -> Identity:
     """Return everything a chain depends on except its seed, part by part."""
-    problem = density.problem
+    elements = density.problem.model
     try:
-        model = json.dumps(describe_model(problem.model), sort_keys=True, default=str)
+        model = json.dumps(describe_model(elements), sort_keys=True, default=str)
     except ModelError:  # a linear system built by a function
-        model = repr(problem.model)
-    data = {
-        name: getattr(problem.data, name)
-        for name in (
-            "quantity", "frequency_hz", "amplitude", "drive", "response", "covariance", "dof",
-            "amplitude_std", "amplitude_covariance", "harmonic", "controlled",
-        )
-    }  # fmt: skip
-    fixed = [(p.name, p.value) for p in problem.sensors.parameters if not p.free]
-    priors = {f"prior of {name}": text for name, text in density.priors.items()}
+        model = repr(elements)
+    if isinstance(density, RecordDensity):
+        samples = [(r.time, r.motion_samples, r.force_samples) for r in density.problem.records]
+        own = {"data": _digest(*(part for record in samples for part in record))}
+        own["estimate"] = _digest(density.values)
+    else:
+        problem = density.problem
+        data = [
+            getattr(problem.data, name)
+            for name in (
+                "quantity", "frequency_hz", "amplitude", "drive", "response", "covariance", "dof",
+                "amplitude_std", "amplitude_covariance", "harmonic", "controlled",
+            )
+        ]  # fmt: skip
+        fixed = [(p.name, p.value) for p in problem.sensors.parameters if not p.free]
+        own = {"data": _digest(*data), "noise": problem.noise, "sensors": repr(fixed)}
     return {
-        "data": _digest(*data.values()),
+        **own,
         "model": model,
-        "noise": problem.noise,
-        "sensors": repr(fixed),
         "likelihood": density.likelihood,
         "parameters": ", ".join(density.names),
         "walkers": f"{walkers} in {ensembles} ensembles",
-        **priors,
+        **{f"prior of {name}": text for name, text in density.priors.items()},
     }
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.bayes.decorrelation import Decorrelation, decorrelation_of
 from dahl_ident.bayes.priors import JointPrior
 from dahl_ident.errors import SamplingError, ValidationError
 from dahl_ident.problem import Problem
@@ -90,6 +91,11 @@ class Density:
         """Every prior in words."""
         texts = {part.parameter.name: str(part) for part in self.prior.priors}
         return texts | ({SCALE: "1/s"} if self.has_scale else {})
+
+    @property
+    def decorrelation(self) -> Decorrelation | None:
+        """Coordinates in which ridges between linear elements and friction are straight."""
+        return decorrelation_of(self.problem)
 
     def to_values(self, x: FloatArray) -> FloatArray:
         """Return values at points of shape (..., D), or (..., P) without the scale."""

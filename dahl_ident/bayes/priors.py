@@ -20,7 +20,7 @@ prior 1/s.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -246,10 +246,10 @@ def joint_prior(
     for parameter, at in zip(problem.parameters, estimates, strict=True):
         name = parameter.name
         if name in given:
-            prior = _checked(parameter, given[name])
+            prior = checked_prior(parameter, given[name])
             parts.append(ParameterPrior(parameter, prior, "given", float(at)))
         elif name in problem.priors:
-            prior = _checked(parameter, problem.priors[name])
+            prior = checked_prior(parameter, problem.priors[name])
             parts.append(ParameterPrior(parameter, prior, "sensors", float(at)))
         else:
             bounds = _default(problem, parameter, float(at))
@@ -257,7 +257,8 @@ def joint_prior(
     return JointPrior(tuple(parts))
 
 
-def _checked(parameter: Parameter, given: Any) -> PriorLike:
+def checked_prior(parameter: Parameter, given: Any) -> PriorLike:
+    """Return a prior as it was given, or raise where it is none for the parameter."""
     frozen = not hasattr(given, "freeze")  # as those of scipy.stats without parameters have
     if frozen and all(hasattr(given, name) for name in ("logpdf", "cdf", "ppf")):
         _check_support(parameter, given)
@@ -309,16 +310,40 @@ def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[f
         return -half, half
     if parameter.name in ("force_gain", "displacement_gain"):
         return 1.0 / _WIDER, _WIDER
+    # the problem shows units of rotation where the data do; dimensions follow those declared
+    declared = next((p for p in problem.model.parameters if p.name == parameter.name), parameter)
+    return default_bounds(declared, estimate, lambda: _sizes(problem, declared))
+
+
+def default_bounds(
+    parameter: Parameter, estimate: float, sizes_of: Callable[[], FloatArray]
+) -> tuple[float, float]:
+    """Return wide bounds of a value.
+
+    Parameters
+    ----------
+    parameter : Parameter
+    estimate : float
+        Of its value, not finite where unknown.
+    sizes_of : callable
+        Returns the sizes that the data give the parameter's unit.
+
+    Returns
+    -------
+    tuple of float
+    """
     if parameter.prior is not None:
         low, high = _widened(parameter, *parameter.prior)
+    elif not any(parameter.dimension):
+        raise _without_default(parameter)
     elif parameter.transform == "log":
-        sizes = _sizes(problem, parameter)
+        sizes = sizes_of()
         seen = sizes[sizes > 0.0]
         if not seen.size:
             raise _without_default(parameter)
         low, high = float(seen.min()) / _DECADES, float(seen.max()) * _DECADES
     else:
-        high = _RESONANCE * float(_sizes(problem, parameter).max())
+        high = _RESONANCE * float(sizes_of().max())
         if np.isfinite(estimate):
             high = max(high, _WIDER * abs(estimate))
         low = -high
@@ -337,12 +362,8 @@ def _widened(parameter: Parameter, low: float, high: float) -> tuple[float, floa
 
 def _sizes(problem: Problem, parameter: Parameter) -> FloatArray:
     """Return the sizes that a parameter's unit has in the rows: of force, displacement, time."""
-    # the problem shows units of rotation where the data do; dimensions follow those declared
-    (declared,) = [p for p in problem.model.parameters if p.name == parameter.name]
-    if not any(declared.dimension):
-        raise _without_default(parameter)
     view = problem.stiffness_data
-    force, displacement, time = declared.dimension
+    force, displacement, time = parameter.dimension
     size = (np.abs(view.stiffness) * view.amplitude) ** force * view.amplitude**displacement
     return np.asarray(size / view.omega**time)
 

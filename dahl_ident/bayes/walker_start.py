@@ -7,10 +7,14 @@ start as wide as the prior, and walkers draw from Student's t with twice that sp
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 from scipy import stats
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.bayes.chain import LogDensity
 from dahl_ident.bayes.density import Density
 from dahl_ident.errors import FitError, SamplingError
 from dahl_ident.fitting import Optimum, solve
@@ -49,13 +53,41 @@ def starting_points(
     """Return `walkers` points of finite density, (walkers, D)."""
     theta, covariance = centre_and_covariance(density, optimum, random)
     centre, root = _with_scale(density, theta, covariance)
+    return scattered(density, centre, root, walkers, random, partial(_in_order, density))
+
+
+def scattered(
+    density: LogDensity,
+    centre: FloatArray,
+    root: FloatArray,
+    walkers: int,
+    random: np.random.Generator,
+    arranged: Callable[[FloatArray], FloatArray] = np.asarray,
+) -> FloatArray:
+    """Return `walkers` points of finite density around a centre, (walkers, D).
+
+    Parameters
+    ----------
+    density : LogDensity
+    centre : ndarray, shape (D,)
+    root : ndarray, shape (D, D)
+        Of the posterior's covariance, about.
+    walkers : int
+    random : Generator
+    arranged : callable, optional
+        Puts coordinates that can change places in order.
+
+    Returns
+    -------
+    ndarray
+    """
     spread = np.full(walkers, _WIDER)
     points = np.empty((walkers, len(centre)))
     missing = np.arange(walkers)
     for _ in range(_TRIES):
         shape = (missing.size, len(centre))
         draws = random.standard_normal(shape) @ root.T
-        points[missing] = _in_order(density, centre + spread[missing, None] * draws)
+        points[missing] = arranged(centre + spread[missing, None] * draws)
         missing = missing[~np.isfinite(density(points[missing]))]
         if not missing.size:
             return points

@@ -329,7 +329,12 @@ class RecordProblem:
             by[:, first + order] = 1.0
         return Prediction(output + own[order], by)
 
-    def set_guess(self, number: int, motion: FloatArray) -> None:
+    @property
+    def guesses(self) -> tuple[FloatArray | None, ...]:
+        """The motion of each record that was solved for last, (n, order)."""
+        return tuple(self._guesses)
+
+    def set_guess(self, number: int, motion: FloatArray | None) -> None:
         """Give a guess of the motion, (n, order), from which the next solution starts."""
         self._guesses[number] = motion
 

@@ -9,6 +9,7 @@ from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.grid_posterior import GridPosterior
 from dahl_ident.results.posterior_base import Posterior
 from dahl_ident.results.record_fit import RecordFit
+from dahl_ident.results.record_posterior import RecordPosterior
 
 __all__ = [
     "ChainPosterior",
@@ -18,6 +19,7 @@ __all__ = [
     "GridPosterior",
     "Posterior",
     "RecordFit",
+    "RecordPosterior",
     "fit",
     "fit_many",
     "posterior",

@@ -3,31 +3,42 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from typing import Literal, overload
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray, positive_number, whole_number
-from dahl_ident.bayes.chain import Chain, Pool, Settings, run
+from dahl_ident.bayes.chain import Chain, LogDensity, Pool, Settings, run
 from dahl_ident.bayes.checkpoint import Stored, identity, open_chain
 from dahl_ident.bayes.conditional_modes import ConditionalModes
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import PriorLike, joint_prior
 from dahl_ident.bayes.quadrature import integrate
-from dahl_ident.bayes.walker_start import centre_and_covariance, optimum_of, starting_points
-from dahl_ident.data import FrequencyResponse
+from dahl_ident.bayes.record_density import RecordDensity, record_prior
+from dahl_ident.bayes.walker_start import (
+    centre_and_covariance,
+    optimum_of,
+    scattered,
+    starting_points,
+)
+from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.elements import Element
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
-from dahl_ident.results.chain_posterior import ChainPosterior, refuse_unusable
+from dahl_ident.results.chain_draws import refuse_unusable
+from dahl_ident.results.chain_posterior import ChainPosterior
+from dahl_ident.results.estimate import fit as fit_any
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.grid_posterior import GridPosterior
 from dahl_ident.results.progress import progress_bar
+from dahl_ident.results.record_fit import RecordFit
+from dahl_ident.results.record_posterior import RecordPosterior
 from dahl_ident.sensors import Sensors
 
 _LEAST_STEPS = 20
@@ -61,6 +72,25 @@ def posterior(
 
 @overload
 def posterior(
+    data: Record | Sequence[Record] | RecordFit,
+    model: Element | None = None,
+    *,
+    priors: Mapping[str, PriorLike] | None = None,
+    free: Iterable[str] = (),
+    fixed: Mapping[str, float] | None = None,
+    seed: int | None = None,
+    steps: int | None = None,
+    max_steps: int = 20000,
+    ess: float = 2000.0,
+    walkers: int | None = None,
+    ensembles: int = 4,
+    resume: str | os.PathLike[str] | None = None,
+    progress: bool = False,
+) -> RecordPosterior: ...
+
+
+@overload
+def posterior(
     data: FrequencyResponse | FitResult,
     model: Element | None = None,
     *,
@@ -78,7 +108,7 @@ def posterior(
 
 
 def posterior(
-    data: FrequencyResponse | FitResult,
+    data: FrequencyResponse | FitResult | Record | Sequence[Record] | RecordFit,
     model: Element | None = None,
     *,
     method: str = "mcmc",
@@ -98,15 +128,16 @@ def posterior(
     pool: Pool | None = None,
     progress: bool = False,
     tolerance: float = 1e-4,
-) -> ChainPosterior | GridPosterior:
+) -> ChainPosterior | GridPosterior | RecordPosterior:
     """Return the posterior of a model's parameters, by Markov chain or by quadrature.
 
     Parameters
     ----------
-    data : FrequencyResponse or FitResult
-        What was measured; or a fit, whose data, model, noise and sensors are taken over.
+    data : FrequencyResponse, Record, sequence of Record, FitResult or RecordFit
+        What was measured; or a fit, whose data, model, noise and sensors are taken over. Records
+        are fitted first; where `output`, `excitation` or `start` is needed, give their fit.
     model : Element, optional
-        One element or a sum, such as ``Dahl() + Mass(0.3)``; left out with a FitResult.
+        One element or a sum, such as ``Dahl() + Mass(0.3)``; left out with a fit.
     method : {"mcmc", "grid"}, default "mcmc"
         "mcmc" samples with emcee. "grid" integrates over up to three free parameters: no chain,
         no Monte Carlo error, and the evidence. An unknown noise scale is integrated analytically
@@ -148,8 +179,8 @@ def posterior(
 
     Returns
     -------
-    ChainPosterior or GridPosterior
-        Both are a ``Posterior``; its first line says where it has not
+    ChainPosterior, GridPosterior or RecordPosterior
+        Each is a ``Posterior``; its first line says where it has not
         converged.
 
     Raises
@@ -183,11 +214,28 @@ def posterior(
     if method not in METHODS:
         raise ValidationError(f"method is {method!r}; expected {' or '.join(METHODS)}")
     if not isinstance(data, FrequencyResponse | FitResult):
-        raise ValidationError(
-            f"a posterior of a {type(data).__name__} is not available; use dahl_ident.fit for "
-            "records of any motion, or the posterior of dahl_ident.extract(record) where the "
-            "record holds settled sines"
+        refused = {
+            "method": method != "mcmc", "noise": noise is not None, "sensors": sensors is not None,
+            "likelihood": likelihood != "gaussian", "pool": pool is not None,
+            "tolerance": tolerance != 1e-4,
+        }  # fmt: skip
+        given = [name for name, is_given in refused.items() if is_given]
+        if given:
+            raise ValidationError(f"{', '.join(given)} given; a posterior of records takes none")
+        fit = _record_fit(data, model, free, fixed)
+        record_density = RecordDensity(
+            fit.problem,
+            fit.optimum.values,
+            fit.covar[: len(fit.problem.free), : len(fit.problem.free)],
+            fit.errors.dof,
+            record_prior(fit.problem, priors, fit.optimum.values),
         )
+        settings = _settings(record_density, seed, steps, max_steps, ess, walkers, ensembles)
+        start = partial(scattered, record_density, record_density.centre, record_density.root)
+        chain, verdict, settings = _chain(
+            record_density, start, settings, seed, resume, None, progress
+        )
+        return refuse_unusable(RecordPosterior(fit, record_density, chain, verdict, settings))
     for_chain = {
         "steps": steps is not None, "max_steps": max_steps != 20000, "ess": ess != 2000.0,
         "walkers": walkers is not None, "ensembles": ensembles != 4, "resume": resume is not None,
@@ -201,7 +249,8 @@ def posterior(
         return _grid(problem, optimum, priors, likelihood, tolerance)
     density = Density(problem, joint_prior(problem, priors, _estimate(optimum)), likelihood)
     settings = _settings(density, seed, steps, max_steps, ess, walkers, ensembles)
-    chain, verdict, settings = _chain(density, optimum, settings, seed, resume, pool, progress)
+    start = partial(starting_points, density, optimum)
+    chain, verdict, settings = _chain(density, start, settings, seed, resume, pool, progress)
     return refuse_unusable(ChainPosterior(density, chain, verdict, settings, optimum))
 
 
@@ -246,9 +295,27 @@ def _grid(
     return GridPosterior(density, grid, tolerance, optimum)
 
 
+def _record_fit(
+    data: Record | Sequence[Record] | RecordFit,
+    model: Element | None,
+    free: Iterable[str],
+    fixed: Mapping[str, float] | None,
+) -> RecordFit:
+    if isinstance(data, RecordFit):
+        if model is not None or fixed is not None or tuple(free):
+            raise ValidationError(
+                "model, free or fixed is given beside a RecordFit, which has its own; pass the "
+                "records instead"
+            )
+        return data
+    if model is None:
+        raise ModelError("there is no model; give one, such as Dahl(), or pass a RecordFit")
+    return fit_any(data, model, free=free, fixed=fixed, throw=False)
+
+
 def _chain(
-    density: Density,
-    optimum: Optimum | None,
+    density: Density | RecordDensity,
+    start_with: Callable[[int, np.random.Generator], FloatArray],
     settings: Settings,
     seed: int | None,
     resume: str | os.PathLike[str] | None,
@@ -268,8 +335,7 @@ def _chain(
             listeners.append(file)
         if stored is None:
             random = np.random.default_rng(settings.seed)
-            start = starting_points(density, optimum, settings.walkers, random)
-            chain = Chain.at(start, settings.seed)
+            chain = Chain.at(start_with(settings.walkers, random), settings.seed)
         else:
             chain = stored.chain
 
@@ -323,7 +389,7 @@ def _estimate(optimum: Optimum | None) -> FloatArray | None:
 
 
 def _settings(
-    density: Density,
+    density: LogDensity,
     seed: int | None,
     steps: int | None,
     max_steps: int,

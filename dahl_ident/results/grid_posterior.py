@@ -14,7 +14,8 @@ from dahl_ident.bayes.noise_scale import ScalePosterior, ln_scale_draws
 from dahl_ident.bayes.quadrature import Grid
 from dahl_ident.errors import ModelError
 from dahl_ident.fitting import Optimum
-from dahl_ident.results.posterior_base import QUANTILES, Posterior
+from dahl_ident.results.posterior_base import QUANTILES
+from dahl_ident.results.response_posterior import ResponsePosterior
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 _END = 1e-6  # of the probability, beyond which quadrature tells nothing
 
 
-class GridPosterior(Posterior):
+class GridPosterior(ResponsePosterior):
     """The posterior by quadrature: the same answer at every call, with its error.
 
     Made by :func:`dahl_ident.posterior` with ``method="grid"``. An unknown scale of the noise

@@ -4,32 +4,22 @@ from __future__ import annotations
 
 import json
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from importlib.metadata import version
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray, whole_number
-from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.chain import LogDensity
 from dahl_ident.bayes.priors import PriorLike
-from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.storage import plain_data
-from dahl_ident.diagnostics.bands import DerivedQuantity, problem_at
-from dahl_ident.diagnostics.budget import Budget, budget
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
-from dahl_ident.errors import FitError, ValidationError
-from dahl_ident.fitting import Optimum
-from dahl_ident.problem import Problem
-from dahl_ident.results.fit_numbers import Estimate, estimates
-from dahl_ident.results.posterior_prediction import PredictiveBand, derived_at_draws
-from dahl_ident.results.predictive_checks import PredictiveCheck, predictive_checks
+from dahl_ident.errors import ValidationError
 from dahl_ident.results.prior_influence import PriorInfluence, prior_influences
 from dahl_ident.results.result import Result
-from dahl_ident.units import Quantity
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,8 +27,8 @@ if TYPE_CHECKING:
 
 SCHEMA = "dahl_ident.posterior"
 
-_RULE_DRAWS = 4000
-_CHECK_DRAWS = 1000
+RULE_DRAWS = 4000
+"""Draws that statements rest on."""
 _HOW = ("seed", "steps", "warm_up", "log_evidence", "error", "evaluations")
 QUANTILES = {"2.5%": 0.025, "16%": 0.16, "median": 0.5, "84%": 0.84, "97.5%": 0.975}
 
@@ -47,13 +37,7 @@ class Posterior(Result):
     """Parameters, priors and draws of one posterior density."""
 
     _called = "a posterior"
-    _density: Density
-    _optimum: Optimum | None
-
-    @property
-    def problem(self) -> Problem:
-        """Data, model, noise and sensors."""
-        return self._density.problem
+    _density: LogDensity
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -61,10 +45,9 @@ class Posterior(Result):
         return self._density.names
 
     @property
+    @abstractmethod
     def units(self) -> tuple[str, ...]:
         """SI units of the parameters."""
-        own = [p.unit for p in self.problem.parameters]
-        return (*own, *([""] * (len(self.names) - len(own))))
 
     @property
     def likelihood(self) -> str:
@@ -97,15 +80,7 @@ class Posterior(Result):
         """The parameters that the prior determines rather than the data, or against them."""
         if self.likelihood == "none":
             return ()
-        return prior_influences(self._density.prior, self._draws(_RULE_DRAWS, 0))
-
-    @cached_property
-    def checks(self) -> tuple[PredictiveCheck, ...]:
-        """Posterior predictive checks of the residuals; none where the prior was sampled."""
-        if self.likelihood == "none":
-            return ()
-        draws = self._draws(_CHECK_DRAWS, 0)
-        return predictive_checks(self._density, draws, np.random.default_rng(0))
+        return prior_influences(self._density.prior, self._draws(RULE_DRAWS, 0))
 
     @property
     def statements(self) -> tuple[str, ...]:
@@ -134,8 +109,9 @@ class Posterior(Result):
         return (*map(str, self.prior_influences), *self._misfits)
 
     @property
+    @abstractmethod
     def _misfits(self) -> tuple[str, ...]:
-        return tuple(str(check) for check in self.checks if not check.passed)
+        """Where the data contradict the model, in words."""
 
     def draws(self, size: int, seed: int = 0) -> FloatArray:
         """Return values drawn from the posterior, shape (size, number of parameters)."""
@@ -144,16 +120,6 @@ class Posterior(Result):
     @abstractmethod
     def _draws(self, size: int, seed: int) -> FloatArray:
         """Return the coordinates of draws."""
-
-    @cached_property
-    def params(self) -> Mapping[str, Estimate]:
-        """Every parameter by name, posterior mean and standard deviation; fixed ones included."""
-        own = len(self.problem.names)
-        values = dict(zip(self.names, self.mean().tolist(), strict=True))
-        stderr = dict(zip(self.names, self.std().tolist(), strict=True))
-        found = estimates(self.problem, values, stderr)
-        scale = {name: Estimate.of_scale(values[name], stderr[name]) for name in self.names[own:]}
-        return MappingProxyType(found | scale)
 
     @property
     def var_names(self) -> list[str]:
@@ -167,71 +133,6 @@ class Posterior(Result):
     @abstractmethod
     def std(self) -> FloatArray:
         """Return the standard deviations of the parameters, in the order of `names`."""
-
-    @property
-    def data(self) -> FrequencyResponse:
-        """The data."""
-        return self.problem.data
-
-    @property
-    def optimum(self) -> Optimum | None:
-        """The least-squares optimum from which the search started; None with too few data."""
-        return self._optimum
-
-    def budget(self) -> Budget:
-        """Return the uncertainty budget of the least-squares fit to the same data and model.
-
-        Raises
-        ------
-        FitError
-            If there are too few data for one.
-        """
-        if self._optimum is None:
-            raise FitError("there are too few data for a least-squares fit, so there is no budget")
-        return budget(self._optimum)
-
-    def predict(
-        self,
-        frequency_hz: ArrayLike,
-        *,
-        amplitude: ArrayLike | None = None,
-        drive: ArrayLike | None = None,
-        quantity: Quantity | None = None,
-        size: int = 1000,
-        seed: int = 0,
-    ) -> PredictiveBand:
-        """Return the response at draws from the posterior, with its bands.
-
-        Parameters
-        ----------
-        frequency_hz, amplitude, drive, quantity
-            As for :meth:`dahl_ident.FitResult.predict`.
-        size, seed : int, default 1000 and 0
-            Of the draws.
-
-        Returns
-        -------
-        PredictiveBand
-        """
-        there = problem_at(self.problem, frequency_hz, amplitude, drive, quantity)
-        return PredictiveBand(there.predict(self._theta(size, seed)))
-
-    def derived(
-        self, amplitudes: Sequence[float] = (), frequency_hz: float | None = None
-    ) -> tuple[DerivedQuantity, ...]:
-        """Return x_c, energy per cycle, equivalent stiffness and damping: means and deviations.
-
-        Parameters
-        ----------
-        amplitudes, frequency_hz
-            As for :meth:`dahl_ident.FitResult.derived`.
-
-        Returns
-        -------
-        tuple of DerivedQuantity
-        """
-        theta = self._theta(_RULE_DRAWS, 0)
-        return tuple(derived_at_draws(self.problem, theta, amplitudes, frequency_hz))
 
     def function(self, of: Callable[..., Any], name: str = "function") -> Mapping[str, float]:
         """Return mean, std and quantiles of a function of the parameters.
@@ -266,10 +167,6 @@ class Posterior(Result):
     def _weighted(self) -> tuple[FloatArray, FloatArray]:
         """Return values, (N, at most D), and weights, (N,), which sum to 1."""
 
-    def _theta(self, size: int, seed: int) -> FloatArray:
-        """Return draws of the model's search coordinates, (size, P)."""
-        return self._density.split(self._draws(size, seed))[0]
-
     _PLOTS: ClassVar[tuple[str, ...]] = ("corner",)
 
     def plot(self, kind: str | None = None, ax: Any = None) -> Any:
@@ -296,7 +193,7 @@ class Posterior(Result):
         """Draw marginals and pairs; options as :func:`dahl_ident.plots.plot_corner`."""
         from dahl_ident.plots import plot_corner
 
-        draws = self.draws(_RULE_DRAWS)
+        draws = self.draws(RULE_DRAWS)
         return plot_corner(self._labels, draws, log=self._density.logarithmic, **options)
 
     @property

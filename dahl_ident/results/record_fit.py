@@ -360,29 +360,37 @@ class RecordFit(Result):
                 "a fit of records predicts a Record; for settled sines ask its model: "
                 "fit.model.dynamic_stiffness(amplitude, frequency_hz)"
             )
+        count = len(self.problem.free)
+        problem, full = self.started(record, self._optimum.values[:count], initial)
+        found = problem.predict(full, 0)
+        by = found.by[:, :count]
+        variance = np.einsum("ij,jk,ik->i", by, self.covar[:count, :count], by)
+        return self.band(problem, found.output, variance)
+
+    def started(
+        self, record: Record, values: FloatArray, initial: Literal["fitted", "rest"]
+    ) -> tuple[RecordProblem, FloatArray]:
+        """Return the problem of another record, and all its values; the model's are given."""
         own = self.problem
         problem = RecordProblem(
             [record], own.model, output=own.output, excitation=own.excitation,
             substeps=own.substeps,
         )  # fmt: skip
-        count = len(own.free)
-        values = self._optimum.values[:count]
         if initial == "fitted":
-            full = hold_model(problem, values)
-        elif initial == "rest":
-            full = np.zeros(len(problem.parameters))
-            full[:count] = values
-        else:
+            return problem, hold_model(problem, values)
+        if initial != "rest":
             raise ValidationError(f"initial is {initial!r}; expected fitted or rest")
-        found = problem.predict(full, 0)
-        by = found.by[:, :count]
-        covariance = self.covar[:count, :count]
-        variance = np.einsum("ij,jk,ik->i", by, covariance, by)
+        full = np.zeros(len(problem.parameters))
+        full[: values.size] = values
+        return problem, full
+
+    def band(self, problem: RecordProblem, output: FloatArray, variance: FloatArray) -> RecordBand:
+        """Return a predicted record with its bands, from the variance of what is predicted."""
         scatter = float(np.mean(np.concatenate(self.residuals) ** 2))
         half = self.coverage_factor * np.sqrt(variance + scatter)
         return RecordBand(
-            record.time, found.output, np.sqrt(variance), found.output - half,
-            found.output + half, problem.measured[0],
+            problem.records[0].time, output, np.sqrt(variance), output - half, output + half,
+            problem.measured[0],
         )  # fmt: skip
 
     def simulate(self, record: Record) -> FloatArray:

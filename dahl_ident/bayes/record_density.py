@@ -1,0 +1,223 @@
+r"""The posterior density of a model's parameters, given records of any motion.
+
+States, offsets and drifts of the records are linear in the output, nearly: the residuals e are
+projected off their derivatives, so that only the model's parameters theta are coordinates. With S
+the sum of squares that is left, nu the effective degrees of freedom of the residuals and P
+parameters, the unknown scale of the noise integrated out,
+
+    ln p(theta) + constants - (nu + P)/2 ln(1 + (S(theta*) - S(t))/(nu s^2)),    s^2 = S(t)/n.
+
+Residuals of neighbouring samples are correlated, so S counts too many samples, of some parameters
+more than of others. It is therefore taken at theta* = t + C (theta - t), t the least-squares
+estimate and C such that the curvature at t is the inverse of the estimate's covariance, in which
+the correlation is accounted for (curvature adjustment of a composite likelihood: Ribatet, Cooley
+and Davison, Statistica Sinica 22 (2012) 813-845).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.bayes.decorrelation import Decorrelation
+from dahl_ident.bayes.priors import (
+    JointPrior,
+    ParameterPrior,
+    PriorLike,
+    checked_prior,
+    default_bounds,
+)
+from dahl_ident.errors import FitError, ModelError, SamplingError
+from dahl_ident.fitting.record_start import in_band
+from dahl_ident.problem.record_problem import RecordProblem
+
+
+@dataclass(frozen=True)
+class RecordDensity:
+    """Log-posterior of the model's free parameters; call it with points of shape (S, P).
+
+    Attributes
+    ----------
+    problem : RecordProblem
+    values : ndarray
+        The least-squares estimate: the model's parameters, then states and offsets.
+    covariance : ndarray, shape (P, P)
+        Of the model's parameters, every source of error included.
+    dof : float
+        Effective degrees of freedom of the residuals.
+    prior : JointPrior
+    """
+
+    problem: RecordProblem
+    values: FloatArray
+    covariance: FloatArray
+    dof: float
+    prior: JointPrior
+    likelihood = "gaussian"
+    decorrelation: Decorrelation | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the model's free parameters."""
+        return tuple(p.name for p in self.problem.free)
+
+    @property
+    def logarithmic(self) -> tuple[bool, ...]:
+        """Which coordinates are logarithms."""
+        return tuple(p.transform == "log" for p in self.problem.free)
+
+    @property
+    def priors(self) -> dict[str, str]:
+        """Every prior in words."""
+        return {part.parameter.name: str(part) for part in self.prior.priors}
+
+    def to_values(self, x: FloatArray) -> FloatArray:
+        """Return values at points of shape (..., P)."""
+        return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, x, 0.0)), x)
+
+    @property
+    def centre(self) -> FloatArray:
+        """Coordinates of the estimate."""
+        return self.problem.theta(self.values)[: len(self.names)]
+
+    @cached_property
+    def root(self) -> FloatArray:
+        """A root of the covariance of the coordinates, (P, P)."""
+        chain = np.where(self.logarithmic, 1.0 / self.values[: len(self.names)], 1.0)
+        covariance = self.covariance * np.outer(chain, chain)
+        size = np.sqrt(covariance.diagonal())
+        try:
+            return np.asarray(size[:, None] * np.linalg.cholesky(covariance / np.outer(size, size)))
+        except np.linalg.LinAlgError as exc:
+            raise SamplingError(
+                "the records do not determine every parameter, so that their likelihood has no "
+                "curvature to begin with; fix what the fit's verdict names"
+            ) from exc
+
+    @cached_property
+    def _nuisance(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Orthonormal derivatives by states and offsets, and those by theta, of each record."""
+        count = len(self.names)
+        chain = np.where(self.logarithmic, self.values[:count], 1.0)
+        found = []
+        for number in range(len(self.problem.records)):
+            by = self.problem.filtered(self.problem.predict(self.values, number).by)
+            first = count + number * self.problem.per_record
+            own = by[:, first : first + self.problem.per_record]
+            basis = np.linalg.qr(own / np.linalg.norm(own, axis=0))[0]
+            found.append((basis, by[:, :count] * chain))
+        return found
+
+    @cached_property
+    def _motions(self) -> list[FloatArray | None]:
+        """The motion at the estimate, from which every other solution starts."""
+        _ = self._nuisance
+        return list(self.problem.guesses)
+
+    @cached_property
+    def _least(self) -> float:
+        return self._squares(self.centre)
+
+    @cached_property
+    def _bend(self) -> FloatArray:
+        """C, symmetric in coordinates in which the covariance is the unit matrix."""
+        hessian = np.zeros((len(self.names),) * 2)
+        for basis, by in self._nuisance:
+            rest = by - basis @ (basis.T @ by)
+            hessian += rest.T @ rest
+        noise = self._least / self.problem.n_residuals
+        inner = self.root.T @ hessian @ self.root / noise
+        values, vectors = np.linalg.eigh(inner)
+        shrunk = vectors @ np.diag(1.0 / np.sqrt(values)) @ vectors.T
+        return np.asarray(self.root @ shrunk @ np.linalg.inv(self.root))
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        """Return the log-density, (S, P) -> (S,); -inf outside the prior's support."""
+        result = self.prior.log_density(x)
+        noise = self._least / self.problem.n_residuals
+        power = 0.5 * (self.dof + len(self.names))
+        for i in np.flatnonzero(result > -np.inf):
+            bent = self.centre + self._bend @ (x[i] - self.centre)
+            excess = (self._squares(bent) - self._least) / (self.dof * noise)
+            result[i] -= power * np.log1p(max(excess, -0.5))
+        return result
+
+    def _squares(self, theta: FloatArray) -> float:
+        """Return the sum of squared residuals, states and offsets projected out."""
+        full = self.values.copy()
+        full[: theta.size] = self.to_values(theta)
+        total = 0.0
+        try:
+            for number, y in enumerate(self.problem.measured):
+                self.problem.set_guess(number, self._motions[number])
+                found = self.problem.predict(full, number, derivatives=False)
+                e = self.problem.filtered(y - found.output)
+                basis = self._nuisance[number][0]
+                total += float(e @ e) - float(np.sum((basis.T @ e) ** 2))
+        except FitError:  # the motion grows beyond all bounds
+            return np.inf
+        return total if np.isfinite(total) else np.inf
+
+
+def record_prior(
+    problem: RecordProblem, priors: Mapping[str, PriorLike] | None, estimate: FloatArray
+) -> JointPrior:
+    """Return the prior of every free parameter of a model of records.
+
+    Parameters
+    ----------
+    problem : RecordProblem
+    priors : mapping of str to distribution or (low, high), optional
+        By parameter name; the rest gets wide bounds from the size of force and motion.
+    estimate : ndarray
+        Least-squares values, the model's first.
+
+    Returns
+    -------
+    JointPrior
+
+    Raises
+    ------
+    ModelError
+        If a name is not that of a free parameter of the model.
+    ValidationError
+        If a prior is neither a distribution nor two bounds in order.
+    """
+    given = dict(priors or {})
+    names = [p.name for p in problem.free]
+    unknown = [name for name in given if name not in names]
+    if unknown:
+        raise ModelError(f"there is a prior for {', '.join(unknown)}, but free are {names}")
+    parts = []
+    for parameter, at in zip(problem.free, estimate.tolist(), strict=False):
+        if parameter.name in given:
+            prior = checked_prior(parameter, given[parameter.name])
+            parts.append(ParameterPrior(parameter, prior, "given", at))
+        else:
+            declared = parameter.dimension
+
+            def sizes(powers: tuple[int, int, int] = declared) -> FloatArray:
+                return _sizes(problem, powers)
+
+            parts.append(ParameterPrior(parameter, default_bounds(parameter, at, sizes), "default"))
+    return JointPrior(tuple(parts))
+
+
+def _sizes(problem: RecordProblem, powers: tuple[int, int, int]) -> FloatArray:
+    """Return the size in each record of a unit, by powers of force, displacement and time."""
+    found = []
+    for number, record in enumerate(problem.records):
+        if problem.output == "force":
+            x = np.asarray(record.displacement)
+            v = np.gradient(x, record.time)
+        else:
+            x, v, _ = in_band(problem, number)
+        length, time = np.std(x), np.std(x) / np.std(v)
+        push = record.force_samples
+        force = np.std(push if push.any() else v / time)  # a free decay: of unit mass
+        found.append(force ** powers[0] * length ** powers[1] * time ** powers[2])
+    return np.asarray(found)

@@ -1,0 +1,120 @@
+"""The posterior of a model's parameters, given records of any motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+
+from dahl_ident.arrays import whole_number
+from dahl_ident.bayes.chain import Chain, Settings
+from dahl_ident.bayes.convergence import Convergence
+from dahl_ident.bayes.record_density import RecordDensity
+from dahl_ident.data import Record
+from dahl_ident.diagnostics.bands import DerivedQuantity
+from dahl_ident.diagnostics.budget import Budget
+from dahl_ident.diagnostics.record_errors import record_derived
+from dahl_ident.diagnostics.verdict_status import VerdictStatus
+from dahl_ident.results.chain_draws import ChainDraws
+from dahl_ident.results.fit_numbers import Estimate
+from dahl_ident.results.record_fit import RecordBand, RecordFit
+
+
+class RecordPosterior(ChainDraws):
+    """Draws from the posterior given records, with the verdict on whether they can be trusted.
+
+    Made by :func:`dahl_ident.posterior`. Its parameters are the model's; states, offsets and
+    drifts of the records are projected out.
+
+    Attributes
+    ----------
+    fit : RecordFit
+        The least-squares fit of the same records, around which the chain started.
+    """
+
+    _density: RecordDensity
+
+    def __init__(
+        self,
+        fit: RecordFit,
+        density: RecordDensity,
+        chain: Chain,
+        convergence: Convergence,
+        settings: Settings,
+    ) -> None:
+        self.fit, self._density, self._chain = fit, density, chain
+        self.convergence, self._settings = convergence, settings
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """SI units of the parameters."""
+        return tuple(p.unit for p in self.fit.problem.free)
+
+    @cached_property
+    def params(self) -> Mapping[str, Estimate]:
+        """Every parameter of the model, posterior mean and standard deviation."""
+        mean = dict(zip(self.names, self.mean().tolist(), strict=True))
+        std = dict(zip(self.names, self.std().tolist(), strict=True))
+        return MappingProxyType(
+            {
+                p.name: Estimate(
+                    p.name, p.unit, p.description, float(mean.get(p.name, p.value or 0.0)),
+                    std.get(p.name), p.value, p.lower, p.upper, p.name in std,
+                )
+                for p in self.fit.problem.model.parameters
+            }
+        )  # fmt: skip
+
+    @property
+    def _misfits(self) -> tuple[str, ...]:
+        if self.fit.status in (VerdictStatus.TRUSTED, VerdictStatus.NOT_DETERMINED):
+            return ()
+        return self.fit.statements[:2]
+
+    def budget(self) -> Budget:
+        """Return the uncertainty budget of the least-squares fit."""
+        return self.fit.budget()
+
+    def predict(
+        self,
+        record: Any,
+        *,
+        initial: Literal["fitted", "rest"] = "fitted",
+        size: int = 100,
+        seed: int = 0,
+        **other: Any,
+    ) -> RecordBand:
+        """Return what another record of the same device should show, at draws.
+
+        Parameters
+        ----------
+        record, initial
+            As for :meth:`dahl_ident.RecordFit.predict`.
+        size, seed : int, default 100 and 0
+            Of the draws.
+
+        Returns
+        -------
+        RecordBand
+        """
+        if other or not isinstance(record, Record):
+            return self.fit.predict(record, **other)  # says what can be predicted
+        outputs = []
+        for values in self.draws(whole_number(size, "size", 2), seed):
+            problem, full = self.fit.started(record, values, initial)
+            outputs.append(problem.predict(full, 0, derivatives=False).output)
+        return self.fit.band(problem, np.mean(outputs, axis=0), np.var(outputs, axis=0, ddof=1))
+
+    def derived(
+        self, amplitudes: Sequence[float] = (), frequency_hz: float | None = None
+    ) -> tuple[DerivedQuantity, ...]:
+        """Return x_c, energy per cycle, equivalent stiffness and damping at the posterior mean."""
+        full = self.fit.optimum.values.copy()
+        count = len(self.names)
+        full[:count] = self.mean()
+        covariance = np.zeros((full.size, full.size))
+        covariance[:count, :count] = np.cov(self.values, rowvar=False)
+        return record_derived(self.fit.problem, full, covariance, amplitudes, frequency_hz)

@@ -1,0 +1,92 @@
+"""Posteriors of records: their width, their priors, what they predict, and their chains on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import norm
+
+import dahl_ident as di
+from dahl_ident.bayes.record_density import RecordDensity, record_prior
+from tests.test_record_fit import DAHL, driven, recorded
+
+
+def slow_noise(seed: int = 0) -> di.Record:
+    """Return a record whose noise has a correlation of 0.95 from sample to sample."""
+    clean = recorded(DAHL, "random", 500, 0.0)
+    white = np.random.default_rng(seed).standard_normal(800)
+    noise = 1e-3 * np.asarray(lfilter([1.0], [1.0, -0.95], white))[300:]
+    return di.Record(clean.time, displacement=clean.displacement, force=clean.force_samples + noise)
+
+
+def test_as_wide_as_the_error_bars_of_the_fit_where_residuals_are_correlated() -> None:
+    fit = di.fit(slow_noise(), di.Dahl())
+    found = di.posterior(fit, seed=1, steps=120, walkers=64)
+    assert found.names == ("f_max", "sigma")
+    for name in found.names:
+        own, other = found.params[name].stderr or 0.0, fit.params[name].stderr or 0.0
+        dof = fit.errors.dof  # the variance of Student's t is beyond its scale
+        assert own == pytest.approx(other * (dof / (dof - 2.0)) ** 0.5, rel=0.08)
+        assert own > 1.5 * _counted_as_independent(fit, name)
+        assert abs(found.params[name].value - fit.params[name].value) < 0.3 * other
+
+
+def _counted_as_independent(fit: di.RecordFit, name: str) -> float:
+    """Return the standard error if every sample counted."""
+    number = fit.var_names.index(name)
+    J = fit.problem.predict(fit.optimum.values, 0).by
+    covariance = np.linalg.inv(J.T @ J) * float(np.var(fit.residuals[0]))
+    return float(covariance[number, number] ** 0.5)
+
+
+def test_density_of_a_driven_motion_is_the_expected_parabola() -> None:
+    model = di.Dahl(f_max=0.1) + di.Mass(0.3) + di.Damper() + di.Spring(50.0)
+    fit = di.fit(driven(1, 0.01, 512), model, start={"sigma": 300.0, "damping": 0.5})
+    values, covariance = fit.optimum.values, fit.covar[:2, :2]
+    density = RecordDensity(
+        fit.problem, values, covariance, 1e9, record_prior(fit.problem, None, values)
+    )
+    z = np.array([[1.0, 0.0], [0.0, -1.5], [1.0, 1.0]])
+    fall = density(density.centre + z @ density.root.T) - density(density.centre[None])
+    np.testing.assert_allclose(fall, -0.5 * (z**2).sum(axis=1), rtol=0.05)
+
+
+def test_priors_and_prediction() -> None:
+    fit = di.fit(recorded(DAHL, "random", 300, 1e-3), di.Dahl())
+    sigma = fit.params["sigma"]
+    at = float(sigma.value) + 3.0 * float(sigma.stderr or 0.0)
+    narrow = di.posterior(
+        fit, priors={"sigma": norm(at, sigma.stderr or 0.0)}, seed=2, steps=100, walkers=64
+    )
+    shift = (narrow.params["sigma"].value - sigma.value) / float(sigma.stderr or 0.0)
+    assert shift == pytest.approx(1.5, abs=0.15)  # half way: prior and data weigh the same
+    other = recorded(DAHL, "multisine", 300, 1e-3)
+    ours, theirs = narrow.predict(other, size=20), fit.predict(other)
+    assert ours.rms_error < 1.5e-3
+    assert np.mean((ours.measured > ours.lower) & (ours.measured < ours.upper)) > 0.9
+    assert ours.stderr.max() < 1.5 * theirs.stderr.max()
+    assert narrow.budget()["sigma"].u == pytest.approx(sigma.stderr)
+    x_c = narrow.derived()[0]
+    assert x_c.value == pytest.approx(np.mean(narrow.values[:, 0] / narrow.values[:, 1]), rel=1e-4)
+
+
+def test_a_stopped_chain_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
+    fit = di.fit(recorded(DAHL, "random", 200, 1e-3), di.Dahl())
+    place = tmp_path / "chain.h5"
+    di.posterior(fit, seed=3, steps=60, walkers=32, resume=place)
+    again = di.posterior(fit, seed=3, steps=120, walkers=32, resume=place)
+    whole = di.posterior(fit, seed=3, steps=120, walkers=32)
+    np.testing.assert_allclose(again.get_chain(), whole.get_chain(), rtol=1e-12)
+    other = di.fit(recorded(DAHL, "random", 200, 1e-3, seed=1), di.Dahl())
+    with pytest.raises(di.errors.SamplingError, match="chain of another run"):
+        di.posterior(other, seed=3, steps=120, walkers=32, resume=place)
+
+
+def test_data_that_the_model_misses_are_said() -> None:
+    with_spring = recorded(DAHL + di.Spring(20.0), "random", 300, 1e-4)
+    found = di.posterior(with_spring, di.Dahl(), seed=1, steps=40, walkers=32)
+    assert found.status.value != "trusted"
+    assert any("misses" in text for text in found.findings)
