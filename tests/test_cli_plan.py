@@ -53,7 +53,7 @@ def test_a_target_out_of_reach_ends_with_3(run: Runner) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--time", "9"), "nothing is known of f_max, sigma; give --ranges"),
+        (("--time", "9"), "nothing is known about f_max, sigma; give --ranges"),
         ((*RANGES, "--target", "f_max=a"), "f_max is 'a'; expected a number"),
         ((*RANGES, "--target", "f_max=1", "--target", "sigma"), "with and without a number"),
         ((*RANGES, "--waveform", "w.csv"), "--waveform and --sample-rate go together"),

@@ -106,5 +106,5 @@ def test_what_is_no_friction_is_refused() -> None:
         FrictionNonlinearity(Dahl(1.0))
     linear = LinearSystem(control.tf([1], [1, 1]), quantity="receptance")
     for element in (Spring(1.0), Damper(1.0), linear):
-        with pytest.raises(ModelError, match="everything linear into the loop"):
+        with pytest.raises(ModelError, match="the linear elements into the loop"):
             FrictionNonlinearity(element)

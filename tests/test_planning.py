@@ -328,11 +328,11 @@ class TestPlan:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"ranges": {}}, "nothing is known of f_max, sigma; give ranges="),
+            ({"ranges": {}}, "nothing is known about f_max, sigma; give ranges="),
             ({"limits": {"time": 3}}, "limits has no frequency_hz"),
             ({"limits": KNEE}, "without a wanted uncertainty the time is needed"),
             ({"limits": {**KNEE, "time": 0.5}}, "the quickest level takes"),
-            ({"limits": {**KNEE, "time": 9, "force": 1e-9}}, "force refuses"),
+            ({"limits": {**KNEE, "time": 9, "force": 1e-9}}, "force excludes"),
             ({"noise": None}, "the noise is unknown before any data"),
             ({"noise": {"relativ": 1}}, "noise has relativ; expected relative"),
             ({"target": {"mass": 0.1}}, "target names 'mass'; free are f_max, sigma"),

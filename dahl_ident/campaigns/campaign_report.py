@@ -1,4 +1,4 @@
-"""A campaign on paper: what the devices have in common, which stand out, and which failed."""
+"""Report on a campaign: the population, outlying devices and failures."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def write_campaign_report(
     table : DataFrame
         That of a campaign.
     found : Population or None
-        What :func:`population` made of it; None where too few devices were usable.
+        Its evaluation by :func:`population`; None where too few devices were usable.
     path : path
         Ending in ``.html`` or ``.pdf``.
     title : str
@@ -93,7 +93,7 @@ def write_campaign_report(
 def campaign_document(
     table: pd.DataFrame, found: Population | None, title: str, reports: str = "reports"
 ) -> Document:
-    """Return the report's content; `reports` is where those of the fits are, for links."""
+    """Return the report's content; `reports` is the folder of the fits' reports, for links."""
     statuses = table["status"].value_counts()
     counted = ", ".join(f"{count} {status}" for status, count in statuses.items())
     verdict = [f"{len(table)} fits of {table['device'].nunique()} devices: {counted}."]
@@ -170,14 +170,14 @@ def _blocks(p: PopulationParameter) -> Iterator[Block]:
     beyond = ", ".join(p.outlying) or "none"
     yield Picture(
         f"devices_{p.name}",
-        f"{p.name} of each device: own estimate, and drawn towards the population",
+        f"{p.name} of each device: own estimate, and estimate shrunk towards the population",
         f"{len(p.devices)} devices around {p.mean[0]:.4g}; outside the population: {beyond}",
         lambda: figure_of(devices()),
     )
     yield Picture(
         f"charts_{p.name}",
         "Individuals (limits: three standard deviations from moving ranges) and EWMA chart, "
-        "covariates taken out",
+        "corrected for covariates",
         f"{len(p.out_of_control)} of {len(p.fits)} fits lie outside the limits",
         lambda: figure_of(charts()),
     )

@@ -1,4 +1,4 @@
-"""What a campaign measures: a declarative file, checked before anything runs.
+"""Definition of a campaign: a declarative file, checked before anything runs.
 
     [files]
     pattern = "data/{device}/{run}_{tension}lb.csv"   # names in braces are read from the path
@@ -75,15 +75,14 @@ class Task:
 
 @dataclass(frozen=True)
 class Definition:
-    """A checked campaign: what to do with which files, and where the results go.
+    """A checked campaign: files, options and the folder of the results.
 
     Attributes
     ----------
     source : str
         Where it was read from, for messages.
     options : mapping
-        Everything that a result depends on besides its files: kind, read, extract, fit,
-        posterior, model and per.
+        All settings that a result depends on: kind, read, extract, fit, posterior, model and per.
     tasks : tuple of Task
         In the order of their names.
     folder : Path

@@ -1,8 +1,8 @@
-"""Jobs through an executor, a few at a time, whatever happens to its workers.
+"""Runs jobs through an executor, a few at a time, even if workers die.
 
-Any ``concurrent.futures`` executor will do. Where a pool of local processes breaks because one
-of them died, the jobs that were under way are tried again one by one, so that a job that kills
-its process is found out and becomes a row, and the others lose nothing.
+Any ``concurrent.futures`` executor can be used. If a pool of local processes breaks because one of
+them died, the jobs in progress are repeated one by one, so that a job that kills its process is
+identified and recorded as failed, and the others are completed.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from dahl_ident.errors import ValidationError
 
 _Tag = TypeVar("_Tag")
 _WAITING = 2
-"""Jobs handed over for each worker: one under way, one waiting."""
+"""Jobs submitted for each worker: one in progress, one waiting."""
 _DEATHS = 3
-"""Workers that a job alone may lose before it counts as the cause; others may be killed too."""
+"""Worker deaths, with the job running alone, after which the job is taken as the cause."""
 
 
 def run_jobs(
     jobs: Iterable[tuple[_Tag, Job]], workers: int, executor: Executor | None = None
 ) -> Iterator[tuple[_Tag, Row]]:
-    """Yield the row of each job as it is done.
+    """Yield the row of each job as it is completed.
 
     Parameters
     ----------
     jobs : iterable of (tag, Job)
-        Taken as they are needed, so that a million of them need no memory.
+        Read as they are needed, so that a million of them need little memory.
     workers : int
-        Processes of this machine; with an `executor`, how many jobs it does at once.
+        Processes on this machine; with an `executor`, the number of jobs at a time.
     executor : concurrent.futures.Executor, optional
-        Where jobs are done instead; it stays open.
+        Runs the jobs instead; it is not shut down.
 
     Yields
     ------
     tag, row
-        In the order in which they are done.
+        In the order of completion.
     """
     if executor is not None:
         yield from _through(jobs, workers, lambda: executor)
@@ -110,7 +110,7 @@ def _through(
                     yield tag, future.result()
                 except BrokenProcessPool:
                     lost.append((tag, job))
-                except Exception as exc:  # an executor's own: it gave the job up
+                except Exception as exc:  # raised by the executor, which gave the job up
                     yield tag, _died(exc)
         if not lost:
             continue
@@ -128,7 +128,7 @@ def _through(
 
 
 def _alone(job: Job, pools: _Pools) -> Row:
-    """Return the row of a job that nothing else runs beside."""
+    """Return the row of a job that runs alone."""
     for _ in range(_DEATHS):
         try:
             return pools.of(1).submit(do, job).result()

@@ -1,7 +1,7 @@
-"""Results as they come: one line a fit, appended; the table is made from them.
+"""Journal of results: one line is appended for each fit; the table is made from the lines.
 
-A line is whole or it is the last one and cut off by a crash; such a rest is dropped when the
-file is opened again. Only keys and places of lines are held in memory.
+Only the last line can be incomplete, after a crash; it is dropped when the file is opened again.
+Only keys and positions of lines are held in memory.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Journal:
     Attributes
     ----------
     places : dict of str to int
-        Where the line of each finished key begins.
+        Position of the line of each finished key.
     """
 
     def __init__(self, path: Path) -> None:
@@ -42,7 +42,7 @@ class Journal:
             raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
 
     def add(self, key: str, row: Mapping[str, Any]) -> None:
-        """Append one result; it is with the operating system when this returns."""
+        """Append one result; it has been passed to the operating system when this returns."""
         line = json.dumps({"key": key, **row}, ensure_ascii=False).encode() + b"\n"
         self.places[key] = self._file.tell()
         self._file.write(line)
@@ -61,7 +61,7 @@ class Journal:
 
 
 def finished(path: Path) -> tuple[dict[str, int], int]:
-    """Return where the line of each finished key begins, and where the last whole line ends.
+    """Return the position of each finished key's line, and the end of the last complete line.
 
     A fit whose process died is not finished: it is tried again.
     """
@@ -80,14 +80,14 @@ def finished(path: Path) -> tuple[dict[str, int], int]:
             except (ValueError, KeyError, AttributeError):
                 raise DataError(
                     f"{path}: line {number} is not a result of a campaign; move the file away to "
-                    "start anew"
+                    "start again"
                 ) from None
             end += len(line)
     return places, end
 
 
 def write_tables(rows: Callable[[], Iterator[dict[str, Any]]], folder: Path) -> list[Path]:
-    """Write ``results.csv`` and, where pyarrow is installed, ``results.parquet``, whole or not.
+    """Write ``results.csv`` and, where pyarrow is installed, ``results.parquet``, atomically.
 
     `rows` is called twice: once for the columns, once for the content.
     """

@@ -1,12 +1,12 @@
-r"""What many devices have in common: mean, scatter, covariates, outlying devices, drift.
+r"""Statistics of many devices: mean, scatter, covariates, outlying devices, drift.
 
-The logarithm of a positive parameter (any other as it is) of fit i, device d(i):
+For the logarithm of a positive parameter (or the value of any other) of fit i, device d(i):
 
     y_i = x_i' b + t_d(i) + r_i + e_i,   t ~ N(0, tau^2),  r ~ N(0, omega^2),  e_i ~ N(0, u_i^2)
 
 u_i is the fit's combined standard uncertainty, tau the scatter between devices, omega that
 between runs of one device (only where some device has several fits). tau and omega have flat
-priors, and everything is averaged over their posterior on a grid, so that few devices give wide
+priors, and all results are averaged over their posterior on a grid, so that few devices give wide
 intervals; b is integrated in closed form. The REML estimate is the posterior's mode.
 """
 
@@ -32,13 +32,13 @@ USABLE = ("trusted", "approximate")
 _NODES = 31
 """Of the grid in tau and in omega; twice as many change no interval by 1 %."""
 _GONE = 14.0
-"""Fall of the log-likelihood to a millionth, where the grid ends."""
+"""Drop of the log-likelihood, a factor of a million, at which the grid ends."""
 _MOST = 20.0
 """Largest tau that REML tries, in standard deviations of the data."""
 _FALSE_ALARMS = 0.01
-"""Probability that any device is called outlying where none is."""
+"""Probability that any device is called outlying although none is."""
 EWMA_WEIGHT, EWMA_WIDTH = 0.2, 2.86
-"""Lucas and Saccucci (1990): one false alarm in 370 points, as three standard deviations have."""
+"""Lucas and Saccucci (1990): one false alarm in 370 points, as with three standard deviations."""
 _MOVING_RANGE = 2.0 / np.sqrt(np.pi)
 """Mean difference of two normal numbers, in standard deviations (1.128)."""
 
@@ -75,7 +75,7 @@ class _Sums:
 
 @dataclass(frozen=True)
 class PopulationParameter:
-    """What the devices say about one parameter.
+    """Population statistics of one parameter.
 
     Attributes
     ----------
@@ -90,8 +90,9 @@ class PopulationParameter:
         Posterior median and limits (95.45 %) of tau and omega; omega is zero where every device
         has one fit.
     devices : DataFrame
-        Each device: own mean, estimate drawn towards the population (`shrunken`) with its
-        standard uncertainty, and `p`, the probability of so distant a device where it is none.
+        Each device: own mean, estimate shrunk towards the population (`shrunken`) with its standard
+        uncertainty, and `p`, the probability of a device this distant if it belongs to the
+        population.
     fits : DataFrame
         Each fit in its order: individuals chart (`value`, its limits) and EWMA chart.
 
@@ -145,9 +146,9 @@ class Population:
     parameters : mapping of str to PopulationParameter
         By name; the population itself is indexed by name as well.
     used : int
-        Fits that counted.
+        Fits that were used.
     left_out : mapping of str to int
-        Fits that did not, by status.
+        Fits that were not used, by status.
 
     Examples
     --------
@@ -197,7 +198,7 @@ def population(
     covariates: Sequence[str] = (),
     order: str | None = None,
 ) -> Population:
-    """Estimate what devices have in common, by partial pooling of their results.
+    """Estimate the statistics of a population of devices by partial pooling of their results.
 
     Parameters
     ----------
@@ -215,7 +216,7 @@ def population(
     -------
     Population
         For each parameter the population's mean, scatter between devices and runs, coefficients
-        of covariates, estimates of each device drawn towards the mean, outlying devices, and
+        of covariates, estimates of each device shrunk towards the mean, outlying devices, and
         control charts.
 
     Raises
@@ -362,7 +363,7 @@ class _Grid:
 
     @cached_property
     def devices(self) -> dict[str, FloatArray]:
-        """Each device's estimate drawn towards the population, and its uncertainty."""
+        """Each device's estimate shrunk towards the population, and its uncertainty."""
         d = self.data
         mean, second = np.zeros(d.devices), np.zeros(d.devices)
         first = np.zeros((d.devices, d.X.shape[1]))
@@ -424,7 +425,7 @@ def _reml(data: _Sums, repeated: bool) -> tuple[float, float]:
 
 
 def _nodes(data: _Sums, mode: tuple[float, float], axis: int) -> FloatArray:
-    """Return nodes from zero to where the likelihood is gone, finer near zero."""
+    """Return nodes from zero to where the likelihood is negligible, finer near zero."""
     point = list(mode)
     top = data.weighted(*point)[2]
     step = 0.1 * float(np.sqrt(np.median(data.u2)))
@@ -436,8 +437,8 @@ def _nodes(data: _Sums, mode: tuple[float, float], axis: int) -> FloatArray:
 def _outlying(data: _Sums, repeated: bool) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return each device's p value against all others, and which are outlying.
 
-    Devices found outlying are taken out one by one, the most distant first, so that they do not
-    hide one another; half of them at most.
+    Outlying devices are removed one by one, the most distant first, so that they do not mask one
+    another; at most half of the devices are removed.
     """
     p, outlying = np.ones(data.devices), np.zeros(data.devices, dtype=bool)
     kept, numbers = data, np.arange(data.devices)
@@ -478,7 +479,7 @@ def _standardised(data: _Sums, repeated: bool) -> FloatArray:
 
 
 def _charts(table: pd.DataFrame, y: FloatArray) -> pd.DataFrame:
-    """Return the control charts of fits in their order, covariates taken out."""
+    """Return the control charts of fits in their order, corrected for covariates."""
     import pandas as pd
 
     centre = y.mean()

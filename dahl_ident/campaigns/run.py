@@ -1,4 +1,4 @@
-"""The door: run what is missing of a campaign, and write its table."""
+"""The public function that runs the missing fits of a campaign and writes its table."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ _JOURNAL = "journal.jsonl"
 
 @dataclass(frozen=True)
 class Campaign:
-    """What a campaign found, or, after a dry run, what it would do.
+    """The results of a campaign, or after a dry run the fits that it would run.
 
     Attributes
     ----------
     folder : Path
         Holds ``results.csv``, ``results.parquet`` (with pyarrow) and ``reports/``.
     finished : tuple of str
-        Fits whose results were there already, by device and run.
+        Fits whose results existed already, by device and run.
     to_do : tuple of str
         Fits that were missing, or whose files had changed; done unless this was a dry run.
     statuses : mapping of str to int
@@ -129,9 +129,9 @@ def campaign(
 ) -> Campaign:
     """Read, extract and fit the files of many devices; one row of a table for each fit.
 
-    Results are keyed by what they depend on: the digests of the files, the options and the
-    version. Run again after an interruption, it does what is missing; after a file has changed,
-    what depends on that file.
+    Results are keyed by everything that they depend on: the digests of the files, the options and
+    the version. If it is run again after an interruption, only the missing fits are computed; after
+    a file has changed, only the fits that depend on that file.
 
     Parameters
     ----------
@@ -139,24 +139,24 @@ def campaign(
         TOML file, or its content; see :mod:`dahl_ident.campaigns.definition`.
     jobs : int, optional
         Processes of this machine, with one numerical thread each; by default as many as there
-        are processors. 1 works in this process. With `executor`: how many fits it does at once.
+        are processors. 1 works in this process. With `executor`: the number of fits at a time.
     executor : concurrent.futures.Executor, optional
-        Where fits are done instead, such as ``dask.distributed.Client(...).get_executor()``.
+        Runs the fits instead, such as ``dask.distributed.Client(...).get_executor()``.
     send_files : bool, default False
-        Send workers the content of the files, for those that cannot see the paths.
+        Send the contents of the files to workers that cannot access the paths.
     dry_run : bool, default False
-        Say what would be done, and do nothing.
+        List what would be done, and do nothing.
     redo : bool, default False
-        Allow options or version to differ from those of results that are there already; all is
-        done anew then.
+        Allow options or version to differ from those of existing results; all fits are then
+        repeated.
     progress : callable, optional
         Called after each fit with the number done, the number to do and the new row.
 
     Returns
     -------
     Campaign
-        Where the results are, and how many there are of each status. A device that fails is a
-        row with its error.
+        The location of the results, and the number of fits with each status. A device that fails is
+        a row with its error.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def campaign(
 
     Notes
     -----
-    Processes are started anew ("spawn"): a script that calls this has to do so below
+    Processes are started by "spawn", so a script must call this under
     ``if __name__ == "__main__":``.
 
     Examples
@@ -276,7 +276,7 @@ def _options_agree(definition: Definition, redo: bool) -> bool:
     if changed and not redo:
         raise DataError(
             f"{definition.source}: {'; '.join(changed)}, but {definition.folder} holds results of "
-            "the former; give another folder, or do all of them anew with redo=True (on the "
+            "the former; give another folder, or repeat all of them with redo=True (on the "
             "command line --redo)"
         )
     return not changed
@@ -285,8 +285,8 @@ def _options_agree(definition: Definition, redo: bool) -> bool:
 def _keys(definition: Definition) -> list[str]:
     """Return the key of each task.
 
-    A file's digest is computed anew only where its size or time of change differs from what was
-    noted with the last digest.
+    A file's digest is computed again only if its size or modification time differs from that stored
+    with the last digest.
     """
     cache_path = definition.folder / "digests.json"
     try:

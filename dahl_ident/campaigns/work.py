@@ -1,4 +1,4 @@
-"""One fit of a campaign, wherever it runs: files in, one row out.
+"""One fit of a campaign, in any process: from files to one row of the table.
 
 This module imports numerical libraries only inside functions, so that a new process can limit
 their threads before they are loaded.
@@ -33,7 +33,7 @@ class Job:
     name : str
         Device and run.
     files : tuple of (str, bytes or None)
-        Paths, with the content where it travels with the job.
+        Paths, with the contents if these are sent with the job.
     runs : tuple of str
         Label of each file.
     options : mapping
@@ -50,7 +50,7 @@ class Job:
 
 
 def one_thread() -> None:
-    """Let numerical libraries use one thread, and end with the process that started this one."""
+    """Limit numerical libraries to one thread, and end when the parent process ends."""
     import multiprocessing
     import threading
 
@@ -67,7 +67,7 @@ def one_thread() -> None:
 
 
 def do(job: Job) -> Row:
-    """Return the row of one fit; a failure is a row that says why.
+    """Return the row of one fit; a failure is a row with the reason.
 
     Returns
     -------
@@ -127,7 +127,7 @@ def _response(
 
 
 def _on_disk(job: Job, digests: list[str]) -> Any:
-    """Return a context that gives the paths of the files, and note what they hold."""
+    """Return a context that gives the paths of the files, and record their digests."""
     if all(content is None for _, content in job.files):
         paths = [Path(name) for name, _ in job.files]
         digests += [digest_of(path) for path in paths]
@@ -182,7 +182,7 @@ def _row(result: FitResult) -> Row:
         row[f"unit_{name}"] = estimate.unit
     try:
         budget = result.budget()
-    except FitError:  # nothing finite to state; the statements say why
+    except FitError:  # there is no finite uncertainty; the statements say why
         return row
     for name, part in budget.items():
         row |= {f"u_{name}": part.u, f"U_{name}": part.U, f"dof_{name}": part.dof}

@@ -1,15 +1,15 @@
-"""Friction among control engineers' objects: loops, limit cycles, margins, branches.
+"""Friction in control engineering: loops, limit cycles, margins, branches.
 
-python-control's systems come in as :class:`~dahl_ident.elements.LinearSystem` elements; this
-room is the way back.
+Systems of python-control can be used in models as :class:`~dahl_ident.elements.LinearSystem`
+elements; this subpackage goes in the other direction.
 
 - :class:`FrictionNonlinearity` puts friction into python-control's describing-function tools.
-- :func:`limit_cycles` finds the free oscillations of a loop, and which of them are approached.
-- :func:`level_responses` gives responses over frequency at several levels, as FRD or pictures.
+- :func:`limit_cycles` finds the free oscillations of a loop, and which of them are stable.
+- :func:`level_responses` gives responses over frequency at several levels, as FRD or plots.
 - :func:`equivalent_plant` and :func:`loop_margins` help to design a controller: the linear plant
   at one amplitude, and the loop's margins against amplitude.
 - :func:`response_branches` gives every steady response of an active plant, with its stability.
-- :func:`closed_loop_response` takes a plant that was measured under feedback.
+- :func:`closed_loop_response` prepares data of a plant that was measured under feedback.
 """
 
 from __future__ import annotations

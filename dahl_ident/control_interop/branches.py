@@ -1,13 +1,13 @@
 r"""Every steady response of a driven plant, with its stability.
 
-Near a steady motion the displacement phasor X and its rate follow, to first order in how slowly
-it changes, L'(s) dX/dt + (L + N(|X|)) X = u_0. A disturbance xi of X, seen along X, obeys
+Near a steady motion, to first order in its rate of change, the displacement phasor X obeys L'(s)
+dX/dt + (L + N(|X|)) X = u_0. A disturbance xi of X, seen along X, obeys
 
     L'(s) dxi/dt = -(Z xi + A N'(A) Re xi),    Z = L + N,
 
 two real equations. Their determinant is |Z|^2/|L'|^2 times d ln(A |Z|)/d ln A: a branch on which
-A |Z| falls is unstable. Their trace is -Re((2 Z + A N')/L'): it tells whether the motion feeds
-an oscillation of its own.
+A |Z| falls is unstable. Their trace is -Re((2 Z + A N')/L'): it shows whether the motion is
+oscillatorily unstable.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def response_branches(plant: Element, frequency_hz: ArrayLike, drive: ArrayLike)
     -----
     The stability is that of slow changes of one sine; another mode may still start to oscillate,
     see :func:`limit_cycles`. Passive plants have one branch; only negative damping gives several.
-    Near the end of a branch the amplitude follows the drive so steeply that harmonics of a few
+    Near the end of a branch the amplitude depends so steeply on the drive that harmonics of a few
     per cent shift it by tens of per cent.
 
     Examples

@@ -1,9 +1,10 @@
-"""Plants measured under feedback: from the reference's response to the plant's.
+"""Plants measured under feedback: from the response to the reference to that of the plant.
 
-With F = C (r - x) the closed loop obeys (Z(A) + C) X = C R. So it is the plant with the controller
-as one more element in parallel, ``LinearSystem(C, quantity="dynamic_stiffness")``, driven by the
-force C R, and is identified as any other force-driven plant. Dividing the controller out of the
-response instead would leave data whose amplitude was held by neither force nor displacement.
+With F = C (r - x) the closed loop obeys (Z(A) + C) X = C R. It is therefore equivalent to the plant
+with the controller as an additional parallel element, ``LinearSystem(C,
+quantity="dynamic_stiffness")``, driven by the force C R, and can be identified like any other
+force-driven plant. Dividing the response by the controller instead would give data in which neither
+the force nor the displacement amplitude was controlled.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Frequency responses of a plant with friction, one a level of drive or amplitude (Fig. 7)."""
+"""Frequency responses of a plant with friction at several drives or amplitudes (Fig. 7)."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def level_responses(
     controlled: Literal["force", "displacement"] = "force",
     quantity: Quantity = "receptance",
 ) -> LevelResponses:
-    """Return the plant's response over frequency at several levels: Fig. 7 in one call.
+    """Return the plant's response over frequency at several levels, as in Fig. 7.
 
     Parameters
     ----------

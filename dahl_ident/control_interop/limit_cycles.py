@@ -1,15 +1,15 @@
-"""Limit cycles of a linear loop around Dahl friction, with their stability.
+"""Limit cycles of a linear loop with Dahl friction, and their stability.
 
-Friction -F(x) acts on a linear loop whose displacement answers a force with H(s). A free
-oscillation x = A cos(omega t) balances its fundamental where
+Friction -F(x) acts on a linear loop with the response H(s) of displacement to force. The
+fundamental of a free oscillation x = A cos(omega t) is balanced if
 
     1 + H(j omega) N(A) = 0,    or    L(omega) + N(A) = 0 with L = 1/H, a dynamic stiffness.
 
 Both curves, -L over frequency and N over amplitude, are drawn in logarithmic polar coordinates,
 where they are smooth and even; their crossings start Newton's method in (ln A, ln omega).
-Since Im N > 0, only a loop with Im L < 0 somewhere, an active one, can oscillate.
+Since Im N > 0, only an active loop, one with Im L < 0 at some frequency, can oscillate.
 
-A cycle whose amplitude is disturbed by dA moves its root by ds = -N'(A) dA/L'(s), so dA grows
+A disturbance dA of the amplitude moves the root by ds = -N'(A) dA/L'(s), so dA grows
 at the rate -A Re(N'/L'(s)); a stable cycle has a negative one, which is Loeb's criterion
 U_A V_omega - U_omega V_A > 0 for U + jV = L + N.
 """
@@ -56,7 +56,7 @@ class LimitCycle:
     frequency_hz : float
         Hz.
     growth_rate : float
-        Rate at which a small disturbance of the amplitude grows, 1/s; negative where it dies.
+        Rate at which a small disturbance of the amplitude grows, 1/s; negative where it decays.
 
     Examples
     --------
@@ -76,7 +76,7 @@ class LimitCycle:
 
     @property
     def stable(self) -> bool:
-        """Whether the oscillation is approached (Loeb's criterion), rather than left."""
+        """Whether the oscillation is stable (Loeb's criterion)."""
         return self.growth_rate < 0.0
 
 
@@ -91,14 +91,13 @@ def limit_cycles(
     Parameters
     ----------
     loop : control.TransferFunction, control.StateSpace, control.FRD, or linear Element
-        H: displacement over a force that acts where the friction acts, all controllers closed,
-        such as ``control.feedback(plant, controller)``. Elements give 1/H, their dynamic
-        stiffness.
+        H: displacement over a force that acts where the friction acts, with all controllers closed,
+        such as ``control.feedback(plant, controller)``. Elements give 1/H, their dynamic stiffness.
     friction : Element
         Rate-independent friction, such as `Dahl`, or a sum of such elements, with a value for
         every parameter.
     frequency_range_hz : (float, float), optional
-        Where to look, Hz. By default three decades beyond all poles and zeros of H and of the
+        Range of the search, Hz. By default three decades beyond all poles and zeros of H and of the
         loop closed by sigma; for an FRD its own range, for a discrete loop up to half its rate.
 
     Returns
@@ -112,26 +111,26 @@ def limit_cycles(
         If `friction` is not rate-independent friction alone, `loop` is not linear, or a
         parameter has no value.
     ValidationError
-        If `loop` is no system, or the range is not two rising frequencies.
+        If `loop` is not a system, or the range is not two rising frequencies.
 
     Notes
     -----
-    Describing functions assume that x is nearly a sine about zero: they are good where H falls
-    steeply with frequency. They do not see motions with long rests, such as the slow slips of a
-    held mass whose integrator winds up, and where such rests set in an unstable cycle can lie at
-    less than half the amplitude given here.
+    Describing functions assume that x is nearly a sine about zero; they are accurate where H falls
+    steeply with frequency. They do not apply to motions with long rests, such as slow stick-slip
+    caused by integrator wind-up; where such rests occur, an unstable cycle can lie at less than
+    half the amplitude given here.
 
-    Two cycles nearer to each other than the grid, 4 % in amplitude and 0.6 % in frequency, may be
+    Two cycles closer to each other than the grid, 4 % in amplitude and 0.6 % in frequency, may be
     missed, and so may any below 1e-6 of the smallest or above 1e8 of the largest characteristic
     displacement.
 
-    The stability is that of the oscillation's own amplitude (Loeb's criterion); an oscillation
-    can still be upset by another mode of the loop.
+    The stability refers to the amplitude of the oscillation (Loeb's criterion); another mode of the
+    loop can still be unstable.
 
     Examples
     --------
-    A derivative term that is filtered too late destabilises the contact stiffness, not the
-    free mass; friction turns that into hunting of a small, definite amplitude:
+    A derivative filter with too low a bandwidth destabilises the mass on the contact stiffness, but
+    not the free mass; the result is hunting with a small, definite amplitude:
 
     >>> import control
     >>> from dahl_ident import Dahl

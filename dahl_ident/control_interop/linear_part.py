@@ -1,4 +1,4 @@
-"""Everything linear of a model as one python-control transfer function."""
+"""The linear part of a model as one python-control transfer function."""
 
 from __future__ import annotations
 

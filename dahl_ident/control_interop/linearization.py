@@ -1,9 +1,9 @@
-"""The linear plant that stands for a plant with friction at one amplitude, and its margins.
+"""The equivalent linear plant of a plant with friction at one amplitude, and its margins.
 
-At the amplitude A and angular frequency omega_0 friction acts as a spring Re N(A) beside a damper
-Im N(A)/omega_0. The damper is exact at omega_0 alone, because friction loses the same energy in
-a cycle at every frequency. Margins need no such approximation: along a frequency response at
-constant amplitude the loop gain is C(j omega)/(L(omega) + N(A)), and they are read from it.
+At the amplitude A and angular frequency omega_0 friction acts as a spring Re N(A) in parallel with
+a damper Im N(A)/omega_0. The damper is exact at omega_0 alone, because friction loses the same
+energy in a cycle at every frequency. Margins need no such approximation: they follow from the
+frequency response at constant amplitude, where the loop gain is C(j omega)/(L(omega) + N(A)).
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ def equivalent_plant(plant: Element, amplitude: float, frequency_hz: float) -> A
     amplitude : float
         Zero-to-peak displacement A > 0, m.
     frequency_hz : float
-        Where the equivalent damper is exact, Hz, > 0; the loop's crossover, say.
+        Frequency at which the equivalent damper is exact, Hz, > 0; for example the crossover of the
+        loop.
 
     Returns
     -------
@@ -92,7 +93,7 @@ class LoopMargins:
     phase_margin_deg : ndarray, shape (..., m)
         Phase, degrees, that reaches -1, the one nearest to 0; infinite without any.
     modulus_margin : ndarray, shape (..., m)
-        Least distance of the loop gain from -1, the inverse of the peak sensitivity.
+        Smallest distance of the loop gain from -1, the inverse of the peak sensitivity.
     """
 
     amplitude: FloatArray
@@ -132,7 +133,7 @@ class LoopMargins:
             raise ValidationError(f"{name} holds no draws; give draws= to loop_margins")
         tail = 0.5 * (1.0 - float(array_between(probability, "probability", 0.0, 1.0)))
         flat = values.reshape(-1, self.amplitude.size)
-        # inverted_cdf takes a value as it is, infinite ones too
+        # inverted_cdf returns one of the values, infinite ones included
         low, high = np.quantile(flat, [tail, 1.0 - tail], axis=0, method="inverted_cdf")
         return low, high
 
@@ -202,8 +203,8 @@ def loop_margins(
 
     Notes
     -----
-    A margin says how far the loop gain at one amplitude passes -1. It does not say on which
-    side a stable loop lies; :func:`limit_cycles` says where the loop oscillates.
+    A margin is the distance of the loop gain from -1 at one amplitude. It does not show whether the
+    loop is stable; :func:`limit_cycles` finds the amplitudes at which the loop oscillates.
 
     Examples
     --------

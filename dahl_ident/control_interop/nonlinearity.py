@@ -36,10 +36,9 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
     loop, python-control looks for H(j omega) N(A) = -1: H is displacement over a force that acts
     with the drive, and friction acts against it.
 
-    Called with one displacement after the other, it returns the law's force and remembers the
-    motion, as python-control's own nonlinearities with memory do. Ask for
-    ``describing_function``, which is exact, rather than for python-control's numerical one,
-    which warms up for a single cycle.
+    Called with successive displacements, it returns the law's force and stores the history of the
+    motion, like python-control's nonlinearities with memory. Use ``describing_function``, which is
+    exact, rather than python-control's numerical one, whose warm-up is only a single cycle.
 
     Examples
     --------
@@ -84,7 +83,7 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
         return complex(self._model.stiffness(self._values, amplitude, _AT_REST))
 
     def __call__(self, A: float) -> float:
-        """Return the force, N, after moving on to the displacement `A`, m, in one stretch."""
+        """Return the force, N, after a monotonic move to the displacement `A`, m."""
         x = finite_number(np.squeeze(A), "displacement")
         if len(self._turns) > 1 and (x - self._turns[-1]) * (self._turns[-1] - self._turns[-2]) > 0:
             self._turns[-1] = x  # between turning points the force does not depend on the samples
@@ -93,7 +92,7 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
         return float(self._model.force(self._turns)[-1])
 
     def reset(self) -> None:
-        """Forget the past: displacement and force zero.
+        """Reset the history: displacement and force are zero.
 
         Examples
         --------
@@ -111,13 +110,13 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
 
 
 def friction_elements(friction: Element) -> tuple[Element, ...]:
-    """Return the elements of a friction model, or say what else than such friction it holds."""
+    """Return the elements of a friction model; raise an error if it has any other element."""
     elements = as_model(friction).elements
     for element in elements:
         if element.is_linear:
             raise ModelError(
                 f"friction holds {element!r}; expected friction alone, such as Dahl: put "
-                "everything linear into the loop"
+                "the linear elements into the loop"
             )
         if not element.rate_independent:
             raise ModelError(

@@ -1,4 +1,4 @@
-"""A model as friction and everything linear."""
+"""Separation of a model into friction and linear elements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a plan costs: settling in the order of the levels, measured cycles, change-over."""
+"""Bench time of a plan: settling in the order of the levels, measured cycles, change-over."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 
-LEAST_CYCLES = 2  # measured at a level: one does not show its own noise
+LEAST_CYCLES = 2  # measured at a level: a single cycle does not show its noise
 _LEAST_SETTLING = 1
 
 
@@ -18,8 +18,9 @@ _LEAST_SETTLING = 1
 class BenchTime:
     """The cost of visiting candidates.
 
-    A transient starts with the share abs(F - F')/F of the friction force F, F' being that of the
-    level before, and shrinks by `decay` a cycle; measuring starts when it is below `settled`.
+    A transient starts as the fraction abs(F - F')/F of the friction force F, where F' is that of
+    the previous level, and shrinks by `decay` per cycle; measuring starts when it is below
+    `settled`.
 
     Attributes
     ----------
@@ -30,7 +31,7 @@ class BenchTime:
     settled : float
         Share of the friction force.
     between_runs : float
-        Seconds that a run takes beside its levels.
+        Seconds that a run takes in addition to its levels.
     """
 
     frequency_hz: FloatArray
@@ -41,10 +42,10 @@ class BenchTime:
     between_runs: float = 0.0
 
     def order(self, levels: Sequence[int] | NDArray[np.intp]) -> NDArray[np.intp]:
-        """Return the levels by rising friction force.
+        """Return the levels in order of rising friction force.
 
-        Then no transient starts larger than the friction force itself, from rest on; a level that
-        follows a larger one starts with more than that.
+        In this order no transient starts larger than the friction force itself; the transient of a
+        level that follows a larger one would.
         """
         chosen = np.asarray(levels, dtype=np.intp)
         return chosen[np.lexsort((self.frequency_hz[chosen], self.force[chosen]))]

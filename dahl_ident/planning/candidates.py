@@ -1,8 +1,8 @@
-"""Levels that may be measured: within the limits of the bench, with what each would tell.
+"""Levels that can be measured within the limits of the bench, and the information in each.
 
 A candidate is an amplitude of displacement, or of drive where force is controlled, at a frequency.
-It is possible if 95 % of the draws keep within every limit there. Where force is controlled, a
-point that has several steady amplitudes, or none, at any draw is left out.
+It is possible if 95 % of the draws stay within every limit there. Where force is controlled, a
+point is left out if any draw has no steady amplitude or several.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from dahl_ident.problem import Problem
 
 CONTROLLED = ("displacement", "force")
 _LIMITS = ("displacement", "force", "speed", "frequency_hz", "time")
-_CERTAIN = 0.95  # share of the draws that keep within a limit
+_CERTAIN = 0.95  # fraction of the draws that stay within a limit
 _FREQUENCIES = 12
-_BELOW, _ABOVE = 0.03, 30.0  # knees, where no limit says how far amplitudes reach
+_BELOW, _ABOVE = 0.03, 30.0  # range of amplitudes over the knee where no limit is given
 _SOFTEST = 3e-3  # of the largest drive
 _STEP = 1e-4
 _CHECKED_DRAWS = 25  # at which the number of steady amplitudes is counted
@@ -35,7 +35,7 @@ _CHECKED_DRAWS = 25  # at which the number of steady amplitudes is counted
 
 @dataclass(frozen=True)
 class Limits:
-    """What the bench can do; low ends are 0 where only the high end is given.
+    """Limits of the bench; lower limits are 0 where only the upper limit is given.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class CycleNoise:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Levels and frequencies with everything that the search needs.
+    """Levels and frequencies with all data that the search needs.
 
     Attributes
     ----------
@@ -174,7 +174,7 @@ class Candidates:
         return replace(self, **{name: getattr(self, name)[draws] for name in parts})
 
     def information(self, scatter: float) -> LevelInformation:
-        """Return what a cycle at each of them tells."""
+        """Return the information in one cycle at each candidate."""
         return LevelInformation.of(self.rows, self.offsets, scatter)
 
 
@@ -228,7 +228,7 @@ def evaluate(
     Raises
     ------
     ValidationError
-        If none is left; the message names the limit that refuses most.
+        If none remains; the message names the limit that excludes most.
     """
     data = placeholder(level, frequency_hz, controlled, knowledge.motion)
     problem = _problem(data, knowledge)
@@ -276,7 +276,7 @@ def _allowed(
     if not allowed.any():
         worst = max(refused, key=lambda name: refused[name])
         raise ValidationError(
-            f"limits leave no level to measure: {worst} refuses {refused[worst]} of "
+            f"limits leave no level to measure: {worst} excludes {refused[worst]} of "
             f"{len(frequency_hz)} candidates; widen limits[{worst!r}], or give narrower ranges"
         )
     return allowed
@@ -314,7 +314,7 @@ def bench_time(
     settled: float,
     between_runs: float,
 ) -> BenchTime:
-    """Return what visiting the candidates costs: the slowest tenth of the draws has to settle."""
+    """Return the bench time of the candidates, so that the slowest tenth of the draws settles."""
     model, omega = knowledge.model, 2.0 * np.pi * candidates.frequency_hz
     values = knowledge.model_values()
     A = np.where(np.isfinite(candidates.amplitude), candidates.amplitude, 1.0)
@@ -355,11 +355,10 @@ def _ring_down(
 def larger_rows(
     larger: Model, knowledge: Knowledge, candidates: Candidates
 ) -> tuple[tuple[str, ...], FloatArray, FloatArray, Problem, FloatArray]:
-    """Return what a cycle at each candidate tells of a larger model.
+    """Return the information in one cycle at each candidate on a larger model.
 
-    Its second harmonic counts beside the fundamental where displacement is controlled, because a
-    lack of symmetry shows only there; the noise of a harmonic's force is that of the
-    fundamental's.
+    Where displacement is controlled, the second harmonic counts in addition to the fundamental,
+    because only it shows asymmetry; the noise of a harmonic's force is that of the fundamental's.
 
     Returns
     -------
@@ -380,7 +379,7 @@ def larger_rows(
     for p in problem.parameters:
         if p.name not in drawn and p.value is None:
             raise ValidationError(
-                f"the larger model has the free parameter {p.name}, of which nothing is known; "
+                f"the larger model has the free parameter {p.name}, about which nothing is known; "
                 "give it a value there"
             )
         one = drawn.get(p.name, np.full(len(knowledge.theta), p.value))
@@ -399,7 +398,7 @@ def larger_rows(
         one = Problem(part, larger, noise="absolute", sensors=knowledge.sensors)
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = one.prediction_jacobian(theta) / fundamental[..., None]
-        # within a gap there is no response, and nothing to learn
+        # within a gap there is no response, and no information
         relative = np.where(np.isfinite(relative), relative, 0.0)
         rows.append(np.stack([relative.real, relative.imag], axis=2) * size)
         shared = np.eye(2) if k == 1 else np.zeros((2, 2))

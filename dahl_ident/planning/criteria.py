@@ -1,14 +1,14 @@
-"""How much a set of levels tells: information matrices, criteria and their derivatives.
+"""Information in a set of levels: information matrices, criteria and their derivatives.
 
 A level measured for n cycles adds n J' J to the information, J being the derivatives of its
 whitened residuals. Errors of gain and phase that all rows of a run share, of standard deviation s,
-are further parameters of each run with the information 1/s^2; without them a run tells
+are further parameters of each run with the information 1/s^2; after their elimination a run gives
 
     S = M - B (C + I/s^2)^{-1} B'
 
-of the parameters, and R like runs R S. S is a concave function of the cycles (a Schur complement),
-and every criterion here is the mean over draws of the logarithm of a concave, homogeneous function
-of the information, so that the best design is a convex problem:
+on the parameters, and R equal runs give R S. S is a concave function of the cycles (a Schur
+complement), and every criterion here is the mean over draws of the logarithm of a concave,
+homogeneous function of the information, so that the best design is a convex problem:
 
 - D: ln det(M)/P;
 - targets: -ln(sum_t (c_t' M^{-1} c_t / u_t^2)^q)/q; with one target c-optimality, with several
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 
-_POWER = 4.0  # q: 1 would add the targets' variances, infinity take the largest
+_POWER = 4.0  # q: 1 would add the targets' variances, infinity would use only the largest
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What is known before a plan, from a model with ranges, a fit, or a posterior.
+"""Prior knowledge for a plan, from a model with ranges, a fit, or a posterior.
 
 All in search coordinates: the logarithm of positive parameters, the number itself for others.
 """
@@ -42,14 +42,14 @@ class Knowledge:
         Of the data measured before, at each draw, and of assumed values such as the exponent of
         ``Dahl()``, which are parameters here as they are in a fit's uncertainty.
     prior : ndarray, shape (P, P)
-        Information of the ranges, each taken for no narrower than a factor of e to either side: a
-        search leans on it where nothing else is known, a predicted uncertainty does not.
+        Information of the ranges, each taken as no narrower than a factor of e to either side: the
+        search uses it where nothing else is known, but a predicted uncertainty does not include it.
     assumed : tuple of str
         Names of the assumed parameters.
     row_noise : float or None
         Standard deviation of ln gain and of phase of a row of earlier data.
     row_cycles : float
-        Cycles that such a row averages, as far as the data say; else 1.
+        Cycles that such a row averages, if the data state it; else 1.
     problem : Problem or None
         Of the earlier data.
     """
@@ -77,7 +77,7 @@ class Knowledge:
         return to_values(self.theta, self.parameters)
 
     def only(self, draws: NDArray[np.intp]) -> Knowledge:
-        """Return what is known at some of the draws."""
+        """Return the knowledge restricted to some of the draws."""
         return replace(self, theta=self.theta[draws], information=self.information[draws])
 
     def model_values(self) -> list[FloatArray]:
@@ -95,7 +95,7 @@ def to_values(theta: FloatArray, parameters: Sequence[Parameter]) -> FloatArray:
 
 
 def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowledge:
-    """Return what a model with ranges, a fit or a posterior says.
+    """Return the knowledge from a model with ranges, a fit or a posterior.
 
     Raises
     ------
@@ -123,14 +123,16 @@ def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowled
 def _of_model(model: Model, ranges: Ranges, draws: int, rng: np.random.Generator) -> Knowledge:
     free = tuple(p for p in model.parameters if p.free)
     if not free:
-        raise ValidationError(f"plan: {model!r} has no free parameter, so nothing is to be found")
+        raise ValidationError(
+            f"plan: {model!r} has no free parameter, so there is nothing to determine"
+        )
     centre, std = _moments(free, ranges)
     missing = [p.name for p, s in zip(free, std, strict=True) if np.isinf(s)]
     if missing:
         wanted = ", ".join(f"{name!r}: (low, high)" for name in missing)
         raise ValidationError(
-            f"plan: nothing is known of {', '.join(missing)}; give ranges={{{wanted}}} that hold "
-            "the values with 95 % probability"
+            f"plan: nothing is known about {', '.join(missing)}; give ranges={{{wanted}}} that "
+            "contain the values with 95 % probability"
         )
     theta = _within(centre + std * rng.standard_normal((draws, len(free))), free)
     model, assumed = _with_assumed(model)
@@ -162,7 +164,7 @@ def _of_fit(optimum: Any, ranges: Ranges, draws: int, rng: np.random.Generator) 
     theta = np.where(finite, theta, centre)
     scale = optimum.scale if np.isfinite(optimum.scale) else 1.0
     covariance = np.linalg.inv(problem.information(theta, scale) + np.diag(1.0 / std**2))
-    # a range counts where the data are silent; its centre, where they are not, is the estimate
+    # a range counts only where the data say nothing; elsewhere the estimate is the centre
     drawn = rng.multivariate_normal(theta, covariance, draws, method="eigh")
     drawn = _within(drawn, problem.parameters)
     prior = _leaned_on(problem.parameters, centre, std)

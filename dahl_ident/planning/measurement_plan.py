@@ -1,4 +1,4 @@
-"""A plan: levels in the order of the run, what they will tell, and what they will not."""
+"""A plan: levels in the order of the run, and the parameters that they will determine."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ class Expected:
     value : float
         Median over the draws.
     before, after : float
-        Relative standard uncertainty by the data before, and with the plan's; inf where nothing
-        is known. Geometric mean over the draws.
+        Relative standard uncertainty from the earlier data, and with the plan's data; inf where
+        nothing is known. Geometric mean over the draws.
     low, high : float
         Tenth and ninetieth percentile of `after` over the draws.
     scatter_share : float
-        Share of the variance that scatter between runs makes.
+        Fraction of the variance that is due to scatter between runs.
     """
 
     value: float
@@ -91,11 +91,11 @@ class Plan:
     steps : tuple of Step
         One run, in its order.
     runs : int
-        Runs alike.
+        Number of equal runs.
     seconds : float
         Time of everything.
     expected : mapping of str to Expected
-        Predicted uncertainty of every parameter and target, without a range's help.
+        Predicted uncertainty of every parameter and target; the ranges are not used.
     target : mapping of str to float
         Relative standard uncertainties that were wanted; empty where time was given.
     reached : bool
@@ -103,7 +103,7 @@ class Plan:
     undetermined : tuple of str
         What the plan does not determine, and which limit prevents it.
     assumptions : tuple of str
-        What the prediction rests on.
+        Assumptions of the prediction.
 
     Examples
     --------

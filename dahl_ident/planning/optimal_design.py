@@ -1,4 +1,4 @@
-"""Optimal designs: the continuous one by multiplication, the one with fixed costs by exchange.
+"""Optimal designs: continuous ones by multiplication, those with fixed costs by exchange.
 
 **Continuous.** Seconds t_k at each candidate, their sum given. With d_k the criterion's derivative
 by t_k and d the mean of d_k weighted by t_k, every t_k is multiplied by (d_k/d)^p; at the optimum
@@ -7,9 +7,9 @@ earlier data d times the time is 1, so that the derivative of ln det never excee
 parameters. Source: Silvey, Titterington and Torsney, *Commun. Stat. A* 7, 1379 (1978); Yu,
 *Ann. Stat.* 38, 1593 (2010).
 
-**With fixed costs** each visited level takes settling and change-over before it tells anything.
-Levels are added, exchanged and left out one at a time while that improves the criterion, the rest
-of the time being shared by multiplication; then the cycles are made whole.
+**With fixed costs** each level needs time for change-over and settling before it gives information.
+Levels are added, exchanged and removed one at a time while this improves the criterion, and the
+remaining time is distributed by multiplication; then the cycles are rounded to whole numbers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
 from dahl_ident.planning.criteria import Objective
 
-_IMPROVES = 1e-4  # of a logarithm, by which a change of the levels must be better
+_IMPROVES = 1e-4  # least improvement of the logarithm by a change of the levels
 _ROUNDS = 12
 _TRIED = 3  # candidates whose times are optimised after a first look at all
 _MOST_LEVELS = 24
@@ -74,7 +74,7 @@ def continuous_design(
         excess = float(rate.max() / mean) - 1.0
         if excess < tolerance:
             break
-        # those that cannot matter rest; those that should be measured come back
+        # candidates that cannot matter are set aside; those that should be measured return
         resting = (seconds < 1e-4 * seconds.max()) & (rate < 0.9 * mean)
         seconds[resting] = 0.0
         missing = ~resting & (seconds == 0.0) & (rate > mean)
@@ -227,7 +227,7 @@ class Exchange:
         return [int(k) for k in possible[np.argsort(-values)[:_TRIED]]]
 
     def whole(self, levels: Sequence[int], time: float) -> Selection:
-        """Return whole cycles at the levels, what is left of the time given where it helps most."""
+        """Return whole cycles at the levels; the remaining time goes where it helps most."""
         ordered = self._bench.order(levels)
         f = self._bench.frequency_hz[ordered]
         shared = self._share(ordered.tolist(), time, 100)

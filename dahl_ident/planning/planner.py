@@ -1,4 +1,4 @@
-"""The public door: from what is known and what the bench can do to a plan."""
+"""The public function that makes a plan from prior knowledge and the limits of the bench."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ _POOL = 80
 _MOST_RUNS = 8
 _WEIGHTS = (0.0, 0.1, 0.25, 0.5, 0.75)  # of the suspected parameters, the least that is enough
 _TIMES = 20  # corrections of the time that reaches a target
-_CLOSE = 0.985  # of the target, near enough to stop
+_CLOSE = 0.985  # fraction of the target at which the search stops
 _NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _UNKNOWN = 1e-2  # the same of a suspected parameter, which is known within a decade or so
-_UNDETERMINED = 0.25  # relative standard uncertainty, above which nothing is known well
+_UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
 _RELAXED = 10.0
 _GRID_LEVELS = 10
 
@@ -79,8 +79,8 @@ def plan(
         relative standard uncertainty: the least time that reaches all. Names alone: their least
         uncertainty in ``limits["time"]``. Left out: D-optimal in that time.
     ranges : mapping of str to (float, float), optional
-        Range that holds a parameter with 95 % probability. The search leans on it, the predicted
-        uncertainty does not.
+        Range that contains a parameter with 95 % probability. The search uses it, but the predicted
+        uncertainty does not include it.
     noise : float or mapping, optional
         Of one cycle: standard deviation of ln gain and phase, or a mapping with ``relative``,
         ``force`` and ``displacement`` (N and m, standard deviation of each part of the
@@ -96,15 +96,15 @@ def plan(
     larger : Element, optional
         Model in which `suspects` are parameters; left out, the model itself.
     suspects : mapping of str to float, optional
-        Parameters that might be there after all, such as ``{"alpha": 0.1}``, and the standard
-        uncertainty that the plan must reach for each in the larger model: relative for positive
-        parameters, absolute for others.
+        Parameters that may be needed although the model fixes or omits them, such as ``{"alpha":
+        0.1}``, and the standard uncertainty that the plan must reach for each in the larger model:
+        relative for positive parameters, absolute for others.
     change_over : float, default 1
         Seconds from one level to the next.
     settled : float, default 0.01
         Share of the friction force below which a transient counts as settled.
     between_runs : float, default 0
-        Seconds that each run takes beside its levels.
+        Seconds that each run takes in addition to its levels.
     draws : int, default 200
         Parameter vectors that the criterion is averaged over.
     seed : int, default 0
@@ -118,7 +118,7 @@ def plan(
     Raises
     ------
     ValidationError
-        If nothing bounds a parameter, the noise is unknown, the limits leave no level, or the time
+        If a parameter has no range, the noise is unknown, the limits leave no level, or the time
         is too short for a single one.
 
     Notes
@@ -218,8 +218,8 @@ def _larger(
     unknown = sorted(set(suspects) - {p.name for p in model.parameters})
     if unknown:
         raise ValidationError(
-            f"suspects names {', '.join(unknown)}, which {model!r} has not; give larger=, a model "
-            "that has"
+            f"suspects names {', '.join(unknown)}, which {model!r} does not have; give larger=, a "
+            "model that has them"
         )
     same = {p.name for p in model.parameters} & set(knowledge.names)
     return model.with_free([*suspects, *same])
@@ -227,7 +227,7 @@ def _larger(
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of the planner; see :func:`plan`."""
+    """The arguments of :func:`plan` in checked form."""
 
     knowledge: Knowledge
     limits: Limits
@@ -254,7 +254,7 @@ class Solution:
 
 
 class Planner:
-    """One question with its candidates: evaluates them once, then answers for any time."""
+    """One planning problem with its candidates, evaluated once and then solved for any time."""
 
     def __init__(self, question: Question, level: FloatArray, frequency_hz: FloatArray) -> None:
         self.question = question
@@ -318,7 +318,7 @@ class Planner:
         return Term(levels, known, targets)
 
     def objective(self, weight: float = 0.0, runs: int = 1) -> Objective:
-        """Return what is maximised, suspected parameters at a weight."""
+        """Return the objective, with a weight for suspected parameters."""
         terms = [replace(self.main, weight=1.0 - weight)]
         if self.suspected is not None and weight > 0.0:
             terms.append(replace(self.suspected, weight=weight))
@@ -362,12 +362,12 @@ class Planner:
 
     @property
     def _fewest(self) -> int:
-        """Levels that leave a fit to them alone at least one residual, two numbers a level."""
+        """Levels needed for at least one degree of freedom, with two numbers per level."""
         known = self.question.knowledge
         return 1 if known.problem is not None else len(known.names) // 2 + 1
 
     def pool(self, time: float) -> Any:
-        """Return candidates worth a closer look: by the continuous design, and evenly spread."""
+        """Return promising candidates: those of the continuous design, and evenly spread ones."""
         if self._pool is None:
             K = self.candidates.count
             if K <= _POOL:
@@ -461,7 +461,7 @@ class Planner:
         return best or found
 
     def plan(self) -> Plan:
-        """Return the answer."""
+        """Return the plan."""
         q = self.question
         found = self.least_time() if q.numbers else self.solve(q.limits.time)
         if found is None:
@@ -504,7 +504,7 @@ class Planner:
         )
 
     def expected(self, levels: Any, cycles: FloatArray, runs: int) -> dict[str, Expected]:
-        """Return what each quantity's uncertainty will be after a design."""
+        """Return the expected uncertainty of each quantity after a design."""
         q = self.question
         after = self.uncertainty(self.covariance(levels, cycles, runs))
         before = self.uncertainty(_inverse(self.before))
@@ -555,7 +555,7 @@ class Planner:
         return ordered, np.full(len(ordered), cycles), runs
 
     def _undetermined(self, found: Solution, expected: Mapping[str, Expected]) -> tuple[str, ...]:
-        """Return a sentence for what the plan does not determine, with the limit that prevents."""
+        """Return a sentence for each undetermined quantity, with the limit that prevents it."""
         q = self.question
         lost = {
             name: f"{name} stays undetermined (standard uncertainty {_percent(e.after)})"
@@ -633,7 +633,7 @@ class Planner:
 
 
 def _sizes(parameters: Any, theta: FloatArray) -> FloatArray:
-    """Return the units in which parameters are reckoned: 1 for logarithms, else their size."""
+    """Return the scale of each parameter: 1 for logarithms, else its size."""
     spread = np.median(np.abs(theta), axis=0)
     spread = np.where(spread > 0.0, spread, np.maximum(theta.std(axis=0), 1e-300))
     spread = np.where(spread > 1e-290, spread, 1.0)
@@ -682,7 +682,7 @@ def _product(expression: str, values: Mapping[str, FloatArray]) -> FloatArray:
 
 
 def _inverse(M: FloatArray) -> FloatArray:
-    """Return the inverse of information; what is not known at all gets a huge variance."""
+    """Return the inverse of the information; unknown directions get a very large variance."""
     return np.asarray(np.linalg.inv(M + _NOTHING * np.eye(M.shape[-1])))
 
 

@@ -1,4 +1,4 @@
-"""Pictures. Every function takes plain numbers and ``ax=``, draws, and returns the axes."""
+"""Plots. Every function takes plain numbers and ``ax=``, draws, and returns the axes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Predicted uncertainty against bench time: a plan's beside that of a logarithmic grid."""
+"""Predicted uncertainty against bench time, of a plan and of a logarithmic grid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An uncertainty budget as bars: which source contributes how much to which parameter."""
+"""An uncertainty budget as bars: the share of each source in the variance of each parameter."""
 
 from __future__ import annotations
 

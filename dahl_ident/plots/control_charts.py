@@ -1,4 +1,4 @@
-"""Many devices beside each other: their estimates, and control charts of fits in time."""
+"""Many devices: their estimates side by side, and control charts of fits over time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def plot_devices(
     label: str,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw each device's own estimate, the one drawn towards the population, and the mean.
+    """Draw each device's own estimate, the estimate shrunk towards the population, and the mean.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def plot_devices(
         axis.axhline(mean, color=style.GREY, lw=1.0, label="population mean")
         axis.errorbar(
             place, shrunken[order], 2.0 * u[order], fmt="o", color=style.BLUE, capsize=0,
-            lw=1.0, label="drawn towards the population, with 2 u",
+            lw=1.0, label="shrunk towards the population, with 2 u",
         )  # fmt: skip
         axis.plot(place, own[order], "x", color=style.VERMILION, label="own estimate")
         marked = [i for i, k in enumerate(order) if names[k] in set(outlying)]

@@ -1,4 +1,4 @@
-"""Pictures of control loops with friction: Nyquist, Nichols, margins over amplitude."""
+"""Plots of control loops with friction: Nyquist, Nichols, margins against amplitude."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def plot_nichols(
     levels : sequence of (label, complex response)
         In the order of the levels, each over rising frequency.
     gain_label : str
-        What the gain is; the label adds "dB", and the unit that 0 dB stands for, where this ends
-        in one: ``"receptance [m/N]"`` becomes "receptance [dB re m/N]".
+        Name of the gain; the label adds "dB", and the reference of 0 dB if the name ends in a unit:
+        ``"receptance [m/N]"`` becomes "receptance [dB re m/N]".
     ax : Axes, optional
         New where left out.
 

@@ -1,4 +1,4 @@
-"""Pictures of a posterior: corner and trace."""
+"""Plots of a posterior: corner and trace."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def plot_trace(
 
 
 def _logarithmic(values: FloatArray, log: Sequence[bool]) -> list[bool]:
-    """Return which axes a logarithm serves: of a narrow range, its ticks are hard to read."""
+    """Return which axes are logarithmic: on a narrow range logarithmic ticks are hard to read."""
     low, high = np.quantile(values, [0.001, 0.999], axis=0)
     wanted = list(log) or [False] * values.shape[1]
     return [bool(w and b > _WIDE * a) for w, a, b in zip(wanted, low, high, strict=True)]
@@ -158,7 +158,7 @@ def _marginal(axis: Axes, values: FloatArray, edges: Any) -> None:
 
 
 def _name_outer_axes(axis: Axes, names: Sequence[str], i: int, j: int) -> None:
-    """Put numbers and names on the axes of a panel that no other panel lies outside of."""
+    """Put numbers and names on the axes of the outer panels only."""
     bottom, left = i == len(names) - 1, j == 0 and i > 0
     axis.grid(visible=False)
     axis.tick_params(labelbottom=bottom, labelleft=left, which="both")

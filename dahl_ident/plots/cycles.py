@@ -20,16 +20,16 @@ def plot_cycles(
     mean_std: float | None = None,
     ax: Sequence[Axes] | None = None,
 ) -> tuple[Axes, Axes]:
-    """Draw how one point settled: its response and the force's mean, cycle by cycle.
+    """Draw how one point settled: its response and mean force, cycle by cycle.
 
     Parameters
     ----------
     response : array_like of complex, shape (n,)
         Dynamic stiffness of each cycle, N/m.
     force_mean : array_like, shape (n,)
-        Mean force of each cycle, N: its decay is where unsettled friction shows first.
+        Mean force of each cycle, N; its decay is the first sign of unsettled friction.
     left_out : int, default 0
-        Leading cycles that do not count, shaded.
+        Leading cycles that were left out, shaded.
     response_std, mean_std : float, optional
         Standard deviation of one cycle's value, drawn as a band around the median.
     ax : sequence of two Axes, optional

@@ -1,4 +1,4 @@
-"""Pictures that judge a fit: residuals, profiles, correlation, where the information is."""
+"""Diagnostic plots of a fit: residuals, profiles, correlation, information of each point."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.plots import style
 
 _LARGEST_DISC = 250.0  # area, points squared
-_MOST_JOINED = 6  # curves, beyond which lines between points only confuse
+_MOST_JOINED = 6  # curves; with more, lines between points only confuse
 
 
 def plot_residuals(
@@ -29,8 +29,8 @@ def plot_residuals(
 ) -> Axes:
     """Draw the two residuals of every point, in standard deviations.
 
-    Points of a group are joined where no two of them share a place, so that sequences of one sign
-    show; with many groups none is.
+    Points of a group are joined where no two of them share a position, so that sequences of one
+    sign are visible; with many groups, points are not joined.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def plot_information(
     x_label: str = "displacement amplitude [m]",
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw how much each point says about each parameter (the identifiability map).
+    """Draw the information of each point on each parameter (the identifiability map).
 
     Parameters
     ----------
@@ -212,7 +212,8 @@ def plot_information(
     Returns
     -------
     Axes
-        A line for each parameter; discs' areas go with the shares, the largest one's is written.
+        A line for each parameter; the areas of the discs are proportional to the shares, and the
+        largest share is written.
 
     Examples
     --------

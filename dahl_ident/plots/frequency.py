@@ -1,4 +1,4 @@
-"""Response of several levels: Fig. 7 of the paper and its measured relatives."""
+"""Responses at several levels, as in Fig. 7 of the paper."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def plot_frequency_response(
 ) -> tuple[Axes, Axes]:
     """Draw gain and phase against frequency, one curve a level.
 
-    The points of a level are joined where no two of them share a place; repeated measurements are
-    drawn as points.
+    The points of a level are joined where no two of them share a position; repeated measurements
+    are drawn as points.
 
     Parameters
     ----------
@@ -80,6 +80,6 @@ def plot_frequency_response(
 
 
 def _is_one_curve(x: ArrayLike) -> bool:
-    """Return whether every point of a level has its own place on the axis."""
+    """Return whether no two points of a level share a position on the axis."""
     places = np.ravel(np.asarray(x))
     return bool(np.unique(places).size == places.size)

@@ -1,4 +1,4 @@
-"""Friction over amplitude: gain and phase, the universal curve, hysteresis loops."""
+"""Friction against amplitude: gain and phase, the universal curve, hysteresis loops."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def plot_universal_curve(
     marked_beta: Sequence[tuple[float, complex]] = (),
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw N/sigma of the data on h(beta), the curve that every linear Dahl element follows.
+    """Draw N/sigma of the data with h(beta), the curve of every linear Dahl element.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def plot_universal_curve(
 
 
 def _inwards(h: complex) -> tuple[float, float]:
-    """Return the way from a point of the curve to its label, clear of the data on it, in points."""
+    """Return the offset of a label from its point of the curve, clear of the data, in points."""
     way = 0.5 + 0.1j - h
     way *= 18.0 / abs(way)
     return way.real, way.imag
@@ -132,7 +132,7 @@ def plot_loops(
     loops : sequence of (displacement, force, label)
         The model's loops.
     measured : sequence of (displacement, force), optional
-        Measured points, drawn as markers in the colour of the loop at the same place.
+        Measured points, drawn as markers in the colour of the corresponding loop.
     displacement_label, force_label : str
         Axis labels with units.
     ax : Axes, optional

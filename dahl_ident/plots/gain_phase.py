@@ -1,4 +1,4 @@
-"""Gain above phase: the parts that pictures over amplitude and over frequency share."""
+"""Gain above phase: the common parts of plots against amplitude and against frequency."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def draw_points(axes: Sequence[Axes], points: Points, **look: Any) -> None:
 
 
 def draw_curve(axes: Sequence[Axes], curve: Curve, *, near: Points, **look: Any) -> None:
-    """Draw a curve and its band, its phase on the same turn as the points that it goes through."""
+    """Draw a curve and its band, with its phase shifted by whole turns to match the points."""
     phase = _degrees(curve.response)
     turns = _turns_away(curve.x, phase, near)
     axes[0].plot(curve.x, np.abs(curve.response), **look)

@@ -1,4 +1,4 @@
-"""Pictures of a fit to a record: over time, as a loop, and what is left."""
+"""Plots of a fit to a record: against time, as a loop, and the residuals."""
 
 from __future__ import annotations
 

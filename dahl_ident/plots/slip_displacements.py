@@ -12,7 +12,7 @@ from dahl_ident.plots import style
 def plot_slip_density(
     slip: FloatArray, stiffness: FloatArray, *, unit: str = "m", ax: Axes | None = None
 ) -> Axes:
-    """Draw which part of the stiffness slips at which displacement.
+    """Draw the share of the stiffness that slips at each displacement.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""One look for every plot: safe for colour-blind readers, in print, and at 400 px.
+"""The style of all plots: readable for colour-blind readers, in print, and at 400 px.
 
-Every colour of a line or marker has a contrast of at least 3 to 1 against white paper. Series
-differ in marker as well, so that they can be distinguished in a grey print. Levels, which have an
-order, take a sequential map from dark to bright, with line styles and markers in turn.
+Every colour of a line or marker has a contrast of at least 3 to 1 against white paper. Series also
+differ in marker, so that they can be distinguished in a greyscale print. Levels, which have an
+order, use a sequential map from dark to bright, with alternating line styles and markers.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P")
 LINE_STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)))
 FIT = BLACK
 GREY = "#767676"
-_MOST_IN_A_ROW = 4  # of legends
+_MOST_IN_A_ROW = 4  # entries of a legend
 _LEVEL_COLOURS = (0.05, 0.66)  # of the map inferno; brighter ones fall below 3 to 1 on white
 
 RC: dict[Any, Any] = {
@@ -55,10 +55,11 @@ RC: dict[Any, Any] = {
 
 @contextmanager
 def house_style() -> Iterator[None]:
-    """Draw in the house style, and leave the user's settings as they were.
+    """Draw in the package's style, and restore the user's settings afterwards.
 
-    Only the settings that the style changes are put back: the first figure of a session loads the
-    backend, and what that sets (a notebook shows figures only while interactive) has to stay.
+    Only the settings that the style changes are restored: the first figure of a session loads the
+    backend, and the settings of the backend (a notebook shows figures only while interactive) have
+    to remain.
     """
     before = {name: mpl.rcParams[name] for name in RC}
     mpl.rcParams.update(RC)
@@ -69,14 +70,14 @@ def house_style() -> Iterator[None]:
 
 
 def new_axes(rows: int, columns: int, *, size: tuple[float, float], sharex: bool) -> NDArray[Any]:
-    """Return the axes, shape (rows, columns), of a new figure in the house style."""
+    """Return the axes, shape (rows, columns), of a new figure in the package's style."""
     with house_style():
         figure = plt.figure(figsize=size, layout="constrained")
         return np.asarray(figure.subplots(rows, columns, sharex=sharex, squeeze=False))
 
 
 def axes(ax: Axes | None, *, size: tuple[float, float] = (4.6, 3.4)) -> Axes:
-    """Return `ax`, or the one axes of a new figure in the house style."""
+    """Return `ax`, or the axes of a new figure in the package's style."""
     if ax is not None:
         return ax
     return cast("Axes", new_axes(1, 1, size=size, sharex=False)[0, 0])
@@ -117,7 +118,7 @@ def level_markers(count: int) -> list[dict[str, Any]]:
 
 
 def labelled_levels(count: int, most: int = 8) -> set[int]:
-    """Return which of many levels stand in the legend: evenly spread, the ends among them."""
+    """Return which of many levels are in the legend: evenly spread, including the ends."""
     return set(np.linspace(0, count - 1, most).round().astype(int).tolist())
 
 
@@ -140,7 +141,7 @@ def readable_log_ticks(axis: Axes) -> None:
 
 
 def few_plain_ticks(line: Axis, most: int = 3) -> None:
-    """Label at most so many places of an axis, with plain numbers and no offset."""
+    """Limit the number of tick labels of an axis; plain numbers without an offset."""
     logarithmic = line.get_scale() == "log"
     line.set_major_locator(_FewLogTicks(most) if logarithmic else MaxNLocator(most - 1))
     line.set_major_formatter(StrMethodFormatter("{x:.10g}"))
@@ -148,7 +149,7 @@ def few_plain_ticks(line: Axis, most: int = 3) -> None:
 
 
 class _FewLogTicks(Locator):
-    """At most so many round values: 1-2-5 steps, else decades; even steps on a narrow range."""
+    """A limited number of round values: 1-2-5 steps or decades; even steps on a narrow range."""
 
     def __init__(self, most: int) -> None:
         self.most = most
@@ -158,7 +159,7 @@ class _FewLogTicks(Locator):
         return self.tick_values(*self.axis.get_view_interval())
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
-        """Return the places between two limits."""
+        """Return the tick positions between two limits."""
         low, high = sorted((vmin, vmax))
         decades = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
         for steps in ((1.0, 2.0, 5.0), (1.0, 3.0), (1.0,)):

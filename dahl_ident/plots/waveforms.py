@@ -1,4 +1,4 @@
-"""Recorded waveforms over time, and the hysteresis loops that they make."""
+"""Recorded waveforms against time, and hysteresis loops."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The public door: the steady response of a known plant, checked and with its verdicts."""
+"""The public function for the steady response of a known plant, with checked arguments."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class SteadyResponse:
     """Displacement X for a drive u_0 cos(omega t): x(t) = A cos(omega t + phase).
 
     All arrays have the broadcast shape of frequency and drive, with one more axis, the
-    amplitudes in rising order, where all were asked for. Scalars for scalar arguments.
+    amplitudes in rising order, if all were requested. Scalars for scalar arguments.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class SteadyResponse:
     displacement : ndarray of complex
         Phasor X = A exp(j phase), the drive's phase being zero.
     found : ndarray of bool
-        Whether the entry holds an amplitude.
+        Whether the entry is an amplitude.
     number_of_solutions : ndarray of int
         How many amplitudes the point has; shape of frequency and drive.
     message : str
@@ -173,20 +173,20 @@ def response(
 
 
 def _check_reach(amplitude: FloatArray) -> None:
-    """Refuse an amplitude, in any unit, of which numbers hold no more than its order."""
+    """Refuse an amplitude that is too large or too small for floating-point numbers."""
     least, most = _REACH
     lost = (amplitude < least) | (amplitude > most)
     if lost.any():
         row = int(np.argwhere(lost)[0, 0])
         raise ValidationError(
             f"point {row} ({lost.sum()} such points) has an amplitude of about "
-            f"{amplitude[lost][0]:g}, outside {least:g} to {most:g}, beyond which numbers end; "
+            f"{amplitude[lost][0]:g}, outside the range of numbers, {least:g} to {most:g}; "
             "check the units"
         )
 
 
 def _read_only(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
-    """Return the array, closed to writing, or its scalar."""
+    """Return the array, read-only, or its scalar."""
     array.flags.writeable = False
     return array[()]
 

@@ -1,4 +1,4 @@
-"""The displacement amplitude as a function of parameters, for estimation; nothing is checked."""
+"""The displacement amplitude as a function of parameters, for estimation; unchecked."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dahl_ident.elements.element import Element
 from dahl_ident.steady_state.plant import flatten
 from dahl_ident.steady_state.roots import find_roots
 
-_SCAN_PER_DECADE = 32  # coarser than where every amplitude is asked for: one is wanted here
+_SCAN_PER_DECADE = 32  # coarse, because only one amplitude is needed
 
 
 def solve(

@@ -1,4 +1,4 @@
-"""A plant at many points: linear part, friction and drive in flat arrays, one row a point."""
+"""A plant at many points: linear part, friction and drive in arrays with one row per point."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _Values = list[Sequence[FloatArray]]
 
 EPS = float(np.finfo(np.float64).eps)
 _ROUNDING = 8.0 * EPS  # of k - m omega^2 and its like, relative to the terms' sizes
-_LARGEST = 1e300  # stands for an amplitude without bound
+_LARGEST = 1e300  # represents an unbounded amplitude
 _REACH = 40  # decades of amplitude, m, to both sides, that are searched where N has no bounds
 _AT_REST = np.zeros(())
 
@@ -38,7 +38,7 @@ class Nonlinear:
     values: tuple[tuple[FloatArray, ...], ...]
     omega: FloatArray
     unique: bool
-    """Whether beside a passive linear part the amplitude is unique."""
+    """Whether the amplitude is unique if the linear part is passive."""
 
     @property
     def shared(self) -> bool:
@@ -46,7 +46,7 @@ class Nonlinear:
         return self.omega.ndim == 0 and all(v.ndim == 0 for own in self.values for v in own)
 
     def force(self, amplitude: FloatArray, vector: IntArray) -> ComplexArray:
-        """Return A N, the force's fundamental; `vector` says whose parameters each row has."""
+        """Return A N, the force's fundamental; `vector` is the parameter vector of each row."""
         force = np.zeros(amplitude.shape, dtype=np.complex128)
         (omega,) = _rows((self.omega,), vector)
         for element, values in zip(self.elements, self.values, strict=True):
@@ -69,7 +69,7 @@ class Nonlinear:
 
     @cached_property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """What |N| and A |N| never exceed, for each vector; infinite where unknown."""
+        """Upper bounds of |N| and A |N| for each vector; infinite where unknown."""
         steepest, largest = np.zeros(()), np.zeros(())
         for element, values in zip(self.elements, self.values, strict=True):
             own = element.force_bounds(values)
@@ -87,13 +87,13 @@ class Nonlinear:
 
 @dataclass(frozen=True)
 class Plant:
-    """A |L + N(A)| = drive at every point, all in units that suit the friction.
+    """A |L + N(A)| = drive at every point, in units scaled to the friction.
 
     All arrays have one entry a point.
     """
 
     linear: ComplexArray
-    rounding: FloatArray  # what rounding the terms of L leaves of it
+    rounding: FloatArray  # rounding error of L from its terms
     drive: FloatArray
     vector: IntArray
     friction: Nonlinear
@@ -111,7 +111,7 @@ class Plant:
         )
 
     def force(self, amplitude: FloatArray) -> ComplexArray:
-        """Return A (L + N), the phasor that a displacement phasor A takes."""
+        """Return A (L + N), the force phasor for a displacement phasor A."""
         return amplitude * self.linear + self.friction.force(amplitude, self.vector)
 
     def largest_friction(self) -> FloatArray:
@@ -158,7 +158,7 @@ class Plant:
             return np.log(size / self.drive), ((rest + slope) / total).real
 
     def conditioning(self, amplitude: FloatArray, force: ComplexArray) -> FloatArray:
-        """Return (|L| + |N|) A/u_0, by which rounding grows near a sharp resonance."""
+        """Return (|L| + |N|) A/u_0, the amplification of rounding near a sharp resonance."""
         return (np.abs(self.linear) * amplitude + np.abs(force)) / self.drive
 
 
@@ -199,7 +199,7 @@ def flatten(
 
 
 def _without_overflow(linear: ComplexArray, friction: _Values) -> tuple[ComplexArray, _Values]:
-    """Put values at which a search overflowed out of the way: no L, and no amplitude, there."""
+    """Mask values at which a search overflowed: no L, and no amplitude, there."""
     finite = [np.isfinite(v) for own in friction for v in own]
     if all(np.all(f) for f in finite):
         return linear, friction
@@ -230,7 +230,7 @@ def _flat_values(values: FloatArray, batch: tuple[int, ...]) -> FloatArray:
 
 
 def _flat(array: NDArray[_Scalar], shape: tuple[int, ...]) -> NDArray[_Scalar]:
-    """Return the broadcast array in one dimension; one number is not copied."""
+    """Return the broadcast array in one dimension; a single number is not copied."""
     if np.size(array) == 1:
         return np.broadcast_to(np.ravel(array), int(np.prod(shape)))
     return np.broadcast_to(array, shape).ravel()

@@ -6,9 +6,9 @@ Newton's method in ln A that never leaves its bracket. With the dense table used
 points, one step from the interpolated start is enough almost everywhere.
 
 **Active points** (Im L < 0) may have several. All lie between the bounds that |N| and A |N|
-set. A grid over this range finds the cells where A |Z| crosses the drive, each of which holds one
-amplitude, and those where it turns near the drive, which hold two if it reaches it. Turning
-points nearer to each other than the grid's nodes, 1.8 % in amplitude, may be missed.
+set. A grid over this range finds the cells where A |Z| crosses the drive, each of which contains
+one amplitude, and those where A |Z| has an extremum near the drive, which contain two if it reaches
+the drive. Extrema closer to each other than the grid's nodes, 1.8 % in amplitude, may be missed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 _NODES_PER_DECADE = (4, 180)
 _SCAN_PER_DECADE = 128
-_SCAN_CELLS = 2**15  # points times nodes of the scan in work at once
+_SCAN_CELLS = 2**15  # points times nodes of the scan that are processed at once
 _CHUNK = 4096  # points solved together: their scratch arrays stay in the processor's cache
 
 
@@ -41,7 +41,7 @@ class Roots(NamedTuple):
 
 
 def find_roots(plant: Plant, per_decade: int = _SCAN_PER_DECADE) -> Roots:
-    """Return every amplitude of every point, and the force that it takes.
+    """Return every amplitude of every point, and the corresponding force.
 
     `per_decade` is the number of nodes a decade of amplitude in the search at active points.
     """
@@ -85,7 +85,7 @@ def _chunks(chosen: BoolArray) -> Iterator[IntArray | slice]:
 
 
 class _Table(NamedTuple):
-    """Friction force over amplitude, the nodes of one parameter vector after the other."""
+    """Friction force against amplitude, the nodes of one parameter vector after another."""
 
     nodes: int  # per vector; 2^k - 1, so that bisection takes k steps
     amplitude: FloatArray
@@ -113,7 +113,7 @@ def _tabulate(friction: Nonlinear, points: int) -> _Table:
 
 
 def _interpolated_roots(plant: Plant, table: _Table) -> tuple[FloatArray, ComplexArray, BoolArray]:
-    """Return amplitude and force of each passive point, and whether one step has settled them."""
+    """Return amplitude and force of each passive point, and whether one step was enough."""
     below = _search(plant, table)
     with np.errstate(all="ignore"):  # beyond the table's ends the result is not used
         start, per_misfit, slope = _inverse_cubic(plant, table, _cell(plant, table, below))
@@ -151,7 +151,7 @@ def _cell(plant: Plant, table: _Table, below: IntArray) -> IntArray:
 
 
 def _search(plant: Plant, table: _Table) -> IntArray:
-    """Return at how many nodes A |Z| lies below the drive, by bisection without branches."""
+    """Return the number of nodes with A |Z| below the drive, by bisection without branches."""
     offset = plant.vector * table.nodes - 1
     last_below = offset.copy()
     width = (table.nodes + 1) // 2
@@ -221,7 +221,7 @@ def _scan(plant: Plant, points: IntArray, per_decade: int) -> tuple[IntArray, Fl
     """Return every amplitude of the chosen points, as pairs (point, amplitude) in rising order."""
     chosen = plant.at(points)
     low, high = chosen.bounds()
-    order = np.argsort(high)  # the few near resonance, which need a long grid, come together
+    order = np.argsort(high)  # groups the few points near resonance, which need a long grid
     decades = np.log10(high[order[order.size // 2]] / low.min())
     together = max(1, int(_SCAN_CELLS / (per_decade * max(decades, 1.0))))
     parts = []
@@ -246,7 +246,7 @@ def _scan(plant: Plant, points: IntArray, per_decade: int) -> tuple[IntArray, Fl
 
 
 class _Cells(NamedTuple):
-    """Cells of a grid in which A |Z| crosses the drive, or may cross it twice where it turns."""
+    """Cells of a grid in which A |Z| crosses the drive, or may cross it twice at an extremum."""
 
     point: IntArray
     low: FloatArray
@@ -341,7 +341,7 @@ def _separated(plant: Plant, cells: _Cells) -> tuple[_Cells, FloatArray]:
 
 
 def _places(point: IntArray) -> IntArray:
-    """Return which entry of its point each entry is; equal points stand side by side."""
+    """Return the index of each entry within its point; equal points are adjacent."""
     _, first, counts = np.unique(point, return_index=True, return_counts=True)
     return np.arange(point.size) - np.repeat(first, counts)
 

@@ -1,10 +1,10 @@
-"""The synthetic laboratory: data whose truth is known, as close to a real laboratory as can be.
+"""The synthetic laboratory: realistic data with known true parameters.
 
-An :class:`Experiment` says which mechanism is driven how, through which sensors; ``simulate``
-turns it and a seed into a :class:`~dahl_ident.data.Record` of waveforms or a
-:class:`~dahl_ident.data.FrequencyResponse`. Friction follows Eqn. 2 in time, so that whatever is
-estimated by describing functions is tested against something else. Ready-made data sets ship
-with the package: see :func:`load_dataset`.
+An :class:`Experiment` describes the mechanism, the excitation and the sensors; ``simulate`` turns
+it and a seed into a :class:`~dahl_ident.data.Record` of waveforms or a
+:class:`~dahl_ident.data.FrequencyResponse`. Friction is simulated in time by Eqn. 2, so that
+estimates by describing functions are tested independently. Ready-made data sets are shipped with
+the package: see :func:`load_dataset`.
 """
 
 from dahl_ident.synthetic.acquisition import Acquisition, Channel

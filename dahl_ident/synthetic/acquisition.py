@@ -1,4 +1,4 @@
-"""Sensors and their recorder: what stands between the true motion and the stored numbers.
+"""Sensors and recorder, which turn the true motion into stored numbers.
 
 A channel stores, at its nominal sampling times t,
 
@@ -116,9 +116,9 @@ class Channel:
         return y if self.limit is None else np.clip(y, -self.limit, self.limit)
 
     def _filtered(self, signal: Signal, start: float, stop: float, step: float) -> Signal:
-        """Return the signal after the anti-alias filter, which was at rest with it at `start`.
+        """Return the signal after the anti-alias filter, which is in steady state at `start`.
 
-        The filter is exact for a signal that is straight between 16 points a sample.
+        The filter is exact for a signal that is linear between 16 points per sample.
         """
         if self.antialias_hz is None:
             return signal
@@ -177,7 +177,7 @@ class Acquisition:
             )
 
     def faults_of_records(self) -> list[str]:
-        """Return the names of the settings that only waveforms can show."""
+        """Return the names of the settings that only affect waveforms."""
         no_fault = Channel()
         faults = [
             f"{name} {fault}"

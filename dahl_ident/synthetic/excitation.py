@@ -1,7 +1,7 @@
-"""What the laboratory does to the mechanism: stepped sines, frequency sweeps, amplitude ramps.
+"""Excitations: stepped sines, frequency sweeps, amplitude ramps.
 
-Each excitation says which of displacement and force it holds, and its levels are zero-to-peak
-amplitudes of that one. Before the first step the mechanism is at rest without force.
+Each excitation controls either displacement or force, and its levels are zero-to-peak amplitudes of
+the controlled one. Before the first step the mechanism is at rest without force.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ class SteppedSine:
     controlled : {"displacement", "force"}
         What the levels are amplitudes of.
     order : {"given", "ascending", "descending", "random"}
-        How the levels follow each other; "random" shuffles the whole grid by the seed.
+        Order of the levels; "random" shuffles the whole grid by the seed.
     settling_periods : int, default 10
         Periods at the full level before measuring starts.
     num_periods : int, default 5
         Measured periods of each step.
     ramp_periods : float, default 2
-        Periods of the smooth passage to the next level and frequency; 0 jumps.
+        Periods of the smooth transition to the next level and frequency; 0 is a jump.
     rest : float, default 0
-        Seconds at rest between the steps, each then ramped down and up; 0 goes straight on.
+        Seconds at rest between the steps, which are then ramped down and up; 0 for no rest.
 
     Raises
     ------
@@ -107,7 +107,7 @@ class SteppedSine:
 
 @dataclass(frozen=True)
 class FrequencySweep:
-    """One level, its frequency moving steadily from start to stop.
+    """One level, with a frequency that moves steadily from start to stop.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ class FrequencySweep:
 
 @dataclass(frozen=True)
 class AmplitudeRamp:
-    """One frequency, its level moving steadily from start to stop.
+    """One frequency, with a level that moves steadily from start to stop.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ class AmplitudeRamp:
 
 
 def _check_passage(passage: FrequencySweep | AmplitudeRamp, *positive: str) -> None:
-    """Check a steady passage, and turn its numbers into floats."""
+    """Check a steady sweep, and turn its numbers into floats."""
     for name in positive:
         object.__setattr__(passage, name, positive_number(getattr(passage, name), name))
     one_of(passage.spacing, "spacing", get_args(Spacing))

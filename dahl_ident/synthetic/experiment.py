@@ -1,7 +1,7 @@
-"""An experiment described: mechanism, excitation, sensors, and what is wanted of it.
+"""Description of an experiment: mechanism, excitation, sensors and requested data.
 
-The description is frozen, prints as TOML, and goes to JSON or TOML and back. Together with a
-seed it determines every number of the data.
+The description is frozen, prints as TOML, and can be converted to JSON or TOML and back. Together
+with a seed it determines every number of the data.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class Experiment:
     excitation : SteppedSine, FrequencySweep or AmplitudeRamp
         What drives it.
     acquisition : Acquisition
-        Sensors and recorder; ideal ones by default. A table sees their gain, delay and
-        anti-alias filter.
+        Sensors and recorder; ideal ones by default. Their gain, delay and anti-alias filter also
+        affect a table.
     table : Table, optional
         Ask for a table of response with these errors; None: a record of waveforms.
     motion : {"translation", "rotation"}
@@ -61,8 +61,8 @@ class Experiment:
     ModelError
         If a parameter of the plant has no value.
     ValidationError
-        If a table is asked of anything but a stepped sine, or of sensors whose faults have no
-        place in a table.
+        If a table is requested of anything but a stepped sine, or of sensors whose faults cannot
+        appear in a table.
 
     Examples
     --------
@@ -98,7 +98,7 @@ class Experiment:
         return values | {name: v for name, (v, ideal) in sensors.items() if v != ideal}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the description as plain data; what is None is left out."""
+        """Return the description as plain data; None values are left out."""
         kinds = {cls: kind for kind, cls in _EXCITATIONS.items()}
         description: dict[str, Any] = {
             "motion": self.motion,
@@ -111,7 +111,7 @@ class Experiment:
 
     @classmethod
     def from_dict(cls, description: Mapping[str, Any]) -> Experiment:
-        """Return the experiment that :meth:`to_dict` described; what is left out has its default.
+        """Return the experiment that :meth:`to_dict` described; missing values have their defaults.
 
         Raises
         ------
@@ -148,7 +148,7 @@ class Experiment:
         Raises
         ------
         DataError
-            If the text is no JSON, or no experiment.
+            If the text is not JSON, or not an experiment.
         """
         try:
             return cls.from_dict(json.loads(text))
@@ -166,7 +166,7 @@ class Experiment:
         Raises
         ------
         DataError
-            If the text is no TOML, or no experiment.
+            If the text is not TOML, or not an experiment.
         """
         try:
             return cls.from_dict(tomllib.loads(text))
@@ -209,8 +209,8 @@ class Experiment:
     def _check_table(self, table: Table) -> None:
         if not isinstance(self.excitation, SteppedSine):
             raise ValidationError(
-                f"a table was asked of a {type(self.excitation).__name__}; only a SteppedSine has "
-                "one response for each step: leave table out to record waveforms"
+                f"a table was requested of a {type(self.excitation).__name__}; only a SteppedSine "
+                "has one response for each step: leave table out to record waveforms"
             )
         if self.excitation.controlled == "force" and table.harmonics != (1,):
             raise ValidationError(
@@ -219,8 +219,8 @@ class Experiment:
         faults = self.acquisition.faults_of_records()
         if faults:
             raise ValidationError(
-                f"{', '.join(faults)} have no place in a table; leave table out to record "
-                "waveforms, or say how the table scatters in Table"
+                f"{', '.join(faults)} cannot appear in a table; leave table out to record "
+                "waveforms, or give the errors of the table in Table"
             )
 
 

@@ -1,4 +1,4 @@
-"""Run an experiment: from its description and a seed to data as a laboratory would store them."""
+"""Simulation of an experiment, from its description and a seed to data."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Steps = tuple[FloatArray, FloatArray]
 def simulate(
     experiment: Experiment, *, seed: int, progress: Progress | None = None
 ) -> Record | FrequencyResponse:
-    """Return the data of one experiment, sensors and all.
+    """Return the data of one experiment, including the effects of its sensors.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def simulate(
     seed : int
         Whole number >= 0. The same seed gives the same values to 1e-12 on every platform.
     progress : callable, optional
-        Told the fraction that is done, now and then, while a plant is simulated.
+        Called from time to time with the completed fraction, while a plant is simulated.
 
     Returns
     -------
@@ -51,16 +51,18 @@ def simulate(
     Raises
     ------
     ModelError
-        If the plant has no motion in time, no steady state, or moves beyond all bounds.
+        If the motion in time of the plant is not available, it has no steady state, or its motion
+        grows without bound.
     ValidationError
-        If `experiment` is no Experiment, `seed` no whole number, or the sampling rate too low.
+        If `experiment` is not an Experiment, `seed` is not a whole number, or the sampling rate is
+        too low.
 
     Notes
     -----
     A displacement-controlled mechanism is exact (Eqn. 3 from turning point to turning point).
     A force-controlled plant (Eqn. 53) is solved to about 1e-11 of its motion, reversals located;
-    the describing function plays no part in it. Tables hold the describing-function steady
-    state, :func:`dahl_ident.response`.
+    the describing function is not used. Tables contain the describing-function steady state,
+    :func:`dahl_ident.response`.
 
     Examples
     --------
@@ -116,7 +118,7 @@ def _record(
 
 
 def _table(experiment: Experiment, steps: Steps, table: Table, draws: Draws) -> FrequencyResponse:
-    """Return the table of a stepped sine: the true phasors, as the sensors show them."""
+    """Return the table of a stepped sine: the true phasors, as measured by the sensors."""
     if experiment.excitation.controlled == "force":
         phasors = _forced_phasors(experiment, *steps)
         return receptance_table(phasors, table, draws)
@@ -127,7 +129,7 @@ def _table(experiment: Experiment, steps: Steps, table: Table, draws: Draws) -> 
 def _held_phasors(
     experiment: Experiment, level: FloatArray, frequency_hz: FloatArray, harmonics: IntArray
 ) -> Phasors:
-    """Return a row for every step and harmonic, the displacement held at its level."""
+    """Return a row for every step and harmonic, with controlled displacement."""
     step, k = (g.ravel() for g in np.meshgrid(np.arange(level.size), harmonics, indexing="ij"))
     A, f = level[step], frequency_hz[step]
     omega = 2.0 * np.pi * f
@@ -147,7 +149,7 @@ def _held_phasors(
 
 
 def _forced_phasors(experiment: Experiment, drive: FloatArray, frequency_hz: FloatArray) -> Phasors:
-    """Return a row for every step, the force held at its level."""
+    """Return a row for every step, with controlled force."""
     steady = response(experiment.plant, frequency_hz, drive)
     if not steady.found.all():
         raise ModelError(steady.message)

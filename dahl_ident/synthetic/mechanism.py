@@ -1,4 +1,4 @@
-"""A model taken apart for the time domain: its friction, and everything linear as one."""
+"""A model split for the time domain into its friction and one linear part."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dahl_ident.synthetic.state_space import Rational
 from dahl_ident.synthetic.waveform import Waveform
 
 Signal = Callable[[FloatArray], FloatArray]
-"""A channel's true value at any times, shape in and out (n,)."""
+"""A channel's true value at any times, (n,) -> (n,)."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Mechanism:
     """Laws whose branches have a closed form."""
     linear: Rational
     others: tuple[Element, ...] = ()
-    """Laws whose force is known for a given displacement alone."""
+    """Laws whose force is available only for a given displacement."""
 
     @classmethod
     def of(cls, plant: Element) -> Mechanism:
@@ -57,7 +57,7 @@ class Mechanism:
         Raises
         ------
         ModelError
-            If nothing linear bounds the motion, or it grows beyond all bounds.
+            If no linear element bounds the motion, or it grows without bound.
         """
         if self.others:
             raise ModelError(
@@ -73,12 +73,12 @@ class Mechanism:
         return simulate_plant(receptance, self.friction, force, progress)
 
     def force_under(self, displacement: Waveform, progress: Progress | None = None) -> Signal:
-        """Return the force F(t) that a displacement x(t) takes, from rest.
+        """Return the force F(t) for a displacement x(t), from rest.
 
         Raises
         ------
         ModelError
-            If the linear part asks for more than the displacement's second derivative.
+            If the linear part needs more than the second derivative of the displacement.
         """
         polynomial, rest = self.linear.split()
         if polynomial.size > 3:

@@ -5,11 +5,11 @@ With H the linear part's receptance as a state-space system and F the Dahl force
     z' = A z + B w,   x = C z + D w,   w(t) = u(t) - sum F(x)
 
 Between two reversals every Dahl force is a smooth function of x alone, known in closed form
-from the force at the last turning point, so friction needs no state and no step can drift from
-Eqn. 2. Each interval is solved by collocation at the 13 Chebyshev points (Newton's method in x;
-the linear states are eliminated exactly), and is halved until the last Chebyshev coefficients
-vanish beside the motion. Where the velocity's polynomial changes sign, the interval ends: the
-reversal is located, not stepped over, and the next interval starts on the new branch.
+from the force at the last turning point, so friction needs no integrated state and cannot drift
+from Eqn. 2. Each interval is solved by collocation at the 13 Chebyshev points (Newton's method in
+x; the linear states are eliminated exactly), and is halved until the last Chebyshev coefficients
+are negligible compared with the motion. The interval ends where the velocity's polynomial changes
+sign: the reversal is located exactly, and the next interval starts on the new branch.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def simulate_plant(
     force: Waveform,
     progress: Progress | None = None,
 ) -> Trajectory:
-    """Return the displacement of a plant that starts at rest, without force in its friction.
+    """Return the displacement of a plant that starts at rest with zero friction force.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def simulate_plant(
     force : Waveform
         u(t), N.
     progress : callable, optional
-        Told the fraction of the time that is done, now and then.
+        Called from time to time with the completed fraction of the time.
 
     Returns
     -------
@@ -105,7 +105,7 @@ class _Friction:
         return force, slope
 
     def turn(self, x: float) -> None:
-        """Go on from `x` in the other direction."""
+        """Continue from `x` in the other direction."""
         self._at_turn = [self.direction * float(own) for own, _ in self._branches(np.asarray(x))]
         self._x_turn = x
         self.direction = -self.direction
@@ -126,7 +126,7 @@ class _Operator(NamedTuple):
     states_driven: FloatArray  # from w at all nodes, (12, n, 13)
     x_free: FloatArray  # (12, n)
     x_driven: FloatArray  # (12, 13)
-    softness: float  # the most that a force of 1 within the interval moves x
+    softness: float  # largest change of x by a force of 1 within the interval
 
 
 class _Interval(NamedTuple):
@@ -153,8 +153,8 @@ class _Run:
         self.coefficients: list[FloatArray] = []
 
     def advance(self, segment: Segment) -> None:
-        """Go on to the end of one segment of the force."""
-        # powers of two, so that few operators are ever built
+        """Continue to the end of one segment of the force."""
+        # powers of two, so that only few operators are built
         longest = 2.0 ** float(np.floor(np.log2(0.25 / min(segment.frequency_hz))))
         self._length = min(self._length, longest)
         t = segment.start
@@ -181,7 +181,7 @@ class _Run:
             self._friction.turn(self._x)
             self._flipped = True
             return t
-        if turn == 0.0:  # at rest within rounding: no direction is right
+        if turn == 0.0:  # at rest within rounding: the direction is undefined
             turn = 1.0
         self._keep(t, length, interval)
         self._move_on(operator, interval, turn)
@@ -221,7 +221,7 @@ class _Run:
         return _Interval(x, u - force, tail / (_TOLERANCE * peak) if tail > 0.0 else 0.0)
 
     def _first_turn(self, x: FloatArray) -> float:
-        """Return the place in [0, 1] where the motion turns back, 0 if from the start, else 1."""
+        """Return the position in [0, 1] of the reversal; 0 if at the start, 1 if there is none."""
         speed = self._friction.direction * (FINE_DERIVATIVE @ x)
         noise = _NOISE * max(self._peak, float(np.max(np.abs(x))))
         backwards = speed < -noise
@@ -247,7 +247,7 @@ class _Run:
         self.coefficients.append(TO_COEFFICIENTS @ interval.x)
 
     def _move_on(self, operator: _Operator, interval: _Interval, turn: float) -> None:
-        """Take over states and displacement at the end of the interval, or where it turns."""
+        """Store states and displacement at the end of the interval, or at the reversal."""
         states = operator.states_free @ self._states + operator.states_driven @ interval.w
         if turn < 1.0:
             row = row_at(turn)

@@ -1,9 +1,9 @@
-"""Random numbers that depend on a seed and a purpose alone.
+"""Random numbers that depend only on a seed and a purpose.
 
-Every effect of the synthetic laboratory draws from a stream of its own, so that adding one
-leaves the others as they were. The bits come from PCG64, and normal numbers from the inverse
-of their distribution: no draw is ever rejected, so no difference in the last digit of a
-platform's mathematics can shift a stream.
+Every effect of the synthetic laboratory has its own stream, so that adding an effect does not
+change the others. The bits come from PCG64, and normal numbers from the inverse of their
+distribution: no draw is ever rejected, so platform differences in the last digit cannot shift a
+stream.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dahl_ident.arrays import FloatArray
 
 
 class Draws:
-    """The random streams of one seed, each called by its purpose.
+    """The random streams of one seed, each identified by its purpose.
 
     Parameters
     ----------

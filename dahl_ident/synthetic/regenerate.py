@@ -22,7 +22,7 @@ from dahl_ident.synthetic.shipped import datasets_directory
 
 
 def make(one: DataSet) -> Record | FrequencyResponse:
-    """Return a data set as its experiment and seed give it."""
+    """Return the data set of an experiment and its seed."""
     return simulate(one.experiment, seed=one.seed)
 
 

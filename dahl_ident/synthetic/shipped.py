@@ -1,4 +1,4 @@
-"""Load the data sets that ship with the package, each with its truth beside it."""
+"""Loading of the shipped data sets, each with its true parameters."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def load_dataset(name: str) -> FrequencyResponse | Record:
     Returns
     -------
     FrequencyResponse or Record
-        Its provenance holds what the JSON file beside it says: the true parameters (truth),
+        Its provenance holds the content of the accompanying JSON file: the true parameters (truth),
         the experiment and seed that made it, what it teaches, which parameters it determines.
 
     Raises

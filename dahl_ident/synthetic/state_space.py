@@ -102,7 +102,7 @@ class Rational:
 
 
 def _leading(polynomial: FloatArray, rate: float) -> FloatArray:
-    """Return a polynomial from its first coefficient that matters at s = rate."""
+    """Return a polynomial without leading coefficients that are negligible at s = rate."""
     sizes = np.abs(polynomial) * rate ** np.arange(polynomial.size - 1, -1, -1)
     return polynomial[int(np.argmax(sizes > 1e-12 * np.max(sizes))) :]
 

@@ -1,8 +1,8 @@
-"""Tables of response as a laboratory would have extracted them, errors included.
+"""Tables of response as extracted by a laboratory, with their errors.
 
 With the true phasors X and F and relative errors e of each part, the table holds
-F (1 + e_F) over X (1 + e_X) and the amplitude |X (1 + e_X)|, so that response and amplitude
-share the displacement's error; the covariance says so.
+F (1 + e_F) over X (1 + e_X) and the amplitude |X (1 + e_X)|, so that response and amplitude share
+the displacement's error, and the covariance includes this.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dahl_ident.synthetic.randomness import Draws
 
 @dataclass(frozen=True)
 class Table:
-    """Ask for a table of response, and say how good it is.
+    """Request for a table of response with given errors.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class Table:
 
 
 class Phasors(NamedTuple):
-    """What the sensors show of each row, without their noise; F_k is referred to t = 0."""
+    """The measured phasors of each row, without noise; F_k is referred to t = 0."""
 
     frequency_hz: FloatArray
     level: FloatArray
@@ -143,7 +143,7 @@ def _finished(
     table: Table,
     draws: Draws,
 ) -> FrequencyResponse:
-    """Add what is known of the errors, and the outliers, which nobody knows of."""
+    """Add the covariance of the errors, and the outliers, which it does not include."""
     rows = table.outlier_rows(data.n, draws)
     angle = 2.0 * np.pi * draws.uniform("outlier direction", data.n)[rows]
     response = data.response.copy()

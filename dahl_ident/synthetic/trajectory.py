@@ -1,4 +1,4 @@
-"""Chebyshev polynomials on short intervals: how a solution is computed, stored and read.
+"""Chebyshev polynomials on short intervals, in which solutions are computed and stored.
 
 A function is known by its values at the 13 Chebyshev points of every interval. From them come
 its integral (for the solver), its derivative (where the motion turns back), the size of its
@@ -46,7 +46,7 @@ def row_at(tau: float) -> FloatArray:
 
 
 class Trajectory:
-    """A function of time on consecutive intervals; still at its end values outside.
+    """A function of time on consecutive intervals; constant outside, at its end values.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """Smooth excitation waveforms: sines whose amplitude and frequency move from step to step.
 
-A waveform is a chain of segments, each a(t) sin(phi(t)) with the phase carried on, so value,
+A waveform is a chain of segments, each a(t) sin(phi(t)) with continuous phase, so value,
 velocity and acceleration are known in closed form at every instant. A level or a frequency
 changes along the quintic 10 tau^3 - 15 tau^4 + 6 tau^5, whose first two derivatives vanish at
-both ends: the acceleration has no jump for a mass to feel.
+both ends: the acceleration has no jumps.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Waveform:
         return max(max(s.frequency_hz) for s in self.segments)
 
     def motion(self, time: FloatArray) -> Motion:
-        """Return value and derivatives at any times; still at its end values outside."""
+        """Return value and derivatives at any times; constant outside, at the end values."""
         t = np.clip(np.asarray(time), 0.0, self.duration)
         starts = np.array([s.start for s in self.segments])
         which = np.searchsorted(starts, t, side="right") - 1
@@ -166,7 +166,7 @@ class WaveformBuilder:
 
 
 def _between(q0: float, q1: float, course: Course, tau: FloatArray) -> FloatArray | float:
-    """Return what moves from q0 to q1 as tau goes from 0 to 1."""
+    """Return the course from q0 to q1 as tau goes from 0 to 1."""
     if q0 == q1:
         return q0
     return _between_with_slopes(q0, q1, course, tau)[0]
@@ -175,7 +175,7 @@ def _between(q0: float, q1: float, course: Course, tau: FloatArray) -> FloatArra
 def _between_with_slopes(
     q0: float, q1: float, course: Course, tau: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return what moves from q0 to q1, with two derivatives by tau."""
+    """Return the course from q0 to q1, with two derivatives with respect to tau."""
     step = q1 - q0
     if course == "linear" or step == 0.0:
         return q0 + step * tau, np.full_like(tau, step), np.zeros_like(tau)
@@ -191,7 +191,7 @@ def _between_with_slopes(
 
 
 def _integral(q0: float, q1: float, course: Course, tau: FloatArray) -> FloatArray:
-    """Return the integral of what moves from q0 to q1, from 0 to tau."""
+    """Return the integral of the course from q0 to q1, from 0 to tau."""
     step = q1 - q0
     if step == 0.0:
         return q0 * tau
