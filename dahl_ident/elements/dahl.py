@@ -661,7 +661,7 @@ class TabulatedDahl(Dahl):
 
 
 def _is_linear(alpha: FloatArray) -> bool:
-    return bool(np.all(alpha == 1.0))
+    return bool(np.equal(alpha, 1.0).all())
 
 
 def _per(c: ComplexArray, beta: FloatArray) -> ComplexArray:

@@ -54,8 +54,9 @@ class Model(Element):
         self.is_linear = all(element.is_linear for element in flat)
         self.rate_independent = all(element.rate_independent for element in flat)
         self.has_memory = any(element.has_memory for element in flat)
-        clashes = [n for n, count in Counter(p.name for p in self.parameters).items() if count > 1]
-        if clashes:
+        names = [p.name for p in self.parameters]
+        if len(set(names)) < len(names):
+            clashes = [name for name, count in Counter(names).items() if count > 1]
             raise ModelError(
                 f"two elements share the parameter names {', '.join(clashes)}; "
                 "give each a name, such as Dahl(name='pivot')"

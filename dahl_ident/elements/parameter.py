@@ -120,6 +120,8 @@ class Parameter:
 
     def bound(self, name: str, given: float | None) -> Parameter:
         """Return this declaration as a parameter called `name`: fixed at a number, or free."""
+        if given is None and self.value is None and self.free and name == self.name:
+            return self
         assumed = isinstance(given, Assumed)
         return replace(self, name=name, value=given, free=None, assumed=assumed)
 

@@ -9,7 +9,7 @@ given,
 and springs, dampers and masses are linear anyway. Least squares in dynamic stiffness, with
 amplitudes as measured and weights that the noise model has at the data, is therefore a search
 over the directions that are left (:mod:`dahl_ident.fitting.directions`): at each node of a grid of
-those, the linear parameters are solved exactly. Every local minimum over the grid is a start.
+those, the linear parameters are solved exactly. The lowest local minima are the starts.
 
 A length has four nodes a decade from a hundredth of the smallest amplitude to a hundred times
 the largest, and one a decade beyond, down to 1e-8 and up to 1e6 times. Farther out the curve is
@@ -53,6 +53,7 @@ _DEPENDENT = 1e-12  # of a column's length that others leave
 _MOST_COMBINATIONS = 4000
 _MOST_OF_ONE = 1000  # of one element whose curves have to be computed node by node
 _MOST_STARTS = 4
+_HOPELESS = 100.0  # times the lowest sum of squares: no start, even with coarse nodes
 _AROUND = np.array([-1, 0, 1])
 
 
@@ -104,11 +105,8 @@ def _starts(problem: Problem, view: StiffnessData) -> Starts:
     lead = cost.shape[:-1]
     S, nodes = problem.n_tables, cost.shape[-1]
     table, place = _local_minima(cost.reshape(S, *grid.shape))
-    one = grid.shape == (nodes,)
-    edges = ((place == 0) | (place == nodes - 1)).any()
-    if (
-        one and nodes > sum(_FINE_ENDS) and edges
-    ):  # an optimum far out may be kept from there by bounds
+    at_edge = grid.shape == (nodes,) and ((place == 0) | (place == nodes - 1)).any()
+    if at_edge and nodes > sum(_FINE_ENDS):  # bounds may keep an optimum far out from there
         first = np.flatnonzero(np.diff(table, prepend=-1))
         for edge, nearer in ((0, _FINE_ENDS[0]), (nodes - 1, nodes - 1 - _FINE_ENDS[1])):
             there = first[place[first] == edge]
@@ -116,12 +114,13 @@ def _starts(problem: Problem, view: StiffnessData) -> Starts:
             place = np.append(place, np.full(there.size, nearer))
         order = np.argsort(table, kind="stable")
         table, place = table[order], place[order]
-    is_first = np.diff(table, prepend=-1) > 0
-    if lead:
-        theta = grid.of_tables(table).theta(coefficients[table], place[:, None])[:, 0]
-    else:
-        theta = grid.theta(coefficients, place)
-    theta[is_first] = best
+    theta = best
+    if table.size > S:
+        if lead:
+            theta = grid.of_tables(table).theta(coefficients[table], place[:, None])[:, 0]
+        else:
+            theta = grid.theta(coefficients, place)
+        theta[np.diff(table, prepend=-1) > 0] = best
     found = Starts(table, theta)
     if all(p.value is None for p in problem.parameters):
         return found
@@ -473,7 +472,7 @@ def _tabulated_curves(
         values[direction.parameter.name] = np.repeat(combinations[:, column], offsets.size)
     assert d.reference is not None
     values[d.reference.name] = np.ones(K * offsets.size)
-    node = np.tile(np.arange(offsets.size), K)
+    node = np.arange(K * offsets.size) % offsets.size
     edges = [node == 0, node == offsets.size - 1]
     # the curve at unit length is that of unit reference, whatever the reference's own dimension
     shift = d.reference.dimension[1] + 1
@@ -636,8 +635,11 @@ def _local_minima(cost: FloatArray) -> tuple[IntArray, IntArray]:
         return table, place
     order = np.lexsort((flat[table, place], table))
     table, place = table[order], place[order]
-    rank = np.arange(table.size) - np.searchsorted(table, table)
-    return table[rank < _MOST_STARTS], place[rank < _MOST_STARTS]
+    first = np.searchsorted(table, table)
+    rank = np.arange(table.size) - first
+    found = flat[table, place]
+    good = (rank == 0) | ((rank < _MOST_STARTS) & (found <= _HOPELESS * found[first]))
+    return table[good], place[good]
 
 
 def _taken(values: FloatArray, node: IntArray) -> FloatArray:

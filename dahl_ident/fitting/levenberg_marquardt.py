@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.problem import Quadratic
@@ -157,10 +158,10 @@ def gauss_newton(
         lever = size * np.where(logarithmic, 1.0, theta)
         if not 0.0 < size.min() <= size.max() < np.inf:
             return None
-        try:
-            step = np.linalg.solve(at.hessian / size / size[:, None], at.gradient / size) / -size
-        except np.linalg.LinAlgError:
+        _, scaled, failed = dposv(at.hessian / (size * size[:, None]), at.gradient / size)
+        if failed:
             return None
+        step = scaled / -size
         longest = (np.abs(step) * logarithmic).max()
         if not longest < _LONGEST_STEP:
             return None

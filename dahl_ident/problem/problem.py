@@ -126,11 +126,9 @@ class Problem:
     ) -> None:
         model, sensors = with_changes(as_model(model), sensors or EXACT, free, fixed or {})
         self.model, self.sensors = model, sensors
-        parameters = [
-            replace(p, unit=shown_unit(p.unit, motion))
-            for p in (*model.parameters, *sensors.parameters)
-            if p.free
-        ]
+        parameters = [p for p in (*model.parameters, *sensors.parameters) if p.free]
+        if motion == "rotation":
+            parameters = [replace(p, unit=shown_unit(p.unit, motion)) for p in parameters]
         if not parameters:
             raise ModelError(f"{model!r} has no free parameter; leave one out, or name it in free=")
         self._coordinates = Coordinates(parameters)
