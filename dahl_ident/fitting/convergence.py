@@ -120,8 +120,9 @@ def optima(
         covariance = inner * (final / scale)[:, None, None] ** 2
     status: list[Status] = []
     combinations: dict[int, tuple[Combination, ...]] = {}
-    bounded = np.isfinite(problem.bounds()).any()
-    outside = np.any(at_bound(problem, theta), axis=1) if bounded else np.zeros(S, dtype=np.bool_)
+    outside: NDArray[np.bool_] = np.zeros(S, dtype=np.bool_)
+    if problem.is_bounded:
+        outside = np.any(at_bound(problem, theta), axis=1)
     for table in range(S):
         at = ends.limits.get(table)
         if at is not None:

@@ -23,6 +23,7 @@ ln(A/length) whose steps divide those of the grid.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -148,9 +149,9 @@ def _vertices(grid: _Grid, cost: FloatArray, coefficients: FloatArray) -> FloatA
     nodes, P = cost.shape[-1], len(grid.problem.parameters)
     if grid.shape != (nodes,) or nodes < 3:
         return grid.theta(coefficients, best).reshape(-1, P)
-    around = np.clip(best, 1, nodes - 2) + _AROUND
+    around = np.minimum(np.maximum(best, 1), nodes - 2) + _AROUND
     theta = grid.theta(coefficients, around)
-    vertex = _vertex(np.take_along_axis(cost, around, axis=-1), theta)
+    vertex = _vertex(_taken(cost, around), theta)
     vertex = np.where(best == 0, theta[..., 0, :], vertex)
     return np.where(best == nodes - 1, theta[..., 2, :], vertex).reshape(-1, P)
 
@@ -265,7 +266,10 @@ class _Grid:
 
     def theta(self, coefficients: FloatArray, places: IntArray) -> FloatArray:
         """Return the search coordinates at some combinations of nodes, (..., k) -> (..., k, P)."""
-        chosen = np.take_along_axis(coefficients, places[..., None], axis=-2)
+        if coefficients.ndim == 2:
+            chosen = coefficients[places]
+        else:
+            chosen = np.take_along_axis(coefficients, places[..., None], axis=-2)
         found: dict[str, FloatArray] = {}
         used = 0
         for column in self.common:
@@ -299,7 +303,7 @@ def _grid(problem: Problem, view: StiffnessData) -> _Grid:
     each = _MOST_COMBINATIONS ** (1.0 / max(1, len(searched)))
     curves = [_curves(d, view, each) for d in searched]
     counts = [_size(c) for c in curves]
-    nodes = np.indices(counts).reshape(len(counts), int(np.prod(counts))).T
+    nodes = np.indices(counts).reshape(len(counts), math.prod(counts)).T
     rest = np.zeros(view.stiffness.shape, dtype=np.complex128)
     common: list[_Column] = []
     for d in every:

@@ -155,7 +155,6 @@ def gauss_newton(
     at, last, dof = evaluate(theta), 1e-300, max(n_residuals - theta.size, 1)
     for count in range(1, steps):
         size = np.sqrt(at.hessian.diagonal())
-        lever = size * np.where(logarithmic, 1.0, theta)
         if not 0.0 < size.min() <= size.max() < np.inf:
             return None
         _, scaled, failed = dposv(at.hessian / (size * size[:, None]), at.gradient / size)
@@ -166,15 +165,18 @@ def gauss_newton(
         if not longest < _LONGEST_STEP:
             return None
         moves = -float(step @ at.gradient)
+        if longest < _LAST_STEP:
+            lever = size * np.where(logarithmic, 1.0, theta)
+            shortest = max(
+                2.0 * _REMAINDER**2 * float(at.cost) / dof,
+                _ROUNDING_TOLERANCE**2 * float(lever @ lever),
+            )
+            if moves * min(1.0, moves / last) <= shortest:
+                cost = np.maximum(at.cost - 0.5 * moves, 0.0)
+                converged, counts = np.ones(1, dtype=np.bool_), np.array([count])
+                end = (theta + step)[None]
+                return Minima(end, cost[None], at.hessian[None], converged, counts)
         theta = theta + step
-        shortest = max(
-            2.0 * _REMAINDER**2 * float(at.cost) / dof,
-            _ROUNDING_TOLERANCE**2 * float(lever @ lever),
-        )
-        if longest < _LAST_STEP and moves * min(1.0, moves / last) <= shortest:
-            cost = np.maximum(at.cost - 0.5 * moves, 0.0)
-            converged, counts = np.ones(1, dtype=np.bool_), np.array([count])
-            return Minima(theta[None], cost[None], at.hessian[None], converged, counts)
         cost, last = at.cost, moves
         at = evaluate(theta)
         if not at.cost < cost:

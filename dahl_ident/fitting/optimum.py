@@ -368,18 +368,20 @@ def inverse(information: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     Parameters with a part in a null direction of the information have infinite variance and no
     covariance; the others keep what is determined.
     """
-    finite = np.asarray(np.isfinite(information).all(axis=(-2, -1)))[..., None, None]
-    information = np.where(finite, information, 0.0)
+    finite = np.isfinite(information)
+    if not finite.all():
+        information = np.where(finite.all(axis=(-2, -1), keepdims=True), information, 0.0)
     size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
     size = np.where(size > _NOTHING, size, 1.0)
     sizes = size[..., :, None] * size[..., None, :]
     values, vectors = np.linalg.eigh(information / sizes)
     null = values <= _NULL * np.maximum(1.0, values[..., -1:])
-    parts = np.abs(vectors) * null[..., None, :]
-    undetermined = np.asarray((parts > _PART).any(axis=-1), dtype=np.bool_)
     inverted = np.where(null, 0.0, 1.0 / np.where(null, 1.0, values))
     covariance = (vectors * inverted[..., None, :]) @ vectors.swapaxes(-1, -2) / sizes
-    return (blanked(covariance, undetermined) if undetermined.any() else covariance), undetermined
+    if not null.any():
+        return covariance, null
+    undetermined = np.any(np.abs(vectors) * null[..., None, :] > _PART, axis=-1)
+    return blanked(covariance, undetermined), undetermined
 
 
 def blanked(covariance: FloatArray, undetermined: NDArray[np.bool_]) -> FloatArray:

@@ -213,7 +213,7 @@ class _Search:
         self.logarithmic = np.array([p.transform == "log" for p in problem.parameters])
         self.friction = problem.friction_columns
         self.low, self.high = problem.bounds()
-        self.bounded = bool(np.isfinite([self.low, self.high]).any())
+        self.bounded = problem.is_bounded
         self.rescales = not problem.scale_known and bool(loss is not None or problem.priors)
         self.given = False
 
@@ -310,8 +310,9 @@ class _Search:
         if self.method == "scipy":
             minima = self._by_scipy(begin, phi, scale, chart, None if limit else inside)
         elif chart is None and loss is None and len(phi) == 1:
+            one = problem.table(0)
             minima = gauss_newton(
-                lambda theta: _only(evaluate(theta[None], None)), phi[0], logarithmic, self.m
+                lambda theta: one.quadratic(theta, scale), phi[0], logarithmic, self.m
             )
         minima = minima or minimise(
             evaluate,
@@ -420,8 +421,3 @@ class _Search:
         with np.errstate(invalid="ignore"):
             largest = np.asarray(np.sqrt(variance * spread.max(axis=1, initial=0.0)))
         return np.where(np.isnan(largest), np.inf, largest)
-
-
-def _only(at: Quadratic) -> Quadratic:
-    """Return the one entry of a batch of one."""
-    return Quadratic(at.cost[0], at.gradient[0], at.hessian[0])

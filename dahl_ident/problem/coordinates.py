@@ -56,6 +56,14 @@ class Coordinates:
         return np.where(self.positive, values, 1.0)
 
     @cached_property
+    def is_bounded(self) -> bool:
+        """Whether any parameter has a finite bound in search coordinates."""
+        return any(
+            p.upper < np.inf or p.lower > (0.0 if p.transform == "log" else -np.inf)
+            for p in self.parameters
+        )
+
+    @cached_property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """The parameters' lower and upper bounds in search coordinates."""
         lower = np.array([p.lower for p in self.parameters])

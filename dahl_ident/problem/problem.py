@@ -226,6 +226,11 @@ class Problem:
         """Return the parameters' lower and upper bounds in search coordinates."""
         return self._coordinates.bounds
 
+    @property
+    def is_bounded(self) -> bool:
+        """Whether any parameter has a finite bound in search coordinates."""
+        return self._coordinates.is_bounded
+
     def in_order(self, theta: ArrayLike) -> FloatArray:
         """Return theta with interchangeable elements ordered by rising knee, Dahl's by x_c.
 
