@@ -243,3 +243,27 @@ def test_use_of_the_velocity_must_be_declared() -> None:
         Forgot(1.0, 3.0, 1.5, 0.7).describing_function(1.0)
     with pytest.raises(ModelError, match="give the frequency"):
         SlopeOfLuGre(1.0, 3.0, 1.5, 0.7).describing_function(1.0)
+
+
+class Offset(Friction):
+    """Dahl's law over a length that no parameter holds: its units do not agree."""
+
+    parameters = (
+        Parameter("f_max", "N", "friction limit", lower=0.0, transform="log"),
+        Parameter("sigma", "N/m", "contact stiffness", lower=0.0, transform="log"),
+    )
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        f_max, sigma = values
+        return (sigma + 0.5 * f_max) * (1.0 - direction * force / f_max)
+
+
+def test_derivatives_of_a_law_whose_units_do_not_agree() -> None:
+    f_max, sigma, A = 1.3, 7.0, np.geomspace(1e-2, 1e1, 7)
+    values = [np.asarray(f_max), np.asarray(sigma)]
+    ours = Offset().stiffness_gradient(values, A, np.zeros(()))
+    stiff = Dahl(f_max, sigma + 0.5 * f_max)
+    exact = stiff.stiffness_gradient(stiff.known_values(), A, np.zeros(()))
+    by_f_max = exact.by_parameter[0] + 0.5 * exact.by_parameter[1]
+    np.testing.assert_allclose(ours.by_parameter[0], by_f_max, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(ours.by_parameter[1], exact.by_parameter[1], rtol=1e-7, atol=1e-9)

@@ -163,11 +163,11 @@ class Backlash(Friction):
             values[:-1], A, values[-1], harmonic, derivatives=derivatives
         )
 
-    def _loops(self, values: Sequence[FloatArray], A: FloatArray, rows: Rows) -> Loop:
+    def _loops(self, values: Sequence[FloatArray], A: FloatArray, rows: Rows, owner: Rows) -> Loop:
         gap = values[-1][rows] if values[-1].ndim else np.full(rows.size, float(values[-1]))
         moved = A.copy()
         moved[rows] -= 0.5 * gap
-        loop = super()._loops(values, moved, rows)
+        loop = super()._loops(values, moved, rows, owner)
         falling = None if loop.falling is None else _widened(loop.falling, gap)
         return replace(loop, amplitude=A[rows], rising=_widened(loop.rising, gap), falling=falling)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.steady_loop import Slope, branch_limit
+from dahl_ident.elements.steady_loop import ONE, Slope, branch_limit
 
 _BELOW, _ABOVE = 400, 720  # panels for forces against and with the motion
 _DEEPEST = 18.0  # y beyond which the law slips fully
@@ -33,7 +33,7 @@ class ForceCurve:
     """
 
     def __init__(self, slope: Slope, span: float, reach: float) -> None:
-        self._limit = float(branch_limit(slope, np.array([span]))[0])
+        self._limit = float(branch_limit(slope, np.array([span]), ONE)[0])
         self._reach = reach
         low = np.linspace(-reach, 0.0, _BELOW + 1)
         y = np.linspace(0.0, _DEEPEST, _ABOVE + 1)
@@ -118,7 +118,7 @@ def force_history(
     span = float(np.ptp(displacement)) if displacement.size else 0.0
     if displacement.size < 2 or span == 0.0:
         return np.full(displacement.shape, initial_force)
-    tops = [float(branch_limit(s, np.array([span]))[0]) for s in (rising, falling)]
+    tops = [float(branch_limit(s, np.array([span]), ONE)[0]) for s in (rising, falling)]
     reach = [max(tops[1], -initial_force), max(tops[0], initial_force)]
     curves = ForceCurve(rising, span, reach[0]), ForceCurve(falling, span, reach[1])
     steps = np.sign(np.diff(displacement))

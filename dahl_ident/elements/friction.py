@@ -7,9 +7,11 @@ else follows from it here, by quadrature (:mod:`dahl_ident.elements.steady_loop`
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -43,6 +45,7 @@ _RATED_BLOCK = 64
 _SUBSTEPS, _FORCE_STEP = 4, 1e-6
 _FARTHEST = 1e9  # m; a law that has not slipped fully there never does
 _START = 60  # steps from rest to the start of a path: as fine as a cycle of 240
+_FORCE_UNIT, _LENGTH_UNIT = 32.0, 2.0**-7  # in which a law should read the same
 _SOFTENED = 0.01  # share of the stiffness that is gone at the lower knee
 
 
@@ -162,12 +165,13 @@ class Friction(Element):
         """Return F_k/X_1 of the steady loop, unchecked."""
         if not self.rate_independent:
             return self._rated_stiffness(values, amplitude, omega, harmonic)
-        values, A, shape = _flat(values, amplitude, omega)
+        values, A, shape, owner = _flat(values, amplitude, omega)
         result = np.zeros(A.shape, dtype=np.complex128)
         moving = np.flatnonzero(A > _AT_REST)
         for start in range(0, moving.size, _BLOCK):
             rows = moving[start : start + _BLOCK]
-            result[rows] = self._loops(values, A, rows).coefficients(harmonic) / A[rows]
+            loops = self._loops(values, A, rows, owner)
+            result[rows] = loops.coefficients(harmonic) / A[rows]
         if harmonic == 1 and moving.size < A.size:
             rows = np.flatnonzero(A <= _AT_REST)
             result[rows] = _at_rest(self.quasi_static_slope, values, rows)
@@ -181,7 +185,7 @@ class Friction(Element):
         harmonic: int,
     ) -> ComplexArray:
         """Return F_k/X_1 of a velocity-dependent law, by collocation."""
-        values, A, shape = _flat(values, amplitude, omega)
+        values, A, shape, _ = _flat(values, amplitude, omega)
         w = np.broadcast_to(omega, shape).ravel().astype(np.float64)
         A = np.maximum(A, _SMALLEST)
         result = np.empty(A.shape, dtype=np.complex128)
@@ -218,19 +222,70 @@ class Friction(Element):
     ) -> StiffnessGradient:
         """Return F_k/X_1 with its derivatives, by central differences of fourth order.
 
-        Derivatives by parameters that are fixed are left at zero, which no estimate looks at.
+        Two parameters need none where the units of all agree with the law: N is then homogeneous
+        in the unit of force and in that of displacement, and Euler's theorem gives the two from
+        the others. Derivatives by parameters that are fixed may be left at zero, which no estimate
+        looks at.
         """
         value = self.stiffness(values, amplitude, omega, harmonic)
         arguments = [np.asarray(v) for v in values] + [np.asarray(amplitude)]
-        wanted = [i for i, p in enumerate(self.parameters) if p.free] + [len(values)]
+        P = len(values)
+        wanted = {P, *(i for i, p in enumerate(self.parameters) if p.free)}
+        powers, pair = self._scaled_pair(arguments)
+        others = {i for i, row in enumerate(powers) if any(row)} - {*pair}
+        fewer = (wanted | others) - {*pair}
+        if len(fewer) < len(wanted):
+            wanted = fewer
+        else:
+            pair = ()
 
         def at(*moved: FloatArray) -> ComplexArray:
             return self.stiffness(moved[:-1], moved[-1], omega, harmonic)
 
         slopes = {i: central_differences(at, arguments, i, value.shape) for i in wanted}
+        if pair:
+            # a_i p_i dN/dp_i sums up to N, and b_i p_i dN/dp_i with A dN/dA to -N
+            rest = np.stack([value, -value - arguments[P] * slopes[P]])
+            for i in others:
+                rest = rest - np.multiply.outer(powers[i], arguments[i] * slopes[i])
+            solved = np.tensordot(np.linalg.inv(np.transpose([powers[i] for i in pair])), rest, 1)
+            slopes |= {i: s / arguments[i] for i, s in zip(pair, solved, strict=True)}
         nothing = np.zeros(value.shape, dtype=np.complex128)
-        by_parameter = tuple(slopes.get(i, nothing) for i in range(len(values)))
-        return StiffnessGradient(value, slopes[len(values)], by_parameter)
+        by_parameter = tuple(slopes.get(i, nothing) for i in range(P))
+        return StiffnessGradient(value, slopes[P], by_parameter)
+
+    def _scaled_pair(
+        self, arguments: Sequence[FloatArray]
+    ) -> tuple[list[tuple[int, int]], tuple[int, ...]]:
+        """Return powers of force and displacement in all units, and two that are independent.
+
+        Two positive parameters; none where the units do not agree with the law. They do where the
+        slope is the same with force and displacement in other units, powers of two that change no
+        digit.
+        """
+        powers = [p.dimension[:2] if p.is_mechanical else (0, 0) for p in self.parameters]
+        positive = [i for i, p in enumerate(self.parameters) if p.transform == "log"]
+        pairs = [
+            (i, j)
+            for i, j in combinations(positive, 2)
+            if powers[i][0] * powers[j][1] != powers[i][1] * powers[j][0]
+        ]
+        if not (pairs and self.rate_independent and self.one_state):
+            return powers, ()
+        *one, A = (np.asarray(np.quantile(v, 0.5, method="nearest")) for v in arguments)
+        force = float(self.rest_stiffness(one)) * A * np.linspace(-1.5, 1.5, 12)
+        other = [
+            v * _FORCE_UNIT ** float(a) * _LENGTH_UNIT ** float(b)
+            for v, (a, b) in zip(one, powers, strict=True)
+        ]
+        same = True
+        with np.errstate(all="ignore"):
+            for direction in (1.0, -1.0):
+                s = self.quasi_static_slope(force, direction, one)
+                t = self.quasi_static_slope(force * _FORCE_UNIT, direction, other)
+                expected = np.asarray(s) * (_FORCE_UNIT / _LENGTH_UNIT)
+                same &= np.allclose(t, expected, rtol=1e-12, atol=0.0, equal_nan=True)
+        return powers, (pairs[0] if same else ())
 
     def stiffness_slope(
         self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
@@ -288,7 +343,7 @@ class Friction(Element):
 
     def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Return the forces of full slip in both directions, N; inf where there is none."""
-        values, _, shape = _flat(values, np.zeros(()), np.zeros(()))
+        values, _, shape, _ = _flat(values, np.zeros(()), np.zeros(()))
         rows = np.arange(int(np.prod(shape)))
         limits = []
         for side in (self._rising, self._falling):
@@ -355,14 +410,14 @@ class Friction(Element):
 
         Along one direction a deviation changes as the slope does: by its ratio at the two tips.
         """
-        values, A, shape = _flat(values, amplitude, omega)
+        values, A, shape, owner = _flat(values, amplitude, omega)
         result = np.ones(A.shape)
         rows = np.flatnonzero(A > _AT_REST)
         if not self.rate_independent:
             w = np.broadcast_to(omega, shape).ravel().astype(np.float64)
             result[rows] = np.abs(self._rated(values, A, w, rows)[0].decay)
         elif rows.size:
-            loop = self._loops(values, A, rows)
+            loop = self._loops(values, A, rows, owner)
             ends = np.stack([loop.top, loop.bottom], axis=1)
             up = self._rising(_rows(values, rows), ends, np.arange(rows.size))
             down = self._falling(_rows(values, rows), -ends, np.arange(rows.size))
@@ -414,9 +469,10 @@ class Friction(Element):
                 f"slip, {-down:g} and {up:g}"
             )
 
-    def _loops(self, values: Sequence[FloatArray], A: FloatArray, rows: Rows) -> Loop:
+    def _loops(self, values: Sequence[FloatArray], A: FloatArray, rows: Rows, owner: Rows) -> Loop:
         own = _rows(values, rows)
-        return closed_loop(partial(self._rising, own), partial(self._falling, own), A[rows])
+        sides = partial(self._rising, own), partial(self._falling, own)
+        return closed_loop(*sides, A[rows], owner[rows])
 
     def _rising(self, values: Sequence[FloatArray], force: FloatArray, rows: Rows) -> FloatArray:
         own = [v[rows, None] if v.ndim else v for v in values]
@@ -429,7 +485,8 @@ class Friction(Element):
     def _loop(self, values: Sequence[float], amplitude: float, theta: FloatArray) -> FloatArray:
         """Return the force on the closed loop at angles from 0 to 2 pi."""
         at = [np.asarray(v) for v in values]
-        top = self._loops(at, np.array([amplitude]), np.zeros(1, dtype=np.intp)).top[0]
+        one = np.zeros(1, dtype=np.intp)
+        top = self._loops(at, np.array([amplitude]), one, one).top[0]
         x = amplitude * np.cos(theta)
         return self.force_history(values, x, -amplitude * np.sin(theta), float(top))
 
@@ -642,12 +699,17 @@ class Friction(Element):
 
 def _flat(
     values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
-) -> tuple[list[FloatArray], FloatArray, tuple[int, ...]]:
-    """Return values and amplitudes as rows, single numbers left alone, and the whole shape."""
+) -> tuple[list[FloatArray], FloatArray, tuple[int, ...], Rows]:
+    """Return values and amplitudes as rows, single numbers left alone, and the whole shape.
+
+    And the same number for rows with the same values.
+    """
     arrays = [np.asarray(v, dtype=np.float64) for v in values]
     shape = np.broadcast_shapes(*(v.shape for v in arrays), np.shape(amplitude), np.shape(omega))
     flat = [np.broadcast_to(v, shape).ravel() if v.size != 1 else v.reshape(()) for v in arrays]
-    return flat, np.broadcast_to(amplitude, shape).ravel().astype(np.float64), shape
+    batch = np.broadcast_shapes(*(v.shape for v in arrays))
+    owner = np.broadcast_to(np.arange(math.prod(batch)).reshape(batch), shape).ravel()
+    return flat, np.broadcast_to(amplitude, shape).ravel().astype(np.float64), shape, owner
 
 
 def _rows(values: Sequence[FloatArray], rows: NDArray[Any]) -> list[FloatArray]:

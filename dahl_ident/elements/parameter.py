@@ -97,6 +97,11 @@ class Parameter:
             raise ValidationError(f"{self.name} is fixed but has no value; give one, or free it")
 
     @property
+    def is_mechanical(self) -> bool:
+        """Whether the unit is made of those of force, displacement and time."""
+        return _dimension(self.unit) is not None
+
+    @property
     def dimension(self) -> tuple[int, int, int]:
         """Powers of force, displacement and time in the unit: (1, -1, 0) for N/m.
 

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -40,7 +41,7 @@ with which a tip is approached."""
 _DEEPEST = 18.0  # y beyond which L - F is rounding
 _SECTIONS = 16  # of a bracket, when the force is sought at which s vanishes
 _NEWTON_STEPS = 60
-_CLOSE, _CONVERGED = 1e-4, 1e-9  # last steps of y, with the coarse and the fine rule
+_CLOSE, _CONVERGED = 1e-3, 1e-5  # last steps of y, with the coarse and the fine rule
 _OPEN = 1e-6  # of the path: a loop that misses it by more is not resolved
 
 
@@ -66,12 +67,17 @@ class Branch:
     left: FloatArray
     path: FloatArray
 
-    def half_angle(self, amplitude: FloatArray) -> FloatArray:
-        """Return psi, with x = -A cos(psi), at the nodes."""
+    def phasor(self, amplitude: FloatArray) -> ComplexArray:
+        """Return exp(-j psi), with x = -A cos(psi), at the nodes."""
         missing = 2.0 * amplitude - self.path
         missing[np.abs(missing) < 1e-10 * amplitude] = 0.0
         left = np.maximum(self.left + missing[:, None], 0.0)
-        return 2.0 * np.arctan2(np.sqrt(self.travelled), np.sqrt(left))
+        whole = 1.0 / (self.travelled + left)
+        gone, left = self.travelled * whole, left * whole
+        result = np.empty(left.shape, dtype=np.complex128)
+        result.real = left - gone
+        result.imag = -2.0 * np.sqrt(left * gone)
+        return result
 
 
 @dataclass(frozen=True)
@@ -89,33 +95,27 @@ class Loop:
 
     def coefficients(self, k: int) -> ComplexArray:
         """Return c_k, N; for k = 0 the mean force."""
-        psi = self.rising.half_angle(self.amplitude)
+        if self.falling is None and k % 2 == 0:
+            return np.zeros(self.amplitude.shape, dtype=np.complex128)
+        rising = self.rising.phasor(self.amplitude)
         if self.falling is None:
-            if k % 2 == 0:
-                return np.zeros(self.amplitude.shape, dtype=np.complex128)
-            return np.asarray(2j / (np.pi * k) * _transform(psi, self.rising.weight, k))
-        theta = self.falling.half_angle(self.amplitude)
+            return np.asarray(2j / (np.pi * k) * _transform(rising, self.rising.weight, k))
+        falling = self.falling.phasor(self.amplitude)
         if k == 0:
-            turned = np.sum(psi * self.rising.weight, axis=1)
-            turned -= np.sum(theta * self.falling.weight, axis=1)
+            turned = np.sum(np.angle(falling) * self.falling.weight, axis=1)
+            turned -= np.sum(np.angle(rising) * self.rising.weight, axis=1)
             return np.asarray(0.5 * (self.top + self.bottom) - 0.5 / np.pi * turned + 0j)
-        up = _transform(psi, self.rising.weight, k)
-        down = _transform(theta, self.falling.weight, k)
+        up = _transform(rising, self.rising.weight, k)
+        down = _transform(falling, self.falling.weight, k)
         return np.asarray(((-1) ** k * up - down) / (1j * np.pi * k))
 
 
-def _transform(angle: FloatArray, weight: FloatArray, k: int) -> ComplexArray:
-    """Return Int exp(-j k angle) dF."""
-    if k == 1:
-        real, imag = np.cos(angle), np.sin(angle)
-    else:
-        real, imag = np.cos(k * angle), np.sin(k * angle)
-    return np.asarray(
-        np.einsum("rn,rn->r", real, weight) - 1j * np.einsum("rn,rn->r", imag, weight)
-    )
+def _transform(phasor: ComplexArray, weight: FloatArray, k: int) -> ComplexArray:
+    """Return Int exp(-j k psi) dF, from exp(-j psi)."""
+    return np.asarray(np.einsum("rn,rn->r", phasor if k == 1 else phasor**k, weight))
 
 
-def closed_loop(rising: Slope, falling: Slope, amplitude: FloatArray) -> Loop:
+def closed_loop(rising: Slope, falling: Slope, amplitude: FloatArray, owner: Rows) -> Loop:
     """Return the steady loops of a law.
 
     Parameters
@@ -126,6 +126,8 @@ def closed_loop(rising: Slope, falling: Slope, amplitude: FloatArray) -> Loop:
         s(-F, -1): the falling branch turned about the origin.
     amplitude : ndarray, shape (rows,)
         A > 0, m.
+    owner : ndarray of int, shape (rows,)
+        The same number for rows that have the same parameters.
 
     Returns
     -------
@@ -133,13 +135,15 @@ def closed_loop(rising: Slope, falling: Slope, amplitude: FloatArray) -> Loop:
         With the Fourier coefficients.
     """
     A, rows = amplitude, np.arange(amplitude.size)
-    top = branch_limit(rising, A)
-    up = _odd_tip(rising, top, A)
-    if _same(rising, falling, top):
+    _, first, group = np.unique(owner, return_index=True, return_inverse=True)
+    same = Groups(first, group)
+    top = branch_limit(rising, A, same)
+    up = _odd_tip(rising, top, A, same)
+    if _same(rising, falling, top, first):
         force = top * np.tanh(up)
         return Loop(A, force, -force, _branch(rising, rows, -force, top, up), None)
-    bottom = branch_limit(falling, A)
-    down = _odd_tip(falling, bottom, A)
+    bottom = branch_limit(falling, A, same)
+    down = _odd_tip(falling, bottom, A, same)
     up, down = _both_tips(rising, falling, top, bottom, up, down, A)
     highest, lowest = top * np.tanh(up), -bottom * np.tanh(down)
     return Loop(
@@ -151,54 +155,76 @@ def closed_loop(rising: Slope, falling: Slope, amplitude: FloatArray) -> Loop:
     )
 
 
-def _same(rising: Slope, falling: Slope, top: FloatArray) -> bool:
+class Groups(NamedTuple):
+    """Rows that have the same parameters: the first of each group, and every row's group."""
+
+    first: Rows
+    of: Rows
+
+
+ONE = Groups(np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp))
+
+
+def _same(rising: Slope, falling: Slope, top: FloatArray, rows: Rows) -> bool:
     """Return whether the law is odd, judged at nine forces."""
-    force, rows = top[:, None] * np.linspace(-0.93, 0.97, 9), np.arange(top.size)
+    force = top[rows, None] * np.linspace(-0.93, 0.97, 9)
     one, other = rising(force, rows), falling(force, rows)
     return bool(np.all(np.abs(one - other) <= 1e-13 * (np.abs(one) + np.abs(other))))
 
 
-def force_limit(rising: Slope, start: FloatArray) -> FloatArray:
-    """Return the least force above 0 at which s vanishes, inf where there is none below `start`."""
+def force_limit(rising: Slope, start: FloatArray, first: Rows | None = None) -> FloatArray:
+    """Return the least force above 0 at which s vanishes, inf where there is none below `start`.
+
+    `first` are the rows whose parameters are meant, if not all.
+    """
     fractions = np.arange(1, _SECTIONS + 1) / _SECTIONS
     result = np.full(start.shape, np.inf)
-    rows = np.arange(start.size)
+    place = np.arange(start.size)
+    rows = place if first is None else first
     low, width = np.zeros(start.shape), start.copy()
     for step in range(60):
         with np.errstate(all="ignore"):
             stuck = ~(rising(low[:, None] + width[:, None] * fractions, rows) > 0.0)
         if step == 0:
             found = stuck.any(axis=1)
-            rows, low, width, stuck = rows[found], low[found], width[found], stuck[found]
+            place, rows, stuck = place[found], rows[found], stuck[found]
+            low, width = low[found], width[found]
         stuck[:, -1] = True
         width = width / _SECTIONS
         low = low + width * stuck.argmax(axis=1)
-        result[rows] = low
+        result[place] = low
         if np.all(width <= 1e-16 * low):
             break
     return result
 
 
-def branch_limit(rising: Slope, A: FloatArray) -> FloatArray:
+def branch_limit(rising: Slope, A: FloatArray, same: Groups) -> FloatArray:
     """Return L of every row: where s vanishes, or else a force beyond the loop's tip."""
-    rows = np.arange(A.size)
-    start = 2.0 * rising(np.zeros((A.size, 1)), rows)[:, 0] * A
+    start = 2.0 * rising(np.zeros((A.size, 1)), np.arange(A.size))[:, 0] * A
     while True:
-        limit = np.minimum(force_limit(rising, start), start)
-        deepest = np.full(A.shape, _DEEPEST)
-        path = _branch(rising, rows, -limit, limit, deepest, _COARSE).path
-        short = (limit == start) & (path < 2.0 * A) & (start < 1e150) & (start > 0.0)
-        if not short.any():
+        farthest = np.zeros(same.first.shape)
+        np.maximum.at(farthest, same.of, start)
+        limit = np.minimum(force_limit(rising, farthest, same.first)[same.of], start)
+        beyond = np.flatnonzero((limit == start) & (start < 1e150) & (start > 0.0))
+        if not beyond.size:
             return limit
-        start = np.where(short, 4.0 * start, start)
+        top = limit[beyond]
+        path = _path(rising, beyond, -top, top, np.full(top.shape, _DEEPEST), _COARSE)
+        short = beyond[path < 2.0 * A[beyond]]
+        if not short.size:
+            return limit
+        start[short] *= 4.0
 
 
-def _odd_tip(rising: Slope, limit: FloatArray, A: FloatArray) -> FloatArray:
+def _odd_tip(rising: Slope, limit: FloatArray, A: FloatArray, same: Groups) -> FloatArray:
     """Return Y at which an odd loop of this branch closes; the deepest where it slips fully."""
-    rows = np.arange(A.size)
     result = np.full(A.shape, _DEEPEST)
-    slips = _branch(rising, rows, -limit, limit, result).path <= 2.0 * A
-    rows = rows[~slips]
+    # rows of one group with the same limit have the same longest path
+    _, first, group = np.unique(
+        np.stack([same.of, limit]), axis=1, return_index=True, return_inverse=True
+    )
+    longest = _path(rising, first, -limit[first], limit[first], result[first])[group.ravel()]
+    rows = np.flatnonzero(longest > 2.0 * A)
     stiffness = rising(np.zeros((rows.size, 1)), rows)[:, 0]
     guess = np.minimum(stiffness * A[rows] / limit[rows], 0.5 * _DEEPEST)
     result[rows] = _newton(rising, rows, limit[rows], A[rows], guess, _COARSE, _CLOSE)
@@ -222,7 +248,7 @@ def _newton(
     for _ in range(_NEWTON_STEPS):
         y, top = result[going], limit[going]
         force = top * np.tanh(y)
-        path = _branch(rising, rows[going], -force, top, y, nodes).path
+        path = _path(rising, rows[going], -force, top, y, nodes)
         excess = np.log(path / (2.0 * A[going]))
         ends = rising(np.stack([force, -force], axis=1), rows[going])
         with np.errstate(all="ignore"):
@@ -253,8 +279,8 @@ def _both_tips(
     rows = np.arange(A.size)
     for _ in range(_NEWTON_STEPS):
         highest, lowest = top * np.tanh(up), bottom * np.tanh(down)
-        one = np.log(_branch(rising, rows, -lowest, top, up).path / (2.0 * A))
-        other = np.log(_branch(falling, rows, -highest, bottom, down).path / (2.0 * A))
+        one = np.log(_path(rising, rows, -lowest, top, up) / (2.0 * A))
+        other = np.log(_path(falling, rows, -highest, bottom, down) / (2.0 * A))
         s = rising(np.stack([highest, -lowest], axis=1), rows)
         t = falling(np.stack([lowest, -highest], axis=1), rows)
         p, q = top / np.cosh(up) ** 2, bottom / np.cosh(down) ** 2
@@ -276,16 +302,43 @@ def _both_tips(
     return up, down
 
 
-def _branch(
+def _path(
     rising: Slope,
     rows: Rows,
     bottom: FloatArray,
     limit: FloatArray,
     Y: FloatArray,
     nodes: tuple[int, int] = _FINE,
+) -> FloatArray:
+    """Return the path of the branch from the force `bottom` up to ``limit tanh(Y)``."""
+    return np.asarray(_steps(rising, rows, bottom, limit, Y, _rule(*nodes))[2].sum(axis=1))
+
+
+def _branch(
+    rising: Slope, rows: Rows, bottom: FloatArray, limit: FloatArray, Y: FloatArray
 ) -> Branch:
     """Return the branch from the force `bottom` up to ``limit tanh(Y)``."""
-    rule = _rule(*nodes)
+    rule = _rule(*_FINE)
+    force, weight, path = _steps(rising, rows, bottom, limit, Y, rule)
+    down, up = path[:, : _FINE[0]], path[:, _FINE[0] :]
+    below, above = down.sum(axis=1)[:, None], up.sum(axis=1)[:, None]
+    # what is small near a tip is summed from there, the rest is its complement
+    to, rest = down @ rule.below_to, up @ rule.above_from
+    travelled = np.concatenate([to, below + (above - rest)], axis=1)
+    left = np.concatenate([(below - to) + above, rest], axis=1)
+    whole = (below + above)[:, 0]
+    return Branch(force, weight, np.abs(travelled), np.abs(left), whole)
+
+
+def _steps(
+    rising: Slope,
+    rows: Rows,
+    bottom: FloatArray,
+    limit: FloatArray,
+    Y: FloatArray,
+    rule: _Rule,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return forces, their weights and the path's weighted slopes at the nodes of a branch."""
     start, limit = np.minimum(bottom, 0.0)[:, None], limit[:, None]
     y = Y[:, None] * rule.rise
     tanh = np.tanh(y)
@@ -294,14 +347,7 @@ def _branch(
     weight = np.concatenate([start * rule.below_weight, high_weight], axis=1)
     with np.errstate(all="ignore"):
         path = weight / rising(force, rows)
-    path = np.where(path > 0.0, path, 0.0)  # L itself, to rounding
-    down, up = path[:, : nodes[0]], path[:, nodes[0] :]
-    below, above = down.sum(axis=1), up.sum(axis=1)
-    if nodes != _FINE:
-        return Branch(force, weight, path, path, below + above)
-    travelled = np.concatenate([down @ rule.below_to, below[:, None] + up @ rule.above_to], axis=1)
-    left = np.concatenate([down @ rule.below_from + above[:, None], up @ rule.above_from], axis=1)
-    return Branch(force, weight, np.abs(travelled), np.abs(left), below + above)
+    return force, weight, np.where(path > 0.0, path, 0.0)  # L itself, to rounding
 
 
 @dataclass(frozen=True)
@@ -311,22 +357,21 @@ class _Rule:
     fall: FloatArray  # the force below 0 over the tip's
     below_weight: FloatArray  # of the force, over the tip's
     below_to: FloatArray
-    below_from: FloatArray
     rise: FloatArray  # y over Y
     above_weight: FloatArray  # of y, over Y
-    above_to: FloatArray
     above_from: FloatArray
 
 
 @lru_cache
 def _rule(below: int, above: int) -> _Rule:
-    root, weight, to, rest = _gauss(below)
-    down = 1.0 - root * root, -2.0 * root * weight, to, rest
-    node, weight, to, rest = _gauss(above)
-    return _Rule(*down, 1.0 - (1.0 - node) ** 2, 2.0 * (1.0 - node) * weight, to, rest)
+    root, weight, to = _gauss(below)
+    down = 1.0 - root * root, -2.0 * root * weight, to
+    node, weight, to = _gauss(above)
+    return _Rule(*down, 1.0 - (1.0 - node) ** 2, 2.0 * (1.0 - node) * weight, 1.0 - to)
 
 
-def _gauss(n: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _gauss(n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return places and weights between 0 and 1, and integrals of weighted values to each."""
     node, weight = legendre.leggauss(n)
     to = np.zeros((n, n))
     for degree in range(n):
@@ -335,4 +380,4 @@ def _gauss(n: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         # the coefficient of a Legendre polynomial is a weighted sum of the values
         share = (degree + 0.5) * legendre.legval(node, series)
         to += np.outer(share, legendre.legval(node, legendre.legint(series, lbnd=-1.0)))
-    return (1.0 + node) / 2.0, weight / 2.0, to, 1.0 - to
+    return (1.0 + node) / 2.0, weight / 2.0, to
