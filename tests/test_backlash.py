@@ -163,3 +163,58 @@ def test_description_and_refusals() -> None:
         with pytest.raises(ModelError, match="Backlash got"):
             Backlash(element, 0.1)
     assert isinstance(Backlash(Dahl()).element, Friction)
+
+
+def test_two_limits_behind_a_gap_are_those_of_the_general_loop() -> None:
+    """Closed forms against the quadrature that every law takes, and against differences."""
+    rng = np.random.default_rng(3)
+    for i in range(30):
+        f_max, sigma = 10.0 ** rng.uniform(-2.0, 2.0, 2)
+        asymmetry, gap = rng.uniform(-0.7, 0.7), f_max / sigma * 10.0 ** rng.uniform(-2.0, 1.0)
+        A = 0.5 * gap + f_max / sigma * 10.0 ** rng.uniform(-1.0, 1.2, 2)
+        law = Backlash(Dahl(f_max, sigma, asymmetry=asymmetry), gap)
+        free = as_model(law).with_free(["f_max", "sigma", "asymmetry", "gap"])
+        values, k = law.known_values(), i % 8
+        found = free.stiffness_gradient(values, A, AT_REST, k)
+        # an exponent of 1 to rounding has no closed form
+        other = Backlash(Dahl(f_max, sigma, 1.0 + 1e-12, asymmetry=asymmetry), gap)
+        general = other.stiffness(other.known_values(), A, AT_REST, k)
+        size = np.abs(law.stiffness(values, A, AT_REST))
+        assert np.all(np.abs(found.value - general) < 1e-8 * size)
+        for j in (0, 1, 3, 4):
+            step = 1e-6 * abs(float(values[j]))
+            ends = [
+                law.stiffness(
+                    [v + s * step * (m == j) for m, v in enumerate(values)], A, AT_REST, k
+                )
+                for s in (1.0, -1.0)
+            ]
+            slope = (ends[0] - ends[1]) / (2.0 * step)
+            error = np.abs(slope - found.by_parameter[j]) * abs(float(values[j]))
+            assert np.all(error < 1e-6 * size * A / (A - 0.5 * gap))
+
+
+@pytest.mark.parametrize("asymmetry", [0.0, 0.3])
+@pytest.mark.parametrize("start", [0.0, 0.4])
+def test_a_history_behind_a_gap_is_exact(asymmetry: float, start: float) -> None:
+    """Against the tables that every law takes, and its derivatives against differences."""
+    rng = np.random.default_rng(5)
+    x = 0.3 * np.cumsum(rng.standard_normal(300)) + 2.0 * np.sin(0.05 * np.arange(300.0))
+    inner = Dahl(1.0, 3.0, asymmetry=asymmetry) if asymmetry else Dahl(1.0, 3.0)
+    law = Backlash(inner, 0.8)
+    values = [float(v) for v in law.known_values()]
+    found = law.force_history_gradient(values, x, state=start)
+    moved = [v + 1e-12 * (label == "alpha") for label, v in zip(law.labels, values, strict=True)]
+    np.testing.assert_allclose(found.value, law.force_history(moved, x, state=start), atol=1e-7)
+    for j, label in enumerate(law.labels):
+        if label != "alpha":
+            ends = [
+                law.force_history([v * (1.0 + s * 1e-6 * (m == j)) for m, v in enumerate(values)],
+                                  x, state=start)
+                for s in (1.0, -1.0)
+            ]  # fmt: skip
+            slope = (ends[0] - ends[1]) / (2e-6 * values[j])
+            np.testing.assert_allclose(found.by_parameter[j], slope, atol=1e-7)
+    if start:
+        ends = [law.force_history(values, x, state=start + s) for s in (1e-6, -1e-6)]
+        np.testing.assert_allclose(found.by_state, (ends[0] - ends[1]) / 2e-6, atol=1e-7)

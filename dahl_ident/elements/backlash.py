@@ -26,6 +26,7 @@ from dahl_ident.elements.element import (
     Asymptote,
     Combination,
     Element,
+    HistoryGradient,
     Mechanics,
     StiffnessGradient,
     prefixed,
@@ -181,10 +182,32 @@ class Backlash(Friction):
         acceleration: FloatArray | None = None,
     ) -> FloatArray:
         """Return the force at every sample, unchecked."""
+        known = self.element.history_behind_gap(
+            values[:-1], float(values[-1]), displacement, float(state), derivatives=False
+        )
+        if known is not None:
+            return known.value
         at = [np.asarray(v, dtype=np.float64) for v in values]
         rising, falling = partial(self._rising, at), partial(self._falling, at)
         return force_curve.force_history(
             rising, falling, displacement, float(state), gap=float(values[-1])
+        )
+
+    def force_history_gradient(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
+        *,
+        acceleration: FloatArray | None = None,
+    ) -> HistoryGradient:
+        """Return the force at every sample with its derivatives, exactly for linear Dahl."""
+        known = self.element.history_behind_gap(
+            values[:-1], float(values[-1]), displacement, float(state)
+        )
+        return known or super().force_history_gradient(
+            values, displacement, velocity, state, acceleration=acceleration
         )
 
     def steady_force(

@@ -24,8 +24,10 @@ from dahl_ident.arrays import (
     non_negative_array,
 )
 from dahl_ident.elements import (
+    asymmetric_backlash,
     asymmetric_dahl,
     dahl_backlash,
+    dahl_gap_history,
     general_dahl,
     general_dahl_table,
     hysteresis,
@@ -480,6 +482,35 @@ class Dahl(Friction):
         by = (-sigma / f_max * both, h + both, np.zeros_like(h), 0.5 * sigma**2 / f_max * by_eta)
         return StiffnessGradient(sigma * h, sigma**2 / f_max * by_beta, by)
 
+    def history_behind_gap(
+        self,
+        values: Sequence[FloatArray | float],
+        gap: float,
+        displacement: FloatArray,
+        state: float,
+        *,
+        derivatives: bool = True,
+    ) -> HistoryGradient | None:
+        """Return the force behind a gap over time; None unless alpha = 1, and fixed."""
+        f_max, sigma, alpha, *asymmetry = (float(v) for v in values)
+        if alpha != 1.0 or (derivatives and self.parameters[2].free):
+            return None
+        force, by_state, by = dahl_gap_history.force_history(
+            displacement,
+            f_max,
+            sigma,
+            *(asymmetry or [0.0]),
+            gap,
+            float(state),
+            derivatives=derivatives,
+        )
+        if not derivatives:
+            return HistoryGradient(force, by_state, ())
+        by_asymmetry = by[2:3] if asymmetry else ()
+        return HistoryGradient(
+            force, by_state, (by[0], by[1], np.zeros(force.shape), *by_asymmetry, by[3])
+        )
+
     def _gradient(
         self,
         values: Sequence[FloatArray],
@@ -599,6 +630,55 @@ class _AsymmetricDahl(Dahl):
         f_max, sigma, *shape = values
         return f_max, sigma, (np.ones(()), np.ones(()), *shape)
 
+    def force_history(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
+        *,
+        acceleration: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return the force at every sample, exactly for alpha = 1, unchecked."""
+        known = self.history_behind_gap(values, 0.0, displacement, state, derivatives=False)
+        if known is not None:
+            return known.value
+        return Friction.force_history(self, values, displacement, velocity, state)
+
+    def force_history_gradient(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
+        *,
+        acceleration: FloatArray | None = None,
+    ) -> HistoryGradient:
+        """Return the force at every sample with its derivatives, exactly for alpha fixed at 1."""
+        known = self.history_behind_gap(values, 0.0, displacement, state)
+        if known is not None:
+            return known._replace(by_parameter=known.by_parameter[:-1])
+        return Friction.force_history_gradient(self, values, displacement, velocity, state)
+
+    def behind_gap(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        gap: FloatArray,
+        harmonic: int,
+        *,
+        derivatives: bool = True,
+    ) -> StiffnessGradient | None:
+        """Return F_k/X_1 behind a gap, with derivatives, the gap's last; None unless alpha = 1."""
+        f_max, sigma, alpha, asymmetry = values
+        by_alpha = derivatives and self.parameters[2].free
+        if by_alpha or not _is_linear(alpha) or harmonic > asymmetric_backlash.HIGHEST:
+            return None
+        value, by_A, by = asymmetric_backlash.stiffness_gradient(
+            amplitude, f_max, sigma, asymmetry, gap, harmonic
+        )
+        return StiffnessGradient(value, by_A, (*by[:2], np.zeros_like(value), *by[2:]))
+
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return an objection to a limit that is hardly there."""
         if abs(values[3]) < _ONE_SIDED:
@@ -612,9 +692,6 @@ class _AsymmetricDahl(Dahl):
     def __repr__(self) -> str:
         return super().__repr__().replace(type(self).__name__, "Dahl", 1)
 
-    behind_gap = Friction.behind_gap
-    force_history = Friction.force_history
-    force_history_gradient = Friction.force_history_gradient
     force_bounds = Friction.force_bounds
     knee = Friction.knee
     transient_decay = Friction.transient_decay

@@ -29,6 +29,7 @@ from dahl_ident.arrays import (
 from dahl_ident.elements import force_curve
 from dahl_ident.elements.element import (
     Element,
+    HistoryGradient,
     Mechanics,
     StiffnessGradient,
     central_differences,
@@ -435,6 +436,21 @@ class Friction(Element):
         derivatives: bool = True,
     ) -> StiffnessGradient | None:
         """Return F_k/X_1 of this law behind a gap, if wanted with derivatives, the gap's last.
+
+        None where the law has no closed form for it.
+        """
+        return None
+
+    def history_behind_gap(
+        self,
+        values: Sequence[FloatArray | float],
+        gap: float,
+        displacement: FloatArray,
+        state: float,
+        *,
+        derivatives: bool = True,
+    ) -> HistoryGradient | None:
+        """Return the force behind a gap over time, if wanted with derivatives, the gap's last.
 
         None where the law has no closed form for it.
         """

@@ -7,8 +7,8 @@
 3. Where a table's search has not converged, or leaves friction badly determined, the charts of
    microslip and the limits at infinity are searched as well
    (:mod:`dahl_ident.fitting.asymptotes`).
-4. Where there are bounds, or nothing has converged, `scipy.optimize.least_squares` goes on from
-   there.
+4. Where a search has left the bounds, or nothing has converged, `scipy.optimize.least_squares`
+   goes on from there.
 
 A robust loss, and a prior beside noise of unknown scale, make the optimum depend on the scale;
 it is then estimated and the search repeated until both agree. One table is a batch of one.
@@ -216,6 +216,7 @@ class _Search:
         self.bounded = problem.is_bounded
         self.rescales = not problem.scale_known and bool(loss is not None or problem.priors)
         self.given = False
+        self._strayed = np.zeros(problem.n_tables, dtype=np.bool_)  # where searches left the bounds
 
     @cached_property
     def reach(self) -> Reach:
@@ -255,7 +256,8 @@ class _Search:
             where = np.flatnonzero(doubtful)
             part = self._of(where)
             ends.put(where, part._look_wider(ends.take(where), begin.of(where), scale))
-        for table in np.flatnonzero(self.bounded | ~ends.minima.converged).tolist():
+        held = (doubtful | self._strayed) & self.bounded
+        for table in np.flatnonzero(held | ~ends.minima.converged).tolist():
             if table not in ends.limits:
                 ends.put_one(table, self._trust_region(table, ends, begin, scale))
         return ends
@@ -325,7 +327,9 @@ class _Search:
         )
         if self.bounded:
             theta = minima.theta if chart is None else chart.of(begin.table).theta(minima.theta)
-            minima.converged[:] &= ((theta >= self.low) & (theta <= self.high)).all(axis=1)
+            within = ((theta >= self.low) & (theta <= self.high)).all(axis=1)
+            minima.converged[:] &= within
+            self._strayed[begin.table[~within]] = True
         return minima if each else minima.best(begin.table, S)
 
     def _by_scipy(

@@ -33,6 +33,7 @@ from dahl_ident.time_domain import (
 
 Output = Literal["force", "motion"]
 _SHORTEST = 16
+_PER_CYCLE = 100.0  # samples that a slow cycle keeps where a record is too long
 _SUBSTEP = 0.4  # rad of the fastest motion in a step of integration
 _POWER = 0.999  # share of the drive's power below its band's end
 
@@ -166,13 +167,24 @@ class RecordProblem:
         return found
 
     def shortened(self, samples: int) -> RecordProblem:
-        """Return the problem with the liveliest part of each record, `samples` in all."""
+        """Return the problem with about `samples` samples in all.
+
+        Of measured displacements so many samples are left out as slow cycles do without; what is
+        still too long is cut to the liveliest part of each record.
+        """
         parts = []
+        spare = self.n_residuals / samples
         for record, y in zip(self.records, self.measured, strict=True):
-            n = max(_SHORTEST, samples * len(record) // self.n_residuals)
-            energy = np.concatenate([[0.0], np.cumsum((y - y.mean()) ** 2)])
-            start = int(np.argmax(energy[n:] - energy[:-n]))
-            parts.append(_cut(record, slice(start, start + n)))
+            step = 1
+            if self.output == "force":
+                x = np.asarray(record.displacement)
+                per_cycle = 2.0 * np.pi * np.std(x) / (np.std(np.diff(x)) or 1.0)
+                step = int(np.clip(per_cycle / _PER_CYCLE, 1.0, np.ceil(spare)))
+            n = max(_SHORTEST, int(samples * len(record) // self.n_residuals))
+            thin, wave = _cut(record, slice(None, None, step)), y[::step]
+            energy = np.concatenate([[0.0], np.cumsum((wave - wave.mean()) ** 2)])
+            start = int(np.argmax(energy[n:] - energy[:-n])) if n < wave.size else 0
+            parts.append(_cut(thin, slice(start, start + n)))
         return RecordProblem(
             parts,
             self.model,

@@ -1,0 +1,77 @@
+"""Measured dampers: what laws beyond Dahl find in whole records, from no guess."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from dahl_ident import (
+    Backlash,
+    Dahl,
+    Damper,
+    Element,
+    Mass,
+    PowerDamper,
+    Record,
+    Spring,
+    read_record,
+)
+from dahl_ident.fitting.record_search import solve_records
+from dahl_ident.problem.record_problem import RecordProblem
+
+FOLDER = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent"))
+pytestmark = pytest.mark.skipif(
+    not FOLDER.is_dir(), reason="DAHL_IDENT_MEASURED_DATA names no folder of measured data"
+)
+
+
+def estimated(records: list[Record], model: Element) -> tuple[dict[str, float], float]:
+    """Return the estimates, and the share of the force's rms that is left."""
+    problem = RecordProblem(records, model, output="force")
+    found = solve_records(problem)
+    left = np.concatenate(problem.split_residuals(found.values))
+    share = np.sqrt(np.mean(left**2) / np.mean(np.concatenate(problem.measured) ** 2))
+    return dict(zip(problem.names, found.values.tolist(), strict=True)), float(share)
+
+
+def test_a_friction_damper_with_a_gap() -> None:
+    """Two whole tests at 0.5 Hz: stiffness and gap as others found them."""
+    records = [
+        read_record(f, displacement="displacement", force="friction force")
+        for f in sorted((FOLDER / "brfd").glob("band30lb_0.5Hz_*.csv"))[::2]
+    ]
+    values, share = estimated(records, Backlash(Dahl(asymmetry=None)) + Mass() + Damper())
+    assert share < 0.18
+    assert values["sigma"] == pytest.approx(4.6e6, rel=0.1)
+    assert values["gap"] == pytest.approx(3.3e-3, rel=0.1)
+
+
+def cranked(pattern: str) -> list[Record]:
+    """Return a series of the magneto-rheological damper, every second record."""
+    records = []
+    for file in sorted((FOLDER / "mr_damper").glob(pattern))[::2]:
+        content = loadmat(file)
+        columns, step = content["x_F"], float(content["Ts"].squeeze())
+        records.append(
+            Record(
+                step * np.arange(len(columns)),
+                displacement=1e-3 * columns[:, 0],
+                force=columns[:, 2],
+            )
+        )
+    return records
+
+
+@pytest.mark.parametrize(
+    ("pattern", "most"),
+    [("ensaio[0-9]*.1.mat", 0.14), ("ensaio.A.*.mat", 0.12), ("ensaio.vali.*", 0.07)],
+)
+def test_magneto_rheological_dampers_ask_for_a_power_law(pattern: str, most: float) -> None:
+    model = Dahl() + PowerDamper() + Spring() + Mass()
+    values, share = estimated(cranked(pattern), model)
+    assert share < most
+    assert 0.1 < values["exponent"] < 1.2
