@@ -184,7 +184,8 @@ def _branch(
     end = np.exp(-kappa * length) * ((-1.0) ** k if k else np.pi)
     jump = (np.exp(-1j * k * before) - np.exp(-1j * k * beyond)) if k else before - beyond
     by_crossing = kappa * np.exp(-kappa * crossing) * jump
-    return S, by_kappa, by_crossing, by_gap - kappa * end, by_A + 2.0 * kappa * end
+    by_gap, by_A = by_gap - kappa * end, by_A + 2.0 * kappa * end
+    return S, by_kappa, np.asarray(by_crossing, dtype=np.complex128), by_gap, by_A
 
 
 def _sum(weight: FloatArray, wave: ComplexArray | FloatArray) -> ComplexArray:

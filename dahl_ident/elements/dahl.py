@@ -499,7 +499,7 @@ class Dahl(Friction):
             displacement,
             f_max,
             sigma,
-            *(asymmetry or [0.0]),
+            sum(asymmetry),
             gap,
             float(state),
             derivatives=derivatives,
