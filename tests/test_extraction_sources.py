@@ -260,4 +260,4 @@ def test_a_tdms_file_that_was_appended_to_another_is_named(tmp_path: Path) -> No
     path.write_bytes(2 * path.read_bytes())
     with pytest.warns(DataWarning, match=r"segments 2 of the file state wf_increment again"):
         twice = read_record(path)
-    assert "appended" in " ".join((twice.provenance or {})["notes"])
+    assert "appended" in " ".join((twice.provenance or {})["warnings"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import gzip
 import importlib
 import json
 import re
@@ -678,6 +679,15 @@ class TestHostileFiles:
         (tmp_path / "a.json").write_text(content)
         with pytest.raises(DataError):
             read_record(tmp_path / "a.json")
+
+    def test_bytes_behind_an_npy_array(self, tmp_path: Path) -> None:
+        np.save(tmp_path / "a.npy", np.arange(8.0))
+        data = (tmp_path / "a.npy").read_bytes() + bytes(8)
+        (tmp_path / "a.npy").write_bytes(data)
+        (tmp_path / "a.npy.gz").write_bytes(gzip.compress(data))
+        for name in ("a.npy", "a.npy.gz"):
+            with pytest.raises(DataError, match="damaged: 8 bytes behind its array"):
+                read_record(tmp_path / name)
 
     def test_objects_in_npz_are_not_run(self, tmp_path: Path) -> None:
         np.savez(tmp_path / "a.npz", a=np.array([{"x": 1}], dtype=object))

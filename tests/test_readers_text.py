@@ -264,13 +264,16 @@ class TestUnusualTables:
 
     def test_a_repeated_header_begins_a_run(self, tmp_path: Path) -> None:
         day = "frequency_hz,amplitude [m],real [N/m],imag [N/m]\n1,1,2,1\n1,2,2,1\n"
-        data = read_frequency_response(written(tmp_path, day + day + day.replace("1,2,2,1\n", "")))
+        table = written(tmp_path, day + day + day.replace("1,2,2,1\n", ""))
+        with pytest.warns(DataWarning, match="the header is repeated in the file: read as 3 runs"):
+            data = read_frequency_response(table)
         assert data.amplitude is not None
         assert data.amplitude.tolist() == [1, 2, 1, 2, 1]
         assert data.run is not None
         assert data.run.tolist() == ["1", "1", "2", "2", "3"]
         units = "frequency,amplitude,real,imag\nHz,m,N/m,N/m\n1,1,2,1\n1,2,2,1\n"
-        assert read_frequency_response(written(tmp_path, units + units)).runs == ["1", "2"]
+        with pytest.warns(DataWarning, match="read as 2 runs"):
+            assert read_frequency_response(written(tmp_path, units + units)).runs == ["1", "2"]
 
     def test_a_converter_that_sticks(self, tmp_path: Path) -> None:
         t = np.arange(400) / 100.0

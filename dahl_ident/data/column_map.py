@@ -23,18 +23,20 @@ one level: ``column = "FRdata.*[*].frequency"``. Indices count from 0.
 from __future__ import annotations
 
 import tomllib
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray, finite_number, non_negative_array, positive_number
 from dahl_ident.data.fields import CONTROLLED, one_of
 from dahl_ident.data.raw_columns import Channel, Source, plain
 from dahl_ident.data.tabular import listed
-from dahl_ident.errors import DataError, UnitError, ValidationError
+from dahl_ident.errors import DataError, DataWarning, UnitError, ValidationError
 from dahl_ident.units import (
     MECHANICAL_KINDS,
     QUANTITIES,
@@ -47,6 +49,7 @@ from dahl_ident.units import (
     si_unit,
 )
 
+_SHOWN = 10  # rows that a warning names
 # Names under which a column is found without a map.
 RECORD_NAMES: dict[str, tuple[str, ...]] = {
     "time": ("time", "t", "time_s"),
@@ -270,7 +273,8 @@ _EXAMPLES = {
 class Binding:
     """Roles looked up in one source; what was found, and what had to be assumed.
 
-    `names` are the column names under which each role is found without a map.
+    `names` are the column names under which each role is found without a map; `doubts` are the
+    warnings that were shown.
     """
 
     source: Source
@@ -278,6 +282,7 @@ class Binding:
     names: Mapping[str, tuple[str, ...]]
     motions: dict[str, Motion] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
@@ -436,9 +441,23 @@ class Binding:
             "sha256": self.source.sha256,
             "options": dict(self.source.options),
             "notes": notes,
+            "warnings": list(dict.fromkeys([*self.source.doubts, *self.doubts])),
             "origin": self.source.metadata.get("provenance"),
         }
         return {key: value for key, value in found.items() if value}
+
+    def doubt(self, message: str) -> None:
+        """Warn, and keep the warning with the data: verdict and report repeat it."""
+        warnings.warn(f"{self.source.name}: {message}", DataWarning, stacklevel=3)
+        self.doubts.append(message)
+
+    def doubt_rows(self, rows: NDArray[np.bool_], message: str) -> None:
+        """Warn of the rows that are marked, if there are any."""
+        found = np.flatnonzero(rows)
+        if found.size:
+            names = ", ".join(self.source.row_name(int(i)) for i in found[:_SHOWN])
+            more = f" and {found.size - _SHOWN} more" if found.size > _SHOWN else ""
+            self.doubt(f"{message}: {names}{more}")
 
     def note_peak(self, role: str, unit: Unit) -> None:
         """Note the assumption that an unmarked amplitude rests on; our own files need none."""

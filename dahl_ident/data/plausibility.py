@@ -8,7 +8,6 @@ columns, wrong.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -17,47 +16,35 @@ from scipy.special import stdtrit
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.frequency_response import FrequencyResponse
-from dahl_ident.errors import DataError, DataWarning
+from dahl_ident.errors import DataError
 
-RowName = Callable[[int], str]
+Doubt = Callable[[NDArray[np.bool_], str], None]
+"""What warns of the rows that are marked, with a message, if there are any."""
 _SIGNIFICANT = 0.00135  # one-sided; three standard deviations of a normal distribution
 _ASSUMED_ERROR = 0.1  # of the gain, where no covariance is known
 _MISMATCH = 0.1
 _FEWEST_ROWS, _FEW_ROWS = 4, 0.26  # rows to compare, and the share of them that may be wrong
 _STUCK_SAMPLES, _STUCK_TRAVEL = 8, 0.02  # samples of one value, and share of the motion's range
 _SMALL_PHASE = 0.1  # rad, for a gain that falls to nothing
-_SHOWN = 10
 
 
-def warn_of_rows(file: str, rows: NDArray[np.bool_], row_name: RowName, message: str) -> None:
-    """Warn about the rows that are marked, if there are any."""
-    found = np.flatnonzero(rows)
-    if not found.size:
-        return
-    names = ", ".join(row_name(int(i)) for i in found[:_SHOWN])
-    more = f" and {found.size - _SHOWN} more" if found.size > _SHOWN else ""
-    warnings.warn(f"{file}: {message}: {names}{more}", DataWarning, stacklevel=2)
-
-
-def check_phase_unit(
-    file: str, phase: FloatArray, degrees: bool, row_name: RowName, name: str
-) -> None:
+def check_phase_unit(phase: FloatArray, degrees: bool, name: str, doubt: Doubt) -> None:
     """Warn where a phase in degrees looks like radians, or the reverse."""
     largest = np.abs(phase).max()
     everywhere = np.ones(phase.shape, dtype=bool)
     if degrees and 0.5 <= largest <= 2.0 * np.pi and phase.size > 1:
-        warn_of_rows(
-            file, everywhere, row_name,
+        doubt(
+            everywhere,
             f"column {name!r} is in degrees, yet no phase is above 2 pi; are they radians?",
-        )  # fmt: skip
+        )
     if not degrees:
-        warn_of_rows(
-            file, np.abs(phase) > 4.0 * np.pi, row_name,
+        doubt(
+            np.abs(phase) > 4.0 * np.pi,
             f"column {name!r} is in radians, yet these phases are above 4 pi; are they degrees?",
-        )  # fmt: skip
+        )
 
 
-def check_drive(file: str, data: FrequencyResponse, row_name: RowName) -> None:
+def check_drive(data: FrequencyResponse, doubt: Doubt) -> None:
     """Warn where the drive is not the response times the amplitude."""
     amplitude, drive, fundamental = data.amplitude, data.drive, data.harmonic == 1
     if amplitude is None or drive is None or not fundamental.any():
@@ -65,14 +52,14 @@ def check_drive(file: str, data: FrequencyResponse, row_name: RowName) -> None:
     gain = data.select(harmonic=1).to("dynamic_stiffness").gain
     mismatch = np.zeros(data.n)
     mismatch[fundamental] = np.log(gain) + np.log(amplitude / drive)[fundamental]
-    warn_of_rows(
-        file, np.abs(mismatch) > _MISMATCH, row_name,
+    doubt(
+        np.abs(mismatch) > _MISMATCH,
         "drive and amplitude do not agree with the response by more than "
         f"{_MISMATCH:.0%} (rms against zero to peak?)",
-    )  # fmt: skip
+    )
 
 
-def check_energy(file: str, data: FrequencyResponse, row_name: RowName) -> None:
+def check_energy(file: str, data: FrequencyResponse, doubt: Doubt) -> None:
     """Warn of single rows that create energy, refuse a table that does as a whole.
 
     Raises
@@ -109,7 +96,7 @@ def check_energy(file: str, data: FrequencyResponse, row_name: RowName) -> None:
     creating[fundamental] = creates_energy(loss, std, dof)
     if part.covariance is None:
         creating[fundamental] |= _against_the_others(part)
-    warn_of_rows(file, creating, row_name, "the phase's sign creates energy")
+    doubt(creating, "the phase's sign creates energy")
 
 
 def _against_the_others(part: FrequencyResponse) -> NDArray[np.bool_]:
@@ -121,7 +108,7 @@ def _against_the_others(part: FrequencyResponse) -> NDArray[np.bool_]:
     return np.asarray(sine < -0.5 * np.median(sine[~against]))
 
 
-def check_phase_size(file: str, data: FrequencyResponse, row_name: RowName) -> None:
+def check_phase_size(data: FrequencyResponse, doubt: Doubt) -> None:
     """Warn where the gain falls with the amplitude and the phase is far too small for it.
 
     Friction that takes a share d off the gain at one frequency turns the phase by about d rad;
@@ -136,11 +123,11 @@ def check_phase_size(file: str, data: FrequencyResponse, row_name: RowName) -> N
         fall = 1.0 - part.gain.min() / part.gain.max()
         angle = np.abs(np.arcsin(np.clip(part.response.imag / part.gain, -1.0, 1.0))).max()
         if part.n >= _FEWEST_ROWS and fall > _MISMATCH and 0.0 < angle < _SMALL_PHASE * fall:
-            warn_of_rows(
-                file, rows, row_name,
+            doubt(
+                rows,
                 f"the gain varies by {fall:.0%} at {frequency:g} Hz, yet no phase is above "
                 f"{np.degrees(angle):.2g} degrees; are the phases in radians?",
-            )  # fmt: skip
+            )
 
 
 def stuck_samples(motion: FloatArray, force: FloatArray) -> NDArray[np.intp]:

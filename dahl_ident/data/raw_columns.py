@@ -96,7 +96,8 @@ class Source:
     `row_name` turns the index of a value into the words that find it in the file. `decimal` is
     the decimal mark of numbers in columns of text. `metadata` is what an earlier save of this
     package left in the file, `options` what the user said. `runs` are the rows at which a header
-    that is repeated within the file begins another run.
+    that is repeated within the file begins another run. `doubts` are the warnings that its reader
+    has shown.
     """
 
     name: str
@@ -108,6 +109,7 @@ class Source:
     row_name: Callable[[int], str] = field(default=lambda i: f"row {i + 1}")
     metadata: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
     runs: tuple[int, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
 
@@ -195,20 +197,14 @@ class Source:
         return values if infinite else self._without_codes(channel, values)
 
     def _without_codes(self, channel: Channel, values: FloatArray) -> FloatArray:
-        """Refuse numbers that stand for a missing one: far from all others, and one of a few."""
-        if values.size < _FEWEST_FOR_CODES:
-            return values
-        for code in {float(values.min()), float(values.max())}:
-            if abs(code) not in _CODES and abs(code) < _SMALLEST_OVERFLOW:
-                continue
-            others = np.abs(values[values != code])
-            if others.size and others.max() < abs(code) / _CODE_RATIO:
-                bad = np.flatnonzero(values == code)
-                raise DataError(
-                    f"{self.where(channel, int(bad[0]))}: the cell is {code:g} ({bad.size} such "
-                    f"cells), and all others are below {others.max():.3g} in size: a mark of a "
-                    "missing value? Delete these rows, or leave the cells empty"
-                )
+        """Refuse numbers that stand for a missing one."""
+        for code, others in missing_marks(values).items():
+            bad = np.flatnonzero(values == code)
+            raise DataError(
+                f"{self.where(channel, int(bad[0]))}: the cell is {code:g} ({bad.size} such "
+                f"cells), and all others are below {others:.3g} in size: a mark of a "
+                "missing value? Delete these rows, or leave the cells empty"
+            )
         return values
 
     def complex_numbers(self, channel: Channel) -> ComplexArray:
@@ -270,6 +266,22 @@ class Source:
                 )
             numbers[i] = float(text)
         return numbers
+
+
+def missing_marks(values: FloatArray) -> dict[float, float]:
+    """Return numbers that stand for a missing one, and the size of the largest other number.
+
+    They are far from all others, and -9999, 9.9e37 or the like.
+    """
+    if values.size < _FEWEST_FOR_CODES:
+        return {}
+    marks = {}
+    for code in {float(values.min()), float(values.max())}:
+        if abs(code) in _CODES or abs(code) >= _SMALLEST_OVERFLOW:
+            others = np.abs(values[values != code])
+            if others.size and others.max() < abs(code) / _CODE_RATIO:
+                marks[code] = float(others.max())
+    return marks
 
 
 def plain(name: str) -> str:

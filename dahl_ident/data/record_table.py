@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import re
-import warnings
 from typing import Any, Literal
 
 import numpy as np
@@ -12,10 +11,10 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.column_map import RECORD_NAMES, Binding, ColumnMap, scaled
 from dahl_ident.data.plausibility import stuck_samples
-from dahl_ident.data.raw_columns import Channel, Source
+from dahl_ident.data.raw_columns import Channel, Source, missing_marks
 from dahl_ident.data.record import DriveUnit, Record
 from dahl_ident.data.tabular import listed
-from dahl_ident.errors import DataError, DataWarning, UnitError, ValidationError
+from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS, si_unit
 
 _STAMP = re.compile(r"\s*(?P<date>\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d{1,9})?Z?")
@@ -43,7 +42,16 @@ def record_from(
     size = next(iter(channels.values())).size
     complete: Any = slice(None)
     if missing == "drop":
-        complete = np.all([np.isfinite(_numeric(c)) for c in channels.values()], axis=0)
+        numbers = {c.name: _numeric(c) for c in channels.values()}
+        complete = np.all([np.isfinite(found) for found in numbers.values()], axis=0)
+        for name, found in numbers.items():
+            for mark in missing_marks(found[np.isfinite(found)]):
+                marked = found == mark
+                bound.doubt(
+                    f"{np.sum(marked)} samples left out: column {name!r} is {mark:g} in them, a "
+                    "mark of a missing value"
+                )
+                complete &= ~marked
         bound.source = source.rows(complete)
         channels = _channels(bound)
         if not complete.all():
@@ -62,9 +70,10 @@ def record_from(
     stuck = stuck_samples(motion, force)
     if stuck.size:
         first = f"{bound.source.row_name(int(stuck[0]))} ({stuck.size} such places)"
-        text = f"the force repeats one value while the motion goes on, and then jumps, from {first}"
-        warnings.warn(f"{source.name}: {text}: does a converter stick?", DataWarning, stacklevel=3)
-        bound.notes.append(text)
+        bound.doubt(
+            "the force repeats one value while the motion goes on, and then jumps, from "
+            f"{first}: does a converter stick?"
+        )
     try:
         return Record(**values, motion=bound.motion(), provenance=bound.provenance())
     except ValidationError as exc:

@@ -76,6 +76,8 @@ def response_from(
         Naming file, row and column.
     """
     whole = Binding(source, columns, RESPONSE_NAMES)
+    if source.runs:
+        whole.doubt(f"the header is repeated in the file: read as {len(source.runs) + 1} runs")
     parts = []
     for label, one in by_level(source, columns).items():
         if label is not None:
@@ -85,6 +87,8 @@ def response_from(
         parts.append(table.response())
         whole.used |= table.bound.used
         whole.notes += table.bound.notes
+        of = "" if label is None else f"level {label}: "
+        whole.doubts += [f"{of}{text}" for text in table.bound.doubts]
     data = parts[0] if len(parts) == 1 else FrequencyResponse.concatenate(parts)
     return replace(data, provenance=whole.provenance())
 
@@ -134,10 +138,10 @@ class _Table:
             )
         except ValidationError as exc:
             raise DataError(f"{source.name}: {exc}") from exc
-        check_drive(source.name, data, source.row_name)
-        check_phase_size(source.name, data, source.row_name)
+        check_drive(data, bound.doubt_rows)
+        check_phase_size(data, bound.doubt_rows)
         if self.options.passive:
-            check_energy(source.name, data, source.row_name)
+            check_energy(source.name, data, bound.doubt_rows)
         return data
 
     def _within_range(self) -> None:
@@ -319,8 +323,7 @@ class _Table:
         values = self.bound.numbers("phase", channel)
         unit = self.bound.unit("phase", channel)
         _, factor = self.bound.kind("phase", unit, ("angle",))
-        source = self.bound.source
-        check_phase_unit(source.name, values, factor != 1.0, source.row_name, channel.name)
+        check_phase_unit(values, factor != 1.0, channel.name, self.bound.doubt_rows)
         return values * factor
 
     def _errors(self, quantity: Quantity, response: ComplexArray) -> dict[str, Any]:

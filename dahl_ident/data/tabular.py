@@ -67,7 +67,22 @@ def noted(provenance: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     files = distinct(np.array([str(part["file"]) for part in parts if "file" in part]))
     notes = dict.fromkeys(note for part in parts for note in part.get("notes", []))
     lines = [("from", listed(files, shown=3))] if files else []
+    lines += [("warning", text) for text in doubts(provenance)]
     return lines + [("note", note) for note in notes]
+
+
+def doubts(provenance: Mapping[str, Any] | None) -> list[str]:
+    """Return the warnings that were shown on reading data, and what they were made from."""
+    found: list[str] = []
+    waiting = [provenance or {}]
+    while waiting:
+        part = waiting.pop(0)
+        file = f"{part['file']}: " if "file" in part else ""
+        found += [f"{file}{text}" for text in part.get("warnings", ())]
+        waiting += [one for one in part.get("parts", ()) if isinstance(one, Mapping)]
+        if isinstance(part.get("origin"), Mapping):
+            waiting.append(part["origin"])
+    return list(dict.fromkeys(found))
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)

@@ -6,9 +6,10 @@ kind. Assumed? What the result rests on and the data cannot test. Most serious f
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Protocol
+from collections.abc import Iterator, Mapping
+from typing import Any, Protocol
 
+from dahl_ident.data.tabular import doubts
 from dahl_ident.diagnostics.budget import taken_as_exact
 from dahl_ident.diagnostics.cross_validation import CrossValidation
 from dahl_ident.diagnostics.error_model import ErrorModel
@@ -21,6 +22,7 @@ from dahl_ident.fitting import Optimum, solve
 _TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
 _ENOUGH_HELD_OUT = 16  # values, of which 80 % in bands of 95 % happen once in 100 times
+_DOUBTS_SHOWN = 5
 _CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chance
 
 
@@ -67,11 +69,11 @@ def verdict_status(fit: Judged) -> VerdictStatus:
 
 def statements(fit: Judged) -> tuple[str, ...]:
     """Return the verdict in its parts; the first is what to remember, the others say why."""
-    status = verdict_status(fit)
+    status, data = verdict_status(fit), fit.optimum.problem.data
     goodness, known = fit.goodness, fit.identifiability
     if status is VerdictStatus.TRUSTED:
         first = f"Trusted. {known.headline} {goodness.headline}"
-        return (first, *_assumptions(fit))
+        return (first, *doubted(data.provenance), *_assumptions(fit))
     if status is VerdictStatus.APPROXIMATE:
         found = list(goodness.statements)
         if goodness.described in found and goodness.objections:
@@ -79,9 +81,19 @@ def statements(fit: Judged) -> tuple[str, ...]:
             misfit = f"misfit of {100.0 * goodness.rms_misfit:.2g} % rms"
             found.insert(0, f"The stated uncertainties include a {misfit}: {goodness.departures}.")
         first, *others = (*found, *_reservations(fit), known.headline)
-        return (f"Approximate. {first}", *others, *_checked(fit), *_assumptions(fit))
+        said = (*others, *_checked(fit), *doubted(data.provenance))
+        return (f"Approximate. {first}", *said, *_assumptions(fit))
     first, *others = _objections(fit)
-    return (f"{status.capitalize()}. {first}", *others)
+    return (f"{status.capitalize()}. {first}", *others, *doubted(data.provenance))
+
+
+def doubted(*provenances: Mapping[str, Any] | None) -> Iterator[str]:
+    """Yield the warnings that were shown when the data were read."""
+    found = list(dict.fromkeys(text for one in provenances for text in doubts(one)))
+    for text in found[:_DOUBTS_SHOWN]:
+        yield f"Warning on reading: {text}."
+    if len(found) > _DOUBTS_SHOWN:
+        yield f"{len(found) - _DOUBTS_SHOWN} more warnings on reading."
 
 
 def _noise_of_no_sensor(goodness: Goodness) -> bool:

@@ -49,7 +49,9 @@ def record_response(
     known = None if frequency is None else positive_number(frequency, "frequency")
     points: list[Point] = []
     refused: list[str] = []
+    doubts: dict[str, None] = {}
     for record in pieces:
+        doubts |= dict.fromkeys((record.provenance or {}).get("warnings", ()))
         settings = replace(settings, motion_channel=record.motion_channel)
         try:
             further, unusable = _points(record, known, mode, settings)
@@ -72,7 +74,7 @@ def record_response(
         "min_share": settings.min_share,
         "refused": refused,
     }
-    provenance |= {"extraction": options}
+    provenance |= {"extraction": options} | ({"warnings": list(doubts)} if doubts else {})
     return _table(points, record, settings, {"level": level, "run": run}, provenance)
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
 
 _PACKAGES = ("numpy", "scipy", "casadi", "emcee", "pandas", "matplotlib", "pint")
-_LISTED_ELSEWHERE = {"parts", "file", "sha256", "notes"}
+_LISTED_ELSEWHERE = {"parts", "file", "sha256", "notes", "warnings"}
 
 
 @dataclass(frozen=True)

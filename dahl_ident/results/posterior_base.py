@@ -16,6 +16,7 @@ from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.bayes.chain import LogDensity
 from dahl_ident.bayes.priors import PriorLike
 from dahl_ident.data.storage import plain_data
+from dahl_ident.diagnostics.statements import doubted
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.errors import ValidationError
 from dahl_ident.results.prior_influence import PriorInfluence, prior_influences
@@ -85,10 +86,14 @@ class Posterior(Result):
     @property
     def statements(self) -> tuple[str, ...]:
         """The verdict sentence by sentence: the first says whether to trust, the others why."""
-        if not self._objections:
-            return (f"Trusted. {self.message}",)
-        first, *others = self._objections
-        return (f"{self.status.capitalize()}. {first}", *others)
+        first, *others = self._objections or (self.message,)
+        said = doubted(*self._provenances)
+        return (f"{self.status.capitalize()}. {first}", *others, *said)
+
+    @property
+    @abstractmethod
+    def _provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
+        """Where the data come from."""
 
     @property
     def status(self) -> VerdictStatus:

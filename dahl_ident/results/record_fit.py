@@ -28,6 +28,7 @@ from dahl_ident.diagnostics.record_errors import (
 )
 from dahl_ident.diagnostics.record_goodness import RecordGoodness, record_goodness
 from dahl_ident.diagnostics.record_identifiability import undetermined
+from dahl_ident.diagnostics.statements import doubted
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.elements import Element, Model
 from dahl_ident.elements.description import describe_model, model_from_description
@@ -272,6 +273,7 @@ class RecordFit(Result):
                 else ()
             ),
             *(f"Physically doubtful: {o}." for o in objections),
+            *doubted(*(record.provenance for record in self.records)),
             f"Error bars take the residuals' correlation into account: {self.effective_samples:.0f}"
             f" effective of {self.problem.n_residuals} samples.",
             f"Assumed: {listed(self.errors.exact)} exact.",

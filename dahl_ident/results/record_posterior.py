@@ -69,6 +69,10 @@ class RecordPosterior(ChainDraws):
         )  # fmt: skip
 
     @property
+    def _provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
+        return tuple(record.provenance for record in self.fit.records)
+
+    @property
     def _misfits(self) -> tuple[str, ...]:
         if self.fit.status in (VerdictStatus.TRUSTED, VerdictStatus.NOT_DETERMINED):
             return ()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -50,6 +51,10 @@ class ResponsePosterior(Posterior):
             return ()
         draws = self._draws(_CHECK_DRAWS, 0)
         return predictive_checks(self._density, draws, np.random.default_rng(0))
+
+    @property
+    def _provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
+        return (self.data.provenance,)
 
     @property
     def _misfits(self) -> tuple[str, ...]:

@@ -129,10 +129,17 @@ def read_npy(file: File) -> Source:
     try:
         if file.content is None:
             array = np.load(file.stream(), mmap_mode="r", allow_pickle=False)
+            left = file.size - getattr(array, "offset", 0) - array.nbytes
         else:
-            array = np.load(file.stream(), allow_pickle=False)
+            stream = file.stream()
+            array = np.load(stream, allow_pickle=False)
+            left = len(file.content) - stream.tell()
     except _NUMPY_ERRORS as exc:
         raise DataError(f"{file.name}: the file is damaged: {exc}") from exc
+    if left:
+        raise DataError(
+            f"{file.name}: the file is damaged: {left} bytes behind its array; were some added?"
+        )
     return tree_source(file, "NumPy .npy", _fields({"data": _numpy_array(array)}))
 
 

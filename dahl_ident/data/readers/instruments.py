@@ -198,7 +198,7 @@ def read_tdms(file: File) -> Source:
         weakref.finalize(content, stream.close)  # open as long as a channel waits to be read
         channels = [c for group in content.groups() for c in _tdms_channels(file, content, group)]
         begun = _begun_again(file)
-    notes = []
+    doubts = []
     if begun:
         text = (
             f"segments {listed([str(i) for i in begun], 5)} of the file state wf_increment again, "
@@ -206,8 +206,8 @@ def read_tdms(file: File) -> Source:
             "Split the file where it holds several runs"
         )
         warnings.warn(f"{file.name}: {text}", DataWarning, stacklevel=3)
-        notes.append(text)
-    return instrument_source(file, "TDMS", channels, notes)
+        doubts.append(text)
+    return instrument_source(file, "TDMS", channels, doubts=doubts)
 
 
 def _begun_again(file: File) -> list[int]:
@@ -319,7 +319,11 @@ def evenly_timed(times: Sequence[NDArray[Any]], prefix: str) -> Iterator[Channel
 
 
 def instrument_source(
-    file: File, kind: str, channels: list[Channel], notes: list[str] | None = None
+    file: File,
+    kind: str,
+    channels: list[Channel],
+    notes: Sequence[str] = (),
+    doubts: Sequence[str] = (),
 ) -> Source:
     """Return the channels of an instrument's file.
 
@@ -336,5 +340,6 @@ def instrument_source(
         tuple(channels),
         file.sha256,
         row_name=lambda i: f"sample {i}",
-        notes=tuple(notes or ()),
+        notes=tuple(notes),
+        doubts=tuple(doubts),
     )
