@@ -33,11 +33,11 @@ from dahl_ident.diagnostics.error_sources import (
     MODEL_ERROR,
     NOISE,
     Source,
+    StructuredSources,
     additive,
     gain_and_phase,
     of_one_scale,
     relative_scatter,
-    structured_sources,
 )
 from dahl_ident.diagnostics.variance_components import (
     LinearModel,
@@ -267,20 +267,23 @@ def _estimated(optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumpt
     rows = _Rows(optimum, problem, assumed)
     theta, m = rows.start, rows.m
     noise: tuple[Source, ...] | None = None
+    tells = m - len(problem.names) + len(assumed) >= _LEAST_DOF
+    shared = StructuredSources(problem) if tells else None
+    last: FloatArray | None = None
     for step in range(_STEPS):
         y, J = rows.at(theta)
         level = float(y[:m] @ y[:m]) / max(m - J.shape[1], 1)
-        rest: tuple[Source, ...] = ()
-        if m - J.shape[1] + len(assumed) >= _LEAST_DOF:
-            rest = structured_sources(problem, theta, J[:m])
+        rest = () if shared is None else shared.at(theta, J[:m])
         plain = (
             (*of_one_scale(problem), *relative_scatter(problem, theta))
             if rest and m <= 2 * _FEW_ROWS
             else of_one_scale(problem)
         )
-        sources, linear, found = _supported(problem, y, J, noise or plain, rest, level)
+        (sources, linear, found), last = _supported(
+            problem, y, J, noise or plain, rest, level, last
+        )
         if noise is None and step == 1:
-            noise = plain
+            noise, last = plain, None
             if rest and not problem.scale_known and m <= 2 * _FEW_ROWS:
                 noise, sources, linear, found = _kind_of_noise(
                     problem, y, J, (sources, linear, found), level
@@ -302,23 +305,25 @@ _Found = tuple[tuple[Source, ...], LinearModel, VarianceComponents]
 
 
 def _fitted(
-    problem: Problem, y: FloatArray, J: FloatArray, sources: tuple[Source, ...], level: float
+    problem: Problem,
+    y: FloatArray,
+    J: FloatArray,
+    sources: tuple[Source, ...],
+    level: float,
+    start: FloatArray | None = None,
 ) -> _Found:
-    """Return the variances of these sources."""
+    """Return the variances of these sources, which may start where they were before."""
     m, extra = problem.n_residuals, len(y) - problem.n_residuals
     known = np.concatenate([np.full(m, float(problem.scale_known)), np.ones(extra)])
     Z = [np.concatenate([s.columns, np.zeros((extra, *s.columns.shape[1:]))]) for s in sources]
-    start = np.array(
-        [
-            level if s.name == NOISE and s.columns.ndim == 1 and not problem.scale_known else 0.0
-            for s in sources
-        ]
-    )
     upper = np.array([s.largest for s in sources])
+    if start is None or not (problem.scale_known or start[0] > 0.0):
+        scales = [s.columns.ndim == 1 and not problem.scale_known for s in sources]
+        start = np.where(scales, level, 0.0)
     linear = LinearModel(y, J, known, Z)
     if m > 2 * _FEW_ROWS:
         linear = linear.compressed(m)
-    return sources, linear, variance_components(linear, start, upper)
+    return sources, linear, variance_components(linear, np.minimum(start, upper), upper)
 
 
 def _supported(
@@ -328,19 +333,34 @@ def _supported(
     noise: tuple[Source, ...],
     rest: tuple[Source, ...],
     level: float,
-) -> _Found:
-    """Return the sources; model errors and noise of the amplitudes where the data ask for them."""
-    optional = [s for s in rest if s.name in (MODEL_ERROR, NOISE)]
-    always = [s for s in rest if s.name not in (MODEL_ERROR, NOISE)]
-    subsets = [c for k in range(len(optional) + 1) for c in combinations(optional, k)]
+    start: FloatArray | None,
+) -> tuple[_Found, FloatArray]:
+    """Return the sources; model errors and noise of the amplitudes where the data ask for them.
+
+    Also the variances with all sources, to start from at the next estimate.
+    """
+    every = (*noise, *rest)
+    _, _, whole = _fitted(problem, y, J, every, level, start)
+    optional = [s.name in (MODEL_ERROR, NOISE) for s in rest]
+    # what has no variance beside all others has none beside fewer that explain as much
+    asked = [
+        i
+        for i, wanted in enumerate(optional, start=len(noise))
+        if wanted and whole.variances[i] > 0.0
+    ]
+    always = [i for i in range(len(every)) if i < len(noise) or not optional[i - len(noise)]]
     best, best_value = None, -np.inf
-    for subset in subsets:
-        found = _fitted(problem, y, J, (*noise, *subset, *always), level)
-        value = found[2].log_likelihood - sum(_ASKED_FOR[s.name] for s in subset)
-        if best is None or value > best_value:
-            best, best_value = found, value
+    for k in range(len(asked) + 1):
+        for subset in combinations(asked, k):
+            kept = sorted([*always, *subset])
+            trial = _fitted(
+                problem, y, J, tuple(every[i] for i in kept), level, whole.variances[kept]
+            )
+            value = trial[2].log_likelihood - sum(_ASKED_FOR[every[i].name] for i in subset)
+            if value > best_value:
+                best, best_value = trial, value
     assert best is not None
-    return best
+    return best, whole.variances
 
 
 def _kind_of_noise(

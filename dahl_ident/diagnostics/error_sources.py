@@ -156,68 +156,85 @@ def relative_scatter(problem: Problem, theta: FloatArray) -> tuple[Source, ...]:
     return tuple(found)
 
 
-def amplitude_noise(problem: Problem, theta: FloatArray) -> tuple[Source, ...]:
-    """Return noise of the amplitudes at which relative responses are said to have been measured.
+class StructuredSources:
+    """The sources that several rows share, and noise of the amplitudes."""
 
-    It counts in slip, where the response changes with amplitude, and not in microslip.
-    """
-    data = problem.data
-    if data.amplitude is None or problem.scale_known or problem.noise != "relative":
-        return ()
-    moved = replace(data, amplitude=data.amplitude * np.exp(_STEP))
-    other = Problem(moved, problem.model, noise=problem.noise, sensors=problem.sensors)
-    change = (other.predict(theta) - problem.predict(theta)) / _STEP
-    n = data.n
-    columns = np.zeros((n, 2, n))
-    columns[np.arange(n), :, np.arange(n)] = -problem.residual_change(theta, change).reshape(n, 2)
-    square = 0.5 * float(np.mean(np.abs(change / problem.predict(theta)) ** 2))
-    return (Source(NOISE, columns.reshape(2 * n, n), square),)
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        view, data = problem.stiffness_data, problem.data
+        self._places = places(view.amplitude, view.omega)
+        self._fundamental = view.harmonic == 1
+        self._repeats = _repeats(self._places, self._fundamental)
+        self._runs = (
+            np.empty((0, data.n)) if data.run is None else _indicators(np.asarray(data.run))
+        )
+        unit = float(np.abs(view.stiffness[self._fundamental]).max(initial=0.0)) or 1.0
+        self._shapes = (
+            Shapes.of(self._places, parallel=False),
+            Shapes.of(self._places, parallel=True, unit=unit),
+        )
+        stiffness = np.where(self._fundamental, view.stiffness, np.inf)
+        self._changes = [shape.changes(self._places, stiffness) for shape in self._shapes]
+        self._moved = None
+        if data.amplitude is not None and not problem.scale_known and problem.noise == "relative":
+            moved = replace(data, amplitude=data.amplitude * np.exp(_STEP))
+            self._moved = Problem(
+                moved, problem.model, noise=problem.noise, sensors=problem.sensors
+            )
 
+    def at(self, theta: FloatArray, J: FloatArray) -> tuple[Source, ...]:
+        """Return the sources at theta; `J` is the data's Jacobian there."""
+        problem = self._problem
+        predicted = problem.predict(theta)
+        size = _sizes(problem, predicted)
 
-def structured_sources(problem: Problem, theta: FloatArray, J: FloatArray) -> tuple[Source, ...]:
-    """Return the sources that several rows share, at theta; `J` is the data's Jacobian there."""
-    view, data = problem.stiffness_data, problem.data
-    predicted = problem.predict(theta)
-    size = _sizes(problem, predicted)
-    where = places(view.amplitude, view.omega)
-    fundamental = view.harmonic == 1
+        def columns(changes: ComplexArray) -> FloatArray:
+            """Return residuals for relative changes (k, n), shape (m, k)."""
+            return -problem.residual_change(theta, changes * size).T
 
-    def columns(changes: ComplexArray) -> FloatArray:
-        """Return residuals for relative changes (k, n), shape (m, k)."""
-        return -problem.residual_change(theta, changes * size).T
-
-    unit = float(np.abs(view.stiffness[fundamental]).max(initial=0.0)) or 1.0
-    stiffness = np.where(fundamental, view.stiffness, np.inf)
-    shapes = (Shapes.of(where, parallel=False), Shapes.of(where, parallel=True, unit=unit))
-    missed = np.abs(data.response / size - 1.0)[fundamental]
-    most = _MOST_DEPARTURE**2 * 0.5 * float(np.mean(missed**2))
-    found = []
-    for shape in shapes:
-        changes = shape.changes(where, stiffness)
-        square, made, absorbed = _mean_square(changes), columns(changes), None
-        if shape.parallel:
-            absorbed = _absorbed(problem, J, made)
-            made = made + J @ absorbed
-        largest = most / square
-        found.append(Source(MODEL_ERROR, made, square, shape, largest=largest, absorbed=absorbed))
-    if data.run is not None:
-        own = _indicators(np.asarray(data.run))
-        if len(own) >= _FEWEST:
-            share = own.astype(np.complex128)
+        missed = np.abs(problem.data.response / size - 1.0)[self._fundamental]
+        most = _MOST_DEPARTURE**2 * 0.5 * float(np.mean(missed**2))
+        found = []
+        for shape, changes in zip(self._shapes, self._changes, strict=True):
+            square, made, absorbed = _mean_square(changes), columns(changes), None
+            if shape.parallel:
+                absorbed = _absorbed(problem, J, made)
+                made = made + J @ absorbed
+            largest = most / square
+            found.append(
+                Source(MODEL_ERROR, made, square, shape, largest=largest, absorbed=absorbed)
+            )
+        if len(self._runs) >= _FEWEST:
+            share = self._runs.astype(np.complex128)
             found.append(Source(RUNS, columns(share), 0.5, own="gain"))
-            found.append(Source(RUNS, columns(1j * view.harmonic * share), 0.5, own="phase"))
+            turned = 1j * problem.stiffness_data.harmonic * share
+            found.append(Source(RUNS, columns(turned), 0.5, own="phase"))
+            each = np.repeat(self._runs, 2, axis=1).T
             found += [
-                Source(
-                    RUNS, np.repeat(own, 2, axis=1).T * J[:, i : i + 1], 0.0, own=problem.names[i]
-                )
+                Source(RUNS, each * J[:, i : i + 1], 0.0, own=problem.names[i])
                 for i in _scattering_parameters(problem)
             ]
-    found += amplitude_noise(problem, theta)
-    repeats = _repeats(where, fundamental)
-    if len(repeats) >= _FEWEST:
-        changes = np.concatenate([repeats, 1j * repeats]).astype(np.complex128)
-        found.append(Source(LEVELS, columns(changes), 1.0, own="both"))
-    return tuple(found)
+        if self._moved is not None:
+            found.append(self._amplitude_noise(theta, predicted, self._moved))
+        if len(self._repeats) >= _FEWEST:
+            shared = np.concatenate([self._repeats, 1j * self._repeats])
+            found.append(Source(LEVELS, columns(shared), 1.0, own="both"))
+        return tuple(found)
+
+    def _amplitude_noise(
+        self, theta: FloatArray, predicted: ComplexArray, moved: Problem
+    ) -> Source:
+        """Return noise of the amplitudes at which relative responses were measured.
+
+        It counts in slip, where the response changes with amplitude, and not in microslip.
+        """
+        change = (moved.predict(theta) - predicted) / _STEP
+        n = len(change)
+        columns = np.zeros((n, 2, n))
+        own = -self._problem.residual_change(theta, change).reshape(n, 2)
+        columns[np.arange(n), :, np.arange(n)] = own
+        square = 0.5 * float(np.mean(np.abs(change / predicted) ** 2))
+        return Source(NOISE, columns.reshape(2 * n, n), square)
 
 
 def _sizes(problem: Problem, predicted: ComplexArray) -> ComplexArray:

@@ -2,10 +2,11 @@ r"""Variances of several sources of error from one set of residuals (REML).
 
 Residuals y = J delta + e with the covariance V = F + sum_k s_k Z_k Z_k', F known and s_k >= 0
 unknown. Restricted maximum likelihood takes what the parameters explain out of y first, so that
-the variances are not too small by the degrees of freedom used. Fisher scoring, projected on
-s_k >= 0: with P = V^-1 - V^-1 J (J' V^-1 J)^-1 J' V^-1,
+the variances are not too small by the degrees of freedom used: with orthonormal contrasts K,
+K'J = 0, it is the likelihood of K'y, whose covariance is W = K'VK. Fisher scoring, projected on
+s_k >= 0: with W_k = K'Z_k Z_k'K and r = W^-1 K'y,
 
-    gradient_k = (|Z_k' P y|^2 - tr Z_k' P Z_k)/2,    information_kl = |Z_k' P Z_l|^2/2.
+    gradient_k = (r' W_k r - tr W^-1 W_k)/2,    information_kl = tr(W^-1 W_k W^-1 W_l)/2.
 
 Source: Patterson and Thompson, Biometrika 58 (1971) 545; Searle, Casella and McCulloch,
 *Variance Components*, 1992, chapter 6.
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,7 @@ from dahl_ident.arrays import FloatArray
 _STEPS = 40
 _LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.02)  # of a scoring step, until the likelihood rises
 _CLOSE = 1e-4  # rise of the log-likelihood that no longer matters
+_ALIKE = 1e-10  # added to correlations of one: sources that do the same share a variance
 _LEAST = 1e-10  # variance over the largest, below which it is none
 
 
@@ -120,23 +123,67 @@ class Projection:
 
     def __init__(self, model: LinearModel, variances: FloatArray) -> None:
         L = np.linalg.cholesky(model.covariance(variances))
-        self.inverse_factor = linalg.lapack.dtrtri(L, lower=1)[0]
-        white = self.inverse_factor @ np.column_stack([model.J, model.y])
-        Q, self.R = np.linalg.qr(white[:, :-1])
-        left = white[:, -1] - Q @ (Q.T @ white[:, -1])
-        self.explained = Q.T @ self.inverse_factor
-        self.P = self.inverse_factor.T @ self.inverse_factor - self.explained.T @ self.explained
-        self.Py = self.inverse_factor.T @ left
-        log_det = np.log(np.diagonal(L)).sum() + np.log(np.abs(np.diagonal(self.R))).sum()
-        self.log_likelihood = float(-log_det - 0.5 * left @ left)
-        rest, count = model.outside
-        if count:
-            variance = model.outside_variance(variances)
-            self.log_likelihood -= 0.5 * (count * float(np.log(variance)) + rest / variance)
+        inverse_factor = linalg.lapack.dtrtri(L, lower=1)[0]
+        Q, self._R = np.linalg.qr(inverse_factor @ model.J)
+        self._explained = Q.T @ inverse_factor
+        self.P = inverse_factor.T @ inverse_factor - self._explained.T @ self._explained
 
     def generalised_inverse(self) -> FloatArray:
         """Return G = (J' V^-1 J)^-1 J' V^-1, shape (P, m)."""
-        return np.asarray(linalg.solve_triangular(self.R, self.explained))
+        return np.asarray(linalg.solve_triangular(self._R, self._explained))
+
+
+class _State(NamedTuple):
+    """The restricted likelihood at some variances."""
+
+    log_likelihood: float
+    gradient: FloatArray
+    information: FloatArray
+
+
+class Contrasts:
+    """Residuals that no parameter can change, and the covariance that each source makes there."""
+
+    def __init__(self, model: LinearModel) -> None:
+        n = model.J.shape[1]
+        K = np.linalg.qr(model.J, mode="complete")[0][:, n:].T
+        self._y = K @ model.y
+        self._known = (K * model.known) @ K.T
+        parts = [K * part if part.ndim == 1 else K @ part for part in model.Z]
+        self._sources = np.stack([part @ part.T for part in parts])
+        self._model = model
+
+    def at(self, variances: FloatArray) -> _State:
+        """Return likelihood, gradient and expected information.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the covariance is singular.
+        """
+        K, r = len(variances), len(self._y)
+        W = self._known + (variances @ self._sources.reshape(K, -1)).reshape(r, r)
+        L, singular = linalg.lapack.dpotrf(W, lower=1)
+        if singular:
+            raise np.linalg.LinAlgError("the covariance of the residuals is singular")
+        inverse = linalg.lapack.dpotri(L, lower=1)[0]
+        inverse = inverse + inverse.T  # the other triangle is zero
+        inverse[np.diag_indices(r)] *= 0.5
+        weighted = inverse @ self._y
+        likelihood = -np.log(np.diagonal(L)).sum() - 0.5 * self._y @ weighted
+        products = inverse @ self._sources
+        across = products.swapaxes(1, 2).reshape(K, -1)
+        gradient = 0.5 * (
+            weighted @ self._sources @ weighted - np.trace(products, axis1=1, axis2=2)
+        )
+        information = 0.5 * products.reshape(K, -1) @ across.T
+        rest, count = self._model.outside
+        if count:
+            variance = self._model.outside_variance(variances)
+            likelihood -= 0.5 * (count * np.log(variance) + rest / variance)
+            gradient[0] += 0.5 * (rest / variance - count) / variance
+            information[0, 0] += 0.5 * count / variance**2
+        return _State(float(likelihood), gradient, information)
 
 
 def variance_components(
@@ -172,17 +219,18 @@ def variance_components(
     [1.0, 2.8]
     """
     s = np.array(start, dtype=np.float64)
-    state = Projection(model, s)
-    gradient, information = _scores(state, model, s)
+    contrasts = Contrasts(model)
+    state = contrasts.at(s)
     for _ in range(_STEPS):
-        step = _projected(s, gradient, information, s >= upper)
-        found, rise = _along(model, state, s, step, upper)
+        step = _projected(s, state.gradient, state.information, s >= upper)
+        found = _along(contrasts, state, s, step, upper)
         if found is None:
             break
+        rise = found[1].log_likelihood - state.log_likelihood
         s, state = found
-        gradient, information = _scores(state, model, s)
         if rise < _CLOSE:
             break
+    information = state.information
     covariance = np.zeros_like(information)
     inside = np.flatnonzero(s > 0.0)
     part = np.ix_(inside, inside)
@@ -197,11 +245,12 @@ def _projected(
     """Return the scoring step of the variances that are not held at zero or at their largest."""
     active = ((s > 0.0) | (gradient > 0.0)) & ~(largest & (gradient > 0.0))
     step = np.zeros(len(s))
+    scaled, size = _scaled(information)
+    scaled[np.diag_indices(len(s))] += _ALIKE
     while active.any():
-        part = np.ix_(active, active)
         step[:] = 0.0
-        scaled, size = _scaled(information[part])
-        step[active] = size * np.linalg.lstsq(scaled, size * gradient[active], rcond=None)[0]
+        step[active] = np.linalg.solve(scaled[active][:, active], (size * gradient)[active])
+        step *= size
         leaving = active & (((s == 0.0) & (step <= 0.0)) | (largest & (step > 0.0)))
         if not leaving.any():
             break
@@ -219,45 +268,22 @@ def _scaled(information: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _along(
-    model: LinearModel,
-    state: Projection,
+    contrasts: Contrasts,
+    state: _State,
     s: FloatArray,
     step: FloatArray,
     upper: FloatArray | float,
-) -> tuple[tuple[FloatArray, Projection] | None, float]:
-    """Return the first point along the step at which the likelihood is higher, and by how much."""
+) -> tuple[FloatArray, _State] | None:
+    """Return the first point along the step at which the likelihood is higher."""
     for length in _LENGTHS:
         trial = np.clip(s + length * step, 0.0, upper)
         trial[trial < _LEAST * trial.max(initial=0.0)] = 0.0
         if not trial.any():
             continue
         try:
-            other = Projection(model, trial)
+            other = contrasts.at(trial)
         except np.linalg.LinAlgError:
             continue
-        rise = other.log_likelihood - state.log_likelihood
-        if rise > 0.0:
-            return (trial, other), rise
-    return None, 0.0
-
-
-def _scores(
-    state: Projection, model: LinearModel, variances: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the gradient of the restricted likelihood and its expected information."""
-    Z, K = model.Z, len(model.Z)
-    gradient, information = np.empty(K), np.empty((K, K))
-    projected = [state.P * part if part.ndim == 1 else state.P @ part for part in Z]
-    for k, own in enumerate(Z):
-        score = own * state.Py if own.ndim == 1 else own.T @ state.Py
-        for j in range(k, K):
-            cross = own[:, None] * projected[j] if own.ndim == 1 else own.T @ projected[j]
-            information[k, j] = information[j, k] = 0.5 * float(np.sum(cross**2))
-            if j == k:
-                gradient[k] = 0.5 * float(score @ score - np.trace(cross))
-    rest, count = model.outside
-    if count:
-        variance = model.outside_variance(variances)
-        gradient[0] += 0.5 * (rest / variance - count) / variance
-        information[0, 0] += 0.5 * count / variance**2
-    return gradient, information
+        if other.log_likelihood > state.log_likelihood:
+            return trial, other
+    return None
