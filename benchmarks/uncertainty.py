@@ -5,24 +5,41 @@ model, and counts in how many of those with a usable status (trusted or approxim
 95.45 % intervals hold the truth. A cell holds where that is 91 to 99 %, or where at most 5 % of
 its tables are usable; every cell that was ordered is judged. Where the model is right, at least
 95 % of the tables must be trusted, and the intervals at most 1.5 times as long as from noise
-alone (median).
+alone (median). Truth where it is not one number: the mean over days, the mean of the two limits,
+f_max at the geometric mean of the table's peak speeds. Last, small tables of parameters that are
+drawn from a prior: with the exponent free and the noise unknown, the truth must lie at every
+quantile of its estimated distribution equally often.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy import stats
 
-from dahl_ident import Dahl, FitResult, FrequencyResponse, fit
+from dahl_ident import (
+    Backlash,
+    Dahl,
+    Damper,
+    Element,
+    FitResult,
+    FrequencyResponse,
+    Mass,
+    Record,
+    Spring,
+    extract,
+    fit,
+    response,
+)
 from dahl_ident.arrays import ComplexArray, FloatArray
 
 F_MAX, SIGMA = 0.1, 30.0
 X_C = F_MAX / SIGMA
-SEED = 2027
+SEED = 2027  # of the page; what was found wrong was mended on tables of other seeds
 TABLES = 500
 ROWS = 12
 NOISE = 0.01
@@ -44,6 +61,7 @@ class Cell:
     name: str
     draw: Draw
     right: bool = False
+    model: Element = field(default_factory=Dahl)
 
 
 @dataclass(frozen=True)
@@ -193,6 +211,70 @@ def unmodelled(part: str, share: float) -> Draw:
     return altered(change)
 
 
+def late(rng: np.random.Generator, A: FloatArray, N: ComplexArray) -> Table:
+    """Return a table at three frequencies whose force is 2 ms late."""
+    f = np.tile([0.5, 1.0, 2.0], ROWS // 3)
+    return _of(N * np.exp(-2e-3j * 2.0 * np.pi * f) * _noise(rng, ROWS, NOISE, NOISE), A, f)
+
+
+def of_another_law(law: Element) -> Draw:
+    """Return tables of another law than linear Dahl."""
+    A = _amplitudes(0.1, 10.0)
+    N = law.describing_function(A)
+    return lambda rng: _of(N * _noise(rng, ROWS, NOISE, NOISE), A)
+
+
+def growing(power: float) -> Draw:
+    """Return tables at three frequencies whose f_max grows with a power of the peak speed."""
+    f = np.tile([0.5, 1.0, 2.0], ROWS // 3)
+
+    def change(rng: np.random.Generator, A: FloatArray, _: ComplexArray) -> Table:
+        speed = f * A
+        # sigma h(A/x_c): a larger f_max is a smaller amplitude
+        N = _friction(A * (stats.gmean(speed) / speed) ** power)
+        return _of(N * _noise(rng, ROWS, NOISE, NOISE), A, f)
+
+    return altered(change)
+
+
+def driven(rng: np.random.Generator) -> Table:
+    """Return a plant's receptance at drives that are off by 3 %."""
+    f = np.tile([0.1, 0.2, 0.5, 1.0, 2.0, 3.0], 4)
+    drive = np.repeat(np.geomspace(0.02, 2.0, 4), 6)
+    true = drive * np.exp(0.03 * rng.standard_normal(24))
+    plant = Dahl(F_MAX, SIGMA) + Mass(0.3) + Damper(0.24) + Spring(0.3)
+    R = response(plant, f, true).receptance * _noise(rng, 24, NOISE, NOISE)
+    data = FrequencyResponse(f, R, drive=drive, controlled="force", quantity="receptance")
+    return data, (F_MAX, SIGMA)
+
+
+def recorded(*, skew: float = 0.0, stuck: float = 0.0) -> Draw:
+    """Return tables extracted from records whose force lags, or whose samples stick."""
+    rate, f = 2000.0, 20.0
+    t = np.arange(1200) / rate
+    phase = 2.0 * np.pi * f * t
+
+    def channel(rng: np.random.Generator, exact: FloatArray) -> FloatArray:
+        size = np.abs(exact).max()
+        noisy = exact + 0.02 * size * rng.standard_normal(exact.size)
+        last = np.arange(exact.size)
+        last[1:] -= (rng.random(exact.size - 1) < stuck).astype(int)
+        return np.asarray(noisy[last])
+
+    def draw(rng: np.random.Generator) -> Table:
+        records = []
+        for A in _amplitudes(0.1, 10.0).tolist():
+            lagged = phase - 2.0 * np.pi * f * skew
+            sign = np.where(np.sin(lagged) > 0.0, -1.0, 1.0)  # of the velocity
+            path = A + sign * A * np.cos(lagged)
+            force = sign * F_MAX * (1.0 - (1.0 + np.tanh(A / X_C)) * np.exp(-path / X_C))
+            x = channel(rng, A * np.cos(phase))
+            records.append(Record(t, displacement=x, force=channel(rng, force)))
+        return extract(records, frequency=f, harmonics=[1]), (F_MAX, SIGMA)
+
+    return draw
+
+
 def understated(rng: np.random.Generator, A: FloatArray, N: ComplexArray) -> Table:
     """Return a table whose stated standard deviations are 1.4 times too small."""
     N = N * _noise(rng, ROWS, 1.4 * NOISE, 1.4 * NOISE)
@@ -223,6 +305,14 @@ def cells() -> list[Cell]:
         Cell("amplitude off by 2 %, also in N", amplitude_error(shared=True)),
         Cell("amplitude off by 2 %, not in N", amplitude_error(shared=False)),
         Cell("10 % of the rows off by 10 %", altered(outliers)),
+        Cell("force 2 ms late at 0.5 to 2 Hz", altered(late)),
+        Cell("limits 20 % asymmetric", of_another_law(Dahl(F_MAX, SIGMA, asymmetry=0.2))),
+        Cell("backlash of 0.05 x_c", of_another_law(Backlash(Dahl(F_MAX, SIGMA), 0.05 * X_C))),
+        Cell("f_max grows as v^0.02", growing(0.02)),
+        Cell("f_max grows as v^0.1", growing(0.1)),
+        Cell("plant, drive off by 3 %", driven, model=Dahl() + Mass() + Damper() + Spring()),
+        Cell("records, force 0.1 ms late at 20 Hz", recorded(skew=1e-4)),
+        Cell("records, 2 % of the samples stuck", recorded(stuck=0.02)),
         Cell("stated deviations 1.4 times too small", altered(understated)),
     ]
     found += [
@@ -233,15 +323,15 @@ def cells() -> list[Cell]:
     return found
 
 
-def judge(cell: Cell, tables: int) -> Outcome:
+def judge(cell: Cell, tables: int, seed: int = SEED) -> Outcome:
     """Return what `tables` tables of a cell give; each has its own stream of random numbers."""
     usable, trusted = np.zeros(tables, dtype=bool), np.zeros(tables, dtype=bool)
     covered, plain = np.zeros((tables, 2), dtype=bool), np.zeros((tables, 2), dtype=bool)
     longer = np.full((tables, 2), np.nan)
     stream = sum(map(ord, cell.name))
     for index in range(tables):
-        data, truth = cell.draw(np.random.default_rng([SEED, stream, index]))
-        result = fit(data, Dahl(), throw=False)
+        data, truth = cell.draw(np.random.default_rng([seed, stream, index]))
+        result = fit(data, cell.model, throw=False)
         usable[index] = result.status.usable
         trusted[index] = result.trusted
         for i, (name, value) in enumerate(zip(("f_max", "sigma"), truth, strict=True)):
@@ -268,7 +358,52 @@ def _interval(result: FitResult, method: str, name: str) -> tuple[float, float]:
     return limits.lower, limits.upper
 
 
-def as_markdown(outcomes: Sequence[Outcome]) -> str:
+@dataclass(frozen=True)
+class Calibration:
+    """Where truths drawn from a prior lie in their estimated distributions."""
+
+    tables: int
+    usable: float
+    p_values: dict[str, float]
+    """Of Kolmogorov's test for a uniform distribution, by parameter."""
+
+    def __str__(self) -> str:
+        shown = ", ".join(f"{name} {p:.2g}" for name, p in self.p_values.items())
+        holds = min(self.p_values.values()) * len(self.p_values) > 0.01
+        return (
+            f"Six points, exponent free, noise unknown: {self.tables} tables, "
+            f"{100.0 * self.usable:.0f} % usable; p-values of uniform places {shown}: "
+            f"{'holds' if holds else 'does not hold'}."
+        )
+
+
+def calibrated(tables: int, seed: int = SEED) -> Calibration:
+    """Return the places of truths in Student's t of their combined uncertainties."""
+    A = _amplitudes(0.1, 10.0, 6)
+    names = ("f_max", "sigma", "alpha")
+    places, usable = [], 0
+    for index in range(tables):
+        rng = np.random.default_rng([seed, 6, index])
+        truth = np.array([F_MAX, SIGMA, 1.0]) * np.exp([0.5, 0.5, 0.25] * rng.standard_normal(3))
+        N = Dahl(*truth).describing_function(A) * _noise(rng, 6, NOISE, NOISE)
+        result = fit(FrequencyResponse(np.ones(6), N, A), Dahl(), free=["alpha"], throw=False)
+        if not result.status.usable or result.errors is None:
+            continue
+        usable += 1
+        errors = result.errors
+        rows = [errors.names.index(name) for name in names]
+        u = np.sqrt(np.diagonal(errors.covariance)[rows])
+        dof = np.array([errors.dof(np.eye(len(errors.names))[row]) for row in rows])
+        places.append(stats.t(dof).cdf((np.log(truth) - errors.theta[rows]) / u))
+    found = np.array(places).reshape(-1, 3)
+    p = {
+        name: float(stats.kstest(column, "uniform").pvalue) if usable else float("nan")
+        for name, column in zip(names, found.T, strict=True)
+    }
+    return Calibration(tables, usable / tables, p)
+
+
+def as_markdown(outcomes: Sequence[Outcome], calibration: Calibration | None = None) -> str:
     """Return the page: every cell, and which do not hold."""
     lines = [
         "# Stated uncertainties where the model or its noise is not quite right",
@@ -287,6 +422,8 @@ def as_markdown(outcomes: Sequence[Outcome]) -> str:
         )
     bad = sum(bool(o.failures) for o in outcomes)
     lines += ["", f"{len(outcomes) - bad} of {len(outcomes)} cells hold. Numbers in percent.", ""]
+    if calibration is not None:
+        lines += [str(calibration), ""]
     return "\n".join(lines)
 
 
@@ -295,15 +432,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--tables", type=int, default=TABLES)
     parser.add_argument("--only", default="", help="part of the names of the cells to judge")
+    parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--write", type=Path, default=None, help="page to write")
     arguments = parser.parse_args()
     outcomes = []
     for cell in cells():
         if arguments.only in cell.name:
-            outcomes.append(judge(cell, arguments.tables))
+            outcomes.append(judge(cell, arguments.tables, arguments.seed))
             print(as_markdown(outcomes[-1:]).splitlines()[-3], flush=True)
+    calibration = None if arguments.only else calibrated(arguments.tables, arguments.seed)
+    print(calibration or "")
     if arguments.write is not None:
-        arguments.write.write_text(as_markdown(outcomes))
+        arguments.write.write_text(as_markdown(outcomes, calibration))
 
 
 if __name__ == "__main__":
