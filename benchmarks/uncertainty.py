@@ -284,7 +284,10 @@ def understated(rng: np.random.Generator, A: FloatArray, N: ComplexArray) -> Tab
 
 def cells() -> list[Cell]:
     """Return every cell that is judged."""
-    found = [Cell("the model is right", wrong_exponent(1.0, 0.1, 10.0), right=True)]
+    found = [
+        Cell("the model is right", wrong_exponent(1.0, 0.1, 10.0), right=True),
+        Cell("the model is right, three frequencies", growing(0.0), right=True),
+    ]
     found += [
         Cell(f"exponent {alpha}, beta {low} to {high}", wrong_exponent(alpha, low, high))
         for alpha in (0.5, 0.8, 0.9, 1.3, 2.0)

@@ -40,6 +40,7 @@ from dahl_ident.diagnostics.error_sources import (
     relative_scatter,
 )
 from dahl_ident.diagnostics.variance_components import (
+    Contrasts,
     LinearModel,
     Projection,
     VarianceComponents,
@@ -53,7 +54,8 @@ DRIVE = "drive factor"
 _STEPS = 6
 _SETTLED = 0.02  # of a standard deviation that an iteration still moves an estimate
 _LONGEST_STEP = 0.7  # of a logarithm, in one iteration: the model is linearised
-_ASKED_FOR = {MODEL_ERROR: 0.2, NOISE: 0.3}  # rise of the log-likelihood that a source takes
+_ASKED_FOR = {MODEL_ERROR: 0.3, NOISE: 0.5}  # rise of the log-likelihood that a source takes
+_RATE = 0.1  # the same for a force limit that changes with speed
 _SUPPORTED = 4.0  # the same for another kind of noise: 0.5 % of the tables, by chance
 _LEAST_DOF = 4  # residuals beyond the parameters, below which there is noise alone
 _FEW_ROWS = 100  # with more, rows are compressed to the directions that sources can change
@@ -242,16 +244,31 @@ class _Rows:
             [known.get(p.name, np.log(p.value or 1.0)) for p in problem.parameters]
         )
         self.m = problem.n_residuals
-        self._select = np.zeros((len(assumed), len(names)))
-        for row, (name, one) in enumerate(assumed.items()):
-            self._select[row, names.index(name)] = 1.0 / one.std
+        self._columns = [names.index(name) for name in assumed]
+        self._select = np.eye(len(names))[self._columns]
+        self._given = np.array([one.std for one in assumed.values()])
+        self._ranges = np.array([one.source == EXPONENT for one in assumed.values()], dtype=bool)
+        self.std = self._given.copy()
+
+    def widen(self, covariance: FloatArray) -> None:
+        """Let ranges count for less where the data say more; `covariance` is that of theta.
+
+        A range is no best guess: where the data alone know the parameter to u, better than its
+        range does to s, an estimate must not be drawn to the middle of the range, so s^2/u takes
+        the place of s.
+        """
+        found = np.diagonal(covariance)[self._columns]
+        by_data = np.sqrt(np.maximum(1.0 / found - 1.0 / self.std**2, 1e-12))  # 1/u
+        wider = np.maximum(self._given, self._given**2 * by_data)
+        self.std = np.where(self._ranges, wider, self._given)
 
     def at(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return residuals and Jacobian: data, priors of sensors, ranges of exponents."""
         y, J = self._problem.residuals_and_jacobian(theta, tails=False)
         weight = self._weight(y)
-        y = np.concatenate([y * weight, self._select @ (theta - self.start)])
-        return y, np.vstack([J * weight[:, None], self._select])
+        select = self._select / self.std[:, None]
+        y = np.concatenate([y * weight, select @ (theta - self.start)])
+        return y, np.vstack([J * weight[:, None], select])
 
     def _weight(self, y: FloatArray) -> FloatArray:
         """Return the root of what a covariance of few degrees of freedom counts a row for."""
@@ -291,9 +308,11 @@ def _estimated(optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumpt
         projection = Projection(linear, found.variances)
         G = projection.generalised_inverse()
         move = -G @ linear.y
-        std = np.sqrt(np.diagonal(G @ linear.covariance(found.variances) @ G.T))
+        covariance = G @ linear.covariance(found.variances) @ G.T
+        std = np.sqrt(np.diagonal(covariance))
         if step == _STEPS - 1 or (step > 1 and np.all(np.abs(move) < _SETTLED * std)):
             break
+        rows.widen(covariance)
         theta = theta + move * min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
     contributions = _by_source(problem, assumed, sources, linear, found, G)
     return ErrorModel(
@@ -304,26 +323,14 @@ def _estimated(optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumpt
 _Found = tuple[tuple[Source, ...], LinearModel, VarianceComponents]
 
 
-def _fitted(
-    problem: Problem,
-    y: FloatArray,
-    J: FloatArray,
-    sources: tuple[Source, ...],
-    level: float,
-    start: FloatArray | None = None,
-) -> _Found:
-    """Return the variances of these sources, which may start where they were before."""
+def _linear(
+    problem: Problem, y: FloatArray, J: FloatArray, sources: tuple[Source, ...]
+) -> LinearModel:
     m, extra = problem.n_residuals, len(y) - problem.n_residuals
     known = np.concatenate([np.full(m, float(problem.scale_known)), np.ones(extra)])
     Z = [np.concatenate([s.columns, np.zeros((extra, *s.columns.shape[1:]))]) for s in sources]
-    upper = np.array([s.largest for s in sources])
-    if start is None or not (problem.scale_known or start[0] > 0.0):
-        scales = [s.columns.ndim == 1 and not problem.scale_known for s in sources]
-        start = np.where(scales, level, 0.0)
     linear = LinearModel(y, J, known, Z)
-    if m > 2 * _FEW_ROWS:
-        linear = linear.compressed(m)
-    return sources, linear, variance_components(linear, np.minimum(start, upper), upper)
+    return linear.compressed(m) if m > 2 * _FEW_ROWS else linear
 
 
 def _supported(
@@ -340,27 +347,32 @@ def _supported(
     Also the variances with all sources, to start from at the next estimate.
     """
     every = (*noise, *rest)
-    _, _, whole = _fitted(problem, y, J, every, level, start)
-    optional = [s.name in (MODEL_ERROR, NOISE) for s in rest]
+    linear = _linear(problem, y, J, every)
+    contrasts = Contrasts(linear)
+    upper = np.array([s.largest for s in every])
+    scales = np.array([s.columns.ndim == 1 and not problem.scale_known for s in every])
+    floor = np.where(scales, level, 0.0)
+    whole = variance_components(contrasts, floor if start is None else start, upper)
+    optional = np.array([i >= len(noise) and s.name in _ASKED_FOR for i, s in enumerate(every)])
     # what has no variance beside all others has none beside fewer that explain as much
-    asked = [
-        i
-        for i, wanted in enumerate(optional, start=len(noise))
-        if wanted and whole.variances[i] > 0.0
-    ]
-    always = [i for i in range(len(every)) if i < len(noise) or not optional[i - len(noise)]]
+    asked = np.flatnonzero(optional & (whole.variances > 0.0)).tolist()
     best, best_value = None, -np.inf
     for k in range(len(asked) + 1):
         for subset in combinations(asked, k):
-            kept = sorted([*always, *subset])
-            trial = _fitted(
-                problem, y, J, tuple(every[i] for i in kept), level, whole.variances[kept]
-            )
-            value = trial[2].log_likelihood - sum(_ASKED_FOR[every[i].name] for i in subset)
+            kept = ~optional
+            kept[list(subset)] = True
+            most = np.where(kept, upper, 0.0)
+            begin = np.minimum(np.where(whole.variances > 0.0, whole.variances, floor), most)
+            trial = variance_components(contrasts, begin, most)
+            value = trial.log_likelihood - sum(_asked_for(every[i]) for i in subset)
             if value > best_value:
                 best, best_value = trial, value
     assert best is not None
-    return best, whole.variances
+    return (every, linear, best), whole.variances
+
+
+def _asked_for(source: Source) -> float:
+    return _RATE if source.rate_of is not None else _ASKED_FOR[source.name]
 
 
 def _kind_of_noise(
@@ -369,12 +381,17 @@ def _kind_of_noise(
     """Return the kind of noise that the residuals support, and the sources with it."""
     best, kind = found, tuple(s for s in found[0] if s.name == NOISE and s.columns.ndim == 1)
     rest = tuple(s for s in found[0] if not any(s is k for k in kind))
+    kept = found[2].variances[len(kind) :] > 0.0
     for trial in (gain_and_phase(problem), additive(problem)):
         if not trial:
             continue
-        other = _fitted(problem, y, J, (*trial, *rest), level)
-        if other[2].log_likelihood > best[2].log_likelihood + _SUPPORTED:
-            best, kind = other, trial
+        sources = (*trial, *rest)
+        linear = _linear(problem, y, J, sources)
+        own = np.array([s.columns.ndim == 1 for s in sources])
+        upper = np.where([*np.full(len(trial), True), *kept], [s.largest for s in sources], 0.0)
+        other = variance_components(linear, np.where(own, level, 0.0), upper)
+        if other.log_likelihood > best[2].log_likelihood + _SUPPORTED:
+            best, kind = (sources, linear, other), trial
     return (kind, *best)
 
 

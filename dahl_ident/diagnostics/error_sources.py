@@ -31,6 +31,7 @@ _SMOOTH = 1e-3  # eigenvalue of the correlation, over the largest, that no row n
 _MOST_SHAPES = 24  # of its eigenvectors; a decade of both amplitude and frequency takes 15
 _SAME_LEVEL = 0.02  # of ln A and ln f, within which rows repeat each other
 _MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it leaves
+_LEAST_RATE_RANGE = np.log(2.0)  # of frequency, that tells speed from amplitude
 _STEP = 1e-5  # of ln A, for a slope
 _FEWEST = 2  # runs, or repeated levels, that show a scatter
 
@@ -56,6 +57,9 @@ class Source:
         Variance.
     absorbed : ndarray, shape (Q, q), or None
         Changes of theta that do the same as each column; taken out of the columns.
+    rate_of : (str, float) or None
+        Parameter that changes as a power of the peak speed, and ln of the speed where it is its
+        estimate.
     """
 
     name: str
@@ -65,6 +69,7 @@ class Source:
     own: str = ""
     largest: float = np.inf
     absorbed: FloatArray | None = None
+    rate_of: tuple[str, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -175,12 +180,9 @@ class StructuredSources:
         )
         stiffness = np.where(self._fundamental, view.stiffness, np.inf)
         self._changes = [shape.changes(self._places, stiffness) for shape in self._shapes]
-        self._moved = None
-        if data.amplitude is not None and not problem.scale_known and problem.noise == "relative":
-            moved = replace(data, amplitude=data.amplitude * np.exp(_STEP))
-            self._moved = Problem(
-                moved, problem.model, noise=problem.noise, sensors=problem.sensors
-            )
+        self._speed = self._places.sum(axis=1)
+        self._rates = bool(np.ptp(self._places[:, 1]) > _LEAST_RATE_RANGE)
+        self._moved = _moved(problem)
 
     def at(self, theta: FloatArray, J: FloatArray) -> tuple[Source, ...]:
         """Return the sources at theta; `J` is the data's Jacobian there."""
@@ -204,6 +206,18 @@ class StructuredSources:
             found.append(
                 Source(MODEL_ERROR, made, square, shape, largest=largest, absorbed=absorbed)
             )
+        centre = float(self._speed[self._fundamental].mean()) if self._fundamental.any() else 0.0
+        change = np.repeat(self._speed - centre, 2)[:, None]
+        found += [
+            Source(
+                MODEL_ERROR,
+                J[:, i : i + 1] * change,
+                float(np.mean((J[:, i] * change[:, 0]) ** 2)) * _unit_noise(problem),
+                rate_of=(problem.names[i], centre),
+            )
+            for i in _scattering_parameters(problem)
+            if self._rates
+        ]
         if len(self._runs) >= _FEWEST:
             share = self._runs.astype(np.complex128)
             found.append(Source(RUNS, columns(share), 0.5, own="gain"))
@@ -215,16 +229,16 @@ class StructuredSources:
                 for i in _scattering_parameters(problem)
             ]
         if self._moved is not None:
-            found.append(self._amplitude_noise(theta, predicted, self._moved))
+            found.append(self._noise_of_levels(theta, predicted, self._moved))
         if len(self._repeats) >= _FEWEST:
             shared = np.concatenate([self._repeats, 1j * self._repeats])
             found.append(Source(LEVELS, columns(shared), 1.0, own="both"))
         return tuple(found)
 
-    def _amplitude_noise(
+    def _noise_of_levels(
         self, theta: FloatArray, predicted: ComplexArray, moved: Problem
     ) -> Source:
-        """Return noise of the amplitudes at which relative responses were measured.
+        """Return noise of the amplitudes, or drives, at which responses were measured.
 
         It counts in slip, where the response changes with amplitude, and not in microslip.
         """
@@ -235,6 +249,22 @@ class StructuredSources:
         columns[np.arange(n), :, np.arange(n)] = own
         square = 0.5 * float(np.mean(np.abs(change / predicted) ** 2))
         return Source(NOISE, columns.reshape(2 * n, n), square)
+
+
+def _moved(problem: Problem) -> Problem | None:
+    """Return the problem at levels a little higher; None where their noise is known or nothing."""
+    data = problem.data
+    driven = data.controlled == "force"
+    stated = problem.scale_known or problem.noise != "relative"
+    if stated and not driven.any():
+        return None
+    step = np.exp(_STEP)
+    moved = replace(
+        data,
+        amplitude=None if data.amplitude is None else data.amplitude * np.where(driven, 1.0, step),
+        drive=None if data.drive is None else data.drive * np.where(driven, step, 1.0),
+    )
+    return Problem(moved, problem.model, noise=problem.noise, sensors=problem.sensors)
 
 
 def _sizes(problem: Problem, predicted: ComplexArray) -> ComplexArray:

@@ -72,6 +72,13 @@ def prediction_error(
         errors.sources, errors.linear.Z, errors.variances.tolist(), strict=True
     ):
         shapes = source.shapes
+        if source.rate_of is not None:
+            name, centre = source.rate_of
+            away = (where.sum(axis=1) - centre)[:, None, None]
+            changes = _parts(slopes[:, [errors.names.index(name)]]) * away
+            here.append(changes)
+            c += variance * changes @ part.T
+            continue
         if shapes is None or (shapes.parallel and stiffness is None):
             here.append(None)
             continue

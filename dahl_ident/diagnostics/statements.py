@@ -15,12 +15,14 @@ from dahl_ident.diagnostics.cross_validation import CrossValidation
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.goodness import Goodness
+from dahl_ident.diagnostics.misfit_explanations import rms_misfit
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Identifiability
 from dahl_ident.fitting import Optimum, solve
 
 _TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
+_NARROWEST = 0.7  # half width of 95 % bands over the rms misfit, which for noise is 1.4
 _ENOUGH_HELD_OUT = 16  # values, of which 80 % in bands of 95 % happen once in 100 times
 _DOUBTS_SHOWN = 5
 _CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chance
@@ -113,6 +115,10 @@ def _bands_hold(fit: Judged) -> bool:
     check = fit.cross_validation
     if check is None or check.count < _ENOUGH_HELD_OUT:
         return True
+    if fit.errors is not None:
+        misfit = rms_misfit(fit.errors.problem, fit.errors.theta)
+        if check.width < _NARROWEST * misfit:
+            return False
     return check.inside >= _FEWEST_INSIDE * check.count
 
 

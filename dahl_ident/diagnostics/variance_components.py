@@ -26,7 +26,7 @@ from dahl_ident.arrays import FloatArray
 
 _STEPS = 40
 _LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.02)  # of a scoring step, until the likelihood rises
-_CLOSE = 1e-4  # rise of the log-likelihood that no longer matters
+_CLOSE = 1e-3  # rise of the log-likelihood that no longer matters
 _ALIKE = 1e-10  # added to correlations of one: sources that do the same share a variance
 _LEAST = 1e-10  # variance over the largest, below which it is none
 
@@ -187,14 +187,14 @@ class Contrasts:
 
 
 def variance_components(
-    model: LinearModel, start: FloatArray, upper: FloatArray | float = np.inf
+    model: LinearModel | Contrasts, start: FloatArray, upper: FloatArray | float = np.inf
 ) -> VarianceComponents:
     """Return the restricted maximum-likelihood variances of the sources.
 
     Parameters
     ----------
-    model : LinearModel
-        Residuals and sources.
+    model : LinearModel or Contrasts
+        Residuals and sources, or their contrasts where those are known.
     start : ndarray, shape (K,)
         Variances to start from; those at 0 join where the likelihood rises with them.
     upper : ndarray, shape (K,), optional
@@ -219,7 +219,7 @@ def variance_components(
     [1.0, 2.8]
     """
     s = np.array(start, dtype=np.float64)
-    contrasts = Contrasts(model)
+    contrasts = Contrasts(model) if isinstance(model, LinearModel) else model
     state = contrasts.at(s)
     for _ in range(_STEPS):
         step = _projected(s, state.gradient, state.information, s >= upper)
