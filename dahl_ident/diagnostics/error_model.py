@@ -21,7 +21,7 @@ Williams, *Gaussian Processes*, 2006, section 2.7.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple
@@ -368,7 +368,14 @@ def _supported(
             if value > best_value:
                 best, best_value = trial, value
     assert best is not None
-    return (every, linear, best), whole.variances
+    kept = np.flatnonzero(~optional | (best.variances > 0.0))
+    return (
+        tuple(every[i] for i in kept),
+        replace(linear, Z=[linear.Z[i] for i in kept]),
+        replace(
+            best, variances=best.variances[kept], covariance=best.covariance[np.ix_(kept, kept)]
+        ),
+    ), whole.variances
 
 
 def _asked_for(source: Source) -> float:
@@ -381,14 +388,13 @@ def _kind_of_noise(
     """Return the kind of noise that the residuals support, and the sources with it."""
     best, kind = found, tuple(s for s in found[0] if s.name == NOISE and s.columns.ndim == 1)
     rest = tuple(s for s in found[0] if not any(s is k for k in kind))
-    kept = found[2].variances[len(kind) :] > 0.0
     for trial in (gain_and_phase(problem), additive(problem)):
         if not trial:
             continue
         sources = (*trial, *rest)
         linear = _linear(problem, y, J, sources)
         own = np.array([s.columns.ndim == 1 for s in sources])
-        upper = np.where([*np.full(len(trial), True), *kept], [s.largest for s in sources], 0.0)
+        upper = np.array([s.largest for s in sources])
         other = variance_components(linear, np.where(own, level, 0.0), upper)
         if other.log_likelihood > best[2].log_likelihood + _SUPPORTED:
             best, kind = (sources, linear, other), trial

@@ -1,0 +1,46 @@
+"""The validation of stated uncertainties on few tables: the code that writes the long page."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks import uncertainty
+
+
+def of(name: str) -> uncertainty.Cell:
+    (cell,) = (c for c in uncertainty.cells() if c.name == name)
+    return cell
+
+
+def test_a_cell_holds() -> None:
+    found = uncertainty.judge(of("three days, gain scatters by 5 %"), tables=8)
+    assert found.failures == []
+    assert "1 of 1 cells hold" in uncertainty.as_markdown([found])
+    assert found.plain[0] < 0.8
+
+
+def test_the_right_model_is_trusted() -> None:
+    found = uncertainty.judge(of("the model is right"), tables=8)
+    assert found.trusted >= 0.9
+    assert min(found.covered) >= 0.75
+
+
+def test_noise_alone_does_not_hold() -> None:
+    found = uncertainty.judge(of("exponent 0.8, beta 0.1 to 10.0"), tables=8)
+    assert found.plain[0] < 0.5
+    assert found.covered[0] > 0.7
+
+
+def test_every_cell_draws_its_truth() -> None:
+    cells = uncertainty.cells()
+    assert len({cell.name for cell in cells}) == len(cells)
+    for cell in cells:
+        data, truth = cell.draw(np.random.default_rng(1))
+        assert truth == (uncertainty.F_MAX, uncertainty.SIGMA)
+        assert data.n >= uncertainty.ROWS
+
+
+def test_small_tables_are_calibrated() -> None:
+    found = uncertainty.calibrated(tables=10)
+    assert found.usable > 0.9
+    assert "holds" in str(found)
