@@ -115,11 +115,21 @@ def _bands_hold(fit: Judged) -> bool:
     check = fit.cross_validation
     if check is None or check.count < _ENOUGH_HELD_OUT:
         return True
-    if fit.errors is not None:
-        misfit = rms_misfit(fit.errors.problem, fit.errors.theta)
-        if check.width < _NARROWEST * misfit:
-            return False
-    return check.inside >= _FEWEST_INSIDE * check.count
+    return not _too_narrow(fit) and check.inside >= _FEWEST_INSIDE * check.count
+
+
+def _too_narrow(fit: Judged) -> str:
+    """Return what is wrong with bands that leave out most of the misfit; empty where they hold."""
+    check, errors = fit.cross_validation, fit.errors
+    if check is None or errors is None:
+        return ""
+    misfit = rms_misfit(errors.problem, errors.theta)
+    if check.width >= _NARROWEST * misfit:
+        return ""
+    return (
+        f"The 95 % bands (half width {100.0 * check.width:.2g} %) do not cover the misfit "
+        f"({100.0 * misfit:.2g} % rms): no uncertainty can be stated."
+    )
 
 
 def _checked(fit: Judged) -> Iterator[str]:
@@ -228,5 +238,5 @@ def _objections(fit: Judged) -> Iterator[str]:
     if not goodness.acceptable and not goodness.cause:
         yield from goodness.statements
     if not _bands_hold(fit):
-        yield from _checked(fit)
+        yield _too_narrow(fit) or next(_checked(fit))
     yield from _reservations(fit)
