@@ -28,6 +28,7 @@ from dahl_ident import (
     Element,
     FitResult,
     FrequencyResponse,
+    Friction,
     Mass,
     Record,
     Spring,
@@ -218,7 +219,7 @@ def late(rng: np.random.Generator, A: FloatArray, N: ComplexArray) -> Table:
     return _of(N * np.exp(-2e-3j * 2.0 * np.pi * f) * _noise(rng, ROWS, NOISE, NOISE), A, f)
 
 
-def of_another_law(law: Element) -> Draw:
+def of_another_law(law: Friction) -> Draw:
     """Return tables of another law than linear Dahl."""
     A = _amplitudes(0.1, 10.0)
     N = law.describing_function(A)

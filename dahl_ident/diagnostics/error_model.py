@@ -370,8 +370,8 @@ def _supported(
     assert best is not None
     kept = np.flatnonzero(~optional | (best.variances > 0.0))
     return (
-        tuple(every[i] for i in kept),
-        replace(linear, Z=[linear.Z[i] for i in kept]),
+        tuple(every[i] for i in kept.tolist()),
+        replace(linear, Z=[linear.Z[i] for i in kept.tolist()]),
         replace(
             best, variances=best.variances[kept], covariance=best.covariance[np.ix_(kept, kept)]
         ),
