@@ -179,6 +179,15 @@ class TestPlan:
         assert not less.reached
         assert less.seconds <= 0.93 * plan.seconds
 
+    def test_a_time_that_rounding_exceeds_still_counts(self) -> None:
+        """Whole cycles fill the first time tried but for rounding; a twentieth is enough."""
+        limits = {"displacement": (1e-4, 1e-2), "frequency_hz": 5.0}
+        ranges = {"f_max": (0.05, 0.2), "sigma": (15.0, 60.0)}
+        wanted = {"f_max": 0.01, "sigma": 0.01}
+        plan = di.plan(di.Dahl(), ranges=ranges, limits=limits, noise=0.01, target=wanted)
+        assert plan.reached
+        assert plan.seconds < 5.0
+
     def test_earlier_data_shorten_it(self) -> None:
         rng = np.random.default_rng(2)
         A = np.geomspace(0.01, 0.3, 12) * X_C

@@ -37,6 +37,7 @@ _POOL = 80
 _MOST_RUNS = 8
 _WEIGHTS = (0.0, 0.1, 0.25, 0.5, 0.75)  # of the suspected parameters, the least that is enough
 _TIMES = 20  # corrections of the time that reaches a target
+_WITHIN = 1.0 + 1e-9  # of a time: sums of cycles are rounded
 _CLOSE = 0.985  # fraction of the target at which the search stops
 _NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _UNKNOWN = 1e-2  # the same of a suspected parameter, which is known within a decade or so
@@ -440,7 +441,7 @@ class Planner:
                 return found
             if found is not None:
                 start = found.selection.levels.tolist()
-            if found is not None and found.seconds <= time and found.ratio <= 1.0:
+            if found is not None and found.seconds <= _WITHIN * time and found.ratio <= 1.0:
                 best = found if best is None or found.seconds < best.seconds else best
                 if found.ratio >= _CLOSE:
                     break
