@@ -1,8 +1,7 @@
-"""Fits to records: against a loop with solve_ivp, and against finite differences; coverage."""
+"""Fits to records: against a loop with solve_ivp, and against finite differences."""
 
 from __future__ import annotations
 
-import sys
 from functools import partial
 
 import numpy as np
@@ -99,27 +98,5 @@ def _displacement(samples: int, seed: int) -> FloatArray:
     return np.asarray(1e-2 * shaped / np.abs(shaped).max())
 
 
-def coverage(runs: int = 200, pole: float = 0.9) -> dict[str, float]:
-    """Return the share of records whose 95 % intervals hold the truth, by parameter."""
-    x = _displacement(600, 2)
-    clean = di.Dahl(0.1, 30.0).force(x) + 5.0 * x
-    model = di.Dahl() + di.Spring()
-    truth = {"f_max": 0.1, "sigma": 30.0, "stiffness": 5.0}
-    inside = dict.fromkeys(truth, 0)
-    for seed in range(runs):
-        rng = np.random.default_rng(seed)
-        noise = lfilter([1.0], [1.0, -pole], rng.standard_normal(900))[300:]
-        force = clean + 1e-3 * np.sqrt(1.0 - pole**2) * noise
-        record = di.Record(np.arange(600) / RATE, displacement=x, force=force)
-        within = di.fit(record, model, start=truth).conf_interval()
-        for name, value in truth.items():
-            inside[name] += within[name][0] < value < within[name][1]
-    return {name: count / runs for name, count in inside.items()}
-
-
 if __name__ == "__main__":
-    if "coverage" in sys.argv:
-        for pole in (0.0, 0.9):
-            print(f"noise with a pole at {pole}:", coverage(500, pole))
-    else:
-        print_table(TITLE, run())
+    print_table(TITLE, run())

@@ -16,7 +16,7 @@ import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.correlated_residuals import autoregression, sandwich
 from dahl_ident.elements import Element, Model
-from dahl_ident.errors import DataError, ModelError, ValidationError
+from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
 from dahl_ident.problem.record_noise import drive_noise, excited, prediction_error_filter
 from dahl_ident.results import RecordFit
 from dahl_ident.time_domain import ForcedMotion, Plant, band_limited, differentiated
@@ -230,6 +230,41 @@ def test_what_is_not_determined_is_said_with_the_motion_that_would() -> None:
     assert not fit.trusted
     assert "f_max is not determined" in fit.verdict
     assert "move farther" in fit.verdict
+
+
+def test_what_the_model_misses_from_place_to_place_is_in_the_budget() -> None:
+    # friction whose level wanders by 10 % from one twentieth of the record to the next
+    samples = 4000
+    clean = recorded(DAHL, "random", samples, 0.0)
+    levels = np.random.default_rng(3).standard_normal(20)
+    levels = 1.0 + 0.1 * (levels - levels.mean()) / levels.std(ddof=1)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(samples)
+    force = np.repeat(levels, samples // 20) * clean.force_samples + noise
+    wandering = di.Record(clean.time, displacement=clean.displacement, force=force)
+    fit = di.fit(wandering, di.Dahl())
+    rows = {row.source: row for row in fit.budget()["f_max"].rows}
+    assert rows["model error"].u == pytest.approx(0.1 * 0.1 / np.sqrt(20.0), rel=0.25)
+    assert rows["model error"].dof == 19.0
+    assert fit.status.value == "approximate"
+    assert fit.coverage_factor == pytest.approx(2.093, abs=1e-3)  # Student's t of 19
+    steady = di.fit(recorded(DAHL, "random", samples, 1e-3), di.Dahl())
+    assert [row.source for row in steady.budget()["f_max"].rows] == ["noise"]
+    assert steady.trusted
+
+
+def test_parts_that_are_left_out_are_predicted() -> None:
+    record = recorded(DAHL, "random", 900, 1e-3)
+    check = di.fit(record, di.Dahl()).hold_out(3)
+    assert [part.samples for part in check.parts] == [300, 300, 300]
+    assert check.parts[1].start == record.time[300]
+    for part in check.parts:
+        assert part.rms_share < 2.0 * 1e-3 / np.std(record.force_samples)
+        assert binom.ppf(1e-5, 300, 0.95) < 300 * part.inside
+    assert "all samples:" in str(check)
+    runs = [recorded(DAHL, "random", 300, 1e-3, seed) for seed in (1, 2)]
+    assert [part.record for part in di.fit(runs, di.Dahl()).hold_out().parts] == [1, 2]
+    with pytest.raises(FitError, match="nothing is left to fit"):
+        di.fit(record, di.Dahl()).hold_out(1)
 
 
 def test_a_wrong_model_is_not_trusted() -> None:

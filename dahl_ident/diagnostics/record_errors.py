@@ -1,4 +1,4 @@
-"""What a fit to records is uncertain of: noise, noise in the drive, calibration; and its budget."""
+"""What a fit to records is uncertain of: noise, model error, drive, calibration; its budget."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.stats import chi2
 
 from dahl_ident.arrays import FloatArray, positive_array
 from dahl_ident.diagnostics.bands import DerivedQuantity
@@ -17,7 +18,10 @@ from dahl_ident.problem.record_problem import RecordProblem
 
 _SLIGHT = 1e-6  # relative: noise of the drive below does not count
 _STEP = 1e-5  # relative, of parameters, for slopes of derived quantities
+_BLOCKS = 20  # of all records together, from which the model error is estimated
+_LEVEL = 0.9995  # of chance, at which scatter between blocks is no noise
 NOISE, DRIVE, FORCE = "noise", "noise in the drive", "force calibration"
+MODEL = "model error"
 
 
 @dataclass(frozen=True)
@@ -45,8 +49,14 @@ class RecordErrors:
 
     @property
     def dof(self) -> float:
-        """Degrees of freedom of the noise."""
-        return max(self.effective - len(self.covariance), 1.0)
+        """Degrees of freedom: of the noise, or of the blocks that show a model error."""
+        return _BLOCKS - 1.0 if MODEL in self.contributions else self.dof_of(NOISE)
+
+    def dof_of(self, source: str) -> float:
+        """Degrees of freedom of one source."""
+        if source == NOISE:
+            return max(self.effective - len(self.covariance), 1.0)
+        return _BLOCKS - 1.0 if source == MODEL else np.inf
 
 
 def record_errors(
@@ -57,8 +67,11 @@ def record_errors(
 ) -> RecordErrors:
     """Return the errors of an estimate.
 
-    Noise in a measured drive makes the response look smaller than it is, by the noise's share of
-    the drive's power within its band; a calibration error of the force scales every force.
+    A model that misses more than noise does so differently from place to place: where the blocks
+    of a record ask for parameters that scatter more than noise explains, the excess is the model
+    error. What the model misses everywhere alike does not show. Noise in a measured drive makes
+    the response look smaller than it is, by the noise's share of the drive's power within its
+    band; a calibration error of the force scales every force.
 
     Parameters
     ----------
@@ -75,6 +88,11 @@ def record_errors(
     white = [problem.filtered(J) for J in jacobians]
     covariance, effective = sandwich(white, [problem.filtered(e) for e in residuals])
     found = {NOISE: covariance}
+    beyond = _model_error(
+        white, [problem.filtered(e) for e in residuals], covariance, len(problem.free)
+    )
+    if beyond is not None:
+        found[MODEL] = beyond
     scale = np.zeros(values.size)
     for i, parameter in enumerate(problem.free):
         scale[i] = values[i] * parameter.dimension[0]
@@ -95,6 +113,42 @@ def record_errors(
     return RecordErrors(found, effective, tuple(exact))
 
 
+def _model_error(
+    jacobians: Sequence[FloatArray],
+    residuals: Sequence[FloatArray],
+    noise: FloatArray,
+    count: int,
+) -> FloatArray | None:
+    """Return the covariance between blocks beyond that of noise, or None where it shows none.
+
+    The covariance between blocks is that of Liang and Zeger, Biometrika 73 (1986) 13-22; whether
+    it exceeds noise is judged for each of the first `count` parameters.
+    """
+    samples = sum(e.size for e in residuals)
+    if samples < _BLOCKS * _BLOCKS or not np.isfinite(noise).all() or not noise.any():
+        return None
+    size = np.sqrt(noise.diagonal())
+    scores, parts = [], []
+    for J, e in zip(jacobians, residuals, strict=True):
+        scaled = J * size
+        for rows in np.array_split(np.arange(e.size), max(1, round(_BLOCKS * e.size / samples))):
+            scores.append(scaled[rows].T @ e[rows])
+            parts.append(scaled[rows].T @ scaled[rows])
+    inverse = np.linalg.inv(sum(parts))
+    steps = np.array(scores) @ inverse
+    blocks = len(steps)
+    between = blocks / (blocks - 1.0) * steps.T @ steps
+    correlation = noise / np.outer(size, size)
+    weights = np.array([(inverse @ part @ inverse).diagonal() for part in parts])
+    dof = np.maximum(weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0) - 1.0, 1.0)
+    ratio = between.diagonal() / correlation.diagonal()
+    if not (ratio > chi2.ppf(_LEVEL, dof) / dof)[:count].any():
+        return None
+    values, vectors = np.linalg.eigh(between - correlation)
+    beyond = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return np.asarray(beyond * np.outer(size, size))
+
+
 def record_budget(problem: RecordProblem, values: FloatArray, errors: RecordErrors) -> Budget:
     """Return the uncertainty budget of the model's free parameters."""
     count = len(problem.free)
@@ -104,12 +158,12 @@ def record_budget(problem: RecordProblem, values: FloatArray, errors: RecordErro
         u2 = float(total[i, i])
         rows = []
         for source, covariance in errors.contributions.items():
-            kind: Literal["A", "B"] = "A" if source == NOISE else "B"
+            kind: Literal["A", "B"] = "A" if source in (NOISE, MODEL) else "B"
             own = float(covariance[i, i])
-            dof = errors.dof if kind == "A" else np.inf
+            dof = errors.dof_of(source)
             rows.append(BudgetRow(source, kind, own**0.5, dof, own / u2 if u2 > 0.0 else 0.0))
-        noise = float(errors.contributions[NOISE][i, i])
-        dof = errors.dof * (u2 / noise) ** 2 if noise > 0.0 else np.inf
+        loss = sum(row.u**4 / row.dof for row in rows)  # Welch and Satterthwaite
+        dof = u2**2 / loss if loss > 0.0 else np.inf
         rows.sort(key=lambda row: -row.u)
         parameters.append(
             ParameterBudget(

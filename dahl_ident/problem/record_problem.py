@@ -181,10 +181,10 @@ class RecordProblem:
                 per_cycle = 2.0 * np.pi * np.std(x) / (np.std(np.diff(x)) or 1.0)
                 step = int(np.clip(per_cycle / _PER_CYCLE, 1.0, np.ceil(spare)))
             n = max(_SHORTEST, int(samples * len(record) // self.n_residuals))
-            thin, wave = _cut(record, slice(None, None, step)), y[::step]
+            thin, wave = cut(record, slice(None, None, step)), y[::step]
             energy = np.concatenate([[0.0], np.cumsum((wave - wave.mean()) ** 2)])
             start = int(np.argmax(energy[n:] - energy[:-n])) if n < wave.size else 0
-            parts.append(_cut(thin, slice(start, start + n)))
+            parts.append(cut(thin, slice(start, start + n)))
         return RecordProblem(
             parts,
             self.model,
@@ -393,7 +393,7 @@ class RecordProblem:
         return (size,) * len(self.records)
 
 
-def _cut(record: Record, part: slice) -> Record:
+def cut(record: Record, part: slice) -> Record:
     """Return some of a record's samples."""
     channels = {
         name: None if samples is None else samples[part]

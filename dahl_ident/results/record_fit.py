@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from scipy.stats import t as student_t
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.data import Record
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.formatting import listed, rounded, table
 from dahl_ident.diagnostics.record_errors import (
+    MODEL,
     NOISE,
     RecordErrors,
     record_budget,
@@ -35,8 +36,9 @@ from dahl_ident.elements.description import describe_model, model_from_descripti
 from dahl_ident.errors import DataError, FitError, ValidationError
 from dahl_ident.fitting.record_search import RecordOptimum, hold_model, solve_records
 from dahl_ident.problem.record_noise import share_in_band
-from dahl_ident.problem.record_problem import RecordProblem
+from dahl_ident.problem.record_problem import RecordProblem, cut
 from dahl_ident.results.fit_numbers import Estimate
+from dahl_ident.results.hold_out import HeldOut, HoldOut
 from dahl_ident.results.result import Result
 
 if TYPE_CHECKING:
@@ -239,7 +241,8 @@ class RecordFit(Result):
             return VerdictStatus.NOT_DESCRIBED
         if self.findings:
             return VerdictStatus.NOT_DETERMINED
-        if self.goodness.correlation > _STRUCTURED and self._share_left > _WELL:
+        structured = self.goodness.correlation > _STRUCTURED and self._share_left > _WELL
+        if structured or MODEL in self.errors.contributions:
             return VerdictStatus.APPROXIMATE
         return VerdictStatus.TRUSTED
 
@@ -368,6 +371,51 @@ class RecordFit(Result):
         by = found.by[:, :count]
         variance = np.einsum("ij,jk,ik->i", by, self.covar[:count, :count], by)
         return self.band(problem, found.output, variance)
+
+    def hold_out(self, parts: int | None = None) -> HoldOut:
+        """Return how well parts of the records are predicted by fits to the rest.
+
+        Parameters
+        ----------
+        parts : int, optional
+            In how many parts each record is cut. Left out: several records are left out as a
+            whole, one at a time, and a single one is cut in four.
+
+        Returns
+        -------
+        HoldOut
+            Each part left out in turn; printed, a table.
+
+        Raises
+        ------
+        DataError
+            If a part is too short to be fitted.
+        FitError
+            If nothing is left to fit.
+        """
+        if parts is None:
+            parts = 1 if len(self.records) > 1 else 4
+        if whole_number(parts, "parts", 1) * len(self.records) < 2:
+            raise FitError("with the only record left out, nothing is left to fit; give parts=2")
+        pieces = [
+            (number, cut(record, slice(int(rows[0]), int(rows[-1]) + 1)))
+            for number, record in enumerate(self.records, 1)
+            for rows in np.array_split(np.arange(len(record)), parts)
+        ]
+        own = self.problem
+        start = {p.name: self.params[p.name].value for p in own.free}
+        found = []
+        for k, (number, piece) in enumerate(pieces):
+            rest = [other for i, (_, other) in enumerate(pieces) if i != k]
+            fit = fit_records(
+                rest, own.model, start=start, throw=False, output=own.output,
+                excitation=own.excitation, substeps=own.substeps,
+            )  # fmt: skip
+            band = fit.predict(piece)
+            inside = np.mean((band.measured >= band.lower) & (band.measured <= band.upper))
+            first, last = float(piece.time[0]), float(piece.time[-1])
+            found.append(HeldOut(number, first, last, len(piece), band.rms_share, float(inside)))
+        return HoldOut(tuple(found))
 
     def started(
         self, record: Record, values: FloatArray, initial: Literal["fitted", "rest"]
