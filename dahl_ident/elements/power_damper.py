@@ -14,7 +14,7 @@ force becomes Coulomb's, 4 c/pi of fundamental.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import gamma, rgamma
@@ -23,6 +23,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.element import (
     Element,
     HistoryGradient,
+    Mechanics,
     StiffnessGradient,
     central_differences,
     motion,
@@ -32,6 +33,7 @@ from dahl_ident.elements.parameter import Parameter
 if TYPE_CHECKING:
     import casadi as ca
 
+_AT_REST = 1e-12  # square of the speed, over the reference speed, that counts as rest
 _LANCZOS = (
     0.99999999999980993, 676.5203681218851, -1259.1392167224028, 771.32342877765313,
     -176.61502916214059, 12.507343278686905, -0.13857109526572012, 9.9843695780195716e-6,
@@ -175,6 +177,14 @@ class PowerDamper(Element):
             logarithm = np.where(v == 0.0, 0.0, np.log(np.abs(v)))
         by = (unit, c * unit * logarithm, -c * p / speed * unit)
         return HistoryGradient(np.asarray(c * unit), np.zeros(unit.shape), by)
+
+    def mechanics(
+        self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
+    ) -> Mechanics:
+        """Return the force for the velocity; smooth within 1e-6 of the reference speed from rest."""
+        c, p, speed = values
+        ratio = velocity / speed
+        return Mechanics(0.0, c * ratio * (ratio * ratio + _AT_REST) ** (0.5 * (p - 1.0)), 0.0)
 
     def casadi_stiffness(
         self, values: Sequence[ca.SX], amplitude: ca.SX, omega: ca.SX, harmonic: int = 1
