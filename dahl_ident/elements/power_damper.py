@@ -181,7 +181,7 @@ class PowerDamper(Element):
     def mechanics(
         self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
     ) -> Mechanics:
-        """Return the force for the velocity; smooth within 1e-6 of the reference speed from rest."""
+        """Return the force; within 1e-6 of the reference speed from rest it is smooth."""
         c, p, speed = values
         ratio = velocity / speed
         return Mechanics(0.0, c * ratio * (ratio * ratio + _AT_REST) ** (0.5 * (p - 1.0)), 0.0)

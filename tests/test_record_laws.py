@@ -1,0 +1,121 @@
+"""Every law is recovered from records of a multisine, a trapezoidal motion and a ring-down."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dahl_ident as di
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements import Element, Model
+from dahl_ident.time_domain import ForcedMotion, Plant, band_limited, differentiated
+from tests.test_forced_motion import multisine
+from tests.test_record_fit import RATE, trajectory
+
+MOTIONS = ("multisine", "trapezoid", "ring-down")
+LAWS: list[tuple[Element, Element]] = [
+    (di.Dahl(0.1, 30.0), di.Dahl()),
+    (di.Dahl(0.1, 30.0, alpha=1.5), di.Dahl(alpha=None)),
+    (di.Dahl(0.1, 30.0, asymmetry=0.2), di.Dahl(asymmetry=None)),
+    (di.BoucWen(30.0, 200.0, 500.0), di.BoucWen()),
+    (di.Backlash(di.Dahl(0.1, 60.0), gap=1e-3), di.Backlash(di.Dahl())),
+    (di.PowerDamper(0.2, 0.5), di.PowerDamper()),
+    (di.MaxwellSlip([1e-3, 4e-3], [20.0, 10.0]), di.MaxwellSlip([1e-3, 4e-3])),
+]
+_DAHL = (di.Dahl(0.1, 300.0) + di.Damper(0.5), di.Dahl() + di.Damper())
+_LOSS = (di.PowerDamper(0.5, 0.5), di.PowerDamper())
+PLANTS: list[tuple[str, Element, Element]] = [
+    *((kind, *pair) for pair in (_DAHL, _LOSS) for kind in MOTIONS),
+    (
+        "ring-down",
+        di.Dahl(0.1, 300.0, asymmetry=0.2) + di.Damper(0.5),
+        di.Dahl(asymmetry=None) + di.Damper(),
+    ),
+    ("multisine", di.BoucWen(300.0, 1500.0, 3000.0) + di.Damper(0.5), di.BoucWen() + di.Damper()),
+    ("multisine", di.PowerDamper(0.5, 2.0), di.PowerDamper()),
+]
+
+
+def displacement(kind: str, samples: int) -> FloatArray:
+    """Return a displacement of about 10 mm."""
+    if kind == "ring-down":
+        t = np.arange(samples) / RATE
+        return np.asarray(1.2e-2 * np.exp(-2.0 * t) * np.cos(6.0 * np.pi * t))
+    return trajectory(kind, samples)
+
+
+def drive(kind: str, samples: int) -> FloatArray:
+    """Return a force of about 1 N; none for a ring-down."""
+    t = np.arange(samples) / RATE
+    if kind == "trapezoid":
+        corners = [0.0, 0.6, 0.6, -0.6, -0.6, 0.6, 0.6, -0.3, 0.0]
+        return np.interp(t, np.linspace(0.0, t[-1], len(corners)), corners)
+    if kind == "ring-down":
+        return np.zeros(samples)
+    phases = np.random.default_rng(0).random(57)
+    lines = zip(np.arange(3, 60) * RATE / 1024.0, phases, strict=True)
+    return np.asarray(0.03 * np.sum([np.sin(2 * np.pi * (f * t + p)) for f, p in lines], axis=0))
+
+
+def assert_recovered(fit: di.RecordFit, truth: Element) -> None:
+    """Check every free parameter against its uncertainty, which must say something."""
+    assert fit.trusted, fit.verdict
+    for parameter in truth.parameters:
+        found = fit.params[parameter.name]
+        if found.vary:
+            value = float(parameter.value or 0.0)
+            assert abs(found.value - value) < 4.5 * float(found.stderr or 0.0), found
+            assert float(found.stderr or 0.0) < 0.3 * value, found
+
+
+@pytest.mark.parametrize("kind", MOTIONS)
+@pytest.mark.parametrize(("truth", "model"), LAWS)
+def test_force_from_displacement(truth: Element, model: Element, kind: str) -> None:
+    samples = 600
+    x = displacement(kind, samples)
+    v, _ = differentiated(x, 1.0 / RATE)
+    values = [float(p.value or 0.0) for p in truth.parameters]
+    start = 0.02 if truth.has_memory and not isinstance(truth, di.MaxwellSlip) else 0.0
+    force = truth.force_history(values, x, v, start)
+    force = force + 5e-4 * np.random.default_rng(1).standard_normal(samples)
+    record = di.Record(np.arange(samples) / RATE, displacement=x, force=force)
+    assert_recovered(di.fit(record, model, throw=False), truth)
+
+
+@pytest.mark.parametrize(("kind", "truth", "model"), PLANTS)
+def test_motion_from_force(kind: str, truth: Element, model: Element) -> None:
+    samples = 384
+    known = kind == "ring-down"  # no force is measured, so the mass has to be known
+    whole = Model(truth + di.Mass(0.3) + di.Spring(50.0))
+    wave = drive(kind, samples)
+    forced = ForcedMotion(Plant(whole, "force"), band_limited(wave, 1 / RATE, 4), 1 / RATE)
+    first = np.zeros(forced.plant.order)
+    first[0] = 2e-2 if known else 0.0
+    motion = forced.solve(np.zeros(0), first, np.tile(first, (samples, 1)))
+    x = motion[:, 0]
+    x = x + 1e-3 * x.std() * np.random.default_rng(1).standard_normal(samples)
+    record = di.Record(np.arange(samples) / RATE, displacement=x, force=wave)
+    mass = di.Mass(0.3) if known else di.Mass()
+    assert_recovered(di.fit(record, model + mass + di.Spring(), throw=False), whole)
+
+
+@pytest.mark.parametrize(("exponent", "accuracy"), [(1.5, 1e-8), (0.5, 1e-5)])
+def test_power_damper_against_scipy(exponent: float, accuracy: float) -> None:
+    samples = 128
+    wave, force = multisine(samples)
+
+    def rates(t: float, y: FloatArray) -> list[float]:
+        damping = 8.0 * np.sign(y[1]) * abs(y[1]) ** exponent
+        return [y[1], (force(t) - damping - 5e4 * y[0]) / 2.0]
+
+    times = np.arange(samples) / 750.0
+    expected = solve_ivp(
+        rates, (0.0, times[-1]), [1e-4, 0.0], method="DOP853", t_eval=times,
+        rtol=1e-11, atol=1e-14, max_step=0.1 / 750.0,
+    ).y.T  # fmt: skip
+    whole = Model(di.PowerDamper(8.0, exponent) + di.Mass(2.0) + di.Spring(5e4))
+    forced = ForcedMotion(Plant(whole, "force"), band_limited(wave, 1 / 750.0, 8), 1 / 750.0)
+    found = forced.solve(np.zeros(0), np.array([1e-4, 0.0]), np.zeros((samples, 2)))
+    error = np.abs(found - expected).max(axis=0) / np.abs(expected).max(axis=0)
+    assert error.max() < accuracy
