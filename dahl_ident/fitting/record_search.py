@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,7 +24,7 @@ _SLOW = 0.5  # correlation of neighbouring residuals that are weighted by their 
 _DESCRIBED = 0.1  # share of variance left beyond which the model is wrong, not the drive noisy
 _EXACT = 1e-12  # share of variance left that is rounding
 _REPEATS = 12
-_SETTLED = 0.03  # change of the estimate in standard errors at which weighting ends
+_SETTLED = 0.03  # step in standard errors that no longer matters
 _LOOSE = 1e4  # of the step at which a search of a long record has converged
 
 
@@ -213,7 +213,16 @@ def _descend(problem: RecordProblem, theta: FloatArray, steps: int) -> Minima:
     if bool(found.converged[0]) or not np.isfinite(found.cost[0]):
         return found
     noise = 2.0 * float(found.cost[0]) / problem.n_residuals
-    return _minimise(problem, found.theta, _WORTHLESS * noise, steps)
+    found = _minimise(problem, found.theta, _WORTHLESS * noise, steps)
+    if bool(found.converged[0]):
+        return found
+    # where a motion comes to rest, errors of its integration hide the last small falls of the cost
+    end = problem.quadratic(found.theta[0])
+    with np.errstate(all="ignore"):
+        size = np.sqrt(end.hessian.diagonal())
+        slope = end.gradient / size
+        left = slope @ np.linalg.pinv(end.hessian / np.outer(size, size), hermitian=True) @ slope
+    return replace(found, converged=np.array([bool(left < _SETTLED**2 * noise)]))
 
 
 def _minimise(problem: RecordProblem, begin: FloatArray, enough: float, most: int) -> Minima:
