@@ -309,7 +309,7 @@ def _estimated(optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumpt
         G = projection.generalised_inverse()
         move = -G @ linear.y
         covariance = G @ linear.covariance(found.variances) @ G.T
-        std = np.sqrt(np.diagonal(covariance))
+        std = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))  # below zero by rounding
         if step == _STEPS - 1 or (step > 1 and np.all(np.abs(move) < _SETTLED * std)):
             break
         rows.widen(covariance)
