@@ -206,7 +206,7 @@ class TestOutliers:
         assert first.level == "run 7"
         assert first.amplitude == amplitudes(data)[7]
         assert first.deviation > 5.0
-        assert "row 7 (1 Hz, amplitude 0.00101, level run 7) lies" in str(first)
+        assert "1 Hz, 1.01 mm, level run 7 lies" in str(first)
 
     def test_deviation_is_that_of_the_fit_without_the_point(self) -> None:
         """The mean-shift test is exact for a linear model: leave the point out and predict it."""
@@ -229,7 +229,7 @@ class TestOutliers:
         R[7] *= 1.1
         found = judge(replace(data, response=R), loss="huber")
         assert [point.row for point in found.suspicious] == [7]
-        assert "Suspicious rows: 7; check them" in found.headline
+        assert "Suspicious rows: 1 Hz, 1.01 mm; check them" in found.headline
         assert judge(data, loss="huber").suspicious == ()
 
     def test_none_where_too_few_points(self) -> None:
@@ -278,7 +278,7 @@ class TestPhysics:
         R = data.response.copy()
         R[-1] *= 1.2
         warnings = judge(replace(data, response=R)).warnings
-        assert any("in row 29 friction's fundamental is" in w for w in warnings)
+        assert any("at 1 Hz, 333 mm friction's fundamental is" in w for w in warnings)
         assert not judge(data).warnings
 
     def test_a_parameter_at_its_bound(self) -> None:
@@ -318,7 +318,8 @@ class TestPhysics:
         result = fit(mixed, Dahl() + Mass(0.3) + Damper(0.24) + Spring())
         row = 7 + int(np.argmax(third_harmonic_share(result.optimum)))
         (text,) = result.goodness.warnings
-        assert f"of its fundamental in row {row}: a describing function" in text
+        where = f"{f[row]:.4g} Hz, {1e3 * driven.drive[row - 7]:.3g} mN"
+        assert f"of its fundamental at {where}: a describing function" in text
 
     def test_a_nearly_linear_plant_moves_in_a_sine(self) -> None:
         plant = FRICTION + Mass(0.3) + Damper(20.0) + Spring(300.0)

@@ -165,13 +165,13 @@ def extract(
 
 def good_points(data: FrequencyResponse) -> FrequencyResponse:
     """Return the points whose verdict is good, and name the others."""
+    from dahl_ident.data.row_names import row_names
     from dahl_ident.errors import ExtractionError
 
     good = data.quality["verdict"] == "good"
-    for i in (~good & (data.harmonic == data.harmonic.min())).nonzero()[0]:
-        console.write_error(
-            f"left out: row {i} at {data.frequency_hz[i]:.5g} Hz: {data.quality['verdict'][i]}"
-        )
+    rows = (~good & (data.harmonic == data.harmonic.min())).nonzero()[0].tolist()
+    for i, name in zip(rows, row_names(data, rows), strict=True):
+        console.write_error(f"left out: {name}: {data.quality['verdict'][i]}")
     if not good.any():
         raise ExtractionError("no point is good; without --good-only the table holds them all")
     return data.select(rows=good)

@@ -299,7 +299,7 @@ class Goodness:
     def _apart(self) -> str:
         if not self.suspicious:
             return ""
-        rows = _joined([str(point.row) for point in self.suspicious], 5, ", ")
+        rows = _joined([point.name for point in self.suspicious], 5)
         if self.neighbours:
             return (
                 f"Suspicious rows: {rows}; without them the model describes the data, but they are "
@@ -344,11 +344,11 @@ def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
     where = neighbourhood(optimum, rows)
     if where:
         return replace(found, neighbours=where)
-    numbers = _joined([str(row) for row in rows], 10, ", ")
+    names = _joined([point.name for point in found.suspicious], 10)
     n = optimum.problem.data.n
-    them, named = "them", f"Only {len(rows)} of {n} rows ({numbers}) contradict"
+    them, named = "them", f"Only {len(rows)} of {n} rows ({names}) contradict"
     if len(rows) == 1:
-        them, named = "it", f"Only row {numbers} contradicts"
+        them, named = "it", f"Only the row at {names} contradicts"
     left = rest.described[0].lower() + rest.described[1:].rstrip(".")
     return replace(
         found,

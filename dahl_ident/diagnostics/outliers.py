@@ -18,6 +18,7 @@ from scipy import special
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.data.row_names import row_names
 from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.fitting import Optimum
 
@@ -35,6 +36,8 @@ class SuspiciousPoint:
     ----------
     row : int
         Its index in the table.
+    name : str
+        What a person calls it: frequency, level, harmonic, run.
     frequency_hz, amplitude : float
         Where it is.
     level : object
@@ -46,6 +49,7 @@ class SuspiciousPoint:
     """
 
     row: int
+    name: str
     frequency_hz: float
     amplitude: float
     level: Any
@@ -53,11 +57,7 @@ class SuspiciousPoint:
     p_value: float
 
     def __str__(self) -> str:
-        label = "" if self.level is None else f", level {self.level}"
-        return (
-            f"row {self.row} ({self.frequency_hz:.4g} Hz, amplitude {self.amplitude:.3g}{label}) "
-            f"lies {self.deviation:.1f} standard deviations off"
-        )
+        return f"{self.name} lies {self.deviation:.1f} standard deviations off"
 
 
 def suspicious_points(optimum: Optimum, space: ResidualSpace) -> tuple[SuspiciousPoint, ...]:
@@ -67,13 +67,16 @@ def suspicious_points(optimum: Optimum, space: ResidualSpace) -> tuple[Suspiciou
     return tuple(
         SuspiciousPoint(
             row,
+            name,
             float(data.frequency_hz[row]),
             float(amplitude[row]),
             None if data.level is None else data.level[row].item(),
             deviation,
             p,
         )
-        for row, deviation, p in found
+        for (row, deviation, p), name in zip(
+            found, row_names(data, [row for row, *_ in found]), strict=True
+        )
     )
 
 
@@ -154,10 +157,13 @@ def flagged_rows(data: FrequencyResponse) -> tuple[str, ...]:
     ...     [1.0, 1.0], [1.0, 2.0], [1.0, 2.0], quality={"verdict": ["good", "not settled"]}
     ... )
     >>> flagged_rows(data)
-    ('row 1: not settled',)
+    ('1 Hz, 2 m: not settled',)
     """
     verdicts = data.quality.get("verdict")
     if verdicts is None:
         return ()
     rows = np.flatnonzero((verdicts != _GOOD) & (data.harmonic == 1))
-    return tuple(f"row {row}: {verdicts[row]}" for row in rows)
+    return tuple(
+        f"{name}: {verdicts[row]}"
+        for row, name in zip(rows, row_names(data, rows.tolist()), strict=True)
+    )

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.row_names import row_names
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.third_harmonic import third_harmonic_share
@@ -33,10 +34,11 @@ def _not_a_sine(optimum: Optimum) -> Iterator[str]:
     """Yield where the motion of a driven plant is far from the sine that is assumed."""
     share = third_harmonic_share(optimum)
     if share.size and share.max() > _HARMONIC_SHARE:
-        row = np.flatnonzero(optimum.problem.data.controlled == "force")[np.argmax(share)]
+        data = optimum.problem.data
+        (name,) = row_names(data, [int(np.flatnonzero(data.controlled == "force")[share.argmax()])])
         yield (
             f"the displacement's third harmonic is predicted to be {100.0 * share.max():.2g} % of "
-            f"its fundamental in row {row}: a describing function, which assumes a sine, is "
+            f"its fundamental at {name}: a describing function, which assumes a sine, is "
             "inaccurate there; control the displacement, or leave such points out"
         )
 
@@ -78,8 +80,9 @@ def _beyond_friction_limit(optimum: Optimum) -> Iterator[str]:
     dof = 1e9 if optimum.scale_known else max(optimum.dof, 1)
     if excess[row] > special.stdtrit(dof, 1.0 - _LEVEL / rows.size):
         unit = shown_unit("N", optimum.problem.data.motion)
+        (name,) = row_names(optimum.problem.data, [row])
         yield (
-            f"in row {row} friction's fundamental is {with_unit(force[row], error[row], unit)}, "
+            f"at {name} friction's fundamental is {with_unit(force[row], error[row], unit)}, "
             f"more than full slip can give ({limit:.3g} {unit}, 4/pi of its limit): something "
             "besides the model carries force"
         )

@@ -176,10 +176,10 @@ def _moved_by_outliers(fit: Judged) -> Iterator[str]:
         if abs(after - before) > errors.stderr[name]
     ]
     if moved:
-        rows = ", ".join(str(point.row) for point in fit.goodness.suspicious[:5])
+        rows = "; ".join(point.name for point in fit.goodness.suspicious[:5])
         yield (
             f"A robust fit moves {listed(moved)} by more than one standard uncertainty: look at "
-            f'rows {rows}, or fit with loss="huber".'
+            f'{rows}, or fit with loss="huber".'
         )
 
 
