@@ -129,10 +129,26 @@ class TestBudget:
         number = found.numbers()["f_max"]
         assert number.std_dev == pytest.approx(found["f_max"].u)
 
-    def test_no_budget_of_what_is_undetermined(self) -> None:
+    def test_at_infinity_what_is_determined_has_a_budget(self) -> None:
         result = fit(table(beta=(1e-3, 1e-2), seed=3), Dahl() + Spring(), throw=False)
+        assert not result.success
+        (only,) = result.budget().parameters
+        assert only.name == "sigma + stiffness"
+        assert only.value == pytest.approx(30.0, abs=only.U)
+        (alone,) = (c for c in result.combinations if c.expression == only.name)
+        assert only.u == pytest.approx(alone.stderr, rel=0.05)  # these data have noise alone
+
+    def test_the_exponent_is_no_part_of_what_it_cannot_change(self) -> None:
+        """In microslip f_max takes the exponent's range, and alpha sigma^2/f_max does not."""
+        found = budget(fit(table(beta=(0.01, 0.1), n=60, noise=3e-3), Dahl()).optimum)
+        assert found["f_max"].u > 0.3 * found["f_max"].value
+        kept = found["alpha sigma^2/f_max"]
+        assert kept.value == pytest.approx(30.0**2 / 0.1, abs=kept.U)
+        assert kept.u < 0.1 * kept.value
+
+    def test_no_budget_where_no_number_is_left(self) -> None:
         with pytest.raises(FitError, match="no uncertainty budget"):
-            budget(result.optimum)
+            budget(fit(table(n=1), Dahl(), throw=False).optimum)
 
     def test_coverage_factor(self) -> None:
         assert coverage_factor(2.0, 0.95) == pytest.approx(stats.t(2).ppf(0.975))

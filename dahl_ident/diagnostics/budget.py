@@ -7,13 +7,14 @@ factor k of Student's t for a confidence of 95.45 %, expanded uncertainty U = k 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from scipy import special
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.combinations import candidates, runaway
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.error_sources import LEVELS, MODEL_ERROR, NOISE, RUNS
 from dahl_ident.diagnostics.formatting import listed, rounded, table
@@ -21,6 +22,8 @@ from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 
 CONFIDENCE = 0.9545
+_DETERMINED = 0.25  # u of a logarithm
+_OUTSIDE = 1e-3  # share of a direction that the data may leave open, from rounding
 # What rounding leaves where a source has no part: variances relative to the combined one.
 _ROUNDING = 1e-18
 # Student's t with more degrees of freedom is normal to all digits that a budget shows.
@@ -235,7 +238,10 @@ class Budget(Mapping[str, ParameterBudget]):
 
 
 def budget(optimum: Optimum, errors: ErrorModel | None = None) -> Budget:
-    """Return the uncertainty budget of every free parameter of a fit.
+    """Return the uncertainty budget of what a fit determines.
+
+    That is every free parameter; where one is not determined, the determined combinations of it
+    with others have a budget as well, and at infinity they alone.
 
     Parameters
     ----------
@@ -251,28 +257,57 @@ def budget(optimum: Optimum, errors: ErrorModel | None = None) -> Budget:
     Raises
     ------
     FitError
-        If a parameter is undetermined, or no residual is left to estimate an uncertainty from.
+        If nothing is determined, or no residual is left to estimate an uncertainty from.
     """
-    errors = errors or error_model(optimum)
-    if errors is None:
+    errors = errors or error_model(optimum, of_combinations=True)
+    found = [] if errors is None else list(_determined(optimum, errors))
+    if errors is None or not found:
         raise FitError(
             "no uncertainty budget: a parameter is undetermined, or nothing is left to estimate "
             f"the errors from ({optimum.message}); fix a parameter or measure more points"
         )
-    problem = errors.problem
+    parameters = [_parameter(errors, *each) for each in found]
+    D = np.array([direction for *_, direction in found])
+    return Budget(tuple(parameters), D @ errors.covariance @ D.T, taken_as_exact(optimum))
+
+
+_Entry = tuple[str, str, float, FloatArray]  # name, unit, value, and its derivatives by theta
+
+
+def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
+    """Yield parameters, then determined combinations of those which are not."""
+    problem, names = errors.problem, errors.names
     slopes = problem.value_slopes(errors.theta)
-    parameters = []
     units = {p.name: p.unit for p in problem.parameters}
-    for i, name in enumerate(errors.names):
-        if name in errors.assumed:
+    lost = runaway(optimum)
+    for i, name in enumerate(names):
+        if name in errors.assumed or name in lost:
             continue
-        direction = np.zeros(len(errors.names))
-        direction[i] = abs(float(slopes[i]))
-        parameters.append(_parameter(errors, name, units[name], direction))
-    kept = [i for i, name in enumerate(errors.names) if name not in errors.assumed]
-    D = slopes[kept]
-    covariance = errors.covariance[np.ix_(kept, kept)] * np.outer(D, D)
-    return Budget(tuple(parameters), covariance, taken_as_exact(optimum))
+        direction = np.eye(len(names))[i]
+        if _noticed(errors, direction):
+            yield name, units[name], errors.values[name], direction * abs(float(slopes[i]))
+            positive = problem.parameters[i].transform == "log"
+            if positive and errors.covariance[i, i] ** 0.5 > _DETERMINED:
+                lost |= {name}
+        else:
+            lost |= {name}
+    # an exponent that was assumed is a member as any other
+    freed = replace(optimum, problem=problem, theta=errors.theta)
+    for candidate in candidates(freed):
+        direction = candidate.direction
+        u = float(direction @ errors.covariance @ direction) ** 0.5
+        if candidate.members & lost and u < _DETERMINED and _noticed(errors, direction):
+            value = candidate.value
+            yield candidate.expression, candidate.unit, value, direction * abs(value)
+
+
+def _noticed(errors: ErrorModel, direction: FloatArray) -> bool:
+    """Return whether the data determine a direction at all."""
+    if errors.basis is None:
+        return True
+    scaled, own = direction * errors.basis.size, errors.basis.directions
+    left = scaled - own @ (own.T @ scaled)
+    return bool(np.linalg.norm(left) < _OUTSIDE * np.linalg.norm(scaled))
 
 
 def coverage_factor(dof: float, confidence: float = CONFIDENCE) -> float:
@@ -296,7 +331,9 @@ def taken_as_exact(optimum: Optimum) -> tuple[str, ...]:
     )
 
 
-def _parameter(errors: ErrorModel, name: str, unit: str, direction: FloatArray) -> ParameterBudget:
+def _parameter(
+    errors: ErrorModel, name: str, unit: str, value: float, direction: FloatArray
+) -> ParameterBudget:
     total = float(direction @ errors.covariance @ direction)
     rows = []
     for source, covariance in errors.contributions.items():
@@ -308,7 +345,6 @@ def _parameter(errors: ErrorModel, name: str, unit: str, direction: FloatArray) 
     rows.sort(key=lambda row: -row.u)
     dof = errors.dof(direction)
     dof = dof if dof < _MANY else np.inf
-    value = errors.values[name]
     return ParameterBudget(name, unit, value, tuple(rows), total**0.5, dof, coverage_factor(dof))
 
 

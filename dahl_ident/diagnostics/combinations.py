@@ -100,6 +100,13 @@ def stiffness_seen(optimum: Optimum) -> Candidate | None:
     return Candidate(where, shown_unit("N/m", motion), value, direction, members)
 
 
+def runaway(optimum: Optimum) -> frozenset[str]:
+    """Return the names of the parameters whose optimum lies at infinity, or at a positive zero."""
+    positive = np.array([p.transform == "log" for p in optimum.problem.parameters])
+    gone = ~np.isfinite(optimum.values) | (positive & (optimum.values == 0.0))
+    return frozenset(np.array(optimum.names)[gone].tolist())
+
+
 def _product(
     optimum: Optimum, theta: Mapping[str, float], powers: Mapping[Parameter, float], text: str
 ) -> Candidate:

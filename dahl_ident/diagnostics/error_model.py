@@ -57,6 +57,7 @@ _LONGEST_STEP = 0.7  # of a logarithm, in one iteration: the model is linearised
 _ASKED_FOR = {MODEL_ERROR: 0.3, NOISE: 0.5}  # rise of the log-likelihood that a source takes
 _RATE = 0.1  # the same for a force limit that changes with speed
 _SUPPORTED = 4.0  # the same for another kind of noise: 0.5 % of the tables, by chance
+_NOTICED = 1e-5  # change of residuals over the largest, below which a direction is undetermined
 _LEAST_DOF = 4  # residuals beyond the parameters, below which there is noise alone
 _FEW_ROWS = 100  # with more, rows are compressed to the directions that sources can change
 _CALIBRATIONS = {
@@ -71,6 +72,18 @@ class Assumption(NamedTuple):
 
     source: str
     std: float
+
+
+class Basis(NamedTuple):
+    """Orthonormal directions, (Q, r), of theta over the size of what residuals notice, (Q,)."""
+
+    size: FloatArray
+    directions: FloatArray
+
+    @property
+    def matrix(self) -> FloatArray:
+        """Changes of theta, shape (Q, r)."""
+        return np.asarray(self.size[:, None] * self.directions)
 
 
 @dataclass(frozen=True)
@@ -104,6 +117,8 @@ class ErrorModel:
     assumed: tuple[str, ...]
     linear: LinearModel
     projection: Projection
+    basis: Basis | None = None
+    """Changes of theta that the data determine at all; None where that is every one."""
 
     @property
     def variances(self) -> FloatArray:
@@ -123,7 +138,8 @@ class ErrorModel:
     @cached_property
     def inverse(self) -> FloatArray:
         """G, shape (Q, m)."""
-        return self.projection.generalised_inverse()
+        G = self.projection.generalised_inverse()
+        return G if self.basis is None else self.basis.matrix @ G
 
     @cached_property
     def values(self) -> Mapping[str, float]:
@@ -188,13 +204,16 @@ def relative_units(problem: Problem, theta: FloatArray) -> FloatArray:
     return np.linalg.pinv(np.stack([part.reshape(-1, 2) for part in parts], axis=-1))
 
 
-def error_model(optimum: Optimum) -> ErrorModel | None:
+def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorModel | None:
     """Return the model of an optimum's errors; None where there is nothing to estimate it from.
 
     Parameters
     ----------
     optimum : Optimum
         From :func:`dahl_ident.fitting.solve`.
+    of_combinations : bool, default False
+        Also where parameters are undetermined, or their optimum lies at infinity: then
+        the covariance holds for combinations that the data determine, and for these alone.
 
     Returns
     -------
@@ -204,13 +223,16 @@ def error_model(optimum: Optimum) -> ErrorModel | None:
     """
     if optimum.loss != "linear":
         return None  # its errors are those of the robust estimate, noise alone
-    if not optimum.success or optimum.is_exact or not np.isfinite(optimum.covariance).all():
+    if optimum.is_exact or not np.isfinite(optimum.theta).all():
+        return None
+    determined = optimum.success and bool(np.isfinite(optimum.covariance).all())
+    if not (determined or of_combinations):
         return None
     problem, assumed = _with_assumed(optimum.problem)
     if problem.n_residuals - len(optimum.names) <= 0:
         return None
     try:
-        return _estimated(optimum, problem, assumed)
+        return _estimated(optimum, problem, assumed, determined)
     except np.linalg.LinAlgError:
         return None
 
@@ -280,9 +302,18 @@ class _Rows:
         return weight
 
 
-def _estimated(optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumption]) -> ErrorModel:
+def _basis(J: FloatArray) -> Basis:
+    size = 1.0 / np.maximum(np.linalg.norm(J, axis=0), np.finfo(float).tiny)
+    _, singular, directions = np.linalg.svd(J * size, full_matrices=False)
+    return Basis(size, directions[singular > _NOTICED * singular[0]].T)
+
+
+def _estimated(
+    optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumption], determined: bool
+) -> ErrorModel:
     rows = _Rows(optimum, problem, assumed)
     theta, m = rows.start, rows.m
+    basis = None if determined else _basis(rows.at(theta)[1])
     noise: tuple[Source, ...] | None = None
     tells = m - len(problem.names) + len(assumed) >= _LEAST_DOF
     shared = StructuredSources(problem) if tells else None
@@ -291,6 +322,7 @@ def _estimated(optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumpt
         y, J = rows.at(theta)
         level = float(y[:m] @ y[:m]) / max(m - J.shape[1], 1)
         rest = () if shared is None else shared.at(theta, J[:m])
+        J = J if basis is None else J @ basis.matrix
         plain = (
             (*of_one_scale(problem), *relative_scatter(problem, theta))
             if rest and m <= 2 * _FEW_ROWS
@@ -307,6 +339,7 @@ def _estimated(optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumpt
                 )
         projection = Projection(linear, found.variances)
         G = projection.generalised_inverse()
+        G = G if basis is None else basis.matrix @ G
         move = -G @ linear.y
         covariance = G @ linear.covariance(found.variances) @ G.T
         std = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))  # below zero by rounding
@@ -316,8 +349,9 @@ def _estimated(optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumpt
         theta = theta + move * min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
     contributions = _by_source(problem, assumed, sources, linear, found, G)
     return ErrorModel(
-        optimum, problem, theta, sources, found, contributions, tuple(assumed), linear, projection
-    )
+        optimum, problem, theta, sources, found, contributions, tuple(assumed), linear, projection,
+        basis,
+    )  # fmt: skip
 
 
 _Found = tuple[tuple[Source, ...], LinearModel, VarianceComponents]

@@ -24,7 +24,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.advice import advice
-from dahl_ident.diagnostics.combinations import Candidate, candidates, stiffness_seen
+from dahl_ident.diagnostics.combinations import Candidate, candidates, runaway, stiffness_seen
 from dahl_ident.diagnostics.confidence_levels import LEVELS, percent, thresholds
 from dahl_ident.diagnostics.error_model import EXPONENT, ErrorModel
 from dahl_ident.diagnostics.error_sources import RUNS
@@ -350,7 +350,7 @@ def _determined(
         if c.expression not in optimum.names and c.stderr < IDENTIFIED_BELOW * abs(c.value)
     ]
     known = {c.expression for c in optimum.combinations}
-    gone = _run_away(optimum)  # the optimum itself says which combinations of these are left
+    gone = runaway(optimum)  # the optimum itself says which combinations of these are left
     for candidate in candidates(optimum):
         if candidate.expression in known or _runs_away(candidate, optimum, gone):
             continue
@@ -379,13 +379,6 @@ def _stiffness_seen(
     if not std < IDENTIFIED_BELOW:
         return ()
     return (DeterminedCombination(seen.expression, seen.unit, seen.value, abs(seen.value) * std),)
-
-
-def _run_away(optimum: Optimum) -> frozenset[str]:
-    """Return the names of the parameters whose optimum lies at infinity, or at a positive zero."""
-    positive = np.array([p.transform == "log" for p in optimum.problem.parameters])
-    gone = ~np.isfinite(optimum.values) | (positive & (optimum.values == 0.0))
-    return frozenset(np.array(optimum.names)[gone].tolist())
 
 
 def _runs_away(candidate: Candidate, optimum: Optimum, gone: frozenset[str]) -> bool:
