@@ -281,6 +281,10 @@ def test_stored_and_read_again(tmp_path: Path) -> None:
     assert again.verdict == fit.verdict
     with pytest.raises(DataError, match="holds no fit"):
         RecordFit.from_json("{}")
+    edited = json.loads(fit.to_json())
+    edited["values"][0] *= 1.01
+    with pytest.raises(DataError, match="was changed after the fit was saved"):
+        RecordFit.from_json(json.dumps(edited))
     table = fit.summary()
     assert list(table.index[:3]) == ["sigma", "q", "p"]
     assert again.budget().to_dict() == fit.budget().to_dict()

@@ -346,6 +346,23 @@ class TestStorage:
         assert stored.optimum.values[0] == pytest.approx(0.10028228058572991, rel=1e-9)
         assert stored.trusted
 
+    @pytest.mark.parametrize(
+        "change",
+        [
+            lambda c: c["optimum"]["values"].__setitem__(0, 0.5),
+            lambda c: c["optimum"]["theta"].__setitem__(1, 3.0),
+            lambda c: c["data"]["real"].__setitem__(3, 20.0),
+            lambda c: c["model"][0].__setitem__("alpha", 2.0),
+        ],
+    )
+    def test_a_file_of_the_first_version_that_was_edited_is_refused(
+        self, change: Callable[[dict[str, Any]], Any]
+    ) -> None:
+        content = json.loads((Path(__file__).parent / "fit_version_1.json").read_text("utf-8"))
+        change(content)
+        with pytest.raises(DataError, match="was changed after the fit was saved"):
+            FitResult.from_json(json.dumps(content))
+
     def test_what_is_no_fit(self, result: FitResult, tmp_path: Path) -> None:
         content = json.loads(result.to_json())
         with pytest.raises(DataError, match="is no JSON"):

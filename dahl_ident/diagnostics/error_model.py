@@ -229,7 +229,7 @@ def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorMode
     if not (determined or of_combinations):
         return None
     problem, assumed = _with_assumed(optimum.problem)
-    if problem.n_residuals - len(optimum.names) <= 0:
+    if problem.n_numbers - len(optimum.names) <= 0:
         return None
     try:
         return _estimated(optimum, problem, assumed, determined)
@@ -315,12 +315,13 @@ def _estimated(
     theta, m = rows.start, rows.m
     basis = None if determined else _basis(rows.at(theta)[1])
     noise: tuple[Source, ...] | None = None
-    tells = m - len(problem.names) + len(assumed) >= _LEAST_DOF
+    dof = problem.n_numbers - len(problem.names)
+    tells = dof + len(assumed) >= _LEAST_DOF
     shared = StructuredSources(problem) if tells else None
     last: FloatArray | None = None
     for step in range(_STEPS):
         y, J = rows.at(theta)
-        level = float(y[:m] @ y[:m]) / max(m - J.shape[1], 1)
+        level = float(y[:m] @ y[:m]) / max(dof, 1)
         rest = () if shared is None else shared.at(theta, J[:m])
         J = J if basis is None else J @ basis.matrix
         plain = (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 
@@ -13,53 +12,11 @@ import numpy as np
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
-from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.elements import Model, Parameter
 from dahl_ident.fitting.optimum import Combination, Optimum
 from dahl_ident.problem import Problem
-from dahl_ident.results.result import Result
+from dahl_ident.results.result import Estimate, Result
 from dahl_ident.units import Motion, shown_unit
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """One parameter of a fit.
-
-    Attributes
-    ----------
-    name, unit, description : str
-        As declared beside the element; the unit is that of the data's motion.
-    value : float
-        The estimate, or the fixed value.
-    stderr : float or None
-        Standard error, first order (Wald); infinite where undetermined, None where fixed.
-    init_value : float or None
-        The start that the user gave.
-    min, max : float
-        Bounds.
-    vary : bool
-        Whether it was estimated.
-    """
-
-    name: str
-    unit: str
-    description: str
-    value: float
-    stderr: float | None
-    init_value: float | None
-    min: float
-    max: float
-    vary: bool
-
-    @classmethod
-    def of_scale(cls, value: float, stderr: float) -> Estimate:
-        """Return the estimate of an unknown noise scale."""
-        return cls("noise_scale", "", "noise scale", value, stderr, None, 0.0, math.inf, True)
-
-    def __str__(self) -> str:
-        if not self.vary:
-            return f"{self.name} = {self.value:g} {self.unit}".rstrip() + " (fixed)"
-        return f"{self.name} = {with_unit(self.value, self.stderr, self.unit)}"
 
 
 class FitNumbers(Result):

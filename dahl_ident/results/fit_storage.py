@@ -28,6 +28,7 @@ from dahl_ident.sensors import EXACT, Sensors
 SCHEMA = "dahl_ident.fit_result"
 VERSION = 2
 _FIRST_WITH_DIGEST = 2
+_SAME = 1e-6  # relative: what versions of numerical libraries never change
 
 _COLUMNS = (
     "frequency_hz", "amplitude", "drive", "covariance", "dof", "amplitude_std",
@@ -67,21 +68,25 @@ def to_dict(optimum: Optimum, first_order: bool) -> dict[str, Any]:
             ],
         },
     }
-    content = plain_data(facts, not_finite=str)
-    return {**content, "digest": digest(content)}
+    return sealed(plain_data(facts, not_finite=str))
 
 
 def from_dict(content: Mapping[str, Any], source: str = "the content") -> tuple[Optimum, bool]:
     """Return the fit that :func:`to_dict` described, and whether only first order holds."""
     _check_schema(content, source)
-    _check_digest(content, source)
+    has_digest = content["schema_version"] >= _FIRST_WITH_DIGEST
+    if has_digest:
+        check_digest(content, source)
     try:
-        return _optimum(content), content["optimum"]["first_order"]
+        optimum, first_order = _optimum(content), content["optimum"]["first_order"]
     except (KeyError, TypeError) as exc:
         raise DataError(
             f"{source} says {SCHEMA}, version {content['schema_version']}, but lacks or garbles "
             f"{exc}; it may have been edited or cut short"
         ) from exc
+    if not (has_digest or first_order or _agrees(optimum)):
+        raise changed(source)
+    return optimum, first_order
 
 
 def to_json(optimum: Optimum, first_order: bool) -> str:
@@ -120,16 +125,39 @@ def _check_schema(content: Any, source: str) -> None:
         )
 
 
-def _check_digest(content: Mapping[str, Any], source: str) -> None:
+def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return plain data with their digest."""
+    return {**content, "digest": digest(content)}
+
+
+def check_digest(content: Mapping[str, Any], source: str) -> None:
     """Refuse content that is not as it was written: nobody can answer for such numbers."""
     facts = {key: value for key, value in content.items() if key != "digest"}
-    if content["schema_version"] < _FIRST_WITH_DIGEST:
-        return
     if content.get("digest") != digest(facts):
-        raise DataError(
-            f"{source} was changed after the fit was saved: its data, model and estimate do not "
-            "match its digest; take the file as it was written, or repeat the fit"
-        )
+        raise changed(source)
+
+
+def changed(source: str) -> DataError:
+    """Return the error about a file that is not as it was written."""
+    return DataError(
+        f"{source} was changed after the fit was saved: its data, model and estimate do not "
+        "agree with each other; take the file as it was written, or repeat the fit"
+    )
+
+
+def _agrees(optimum: Optimum) -> bool:
+    """Return whether values and sum of squares are those of the estimate, with these data.
+
+    What a file without a digest is checked by. At a limit the values are no finite numbers, and
+    a robust loss has another sum.
+    """
+    if optimum.status.at_infinity or optimum.loss != "linear":
+        return True
+    problem = optimum.problem
+    cost = float(problem.quadratic(optimum.theta, 1.0).cost)
+    same = np.allclose(problem.to_values(optimum.theta), optimum.values, rtol=_SAME, atol=0.0)
+    least = problem.n_residuals * float(np.max(problem.rounding)) ** 2
+    return bool(same and np.isclose(cost, optimum.cost, rtol=_SAME, atol=least))
 
 
 def _optimum(content: Mapping[str, Any]) -> Optimum:

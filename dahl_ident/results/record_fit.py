@@ -37,9 +37,9 @@ from dahl_ident.errors import DataError, FitError, ValidationError
 from dahl_ident.fitting.record_search import RecordOptimum, hold_model, solve_records
 from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.problem.record_problem import RecordProblem, cut
-from dahl_ident.results.fit_numbers import Estimate
+from dahl_ident.results.fit_storage import check_digest, sealed
 from dahl_ident.results.hold_out import HeldOut, HoldOut
-from dahl_ident.results.result import Result
+from dahl_ident.results.result import Estimate, Result
 
 if TYPE_CHECKING:
     from dahl_ident.plots import Axes
@@ -490,22 +490,24 @@ class RecordFit(Result):
             for r in self.records
         ]
         return json.dumps(
-            {
-                "schema": SCHEMA,
-                "schema_version": _SCHEMA_VERSION,
-                "dahl_ident_version": version("dahl_ident"),
-                "records": records,
-                "model": describe_model(problem.model),
-                "output": problem.output,
-                "excitation": problem.excitation,
-                "substeps": problem.substeps,
-                "whitening": problem.whitening.tolist(),
-                "names": self.var_names,
-                "values": self._optimum.values.tolist(),
-                "cost": self._optimum.cost,
-                "converged": self._optimum.converged,
-                "evaluations": self._optimum.evaluations,
-            }
+            sealed(
+                {
+                    "schema": SCHEMA,
+                    "schema_version": _SCHEMA_VERSION,
+                    "dahl_ident_version": version("dahl_ident"),
+                    "records": records,
+                    "model": describe_model(problem.model),
+                    "output": problem.output,
+                    "excitation": problem.excitation,
+                    "substeps": problem.substeps,
+                    "whitening": problem.whitening.tolist(),
+                    "names": self.var_names,
+                    "values": self._optimum.values.tolist(),
+                    "cost": self._optimum.cost,
+                    "converged": self._optimum.converged,
+                    "evaluations": self._optimum.evaluations,
+                }
+            )
         )
 
     @classmethod
@@ -515,7 +517,7 @@ class RecordFit(Result):
         Raises
         ------
         DataError
-            If the text holds no such fit.
+            If the text holds no such fit, or was changed since.
         """
         try:
             held = json.loads(text)
@@ -524,6 +526,7 @@ class RecordFit(Result):
                     f"the schema is {held['schema']!r} version {held['schema_version']}; expected "
                     f"{SCHEMA!r} up to version {_SCHEMA_VERSION}"
                 )
+            check_digest(held, "the text")
             records = [Record(r.pop("time"), **r) for r in held["records"]]
             problem = RecordProblem(
                 records, model_from_description(held["model"]), output=held["output"],

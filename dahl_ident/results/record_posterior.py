@@ -19,8 +19,8 @@ from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.record_errors import record_derived
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.results.chain_draws import ChainDraws
-from dahl_ident.results.fit_numbers import Estimate
 from dahl_ident.results.record_fit import RecordBand, RecordFit
+from dahl_ident.results.result import Estimate
 
 
 class RecordPosterior(ChainDraws):

@@ -18,10 +18,11 @@ from dahl_ident.diagnostics.budget import Budget, budget
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
-from dahl_ident.results.fit_numbers import Estimate, estimates
+from dahl_ident.results.fit_numbers import estimates
 from dahl_ident.results.posterior_base import RULE_DRAWS, Posterior
 from dahl_ident.results.posterior_prediction import PredictiveBand, derived_at_draws
 from dahl_ident.results.predictive_checks import PredictiveCheck, predictive_checks
+from dahl_ident.results.result import Estimate
 from dahl_ident.units import Quantity
 
 _CHECK_DRAWS = 1000

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -11,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.data.storage import place_of, write_whole
 from dahl_ident.diagnostics.bands import DerivedQuantity
+from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.units import Quantity
 
@@ -18,9 +21,49 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from dahl_ident.diagnostics import Budget
-    from dahl_ident.results.fit_numbers import Estimate
 
 FORMATS = (".json",)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter of a fit.
+
+    Attributes
+    ----------
+    name, unit, description : str
+        As declared beside the element; the unit is that of the data's motion.
+    value : float
+        The estimate, or the fixed value.
+    stderr : float or None
+        Standard error, first order (Wald); infinite where undetermined, None where fixed.
+    init_value : float or None
+        The start that the user gave.
+    min, max : float
+        Bounds.
+    vary : bool
+        Whether it was estimated.
+    """
+
+    name: str
+    unit: str
+    description: str
+    value: float
+    stderr: float | None
+    init_value: float | None
+    min: float
+    max: float
+    vary: bool
+
+    @classmethod
+    def of_scale(cls, value: float, stderr: float) -> Estimate:
+        """Return the estimate of an unknown noise scale."""
+        return cls("noise_scale", "", "noise scale", value, stderr, None, 0.0, math.inf, True)
+
+    def __str__(self) -> str:
+        if not self.vary:
+            return f"{self.name} = {self.value:g} {self.unit}".rstrip() + " (fixed)"
+        return f"{self.name} = {with_unit(self.value, self.stderr, self.unit)}"
 
 
 class Result(ABC):
