@@ -10,7 +10,7 @@ import numpy as np
 from dahl_ident import Dahl, FrequencyResponse, Spring
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element, Model
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.fitting.levenberg_marquardt import minimise
 from dahl_ident.problem import Problem
 

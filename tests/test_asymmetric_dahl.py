@@ -13,8 +13,8 @@ from scipy.special import ive
 
 from dahl_ident import Dahl, Mass
 from dahl_ident.elements.description import describe_model, model_from_description
+from dahl_ident.elements.element import as_model
 from dahl_ident.elements.friction import Friction
-from dahl_ident.elements.model import as_model
 from dahl_ident.errors import ValidationError
 
 AT_REST = np.zeros(())

@@ -21,7 +21,7 @@ from dahl_ident import (
 )
 from dahl_ident.arrays import ComplexArray
 from dahl_ident.elements.description import describe_model, model_from_description
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ModelError
 from tests.test_generic_friction import Jenkins
 from tests.test_response_of_any_law import all_amplitudes

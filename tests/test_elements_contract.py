@@ -15,7 +15,7 @@ from mpmath import mpf
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Dahl, Damper, Element, LinearSystem, Mass, Model, Parameter, Spring
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ModelError, ValidationError
 
 control: Any = importlib.import_module("control")

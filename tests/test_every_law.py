@@ -20,8 +20,7 @@ from dahl_ident import (
     simulate,
 )
 from dahl_ident.elements.description import describe_model, model_from_description
-from dahl_ident.elements.element import KINDS
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import KINDS, as_model
 from dahl_ident.synthetic.excitation import SteppedSine
 from dahl_ident.synthetic.experiment import Experiment
 from tests.test_generic_friction import Jenkins

@@ -11,7 +11,7 @@ from scipy import optimize, stats
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring, fit, response
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting import Status, solve, solve_many
 from dahl_ident.fitting.levenberg_marquardt import minimise

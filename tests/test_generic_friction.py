@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp, trapezoid
 
 from dahl_ident import Dahl, Friction, Parameter
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ModelError
 
 

@@ -14,7 +14,7 @@ import pytest
 
 import dahl_ident as di
 from dahl_ident.elements import Element
-from dahl_ident.elements.model import Model, as_model
+from dahl_ident.elements.element import Model, as_model
 from tests.command_line import Runner
 from tests.test_every_law import LAWS
 from tests.test_response_of_any_law import all_amplitudes

@@ -10,7 +10,7 @@ import pytest
 
 from dahl_ident import Dahl, Damper, Mass, PowerDamper, Spring, response
 from dahl_ident.elements.description import describe_model, model_from_description
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError
 from tests.test_response_of_any_law import all_amplitudes
 

@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring, response
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ModelError
 from dahl_ident.synthetic import AmplitudeRamp, FrequencySweep, SteppedSine
 from dahl_ident.synthetic.mechanism import Mechanism, Signal

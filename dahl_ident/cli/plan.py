@@ -159,7 +159,7 @@ def plan(
 
 def _known(fit: str | None, options: ModelOptions) -> Any:
     """Return the saved fit, or the model of the options."""
-    from dahl_ident.elements.model import as_model
+    from dahl_ident.elements.element import as_model
     from dahl_ident.results import FitResult
 
     if fit is not None:

@@ -180,7 +180,7 @@ def _usual_levels(truth: Element, controlled: str) -> str:
     """Return levels about the knee of friction, of displacement or of force."""
     import numpy as np
 
-    from dahl_ident.elements.model import as_model
+    from dahl_ident.elements.element import as_model
 
     laws = [e for e in as_model(truth).elements if not e.is_linear]
     knees = np.array([[float(knee) for knee in e.knee(e.known_values())] for e in laws])

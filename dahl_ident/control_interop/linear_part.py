@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.element import Element
+from dahl_ident.elements.element import Element, as_model
 from dahl_ident.elements.linear_system import LinearSystem, check_system
-from dahl_ident.elements.model import as_model
 from dahl_ident.errors import ModelError
 
 

@@ -31,8 +31,7 @@ from dahl_ident.control_interop.linear_part import (
     transfer_stiffness,
 )
 from dahl_ident.control_interop.split import split
-from dahl_ident.elements.element import Element
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import Element, as_model
 from dahl_ident.errors import ValidationError
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from dahl_ident.elements.element import Element
-from dahl_ident.elements.model import Model, as_model
+from dahl_ident.elements.element import Element, Model, as_model
 from dahl_ident.errors import ModelError
 
 

@@ -20,8 +20,8 @@ from scipy.optimize import nnls
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.elements import Element, MaxwellSlip, Model
+from dahl_ident.elements.element import as_model
 from dahl_ident.elements.masing import jenkins
-from dahl_ident.elements.model import as_model
 from dahl_ident.errors import DataError, ModelError
 from dahl_ident.problem import Problem
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dahl_ident.elements.backlash import Backlash
+from dahl_ident.elements.behaviour import Asymptote, Combination, UniversalCurve
 from dahl_ident.elements.bouc_wen import BoucWen
 from dahl_ident.elements.dahl import Dahl
-from dahl_ident.elements.element import Asymptote, Combination, Element, UniversalCurve
+from dahl_ident.elements.element import Element, Model
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.iwan import Iwan
 from dahl_ident.elements.linear import Damper, Mass, Spring
 from dahl_ident.elements.linear_system import LinearSystem
 from dahl_ident.elements.lugre import LuGre
 from dahl_ident.elements.maxwell_slip import MaxwellSlip
-from dahl_ident.elements.model import Model
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.power_damper import PowerDamper
 

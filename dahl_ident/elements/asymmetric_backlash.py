@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.element import StiffnessGradient
+from dahl_ident.elements.behaviour import StiffnessGradient
 
 _RULES = tuple(np.polynomial.legendre.leggauss(n) for n in (16, 32))
 _FADED = 42.0  # exp(-42) is below rounding

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.special import i0e, i1e, ive
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.element import StiffnessGradient
+from dahl_ident.elements.behaviour import StiffnessGradient
 
 _LARGE = 30.0  # b beyond which exp(-2 b) is nothing
 _NODES = 96

@@ -21,16 +21,14 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import force_curve
-from dahl_ident.elements.element import (
-    KINDS,
+from dahl_ident.elements.behaviour import (
     Asymptote,
     Combination,
-    Element,
     HistoryGradient,
     Mechanics,
     StiffnessGradient,
-    prefixed,
 )
+from dahl_ident.elements.element import KINDS, Element, prefixed
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.steady_loop import Branch, Loop, Rows

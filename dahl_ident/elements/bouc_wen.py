@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.element import HistoryGradient, StiffnessGradient
+from dahl_ident.elements.behaviour import HistoryGradient, StiffnessGradient
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.recursion import linear_recursion, stretches

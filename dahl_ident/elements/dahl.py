@@ -33,14 +33,14 @@ from dahl_ident.elements import (
     hysteresis,
     linear_dahl,
 )
-from dahl_ident.elements.element import (
+from dahl_ident.elements.behaviour import (
     Asymptote,
     Combination,
-    Element,
     HistoryGradient,
     StiffnessGradient,
     UniversalCurve,
 )
+from dahl_ident.elements.element import Element
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Assumed, Parameter
 from dahl_ident.errors import ValidationError

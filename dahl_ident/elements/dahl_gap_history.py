@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.element import HistoryGradient
+from dahl_ident.elements.behaviour import HistoryGradient
 from dahl_ident.elements.recursion import Stretches, stretches
 
 _INSIDE = 1.0 - 1e-12  # of half the gap: nearer to its end is contact

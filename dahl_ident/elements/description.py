@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dahl_ident.elements.element import KINDS, Element
-from dahl_ident.elements.model import Model, as_model
+from dahl_ident.elements.element import KINDS, Element, Model, as_model
 from dahl_ident.errors import ModelError
 
 

@@ -1,15 +1,14 @@
-"""What every element of a model provides: its dynamic stiffness, derivatives, force and facts."""
+"""Elements and their sums: names, plain data, checked calls, and ``+``."""
 
 from __future__ import annotations
 
-import re
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import (
     ComplexArray,
@@ -21,131 +20,34 @@ from dahl_ident.arrays import (
     real_array,
     whole_number,
 )
+from dahl_ident.elements.behaviour import Behaviour, StiffnessGradient
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError, ValidationError
 
 if TYPE_CHECKING:
     import casadi as ca
 
-    from dahl_ident.elements.model import Model
 
-Scalar = TypeVar("Scalar", bound=np.generic)
+Value = TypeVar("Value")
 
-_STEP = 1e-3
-_STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -2.0 / 3.0), (1.0, 2.0 / 3.0), (2.0, -1.0 / 12.0))
-"""Central difference of fourth order: places and weights."""
+KINDS: dict[str, type[Element]] = {}
+"""Every element class by the name that files and the command line know it by."""
 
 
-class StiffnessGradient(NamedTuple):
-    """A dynamic stiffness with its first derivatives; all of one broadcast shape.
-
-    Attributes
-    ----------
-    value : ndarray of complex
-        Z(A, omega), N/m (N m/rad in rotation).
-    by_amplitude : ndarray of complex
-        dZ/dA.
-    by_parameter : tuple of ndarray of complex
-        dZ/dp for each parameter p of the element, in the order of its `parameters`.
-    """
-
-    value: ComplexArray
-    by_amplitude: ComplexArray
-    by_parameter: tuple[ComplexArray, ...]
+def _register(cls: type[Element]) -> None:
+    known = KINDS.get(cls.kind)
+    if known is not None and (known.__module__, known.__qualname__) != (
+        cls.__module__,
+        cls.__qualname__,
+    ):
+        raise ModelError(
+            f"{cls.__name__} has the kind {cls.kind!r}, which {known.__module__}."
+            f"{known.__qualname__} has already; choose another"
+        )
+    KINDS[cls.kind] = cls
 
 
-class HistoryGradient(NamedTuple):
-    """A force over time with its first derivatives; all of one shape.
-
-    Attributes
-    ----------
-    value : ndarray
-        Force, N.
-    by_state : ndarray
-        Derivative by the force at the first sample; zero without memory.
-    by_parameter : tuple of ndarray
-        Derivative by each parameter of the element, in the order of its `parameters`.
-    """
-
-    value: FloatArray
-    by_state: FloatArray
-    by_parameter: tuple[FloatArray, ...]
-
-
-class Mechanics(NamedTuple):
-    """An element's part in an equation of motion: numbers, arrays or casadi symbols.
-
-    Attributes
-    ----------
-    inertia
-        What multiplies the acceleration, kg.
-    force
-        The rest of the force, N.
-    rate
-        Its change over time, N/s, for an element with memory; 0 for others.
-    """
-
-    inertia: Any
-    force: Any
-    rate: Any
-
-
-@dataclass(frozen=True)
-class Asymptote:
-    """A limit of an element in which some parameters run away and fewer numbers remain.
-
-    Parameters
-    ----------
-    name : str
-        Such as "gross_slip".
-    meaning : str
-        What the element is in this limit, a few words.
-    pinned : mapping of str to float
-        Values, by label, so far out that the element is its limit.
-    follows : (str, str, float) or None
-        ``label = factor * other``: a parameter that stays at a fixed ratio to another one.
-    runs_away : mapping of str to float
-        The parameters that the data no longer determine and where they go, 0 or inf.
-    kept : tuple of (str, mapping of str to float)
-        Combinations that stay determined: expression, and the power of each label in it.
-    adds_to_spring : str or None
-        A label whose value shows only in the sum with the stiffness of a free spring beside it;
-        the limit exists only beside such a spring.
-    """
-
-    name: str
-    meaning: str
-    pinned: Mapping[str, float]
-    follows: tuple[str, str, float] | None
-    runs_away: Mapping[str, float]
-    kept: tuple[tuple[str, Mapping[str, float]], ...] = ()
-    adds_to_spring: str | None = None
-
-
-class Combination(NamedTuple):
-    """A product of powers of parameters that data may determine where single ones are lost."""
-
-    expression: str
-    powers: Mapping[str, float]
-    meaning: str
-
-
-class UniversalCurve(NamedTuple):
-    """N over a stiffness as a function of beta alone, whatever the scale parameters.
-
-    Parameters
-    ----------
-    stiffness : float
-        What N is divided by, N/m.
-    response : callable
-        h(beta), for an array of beta.
-    """
-
-    stiffness: float
-    response: Callable[[FloatArray], ComplexArray]
-
-
-class Element(ABC):
+class Element(Behaviour):
     """Part of a mechanism: Z(A, omega) = F/X, its share of the dynamic stiffness.
 
     Elements act in parallel: ``+`` adds their forces at one displacement. A number given to an
@@ -179,20 +81,6 @@ class Element(ABC):
         True: a displacement held constant may take a force.
     """
 
-    kind: ClassVar[str] = ""
-    equation: str = ""
-    is_linear: bool = False
-    rate_independent: bool = True
-    has_memory: bool = False
-    unique_response: bool = False
-    parameters: tuple[Parameter, ...] = ()
-    linear_parameters: tuple[str, ...] = ()
-    scale_parameters: tuple[str, ...] = ()
-    softens: bool = False
-    holds_at_rest: bool = True
-    _name: str | None = None
-    _in_parallel: ClassVar[type[Model]]  # set where Model is defined, which builds on this class
-
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         if cls.__dict__.get("kind"):
@@ -206,221 +94,9 @@ class Element(ABC):
             for declared in type(self).parameters
         )
 
-    @property
-    def name(self) -> str | None:
-        """The element's name, which prefixes its parameters, or None."""
-        return self._name
-
-    def label(self, parameter: Parameter) -> str:
-        """Return a parameter's name without the element's prefix."""
-        return parameter.name.removeprefix(f"{self.name}_") if self.name else parameter.name
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """The parameters' names without the element's prefix."""
-        return tuple(self.label(p) for p in self.parameters)
-
-    def parameter(self, label: str) -> Parameter:
-        """Return the parameter called `label` within this element."""
-        if label not in self.labels:
-            raise ModelError(f"{self!r} has no parameter {label}; it has {', '.join(self.labels)}")
-        return self.parameters[self.labels.index(label)]
-
-    def named(self, expression: str) -> str:
-        """Return an expression of labels with the parameters' full names."""
-        for label, parameter in zip(self.labels, self.parameters, strict=True):
-            expression = re.sub(rf"\b{label}\b", parameter.name, expression)
-        return expression
-
-    @abstractmethod
-    def stiffness(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> ComplexArray:
-        """Return F_k/X_1 at the parameter `values`, unchecked; all arguments broadcast.
-
-        `harmonic` 0 is the mean force over the amplitude.
-        """
-
-    @abstractmethod
-    def stiffness_gradient(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> StiffnessGradient:
-        """Return F_k/X_1 with its derivatives by amplitude and by each parameter, unchecked."""
-
-    def stiffness_slope(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Return F/X of the fundamental and its derivative by amplitude, unchecked."""
-        found = self.stiffness_gradient(values, amplitude, omega)
-        return found.value, found.by_amplitude
-
-    def normalised(
-        self, values: Sequence[FloatArray]
-    ) -> tuple[FloatArray, FloatArray, Sequence[FloatArray]]:
-        """Return units of force and stiffness in which the law has fewer numbers, and those.
-
-        ``N(A; values) = stiffness * N(A stiffness/force; numbers)``. One and the values
-        themselves where a law has no such units.
-        """
-        return np.ones(()), np.ones(()), values
-
-    @abstractmethod
-    def force_history(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return the force at every sample of one history, unchecked; `state` is the first."""
-
-    def force_history_gradient(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-    ) -> HistoryGradient:
-        """Return the force at every sample with its derivatives, unchecked.
-
-        By central differences of fourth order, where an element has nothing better.
-        """
-        at = [float(v) for v in values]
-
-        def force(vector: Sequence[float], start: float) -> FloatArray:
-            return self.force_history(
-                vector, displacement, velocity, start, acceleration=acceleration
-            )
-
-        value = force(at, state)
-        slopes = []
-        for i, size in enumerate(at):
-            step = _STEP * (abs(size) or 1.0)
-            moved = [(w, [*at[:i], size + k * step, *at[i + 1 :]]) for k, w in _STENCIL]
-            slopes.append(np.asarray(sum(w / step * force(v, state) for w, v in moved)))
-        step = _STEP * float(np.max(np.abs(value), initial=0.0)) or 1.0
-        by_state = np.zeros(value.shape)
-        if self.has_memory:
-            by_state = np.asarray(
-                sum(w / step * force(at, state + k * step) for k, w in _STENCIL), dtype=np.float64
-            )
-        return HistoryGradient(value, by_state, tuple(slopes))
-
-    def mechanics(
-        self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
-    ) -> Mechanics:
-        """Return the part in an equation of motion, in plain arithmetic.
-
-        `direction` is the sign of the velocity, `force` the present force of an element with
-        memory.
-        """
-        raise ModelError(
-            f"{self!r} has no equation of motion, so it cannot be driven by a force over time; "
-            "give records with measured displacement and force"
-        )
-
-    def steady_force(
-        self, values: Sequence[FloatArray], path: FloatArray, cycles: int
-    ) -> FloatArray:
-        """Return the force along closed paths of displacement, shape (..., n), unchecked.
-
-        Every path is run through `cycles` times; the last time counts.
-        """
-        steps = path.shape[-1]
-        every = np.broadcast_arrays(*(np.asarray(v) for v in values), path[..., 0])
-        force = np.empty(path.shape)
-        for i in np.ndindex(path.shape[:-1]):
-            own = [float(v[i]) for v in every[:-1]]
-            force[i] = self.force_history(own, np.tile(path[i], cycles))[-steps:]
-        return force
-
-    def rational_stiffness(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return numerator and denominator of Z(s), from the highest power of s down.
-
-        None for an element that is not linear.
-
-        Raises
-        ------
-        ModelError
-            If a parameter has no value, or Z is no rational function of s.
-        """
-        return None
-
-    def system_at(self, values: Sequence[float]) -> Any:
-        """Return the python-control system that the element was made from, or None."""
-        return None
-
-    def branch(
-        self, values: Sequence[float], start: FloatArray | float, path: FloatArray
-    ) -> FloatArray | None:
-        """Return the force on the way up from `start`, in closed form, and its slope, (2, n).
-
-        `path` is the displacement since then, m, and may be below 0. A law whose two directions
-        are alike answers; None from any other.
-        """
-        return None
-
-    def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Return what abs(N) and A abs(N) never exceed, over all amplitudes; inf where nothing."""
-        return np.full((), np.inf), np.full((), np.inf)
-
-    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Return amplitudes between which N changes, m; NaN for a linear element."""
-        return np.full((), np.nan), np.full((), np.nan)
-
-    def answers(self, harmonic: int) -> bool:
-        """Return whether a sine of displacement may give the force this harmonic, at any values.
-
-        A linear element answers with the fundamental alone, a law that is the same in both
-        directions with odd harmonics.
-        """
-        return harmonic == 1 if self.is_linear else harmonic % 2 == 1
-
-    def transient_decay(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
-    ) -> FloatArray:
-        """Return the factor by which a deviation from the steady loop shrinks in one cycle."""
-        return np.zeros(np.broadcast_shapes(np.shape(amplitude), np.shape(omega)))
-
-    def casadi_stiffness(
-        self, values: Sequence[ca.SX], amplitude: ca.SX, omega: ca.SX, harmonic: int = 1
-    ) -> tuple[ca.SX, ca.SX]:
-        """Return real and imaginary part of F_k/X_1 as casadi expressions."""
-        raise ModelError(
-            f"{self!r} cannot be written as a casadi expression; use a method other than ipopt"
-        )
-
-    def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
-        """Return the limits at infinity that this law declares, for amplitudes low to high, m."""
-        return ()
-
-    def combinations(self) -> tuple[Combination, ...]:
-        """Return products of powers that data may determine where single parameters are lost."""
-        return ()
-
     def alternatives(self) -> dict[str, tuple[Element, ...]]:
         """Return, by a few words, what is usually tried in place of this element."""
         return {}
-
-    def universal_curve(self) -> UniversalCurve | None:
-        """Return the curve that all values of the scale parameters follow, or None."""
-        return None
-
-    def physics(self, values: Sequence[float]) -> tuple[str, ...]:
-        """Return what speaks against the values physically, in words; empty where nothing."""
-        return ()
 
     def tabulated(self) -> Element:
         """Return this element, or a faster variant of it for very many evaluations."""
@@ -563,16 +239,6 @@ class Element(ABC):
                 f"initial_force is {initial_force!r}, but {self!r} has no memory; leave it out"
             )
 
-    def known_values(self) -> tuple[FloatArray, ...]:
-        """Return the value of every parameter, or name those that have none."""
-        missing = [p.name for p in self.parameters if p.value is None]
-        if missing:
-            raise ModelError(
-                f"{self!r} has no value for {', '.join(missing)}; "
-                "give a number to evaluate the model, or estimate it with fit"
-            )
-        return tuple(np.asarray(p.value) for p in self.parameters)
-
     def with_bound(self, parameters: tuple[Parameter, ...]) -> Self:
         """Return a copy of this element with other values, bounds or free flags."""
         copy = object.__new__(type(self))
@@ -584,7 +250,7 @@ class Element(ABC):
         """Put two elements, or sums of elements, in parallel."""
         if not isinstance(other, Element):
             return NotImplemented
-        return self._in_parallel(self, other)
+        return Model(self, other)
 
     def __repr__(self) -> str:
         parts = []
@@ -598,40 +264,248 @@ class Element(ABC):
         return f"{type(self).__name__}({', '.join(parts)})"
 
 
-def central_differences(
-    function: Callable[..., NDArray[Scalar]],
-    arguments: Sequence[FloatArray],
-    index: int,
-    shape: tuple[int, ...],
-) -> NDArray[Scalar]:
-    """Return the derivative of a function of arrays by one of them, to fourth order."""
-    size = np.asarray(arguments[index], dtype=np.float64)
-    step = _STEP * np.where(size == 0.0, 1.0, np.abs(size))
-    places = [place for place, _ in _STENCIL]
-    ndim = len(shape)
-    stacked = size.reshape((1,) * (ndim - size.ndim) + size.shape)
-    by = np.asarray(places).reshape((-1,) + (1,) * ndim) * step.reshape(stacked.shape)
-    moved = [*arguments[:index], stacked + by, *arguments[index + 1 :]]
-    values = np.broadcast_to(function(*moved), (len(places), *shape))
-    weights = np.asarray([weight for _, weight in _STENCIL])
-    return np.asarray(np.tensordot(weights, values, axes=1) / step)
+class Model(Element):
+    """Elements in parallel: Z(A, omega) is the sum of theirs, at one displacement.
 
+    Usually written with ``+``. Sums of sums are flattened.
 
-KINDS: dict[str, type[Element]] = {}
-"""Every element class by the name that files and the command line know it by."""
+    Parameters
+    ----------
+    *elements : Element
+        One or more elements or sums.
 
+    Raises
+    ------
+    ModelError
+        If there is no element, or two parameters share a name.
 
-def _register(cls: type[Element]) -> None:
-    known = KINDS.get(cls.kind)
-    if known is not None and (known.__module__, known.__qualname__) != (
-        cls.__module__,
-        cls.__qualname__,
-    ):
-        raise ModelError(
-            f"{cls.__name__} has the kind {cls.kind!r}, which {known.__module__}."
-            f"{known.__qualname__} has already; choose another"
+    Examples
+    --------
+    >>> from dahl_ident import Dahl, Damper, Mass, Spring
+    >>> plant = Dahl() + Mass(0.3) + Damper() + Spring()
+    >>> [p.name for p in plant.parameters if p.free]
+    ['f_max', 'sigma', 'damping', 'stiffness']
+    """
+
+    def __init__(self, *elements: Element) -> None:
+        flat: list[Element] = []
+        for element in elements:
+            flat.extend(element.elements if isinstance(element, Model) else [element])
+        if not flat:
+            raise ModelError("a model needs at least one element, got none")
+        self._elements = tuple(flat)
+        self.parameters = tuple(p for element in flat for p in element.parameters)
+        self.is_linear = all(element.is_linear for element in flat)
+        self.rate_independent = all(element.rate_independent for element in flat)
+        self.has_memory = any(element.has_memory for element in flat)
+        names = [p.name for p in self.parameters]
+        if len(set(names)) < len(names):
+            clashes = [name for name, count in Counter(names).items() if count > 1]
+            raise ModelError(
+                f"two elements share the parameter names {', '.join(clashes)}; "
+                "give each a name, such as Dahl(name='pivot')"
+            )
+        self._slices: list[slice] = []
+        start = 0
+        for element in flat:
+            self._slices.append(slice(start, start + len(element.parameters)))
+            start += len(element.parameters)
+
+    @property
+    def elements(self) -> tuple[Element, ...]:
+        """The elements, in the order in which they were added."""
+        return self._elements
+
+    def stiffness(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> ComplexArray:
+        """Return the sum of the elements' F_k/X_1 at `values`, unchecked."""
+        parts = [
+            element.stiffness(values[s], amplitude, omega, harmonic)
+            for element, s in zip(self._elements, self._slices, strict=True)
+        ]
+        total = parts[0]
+        for part in parts[1:]:
+            total = total + part
+        return total
+
+    def stiffness_gradient(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int = 1,
+    ) -> StiffnessGradient:
+        """Return the sum of the elements' F_k/X_1 with all derivatives, unchecked."""
+        parts = [
+            element.stiffness_gradient(values[s], amplitude, omega, harmonic)
+            for element, s in zip(self._elements, self._slices, strict=True)
+        ]
+        value, by_amplitude = parts[0].value, parts[0].by_amplitude
+        for part in parts[1:]:
+            value = value + part.value
+            by_amplitude = by_amplitude + part.by_amplitude
+        return StiffnessGradient(
+            value, by_amplitude, tuple(d for part in parts for d in part.by_parameter)
         )
-    KINDS[cls.kind] = cls
+
+    def stiffness_slope(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Return the sum of the elements' F/X and its derivative by amplitude, unchecked."""
+        pairs = [e.stiffness_slope(own, amplitude, omega) for e, own in self.of(values)]
+        value, slope = pairs[0]
+        for one, other in pairs[1:]:
+            value, slope = value + one, slope + other
+        return value, slope
+
+    def force_history(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
+        *,
+        acceleration: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return the sum of the elements' forces, unchecked; `state` is the friction's."""
+        total = np.zeros(np.shape(displacement))
+        for element, s in zip(self._elements, self._slices, strict=True):
+            start = state if element.has_memory else 0.0
+            total += element.force_history(
+                values[s], displacement, velocity, start, acceleration=acceleration
+            )
+        return total
+
+    def _check_start(self, values: Sequence[float], initial_force: float) -> None:
+        remember = [e for e in self._elements if e.has_memory]
+        if not remember:
+            super()._check_start(values, initial_force)
+        if initial_force and len(remember) > 1:
+            raise ValidationError(
+                f"initial_force is {initial_force!r} for {len(remember)} elements with memory; "
+                "evaluate them one by one, or leave it out"
+            )
+        for element, s in zip(self._elements, self._slices, strict=True):
+            if element.has_memory:
+                element._check_start(values[s], initial_force)
+
+    def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return the sums of the elements' bounds of abs(N) and A abs(N)."""
+        steepest, largest = np.zeros(()), np.zeros(())
+        for element, s in zip(self._elements, self._slices, strict=True):
+            own = element.force_bounds(values[s])
+            steepest, largest = steepest + own[0], largest + own[1]
+        return steepest, largest
+
+    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return the lowest and highest knee of the elements; NaN where all are linear."""
+        low, high = np.full((), np.nan), np.full((), np.nan)
+        for element, s in zip(self._elements, self._slices, strict=True):
+            own = element.knee(values[s])
+            low, high = np.fmin(low, own[0]), np.fmax(high, own[1])
+        return low, high
+
+    def transient_decay(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> FloatArray:
+        """Return the decay of the element that forgets most slowly."""
+        slowest = np.zeros(np.broadcast_shapes(np.shape(amplitude), np.shape(omega)))
+        for element, s in zip(self._elements, self._slices, strict=True):
+            slowest = np.maximum(slowest, element.transient_decay(values[s], amplitude, omega))
+        return slowest
+
+    def casadi_stiffness(
+        self, values: Sequence[ca.SX], amplitude: ca.SX, omega: ca.SX, harmonic: int = 1
+    ) -> tuple[ca.SX, ca.SX]:
+        """Return real and imaginary part of the sum as casadi expressions."""
+        real, imag = 0.0 * amplitude, 0.0 * amplitude
+        for element, s in zip(self._elements, self._slices, strict=True):
+            own = element.casadi_stiffness(values[s], amplitude, omega, harmonic)
+            real, imag = real + own[0], imag + own[1]
+        return real, imag
+
+    def physics(self, values: Sequence[float]) -> tuple[str, ...]:
+        """Return the objections of all elements to their values."""
+        return tuple(
+            text
+            for element, s in zip(self._elements, self._slices, strict=True)
+            for text in element.physics(values[s])
+        )
+
+    def tabulated(self) -> Model:
+        """Return the model with tables in place of quadratures; itself where it needs none.
+
+        Examples
+        --------
+        >>> from dahl_ident import Dahl
+        >>> Model(Dahl(alpha=2.0)).tabulated()
+        TabulatedDahl(f_max=free, sigma=free, alpha=2)
+        """
+        faster = [element.tabulated() for element in self._elements]
+        if all(new is old for new, old in zip(faster, self._elements, strict=True)):
+            return self
+        return Model(*faster)
+
+    def of(self, values: Sequence[Value]) -> Iterator[tuple[Element, Sequence[Value]]]:
+        """Yield every element with its own part of the model's parameter `values`."""
+        for element, s in zip(self._elements, self._slices, strict=True):
+            yield element, values[s]
+
+    def with_parameters(self, changes: Mapping[str, Parameter]) -> Model:
+        """Return this model with some parameters replaced, by name."""
+        self._check_names(changes)
+        elements = []
+        for element in self._elements:
+            parameters = tuple(changes.get(p.name, p) for p in element.parameters)
+            if parameters == element.parameters:
+                elements.append(element)
+                continue
+            elements.append(element.with_bound(parameters))
+        return Model(*elements)
+
+    def with_free(self, names: Iterable[str]) -> Model:
+        """Return this model with the named parameters estimated, started from their values."""
+        known = {p.name: p for p in self.parameters}
+        names = list(names)
+        self._check_names(names)
+        return self.with_parameters({name: known[name].freed() for name in names})
+
+    def with_fixed(self, values: Mapping[str, float]) -> Model:
+        """Return this model with the named parameters held at the given values."""
+        known = {p.name: p for p in self.parameters}
+        self._check_names(values)
+        return self.with_parameters({n: known[n].fixed(v) for n, v in values.items()})
+
+    def with_values(self, values: Mapping[str, float]) -> Model:
+        """Return this model with values put in, each parameter staying free or fixed as it was."""
+        known = {p.name: p for p in self.parameters}
+        self._check_names(values)
+        return self.with_parameters({n: replace(known[n], value=v) for n, v in values.items()})
+
+    def _check_names(self, names: Iterable[str]) -> None:
+        known = [p.name for p in self.parameters]
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            raise ModelError(
+                f"the model has no parameter {', '.join(unknown)}; it has {', '.join(known)}"
+            )
+
+    def __repr__(self) -> str:
+        return " + ".join(repr(element) for element in self._elements)
+
+
+def as_model(model: Element) -> Model:
+    """Return `model` as a sum, so that one element alone needs no special case."""
+    if isinstance(model, Model):
+        return model
+    if not isinstance(model, Element):
+        raise ModelError(f"expected a model such as Dahl() + Mass(0.3), got {type(model).__name__}")
+    return Model(model)
 
 
 def prefixed(name: str | None, label: str) -> str:

@@ -27,14 +27,13 @@ from dahl_ident.arrays import (
     whole_number,
 )
 from dahl_ident.elements import force_curve
-from dahl_ident.elements.element import (
-    Element,
+from dahl_ident.elements.behaviour import (
     HistoryGradient,
     Mechanics,
     StiffnessGradient,
     central_differences,
-    motion,
 )
+from dahl_ident.elements.element import Element, motion
 from dahl_ident.elements.rated_loop import RatedLoop, rated_loop
 from dahl_ident.elements.steady_loop import Loop, Rows, closed_loop, force_limit
 from dahl_ident.errors import ModelError, ValidationError

@@ -25,7 +25,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.element import StiffnessGradient
+from dahl_ident.elements.behaviour import StiffnessGradient
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 

@@ -9,13 +9,8 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.quantities import power_of_s
-from dahl_ident.elements.element import (
-    Element,
-    HistoryGradient,
-    Mechanics,
-    StiffnessGradient,
-    motion,
-)
+from dahl_ident.elements.behaviour import HistoryGradient, Mechanics, StiffnessGradient
+from dahl_ident.elements.element import Element, motion
 from dahl_ident.elements.parameter import Parameter
 
 if TYPE_CHECKING:

@@ -19,7 +19,8 @@ import numpy as np
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.fields import one_of
 from dahl_ident.data.quantities import DEFINITIONS, converted
-from dahl_ident.elements.element import Element, StiffnessGradient, prefixed
+from dahl_ident.elements.behaviour import StiffnessGradient
+from dahl_ident.elements.element import Element, prefixed
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.units import QUANTITIES, Quantity

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.element import Asymptote, Mechanics, motion
+from dahl_ident.elements.behaviour import Asymptote, Mechanics
+from dahl_ident.elements.element import motion
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.recursion import linear_recursion

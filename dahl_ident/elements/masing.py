@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.element import Mechanics
+from dahl_ident.elements.behaviour import Mechanics
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.recursion import stretches
 from dahl_ident.errors import ModelError

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray, positive_array, whole_number
-from dahl_ident.elements.element import Element, StiffnessGradient, prefixed
+from dahl_ident.elements.behaviour import StiffnessGradient
+from dahl_ident.elements.element import Element, prefixed
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ValidationError

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.special import gamma, rgamma
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements.behaviour import HistoryGradient, StiffnessGradient, central_differences
 from dahl_ident.elements.element import (
     Element,
     HistoryGradient,

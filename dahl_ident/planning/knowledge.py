@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import FloatArray, finite_array
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.elements import Element, Model, Parameter
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError
 from dahl_ident.problem import Problem
 from dahl_ident.sensors import Sensors

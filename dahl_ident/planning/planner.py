@@ -12,7 +12,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray, non_negative_array, positive_number, whole_number
 from dahl_ident.data.fields import one_of
 from dahl_ident.elements import Element
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
 from dahl_ident.planning.candidates import (

@@ -14,7 +14,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Element, Parameter
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import DataError, ModelError, ValidationError
 from dahl_ident.noise import Measured, Rho, bend, correct_amplitude, noise_for
 from dahl_ident.problem.coordinates import (

@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 from dahl_ident.elements import Element, Parameter
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
 from dahl_ident.problem.problem import Quadratic
 from dahl_ident.time_domain import (

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.elements import Element
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.fitting import solve, solve_many
 from dahl_ident.problem import Problem, ProblemBatch

@@ -16,8 +16,7 @@ from dahl_ident.arrays import (
     non_negative_array,
     positive_array,
 )
-from dahl_ident.elements.element import Element
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import Element, as_model
 from dahl_ident.errors import MultipleSolutionsWarning, ValidationError
 from dahl_ident.steady_state.plant import BoolArray, IntArray, flatten
 from dahl_ident.steady_state.roots import find_roots

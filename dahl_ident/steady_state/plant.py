@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.element import Element
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import Element, as_model
 
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]

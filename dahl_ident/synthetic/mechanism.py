@@ -9,7 +9,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ModelError
 from dahl_ident.synthetic.plant_motion import Progress, simulate_plant
 from dahl_ident.synthetic.state_space import Rational
