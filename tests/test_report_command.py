@@ -78,6 +78,19 @@ def test_of_a_shipped_table(run: Runner) -> None:
     assert command.startswith("dahl-ident datasets noisy -o - | dahl-ident fit - ")
 
 
+@pytest.mark.parametrize(
+    ("model", "told"),
+    [
+        (di.Dahl(name="pivot"), "--element 'dahl(name=pivot)'"),
+        (di.BoucWen(q=300.0), "--element 'bouc_wen(q=300.0)'"),
+        (di.Dahl(alpha=None, asymmetry=0.1) + di.Mass(), "'dahl(alpha=free, asymmetry=0.1)'"),
+    ],
+)
+def test_of_any_law(run: Runner, model: di.Element, told: str) -> None:
+    fit = di.fit(shipped("noisy"), model, throw=False)
+    assert told in check_repeated(run, fit)
+
+
 def test_of_waveforms(run: Runner) -> None:
     record = di.read_record(datasets_directory() / "plant_recording.csv.gz")
     data = di.extract(record, controlled="force", harmonics=[1], num_periods=8)
@@ -114,7 +127,7 @@ def test_what_no_command_describes_is_said_so(tmp_path: Path) -> None:
     data = table(di.Dahl(0.1, 30.0))
     fit = di.fit(data, di.Dahl())
     assert equivalent_command([fit]) is None, "these data come from no file"
-    named = di.fit(shipped("noisy"), di.Dahl(name="pivot"))
-    assert equivalent_command([named]) is None, "the command line gives no names"
+    gap = di.fit(shipped("noisy"), di.Backlash(di.Dahl()), throw=False)
+    assert equivalent_command([gap]) is None, "--element takes no element within another"
     text = di.report(fit, tmp_path / "r.md").read_text(encoding="utf-8")
     assert "in Python; no command describes this model and these data" in text

@@ -12,17 +12,23 @@ from dahl_ident.results import ChainPosterior, FitResult
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
-    from dahl_ident.elements import Parameter
+    from dahl_ident.elements import Element, Parameter
     from dahl_ident.problem import Problem
 
-_ON_COMMAND_LINE = {"dahl", "mass", "damper", "spring"}
-_USUAL = {"alpha": 1.0, "force_gain": 1.0, "displacement_gain": 1.0, "delay": 0.0}
+_USUAL = {
+    "f_max": None, "sigma": None, "alpha": 1.0,
+    "force_gain": 1.0, "displacement_gain": 1.0, "delay": 0.0,
+}  # fmt: skip
+"""What options stand for that are left out; None where the parameter is estimated then."""
+_OPTIONS = {"f_max", "sigma", "alpha", "mass", "damping", "stiffness"}
+"""Parameters with an option of their own; other elements are written with --element."""
 
 
 def equivalent_command(results: Sequence[FitResult | ChainPosterior]) -> str | None:
     """Return the commands, a line each; None where no options describe data or model."""
     source = _source(results[0].data)
-    if source is None or not all(_is_plain(result.problem) for result in results):
+    elements = (e for result in results for e in result.problem.model.elements)
+    if source is None or not all(_has_text(element) for element in elements):
         return None
     before, files = source
     lines = []
@@ -75,14 +81,23 @@ def _words(given: Mapping[str, Any]) -> list[str]:
     return [word for name, value in pairs for word in (name, str(value))]
 
 
-def _is_plain(problem: Problem) -> bool:
-    """Return whether the command line has the model: one Dahl element, others at most once."""
-    kinds = [element.kind for element in problem.model.elements]
-    labels = {p.name for p in problem.model.parameters} == {
-        element.label(p) for element in problem.model.elements for p in element.parameters
-    }
-    single = len(set(kinds)) == len(kinds) and "dahl" in kinds
-    return single and set(kinds) <= _ON_COMMAND_LINE and labels
+def _has_text(element: Element) -> bool:
+    """Return whether --element can describe an element: by its declared parameters alone."""
+    described = set(element.describe()) - {"kind", "name"}
+    in_package = type(element).__module__.split(".")[0] == __name__.split(".")[0]
+    return in_package and described == set(element.labels)
+
+
+def _as_text(element: Element) -> str:
+    """Return an element as --element takes it, what is usual left out."""
+    usual = {p.name: p for p in type(element).parameters}
+    given = [f"name={element.name}"] if element.name else []
+    for label, parameter in zip(element.labels, element.parameters, strict=True):
+        if not parameter.free and not parameter.assumed:
+            given.append(f"{label}={parameter.value!r}")
+        elif parameter.free and not (label in usual and usual[label].free):
+            given.append(f"{label}=free")
+    return f"{element.kind}({', '.join(given)})" if given else element.kind
 
 
 def _fit(fit: FitResult) -> list[str]:
@@ -104,8 +119,13 @@ def _sample(posterior: ChainPosterior) -> list[str]:
 
 def _model(problem: Problem) -> list[str]:
     """Return the options of elements and sensors that differ from the usual ones."""
-    parameters = (*problem.model.parameters, *problem.sensors.parameters)
-    return [word for parameter in parameters for word in _parameter(parameter, problem)]
+    model = problem.model
+    names = {p.name for p in model.parameters}
+    if names <= _OPTIONS and {"f_max", "sigma"} <= names:
+        words = [word for p in model.parameters for word in _parameter(p, problem)]
+    else:
+        words = [word for e in model.elements for word in ("--element", _as_text(e))]
+    return [*words, *(w for p in problem.sensors.parameters for w in _parameter(p, problem))]
 
 
 def _parameter(parameter: Parameter, problem: Problem) -> Iterator[str]:
@@ -117,7 +137,7 @@ def _parameter(parameter: Parameter, problem: Problem) -> Iterator[str]:
         value = repr(parameter.value)
         if parameter.value == _USUAL.get(name):
             return
-    elif name in ("f_max", "sigma"):
+    elif name in _USUAL and _USUAL[name] is None:
         return
     yield from (f"--{name.replace('_', '-')}", value)
 
