@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring, response
+from dahl_ident import BoucWen, Dahl, Damper, LinearSystem, Mass, Spring, response
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
@@ -68,6 +68,17 @@ def by_ode_solver(
 
 def _first_state(solution: Any, time: FloatArray) -> FloatArray:
     return np.asarray(solution(time)[0])
+
+
+@pytest.mark.parametrize("levels", [(0.02, 0.2), (0.5, 0.05)])
+def test_motion_of_a_law_without_closed_form(levels: tuple[float, ...]) -> None:
+    """Bouc-Wen's law with q = p = sigma/f_max is Dahl's."""
+    steps = SteppedSine(levels, (0.7,), controlled="force", settling_periods=1, num_periods=1)
+    force = steps.waveform(seed=0)
+    time = np.linspace(0.0, force.duration, 997)
+    exact = Mechanism.of(Dahl(0.1, 30.0) + LINEAR).displacement_under(force)(time)
+    motion = Mechanism.of(BoucWen(30.0, 300.0, 300.0) + LINEAR).displacement_under(force)(time)
+    assert np.max(np.abs(motion - exact)) < 1e-5 * np.max(np.abs(exact))
 
 
 def phasor(signal: Signal, frequency_hz: float, start: float, periods: int, k: int = 1) -> complex:

@@ -20,15 +20,13 @@ import numpy as np
 from scipy.special import gamma, rgamma
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.behaviour import HistoryGradient, StiffnessGradient, central_differences
-from dahl_ident.elements.element import (
-    Element,
+from dahl_ident.elements.behaviour import (
     HistoryGradient,
     Mechanics,
     StiffnessGradient,
     central_differences,
-    motion,
 )
+from dahl_ident.elements.element import Element, motion
 from dahl_ident.elements.parameter import Parameter
 
 if TYPE_CHECKING:
