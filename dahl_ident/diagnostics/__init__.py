@@ -1,4 +1,4 @@
-"""Judging an estimate: how far to trust its numbers, and what the data cannot say."""
+"""Diagnostics of an estimate: whether it can be used, and what the data do not determine."""
 
 from dahl_ident.diagnostics.budget import Budget, budget
 from dahl_ident.diagnostics.comparison import ModelComparison, compare_models

@@ -1,4 +1,4 @@
-"""Why a parameter is not determined, and what to do about it, in words with numbers."""
+"""Advice: why a parameter is not determined, and what to do about it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def advice(optimum: Optimum, name: str, limits: Interval, lost: frozenset[str]) 
 
 
 def _confounding_gain(optimum: Optimum, name: str, lost: frozenset[str]) -> str:
-    """Return the advice where an unknown gain is what hides a parameter."""
+    """Return the advice if a parameter is not determined because of an unknown gain."""
     priors = optimum.problem.priors
     for gain, channel in _CHANNELS.items():
         if gain not in lost or gain in priors:
@@ -130,13 +130,13 @@ def _knee(optimum: Optimum, element: Element) -> tuple[float, float]:
 
 
 def _scaled(element: Element, dimension: tuple[int, int, int]) -> list[Parameter]:
-    """Return the scale parameters of one dimension."""
+    """Return the scale parameters with a given dimension."""
     scale = (element.parameter(label) for label in element.scale_parameters)
     return [p for p in scale if p.dimension == dimension]
 
 
 def _rival(optimum: Optimum, element: Element, label: str, lost: frozenset[str]) -> str:
-    """Return the same parameter of another element of this law, if that is lost as well."""
+    """Return the same parameter of another element of this law, if it is not determined either."""
     for other in optimum.problem.model.elements:
         if other is not element and other.kind == element.kind and label in other.labels:
             name = other.parameter(label).name

@@ -1,10 +1,10 @@
-"""How far a fitted curve is known: bands of a predicted response, and quantities derived from it.
+"""Bands of a predicted response, and quantities derived from the estimate.
 
 First order: with d = dR/dtheta at the estimate and C its covariance, Re R and Im R have the
 covariance Re(d) C Re(d)', Re(d) C Im(d)', Im(d) C Im(d)', and d(ln R) = dR/R gives ln gain and
-phase together. No half of a complex number is taken for the whole. Where the sources of error are
-known (:mod:`dahl_ident.diagnostics.error_model`) all of them count, around the estimate that takes
-them into account (:mod:`dahl_ident.diagnostics.prediction_error`); else noise alone.
+phase together. Real and imaginary part are always treated together. Where the sources of error are
+known (:mod:`dahl_ident.diagnostics.error_model`) all of them are included, around the estimate that
+takes them into account (:mod:`dahl_ident.diagnostics.prediction_error`); else noise alone.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ def problem_at(
 def describing_function_band(
     optimum: Optimum, amplitude: ArrayLike, errors: ErrorModel | None = None
 ) -> ResponseBand:
-    """Return N(A) of all friction laws together, whatever stands beside them."""
+    """Return N(A) of all friction laws together, without the other elements."""
     A = positive_array(amplitude, "amplitude")
     N, by = friction_and_slopes(*_estimate(optimum, errors), A)
     if errors is None:
@@ -264,7 +264,7 @@ def _characteristic_displacements(
         own = [float(values[p.name]) for p in element.parameters]
         x_c, high = _knee(element, own)
         if not element.has_memory or x_c != high:
-            continue  # a law whose knee is a range has no single displacement
+            continue  # a law with a range of knees has no single characteristic displacement
         direction = np.zeros(len(names))
         for i, parameter in enumerate(element.parameters):
             if parameter.free:

@@ -1,4 +1,4 @@
-r"""Parametric bootstrap: the measurement repeated on the computer, and fitted each time.
+r"""Parametric bootstrap: simulated repetitions of the measurement, each of them fitted.
 
 Responses are drawn from the likelihood at the estimate, with the noise scale that was estimated,
 and every set is fitted like the original. The distribution of
@@ -10,15 +10,15 @@ theta_hat - c stderr (the studentised bootstrap, or bootstrap-t; Efron and Tibsh
 Introduction to the Bootstrap, 1993, chapter 12). Because each replicate brings its own standard
 error, the estimated noise scale is accounted for.
 
-Replicates whose optimum lies at infinity have no t*. Where more of them run away than the level
-leaves outside, the distribution of t* says nothing, and the interval is open on both sides; the
-profile knows more there.
+Replicates whose optimum lies at infinity have no t*. If their fraction exceeds the probability
+outside the interval, the distribution of t* is not informative, and the interval is open on both
+sides; use the profile there.
 
-Where any parameter runs away in more than a hundredth of the replicates, the estimate lies at or
-near a limit of the model, and which tail of t* is long depends on which side of it the truth lies:
-a bootstrap from the estimate cannot know (Andrews, Econometrica 68 (2000) 399-405). The size of t*
-depends on it much less, and the interval is theta_hat -+ C stderr, C from the distribution of |t*|
-(Hall, Journal of the Royal Statistical Society B 50 (1988) 35-45).
+If any parameter diverges in more than a hundredth of the replicates, the estimate lies at or near a
+limit of the model, and which tail of t* is long depends on the side of it on which the true value
+lies; a bootstrap from the estimate cannot determine this (Andrews, Econometrica 68 (2000) 399-405).
+The size of t* depends on it much less, and the interval is theta_hat -+ C stderr, C from the
+distribution of |t*| (Hall, Journal of the Royal Statistical Society B 50 (1988) 35-45).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Replicates:
     studentised : ndarray, shape (S, P)
         t*, NaN where an optimum lies at infinity or is not determined.
     gone : ndarray of bool, shape (S, P)
-        Which have no t*: run away, or not determined.
+        Which have no t*: diverging, or not determined.
     """
 
     studentised: FloatArray
@@ -94,14 +94,14 @@ def bootstrap_intervals(
     levels : sequence of float, default 0.6827, 0.9545, 0.9973
         Confidence levels.
     replicates : int, default 4999
-        At least 99; the 99.73 % level wants some thousands.
+        At least 99; the 99.73 % level needs some thousands.
     seed : int, default 0
         Of the simulated noise; the same seed gives the same intervals.
 
     Returns
     -------
     ConfidenceIntervals
-        Open where too many replicates run away.
+        Open if too many replicates diverge.
 
     Raises
     ------

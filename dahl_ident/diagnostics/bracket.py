@@ -1,4 +1,4 @@
-"""Where rising functions meet their targets: Newton's method inside brackets, many at a time."""
+"""Roots of rising functions: Newton's method inside brackets, for many functions at a time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _GROWTH, _SHRINKAGE = 3.0, 0.3  # of a step over the last, until the target is b
 
 
 class Bracket:
-    """S searches outwards from 0, each for where its function meets its target.
+    """S searches outwards from 0, each for the point where its function reaches its target.
 
     Parameters
     ----------

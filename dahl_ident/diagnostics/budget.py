@@ -1,4 +1,4 @@
-"""The uncertainty budget of a fit: which source contributes how much, after JCGM 100 (GUM).
+"""The uncertainty budget of a fit: the contribution of each source, after JCGM 100 (GUM).
 
 Combined standard uncertainty u, effective degrees of freedom (Welch and Satterthwaite), coverage
 factor k of Student's t for a confidence of 95.45 %, expanded uncertainty U = k u.
@@ -47,7 +47,7 @@ class BudgetRow:
     kind : {"A", "B"}
         Evaluated from the data's scatter, or from knowledge beforehand.
     u : float
-        Standard uncertainty that it makes, in the parameter's unit.
+        Standard uncertainty that it contributes, in the parameter's unit.
     dof : float
         Degrees of freedom of `u`.
     share : float
@@ -101,9 +101,9 @@ class Budget(Mapping[str, ParameterBudget]):
     parameters : tuple of ParameterBudget
         In the order of the fit.
     covariance : ndarray, shape (P, P)
-        Combined, of the values.
+        Combined covariance of the values.
     exact : tuple of str
-        Calibrations and other inputs that nobody stated an uncertainty of: taken as exact.
+        Calibrations and other inputs without a stated uncertainty, which are taken as exact.
 
     Examples
     --------
@@ -323,7 +323,7 @@ def coverage_factor(dof: float, confidence: float = CONFIDENCE) -> float:
 
 
 def taken_as_exact(optimum: Optimum) -> tuple[str, ...]:
-    """Return the calibrations that nobody stated an uncertainty of."""
+    """Return the calibrations without a stated uncertainty."""
     sensors, priors = optimum.problem.sensors, optimum.problem.priors
     free = {p.name for p in sensors.parameters if p.free}
     return tuple(

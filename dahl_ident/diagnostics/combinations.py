@@ -1,4 +1,4 @@
-"""Combinations of parameters that data can determine although they do not determine the parts.
+"""Combinations of parameters that data can determine without determining each parameter.
 
 ========================================  =====================================================
 combination                               left by
@@ -75,8 +75,8 @@ def candidates(optimum: Optimum) -> list[Candidate]:
 def stiffness_seen(optimum: Optimum) -> Candidate | None:
     """Return the stiffness of friction and free springs together, in the middle of the amplitudes.
 
-    None without friction and a free spring. Data of a stiffness always know it; it is worth
-    telling where they know nothing else.
+    None without friction and a free spring. Stiffness data always determine it; it is reported only
+    if they determine nothing else.
     """
     problem, names = optimum.problem, optimum.names
     elements = problem.model.elements

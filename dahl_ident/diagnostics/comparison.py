@@ -1,10 +1,10 @@
-"""Would another model describe the data better? Akaike's and Schwarz's criteria say.
+"""Comparison of models by Akaike's and Schwarz's criteria.
 
-Both are -2 ln L plus a price on parameters, 2 each for AIC and ln(2n) for BIC; the lower, the
-better. A difference above 10 is plain, below 2 means nothing. The lowest of several is often that
-of a model too rich, by chance; so another model is called best only where it is clearly better than
-the one fitted. Criteria compare models, they do not prove one: if none describes the data, the
-best of them does not either, and one of negative damping is no mechanism's.
+Both are -2 ln L plus a penalty for each parameter, 2 for AIC and ln(2n) for BIC; lower is better. A
+difference above 10 is clear, one below 2 means nothing. The lowest of several often belongs, by
+chance, to a model with too many parameters, so another model is called best only if it is clearly
+better than the one fitted. Criteria compare models but do not validate one: if none describes the
+data, the best of them does not either, and a model with negative damping is not physical.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class ModelComparison:
 
     @property
     def best(self) -> ComparedModel:
-        """The model of the lowest BIC where that is lower by more than 10, else the one fitted."""
+        """The model with the lowest BIC if that is lower by more than 10, else the one fitted."""
         return self._lowest if self._gain > _PLAIN else self.models[0]
 
     @property

@@ -1,4 +1,4 @@
-r"""Do the bands hold? Each test is predicted from the others, and compared with what was measured.
+r"""Cross-validation of the bands: each test is predicted from the others.
 
 For the linear mixed model of :mod:`dahl_ident.diagnostics.error_model` the prediction of rows b
 from all others, parameters estimated without them, misses by

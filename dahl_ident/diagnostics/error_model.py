@@ -1,4 +1,4 @@
-r"""Where the errors of an estimate come from: one linear mixed model of all sources.
+r"""Linear mixed model of all sources of error of an estimate.
 
 Write each row's log response as
 
@@ -59,7 +59,7 @@ _RATE = 0.1  # the same for a force limit that changes with speed
 _SUPPORTED = 4.0  # the same for another kind of noise: 0.5 % of the tables, by chance
 _NOTICED = 1e-5  # change of residuals over the largest, below which a direction is undetermined
 _LEAST_DOF = 4  # residuals beyond the parameters, below which there is noise alone
-_FEW_ROWS = 100  # with more, rows are compressed to the directions that sources can change
+_FEW_ROWS = 100  # with more, rows are compressed to directions that the sources affect
 _CALIBRATIONS = {
     "force_gain": "force calibration",
     "displacement_gain": "displacement calibration",

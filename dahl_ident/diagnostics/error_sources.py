@@ -1,4 +1,4 @@
-r"""What makes residuals correlated or uneven: noise, scatter, and what the model misses.
+r"""Sources of correlated or uneven residuals: noise, scatter and model error.
 
 Each source is a set of columns: its errors are the columns times independent numbers of one
 variance. Departures are relative changes of the response, so that the same source serves every
@@ -6,9 +6,9 @@ quantity and noise model. The model error is a Gaussian process with the correla
 
     exp(-(d ln A)^2/2 - (d ln omega)^2/2),
 
-a length of one in either logarithm, for gain and phase alike; beside it stands a force in
-proportion to displacement that varies smoothly with frequency alone, as a mass, damper or spring
-that the model lacks would make; what the model's own linear parts can do of it is theirs.
+with a length of one in either logarithm, for both gain and phase. A second part is a force
+proportional to displacement that varies smoothly with frequency only, like that of a mass, damper
+or spring missing from the model; the part that the model's linear elements can describe is removed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ RUNS = "scatter between runs"
 LEVELS = "scatter between repeated levels"
 
 _LENGTH = 1.0  # of the model error, in ln A and ln omega
-_SMOOTH = 1e-3  # eigenvalue of the correlation, over the largest, that no row notices
+_SMOOTH = 1e-3  # eigenvalue of the correlation, over the largest, that is negligible
 _MOST_SHAPES = 24  # of its eigenvectors; a decade of both amplitude and frequency takes 15
 _SAME_LEVEL = 0.02  # of ln A and ln f, within which rows repeat each other
 _MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it leaves
@@ -49,7 +49,7 @@ class Source:
     mean_square : float
         Of ln gain and phase over the rows, at unit variance.
     shapes : Shapes or None
-        What continues the source to other amplitudes and frequencies.
+        Extension of the source to other amplitudes and frequencies.
     own : str
         What another test has an own draw of: "gain", "phase", "both" or a parameter's name;
         empty for noise and model error.
@@ -124,7 +124,7 @@ def of_one_scale(problem: Problem) -> tuple[Source, ...]:
 
 
 def gain_and_phase(problem: Problem) -> tuple[Source, ...]:
-    """Return noise with a scale each for gain and phase; empty where residuals mix them."""
+    """Return noise with separate scales for gain and phase; empty where residuals mix them."""
     if problem.noise != "relative":
         return ()
     n = problem.n_residuals // 2

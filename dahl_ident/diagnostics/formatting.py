@@ -1,12 +1,12 @@
-"""Numbers as people write them: a value no finer than its uncertainty."""
+"""Formatting of numbers: a value is rounded according to its uncertainty."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
-_DIGITS = 12  # of a number that is known more exactly than anyone reads
-_LEAST_P = 1e-12  # smaller ones depend on tails that nobody knows
+_DIGITS = 12  # of a number with a very small uncertainty
+_LEAST_P = 1e-12  # smaller ones depend on unknown tails
 
 
 def rounded(value: float, uncertainty: float | None) -> tuple[str, str]:

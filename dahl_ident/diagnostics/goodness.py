@@ -9,8 +9,8 @@ level of each is a hundredth over their number.
 Where the data are not described, the sign of the response and the suspicious rows are tried as
 the cause (:mod:`dahl_ident.diagnostics.misfit_explanations`); a cause found leads the verdict.
 
-A fit can be statistically perfect and physically absurd; what no mechanism does is said as a
-warning (:mod:`dahl_ident.diagnostics.physics`).
+A fit can be statistically perfect and physically impossible; this gives a warning
+(:mod:`dahl_ident.diagnostics.physics`).
 """
 
 from __future__ import annotations
@@ -333,7 +333,7 @@ def goodness(optimum: Optimum) -> Goodness:
 
 
 def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
-    """Return `found` with what is left of its objections without the suspicious rows."""
+    """Return `found` with the objections that remain without the suspicious rows."""
     rows = [point.row for point in found.suspicious]
     other = set_aside(optimum, rows) if rows and found.objections else None
     rest = None if other is None else _tested(other)
@@ -381,7 +381,7 @@ def _tested(optimum: Optimum) -> Goodness:
 
 
 def _untested(optimum: Optimum) -> bool:
-    """Return whether friction's free parameters alone meet all that one amplitude tells."""
+    """Return whether friction has as many free parameters as one amplitude has numbers."""
     problem = optimum.problem
     view = problem.stiffness_data
     elements = [e for e in problem.model.elements if not e.is_linear]

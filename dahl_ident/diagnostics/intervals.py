@@ -1,4 +1,4 @@
-"""Confidence intervals: which numbers the data leave possible for each parameter.
+"""Confidence intervals of the parameters.
 
 ``combined``
     Every source of the uncertainty budget (:mod:`dahl_ident.diagnostics.budget`), with Student's

@@ -1,7 +1,7 @@
-"""What may mislead a fit that does not describe its data: a sign convention, or single rows.
+"""Possible causes of a misfit: a sign convention, or single rows.
 
-Both are tried on the same problem, model and noise, and named where they explain the data. The fit
-itself is left as it is: nothing is corrected, nothing dropped.
+Both are tried with the same problem, model and noise, and reported if they explain the data. The
+fit itself is not changed: nothing is corrected or dropped.
 """
 
 from __future__ import annotations

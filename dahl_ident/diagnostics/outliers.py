@@ -1,11 +1,11 @@
-"""Points that stand apart: listed for a look, never dropped.
+"""Suspicious points, which are listed but never dropped.
 
 A point is tested by letting it have a response of its own (the mean-shift test): how much of the
 sum of squares goes away with its two residuals, leverage included, against what noise would do.
-The most deviant point is set aside and the others are judged without it, so that one outlier does
-not hide another; up to a tenth of the points are set aside this way. A robust fit is not bent by
-outliers, so its residuals are judged as they are. The level is 1 % for the whole table, divided
-by the number of points.
+The most deviant point is set aside and the others are judged without it, so that outliers do not
+mask one another; up to a tenth of the points are set aside in this way. A robust fit is little
+affected by outliers, so its residuals are tested directly. The level is 1 % for the whole table,
+divided by the number of points.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What no mechanism does: warnings about estimates that fit and yet make no sense."""
+"""Warnings about estimates that fit the data but are physically impossible or unsafe."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""How far a prediction is from what would be measured: parameters, model error, scatter, noise.
+r"""Error of a prediction of a measurement: parameters, model error, scatter, noise.
 
 At an operating point where the model's relative slopes by the parameters are j, ln gain and phase
 of the device are j delta + sum_k C_k u_k beside the model's, u_k the sources of

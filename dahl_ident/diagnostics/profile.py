@@ -1,4 +1,4 @@
-r"""Profile likelihood: how far a parameter can go while the others make the best of it.
+r"""Profile likelihood: the deviance as a function of one parameter, the others being optimal.
 
 The deviance of a parameter at a value is the rise of -2 ln L, with that parameter held there and
 all others optimal,
@@ -11,8 +11,8 @@ Newton's method on that root finds a limit in few steps. All parameters, both si
 are searched together; each step solves all their constrained problems at once, from the tangent
 of the last solution.
 
-A profile that stays below its threshold out to where the model has become its own limit has no
-limit on that side: the interval is open there.
+If a profile stays below its threshold up to the point where the model no longer changes, the
+interval is open on that side.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ class RecordErrors:
     effective : float
         Samples of white noise that would tell as much as the residuals.
     exact : tuple of str
-        What nobody stated an uncertainty of.
+        Inputs without a stated uncertainty.
     """
 
     contributions: Mapping[str, FloatArray]
@@ -101,7 +101,7 @@ def record_errors(
     if problem.output == "motion":
         ratio = drive_noise([record.force_samples for record in problem.records])
         if ratio is None:
-            exact.insert(0, "the drive, whose noise cannot be told from it")
+            exact.insert(0, "the drive (its noise cannot be estimated)")
         elif ratio > _SLIGHT:
             found[DRIVE] = ratio**2 * np.outer(scale, scale)
     stated = [r.drive_factor_uncertainty for r in problem.records]

@@ -1,4 +1,4 @@
-"""What a model leaves of records: share of variance, and where it misses most."""
+"""Residuals of a fit to records: unexplained share of variance, and the worst segment."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SEGMENTS = 50
 
 @dataclass(frozen=True)
 class RecordGoodness:
-    """What is left, over all records.
+    """Residuals of all records.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class RecordGoodness:
 def record_goodness(
     records: Sequence[Record], measured: Sequence[FloatArray], residuals: Sequence[FloatArray]
 ) -> RecordGoodness:
-    """Return what a model leaves of records.
+    """Return the statistics of the residuals of records.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Which parameters records of any motion do not determine, why, and what motion would."""
+"""Parameters that records do not determine, the reasons, and which motion would do so."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dahl_ident.elements.recursion import stretches
 
 _UNCERTAIN = 0.3  # relative standard uncertainty of a parameter that is not determined
 _LONG_ENOUGH = 0.02  # share of samples near a reversal
-_ALIKE = 0.95  # correlation at which two parameters cannot be told apart
+_ALIKE = 0.95  # correlation at which two parameters cannot be distinguished
 
 
 def undetermined(

@@ -1,4 +1,4 @@
-r"""Residuals as unit vectors of noise, with what the fit has taken out of them.
+r"""Residuals in units of the noise, and their component orthogonal to the fit.
 
 A question such as "do the data fall with frequency against the model?" is one more column beside
 those of the Jacobian: a small change u of the predicted responses, R -> R exp(gamma u). After

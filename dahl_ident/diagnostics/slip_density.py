@@ -1,12 +1,12 @@
-r"""The density of slip displacements, and the least misfit that such laws can have.
+r"""The density of slip displacements, and the smallest misfit of such laws.
 
 A symmetric rate-independent Masing law is a sum of Jenkins elements over their slip
 displacements, and N is linear in their stiffnesses, none of which is negative:
 
     N(A) = sum over i of k_i J(d_i/A),    k_i >= 0.
 
-So the best of all these laws is a convex problem, non-negative least squares, with one answer and
-no start. Masses, dampers and springs beside it are linear as well.
+Finding the best of these laws is a convex problem, non-negative least squares, which has a unique
+solution and needs no initial values. Parallel masses, dampers and springs are linear as well.
 """
 
 from __future__ import annotations

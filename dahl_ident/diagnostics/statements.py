@@ -1,7 +1,7 @@
 """The verdict on a fit: its status, and one short sentence for each of three questions.
 
-Determined? Every parameter, or which combination. Described? How large the misfit is and of what
-kind. Assumed? What the result rests on and the data cannot test. Most serious first.
+Determined: every parameter, or which combinations. Described: size and kind of the misfit. Assumed:
+what the result depends on and the data cannot test. The most serious statement comes first.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chan
 
 
 class Judged(Protocol):
-    """What a verdict is on."""
+    """The input of a verdict."""
 
     @property
     def optimum(self) -> Optimum:
@@ -70,7 +70,7 @@ def verdict_status(fit: Judged) -> VerdictStatus:
 
 
 def statements(fit: Judged) -> tuple[str, ...]:
-    """Return the verdict in its parts; the first is what to remember, the others say why."""
+    """Return the verdict in its parts: the first gives the status, the others the reasons."""
     status, data = verdict_status(fit), fit.optimum.problem.data
     goodness, known = fit.goodness, fit.identifiability
     if status is VerdictStatus.TRUSTED:
@@ -146,7 +146,7 @@ def _reservations(fit: Judged) -> Iterator[str]:
 
 
 def _contradicted_priors(fit: Judged) -> Iterator[str]:
-    """Yield every prior whose parameter the data put elsewhere."""
+    """Yield a statement for every prior that the data contradict."""
     optimum = fit.optimum
     values = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
     for name, prior in optimum.problem.priors.items():
@@ -161,7 +161,7 @@ def _contradicted_priors(fit: Judged) -> Iterator[str]:
 
 
 def _moved_by_outliers(fit: Judged) -> Iterator[str]:
-    """Yield parameters that a robust fit puts more than one standard uncertainty elsewhere."""
+    """Yield a statement on parameters that a robust fit moves by more than one uncertainty."""
     optimum, errors = fit.optimum, fit.errors
     if not fit.goodness.suspicious or optimum.loss != "linear" or errors is None:
         return
@@ -184,7 +184,7 @@ def _moved_by_outliers(fit: Judged) -> Iterator[str]:
 
 
 def _assumptions(fit: Judged) -> Iterator[str]:
-    """Yield what the result rests on and these data cannot test, in one sentence."""
+    """Yield one sentence with the assumptions that these data cannot test."""
     optimum, errors = fit.optimum, fit.errors
     parts = []
     for parameter in optimum.problem.model.parameters:
@@ -213,7 +213,7 @@ def _assumptions(fit: Judged) -> Iterator[str]:
 
 
 def _objections(fit: Judged) -> Iterator[str]:
-    """Yield what speaks against a fit, a sentence or more each."""
+    """Yield the objections to a fit, a sentence or more each."""
     optimum, goodness = fit.optimum, fit.goodness
     if goodness.cause:
         yield from goodness.statements

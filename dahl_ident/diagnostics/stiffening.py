@@ -1,4 +1,4 @@
-r"""Does the stiffness of friction and springs rise with amplitude? That of many laws cannot.
+r"""Test for a stiffness that rises with amplitude, which most friction laws exclude.
 
 Re N falls with A for every Dahl element and for every sum of them, whatever the parameters; a
 spring adds a constant. A law says so of itself (`softens`); beside one that does not, there is no

@@ -1,4 +1,4 @@
-r"""How far the motion of a driven plant is from the sine that a describing function assumes.
+r"""Third harmonic in the motion of a driven plant, which describing functions neglect.
 
 Friction under x = A cos(theta) has a third harmonic F_3, which a sine drive does not balance, so
 the displacement gets one as well:

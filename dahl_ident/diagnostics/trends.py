@@ -1,12 +1,12 @@
-"""Do residuals run with amplitude, frequency or drive? If so, the model is not the mechanism's.
+"""Trends of the residuals with amplitude, frequency or drive, which show a wrong model.
 
 For each covariate that varies, the response is allowed a smooth relative departure from the
 model, R exp(u), where u is a polynomial of the covariate's logarithm, complex, so that gain and
 phase each have their own. What the parameters could explain is taken out
-(:mod:`dahl_ident.diagnostics.residual_space`); an F or chi-square test tells whether the rest is
-more than noise. The departure's size comes with it, in percent and degrees, so that a
-significant trend can be distinguished from one that matters. A Wald-Wolfowitz test of the
-residuals' signs looks for runs that no low polynomial follows.
+(:mod:`dahl_ident.diagnostics.residual_space`); an F or chi-square test shows whether the rest is
+more than noise. The departure's size comes with it, in percent and degrees, so that a significant
+trend can be distinguished from one that matters. A Wald-Wolfowitz test of the residuals' signs
+looks for runs that no low polynomial follows.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a result may be used for, in one word."""
+"""The status of a result."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ class VerdictStatus(StrEnum):
     TRUSTED = "trusted"
     """Every parameter is determined and the model describes the data."""
     APPROXIMATE = "approximate"
-    """The model misses more than noise, and the stated uncertainty includes it."""
+    """The misfit exceeds the noise, and the stated uncertainty includes it."""
     NOT_DETERMINED = "not determined"
-    """The data leave a parameter open, or the computation has not converged."""
+    """The data do not determine a parameter, or the computation has not converged."""
     NOT_DESCRIBED = "not described"
-    """The model misses the data so far that no uncertainty can be stated."""
+    """The misfit is so large that no uncertainty can be stated."""
 
     @property
     def usable(self) -> bool:
-        """Whether the numbers hold with their stated uncertainty."""
+        """Whether the numbers can be used with their stated uncertainty."""
         return self in (VerdictStatus.TRUSTED, VerdictStatus.APPROXIMATE)

@@ -1,4 +1,4 @@
-"""Identifiability: which parameter, or which combination, the data determine, and what to do.
+"""Identifiability: which parameters or combinations the data determine, and what to do.
 
 A parameter is **identified** where the standard deviation of its logarithm is below 0.25,
 **not identified** above 1, and **weakly identified** between. The standard deviation is the larger
@@ -55,7 +55,7 @@ class Verdict(Enum):
 
 
 class Fit(Protocol):
-    """What can be judged: an optimum with its intervals."""
+    """An optimum with its intervals."""
 
     @property
     def optimum(self) -> Optimum:
@@ -67,7 +67,7 @@ class Fit(Protocol):
 
 @dataclass(frozen=True)
 class ParameterVerdict:
-    """What the data say about one parameter.
+    """The verdict on one parameter.
 
     Attributes
     ----------
