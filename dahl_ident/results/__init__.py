@@ -1,4 +1,4 @@
-"""What users hold: estimates with their judgement, from one call."""
+"""Results for users: estimates with their verdicts, from one call."""
 
 from dahl_ident.results.bayesian_estimate import posterior
 from dahl_ident.results.chain_posterior import ChainPosterior

@@ -1,4 +1,4 @@
-"""Bayesian estimates: the posterior by Markov chain, or by quadrature for few parameters."""
+"""Bayesian estimation: the posterior by Markov chain, or by quadrature for few parameters."""
 
 from __future__ import annotations
 
@@ -257,7 +257,7 @@ def posterior(
 def _refuse_other_methods(
     method: str, for_chain: Mapping[str, bool], for_grid: Mapping[str, bool]
 ) -> None:
-    """Refuse options that only the other method has."""
+    """Refuse options that belong only to the other method."""
     other = for_grid if method == "mcmc" else for_chain
     given = [name for name, is_given in other.items() if is_given]
     if given:

@@ -1,4 +1,4 @@
-"""The posterior of a model's parameters, as users hold it."""
+"""The posterior from a Markov chain, as returned to users."""
 
 from __future__ import annotations
 

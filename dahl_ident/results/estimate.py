@@ -1,4 +1,4 @@
-"""The main door: from data and a model to estimates."""
+"""The public functions ``fit`` and ``fit_many``: from data and a model to estimates."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def fit(
     substeps: int | None = None,
     throw: bool = True,
 ) -> FitResult | RecordFit:
-    """Estimate a model's free parameters by least squares; no guess is needed.
+    """Estimate a model's free parameters by least squares; no initial values are needed.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def fit(
         "ipopt" goes on from the optimum with exact second derivatives, and alone takes
         `constraints` and noise in the drive. All three find the same optimum; "lm" is the fastest.
     free : iterable of str, optional
-        Names of given parameters to estimate all the same, from their values.
+        Names of parameters that have values but are to be estimated, starting from these values.
     fixed : mapping of str to float, optional
         Parameters to hold at a value.
     noise : {"measured", "relative", "absolute"}, optional
@@ -96,9 +96,9 @@ def fit(
     sensors : Sensors, optional
         Gains and delay of the channels; left out, they are taken as exact.
     loss : {"linear", "huber", "soft_l1", "student_t"}, default "linear"
-        A robust loss makes outliers count less; the noise's scale is estimated robustly then.
+        A robust loss down-weights outliers; the noise's scale is then estimated robustly.
     start : mapping of str to float, optional
-        One more start for the search: values of some or all free parameters.
+        Additional start of the search: values of some or all free parameters.
     constraints : callable, optional
         With "ipopt": takes a mapping of every parameter's name to its casadi symbol and returns
         comparisons, such as ``lambda p: [p["sigma"] >= 100 * p["f_max"]]``.
@@ -106,8 +106,8 @@ def fit(
         With "ipopt", for force-controlled rows: standard deviation of the measured drive, and its
         covariance with real and imaginary part of the response.
     output : {"force", "motion"}, optional
-        Of records: whether the force is predicted from the measured displacement, or the motion
-        from the measured force. Left out: the motion where the model has a mass.
+        For records: predict the force from the measured displacement, or the motion from the
+        measured force. Default: the motion if the model has a mass.
     excitation : {"force", "base"}, default "force"
         Of records whose motion is predicted: "base" where their force channel is the acceleration
         of the base, m/s^2, and the motion relative to it.

@@ -1,4 +1,4 @@
-"""The numbers of a least-squares fit, with the names that lmfit's users know."""
+"""The numbers of a least-squares fit, with the names of lmfit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A fit in words: the verdict first, then every number with its error and where that is from."""
+"""The text report of a fit: the verdict, then every number with its error and its source."""
 
 from __future__ import annotations
 

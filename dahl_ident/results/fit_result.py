@@ -23,7 +23,7 @@ class FitResult(JudgedFit):
     """What a fit found: estimates, their errors, and whether to trust them.
 
     Made by :func:`dahl_ident.fit`. Names follow lmfit's ``ModelResult`` where both have the
-    same thing; nothing rescales the covariance behind the user's back: `scale` is 1 where the
+    same thing; the covariance is never rescaled silently: `scale` is 1 where the
     noise is known, else estimated and reported.
 
     Attributes

@@ -1,4 +1,4 @@
-"""The exact posterior of up to three parameters, as users hold it."""
+"""The exact posterior of up to three parameters, as returned to users."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dahl_ident.results.response_posterior import ResponsePosterior
 if TYPE_CHECKING:
     import pandas as pd
 
-_END = 1e-6  # of the probability, beyond which quadrature tells nothing
+_END = 1e-6  # of the probability, beyond which quadrature is not accurate
 
 
 class GridPosterior(ResponsePosterior):

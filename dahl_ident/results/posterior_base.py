@@ -1,4 +1,4 @@
-"""What posteriors by chain and by quadrature have in common."""
+"""The common base of posteriors by chain and by quadrature."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a posterior predicts: responses with bands, and quantities that follow from the parameters.
+"""Predictions of a posterior: responses with bands, and derived quantities.
 
 Everything is computed at draws from the posterior; no linearization is involved.
 """

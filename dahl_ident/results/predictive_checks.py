@@ -1,4 +1,4 @@
-"""Posterior predictive checks: whether the model could have produced data like these.
+"""Posterior predictive checks: whether the model could have produced such data.
 
 Statistics of the whitened residuals at draws from the posterior are compared with the same of
 replicated ones, which are noise by construction (posterior predictive checks: Gelman et al.,

@@ -89,7 +89,7 @@ class RecordBand:
 
 
 class RecordFit(Result):
-    """What a fit to records found; made by :func:`dahl_ident.fit`.
+    """Result of a fit to records; made by :func:`dahl_ident.fit`.
 
     Attributes
     ----------
@@ -217,7 +217,7 @@ class RecordFit(Result):
 
     @cached_property
     def goodness(self) -> RecordGoodness:
-        """What the model leaves of the records."""
+        """Statistics of the residuals."""
         return record_goodness(self.records, self.problem.measured, self.residuals)
 
     @cached_property
@@ -230,7 +230,7 @@ class RecordFit(Result):
 
     @cached_property
     def findings(self) -> tuple[str, ...]:
-        """What is not determined and why, in words; empty where everything is."""
+        """The undetermined parameters with the reasons, in words; empty if there are none."""
         stderr = {p.name: self.params[p.name].stderr or 0.0 for p in self.problem.free}
         return undetermined(self.model, self.records, stderr, self.covar, self.var_names)
 
@@ -254,9 +254,9 @@ class RecordFit(Result):
         )
         first = {
             VerdictStatus.TRUSTED: "Trusted.",
-            VerdictStatus.APPROXIMATE: "Approximate. The model misses more than noise.",
+            VerdictStatus.APPROXIMATE: "Approximate. The misfit exceeds the noise.",
             VerdictStatus.NOT_DETERMINED: "Not determined. Not every parameter is determined.",
-            VerdictStatus.NOT_DESCRIBED: "Not described. The model misses the records.",
+            VerdictStatus.NOT_DESCRIBED: "Not described. The model does not describe the records.",
         }[self.status]
         described = f"The residuals are {left:.2g} % rms of the measured {self.problem.output}"
         objections = [o for e, v in self.model.of([p.value or 0.0 for p in self.model.parameters])
@@ -268,9 +268,9 @@ class RecordFit(Result):
             f"{described}; {self.goodness.worst_text}.",
             *(
                 (
-                    f"Most of that is slow, as noise in the drive makes it: {within:.2g} % rms is "
-                    "left at the drive's frequencies, and residuals are weighted by their "
-                    "spectrum.",
+                    f"Most of this varies slowly, as noise in the drive causes it: {within:.2g} % "
+                    "rms remains at the drive's frequencies, and the residuals are weighted by "
+                    "their spectrum.",
                 )
                 if self.weighted
                 else ()

@@ -1,4 +1,4 @@
-"""What every result offers: parameters, their judgement, predictions, pictures and storage."""
+"""The common interface of results: parameters, verdicts, predictions, plots and storage."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class Result(ABC):
     @property
     @abstractmethod
     def findings(self) -> tuple[str, ...]:
-        """What else to know of data, model and assumptions."""
+        """Further statements on data, model and assumptions."""
 
     @property
     @abstractmethod
