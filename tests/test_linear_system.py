@@ -211,6 +211,6 @@ def test_linear_system_beside_friction_replaces_the_lumped_part() -> None:
 def test_it_has_no_force_over_time() -> None:
     element = LinearSystem(transfer_function("receptance"), quantity="receptance")
     with pytest.raises(
-        ModelError, match=r"receptance of TransferFunction.* frequency domain alone"
+        ModelError, match=r"receptance of TransferFunction.* only in the frequency domain"
     ):
         element.force([0.0, 1.0])

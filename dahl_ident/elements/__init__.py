@@ -1,4 +1,4 @@
-"""The model: what acts between displacement and force, and its parameters."""
+"""Models: elements that relate force to displacement, and their parameters."""
 
 from __future__ import annotations
 

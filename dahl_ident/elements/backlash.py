@@ -2,12 +2,12 @@ r"""A gap in the link to a friction element.
 
 The link carries no force while the gap is crossed. After a reversal the element unloads along its
 own curve to zero force, the gap is crossed there, then the curve goes on where it stopped. So the
-element moves with the amplitude A - gap/2, and of the path from one turning point to the next the
-part at zero force is the gap. Harmonics are integrals over the force,
+element moves with the amplitude A - gap/2, and the part of the path between two turning points at
+zero force is the gap. Harmonics are integrals over the force,
 
     c_k = 1/(j k pi) * (closed integral of) exp(-j k theta) dF,
 
-in which only theta knows of the gap (:mod:`dahl_ident.elements.steady_loop`).
+in which only theta depends on the gap (:mod:`dahl_ident.elements.steady_loop`).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Backlash(Friction):
     Raises
     ------
     ModelError
-        If `element` is no friction with one state, or depends on the rate.
+        If `element` is not friction with one state, or depends on the rate.
     ValidationError
         If `gap` is not a number above zero.
 
@@ -106,10 +106,10 @@ class Backlash(Friction):
     def mechanics(
         self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
     ) -> Mechanics:
-        """Raise ModelError: the place in the gap is a second state."""
+        """Raise ModelError: the position in the gap is a second state."""
         raise ModelError(
-            f"{self!r} remembers its place in the gap, so it cannot be driven by a force over "
-            "time; give records with measured displacement and force, and output='force'"
+            f"{self!r} has the position in the gap as a state, so it cannot be driven by a force "
+            "over time; give records with measured displacement and force, and output='force'"
         )
 
     def stiffness(
@@ -211,7 +211,7 @@ class Backlash(Friction):
     def steady_force(
         self, values: Sequence[FloatArray], path: FloatArray, cycles: int
     ) -> FloatArray:
-        """Return the force of the element along the path that the play leaves."""
+        """Return the force of the element along the path without the play."""
         half = 0.5 * np.asarray(values[-1])
         y, moved = np.zeros(path.shape[:-1]), np.empty(path.shape)
         for _ in range(2):  # the play repeats itself after the first cycle
@@ -224,7 +224,7 @@ class Backlash(Friction):
         return np.zeros(np.broadcast_shapes(*(np.shape(v) for v in values)))
 
     def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Return those of the element, which moves less."""
+        """Return those of the element, whose amplitude is smaller."""
         return self._element.force_bounds(values[:-1])
 
     def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 _LEAST_BETA = 1e-200
 _NEWTON_STEPS = 6
 _DEEPEST = 42.0
-"""ln(z_0/z) beyond which nothing is left of the margin z to full slip."""
+"""ln(z_0/z) beyond which the margin z to full slip is negligible."""
 
 
 @dataclass(frozen=True)

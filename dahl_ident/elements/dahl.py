@@ -56,7 +56,7 @@ _NO_LOSS, _MICROSLIP, _GROSS_SLIP = 1e9, 1e5, 1e-16
 """x_c over the largest amplitude, twice, and over the smallest: the limits, to every digit."""
 _SHARP, _SOFT = 1e-6, 1e3  # alpha
 _ONE_SIDED = 0.9  # asymmetry
-_NONE: ComplexArray = np.zeros((), dtype=np.complex128)  # a derivative that nobody asked for
+_NONE: ComplexArray = np.zeros((), dtype=np.complex128)  # a derivative that was not requested
 
 
 class Dahl(Friction):
@@ -73,7 +73,7 @@ class Dahl(Friction):
     asymmetry : float or None, default 0
         a, between -1 and 1: the limits are f_max (1 + a) while the displacement rises and
         f_max (1 - a) while it falls. None: free. At exactly 0 it is no parameter of the element.
-        The fundamental hardly shows it; the mean force and the even harmonics do.
+        It hardly affects the fundamental, but it determines the mean force and the even harmonics.
     name : str, optional
         Prefix of the parameters' names, such as "pivot" for ``pivot_f_max``; needed where a
         model has several Dahl elements.
@@ -82,7 +82,7 @@ class Dahl(Friction):
     ------
     ValidationError
         If f_max or sigma is not a number from 1e-90 to 1e90, alpha or asymmetry is outside its
-        range, or `name` is no identifier.
+        range, or `name` is not an identifier.
 
     Notes
     -----
@@ -154,7 +154,7 @@ class Dahl(Friction):
 
     @property
     def characteristic_displacement(self) -> float:
-        """x_c = f_max/sigma, m: the displacement at which friction turns from spring to slip."""
+        """x_c = f_max/sigma, m: the displacement at which friction changes from elastic to slip."""
         f_max, sigma, *_ = self.known_values()
         return float(f_max / sigma)
 
@@ -549,7 +549,7 @@ class Dahl(Friction):
 
 
 class _AsymmetricDahl(Dahl):
-    """Dahl friction with two limits: what follows from symmetry comes from the slope instead."""
+    """Dahl friction with two limits; results that assume symmetry are computed from the slope."""
 
     equation = (
         "dF/dx = sigma |1 - s F/f|^alpha sgn(1 - s F/f), f = f_max (1 + s asymmetry), "
@@ -616,7 +616,7 @@ class _AsymmetricDahl(Dahl):
         return found.value, found.by_amplitude
 
     def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
-        """Return those of one limit; in microslip nothing shows the other."""
+        """Return those of one limit; in microslip the other has no effect."""
         pins = {"asymmetry": 0.0} if self.parameters[3].free else {}
         return tuple(
             replace(a, pinned={**a.pinned, **pins}) if a.name in ("no_loss", "microslip") else a
@@ -680,7 +680,7 @@ class _AsymmetricDahl(Dahl):
         return StiffnessGradient(value, by_A, (*by[:2], np.zeros_like(value), *by[2:]))
 
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
-        """Return an objection to a limit that is hardly there."""
+        """Return an objection to an almost vanishing limit."""
         if abs(values[3]) < _ONE_SIDED:
             return ()
         return (f"{self.parameters[3].name} leaves almost no friction in one direction",)

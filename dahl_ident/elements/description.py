@@ -1,4 +1,4 @@
-"""Models as plain data and back, so that results and experiments can be written to a file."""
+"""Conversion of models to plain data and back, for files of results and experiments."""
 
 from __future__ import annotations
 

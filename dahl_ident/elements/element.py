@@ -52,7 +52,7 @@ class Element(Behaviour):
 
     Elements act in parallel: ``+`` adds their forces at one displacement. A number given to an
     element fixes that parameter; one left out is free, to be estimated. A subclass with a `kind`
-    of its own is known to files by it.
+    can be written to files under this name.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class Element(Behaviour):
         )
 
     def alternatives(self) -> dict[str, tuple[Element, ...]]:
-        """Return, by a few words, what is usually tried in place of this element."""
+        """Return the usual alternatives to this element, by a short name."""
         return {}
 
     def tabulated(self) -> Element:

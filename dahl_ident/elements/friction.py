@@ -1,8 +1,9 @@
 """Friction laws: any relation between displacement and force with memory.
 
-A law is one class: declared parameters and ``slope``, the force's derivative by displacement. All
-else follows from it here, by quadrature (:mod:`dahl_ident.elements.steady_loop`) and from tables
-(:mod:`dahl_ident.elements.force_curve`); a law with closed forms overrides what it does better.
+A law is one class: declared parameters and ``slope``, the derivative of the force with respect to
+displacement. Everything else is computed from the slope, by quadrature
+(:mod:`dahl_ident.elements.steady_loop`) and from tables (:mod:`dahl_ident.elements.force_curve`); a
+law with closed forms overrides these methods.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ _RATED_BLOCK = 64
 _SUBSTEPS, _FORCE_STEP = 4, 1e-6
 _FARTHEST = 1e9  # m; a law that has not slipped fully there never does
 _START = 60  # steps from rest to the start of a path: as fine as a cycle of 240
-_FORCE_UNIT, _LENGTH_UNIT = 32.0, 2.0**-7  # in which a law should read the same
+_FORCE_UNIT, _LENGTH_UNIT = 32.0, 2.0**-7  # units in which a law should have the same form
 _SOFTENED = 0.01  # share of the stiffness that is gone at the lower knee
 
 
@@ -86,7 +87,7 @@ class Friction(Element):
 
     has_memory = True
     one_state: bool = True
-    """Whether the present force tells all that the law remembers."""
+    """Whether the present force is the only state of the law."""
 
     def __init__(
         self, *values: float | None, name: str | None = None, **named: float | None
@@ -342,7 +343,7 @@ class Friction(Element):
         return np.asarray(self.output(forces, slope, v, values)) + 0.0 * forces
 
     def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Return the forces of full slip in both directions, N; inf where there is none."""
+        """Return the forces of full slip in both directions, N; inf if there is none."""
         values, _, shape, _ = _flat(values, np.zeros(()), np.zeros(()))
         rows = np.arange(int(np.prod(shape)))
         limits = []
@@ -357,7 +358,7 @@ class Friction(Element):
         return np.asarray(self.quasi_static_slope(np.zeros(()), 1.0, values), dtype=np.float64)
 
     def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Return what abs(N) and A abs(N) never exceed, from the slopes and the forces of slip.
+        """Return upper bounds of abs(N) and A abs(N), from the slopes and the forces of slip.
 
         The fundamental of a wave of height 1 is at most 4/pi, that of the square wave.
         """

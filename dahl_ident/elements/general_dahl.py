@@ -12,8 +12,8 @@ here depends on ``beta = sigma A / f_max`` and ``alpha`` alone. With ``p = 1 - a
 
     ln E(L) = ln(2 beta) + p ln((1 + exp(-L)) / 2).
 
-Newton's method solves it in ln E in about four steps from anywhere: the slope lies between 1/2
-and 2. For alpha < 1 and ``beta >= 2^-alpha / (1 - alpha)`` the friction slips fully before it
+Newton's method solves it in ln E in about four steps from any start, because the slope lies between
+1/2 and 2. For alpha < 1 and ``beta >= 2^-alpha / (1 - alpha)`` the friction slips fully before it
 turns, and L is infinite.
 
 **Harmonics.** On the half cycle in which ``x = A cos(theta)`` falls, ``sin^2(theta/2) = d / 2 beta
@@ -36,10 +36,10 @@ cos(k theta). Both converge geometrically.
 
 **Accuracy**, for alpha from 0.25 to 4 and beta from 1e-6 to 1e6: N and the harmonics up to the
 15th to 1e-12, derivatives to 1e-10 (``python -m benchmarks.general_dahl_accuracy``); alpha from
-0.01 to 100 has so far shown no larger errors. One place
-is excepted. Where full slip sets in, at ``beta_s = 2^-alpha / (1 - alpha)``, derivatives go as
-``|1 - beta/beta_s|^(alpha/p)``; for alpha below 1/3 this is so steep that one unit in the last
-place of beta changes them by up to 1e-5, and within 1e-12 of beta_s that is their error.
+0.01 to 100 has so far shown no larger errors. There is one exception. Where full slip sets in, at
+``beta_s = 2^-alpha / (1 - alpha)``, derivatives go as ``|1 - beta/beta_s|^(alpha/p)``; for alpha
+below 1/3 this is so steep that one unit in the last place of beta changes them by up to 1e-5, and
+within 1e-12 of beta_s that is their error.
 """
 
 from __future__ import annotations

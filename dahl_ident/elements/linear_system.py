@@ -1,10 +1,9 @@
 """Any linear system from python-control as an element: fixed, or with named free parameters.
 
 A structure's linear part is often known as a transfer function, a state-space model or measured
-frequency response data (FRD). Its response R is one of the six standard quantities, which has to
-be said and is never guessed. FRD is interpolated by a cubic spline of Z, which is exact for one
-mode, where a spline of the receptance overshoots its peak; and only between its first and last
-frequency.
+frequency response data (FRD). Its response R is one of the six standard quantities, which has to be
+given and is never guessed. FRD is interpolated by a cubic spline of Z, which is exact for one mode,
+where a spline of the receptance overshoots its peak; and only between its first and last frequency.
 """
 
 from __future__ import annotations
@@ -148,9 +147,9 @@ class LinearSystem(Element):
         *,
         acceleration: FloatArray | None = None,
     ) -> FloatArray:
-        """Refuse: a response over frequency gives no force for a displacement history."""
+        """Raise ModelError: a frequency response gives no force for a displacement history."""
         raise ModelError(
-            f"{self!r} is known in the frequency domain alone and has no force over time; build "
+            f"{self!r} is defined only in the frequency domain and has no force over time; build "
             "the model from Mass, Damper and Spring to simulate records"
         )
 
@@ -340,7 +339,7 @@ def _to_stiffness(R: ComplexArray, quantity: Quantity, omega: FloatArray) -> Com
 
 
 def check_system(system: Any, name: str) -> None:
-    """Refuse what is no python-control system with one input, one output and a known time."""
+    """Refuse anything but a python-control system with one input, one output and a known time."""
     if not _is_system(system):
         raise ValidationError(
             f"{name} is a {type(system).__name__}; expected a python-control TransferFunction, "

@@ -1,4 +1,4 @@
-r"""LuGre friction: bristles whose sliding force depends on the speed.
+r"""LuGre friction: bristles with a sliding force that depends on the speed.
 
     dz/dt = v - |v| sigma z/g(v),   F = sigma z + micro_damping dz/dt + viscous v,
     g(v) = f_max (1 + (static_ratio - 1) exp(-(v/stribeck_speed)^2)).

@@ -6,7 +6,7 @@ twice its d to slip the other way, so that the force follows V at twice the scal
 
     F = F_r + 2 s V(s (x - x_r)/2),
 
-until the inner loop closes; from there the outer curve goes on as if it had never been left.
+until the inner loop closes; from there on the force follows the outer curve again.
 Under x = A cos(theta) partial integration gives, for odd k,
 
     N_k = F_k/A = (2 j/(pi k)) Int_0^pi V'(A sin^2(theta/2)) sin(theta) exp(-j k theta) dtheta.
@@ -35,7 +35,7 @@ _BISECTIONS = 200
 
 
 class Masing(Friction):
-    """Parallel Jenkins elements, known by the force of a first loading; see the module."""
+    """Parallel Jenkins elements, defined by the force of a first loading; see the module."""
 
     one_state = False
     unique_response = True
@@ -45,7 +45,7 @@ class Masing(Friction):
         """Return V(x), the force when first loaded from rest to x >= 0, N."""
 
     def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
-        """Raise ModelError: the force alone does not tell the slope."""
+        """Raise ModelError: the force alone does not determine the slope."""
         raise ModelError(
             f"{self!r} remembers more than its present force, so it has no slope dF/dx(F); use "
             "a law with one state, such as Dahl or BoucWen"
@@ -125,7 +125,7 @@ class Masing(Friction):
     def transient_decay(
         self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
     ) -> FloatArray:
-        """Return 0: the first full swing erases what was before."""
+        """Return 0: the first full swing erases the history."""
         return np.zeros(np.broadcast_shapes(np.shape(amplitude), np.shape(omega)))
 
     def steady_force(

@@ -16,7 +16,7 @@ from dahl_ident.errors import ValidationError
 
 
 class MaxwellSlip(Masing):
-    """n parallel springs, each of which slips at a displacement of its own.
+    """n parallel springs, each of which slips at a different displacement.
 
     F = sum of f_i, df_i/dx = stiffness_i, abs(f_i) <= stiffness_i slip_i. N is linear in the
     stiffnesses.
@@ -39,8 +39,8 @@ class MaxwellSlip(Masing):
 
     Notes
     -----
-    Many elements describe any symmetric rate-independent law without a memory of its own at full
-    slip (a Masing law). To find such a law from data, see
+    Many elements can describe any symmetric rate-independent law that has no memory at full slip (a
+    Masing law). To find such a law from data, see
     ``dahl_ident.diagnostics.slip_density.slip_density``. At an amplitude equal to a slip
     displacement, where N has a kink, derivatives are those below it.
 

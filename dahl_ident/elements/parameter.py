@@ -1,4 +1,4 @@
-"""A parameter: its name, unit, bounds and search coordinate, declared beside its element."""
+"""A parameter: its name, unit, bounds and search coordinate, declared with its element."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Parameter:
     description : str
         A few words for reports.
     value : float or None
-        The fixed value, or the start where `free`; None where nothing is known.
+        The fixed value, or the start if `free`; None if there is none.
     free : bool or None
         Whether the parameter is estimated. None (the default): exactly where `value` is None.
     lower, upper : float
@@ -56,7 +56,7 @@ class Parameter:
         Range that holds the value with 95 % probability before any data are seen; None where
         the size follows from the data's forces and displacements through the unit.
     assumed : bool
-        True: the value is a default that nobody gave, such as the exponent of ``Dahl()``.
+        True: the value is a default that the user did not give, such as the exponent of ``Dahl()``.
 
     Raises
     ------
@@ -131,7 +131,7 @@ class Parameter:
         return replace(self, name=name, value=given, free=None, assumed=assumed)
 
     def describe(self) -> Any:
-        """Return a fixed value as a number, "free", or a mapping of what there is to say."""
+        """Return a fixed value as a number, "free", or a mapping with the details."""
         if not self.free:
             return {"assumed": self.value} if self.assumed else self.value
         limits = {"lower": self.lower, "upper": self.upper}
