@@ -1,8 +1,7 @@
-"""Column maps: what a laboratory calls time, displacement, force and drive.
+"""Column maps: the columns of time, displacement, force and drive in a laboratory's files.
 
-A laboratory describes its files once, in a small TOML file, and reuses it. Each role is the
-name of a column, or a table with the name, its unit where the header does not say it, a sign
-and a constant factor::
+A laboratory describes its files once, in a small TOML file. Each role is the name of a column, or a
+table with the name, its unit if the header does not give it, a sign and a constant factor::
 
     drive_factor = "12.5 N/V"
     drive_factor_uncertainty = 0.01
@@ -91,7 +90,7 @@ ROLES = tuple(dict.fromkeys((*RECORD_NAMES, *RESPONSE_NAMES)))
 
 @dataclass(frozen=True)
 class Column:
-    """Where a role is found and how its numbers count.
+    """The column of a role, with its unit, sign and factor.
 
     Parameters
     ----------
@@ -112,7 +111,7 @@ class Column:
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """Roles and what else a file does not say about itself.
+    """Roles and other information that a file does not contain.
 
     Parameters
     ----------
@@ -271,7 +270,7 @@ _EXAMPLES = {
 
 @dataclass
 class Binding:
-    """Roles looked up in one source; what was found, and what had to be assumed.
+    """Roles looked up in one source, with the assumptions that were made.
 
     `names` are the column names under which each role is found without a map; `doubts` are the
     warnings that were shown.
@@ -298,7 +297,7 @@ class Binding:
         Raises
         ------
         DataError
-            If the map names a column that is not there, or several columns fit the role.
+            If the map names a column that does not exist, or several columns fit the role.
         """
         channel = self._find(role)
         if channel is not None:
@@ -314,7 +313,7 @@ class Binding:
             for c in self.source.channels
             if c.role == role or (c.role is None and plain(c.short or c.name) in self.names[role])
         ]
-        if role == "run":  # a table may say file, day and test; the first name that is there
+        if role == "run":  # a table may have file, day and test; the first name is used
             found.sort(key=lambda c: self.names[role].index(plain(c.short or c.name)))
             found = found[:1]
         if len(found) > 1:
@@ -337,7 +336,7 @@ class Binding:
         return self.channel(role) is not None
 
     def required(self, role: str) -> Channel:
-        """Return the channel of a role that must be there."""
+        """Return the channel of a required role."""
         channel = self.channel(role)
         if channel is None:
             raise DataError(
@@ -398,7 +397,7 @@ class Binding:
         return positive_number(value, "drive_factor"), self.map.drive_factor_uncertainty
 
     def refuse_idle_factor(self, kind: str | None) -> None:
-        """Refuse keywords on the drive's factor where they would count for nothing.
+        """Refuse keywords on the drive's factor if they would have no effect.
 
         `kind` is that of the drive, None where there is none. A column map may serve other files
         too, and is not refused.
@@ -460,7 +459,7 @@ class Binding:
             self.doubt(f"{message}: {names}{more}")
 
     def note_peak(self, role: str, unit: Unit) -> None:
-        """Note the assumption that an unmarked amplitude rests on; our own files need none."""
+        """Note the assumption made for an unmarked amplitude; files of this package need none."""
         if unit.marker is None and not self.source.metadata:
             self.notes.append(f"{role} [{unit.text}] taken as zero to peak: the table does not say")
 

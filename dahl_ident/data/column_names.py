@@ -1,4 +1,4 @@
-"""What the head of a column says: a name, and often a unit."""
+"""The header of a column: a name, and often a unit."""
 
 from __future__ import annotations
 

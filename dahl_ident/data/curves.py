@@ -1,8 +1,8 @@
 """Curves of a frequency response: over which axis, and which rows make one curve.
 
-:func:`draw` is the one look upwards: it uses the functions of the plotting room. The import
-happens when a picture is asked for, so that data stay light; the contract between the rooms
-names this exception.
+:func:`draw` is the only import from a higher layer: it uses the plot functions. The import happens
+when a plot is requested, so that this module stays fast to import; the import contract names this
+exception.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _NOMINAL = 1.5  # factor within which a numeric level is the amplitude that was 
 
 
 class _Points(Protocol):
-    """What a frequency response must offer to be laid out in curves."""
+    """The attributes of a frequency response that curves need."""
 
     @property
     def n(self) -> int: ...
@@ -127,7 +127,7 @@ def is_force_controlled(data: _Points) -> bool:
 
 
 def held_amplitude(data: _Points) -> FloatArray:
-    """Return the amplitude that the laboratory held, or the other one where that is unknown."""
+    """Return the controlled amplitude, or the other one if that is unknown."""
     held, other = data.amplitude, data.drive
     if is_force_controlled(data):
         held, other = other, held
@@ -187,7 +187,7 @@ def abscissa_label(data: _Points) -> str:
 
 
 def _level(label: Any, part: _Points) -> str:
-    """Return a level with a unit where it is the amplitude that was held, not just a name."""
+    """Return a level with a unit if it is the controlled amplitude and not just a name."""
     if not isinstance(label, (int, float)):
         return str(label)
     held = float(np.median(held_amplitude(part)))
@@ -198,7 +198,7 @@ def _level(label: Any, part: _Points) -> str:
 
 
 def _nominal_frequency(f: FloatArray) -> FloatArray:
-    """Return frequencies that differ by measurement alone as one; those of a fine grid as given."""
+    """Return frequencies that differ only by measurement error as one; a fine grid unchanged."""
     order = np.argsort(f)
     jump = np.diff(f[order], prepend=f[order][0]) > _SAME_FREQUENCY * f[order]
     group = np.empty(f.size, dtype=int)

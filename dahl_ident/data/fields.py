@@ -64,7 +64,7 @@ def column(
 def spread(
     value: ArrayLike | None, name: str, n: int, check: Callable[[ArrayLike, str], NDArray[Any]]
 ) -> NDArray[Any] | None:
-    """Return like :func:`column`, one value standing for all points."""
+    """Return like :func:`column`, with one value allowed for all points."""
     if value is None or np.ndim(value):
         return column(value, name, n, check)
     return frozen_copy(np.full(n, check(value, name)))
@@ -139,7 +139,7 @@ def plain_values(value: ArrayLike, name: str) -> NDArray[Any]:
 def check_covariance(
     covariance: FloatArray, amplitude_std: FloatArray | None, cross: FloatArray | None
 ) -> None:
-    """Refuse what is no covariance of (amplitude, real part, imaginary part)."""
+    """Refuse a matrix that is not a covariance of (amplitude, real part, imaginary part)."""
     joint = np.zeros((len(covariance), 3, 3))
     joint[:, 1:, 1:] = covariance
     if amplitude_std is not None:

@@ -1,4 +1,4 @@
-"""One writer at a time: a lock beside a file that ends with the process, however it ends."""
+"""A lock beside a file for one writer at a time, which is released when the process ends."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Complex response against amplitude and frequency: what a fit is made to.
+"""Complex response against amplitude and frequency: the data of a fit.
 
-A structure with friction answers a sine of another amplitude with another gain and phase, so
-one curve over frequency does not describe it. A :class:`FrequencyResponse` therefore has one
-row for each measured point, and each row carries its amplitude. SI units throughout: m or
-rad, N or N m, Hz. Amplitudes are zero to peak. Phasors go with exp(+j omega t), so that a
-dissipating element has a positive imaginary part of its dynamic stiffness.
+The gain and phase of a structure with friction depend on the amplitude, so one curve over frequency
+does not describe it. A :class:`FrequencyResponse` therefore has one row for each measured point,
+and each row includes its amplitude. SI units throughout: m or rad, N or N m, Hz. Amplitudes are
+zero to peak. Phasors refer to exp(+j omega t), so the dynamic stiffness of a dissipating element
+has a positive imaginary part.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ _COLUMNS = (
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
 class FrequencyResponse(Tabular):
-    """Complex response, its amplitude and frequency, and what is known of their errors.
+    """Complex response, its amplitude and frequency, and their errors.
 
     Parameters
     ----------
@@ -95,10 +95,10 @@ class FrequencyResponse(Tabular):
     level : (n,) array_like or one label, optional
         Nominal drive or displacement level, numbers or text.
     run : (n,) array_like or one label, optional
-        What was measured in one go: a file, a day, a mounting. Kept as text. Scatter between
+        Measurements made in one session: a file, a day, a mounting. Kept as text. Scatter between
         runs is not noise.
     controlled : {"displacement", "force"} or (n,) array_like of them
-        What the laboratory held constant.
+        The controlled quantity.
     harmonic : int or (n,) array_like of int
         0 for the mean force, 1 for the fundamental, 2, 3, ... above it.
     quantity : str
@@ -204,7 +204,7 @@ class FrequencyResponse(Tabular):
         self._check_together()
 
     def _check_together(self) -> None:
-        """Check what only several fields together can violate."""
+        """Check conditions that involve several fields."""
         if self.amplitude is None and self.drive is None:
             raise ValidationError(
                 "neither amplitude nor drive is given; a response with friction means nothing "
@@ -311,7 +311,7 @@ class FrequencyResponse(Tabular):
         return {"frequency_hz": "Hz"} | {k: si_unit(v, self.motion) for k, v in kinds.items()}
 
     def to(self, quantity: Quantity) -> FrequencyResponse:
-        """Return the same points as another standard quantity, their covariance with them.
+        """Return the same points, with their covariance, as another standard quantity.
 
         The covariance transforms by the Jacobian of the conversion, first order in the error.
         The reference of amplitude and drive stays: displacement and force.
@@ -387,7 +387,7 @@ class FrequencyResponse(Tabular):
         Raises
         ------
         ValidationError
-            If no point is left, or a level or run is not there.
+            If no point remains, or a level or run does not exist.
 
         Examples
         --------
@@ -622,7 +622,7 @@ def _combined(
 
 
 def _shape_of(data: FrequencyResponse) -> set[str]:
-    """Return what two tables must share to become one."""
+    """Return the properties that two tables must share to be concatenated."""
     columns = {name for name in _COLUMNS if getattr(data, name) is not None}
     columns.add(f"a drive factor uncertain by {data.drive_factor_uncertainty:.3g}")
     if data.level is not None:

@@ -1,9 +1,9 @@
 """Plausibility of a table: warnings that list the rows, an error where a table must be wrong.
 
-A structure without a motor in it takes energy from its drive: each cycle loses
-``pi A^2 Im Z`` at the fundamental, Z the dynamic stiffness. Single rows below zero may be
-noise; a whole table whose sum is below zero by more than its noise has its phase's sign, or its
-columns, wrong.
+A passive structure takes energy from its drive: each cycle dissipates ``pi A^2 Im Z`` at the
+fundamental, where Z is the dynamic stiffness. Single negative rows may be noise; if the sum of a
+whole table is negative by more than its noise, the sign of the phase or the choice of columns is
+wrong.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def check_energy(file: str, data: FrequencyResponse, doubt: Doubt) -> None:
 
 
 def _against_the_others(part: FrequencyResponse) -> NDArray[np.bool_]:
-    """Return the rows whose phase has the other sign than nearly all, and is as large as theirs."""
+    """Return the rows whose phase is as large as that of nearly all others, with opposite sign."""
     sine = part.response.imag / part.gain
     against = sine < 0.0
     if part.n < _FEWEST_ROWS or against.mean() > _FEW_ROWS:
@@ -131,10 +131,10 @@ def check_phase_size(data: FrequencyResponse, doubt: Doubt) -> None:
 
 
 def stuck_samples(motion: FloatArray, force: FloatArray) -> NDArray[np.intp]:
-    """Return where the force stays at one value while the motion goes on, and then jumps.
+    """Return where the force stays at one value while the motion continues, and then jumps.
 
-    So does a converter that sticks. Dry friction and a coarse converter keep a value too, but
-    leave it by no more than their usual steps.
+    This is typical of a converter that sticks. Dry friction and a coarse converter also keep a
+    value, but leave it by no more than their usual steps.
     """
     if force.size < 2 or force.size != motion.size:
         return np.zeros(0, dtype=np.intp)
@@ -160,7 +160,7 @@ def creates_energy(loss: FloatArray, std: FloatArray, dof: FloatArray) -> NDArra
 def _amplitude(part: FrequencyResponse) -> FloatArray:
     if part.amplitude is not None:
         return part.amplitude
-    assert part.drive is not None  # one of the two is always there
+    assert part.drive is not None  # one of the two always exists
     return part.drive / part.gain
 
 

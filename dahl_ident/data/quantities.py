@@ -1,4 +1,4 @@
-"""The six standard quantities, and how their errors travel from one to another.
+"""The six standard quantities, and the conversion of their errors.
 
 With X the displacement phasor, F the force phasor and s = j omega, the receptance is X/F, the
 mobility s X/F and the accelerance s^2 X/F; their inverses are the dynamic stiffness Z = F/X, the

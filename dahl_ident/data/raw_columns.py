@@ -1,4 +1,4 @@
-"""What a file holds before anyone says what it means: named channels with their units."""
+"""The raw content of a file: named channels with their units."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _NUMBER = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\s*|[-+]?inf|
 _SUFFIXES = {"hz": "Hz", "deg": "deg", "rad": "rad", "s": "s"}
 _CODES = (999.0, 9999.0, 99999.0, 999999.0, 999.9, 9999.9, 999.99, 9999.99)
 _SMALLEST_OVERFLOW = 1e30  # instruments write 1e30, 9.9e37 and the like
-_CODE_RATIO = 5.0  # by which a mark stands off from all measured numbers
+_CODE_RATIO = 5.0  # ratio of a missing-value mark to all measured numbers
 _FEWEST_FOR_CODES = 4
 
 
 @dataclass(frozen=True)
 class Stored:
-    """An array that stays in its file until it is used.
+    """An array that is read from its file when it is used.
 
     `read` returns a part of it, given by a slice of its only axis.
     """

@@ -1,8 +1,7 @@
 """Sampled waveforms of motion and force, as a laboratory stored them.
 
-A :class:`Record` keeps every sample where it was taken: time need not be evenly spaced, and
-gaps are named, not filled. Accelerometers and vibrometers are welcome: motion may be
-displacement, velocity or acceleration. SI units throughout.
+A :class:`Record` keeps every sample at its time: samples need not be evenly spaced, and gaps are
+listed, not filled. Motion may be displacement, velocity or acceleration. SI units throughout.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ class Record(Tabular):
     force : (n,) array_like, optional
         Measured force, N (N m in rotation).
     drive : (n,) array_like, optional
-        What drove the actuator, in `drive_unit`. At least one of `force` and `drive`.
+        Signal that drove the actuator, in `drive_unit`. At least one of `force` and `drive`.
     drive_unit : {"V", "A", "N", "N m"}
         Unit of `drive`.
     drive_factor : float, optional

@@ -1,10 +1,10 @@
-"""Readers: every usual laboratory file becomes a frequency response or a record.
+"""Readers, which turn the usual laboratory files into frequency responses or records.
 
-Formats are told by their content: text tables (CSV, TSV and kin, also packed with gzip, bzip2 or
-xz), Excel, Parquet, MATLAB, HDF5, universal files 58 and 58b, NI TDMS and LabVIEW LVM. What the
-file does not say, such as a unit or which column is the force, comes from a column map
-(:mod:`dahl_ident.data.column_map`) or from keywords; what nobody says is an error. Every
-assumption that is left, such as amplitudes being zero to peak, is noted in the result.
+Formats are recognised by their content: text tables (CSV, TSV and kin, also packed with gzip, bzip2
+or xz), Excel, Parquet, MATLAB, HDF5, universal files 58 and 58b, NI TDMS and LabVIEW LVM.
+Information that the file does not contain, such as a unit or which column is the force, comes from
+a column map (:mod:`dahl_ident.data.column_map`) or from keywords; missing information is an error.
+Every remaining assumption, such as amplitudes being zero to peak, is noted in the result.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def read_frequency_response(
         ``real``, ``imag`` and so on, with unit, sign and factor where the file does not say
         them. Columns that bear these names need no map.
     quantity : str, optional
-        Which of the six standard quantities the response is; by default its unit tells.
+        Which of the six standard quantities the response is; by default it follows from the unit.
     amplitude, drive : str, optional
         One displacement (velocity, acceleration) or force amplitude for the whole file, such
         as ``"5 um rms"`` or ``"0.2 N"``. Braces are filled from the file's name: see
@@ -85,11 +85,11 @@ def read_frequency_response(
         Regular expression on the file's name; its first group is the level. Together with
         ``drive="{level} N"`` it is the drive as well; a named group fills its own braces.
     run : str, optional
-        Label of what was measured in one go, for all rows; braces are filled as in `drive`.
+        Label of the run, for all rows; braces are filled as in `drive`.
         Without it a column ``run``, ``test``, ``file`` or ``day`` is taken, and of several files
         each is a run under its own name.
     controlled : {"displacement", "force"} or mapping, optional
-        What the laboratory held; a mapping gives a pattern of level labels for each.
+        The controlled quantity; a mapping gives a pattern of level labels for each.
     frequency_hz : (low, high), optional
         Read this range only.
     sheet : str, optional
@@ -291,7 +291,7 @@ def _row_after(row_name: Callable[[int], str], start: int, row: int) -> str:
 
 
 def _as_saved(data: FrequencyResponse) -> FrequencyResponse:
-    """Return a table that never was in a file with the provenance that it had before."""
+    """Return a table from memory with its previous provenance."""
     origin = (data.provenance or {}).get("origin")
     return data if origin is None else replace(data, provenance=origin)
 
@@ -302,7 +302,7 @@ def _is_frame(path: Any) -> TypeIs[pd.DataFrame]:
 
 
 def inspect(path: PathLike, *, sheet: str | None = None) -> FileContents:
-    r"""Say what a file holds, and propose a column map for it.
+    r"""List the contents of a file, and propose a column map for it.
 
     Parameters
     ----------
@@ -341,7 +341,7 @@ def open_source(
     sheet: str | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Source:
-    """Return the channels of a file of any format, and beside them what the user said."""
+    """Return the channels of a file of any format, with the user's options."""
     if _is_frame(path):
         from dahl_ident.data.readers.spreadsheets import frame_source
 
@@ -357,7 +357,7 @@ def open_source(
 
 
 def _given(**options: Any) -> dict[str, Any]:
-    """Return the options that differ from saying nothing, as JSON holds them."""
+    """Return the options that were given, as JSON data."""
     return {
         k: plain_data(v)
         for k, v in options.items()
@@ -366,7 +366,7 @@ def _given(**options: Any) -> dict[str, Any]:
 
 
 def _parsed(file: File, sheet: str | None) -> Source:
-    """Hand a file to its reader; each is imported when first used."""
+    """Pass a file to its reader; readers are imported when first used."""
     match file.format:
         case "excel" | "ods":
             from dahl_ident.data.readers.spreadsheets import read_workbook

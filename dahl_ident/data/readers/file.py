@@ -1,7 +1,7 @@
-"""A file, its hash, and which format it is in whatever the name says; and how large it may be.
+"""A file with its hash, its format found from the content, and limits of its size.
 
-What a file unpacks to, or says that it holds, is limited before memory is asked for it: a file
-of some kilobytes may claim exabytes, by damage or by design.
+The unpacked or declared size of a file is limited before memory is allocated, because a damaged or
+malicious file of some kilobytes may declare exabytes.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ class File:
         return max(_UNPACKED_BYTES, _UNPACKED_RATIO * self.size)
 
     def refuse_above_limit(self, claimed: int, what: str) -> None:
-        """Refuse what would take more memory than a file of this size may.
+        """Refuse content that would take more memory than a file of this size may.
 
         Raises
         ------
@@ -241,7 +241,7 @@ def _archive(file: File, suffix: str) -> str:
                 return "excel"
             if "mimetype" in names and b"opendocument.spreadsheet" in archive.read("mimetype"):
                 return "ods"
-    except ZIP_ERRORS:  # its reader will say how it is damaged
+    except ZIP_ERRORS:  # its reader will report the damage
         return {".ods": "ods", ".npz": "npz"}.get(suffix, "excel" if "xls" in suffix else "zip")
     if names and all(name.endswith(".npy") for name in names):
         return "npz"

@@ -1,4 +1,4 @@
-"""Where in a sheet of cells the numbers begin, and what stands above them."""
+"""The start of the numbers in a sheet of cells, and the header above them."""
 
 from __future__ import annotations
 

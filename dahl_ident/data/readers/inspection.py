@@ -1,4 +1,4 @@
-"""What a file holds: channels, sampling, gaps, and the column map that would read it."""
+"""The contents of a file: channels, sampling, gaps, and a column map to read it."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class ChannelSummary:
 
 @dataclass(frozen=True, repr=False)
 class FileContents:
-    """What a file holds, as :func:`inspect` tells it.
+    """The contents of a file, as returned by :func:`inspect`.
 
     `sampling` and `gaps` are empty where the file has no time channel; `column_map` is TOML
     text, to be checked and kept.

@@ -1,4 +1,4 @@
-"""Tables that a library hands over as cells or columns: Excel, Parquet, pandas."""
+"""Tables that a library returns as cells or columns: Excel, Parquet, pandas."""
 
 from __future__ import annotations
 

@@ -161,7 +161,7 @@ def _layout(lines: list[tuple[int, str]], name: str) -> _Layout:
     best: _Layout | None = None
     texts = [text for (_, text), skip in zip(lines, passed, strict=True) if not skip]
     for dialects in (_DIALECTS, _LAST_DIALECTS):
-        merit = (False, 0)  # a header that fits the columns tells more than another number
+        merit = (False, 0)  # a header that fits the columns counts more than another number
         for delimiter, mark in _possible(dialects, texts):
             found = _in_dialect(lines, passed, delimiter, mark)
             if found is not None and found[0] > merit:
