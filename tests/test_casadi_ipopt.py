@@ -441,7 +441,7 @@ def test_search_that_runs_out_of_steps_says_so(monkeypatch: pytest.MonkeyPatch) 
     problem = Problem(friction_data(), Dahl())
     found = solve_ipopt(problem, constraints=lambda p: [p["sigma"] <= 250 * p["f_max"]])
     assert found.status is Status.NOT_CONVERGED
-    assert "IPOPT says: it was still moving when its steps ran out." in found.message
+    assert "IPOPT says: it reached the maximum number of iterations." in found.message
 
 
 def test_start_without_steady_amplitude() -> None:

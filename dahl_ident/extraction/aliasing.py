@@ -1,4 +1,4 @@
-"""Harmonics above half the sampling rate: how much of them aliases onto those that are measured.
+"""Aliasing of harmonics above half the sampling rate onto the measured ones.
 
 With r samples a cycle the harmonics r - k and r + k are sampled as harmonic k, alike in every
 cycle, so that no scatter shows them. A waveform with kinks, such as friction's force, has

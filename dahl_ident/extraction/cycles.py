@@ -1,4 +1,4 @@
-"""Cycles of a waveform: where they begin, and the amplitude and frequency of each.
+"""Cycles of a waveform: their starts, amplitudes and frequencies.
 
 A record of unknown frequency is cut at its rising crossings. A crossing counts when the motion
 goes from below ``-h`` to above ``+h``, so noise makes none; ``h`` is a part of the amplitude, and

@@ -137,7 +137,7 @@ def _points(
 def _refuse_other_motion(
     motion: FloatArray, runs: Sequence[Cycles], points: Sequence[Point]
 ) -> None:
-    """Refuse a record that is no sine test, points by chance included."""
+    """Refuse a record that is not a sine measurement, even if some points occur by chance."""
     moving = sum(float(np.sum(run.stop - run.start)) for run in runs)
     measured = sum(p.quality["end_time"] - p.quality["start_time"] for p in points)
     if measured > _WELL_COVERED * moving:

@@ -1,4 +1,4 @@
-"""Points of one level that a record in pieces was cut into, joined to one.
+"""Joining of the points of one level that was split between pieces of a record.
 
 A piece may end within a level. Each part then has a point of its own, and with n_i cycles they
 give, by weights w_i = n_i / sum n,

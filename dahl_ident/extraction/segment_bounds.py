@@ -1,4 +1,4 @@
-r"""Ends of a segment: which cycles belong to its level, judged by amplitude and phase.
+r"""Ends of a segment: the cycles that belong to its level, by amplitude and phase.
 
 Where a ramp begins or ends, the first cycles that depart are off by a percent, in amplitude or in
 phase. The cycles inside tell how far is too far: a sine that may change linearly is fitted to
@@ -142,7 +142,7 @@ def _inside(segment: Segment, edges: FloatArray) -> _Inside | None:
     coefficients = inverse @ right[:, 0]
     cc, ss, cs, c, s = _cycle_sums(segment, cuts, coefficients)
     determinant = cc * ss - cs**2
-    full = determinant > 0.1 * cc * ss  # a cycle without samples tells nothing
+    full = determinant > 0.1 * cc * ss  # a cycle without samples carries no information
     dof = 2 * int(full.sum()) - 4
     if dof < 2:
         return None

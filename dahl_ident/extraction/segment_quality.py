@@ -1,4 +1,4 @@
-"""What a segment of samples shows about its own quality: steps, clipping, share of the sine.
+"""Quality of a segment of samples: sensor steps, clipping, share of the sine.
 
 The describing function assumes a displacement that is one sine, seen by a sensor that is finer
 than the amplitude and wide enough for it. Each of these is measured here, for each segment.

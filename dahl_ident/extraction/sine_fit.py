@@ -193,7 +193,7 @@ class SineFit:
 
 
 def resolvable_orders(segment: Segment) -> int:
-    """Return how many harmonics are fitted: those that the sampling can tell apart, or fewer."""
+    """Return how many harmonics are fitted: at most those that the sampling can separate."""
     per_cycle = 2.0 * np.pi / segment.sample_phase
     affordable = np.clip(_AFFORDABLE / segment.time.size, HARMONICS, _MOST_HARMONICS)
     orders = int(min(affordable, _NYQUIST_MARGIN * per_cycle))

@@ -1,4 +1,4 @@
-"""Whether a record is a sine test: one line in its spectrum, or cycles like their neighbours.
+"""Check that a record is a sine measurement: one spectral line, or similar neighbouring cycles.
 
 Random motion, an earthquake, or point-to-point motion of a drive cross zero as well, and a few of
 their cycles look alike by chance. In a sine test (steady levels, steps, sweeps, an unsteady
@@ -19,7 +19,7 @@ ROUTE = (
     "expected levels or a sweep of one sine; for any other motion fit the waveform itself: "
     "di.fit(record, model)"
 )
-_PERIOD_CHANGE = 0.03  # from one cycle to the next, in half the energy: more is no sine test
+_PERIOD_CHANGE = 0.03  # limit from one cycle to the next (median by energy) of a sine measurement
 _AMPLITUDE_CHANGE = 0.1
 _FEWEST_PAIRS = 2  # of cycles, that show how alike they are
 _NOISY = 0.03  # of a cycle's log amplitude
@@ -30,7 +30,7 @@ _SPECTRUM_OF = 2**20  # samples at most
 
 
 def not_a_sine_test(motion: FloatArray, runs: Sequence[Cycles], covered: float) -> str:
-    """Return what shows that the motion is no sine test, empty where it may be one.
+    """Return why the motion is not a sine measurement; empty where it may be one.
 
     Parameters
     ----------

@@ -48,9 +48,8 @@ def extract(
 
     The record is split into segments of constant amplitude and frequency; rests and ramps are
     left out. Each segment gives one point: the fundamental of force over that of displacement,
-    N = F_1/X_1, and a row for each further harmonic, F_k/X_1. Cycles in which friction still
-    remembers the level before are left out as far as needed. A continuous sweep gives a series
-    of points.
+    N = F_1/X_1, and a row for each further harmonic, F_k/X_1. Cycles with a transient from the
+    previous level are left out as far as needed. A continuous sweep gives a series of points.
 
     Parameters
     ----------
@@ -128,9 +127,10 @@ def extract(
     Raises
     ------
     ExtractionError
-        If the motion is no sine test; or no segment is usable: too short, motion or force not
+        If the motion is not a sine; or no segment is usable: too short, motion or force not
         dominated by one sine, less motion than the sensor's step, or `frequency` not that of the
-        motion, so that its phase drifts. Where only some are, a warning tells which and why.
+        motion, so that its phase drifts. If only some are usable, a warning lists the others and
+        why.
     ValidationError
         If an argument is out of range, or the record has only a drive without a factor.
     DataError
@@ -141,11 +141,11 @@ def extract(
     The sine fit is that of IEEE Std 1057 with harmonics. Its covariance is taken from what does
     not repeat between the harmonics, plus two errors that do: rounding to sensor steps where no
     noise dithers it, and harmonics above half the sampling rate, which alias onto lower ones (the
-    size of those seen is extended to them; with a hundred samples a cycle it hardly counts, and
-    with so few that none are seen the verdict tells). It holds for white and for 1/f noise. The
-    uncertainty of a record's `drive_factor` is common to all points and not part of it. A hum
-    during rests that is a clean sine in both channels is taken for a level; give `frequency`
-    then.
+    size of the measured ones is extrapolated to them; with a hundred samples per cycle this is
+    negligible, and if the sampling is too slow to measure any the verdict says so). It holds for
+    white and for 1/f noise. The uncertainty of a record's `drive_factor` is common to all points
+    and not part of it. A hum during rests that is a clean sine in both channels is taken for a
+    level; give `frequency` then.
 
     Examples
     --------

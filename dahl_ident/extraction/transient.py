@@ -1,4 +1,4 @@
-r"""The transient of friction: whether a segment has settled, and what is left where it has not.
+r"""The transient of friction: whether a segment has settled, and the remaining bias if not.
 
 After a change of level the force departs from its steady loop. For Dahl friction the departure
 fades along the path s travelled, whatever the direction,
@@ -95,7 +95,7 @@ def estimate_transient(
     displacement_phase : float
         Phase of the displacement's phasor, rad.
     response : complex
-        Dynamic stiffness; its phase tells beta where the decay does not.
+        Dynamic stiffness; its phase determines beta if the decay does not.
 
     Returns
     -------

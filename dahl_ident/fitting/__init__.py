@@ -1,4 +1,4 @@
-"""Least squares: from a problem to its optimum, or to the reason why there is none."""
+"""Least squares: from a problem to its optimum, or the reason why there is none."""
 
 from dahl_ident.fitting.optimum import Combination, Optimum, OptimumBatch
 from dahl_ident.fitting.search import solve, solve_many

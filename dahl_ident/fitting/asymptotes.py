@@ -1,6 +1,6 @@
-r"""Optima at infinity: what a search tends to when the data cannot hold a parameter.
+r"""Optima at infinity, to which a search tends if the data do not determine a parameter.
 
-A law has limits that fewer numbers describe. Dahl, for instance, declares
+A law has limits with fewer parameters. Dahl, for instance, declares
 
 ==================  ===============================  =====================  =====================
 limit               Z of the element                 runs away              determined
@@ -16,11 +16,12 @@ no full slip        dF/dx = sigma exp(-s F/phi)      f_max, alpha           phi 
 and any law may vanish. Of a law that declares none, every direction with a unit
 (:mod:`dahl_ident.fitting.directions`) is tried far out on either side of the data.
 
-Each lies on the edge of the model, so the best fit may lie there, and a search would then return
-whatever huge number it stopped at. A limit is searched as a problem of its own, in a **chart**:
-coordinates phi that stay finite, mapped to a theta so far out that the model is its limit, to five
-digits or more (three for no full slip). If the sum of squares there is no higher than at any
-finite optimum, the limit is the optimum, and phi gives what is determined, with its covariance.
+Each lies at the boundary of the model, so the best fit may lie there, and a search would then
+return the arbitrary large number at which it stopped. A limit is searched as a problem of its own,
+in a **chart**: coordinates phi that stay finite, mapped to a theta so far out that the model is its
+limit, to five digits or more (three for no full slip). If the sum of squares there is no higher
+than at any finite optimum, the limit is the optimum, and phi gives what is determined, with its
+covariance.
 
 In microslip beside a free spring the cost has a long curved valley even where its minimum is
 finite. The chart (kappa, x_c, sigma + stiffness) straightens it; where f_max is given, the chart
@@ -50,7 +51,7 @@ _NUMBERS = (1.0 / 250.0, 25.0)  # a number over the least and most that its law 
 _FAR = (1e9, 1e14)
 """How far a length lies above the largest amplitude, and below the smallest, in a limit.
 
-In slip the stiffness that is left of a law fades as slowly as the root of the length.
+In slip the remaining stiffness of a law decreases only with the square root of the length.
 """
 _FIRMLY = 1e3  # weight of what a limit determines beside single coordinates, in a chart's phi
 
@@ -323,7 +324,7 @@ def _plain(problem: Problem, element: Element, asymptote: Asymptote, spring: boo
         if other in free:
             tying = _tying(element)
             if spring and tying is not None and {other} == {tying.adds_to_spring}:
-                return []  # beside a spring nothing is left of the law
+                return []  # in parallel with a spring the law has no effect
             follow = names[0], names[1], np.log(np.asarray(factor))
         else:
             pins[names[0]] = np.log(np.asarray(factor)) + _ln(element.parameter(other))
@@ -398,7 +399,7 @@ def _undeclared(problem: Problem, own: Directions) -> list[Limit]:
                     if np.count_nonzero(kept[0][1]) > 1:
                         extremes[own.reference.name] = np.inf
             else:
-                # of two parameters in a fixed ratio, that with the unit of what is left stays
+                # of two parameters in a fixed ratio, the one with the unit of the limit remains
                 stiff = over.dimension[1] < p.dimension[1]
                 stays = over if (large == rising) == stiff else p
                 goes = p if stays is over else over
@@ -422,7 +423,7 @@ def _kept_product(
 ) -> tuple[str, FloatArray]:
     """Return the product of scale and length that has a unit: a stiffness (-1), a force (0).
 
-    The stiffness is what is left of a law that never slips, the force of one that always does.
+    The stiffness remains of a law that never slips, the force of one that always slips.
     """
     power = (unit - reference.dimension[1]) / direction.dimension[1]
     powers = np.zeros(len(problem.parameters))

@@ -1,4 +1,4 @@
-"""Elements within casadi expressions: written out where they are short, else expanded.
+"""Elements within casadi expressions: written out if they are short, else expanded.
 
 Written into a larger expression, a quadrature would be differentiated by all of that expression's
 variables. A quadratic polynomial about where the element's own variables are has the same value

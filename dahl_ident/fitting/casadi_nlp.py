@@ -1,4 +1,4 @@
-r"""An optimisation problem over many alike rows, with exact sparse derivatives for IPOPT.
+r"""An optimisation problem over many similar rows, with exact sparse derivatives for IPOPT.
 
     minimise  f_0(xi) + sum_i f(xi, w_i; d_i)
     subject   g(xi, w_i; d_i) = 0 for every row i,    c(xi) between bounds,
@@ -6,8 +6,8 @@ r"""An optimisation problem over many alike rows, with exact sparse derivatives 
 with shared variables xi, and unknowns w_i and numbers d_i of each row. A row depends on xi and
 on its own unknowns alone, so the Hessian has the shape of an arrowhead. casadi differentiates
 one row of each kind; one mapped call evaluates that for all rows, and the results are, in their
-order, the nonzeros of the sparse matrices. Left to itself casadi would colour the whole problem,
-which takes several times as long to build and to evaluate.
+order, the nonzeros of the sparse matrices. By default casadi would use graph colouring on the whole
+problem, which takes several times as long to build and to evaluate.
 
 What is long-winded in a row, the quadrature of a general exponent, enters as its expansion about
 the row's own numbers (:class:`dahl_ident.fitting.casadi_expansion.Expansion`).

@@ -1,4 +1,4 @@
-"""From the ends of searches to optima: covariance, status, and the sentence for the user."""
+"""From the results of searches to optima: covariance, status, and the message for the user."""
 
 from __future__ import annotations
 

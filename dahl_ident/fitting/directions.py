@@ -1,9 +1,9 @@
-"""In which directions a law is nonlinear, and the scale that the data give to each.
+"""Directions in which a law is nonlinear, and their scales from the data.
 
-The force of most laws is proportional to some parameters. What is left are **directions** in
-which it is not: ratios of parameters that scale the force together, such as x_c = f_max/sigma,
-lengths, speeds and pure numbers. The dimension of a direction says what it is measured by: a
-length by the amplitudes of the data, a speed by amplitude times angular frequency.
+The force of most laws is proportional to some parameters. The others are **directions**, in which
+it is nonlinear: ratios of parameters that scale the force together, such as x_c = f_max/sigma,
+lengths, speeds and pure numbers. The dimension of a direction says what it is measured by: a length
+by the amplitudes of the data, a speed by amplitude times angular frequency.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-r"""Where a search starts: variable projection, so that no user has to guess.
+r"""Starts of a search by variable projection, so that no initial values are needed.
 
 The force of a friction law is proportional to some of its parameters, or to one factor on all of
 them; a describing function, for instance, is linear in sigma once x_c = f_max/sigma and alpha are

@@ -61,11 +61,11 @@ _RESCALINGS = 30
 _SAME_SCALE = 1e-10
 _SAME_COST = 1e-6
 _WORDS = {
-    "Maximum_Iterations_Exceeded": "it was still moving when its steps ran out",
-    "Restoration_Failed": "it could not get back to where the constraints hold",
-    "Diverging_Iterates": "a parameter ran away",
-    "Search_Direction_Becomes_Too_Small": "its steps became too small to make a difference",
-    "Invalid_Number_Detected": "the model or a constraint gave no number",
+    "Maximum_Iterations_Exceeded": "it reached the maximum number of iterations",
+    "Restoration_Failed": "it could not return to a point that satisfies the constraints",
+    "Diverging_Iterates": "a parameter diverged",
+    "Search_Direction_Becomes_Too_Small": "its steps became too small",
+    "Invalid_Number_Detected": "the model or a constraint gave an invalid number",
     "Error_In_Step_Computation": "it could not compute a step",
     "Not_Enough_Degrees_Of_Freedom": "there are more equations than unknowns",
 }

@@ -1,4 +1,4 @@
-"""Robust losses: how much a row of data counts that lies far from the model.
+"""Robust losses, which down-weight rows far from the model.
 
 A row has two residuals, real and imaginary part or ln gain and phase; it counts as rho(z), with
 z the sum of their squares over the noise variance, in place of z itself. A point is an outlier as

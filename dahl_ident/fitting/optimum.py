@@ -1,4 +1,4 @@
-"""What a solver returns: plain numbers, and nothing that a report would add."""
+"""The result of a solver as plain numbers."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class Optimum:
 
     @property
     def is_exact(self) -> bool:
-        """Whether the model meets the data to rounding, so that residuals say nothing."""
+        """Whether the model fits the data to rounding, so that residuals carry no information."""
         return _is_rounding(self.problem, self.scale)
 
     @property
@@ -228,7 +228,7 @@ class OptimumBatch(Sequence[Optimum]):
 
     @property
     def scale_known(self) -> bool:
-        """Whether the noise model knows the scale."""
+        """Whether the noise model gives the scale."""
         return self.problem.scale_known
 
     @property

@@ -1,4 +1,4 @@
-"""Least squares for records of any motion: a start without a guess, then Gauss-Newton steps."""
+"""Least squares for records of any motion: automatic starts, then Gauss-Newton steps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Starts for records of any motion without a guess, by variable projection.
+"""Automatic starts for records of any motion, by variable projection.
 
 Given the nonlinear parameters of its laws, a model's force is linear in mass, damping, stiffness
 and one scale for each law. So the nonlinear ones are scanned, and the linear ones solved for: from

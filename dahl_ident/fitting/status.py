@@ -1,4 +1,4 @@
-"""How an estimate ended, in the sentence that the user reads."""
+"""The outcome of a search, as the sentence that the user reads."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Status(Enum):
     )
     GROSS_SLIP = (
         "No finite optimum: the fit improves as sigma grows without bound at constant f_max. The "
-        "data show slip only: drive more softly, or reduce the noise."
+        "data show slip only: use smaller amplitudes, or reduce the noise."
     )
     SHARP_KNEE = (
         "No finite optimum: the fit improves as alpha tends to zero. Friction turns from stiffness "
@@ -42,7 +42,7 @@ class Status(Enum):
     )
     NO_FRICTION = (
         "No finite optimum: the fit improves as friction vanishes. The other elements explain "
-        "the data: drive more softly, or leave the element out."
+        "the data: use smaller amplitudes, or leave the element out."
     )
     RUNS_AWAY = (
         "No finite optimum: the fit improves as a parameter goes to a limit. The amplitudes do not "

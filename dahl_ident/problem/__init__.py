@@ -1,8 +1,8 @@
 """The estimation problem: data, model, noise and sensors, and what follows from them.
 
 A :class:`Problem` is the one source of predictions, residuals, derivatives and likelihood; every
-solver and sampler sees nothing else, so they cannot disagree about what is estimated. A
-:class:`ProblemBatch` is the same for many tables of one shape at once.
+solver and sampler uses only this, so they all estimate the same quantities. A :class:`ProblemBatch`
+is the same for many tables of one shape at once.
 
 Both work in **search coordinates** theta: the logarithm of positive parameters, the number itself
 for the others. Residuals are whitened by the noise model (see :mod:`dahl_ident.noise`), so that

@@ -58,7 +58,7 @@ class _Group:
 
 
 class Predictor:
-    """What a model and its sensors make of the amplitudes, drives and frequencies of `rows`."""
+    """Prediction of a model with its sensors for the operating points of `rows`."""
 
     def __init__(
         self, model: Model, sensors: Sensors, coordinates: Coordinates, rows: Rows

@@ -1,4 +1,4 @@
-"""One estimate's data, model, noise and sensors, as every solver and sampler sees them."""
+"""Data, model, noise and sensors of one estimate, used by every solver and sampler."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Noise in records: the spectrum of residuals, and what the drive holds outside its band."""
+"""Noise in records: the spectrum of residuals, and the drive's content outside its band."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dahl_ident.arrays import FloatArray
 _HIGHEST_ORDER = 60
 _SAMPLES_PER_ORDER = 20
 _BAND = 1e-4  # of the drive's largest power: below, the drive is not in its band
-_OUTSIDE = 0.1  # share of frequencies outside the band that tells the noise there
+_OUTSIDE = 0.1  # share of frequencies outside the band needed to estimate the noise
 
 
 def prediction_error_filter(residuals: Sequence[FloatArray]) -> FloatArray:
@@ -75,7 +75,7 @@ def drive_noise(drives: Sequence[FloatArray]) -> float | None:
     """Return the power of a drive's noise over that of the drive, both within its band.
 
     The noise is taken as white, of the median power outside the band. None where less than a
-    tenth of the frequencies lie outside, so that nothing is known of it.
+    tenth of the frequencies lie outside, so that it cannot be estimated.
     """
     noise, signal = 0.0, 0.0
     for drive in drives:

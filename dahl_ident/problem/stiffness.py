@@ -1,4 +1,4 @@
-"""The data seen as dynamic stiffness at known amplitudes: what starts and first looks work on."""
+"""The data as dynamic stiffness at known amplitudes, for starts and tests."""
 
 from __future__ import annotations
 
