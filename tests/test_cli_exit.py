@@ -85,8 +85,8 @@ def test_an_interrupted_chain_says_how_it_goes_on(tmp_path: Path) -> None:
     out, err = interrupted(tmp_path, *endless, "--resume", "chain.h5", when=chain)
     assert out == ""
     assert err.splitlines() == [
-        "chain.h5 keeps the chain so far; the same command goes on from there",
-        "interrupted; no file is left half-written",
+        "chain.h5 holds the chain so far; the same command continues from there",
+        "interrupted; no file is incomplete",
     ]
     with library("h5py").File(chain, "r") as file:
         assert len(file["points"]) >= 50
@@ -100,7 +100,7 @@ def test_an_interrupted_chain_says_how_it_goes_on(tmp_path: Path) -> None:
 ])  # fmt: skip
 def test_an_interrupt_leaves_nothing(tmp_path: Path, arguments: tuple[str, ...]) -> None:
     out, err = interrupted(tmp_path, *arguments)
-    assert (out, err) == ("", "interrupted; no file is left half-written\n")
+    assert (out, err) == ("", "interrupted; no file is incomplete\n")
     assert not list(tmp_path.iterdir())
 
 
@@ -271,7 +271,7 @@ RECORD = "time [s],displacement [m],force [N]\n0,1,1\n1,2,2\n2,1,1\n"
         (("fit", "t.csv", "--level", "high", "--level-from-name", "(t)"),
          "level and level_from_name are both given"),
         (("simulate", "run.toml", "--f-max", "3", "--force-std", "0.1"),
-         "--f-max, --force-std is given beside run.toml, which describes the whole experiment"),
+         "--f-max, --force-std is given together with run.toml, which describes the whole"),
         (("report", "t.csv", "--record-columns", "map.toml"),
          "--record-columns is given without --record"),
     ],

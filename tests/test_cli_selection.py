@@ -64,12 +64,12 @@ def test_levels_and_runs_are_named() -> None:
     [
         ("level >", "invalid syntax"),
         ("speed > 1", "there is no column speed"),
-        ("level", "it compares nothing"),
+        ("level", "it contains no comparison"),
         ("level.__class__ == 1", "is not understood"),
         ("__import__('os') == 1", "is not understood"),
         ("harmonic in [1, 3]", "is not understood|in, is and the like"),
-        ("run > 1", "a label that is no number is compared with one"),
-        ("level > 100", "leaves none of 6 rows"),
+        ("run > 1", "a label that is not a number is compared with a number"),
+        ("level > 100", "selects none of 6 rows"),
     ],
 )
 def test_conditions_that_cannot_be_met_are_refused(where: str, message: str) -> None:

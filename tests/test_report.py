@@ -297,12 +297,12 @@ def test_measured_loops_and_settling_are_shown(tmp_path: Path) -> None:
     fit = di.fit(di.extract(record), di.Dahl() + di.Spring(0.5), throw=False)
     place = report(fit, tmp_path / "r.html", record=record)
     text = place.read_text(encoding="utf-8")
-    told = re.search(r"measured loops lie within ([0-9.]+) % rms", text)
+    told = re.search(r"measured loops are within ([0-9.]+) % rms", text)
     assert told is not None
     assert 0.0 < float(told[1]) < 3.0, "harmonics up to the ninth make the loop"
     assert "Quality of each point" in text
     assert "Points measured from waveforms: 1, all good." in text
-    assert "How the point at 1.25 Hz, 0.008 m settled" in text
+    assert "Settling of the point at 1.25 Hz, 0.008 m" in text
     other = di.Record(t, displacement=x, force=x, provenance={"sha256": "00"})
     with pytest.raises(ValidationError, match="not extracted from this record"):
         report(fit, tmp_path / "other.html", record=other)

@@ -1,4 +1,4 @@
-"""The commands together, and what happens when one fails."""
+"""All commands, and the handling of their errors."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from dahl_ident.errors import DahlIdentError
 from dahl_ident.version import __version__
 
 _NAME = "dahl-ident"
-# every wrong use, whether Typer stands on click or brings its own copy of it
+# all usage errors, whether Typer uses click or its own copy of it
 _WrongUse: type[Exception] = typer.BadParameter.__bases__[0]
 
 app = typer.Typer(
     name=_NAME,
-    help="Identify Dahl friction from sine-sweep measurements, with error bars that are true.",
+    help="Identify friction from measurements, with an uncertainty budget.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
@@ -47,7 +47,8 @@ def _print_version(wanted: bool) -> None:
 
 
 @app.callback(
-    epilog="Exit status: 0 result can be used, 1 bad input, 2 wrong use, 3 result must not be used."
+    epilog="Exit status: 0 result can be used, 1 bad input, 2 wrong usage, "
+    "3 result must not be used."
 )
 def common(
     color: Annotated[
@@ -58,7 +59,7 @@ def common(
         typer.Option("--version", callback=_print_version, is_eager=True, help="Print it."),
     ] = False,
 ) -> None:
-    """Identify Dahl friction from sine-sweep measurements, with error bars that are true."""
+    """Identify friction from measurements, with an uncertainty budget."""
     console.use_color(color)
 
 
@@ -83,25 +84,25 @@ def main(arguments: list[str] | None = None) -> None:
         console.write_error(f"error: {console.in_options(' '.join(str(exc).split()))}")
         status = console.BAD_INPUT
     except OSError as exc:
-        if not isinstance(exc, BrokenPipeError):  # a reader such as head has seen enough
+        if not isinstance(exc, BrokenPipeError):  # a reader such as head has closed the pipe
             console.write_error(
                 f"error: {exc.filename or 'standard output'}: {exc.strerror or exc}"
             )
-        # what is left in the buffer would fail once more when Python ends
+        # the rest of the buffer would fail again when Python ends
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = console.BAD_INPUT
     if status == console.INTERRUPTED:
-        console.write_error("interrupted; no file is left half-written")
+        console.write_error("interrupted; no file is incomplete")
     sys.exit(status)
 
 
 def _refuse(wrong: Any, typed: Sequence[str]) -> int:
-    """Say in two lines what is wrong with a command, and where its options are listed."""
+    """Print in two lines what is wrong with a command, and where its options are listed."""
     message = " ".join(wrong.format_message().split())
-    if message:  # empty where nothing was typed: Typer has printed the help
+    if message:  # empty if nothing was typed: Typer has printed the help
         errors = getattr(wrong.__cause__, "errors", None)
         got = f"; got {errors()[0]['input']!r}" if errors else ""
-        # the parser of options knows no context; all that can stand before the command are flags
+        # the option parser has no context; only flags can precede the command
         words = [word for word in typed if not word.startswith("-")]
         command = wrong.ctx.command_path if wrong.ctx else " ".join([_NAME, *words[:1]])
         console.write_error(f"error: {message}{got}\nSee {command} --help")

@@ -15,7 +15,7 @@ from dahl_ident.errors import ValidationError
 
 
 def campaign(
-    definition: Annotated[Path, typer.Argument(help="TOML file that says what to do.")],
+    definition: Annotated[Path, typer.Argument(help="TOML file that defines the campaign.")],
     jobs: Annotated[
         int | None, typer.Option(help="Processes; by default as many as processors.")
     ] = None,
@@ -23,29 +23,29 @@ def campaign(
         str | None, typer.Option(help="Address of a Dask scheduler, tcp://host:port.")
     ] = None,
     send_files: Annotated[
-        bool, typer.Option("--send-files", help="Send workers the content of files, not paths.")
+        bool, typer.Option("--send-files", help="Send workers the contents of files, not paths.")
     ] = False,
     report: Annotated[
         Path | None, typer.Option(help="Report on the whole campaign: .html or .pdf.")
     ] = None,
     covariate: Annotated[
-        list[str], typer.Option(help="Column on which parameters may depend; or several.")
+        list[str], typer.Option(help="Column on which parameters may depend; repeatable.")
     ] = [],  # noqa: B006 - typer takes lists as lists
     order: Annotated[
         str | None, typer.Option(help="Column that orders fits in time, for control charts.")
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would be done.")] = False,
     redo: Annotated[
-        bool, typer.Option("--redo", help="Do all anew where options have changed.")
+        bool, typer.Option("--redo", help="Repeat all fits if options have changed.")
     ] = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace a report that is there already.")
+        bool, typer.Option("--overwrite", help="Replace an existing report.")
     ] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Read, extract and fit the files of many devices; a table with one row for each.
+    """Read, extract and fit the files of many devices into one table.
 
-    An interrupted campaign goes on where it stopped; a changed file is done anew.
+    An interrupted campaign continues where it stopped; a changed file is fitted again.
 
     Example: dahl-ident campaign lab.toml --jobs 4 --report campaign.html
     """

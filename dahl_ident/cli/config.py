@@ -1,10 +1,10 @@
-"""Options from a TOML file: a laboratory's standard run in one word.
+"""Options from a TOML file, such as the standard options of a laboratory.
 
-What stands outside of tables is meant for every command that knows it; a table named after a
-command is for that one alone. A name that nothing knows is refused: a slip of the pen must not
-leave a default standing. An option that may be given several times is a list, or, where it
-assigns values to names, a table: ``[sample.prior]`` with ``f_max = [0.01, 1]`` and
-``mass = "norm(0.3, 0.001)"`` is the calibration sheet of a laboratory.
+Options outside of tables apply to every command that has them; a table named after a command
+applies to that command only. An unknown name is refused, so that a misspelt option cannot silently
+leave a default in place. An option that may be given several times is a list, or, if it assigns
+values to names, a table such as ``[sample.prior]`` with ``f_max = [0.01, 1]`` and ``mass =
+"norm(0.3, 0.001)"``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dahl_ident.errors import DataError
 
 
 def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
-    """Take the options that the command line leaves out from a TOML file."""
+    """Read the options that are not given on the command line from a TOML file."""
     if path is None:
         return None
     try:
@@ -75,5 +75,5 @@ def _typed(value: Any) -> Any:
 
 
 def _assigned(value: Any) -> str:
-    """Return bounds as ``low:high``, anything else as it stands."""
+    """Return bounds as ``low:high``, anything else unchanged."""
     return ":".join(map(str, value)) if isinstance(value, list) else str(value)

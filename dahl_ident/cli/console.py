@@ -1,4 +1,4 @@
-"""What a command prints: results on standard output, warnings and errors on standard error."""
+"""Output of commands: results on standard output, warnings and errors on standard error."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _session = _Session()
 
 
 def begin(typed: Sequence[str]) -> None:
-    """Remember what was typed, and show warnings as lines for people, without file and code."""
+    """Store the command, and show warnings as plain lines, without file and code."""
 
     def show(message: Warning | str, *_: Any) -> None:
         write_error(f"warning: {in_options(str(message))}")
@@ -49,12 +49,12 @@ def begin(typed: Sequence[str]) -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         # the name of a file, or a unit, may hold what the terminal's encoding does not
         sys.stdout.reconfigure(errors="backslashreplace")
-    # setattr, because the signature here has no use for file and line
+    # setattr, because this function ignores file and line
     setattr(warnings, "showwarning", show)  # noqa: B010
 
 
 def in_options(message: str) -> str:
-    """Return a message of the library in the words of the command line.
+    """Return a message of the library with its arguments as command-line options.
 
     ``give frequency=, or mode='sweep'`` becomes ``give --frequency, or --mode 'sweep'``, and
     ``columns={'gain': 'K'}`` becomes ``--columns map.toml, a file with the line: gain = "K"``.
@@ -72,7 +72,7 @@ def in_options(message: str) -> str:
 
 
 def _column_map(found: re.Match[str]) -> str:
-    """Return the option and the line of its file that say the same as a map in Python."""
+    """Return the option and the line of its file that correspond to a map in Python."""
     try:
         entries = ast.literal_eval(found[1])
     except (SyntaxError, ValueError):
@@ -88,7 +88,7 @@ def _column_map(found: re.Match[str]) -> str:
 
 
 def typed_command() -> str:
-    """Return the command of this run, as it would be typed again."""
+    """Return the command of this run, as typed."""
     command = shlex.join(["dahl-ident", *_session.typed])
     command = command.encode(errors="backslashreplace").decode()  # as names of files are told
     piped = STANDARD in _session.typed
@@ -96,12 +96,12 @@ def typed_command() -> str:
 
 
 def use_color(color: bool) -> None:
-    """Turn colour on or off for all that follows."""
+    """Turn colour on or off for all further output."""
     _session.color = color
 
 
 def _terminal() -> Console:
-    """Return where people read; colour and width follow the terminal."""
+    """Return the console for results; colour and width follow the terminal."""
     from rich.console import Console
 
     terminal = sys.stdout.isatty()
@@ -114,12 +114,12 @@ def _terminal() -> Console:
 
 
 def write(text: str) -> None:
-    """Print one text as it is."""
+    """Print a text unchanged."""
     sys.stdout.write(f"{text}\n")
 
 
 def write_wrapped(text: str) -> None:
-    """Print a text in the words of the command line, long lines wrapped with an indent."""
+    """Print a text with command-line options in its advice; long lines are wrapped and indented."""
     shown = sys.stdout.isatty() or "COLUMNS" in os.environ
     width = max(_NARROWEST, shutil.get_terminal_size().columns) if shown else None
     for line in in_options(text).splitlines():
@@ -144,7 +144,7 @@ def write_json(value: Any) -> None:
 
 
 def table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table; text from files is not taken for markup."""
+    """Print a table; text from files is not interpreted as markup."""
     from rich import box
     from rich.measure import Measurement
     from rich.table import Table
@@ -153,7 +153,7 @@ def table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> N
     drawn = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
     cells = [list(row) for row in rows]
     for i, name in enumerate(header):
-        # a number broken over two lines would be read as another
+        # a number broken over two lines would be misread
         whole = not any(" " in row[i] for row in cells)
         least = max(len(text) for text in [name, *(row[i] for row in cells)]) if whole else None
         drawn.add_column(Text(name), overflow="fold", no_wrap=whole, min_width=least)
@@ -173,7 +173,7 @@ def heading(text: str) -> None:
 
 
 def finish(trusted: bool, reason: str) -> None:
-    """End a command with the status that its result deserves."""
+    """End a command with the exit status of its result."""
     if not trusted:
         write_error(f"not to be trusted: {reason}")
         raise typer.Exit(NOT_TRUSTED)

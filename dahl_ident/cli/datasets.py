@@ -1,4 +1,4 @@
-"""``dahl-ident datasets``: the data that ship, what each teaches, and a copy of any."""
+"""``dahl-ident datasets``: lists the shipped data sets, or copies one."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ def datasets(
     general: General,
     writing: Writing,
     name: Annotated[
-        str | None, typer.Argument(help="The one to describe or copy; all if left out.")
+        str | None, typer.Argument(help="Data set to describe or copy; lists all if left out.")
     ] = None,
     output: Annotated[
         str | None,
-        typer.Option("--output", "-o", help="Copy it here; - is standard output, as CSV."),
+        typer.Option("--output", "-o", help="File to copy it to; - is standard output, as CSV."),
     ] = None,
 ) -> None:
     """List the shipped synthetic data sets, or copy one to a file.

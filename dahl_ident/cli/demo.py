@@ -1,4 +1,4 @@
-"""``dahl-ident demo``: the whole chain on shipped data, from waveforms to a report."""
+"""``dahl-ident demo``: all steps on shipped data, from waveforms to a report."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def demo(
         Path, typer.Option("--output", "-o", help="Folder for the table and the report.")
     ] = Path("out"),
 ) -> None:
-    """Run the whole chain on a shipped recording of a plant, the true values beside the result.
+    """Run all steps on a shipped recording of a plant, and compare the result with the true values.
 
     With --json the steps are printed on standard error.
 
@@ -62,7 +62,7 @@ def demo(
 def _chain(
     origin: Mapping[str, Any], table: Path, page: Path, *, overwrite: bool
 ) -> tuple[FitResult, ChainPosterior]:
-    """Take every step from the recording to the report, and tell each."""
+    """Run every step from the recording to the report, and print a heading for each."""
     from dahl_ident.data import inspect, read_record
     from dahl_ident.synthetic.shipped import datasets_directory
 
@@ -119,7 +119,7 @@ def _report(
 
 
 def _compare(result: FitResult, truth: Mapping[str, float]) -> None:
-    """Print the true values beside the estimates, and how far off they are."""
+    """Print the estimates, the true values and their differences."""
     rows = []
     for name, estimate in result.params.items():
         off = (estimate.value - truth[name]) / estimate.stderr if estimate.stderr else 0.0

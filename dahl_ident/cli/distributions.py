@@ -1,4 +1,4 @@
-"""Numbers, bounds and distributions as they are typed: ``0.3``, ``0.01:1``, ``norm(1, 0.005)``."""
+"""Parsing of numbers, bounds and distributions: ``0.3``, ``0.01:1``, ``norm(1, 0.005)``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def number(name: str, text: str) -> float:
     Raises
     ------
     ModelError
-        If it is none.
+        If the text is not a value.
     """
     try:
         value = float(text)
@@ -39,7 +39,7 @@ def number_or_free(name: str, text: str | None) -> float | None:
 
 
 def known(name: str, text: str) -> Any:
-    """Return what is known of a sensor: a number, None where it is free, or its prior."""
+    """Return the value of a sensor: a number, None if it is free, or its prior."""
     return distribution(name, text) if "(" in text else number_or_free(name, text)
 
 

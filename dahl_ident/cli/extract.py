@@ -1,4 +1,4 @@
-"""``dahl-ident extract``: from recorded waveforms to a table of response with verdicts."""
+"""``dahl-ident extract``: from recorded waveforms to a table of responses with verdicts."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _READING = "Reading"
 _EXTRACTING = "Extracting"
 Channel = Annotated[
     str | None,
-    typer.Option(help='Its column, with unit if need be: "x \\[mm]".', rich_help_panel=_READING),
+    typer.Option(help='Its column, with unit if needed: "x \\[mm]".', rich_help_panel=_READING),
 ]
 
 
 @dataclass(frozen=True)
 class RecordReading:
-    """How records are read; the words of ``read_record``."""
+    """Reading of records; the options of ``read_record``."""
 
     columns: Annotated[
         Path | None, typer.Option(help="Column map, a TOML file.", rich_help_panel=_READING)
@@ -54,19 +54,17 @@ class RecordReading:
     ] = None
     missing: Annotated[
         str,
-        typer.Option(
-            help="error or drop: what is done about empty samples.", rich_help_panel=_READING
-        ),
+        typer.Option(help="Treatment of empty samples: error or drop.", rich_help_panel=_READING),
     ] = "error"
 
 
 @dataclass(frozen=True)
 class Extracting:
-    """How points are measured; the words of ``extract``."""
+    """Measurement of points; the options of ``extract``."""
 
     frequency: Annotated[
         float | None,
-        typer.Option(help="Excitation frequency where known, Hz.", rich_help_panel=_EXTRACTING),
+        typer.Option(help="Excitation frequency if known, Hz.", rich_help_panel=_EXTRACTING),
     ] = None
     mode: Annotated[
         str, typer.Option(help="auto, steps or sweep.", rich_help_panel=_EXTRACTING)
@@ -77,25 +75,25 @@ class Extracting:
     ] = None
     settling_periods: Annotated[
         int | None,
-        typer.Option(help="Leading ones of these to leave out.", rich_help_panel=_EXTRACTING),
+        typer.Option(help="Leading periods of each segment to omit.", rich_help_panel=_EXTRACTING),
     ] = None
     harmonics: Annotated[
         str | None,
         typer.Option(
-            help="Which become rows, 0 to 9: by default the odd ones, and the even ones of an "
-            "asymmetric force; with force controlled 1 alone.",
+            help="Harmonics to extract, 0 to 9: by default the odd ones, and the even ones of an "
+            "asymmetric force; if force is controlled, only 1.",
             rich_help_panel=_EXTRACTING,
         ),
     ] = None
     controlled: Annotated[
         str,
         typer.Option(
-            help="What the laboratory held: displacement or force.", rich_help_panel=_EXTRACTING
+            help="Controlled quantity: displacement or force.", rich_help_panel=_EXTRACTING
         ),
     ] = "displacement"
     min_share: Annotated[
         float,
-        typer.Option(help="Least share of the sine in the power.", rich_help_panel=_EXTRACTING),
+        typer.Option(help="Minimum share of the sine in the power.", rich_help_panel=_EXTRACTING),
     ] = 0.6
 
     def keywords(self) -> dict[str, Any]:
@@ -124,19 +122,19 @@ def extract(
         str | None,
         typer.Option("--output", "-o", help="Table to write; - is standard output, as CSV."),
     ] = None,
-    plot: Annotated[str | None, typer.Option(help="Picture to write, such as points.png.")] = None,
+    plot: Annotated[str | None, typer.Option(help="Plot to write, such as points.png.")] = None,
     level_from_name: Annotated[
         str | None,
-        typer.Option(help="Regular expression on the file's name; its group is the level."),
+        typer.Option(help="Regular expression for file names; its group is the level."),
     ] = None,
-    jobs: Annotated[int, typer.Option(help="Processes among which several files are divided.")] = 1,
+    jobs: Annotated[int, typer.Option(help="Number of processes for several files.")] = 1,
     good_only: Annotated[
-        bool, typer.Option("--good-only", help="Leave out points with another verdict than good.")
+        bool, typer.Option("--good-only", help="Leave out points whose verdict is not good.")
     ] = False,
 ) -> None:
     """Turn recorded waveforms into dynamic stiffness with covariance and verdicts.
 
-    Ends with status 3 if a point is not good; the table names each with its verdict.
+    The exit status is 3 if a point is not good; the table gives the verdict of each point.
 
     Example: dahl-ident datasets plant_recording -o - | dahl-ident extract - --controlled force
     """
@@ -209,7 +207,7 @@ def show(data: FrequencyResponse) -> None:
 
 
 def judge(data: FrequencyResponse) -> None:
-    """End with status 3 where a point is not good, and say which and why."""
+    """End with status 3 if a point is not good, and print which and why."""
     verdicts = _one_row_a_point(data).quality["verdict"]
     bad = [(i, str(v)) for i, v in enumerate(verdicts) if v != "good"]
     named = "; ".join(f"point {i}: {verdict}" for i, verdict in bad[:3])

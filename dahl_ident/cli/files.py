@@ -1,4 +1,4 @@
-"""Files as commands take and give them: ``-`` is standard input or output, and all are whole."""
+"""Input and output files: ``-`` is standard input or output; files are written atomically."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _T = TypeVar("_T")
 
 
 class Saved(Protocol):
-    """Data that write themselves to a file."""
+    """Data with a method that writes them to a file."""
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write, and return the place."""
+        """Write, and return the path."""
         ...
 
 
@@ -28,7 +28,7 @@ def write_data(data: Saved, output: str, *, overwrite: bool) -> None:
 
 
 def written(write: Callable[[str | Path], Path], output: str, ending: str) -> str:
-    """Let `write` make a file; what is meant for standard output, with this ending."""
+    """Call `write` with a path; for standard output, with a temporary file of this ending."""
     if output != STANDARD:
         return str(write(output))
     with tempfile.TemporaryDirectory() as directory:
@@ -40,7 +40,7 @@ def written(write: Callable[[str | Path], Path], output: str, ending: str) -> st
 
 
 def make_folder(place: Path) -> None:
-    """Make a folder where it is missing.
+    """Make a folder if it does not exist.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def make_folder(place: Path) -> None:
 
 
 def write_picture(axes: Any, path: str, *, overwrite: bool) -> None:
-    """Write the figure of some axes in the format of the file's name."""
+    """Write the figure of some axes in the format given by the file name."""
     from dahl_ident.data.storage import write_whole
     from dahl_ident.errors import DataError
     from dahl_ident.reporting.document import figure_of
@@ -65,15 +65,15 @@ def write_picture(axes: Any, path: str, *, overwrite: bool) -> None:
     try:
         figure_of(axes).savefig(buffer, format=Path(path).suffix.lstrip(".") or "png", dpi=150)
     except ValueError as exc:
-        raise DataError(f"{path}: no picture of this kind: {exc}") from exc
+        raise DataError(f"{path}: not a format for plots: {exc}") from exc
     write_whole(Path(path), buffer.getvalue(), overwrite=overwrite)
 
 
 def progress_bar() -> Any:
-    """Return a progress bar on standard error that vanishes when done, or off a terminal."""
+    """Return a progress bar on standard error that disappears when done; none off a terminal."""
     from rich.console import Console
     from rich.progress import Progress
 
     terminal = sys.stderr.isatty()
-    console = Console(stderr=True, quiet=not terminal)  # some releases end with a line even so
+    console = Console(stderr=True, quiet=not terminal)  # some releases print a line even then
     return Progress(console=console, transient=True, disable=not terminal)

@@ -1,4 +1,4 @@
-"""``dahl-ident fit``: from tables to estimates with their judgement."""
+"""``dahl-ident fit``: from tables to estimates with their verdict."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ReportPlace = Annotated[
 
 @dataclass(frozen=True)
 class Estimating:
-    """How the estimate is made; the words of ``fit``."""
+    """Estimation; the options of ``fit``."""
 
     method: Annotated[
         str,
@@ -44,21 +44,21 @@ class Estimating:
     noise: Annotated[
         str | None,
         typer.Option(
-            help="measured, relative or absolute; by default measured where a covariance is known.",
+            help="measured, relative or absolute; by default measured if a covariance is known.",
             rich_help_panel=_ESTIMATING,
         ),
     ] = None
     loss: Annotated[
         str,
         typer.Option(
-            help="linear, huber, soft_l1 or student_t; all but the first make outliers count less.",
+            help="linear, huber, soft_l1 or student_t; all but the first down-weight outliers.",
             rich_help_panel=_ESTIMATING,
         ),
     ] = "linear"
     start: Annotated[
         list[str] | None,
         typer.Option(
-            help="One more start for the search, f_max=0.1; once for each parameter.",
+            help="Additional initial value for the search, f_max=0.1; once for each parameter.",
             rich_help_panel=_ESTIMATING,
         ),
     ] = None
@@ -79,17 +79,17 @@ def fit(
     writing: Writing,
     report: ReportPlace = None,
     save: Annotated[
-        Path | None, typer.Option(help="Fit to write, as JSON that report and Python load.")
+        Path | None, typer.Option(help="JSON file for the fit, which report and Python can load.")
     ] = None,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Print every section, not the first two.")
+        bool, typer.Option("--verbose", "-v", help="Print all sections, not only the first two.")
     ] = False,
     record: Annotated[
         bool,
-        typer.Option("--record", help="The files are records of any motion, each a run."),
+        typer.Option("--record", help="The files are records of any motion; each is a run."),
     ] = False,
 ) -> None:
-    """Estimate a model's parameters, and say whether the data determine them.
+    """Estimate a model's parameters, and state whether the data determine them.
 
     Example: dahl-ident datasets noisy -o - | dahl-ident fit -
     """
@@ -194,7 +194,7 @@ def write_report(
 def write_report_beside(
     results: Sequence[FitResult | ChainPosterior | RecordFit], place: str, writing: Writing
 ) -> None:
-    """Write a report beside other output, and say where it is."""
+    """Write a report in addition to other output, and print its path."""
     written_to = write_report(results, place, writing)
     if written_to != STANDARD:
         console.write_error(f"report: {written_to}")
@@ -223,5 +223,5 @@ def as_json(result: FitResult) -> dict[str, Any]:
 
 
 def finish(result: Result) -> None:
-    """End with status 3 where the result cannot be used."""
+    """End with status 3 if the result cannot be used."""
     console.finish(result.status.usable, result.statements[0].partition(". ")[2])

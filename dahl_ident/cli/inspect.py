@@ -1,4 +1,4 @@
-"""``dahl-ident inspect``: what a file holds, and the column map that would read it."""
+"""``dahl-ident inspect``: the contents of a file, and a column map to read it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The options that say what is fitted: elements, what is known of them, and the sensors."""
+"""The options that define the model: elements, known values, and the sensors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _MODEL = "Model"
 _SENSORS = "Sensors"
-_KINDS = "a number, 'free', or a prior as scipy.stats has it, such as 'norm(1, 0.005)'."
+_KINDS = "a number, 'free', or a prior from scipy.stats, such as 'norm(1, 0.005)'."
 _CALL = re.compile(r"\s*(\w+)\s*(?:\((.*)\))?\s*", re.DOTALL)
 _FRICTION = ("f_max", "sigma", "alpha")
 OTHERS = ("mass", "damping", "stiffness")
@@ -31,7 +31,7 @@ def model_option(help_text: str) -> Any:
 
 
 ELEMENT_HELP = (
-    "An element in place of the Dahl one, by its kind and what is known: 'bouc_wen', "
+    "An element instead of Dahl friction, by its kind and known values: 'bouc_wen', "
     "'dahl(f_max=0.1, alpha=free)', 'mass(0.3)'; once for each."
 )
 
@@ -42,9 +42,9 @@ def _sensor(help_text: str) -> Any:
 
 @dataclass(frozen=True)
 class ModelOptions:
-    """Elements and sensors, which of their parameters are known, which are free."""
+    """Elements and sensors, with their known and free parameters."""
 
-    f_max: Annotated[str | None, model_option("Friction force, N; estimated if left out.")] = None
+    f_max: Annotated[str | None, model_option("Friction limit, N; estimated if left out.")] = None
     sigma: Annotated[str | None, model_option("Contact stiffness, N/m; estimated if left out.")] = (
         None
     )
@@ -86,12 +86,12 @@ class ModelOptions:
 
 
 def refuse_beside_elements(given: Mapping[str, Any]) -> None:
-    """Refuse parameters of the Dahl element where --element describes the friction."""
+    """Refuse parameters of the Dahl element if --element describes the friction."""
     if given:
         options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
         raise ValidationError(
-            f"{options} is given beside --element; write such values inside the element, as in "
-            "--element 'dahl(f_max=0.1)'"
+            f"{options} is given together with --element; write such values inside the element, as "
+            "in --element 'dahl(f_max=0.1)'"
         )
 
 

@@ -1,7 +1,7 @@
 """Options that several commands share, declared once as a dataclass.
 
-A command takes the dataclass as one argument; :func:`with_option_groups` shows its fields to
-Typer as single options and puts them together again before the command runs.
+A command takes the dataclass as one argument; :func:`with_option_groups` presents its fields to
+Typer as single options and combines them again before the command runs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, get_type_hints
 
 
 def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
-    """Return `command` with the fields of its dataclass arguments as options of its own."""
+    """Return `command` with the fields of its dataclass arguments as separate options."""
     hints = get_type_hints(command, include_extras=True)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
     parameters = []

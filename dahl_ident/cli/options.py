@@ -1,4 +1,4 @@
-"""The options that commands share: how files are read and written, how results are printed."""
+"""Common options: reading and writing of files, printing of results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _READING = "Reading"
 
 
 def _existing(files: list[str]) -> list[str]:
-    """Refuse files that are not there, before anything heavy is loaded."""
+    """Refuse files that do not exist, before heavy libraries are loaded."""
     for file in files:
         if file != STANDARD and not Path(file).exists() and not glob.has_magic(file):
             raise DataError(f"{file}: the file cannot be read: No such file or directory")
@@ -29,7 +29,7 @@ def _existing(files: list[str]) -> list[str]:
 
 
 def one_of(*choices: str) -> Callable[[str], str]:
-    """Return a check of an option's value; any other is a wrong use of the command."""
+    """Return a check of an option's value; any other value is a usage error."""
 
     def check(value: str) -> str:
         if value not in choices:
@@ -64,27 +64,25 @@ Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
 
 @dataclass(frozen=True)
 class General:
-    """What every command knows."""
+    """The options of every command."""
 
-    json: Annotated[bool, typer.Option("--json", help="Print JSON for machines.")] = False
+    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False
     config: Annotated[
         Path | None,
         typer.Option(
             is_eager=True,
             callback=take_options,
-            help="TOML file of options; a table named after the command, such as \\[fit], is for "
-            "it alone. The command line wins.",
+            help="TOML file of options; a table named after a command, such as \\[fit], applies to "
+            "that command only. The command line has precedence.",
         ),
     ] = None
 
 
 @dataclass(frozen=True)
 class Writing:
-    """What becomes of files that are there already."""
+    """The treatment of existing files."""
 
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace files that are there already.")
-    ] = False
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False
 
     def check(
         self,
@@ -93,22 +91,22 @@ class Writing:
         *,
         json: bool = False,
     ) -> None:
-        """Refuse outputs that would destroy something, before any work is done.
+        """Refuse outputs that would destroy files, before any work is done.
 
         Raises
         ------
         ValidationError
-            If an output is one of the inputs, or several things want standard output.
+            If an output is one of the inputs, or several outputs are standard output.
         DataError
-            If an output is there already and may not be replaced, or lies in no folder.
+            If an output exists and may not be replaced, or its folder does not exist.
         """
         from dahl_ident.data.storage import refuse_existing
 
         places = [str(output) for output in outputs if output is not None]
         if places.count(STANDARD) + json > 1:
             raise ValidationError(
-                "more than one thing wants standard output, - and --json included; give files to "
-                "all but one"
+                "more than one output goes to standard output, - and --json included; give files "
+                "for all but one"
             )
         read = {Path(file).resolve() for file in inputs if file != STANDARD}
         for place in map(Path, (place for place in places if place != STANDARD)):
@@ -126,7 +124,7 @@ class Writing:
 
 @dataclass(frozen=True)
 class Reading:
-    """How tables are read; the words of ``read_frequency_response``."""
+    """Reading of tables; the options of ``read_frequency_response``."""
 
     columns: Annotated[
         Path | None, typer.Option(help="Column map, a TOML file.", rich_help_panel=_READING)
@@ -134,7 +132,7 @@ class Reading:
     quantity: Annotated[
         str | None,
         typer.Option(
-            help="What the response is, such as receptance; by default its unit tells.",
+            help="Response quantity, such as receptance; by default it follows from the unit.",
             rich_help_panel=_READING,
         ),
     ] = None
@@ -156,20 +154,18 @@ class Reading:
     level_from_name: Annotated[
         str | None,
         typer.Option(
-            help="Regular expression on the file's name; its group is the level.",
+            help="Regular expression for file names; its group is the level.",
             rich_help_panel=_READING,
         ),
     ] = None
     controlled: Annotated[
         str | None,
-        typer.Option(
-            help="What the laboratory held: displacement or force.", rich_help_panel=_READING
-        ),
+        typer.Option(help="Controlled quantity: displacement or force.", rich_help_panel=_READING),
     ] = None
     frequency_hz: Annotated[
         str | None,
         typer.Option(
-            help="Keep this range only, Hz: 0.2,0.6.", callback=_is_range, rich_help_panel=_READING
+            help="Keep only this range, Hz: 0.2,0.6.", callback=_is_range, rich_help_panel=_READING
         ),
     ] = None
     where: Annotated[
@@ -180,12 +176,12 @@ class Reading:
         ),
     ] = None
     levels: Annotated[
-        str | None, typer.Option(help="Keep these levels only: 1,2,5.", rich_help_panel=_READING)
+        str | None, typer.Option(help="Keep only these levels: 1,2,5.", rich_help_panel=_READING)
     ] = None
     runs: Annotated[
         str | None,
         typer.Option(
-            help="Keep these runs only: day1,day2. Several files are a run each.",
+            help="Keep only these runs: day1,day2. Each of several files is a run.",
             rich_help_panel=_READING,
         ),
     ] = None
@@ -194,9 +190,7 @@ class Reading:
     ] = None
     passive: Annotated[
         bool,
-        typer.Option(
-            help="Refuse a table that creates energy as a whole.", rich_help_panel=_READING
-        ),
+        typer.Option(help="Refuse a table with a net gain of energy.", rich_help_panel=_READING),
     ] = True
 
     def read(self, files: list[str]) -> FrequencyResponse:

@@ -30,17 +30,17 @@ def _aim(help_text: str) -> Any:
 
 @dataclass(frozen=True)
 class Bench:
-    """What the bench can do, and what it costs."""
+    """The limits of the bench and the times that it needs."""
 
     frequency_hz: Annotated[str, _bench(f"Frequency, Hz: {_RANGE}.")]
     displacement: Annotated[str | None, _bench(f"Displacement amplitude, m: {_RANGE}.")] = None
     force: Annotated[str | None, _bench(f"Force amplitude, N: {_RANGE}.")] = None
     speed: Annotated[str | None, _bench("Highest speed, m/s.")] = None
-    time: Annotated[float | None, _bench("Seconds for everything.")] = None
+    time: Annotated[float | None, _bench("Total time, s.")] = None
     controlled: Annotated[
         str,
         typer.Option(
-            help="displacement or force: what the exciter holds.",
+            help="Controlled quantity: displacement or force.",
             callback=one_of("displacement", "force"),
             rich_help_panel=_BENCH,
         ),
@@ -50,9 +50,9 @@ class Bench:
         _bench("Noise of one cycle: 0.01, or 'relative=0.01,force=1e-3,displacement=1e-7'."),
     ] = None
     scatter: Annotated[float, _bench("Scatter of gain and phase between runs: 0.02.")] = 0.0
-    num_runs: Annotated[int | None, _bench("Runs; by default as many as are best.")] = None
+    num_runs: Annotated[int | None, _bench("Number of runs; by default the best one.")] = None
     change_over: Annotated[float, _bench("Seconds from one level to the next.")] = 1.0
-    between_runs: Annotated[float, _bench("Seconds that each run takes beside its levels.")] = 0.0
+    between_runs: Annotated[float, _bench("Additional seconds for each run.")] = 0.0
 
     def limits(self) -> dict[str, Any]:
         """Return the limits that were given."""
@@ -66,22 +66,23 @@ class Bench:
 
 @dataclass(frozen=True)
 class Aim:
-    """What is to be found, and what is known."""
+    """The targets, and prior knowledge."""
 
     target: Annotated[
         list[str] | None,
         _aim(
-            "Wanted relative standard uncertainty, f_max=0.02 or f_max/sigma=0.02, at least time; "
-            "a name alone: least uncertainty in --time. Once for each; by default all parameters."
+            "Wanted relative standard uncertainty, f_max=0.02 or f_max/sigma=0.02, in the least "
+            "time; a name alone: least uncertainty in --time. Repeatable; by default all "
+            "parameters."
         ),
     ] = None
     ranges: Annotated[
         list[str] | None,
-        _aim("Range that holds a parameter with 95 % probability, f_max=0.05,0.2; once for each."),
+        _aim("Range of a parameter with 95 % probability, f_max=0.05,0.2; repeatable."),
     ] = None
     suspects: Annotated[
         list[str] | None,
-        _aim("Parameter that may be there, and the uncertainty wanted for it, alpha=0.1."),
+        _aim("Parameter that may be needed, and the uncertainty wanted for it, alpha=0.1."),
     ] = None
 
     def keywords(self) -> dict[str, Any]:
@@ -111,19 +112,19 @@ def plan(
     writing: Writing,
     fit: Annotated[
         str | None,
-        typer.Argument(help="Saved fit whose data count; without one, a model's ranges."),
+        typer.Argument(help="Saved fit of earlier data; without it, give ranges for the model."),
     ] = None,
     seed: Seed = 0,
-    table: Annotated[Path | None, typer.Option(help="Table of the levels to write, .csv.")] = None,
+    table: Annotated[Path | None, typer.Option(help="File for the table of levels, .csv.")] = None,
     waveform: Annotated[
-        Path | None, typer.Option(help="Waveform of one run for the exciter to write, .csv.")
+        Path | None, typer.Option(help="File for the waveform of one run for the exciter, .csv.")
     ] = None,
     sample_rate: Annotated[
-        float | None, typer.Option(help="Of the waveform, samples a second.")
+        float | None, typer.Option(help="Sample rate of the waveform, Hz.")
     ] = None,
     picture: Annotated[
         Path | None,
-        typer.Option(help="Uncertainty against bench time to draw, .png, .svg or .pdf."),
+        typer.Option(help="File for a plot of uncertainty against bench time, .png, .svg or .pdf."),
     ] = None,
 ) -> None:
     """Plan the next measurement: levels, frequencies and cycles.

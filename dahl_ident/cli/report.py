@@ -1,4 +1,4 @@
-"""``dahl-ident report``: from tables to a report that can be handed on."""
+"""``dahl-ident report``: from tables to a report."""
 
 from __future__ import annotations
 
@@ -34,25 +34,25 @@ def report(
     ] = ["report.html"],  # noqa: B006 - typer takes lists as lists
     record: Annotated[
         Path | None,
-        typer.Option(help="Waveforms that the table is from: the report shows how they settled."),
+        typer.Option(help="Waveforms of the table; the report shows how they settled."),
     ] = None,
     record_columns: Annotated[
         Path | None, typer.Option(help="Column map of these waveforms, a TOML file.")
     ] = None,
-    title: Annotated[str | None, typer.Option(help="First line of the report.")] = None,
+    title: Annotated[str | None, typer.Option(help="Title of the report.")] = None,
     metadata: Annotated[
         Path | None,
-        typer.Option(help="Specimen, instruments, operator and so on, a TOML file."),
+        typer.Option(help="TOML file with specimen, instruments, operator and so on."),
     ] = None,
     bootstrap: Annotated[
-        bool, typer.Option("--bootstrap", help="Bootstrap intervals as well, beside the others.")
+        bool, typer.Option("--bootstrap", help="Add bootstrap intervals.")
     ] = False,
     posterior: Annotated[
-        bool, typer.Option("--posterior", help="Sample the posterior as well, beside the fit.")
+        bool, typer.Option("--posterior", help="Add a sampled posterior.")
     ] = False,
     seed: Seed = 1,
 ) -> None:
-    """Fit, judge and write a report; or report on fits that fit --save has written.
+    """Fit and write a report; or write a report on fits saved by fit --save.
 
     Several saved fits are overlaid, and the changes from each to the next are listed.
 
@@ -69,8 +69,8 @@ def report(
     chosen = (reading, model, estimating) != (Reading(), ModelOptions(), Estimating())
     if any(file.endswith(".json") for file in files) and (not saved or chosen):
         raise ValidationError(
-            "saved fits are reported as they are: give no tables beside them, and no options of "
-            "reading, model or estimate"
+            "saved fits are reported unchanged: give no tables together with them, and no options "
+            "of reading, model or estimate"
         )
     if len(files) > 1 and saved and (posterior or record is not None):
         raise ValidationError("--posterior and --record go with one fit; give one file")

@@ -1,4 +1,4 @@
-"""Rows chosen on the command line: ``--where "level > 3 and harmonic == 1"``."""
+"""Selection of rows on the command line: ``--where "level > 3 and harmonic == 1"``."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _COMPARE: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
 def selected(
     data: FrequencyResponse, where: str | None, levels: str | None, runs: str | None
 ) -> FrequencyResponse:
-    """Return the rows that the options --where, --levels and --runs leave.
+    """Return the rows selected by the options --where, --levels and --runs.
 
     Raises
     ------
     ValidationError
-        If a condition cannot be understood, names no column, or leaves no row.
+        If a condition cannot be understood, names an unknown column, or selects no row.
     """
     for option, column, text in (("--levels", "level", levels), ("--runs", "run", runs)):
         if text is not None:
@@ -42,7 +42,7 @@ def selected(
         return data
     rows = _Condition(data, where).rows()
     if not rows.any():
-        raise ValidationError(f"--where {where!r} leaves none of {data.n} rows")
+        raise ValidationError(f"--where {where!r} selects none of {data.n} rows")
     return data.select(rows=rows)
 
 
@@ -90,7 +90,7 @@ class _Condition:
             raise self._refused(str(exc.msg)) from exc
         rows = np.asarray(found)
         if rows.dtype != np.bool_ or rows.shape != (self._n,):
-            raise self._refused("it compares nothing")
+            raise self._refused("it contains no comparison")
         return rows
 
     def _refused(self, why: str) -> ValidationError:
@@ -133,7 +133,9 @@ class _Condition:
             try:
                 sides = [side.astype(float) for side in sides]
             except ValueError as exc:
-                raise self._refused("a label that is no number is compared with one") from exc
+                raise self._refused(
+                    "a label that is not a number is compared with a number"
+                ) from exc
         else:
             sides = [side.astype(str) for side in sides]
         return _COMPARE[type(op)](*sides)

@@ -26,7 +26,7 @@ _CHAIN = ("seed", "steps", "max_steps", "ess", "walkers", "ensembles", "resume")
 
 @dataclass(frozen=True)
 class Sampling:
-    """How the chain is run; the words of ``sample``."""
+    """Sampling; the options of ``posterior``."""
 
     method: Annotated[
         str,
@@ -64,14 +64,14 @@ class Sampling:
         typer.Option(help="Total steps; by default until converged.", rich_help_panel=_SAMPLING),
     ] = None
     max_steps: Annotated[
-        int, typer.Option(help="Most steps, converged or not.", rich_help_panel=_SAMPLING)
+        int, typer.Option(help="Maximum steps, converged or not.", rich_help_panel=_SAMPLING)
     ] = 20000
     ess: Annotated[
         float, typer.Option(help="Effective draws wanted.", rich_help_panel=_SAMPLING)
     ] = 2000.0
     walkers: Annotated[
         int | None,
-        typer.Option(help="In all ensembles together.", rich_help_panel=_SAMPLING),
+        typer.Option(help="Walkers in all ensembles together.", rich_help_panel=_SAMPLING),
     ] = None
     ensembles: Annotated[
         int, typer.Option(help="Independent groups of walkers.", rich_help_panel=_SAMPLING)
@@ -79,7 +79,7 @@ class Sampling:
     resume: Annotated[
         Path | None,
         typer.Option(
-            help="HDF5 file that keeps the chain; a run that was stopped goes on from it.",
+            help="HDF5 file that keeps the chain; a stopped run continues from it.",
             rich_help_panel=_SAMPLING,
         ),
     ] = None
@@ -93,14 +93,15 @@ class Sampling:
         return {**given, "progress": sys.stderr.isatty()}
 
     def check(self, report: str | None) -> None:
-        """Refuse with --method grid what only a chain has."""
+        """Refuse options of a chain with --method grid."""
         chain = Sampling()
         given = [n for n in _CHAIN if n != "seed" and getattr(self, n) != getattr(chain, n)]
         given += ["report"] if report is not None else []
         if self.method == "grid" and given:
             options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
             raise ValidationError(
-                f"{options} is given beside --method grid, which runs no chain; leave one out"
+                f"{options} is given together with --method grid, which runs no chain; leave one "
+                "out"
             )
 
 
@@ -140,9 +141,9 @@ def sample(
 
 
 def _kept(chain: Path | None) -> str:
-    """Return what is left of a chain that was stopped."""
+    """Return a message on where a stopped chain is kept."""
     if chain is None:
-        return "the chain is not kept; with --resume chain.h5 one that is stopped can go on"
+        return "the chain is not kept; with --resume chain.h5 a stopped chain can be continued"
     if not chain.exists():
         return f"{chain}: the chain had not begun"
-    return f"{chain} keeps the chain so far; the same command goes on from there"
+    return f"{chain} holds the chain so far; the same command continues from there"

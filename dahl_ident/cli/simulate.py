@@ -1,4 +1,4 @@
-"""``dahl-ident simulate``: data of the synthetic laboratory, from options or from a file."""
+"""``dahl-ident simulate``: data of the synthetic laboratory, from options or a file."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
 _EXCITATION = "Excitation"
 _ERRORS = "Errors"
-_SPAN = (0.1, 10.0)  # of the characteristic displacement, where no levels are given
+_SPAN = (0.1, 10.0)  # of the characteristic displacement, if no levels are given
 _COUNT = 30
 
 
 @dataclass(frozen=True)
 class Plant:
-    """The truth: friction, and what is beside it."""
+    """The true plant: friction and the elements in parallel."""
 
     f_max: Annotated[float | None, model_option("Friction force, N.")] = None
     sigma: Annotated[float | None, model_option("Contact stiffness, N/m.")] = None
@@ -64,21 +64,23 @@ class Plant:
 
 @dataclass(frozen=True)
 class Excitation:
-    """A stepped sine; anything else takes an experiment file."""
+    """A stepped sine; other excitations need an experiment file."""
 
     levels: Annotated[
         str | None,
         typer.Option(
-            help="Amplitudes, 1e-4,1e-3 or low:high:count; by default 30 about the knee.",
+            help="Amplitudes, 1e-4,1e-3 or low:high:count; by default 30 around the knee.",
             rich_help_panel=_EXCITATION,
         ),
     ] = None
     frequencies_hz: Annotated[
-        str, typer.Option(help="The same for frequencies, Hz.", rich_help_panel=_EXCITATION)
+        str, typer.Option(help="Frequencies, Hz, in the same form.", rich_help_panel=_EXCITATION)
     ] = "1"
     controlled: Annotated[
         str,
-        typer.Option(help="displacement or force: what is held.", rich_help_panel=_EXCITATION),
+        typer.Option(
+            help="Controlled quantity: displacement or force.", rich_help_panel=_EXCITATION
+        ),
     ] = "displacement"
     order: Annotated[
         str,
@@ -99,11 +101,15 @@ class Errors:
 
     displacement_std: Annotated[
         float,
-        typer.Option(help="Of the table, relative; of samples, m.", rich_help_panel=_ERRORS),
+        typer.Option(
+            help="Displacement noise: of a table, relative; of samples, m.", rich_help_panel=_ERRORS
+        ),
     ] = 0.0
     force_std: Annotated[
         float,
-        typer.Option(help="Of the table, relative; of samples, N.", rich_help_panel=_ERRORS),
+        typer.Option(
+            help="Force noise: of a table, relative; of samples, N.", rich_help_panel=_ERRORS
+        ),
     ] = 0.0
 
 
@@ -123,7 +129,7 @@ def simulate(
         typer.Option("--output", "-o", help="File to write; - is standard output, as CSV."),
     ] = None,
 ) -> None:
-    """Simulate an experiment whose truth is known; without an output, print its description.
+    """Simulate an experiment; without an output file, print its description.
 
     Example: dahl-ident simulate --f-max 0.1 --sigma 30 --force-std 0.01 -o synthetic.csv
     """
@@ -137,7 +143,7 @@ def simulate(
     idle = [f"--{k.replace('_', '-')}" for k, v in given.items() if v != defaults[k]]
     if experiment is not None and idle:
         raise ValidationError(
-            f"{', '.join(idle)} is given beside {experiment}, which describes the whole "
+            f"{', '.join(idle)} is given together with {experiment}, which describes the whole "
             "experiment; leave one of them out"
         )
     inputs = [] if experiment is None else [experiment]
@@ -177,7 +183,7 @@ def _experiment(plant: Plant, excitation: Excitation, errors: Errors) -> Experim
 
 
 def _usual_levels(truth: Element, controlled: str) -> str:
-    """Return levels about the knee of friction, of displacement or of force."""
+    """Return levels of displacement or force around the knee of the friction."""
     import numpy as np
 
     from dahl_ident.elements.element import as_model

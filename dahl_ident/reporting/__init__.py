@@ -1,4 +1,4 @@
-"""Reports to hand on: HTML, PDF, Markdown and JSON from the same content."""
+"""Reports: HTML, PDF, Markdown and JSON from the same content."""
 
 from dahl_ident.reporting.publish import report
 

@@ -1,7 +1,7 @@
-"""A report as plain content: what it says, before any format gives it a look.
+"""The content of a report, independent of its format.
 
-Every writer (HTML, PDF, Markdown, JSON) takes the same :class:`Document`, so that all formats
-tell the same story.
+Every writer (HTML, PDF, Markdown, JSON) takes the same :class:`Document`, so that all formats have
+the same content.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Cell:
-    """A number in a table: as people read it, and as it is copied and sorted.
+    """A cell of a table: its text, and the number for copying and sorting.
 
-    A struck one is printed grey and crossed out: the reason stands beside it. A link is the
-    address of another page, relative to this one.
+    A struck cell is printed grey and crossed out, with the reason beside it. A link is the address
+    of another page, relative to this one.
     """
 
     text: str
@@ -47,7 +47,7 @@ class Bullets:
 
 @dataclass(frozen=True)
 class Listing:
-    """Text to be copied as it stands: a command, a program."""
+    """Text to be copied unchanged, such as a command or a program."""
 
     text: str
 
@@ -63,7 +63,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure that is drawn when a writer asks for it.
+    """A figure, which is drawn when a writer needs it.
 
     Attributes
     ----------
@@ -72,9 +72,9 @@ class Picture:
     caption : str
         What is shown.
     alt : str
-        What it shows, for readers who cannot see it: the finding, not the axes.
+        Description for readers who cannot see it: the kind of plot and its result.
     draw : callable
-        Makes the figure anew.
+        Makes a new figure.
     """
 
     name: str
@@ -101,7 +101,7 @@ Block = Paragraph | Bullets | Listing | Table | Picture
 
 @dataclass(frozen=True)
 class Section:
-    """A heading and what stands under it; details follow the signature."""
+    """A heading with its content; details follow the signature."""
 
     title: str
     blocks: tuple[Block, ...]
@@ -127,9 +127,10 @@ class Document:
     status : str
         "trusted", "approximate", "not determined" or "not described".
     verdict : tuple of str
-        What was found, and what speaks against it.
+        The result, and the objections to it.
     header : tuple of (name, lines)
-        Specimen, model, data, instruments and the like; no lines: to be filled in by hand.
+        Specimen, model, data, instruments and so on; a field without lines is to be filled in by
+        hand.
     sections : tuple of Section
         The rest, in reading order, details last.
     facts : mapping

@@ -1,4 +1,4 @@
-"""The command that repeats a result that was made in Python, where there is one."""
+"""The command that reproduces a result from Python, if there is one."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _OPTIONS = {"f_max", "sigma", "alpha", "mass", "damping", "stiffness"}
 
 
 def equivalent_command(results: Sequence[FitResult | ChainPosterior]) -> str | None:
-    """Return the commands, a line each; None where no options describe data or model."""
+    """Return the commands, one per line; None if no options describe data or model."""
     source = _source(results[0].data)
     elements = (e for result in results for e in result.problem.model.elements)
     if source is None or not all(_has_text(element) for element in elements):
@@ -41,7 +41,7 @@ def equivalent_command(results: Sequence[FitResult | ChainPosterior]) -> str | N
 
 
 def _source(data: FrequencyResponse) -> tuple[list[str], list[str]] | None:
-    """Return the commands that come before, and the files with the options of reading them."""
+    """Return the preceding commands, and the files with the options for reading them."""
     all_parts = parts(data)
     first = all_parts[0]
     options, made = _options_of(first), _extraction_of(first)
@@ -50,7 +50,7 @@ def _source(data: FrequencyResponse) -> tuple[list[str], list[str]] | None:
         return None
     files = [str(part["file"]) for part in all_parts]
     before = []
-    if "generator" in first:  # a shipped data set, which has no place of its own
+    if "generator" in first:  # a shipped data set, which has no path
         before.append(f"dahl-ident datasets {first['name']} -o -")
         files = ["-"]
     if not made:
@@ -68,7 +68,7 @@ def _options_of(part: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _extraction_of(part: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of an extraction as they are typed; none where there was none."""
+    """Return the options of an extraction as typed; none if there was no extraction."""
     made = part.get("extraction")
     if not isinstance(made, Mapping):
         return {}

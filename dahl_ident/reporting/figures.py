@@ -1,4 +1,4 @@
-"""The pictures of a report, each with a caption and a text that states its finding."""
+"""The figures of a report, each with a caption and a description of what is seen."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _STRAIGHT = 1.5  # log of a profile's range beyond which its axis is logarithmic
 
 
 def pictures_of_fit(fit: FitResult) -> Iterator[Picture]:
-    """Yield what a fit has to show."""
+    """Yield the figures of a fit."""
     yield _response(fit)
     if fit.success and _is_plant_over_amplitude(fit):
         yield _over_levels(fit)
@@ -60,7 +60,8 @@ def budget_picture(found: Budget) -> Picture:
     return Picture(
         "budget",
         "Share of each source in the variance of each parameter.",
-        f"The largest source is, for {'; for '.join(largest)}.",
+        "Bars with the shares of the sources. The largest source is, for "
+        f"{'; for '.join(largest)}.",
         lambda: figure_of(plots.plot_budget(rows)),
     )
 
@@ -70,9 +71,9 @@ def _response(fit: FitResult) -> Picture:
     gain, phase = data.gain, np.degrees(data.phase)
     worst = float(np.abs(_whitened_pairs(fit)).max())
     alt = (
-        f"Gain of the data from {gain.min():.3g} to {gain.max():.3g} {data.unit}, phase from "
-        f"{phase.min():.1f} to {phase.max():.1f} degrees; the farthest point lies {worst:.1f} "
-        "standard deviations from the fit."
+        f"Gain above phase, as points with fitted lines: gain from {gain.min():.3g} to "
+        f"{gain.max():.3g} {data.unit}, phase from {phase.min():.1f} to {phase.max():.1f} degrees; "
+        f"the farthest point lies {worst:.1f} standard deviations from the fit."
     )
     over_frequency = curves.is_over_frequency(data)
     over = "frequency" if over_frequency else "amplitude"
@@ -107,14 +108,14 @@ def _over_levels(fit: FitResult) -> Picture:
         "levels",
         "The fitted plant over the frequencies of the data, at five levels of the drive: friction "
         "makes the response depend on its level.",
-        f"The largest receptance is {peaks[0]} {gain_unit} at the smallest drive and {peaks[1]} "
-        f"{gain_unit} at the largest.",
+        f"Receptance against frequency, five lines; the largest is {peaks[0]} {gain_unit} at the "
+        f"smallest drive and {peaks[1]} {gain_unit} at the largest.",
         draw,
     )
 
 
 def _is_plant_over_amplitude(fit: FitResult) -> bool:
-    """Return whether a plant was driven by force at a few frequencies apart from each other."""
+    """Return whether a plant was driven by force at a few widely spaced frequencies."""
     data = fit.data.select(harmonic=1)
     low, high = _ends(data.frequency_hz)
     several = len(fit.model.elements) > 1 and high > _APART * low
@@ -129,8 +130,8 @@ def _residuals(fit: FitResult) -> Picture:
     pairs = _whitened_pairs(fit)
     beyond = int(np.sum(np.abs(pairs) > 3.0))
     alt = (
-        f"{pairs.size} residuals with a standard deviation of {pairs.std():.2f}; {beyond} of them "
-        f"beyond three standard deviations. {fit.goodness.headline}"
+        f"Residuals as points: {pairs.size} with a standard deviation of {pairs.std():.2f}; "
+        f"{beyond} of them beyond three standard deviations. {fit.goodness.headline}"
     )
     caption = (
         "Residuals of every point; the grey band is two standard deviations, suspicious points "
@@ -154,9 +155,10 @@ def _universal(fit: FitResult, curve: UniversalCurve) -> Picture:
 
     return Picture(
         "universal_curve",
-        "Data over the fitted stiffness on the universal curve h(beta), which every set of "
+        "Data divided by the fitted stiffness, and the universal curve h(beta), which every set of "
         "parameters of this law follows; numbers are beta.",
-        f"The farthest point lies {off:.2g} from the curve, where 1 is the response at rest.",
+        f"Points in the complex plane along the curve; the farthest is {off:.2g} from it, in units "
+        "of the stiffness.",
         draw,
     )
 
@@ -179,7 +181,7 @@ def _profiles(fit: FitResult) -> Picture:
         "profiles",
         "Profile likelihood of each parameter: where the curve meets a dashed line is the limit at "
         "that confidence.",
-        f"At the lowest points {', '.join(best)}.",
+        f"One curve for each parameter; at the minima {', '.join(best)}.",
         draw,
     )
 
@@ -204,7 +206,7 @@ def _draw_profile(fit: FitResult, index: int, axis: plots.Axes) -> None:
 def _profile_range(
     fit: FitResult, index: int, profiler: Profiler, q: FloatArray, points: int = 41
 ) -> FloatArray:
-    """Return search coordinates out to the widest limit; three decades where it is open."""
+    """Return search coordinates out to the widest limit; three decades if it is open."""
     lower, upper = (side[-1, index] for side in profiler.limits(q))
     best = float(fit.optimum.theta[index])
     reach = np.log(1e3) if fit.problem.parameters[index].transform == "log" else abs(best) + 1.0
@@ -220,7 +222,8 @@ def _correlation(fit: FitResult) -> Picture:
     return Picture(
         "correlation",
         "Correlation of the estimates.",
-        f"The strongest correlation is {matrix[i, j]:.2f}, between {names[i]} and {names[j]}.",
+        f"Matrix of numbers; the strongest correlation is {matrix[i, j]:.2f}, between {names[i]} "
+        f"and {names[j]}.",
         lambda: figure_of(plots.plot_correlation(names, matrix)),
     )
 
@@ -236,9 +239,11 @@ def _information(fit: FitResult) -> Picture:
     ]
     return Picture(
         "information",
-        "Which amplitudes carry the information on which parameter: the area of a disc is the "
+        "Amplitudes that carry the information on each parameter: the area of a disc is the "
         "share of one point, and the largest share is written.",
-        "; ".join(places) + "." if places else "No point distinguishes the parameters.",
+        "Discs on one line for each parameter; " + "; ".join(places) + "."
+        if places
+        else "No point distinguishes the parameters.",
         lambda: figure_of(
             plots.plot_information(
                 x,
@@ -256,7 +261,7 @@ def _whitened_pairs(fit: FitResult) -> FloatArray:
 
 
 def _is_friction_alone(fit: FitResult) -> bool:
-    """Return whether the data are the dynamic stiffness of one law, through exact channels."""
+    """Return whether the data are the dynamic stiffness of one law, with exact channels."""
     elements = fit.model.elements
     exact = fit.problem.sensors.are_exact and not curves.is_force_controlled(fit.data)
     whole = bool((fit.data.harmonic == 1).all()) and fit.data.quantity == "dynamic_stiffness"

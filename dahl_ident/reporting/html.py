@@ -1,4 +1,4 @@
-"""One HTML file that needs nothing else: styles, script and pictures are in it."""
+"""One self-contained HTML file, including styles, script and figures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dahl_ident.reporting.document import Document, Picture
 
 
 def html(document: Document) -> bytes:
-    """Return the page; text is escaped, and a policy in the page forbids any network access."""
+    """Return the page; text is escaped, and the page's security policy forbids network access."""
     room = files("dahl_ident.reporting")
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True

@@ -1,4 +1,4 @@
-"""Hysteresis loops of the fitted friction, beside those that the harmonics of the data make."""
+"""Hysteresis loops of the fitted friction, and loops from the measured harmonics."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def loops(fit: FitResult, friction: Friction) -> Picture:
 
     lines = "Lines: friction of the fitted element at three amplitudes of the data."
     dots = (
-        "Dots: the sum of the measured harmonics, less what the rest of the model takes."
+        "Dots: the sum of the measured harmonics, less the force of the other elements."
         if measured
         else "The data hold no higher harmonics of the force, so there is no measured loop."
     )
@@ -102,9 +102,9 @@ def _distance(
     drawn: Sequence[tuple[FloatArray, FloatArray]],
     measured: Sequence[tuple[FloatArray, FloatArray]],
 ) -> str:
-    """Say how far the measured loops lie from those of the model."""
+    """Return a sentence on the distance of the measured loops from those of the model."""
     away = []
     for (_, model), (_, force) in zip(drawn, measured, strict=True):
         same = model[:: (model.size - 1) // (force.size - 1)]
         away.append(np.sqrt(np.mean((force - same) ** 2)) / np.abs(force).max())
-    return f"The measured loops lie within {100.0 * max(away):.2g} % rms of the model's."
+    return f"The measured loops are within {100.0 * max(away):.2g} % rms of the model's."

@@ -1,4 +1,4 @@
-"""Markdown for wikis and version control; pictures lie in a folder beside it."""
+"""Markdown for wikis and version control, with figures in a folder beside it."""
 
 from __future__ import annotations
 
@@ -71,5 +71,5 @@ def _cell(cell: Cell) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Return text in which nothing is taken for markup."""
+    """Return text with all markup characters escaped."""
     return re.sub(r"([\\`*_{}\[\]<>|#~$])", r"\\\1", " ".join(text.split()))

@@ -1,4 +1,4 @@
-"""What only the laboratory knows: specimen, instruments, ambient conditions, operator."""
+"""Metadata from the laboratory: specimen, instruments, ambient conditions, operator."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _INSTRUMENT = ("name", "quantity", "model", "serial", "calibration", "uncertaint
 
 @dataclass(frozen=True)
 class Metadata:
-    """What a laboratory states beside the data; an empty field is printed as a line to fill in.
+    """Metadata that a laboratory states; an empty field is printed as a line to fill in.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Metadata:
     instruments: tuple[str, ...] = ()
 
     def header(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
-        """Return the fields that only the laboratory knows, each with its lines."""
+        """Return the fields of the laboratory, each with its lines."""
         known = (
             ("Laboratory", self.laboratory),
             ("Customer", self.customer),
@@ -68,7 +68,7 @@ def metadata_of(given: Mapping[str, Any] | str | Path | None) -> Metadata:
     DataError
         If the file cannot be read or is not TOML.
     ValidationError
-        If a field is unknown, or is not of its kind.
+        If a field is unknown, or has the wrong type.
     """
     if given is None:
         return Metadata()

@@ -1,4 +1,4 @@
-"""Fits on different data side by side: their curves overlaid, their changes with significance."""
+"""Fits on different data side by side: curves overlaid, changes with their significance."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def overlay(
     Raises
     ------
     ValidationError
-        If a result is no fit, or the fits measure different quantities.
+        If a result is not a fit, or the fits measure different quantities.
     """
     fits = [result for result in results if isinstance(result, FitResult)]
     if len(fits) < len(results):
@@ -106,13 +106,13 @@ def overlay(
 _HOW = (
     "A change is the difference of two estimates; its standard uncertainty is the root of the sum "
     "of both variances, so a calibration error that both share does not show in it. p is the "
-    "two-sided probability of a change as large as this without any real one; below "
+    "two-sided probability of a change this large if there is no real change; below "
     f"{SIGNIFICANT:g} it is called significant."
 )
 
 
 def _names(fits: Sequence[FitResult]) -> list[str]:
-    """Return a name for each fit: its file, with a number where several are called the same."""
+    """Return a name for each fit: its file, with a number if several have the same name."""
     named = []
     for i, fit in enumerate(fits, 1):
         files = [Path(str(part["file"])).stem for part in parts(fit.data) if "file" in part]
@@ -154,7 +154,7 @@ def _changes(a: str, fit: FitResult, b: str, later: FitResult) -> list[dict[str,
 
 
 def _is_usable(fit: FitResult, name: str) -> bool:
-    """Return whether the estimate of a parameter has an uncertainty that holds."""
+    """Return whether the uncertainty of a parameter is valid."""
     identified = fit.identifiability.parameters[name].verdict is Verdict.IDENTIFIED
     return identified and str(fit.status) != "not described"
 

@@ -1,6 +1,6 @@
-"""A PDF on A4, made by fpdf2: pure Python, so pip installs all of it.
+"""A PDF on A4, made by fpdf2, which is pure Python and installed by pip.
 
-Letters come from the DejaVu fonts that matplotlib brings along, so Greek and accents print.
+It uses the DejaVu fonts that are shipped with matplotlib, which have Greek letters and accents.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _FONT = "DejaVu"
 _FONTS = Path(mpl.get_data_path()) / "fonts" / "ttf"
 _FACES = {"": "DejaVuSans.ttf", "B": "DejaVuSans-Bold.ttf", "I": "DejaVuSans-Oblique.ttf"}
 _PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
-_HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; what a heading or a caption has below itself
-_WIDEST = 26  # characters that a column of a table has room for
+_HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; space kept below a heading or a caption
+_WIDEST = 26  # characters in the widest column of a table
 _MARGIN, _BOLD = 3.0, 1.25  # characters beside the text; how much wider bold ones are
 _NAME_WIDTH = 38.0  # mm, of the fields' names in the header
 _COLOURS = {
@@ -85,7 +85,7 @@ def pdf(document: Document) -> bytes:
 
 def _page(document: Document) -> FPDF:
     class Page(FPDF):
-        """A page that shows what its font lacks, where fpdf2 would leave it out."""
+        """A page that shows characters missing from its font, which fpdf2 would leave out."""
 
         def normalize_text(self, text: str) -> str:
             return super().normalize_text(_printable(text))
@@ -108,17 +108,17 @@ def _page(document: Document) -> FPDF:
 
 
 def _heading(page: FPDF, text: str, level: int) -> None:
-    """Print a heading, marked as such for programs that read the page aloud."""
+    """Print a heading, tagged for screen readers."""
     page.set_font(_FONT, "B", 17 if level == 1 else 12)
     height = 8 if level == 1 else 6
     _turn_unless_room(page, 3.0 * height)  # a marked sequence must not cross pages
-    with page._marked_sequence(title=text) as element:  # the one way that fpdf2 has
+    with page._marked_sequence(title=text) as element:  # the only way in fpdf2
         element.s = Name(f"H{level}")
         page.multi_cell(0, height, text, new_x="LMARGIN", new_y="NEXT")
 
 
 def _header(page: FPDF, document: Document) -> None:
-    """Print specimen, model, data and so on, with a line to fill in where nothing is known."""
+    """Print specimen, model, data and so on, with a line to fill in for empty fields."""
     page.ln(1)
     for name, lines in document.header:
         page.set_font(_FONT, "B", 8)
@@ -169,7 +169,7 @@ def _text(page: FPDF, text: str) -> None:
 
 
 class _Drawn:
-    """A picture as PNG, with the height that it takes on the page."""
+    """A picture as PNG, with its height on the page."""
 
     def __init__(self, picture: Picture) -> None:
         from PIL import Image
@@ -199,7 +199,7 @@ def _row_height(row: Sequence[_Drawn]) -> float:
 
 
 def _turn_unless_room(page: FPDF, height: float) -> None:
-    """Begin a new page where so much does not fit below."""
+    """Begin a new page if this height does not fit below."""
     if page.get_y() + height > page.h - page.b_margin:
         page.add_page()
 
@@ -299,6 +299,6 @@ def _known_characters() -> frozenset[int]:
 
 
 def _printable(text: str) -> str:
-    """Return text with the codes of characters in place of those that the font has not."""
+    """Return text with codes in place of characters that the font lacks."""
     known = _known_characters()
     return "".join(c if ord(c) in known or c.isspace() else f"<U+{ord(c):04X}>" for c in text)

@@ -1,4 +1,4 @@
-"""What a report says about a posterior."""
+"""The sections of a report on a posterior."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def sections(posterior: ChainPosterior) -> Iterator[Section]:
 
 
 def verdict(posterior: ChainPosterior) -> list[str]:
-    """Return whether to use it, what the prior decides, and what does not fit."""
+    """Return whether it can be used, which parameters the prior determines, and misfits."""
     return [f"Posterior: {posterior.message}", *posterior.findings]
 
 
@@ -60,7 +60,7 @@ def _numbers(posterior: ChainPosterior) -> Iterator[Block]:
     yield _summary(posterior)
     yield Paragraph(
         "mcse is the Monte Carlo standard error of the mean, ess the effective number of draws, "
-        "r_hat compares independent ensembles and is 1 where they agree."
+        "r_hat compares independent ensembles and is 1 if they agree."
     )
     yield Paragraph(f"Priors (likelihood: {posterior.likelihood.replace('_', ' ')}):")
     yield Bullets(tuple(f"{name}: {text}" for name, text in posterior.priors.items()))
@@ -70,7 +70,7 @@ def _numbers(posterior: ChainPosterior) -> Iterator[Block]:
 
 
 def _row(row: pd.Series[Any]) -> Iterator[Cell]:
-    """Yield the numbers of one parameter, no finer than its standard deviation."""
+    """Yield the numbers of one parameter, rounded by its standard deviation."""
     std = float(row["std"])
     for name in ("mean", *QUANTILES):
         value, error = rounded(float(row[name]), std)
@@ -101,7 +101,7 @@ def _corner(posterior: ChainPosterior) -> Picture:
 def _trace(posterior: ChainPosterior) -> Picture:
     return Picture(
         "trace",
-        "Paths of the walkers; the shaded warm-up is left out of every number.",
+        "Paths of the walkers; the shaded warm-up is not used in any result.",
         f"{posterior.steps} steps, of which the first {posterior.warm_up} are warm-up. "
         f"{'The chain has converged' if posterior.converged else 'The chain has NOT converged'}.",
         lambda: posterior.plot_trace()[0].figure,

@@ -1,4 +1,4 @@
-"""Where a result comes from: files and their hashes, options, versions."""
+"""Provenance of a result: files and their hashes, options, versions."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class SourceFile:
     Attributes
     ----------
     file, sha256 : str
-        Its name, and the hash of what was in it; empty where it is unknown.
+        Its name, and the hash of its content; empty if unknown.
     read : bool
-        Whether the data were read from it; else it is what such a file was made from.
+        Whether the data were read from it; otherwise it is the original of such a file.
     """
 
     file: str
@@ -36,7 +36,7 @@ class SourceFile:
 
 
 def sources(data: FrequencyResponse) -> Iterator[SourceFile]:
-    """Yield every file that was read, each followed by those that it was made from."""
+    """Yield every file that was read, each followed by its originals."""
     for part in parts(data):
         for i, one in enumerate(_with_origins(part)):
             if "file" in one:
@@ -44,12 +44,12 @@ def sources(data: FrequencyResponse) -> Iterator[SourceFile]:
 
 
 def notes(data: FrequencyResponse) -> list[str]:
-    """Return what had to be assumed on reading."""
+    """Return the assumptions made when reading."""
     return list(dict.fromkeys(str(note) for part in parts(data) for note in part.get("notes", [])))
 
 
 def options(data: FrequencyResponse) -> list[tuple[str, str]]:
-    """Return how the data were made, key by key, where they say so and it is not the default."""
+    """Return how the data were made, key by key, if stated and not the default."""
     found: dict[str, str] = {}
     for part in (one for whole in parts(data) for one in _with_origins(whole)):
         given_keys = {k: v for k, v in part.items() if k not in _LISTED_ELSEWHERE}
@@ -81,7 +81,7 @@ def parts(data: FrequencyResponse) -> list[Mapping[str, Any]]:
 
 
 def _with_origins(part: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """Yield the provenance of a table, and after it of what that was made from."""
+    """Yield the provenance of a table, followed by that of its originals."""
     waiting = [part]
     while waiting:
         part = waiting.pop(0)

@@ -1,4 +1,4 @@
-"""``report(results, path)``: results to a file that others can read, trust and repeat."""
+"""``report(results, path)``: writes results to a file that others can read and reproduce."""
 
 from __future__ import annotations
 
@@ -43,19 +43,19 @@ def report(
     Parameters
     ----------
     results : FitResult, ChainPosterior, RecordFit, or sequence of them
-        What to report on. Results on different data have to be fits. Fits to records are
-        reported by themselves.
+        The results to report. Results on different data have to be fits. Fits to records are
+        reported separately.
     path : path
         Ending in ``.html`` (one file, no network), ``.pdf``, ``.md`` (pictures in a folder
         beside it) or ``.json``.
     title : str, optional
         First line; by default the file's name.
     command : str, optional
-        The command that repeats it; by default the one that fits the same model.
+        The command that reproduces it; by default the one that fits the same model.
     record : Record, optional
         The waveforms that the data were extracted from; the report shows how a point settled.
     metadata : mapping or path of a TOML file, optional
-        What only the laboratory knows: title, laboratory, customer, specimen, operator, measured
+        Metadata from the laboratory: title, laboratory, customer, specimen, operator, measured
         (date), ambient, instruments, remarks. Fields left out are printed as lines to fill in.
     overwrite : bool, default False
         Replace a report that is there already.
@@ -93,8 +93,8 @@ def report(
     if of_records:
         if len(of_records) < len(given) or record is not None:
             raise ValidationError(
-                "fits to records are reported by themselves; leave out record= and the results "
-                "on frequency responses, and give those a report of their own"
+                "fits to records are reported separately; leave out record= and the results "
+                "on frequency responses, and write another report for those"
             )
         whole = record_document(of_records, title=title, command=command, metadata=known)
     elif _on_one_table(checked := _checked(given)):
@@ -114,7 +114,7 @@ def report(
 
 
 def _checked(results: list[Any]) -> list[Result]:
-    """Return the results, which have to be of kinds that are reported."""
+    """Return the results, after a check of their types."""
     if not results:
         raise ValidationError("there is no result to report on; expected at least one")
     for i, result in enumerate(results):

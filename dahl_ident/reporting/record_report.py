@@ -1,4 +1,4 @@
-"""What a report says on a fit to records: answer, budget, assumptions, pictures, goodness."""
+"""Report on a fit to records: result, budget, assumptions, figures, goodness of fit."""
 
 from __future__ import annotations
 
@@ -145,13 +145,14 @@ def _assumed(fit: RecordFit) -> Iterator[str]:
         yield f"Held fixed: {', '.join(fixed)}."
     yield f"Taken as exact: {', '.join(fit.errors.exact)}."
     if fit.weighted:
-        yield "Residuals are weighted by their spectrum, because slow noise prevails in them."
+        yield "Residuals are weighted by their spectrum, because slow noise dominates them."
 
 
 def _pictures(fit: RecordFit, number: int) -> Iterator[Picture]:
     worst = fit.goodness.worst_record - 1
     of = f" of record {worst + 1}, which is described worst" if len(fit.records) > 1 else ""
-    left = f"{100.0 * fit.goodness.share_left**0.5:.2g} % rms of the measured signal is left"
+    share = 100.0 * fit.goodness.share_left**0.5
+    left = f"the residuals are {share:.2g} % rms of the measured signal"
     shown = [
         ("time", f"Measured and fitted {fit.problem.output}{of}"),
         ("residuals", f"Residuals over time{of}"),

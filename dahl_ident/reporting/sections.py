@@ -1,4 +1,4 @@
-"""What a report says, in this order: answer, budget, what was assumed, pictures, details."""
+"""Sections of a report, in this order: result, budget, assumptions, figures, details."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def title_of(data: FrequencyResponse) -> str:
 
 
 def worst_status(results: Sequence[Result]) -> str:
-    """Return the status of the result that is farthest from being trusted."""
+    """Return the worst status of the results."""
     order = list(MARKS)
     return max((str(result.status) for result in results), key=order.index)
 
@@ -163,7 +163,7 @@ def _model(result: Result) -> Iterator[str]:
 
 
 def _verdict(fit: FitResult, several: bool) -> list[str]:
-    """Return a fit's statements; among others its model and whether to trust it go first."""
+    """Return a fit's statements; if there are several fits, model and status come first."""
     warnings = [f"Warning: {text}" for text in fit.goodness.warnings]
     first, *others = fit.statements
     if several:
@@ -187,7 +187,7 @@ def _answer(fit: FitResult, of: str) -> Iterator[Section]:
 
 
 def _budget(fit: FitResult) -> Iterator[Block]:
-    """Yield where the uncertainty comes from; nothing where none can be stated."""
+    """Yield the uncertainty budget; nothing if none can be stated."""
     if fit.status != VerdictStatus.NOT_DESCRIBED and fit.errors is not None:
         found = fit.budget()
         yield tables.budget(found)
@@ -195,7 +195,7 @@ def _budget(fit: FitResult) -> Iterator[Block]:
 
 
 def _assumed(fit: FitResult) -> Iterator[Block]:
-    """Yield what the result rests on and these data do not test."""
+    """Yield the assumptions of the result that these data do not test."""
     fixed = [_value(p.name, p.value, p.unit) for p in fit.params.values() if not p.vary]
     exact = taken_as_exact(fit.optimum)
     lines = [f"Held fixed: {listed(fixed)}."] if fixed else []
@@ -265,8 +265,8 @@ def _extraction(data: FrequencyResponse, record: Record | None) -> Iterator[Sect
         (
             Paragraph(
                 f"Points measured from waveforms: {verdicts.size}, {says}. Leading cycles are left "
-                "out where friction had not yet settled after the previous step; the bias is an "
-                "upper bound of what remains of the transient in the cycles used."
+                "out if friction had not yet settled after the previous step; the bias is an "
+                "upper bound for the remaining transient in the cycles used."
             ),
             tables.extraction(data),
             *seen,
@@ -296,7 +296,7 @@ def _origin(data: FrequencyResponse, command: str | None, *, typed: bool) -> Ite
         yield Paragraph(f"{when}, in Python; no command describes this model and these data.")
         return
     how = (
-        ". This command repeats it:"
+        ". This command reproduces it:"
         if typed
         else ", in Python. With all rows of the files, this command gives the same result:"
     )

@@ -1,4 +1,4 @@
-"""How a point settled, cycle by cycle: from the waveforms that it was extracted from."""
+"""Settling of a point, cycle by cycle, from the waveforms from which it was extracted."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _INTEGRATIONS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
 
 def settling(data: FrequencyResponse, record: Record) -> Picture:
-    """Return the picture of the point whose bias is largest beside its error.
+    """Return the figure of the point with the largest ratio of bias to error.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def settling(data: FrequencyResponse, record: Record) -> Picture:
     where = f"{f:.4g} Hz, {points.amplitude[i]:.3g} {si_unit('displacement', data.motion)}"
     return Picture(
         "cycles",
-        f"How the point at {where} settled, the one with the largest bias beside its error: "
+        f"Settling of the point at {where}, which has the largest ratio of bias to error: "
         f"{dropped} of {response.size} cycles are left out. The grey band is two standard "
         "deviations of one cycle.",
         f"The response of the {used.size} cycles used scatters by {scatter:.2g} %; the bias is "

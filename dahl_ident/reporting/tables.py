@@ -27,7 +27,7 @@ LEVEL = 0.9545
 
 
 def answer(fit: FitResult, *, described: bool) -> Table:
-    """Return every free parameter with its interval; what is not to be used is struck."""
+    """Return every free parameter with its interval; unusable numbers are struck."""
     limits = fit.conf_interval().at(LEVEL)
     rows = []
     for name in fit.var_names:
@@ -39,7 +39,7 @@ def answer(fit: FitResult, *, described: bool) -> Table:
         closed = lost and bool(np.isfinite([found.lower, found.upper]).all())  # a bound holds
         reason = judged.text.removeprefix(f"{name}: ") if lost else judged.verdict.value
         if not described and not lost:
-            reason = "the model does not describe the data: the interval does not hold"
+            reason = "the model does not describe the data: the interval is not valid"
         if fit.status == VerdictStatus.APPROXIMATE and not lost:
             reason += "; u includes the misfit"
         rows.append(
@@ -65,7 +65,7 @@ def answer(fit: FitResult, *, described: bool) -> Table:
 
 
 def budget(found: Budget) -> Table:
-    """Return every source of uncertainty of every parameter; the combined one stands first."""
+    """Return every source of uncertainty of every parameter; the combined one comes first."""
     rows = []
     for p in found.parameters:
         unit = p.unit or "-"
@@ -132,7 +132,7 @@ def parameters(
 
 
 def method_name(intervals: ConfidenceIntervals) -> str:
-    """Return how a method is called in running text."""
+    """Return the name of a method in running text."""
     return "Wald" if intervals.method == "wald" else intervals.method
 
 
@@ -146,7 +146,7 @@ def credible_interval(posterior: ChainPosterior, name: str) -> str:
 
 
 def linearization(fit: FitResult) -> Table | None:
-    """Return equivalent stiffness, damping and loss of the friction over amplitude."""
+    """Return equivalent stiffness, damping and loss of the friction against amplitude."""
     friction = any(element.has_memory for element in fit.model.elements)
     if not friction or not all(np.isfinite(e.value) for e in fit.params.values()):
         return None
@@ -183,7 +183,7 @@ def comparison(compared: ModelComparison) -> Table:
 
 
 def measured(data: FrequencyResponse) -> Table:
-    """Return the data as they went into the fit."""
+    """Return the data as used in the fit."""
     columns: list[tuple[str, list[Cell]]] = [
         ("frequency [Hz]", [number(v, 5) for v in data.frequency_hz])
     ]
