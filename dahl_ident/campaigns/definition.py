@@ -23,14 +23,17 @@ Paths are relative to the file.
 
 from __future__ import annotations
 
+import csv
 import glob
 import hashlib
 import inspect
 import json
+import math
 import re
 import tomllib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +46,13 @@ _KINDS = ("record", "response")
 _UNITS = ("device", "run")
 _SET_BY_CAMPAIGN = {"data", "model", "path", "record", "run", "throw", "seed", "progress"}
 _FIELD = re.compile(r"\{([A-Za-z_][A-Za-z0-9_]*)\}")
+_COLUMNS = {
+    "device", "run", "status", "error", "statements", "points", "runs", "digests", "seconds",
+    "version", "report", "died", "key",
+}  # fmt: skip
+_PREFIXES = ("u_", "U_", "dof_", "unit_", "posterior_")
+"""Columns of the table of results, which covariates cannot be called."""
+_BLANK = ("", "na", "n/a", "nan")
 
 
 @dataclass(frozen=True)
@@ -120,7 +130,8 @@ def read_definition(source: str | Path | Mapping[str, Any]) -> Definition:
     ------
     DataError
         If the file cannot be read, a table or option is unknown, the pattern finds no file or no
-        device, two files have the same device and run, or a covariate is missing.
+        device, two files have the same device and run, or a covariate is missing, is given twice
+        or is called as a column of results.
     ModelError
         If an element of the model is unknown.
     """
@@ -140,17 +151,23 @@ def read_definition(source: str | Path | Mapping[str, Any]) -> Definition:
     _known(name, "options in [output]", output, _OUTPUT)
     kind = _choice(name, "[files] kind", files.get("kind", "record"), _KINDS)
     per = _choice(name, "[output] per", output.get("per", "device"), _UNITS)
+    place, reports = output.get("folder", "results"), output.get("reports", False)
+    if not isinstance(place, str) or not place:
+        raise DataError(f"{name}: [output] folder is {place!r}; expected the path of a folder")
+    if not isinstance(reports, bool):
+        raise DataError(f"{name}: [output] reports is {reports!r}; expected true or false")
+    model, parameters = _model(name, content.get("model"))
     options = {
         "kind": kind,
         "per": per,
-        "model": _model(name, content.get("model")),
+        "model": model,
         **{table: _table(name, content, table) for table in ("read", "extract", "fit")},
-        "posterior": content.get("posterior"),
+        "posterior": _table(name, content, "posterior") if "posterior" in content else None,
     }
     _check_options(name, options)
     tasks = _tasks(name, folder, files, per)
-    place = folder / str(output.get("folder", "results"))
-    return Definition(name, options, tasks, place, bool(output.get("reports", False)))
+    _check_names(name, tasks, parameters)
+    return Definition(name, options, tasks, folder / place, reports)
 
 
 def _table(name: str, content: Mapping[str, Any], key: str) -> dict[str, Any]:
@@ -175,12 +192,18 @@ def _choice(name: str, what: str, given: Any, known: Collection[str]) -> str:
     return str(given)
 
 
-def _model(name: str, entries: Any) -> list[dict[str, Any]]:
+def _model(name: str, entries: Any) -> tuple[list[dict[str, Any]], Collection[str]]:
+    """Return the model as plain data and the names of its parameters."""
     from dahl_ident.elements.description import describe_model, model_from_description
 
-    if not isinstance(entries, list) or not entries:
+    if (
+        not isinstance(entries, list)
+        or not entries
+        or not all(isinstance(entry, Mapping) for entry in entries)
+    ):
         raise DataError(f'{name}: there is no model; give [[model]] tables, such as kind = "dahl"')
-    return describe_model(model_from_description(entries))
+    model = model_from_description(entries)
+    return describe_model(model), [p.name for p in model.parameters]
 
 
 def _check_options(name: str, options: Mapping[str, Any]) -> None:
@@ -201,6 +224,30 @@ def _check_options(name: str, options: Mapping[str, Any]) -> None:
     for table, function in functions.items():
         known = set(inspect.signature(function).parameters) - _SET_BY_CAMPAIGN
         _known(name, f"options in [{table}]", options[table], known)
+    try:
+        json.dumps(options)
+    except TypeError as exc:
+        raise DataError(
+            f"{name}: a date or time stands where an option has none; expected a number or a text "
+            f"in quotes ({exc})"
+        ) from exc
+
+
+def _check_names(name: str, tasks: Sequence[Task], parameters: Collection[str]) -> None:
+    """Refuse covariates that are called as a column of results, and fits of the same name."""
+    taken = _COLUMNS | set(parameters)
+    for column in {column for task in tasks for column in task.covariates}:
+        if column in taken or column.startswith(_PREFIXES):
+            raise DataError(
+                f"{name}: a covariate is called {column!r}, as a column of the results; give it "
+                "another name"
+            )
+    for one, other in pairwise(sorted(tasks, key=lambda task: task.name)):
+        if one.name == other.name:
+            raise DataError(
+                f"{name}: device {one.device!r}, run {one.run!r} and device {other.device!r}, run "
+                f"{other.run!r} are both called {one.name}; rename the files of one"
+            )
 
 
 def _tasks(name: str, folder: Path, files: Mapping[str, Any], per: str) -> tuple[Task, ...]:
@@ -208,7 +255,7 @@ def _tasks(name: str, folder: Path, files: Mapping[str, Any], per: str) -> tuple
     if not isinstance(pattern, str):
         raise DataError(f"{name}: [files] has no pattern; give one, such as 'data/{{device}}.csv'")
     found = _matches(name, folder, pattern)
-    table = _covariates(folder, files.get("covariates"))
+    table = _covariates(name, folder, files.get("covariates"))
     groups: dict[tuple[str, str], list[tuple[str, Path, dict[str, float | str]]]] = {}
     seen: dict[tuple[str, str], Path] = {}
     for path, fields in found:
@@ -221,7 +268,13 @@ def _tasks(name: str, folder: Path, files: Mapping[str, Any], per: str) -> tuple
             )
         seen[device, run] = path
         values: dict[str, float | str] = {key: _value(text) for key, text in fields.items()}
-        values |= _looked_up(name, table, device, run)
+        own = _looked_up(name, table, device, run)
+        if both := values.keys() & own.keys():
+            raise DataError(
+                f"{name}: {', '.join(sorted(both))} stands in the pattern and in the table of "
+                "covariates; leave it out of one"
+            )
+        values |= own
         groups.setdefault((device, run if per == "run" else ""), []).append((run, path, values))
     return tuple(
         Task(
@@ -245,6 +298,11 @@ def _matches(name: str, folder: Path, pattern: str) -> list[tuple[Path, dict[str
     if len(set(fields)) < len(fields):
         raise DataError(f"{name}: the pattern {pattern!r} names a field twice")
     parts = _FIELD.split(pattern)
+    if any(brace in part for part in parts[::2] for brace in "{}"):
+        raise DataError(
+            f"{name}: the pattern {pattern!r} has braces without a name of letters, digits and _ "
+            "between them"
+        )
     wild = "".join("*" if i % 2 else glob.escape(part) for i, part in enumerate(parts))
     expression = re.compile(
         "".join(f"(?P<{part}>[^/]+?)" if i % 2 else re.escape(part) for i, part in enumerate(parts))
@@ -260,32 +318,42 @@ def _matches(name: str, folder: Path, pattern: str) -> list[tuple[Path, dict[str
 
 
 def _covariates(
-    folder: Path, given: Any
+    name: str, folder: Path, given: Any
 ) -> dict[tuple[str, str | None], dict[str, float | str]] | None:
     """Return the rows of the table by device and run, None where there is no table."""
     if given is None:
         return None
-    import pandas as pd
-
-    path = folder / str(given)
+    if not isinstance(given, str):
+        raise DataError(f"{name}: [files] covariates is {given!r}; expected the path of a table")
+    path = folder / given
     try:
-        frame = pd.read_csv(path, dtype=str)
-    except (OSError, ValueError) as exc:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            header, *lines = list(csv.reader(file)) or [[]]
+    except (OSError, UnicodeDecodeError, csv.Error) as exc:
         raise DataError(f"{path}: cannot be read as a CSV table of covariates: {exc}") from exc
-    if "device" not in frame:
+    if "device" not in header:
         raise DataError(
-            f"{path}: has the columns {', '.join(map(str, frame))}; expected one called device"
+            f"{path}: has the columns {', '.join(header) or 'none'}; expected one called device"
         )
-    keys = [c for c in ("device", "run") if c in frame]
+    if repeated := {c for c in header if header.count(c) > 1}:
+        raise DataError(f"{path}: several columns are called {', '.join(sorted(repeated))}")
+    keys = [c for c in ("device", "run") if c in header]
     rows: dict[tuple[str, str | None], dict[str, float | str]] = {}
-    for number, row in enumerate(frame.to_dict("records"), start=2):
-        key = (str(row["device"]), str(row["run"]) if "run" in frame else None)
+    for number, line in enumerate(lines, start=2):
+        if not line:
+            continue
+        if len(line) != len(header):
+            raise DataError(
+                f"{path}: line {number} has {len(line)} values; the header has {len(header)}"
+            )
+        row = dict(zip(header, line, strict=True))
+        if blank := [c for c in header if row[c].strip().lower() in _BLANK]:
+            raise DataError(f"{path}: line {number} has no value for {', '.join(blank)}")
+        key = (row["device"], row.get("run"))
         if key in rows:
-            raise DataError(f"{path}: line {number} repeats the {' and '.join(keys)} {key[0]!r}")
-        blank = [c for c in row if pd.isna(row[c])]
-        if blank:
-            raise DataError(f"{path}: line {number} has no value for {', '.join(map(str, blank))}")
-        rows[key] = {str(c): _value(str(v)) for c, v in row.items() if c not in keys}
+            both = " and ".join(f"{k} {row[k]!r}" for k in keys)
+            raise DataError(f"{path}: line {number} repeats the {both}")
+        rows[key] = {c: _value(row[c]) for c in header if c not in keys}
     return rows
 
 
@@ -315,6 +383,7 @@ def _shared(
 
 def _value(text: str) -> float | str:
     try:
-        return float(text)
+        number = float(text)
     except ValueError:
         return text
+    return number if math.isfinite(number) else text

@@ -86,26 +86,29 @@ def finished(path: Path) -> tuple[dict[str, int], int]:
     return places, end
 
 
-def write_tables(rows: Callable[[], Iterator[dict[str, Any]]], folder: Path) -> list[Path]:
+def write_tables(rows: Callable[[], Iterator[dict[str, Any]]], folder: Path) -> dict[str, int]:
     """Write ``results.csv`` and, where pyarrow is installed, ``results.parquet``, atomically.
 
-    `rows` is called twice: once for the columns, once for the content.
+    `rows` is called once for the columns and once for each file.
+
+    Returns
+    -------
+    dict of str to int
+        How many rows there are of each status.
     """
     columns: dict[str, type] = {}
+    statuses: dict[str, int] = {}
     for row in rows():
+        statuses[row["status"]] = statuses.get(row["status"], 0) + 1
         for name, value in _flat(row).items():
             if value is not None:
                 columns[name] = str if columns.get(name, type(value)) is str else type(value)
     rest = [c for c in columns if c not in _FIRST]
     order = [*(c for c in _FIRST if c in columns), *sorted(rest)]
-    return [
-        _written(folder / "results.csv", rows, order, columns, _csv),
-        *(
-            [_written(folder / "results.parquet", rows, order, columns, _parquet)]
-            if _has_pyarrow()
-            else []
-        ),
-    ]
+    _written(folder / "results.csv", rows, order, columns, _csv)
+    if _has_pyarrow():
+        _written(folder / "results.parquet", rows, order, columns, _parquet)
+    return statuses
 
 
 def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -148,12 +151,11 @@ def _written(
     order: Sequence[str],
     columns: Mapping[str, type],
     write: Callable[[Path, Iterator[pd.DataFrame]], None],
-) -> Path:
+) -> None:
     try:
         put_in_place(path, lambda part: write(part, _frames(rows, order, columns)))
     except OSError as exc:
         raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
-    return path
 
 
 def _csv(path: Path, frames: Iterator[pd.DataFrame]) -> None:

@@ -9,13 +9,13 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from dahl_ident.arrays import whole_number
 from dahl_ident.campaigns.definition import Definition, Task, read_definition
 from dahl_ident.campaigns.engine import default_workers, run_jobs
 from dahl_ident.campaigns.journal import Journal, finished, write_tables
-from dahl_ident.campaigns.work import Job, digest_of
+from dahl_ident.campaigns.work import Job, Row, digest_of
 from dahl_ident.data.file_lock import locked
 from dahl_ident.data.storage import write_whole
 from dahl_ident.errors import DataError
@@ -24,7 +24,10 @@ from dahl_ident.version import __version__
 if TYPE_CHECKING:
     import pandas as pd
 
+_Tag = TypeVar("_Tag")
 _JOURNAL = "journal.jsonl"
+_TRIALS = 3
+"""Fits that say whether the options of a new campaign can be used at all."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,7 @@ class Campaign:
 
 
 def campaign(
-    source: str | Path | Mapping[str, Any],
+    source: str | Path | Mapping[str, Any] | Definition,
     *,
     jobs: int | None = None,
     executor: Executor | None = None,
@@ -135,7 +138,7 @@ def campaign(
 
     Parameters
     ----------
-    source : path or mapping
+    source : path, mapping or Definition
         TOML file, or its content; see :mod:`dahl_ident.campaigns.definition`.
     jobs : int, optional
         Processes of this machine, with one numerical thread each; by default as many as there
@@ -161,8 +164,9 @@ def campaign(
     Raises
     ------
     DataError
-        If the definition is wrong in any part; if options changed and `redo` is not set; or if
-        another process runs the same campaign.
+        If the definition is wrong in any part; if the first fits all fail because of the options
+        or the model; if options changed and `redo` is not set; or if another process runs the
+        same campaign.
     ValidationError
         If `jobs` is no whole number of at least 1.
 
@@ -188,7 +192,7 @@ def campaign(
     {'device': ['clean', 'noisy'], 'sigma': [30.0, 30.0]}
     """
     workers = default_workers() if jobs is None else whole_number(jobs, "jobs", 1)
-    definition = read_definition(source)
+    definition = source if isinstance(source, Definition) else read_definition(source)
     folder = definition.folder
     if dry_run:
         keys = _keys(definition)
@@ -200,8 +204,7 @@ def campaign(
     except OSError as exc:
         raise DataError(f"{folder}: cannot be made: {exc.strerror or exc}") from exc
     with locked(folder / _JOURNAL, DataError):
-        if not _options_agree(definition, redo) or not (folder / "options.json").exists():
-            write_whole(folder / "options.json", _options(definition), overwrite=True)
+        agree = _options_agree(definition, redo)
         keys = _keys(definition)
         with closing(Journal(folder / _JOURNAL)) as journal:
             outcome = _split(definition, keys, set(journal.places), {})
@@ -209,20 +212,42 @@ def campaign(
                        if key not in journal.places]  # fmt: skip
             jobs_of = ((tag, _job(definition, tag[1], send_files)) for tag in missing)
             done = run_jobs(jobs_of, workers, executor)
+            if not agree:
+                done = _unless_refused(done, min(_TRIALS, len(missing)), definition.source)
             for number, ((key, _), row) in enumerate(done, start=1):
+                if not agree:
+                    write_whole(folder / "options.json", _options(definition), overwrite=True)
+                    agree = True
                 journal.add(key, row)
                 if progress is not None:
                     progress(number, len(missing), row)
-            statuses: dict[str, int] = {}
 
             def rows() -> Iterator[dict[str, Any]]:
                 for task, row in zip(definition.tasks, journal.rows(keys), strict=True):
                     yield _whole(task, row)
 
-            for row in rows():
-                statuses[row["status"]] = statuses.get(row["status"], 0) + 1
-            write_tables(rows, folder)
+            statuses = write_tables(rows, folder)
     return Campaign(folder, outcome.finished, outcome.to_do, statuses)
+
+
+def _unless_refused(
+    done: Iterator[tuple[_Tag, Row]], trials: int, source: str
+) -> Iterator[tuple[_Tag, Row]]:
+    """Pass rows on, unless the first `trials` all say that the options or the model are wrong.
+
+    A device alone may have data that some option does not fit, so that one such row says nothing.
+    """
+    held: list[tuple[_Tag, Row]] = []
+    for tagged in done:
+        held.append(tagged)
+        errors = {row.get("error", "") for _, row in held}
+        if len(errors) == 1 and errors.pop().startswith(("ValidationError:", "ModelError:")):
+            if len(held) < trials:
+                continue
+            raise DataError(f"{source}: the first fits all fail: {tagged[1]['error']}")
+        yield from held
+        break
+    yield from done
 
 
 def _whole(task: Task, row: dict[str, Any]) -> dict[str, Any]:
@@ -259,13 +284,13 @@ def _options(definition: Definition) -> bytes:
 
 
 def _options_agree(definition: Definition, redo: bool) -> bool:
-    """Return whether results in the folder have these options; refuse others without `redo`."""
+    """Return whether the folder holds results with these options; refuse others without `redo`."""
     path = definition.folder / "options.json"
     if not path.exists():
-        return True
+        return False
     try:
-        before = json.loads(path.read_bytes())
-    except (OSError, ValueError) as exc:
+        before = dict(json.loads(path.read_bytes()))
+    except (OSError, ValueError, TypeError) as exc:
         raise DataError(f"{path}: cannot be read: {exc}") from exc
     now = json.loads(_options(definition))
     changed = [

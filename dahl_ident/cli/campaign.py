@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dahl_ident.cli import console
 from dahl_ident.errors import ValidationError
+
+if TYPE_CHECKING:
+    from dahl_ident.campaigns.definition import Definition
+
+_LINE_EVERY = 60.0
+"""Seconds between lines of progress where there is no terminal."""
 
 
 def campaign(
@@ -49,23 +56,21 @@ def campaign(
 
     Example: dahl-ident campaign lab.toml --jobs 4 --report campaign.html
     """
-    from dahl_ident.campaigns.campaign_report import FORMATS
+    from dahl_ident.campaigns.definition import read_definition
+    from dahl_ident.campaigns.population import USABLE
     from dahl_ident.campaigns.run import campaign as run_campaign
-    from dahl_ident.data.storage import place_of, refuse_existing
 
-    if report is not None:
-        place_of(report, "a campaign's report", FORMATS)
-        if not overwrite:
-            refuse_existing(report)
+    read = read_definition(definition)
+    _check_report(report, overwrite, covariate, order, read)
     with ExitStack() as stack:
         options: dict[str, Any] = {"jobs": jobs}
         if scheduler is not None and not dry_run:
             client = stack.enter_context(_client(scheduler))
             workers = jobs or sum(client.ncores().values()) or 1
             options = {"jobs": workers, "executor": client.get_executor()}
-        progress = stack.enter_context(_progress()) if sys.stderr.isatty() else None
+        progress = stack.enter_context(_progress()) if sys.stderr.isatty() else _lines()
         done = run_campaign(
-            definition, **options, send_files=send_files, dry_run=dry_run, redo=redo,
+            read, **options, send_files=send_files, dry_run=dry_run, redo=redo,
             progress=progress,
         )  # fmt: skip
     if report is not None and not dry_run:
@@ -80,13 +85,42 @@ def campaign(
     if json:
         facts = {"finished": list(done.finished), "to_do": list(done.to_do)}
         console.write_json({**facts, "statuses": dict(done.statuses), "folder": str(done.folder)})
+    else:
+        if dry_run:
+            for name in done.to_do:
+                console.write(f"to do: {name}")
+        console.write(str(done))
+        if not dry_run:
+            console.write(f"table: {done.folder / 'results.csv'}")
+    usable = any(status in USABLE for status in done.statuses)
+    console.finish(dry_run or usable, "no fit can be used; the table says why")
+
+
+def _check_report(
+    report: Path | None, overwrite: bool, covariates: list[str], order: str | None, read: Definition
+) -> None:
+    """Refuse, before anything runs, what the report could not be made from."""
+    from dahl_ident.campaigns.campaign_report import FORMATS
+    from dahl_ident.data.storage import place_of, refuse_existing
+
+    if report is None:
+        if covariates or order:
+            raise ValidationError("--covariate and --order are for a report; give --report as well")
         return
-    if dry_run:
-        for name in done.to_do:
-            console.write(f"to do: {name}")
-    console.write(str(done))
-    if not dry_run:
-        console.write(f"table: {done.folder / 'results.csv'}")
+    place_of(report, "a campaign's report", FORMATS)
+    if not overwrite:
+        refuse_existing(report)
+    if not report.parent.is_dir():
+        raise ValidationError(f"--report {report}: there is no folder {report.parent}")
+    known = set.intersection(*(set(task.covariates) for task in read.tasks))
+    for name, choice in [*(("--covariate", c) for c in covariates), ("--order", order)]:
+        if choice is not None and choice not in known | ({"run"} if name == "--order" else set()):
+            there = ", ".join(sorted(known)) or "none"
+            raise ValidationError(f"{name} {choice}: the fits have the covariates {there}")
+    for column in covariates:
+        texts = [v for task in read.tasks if isinstance(v := task.covariates[column], str)]
+        if texts:
+            raise ValidationError(f"--covariate {column} is {texts[0]!r}; expected numbers")
 
 
 def _client(address: str) -> Any:
@@ -95,8 +129,26 @@ def _client(address: str) -> Any:
     distributed = library("distributed", "dask")
     try:
         return distributed.Client(address, timeout=10)
-    except (OSError, TimeoutError) as exc:
+    except (OSError, TimeoutError, ValueError) as exc:
         raise ValidationError(f"--scheduler {address}: no scheduler answers: {exc}") from exc
+
+
+def _lines() -> Callable[[int, int, Mapping[str, Any]], None]:
+    """Print rate and time left once a minute, for logs."""
+    began = shown = time.monotonic()
+
+    def update(done: int, total: int, _: Mapping[str, Any]) -> None:
+        nonlocal shown
+        now = time.monotonic()
+        if now - shown >= _LINE_EVERY:
+            shown = now
+            rate = done / (now - began)
+            left = (total - done) / rate / 60.0
+            console.write_error(
+                f"{done} of {total} fits, {rate:.3g} a second, {left:.0f} minutes left"
+            )
+
+    return update
 
 
 @contextmanager
