@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -10,6 +11,7 @@ import sys
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from dahl_ident.campaigns.campaign_report import write_campaign_report
 from dahl_ident.campaigns.definition import read_definition
 from dahl_ident.campaigns.engine import run_jobs
 from dahl_ident.campaigns.population import population
+from dahl_ident.campaigns.run import _unless_refused
 from dahl_ident.campaigns.work import Job
 from dahl_ident.errors import DahlIdentError, DataError, ValidationError
 from tests.command_line import Runner
@@ -144,7 +147,12 @@ WRONG: Mapping[str, tuple[dict[str, Any], str]] = {
     "table": ({"fitt__noise": "relative"}, "unknown tables: fitt"),
     "extract": ({"extract__mode": "steps"}, "are not extracted"),
     "covariates": ({"files__covariates": "none.csv"}, "cannot be read"),
+    "covariates' path": ({"files__covariates": 3}, "expected the path of a table"),
+    "braces": ({"files__pattern": "{device}_{2}.csv"}, "braces without a name"),
     "per": ({"output__per": "day"}, "expected device or run"),
+    "folder": ({"output__folder": 3}, "expected the path of a folder"),
+    "reports": ({"output__reports": "no"}, "expected true or false"),
+    "date": ({"fit__noise": date(2026, 1, 1)}, "a date or time"),
 }
 
 
@@ -173,6 +181,84 @@ def test_duplicates_and_missing_covariates_are_named(tmp_path: Path) -> None:
     (tmp_path / "devices.csv").write_text("\n".join([*rows, rows[1]]) + "\n")
     with pytest.raises(DataError, match="line 4 repeats"):
         di.campaign(definition(tmp_path), jobs=1)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("device,t\nd000\n", "line 2 has 1 values; the header has 2"),
+        ("device,t,t\nd000,1,2\n", "several columns are called t"),
+        ("device,f_max\nd000,1\nd001,1\n", "called 'f_max', as a column of the results"),
+        ("device,u_t\nd000,1\nd001,1\n", "called 'u_t', as a column of the results"),
+        ("device,t\nd000,nan\n", "line 2 has no value for t"),
+        ("", "has the columns none"),
+    ],
+)
+def test_a_wrong_table_of_covariates_is_named(tmp_path: Path, text: str, message: str) -> None:
+    make_tables(tmp_path, 2)
+    (tmp_path / "devices.csv").write_text(text)
+    with pytest.raises(DataError, match=message):
+        read_definition(definition(tmp_path))
+
+
+def test_a_covariate_given_twice_and_fits_of_one_name_are_named(tmp_path: Path) -> None:
+    for name in ("a_b-c", "a-b_c"):
+        (tmp_path / f"{name}.csv").write_text("")
+    (tmp_path / "devices.csv").write_text("device,day\na_b,1\na,1\n")
+    pattern = f"{tmp_path.as_posix()}/{{device}}-{{day}}.csv"
+    with pytest.raises(DataError, match="day stands in the pattern and in the table"):
+        read_definition(definition(tmp_path, files__pattern=pattern))
+    for place in ("a_b/c", "a/b_c"):
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / "x.csv").write_text("")
+    both = {"pattern": f"{tmp_path.as_posix()}/{{device}}/{{run}}/x.csv", "kind": "response"}
+    content = {"files": both, "model": [{"kind": "dahl"}], "output": {"per": "run"}}
+    with pytest.raises(DataError, match="are both called a_b_c"):
+        read_definition(content)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fit__noise": "pink"}, "the first fits all fail: ValidationError: noise is 'pink'"),
+        ({"fit__free": ["mass"]}, "the first fits all fail: ModelError: the model has no"),
+    ],
+)
+def test_options_that_no_fit_can_use_leave_no_result(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    make_tables(tmp_path, 2)
+    with pytest.raises(DataError, match=message):
+        di.campaign(definition(tmp_path, **changes), jobs=1)
+    assert di.campaign(definition(tmp_path), jobs=1).statuses == {"trusted": 2}
+
+
+def test_one_device_that_the_options_do_not_fit_is_a_row(tmp_path: Path) -> None:
+    """The first of the fits fails with an error of options; the others can use them."""
+    refused = {"status": "failed", "error": "ValidationError: the drive has 3 rows"}
+    fine = {"status": "trusted"}
+    rows = iter([("a", refused), ("b", fine), ("c", refused)])
+    assert list(_unless_refused(rows, 3, "lab")) == [("a", refused), ("b", fine), ("c", refused)]
+    with pytest.raises(DataError, match="the drive has 3 rows"):
+        list(_unless_refused(iter([("a", refused)] * 3), 3, "lab"))
+
+
+def test_what_a_report_cannot_use_is_named_before_anything_runs(
+    tmp_path: Path, run: Runner
+) -> None:
+    make_tables(tmp_path, 2)
+    path = as_toml(tmp_path)
+    report = str(tmp_path / "r.html")
+    for options, message in (
+        (["--covariate", "heat", "--report", report], "the fits have the covariates temperature"),
+        (["--order", "day", "--report", report], "the fits have the covariates temperature"),
+        (["--order", "temperature"], "give --report as well"),
+        (["--report", str(tmp_path / "none" / "r.html")], "there is no folder"),
+    ):
+        refused = run("campaign", str(path), *options)
+        assert refused.status == 1
+        assert message in refused.err
+    assert not (tmp_path / "results").exists()
 
 
 def test_waveforms_with_content_sent_along_and_any_executor(tmp_path: Path) -> None:
@@ -213,31 +299,43 @@ class _Deadly(tuple[Any, ...]):
         os._exit(9)
 
 
-def test_a_killed_driver_loses_nothing(tmp_path: Path) -> None:
+def test_a_killed_driver_and_a_killed_worker_lose_nothing(tmp_path: Path) -> None:
     make_tables(tmp_path, 12)
-    undisturbed = di.campaign(definition(tmp_path, output__folder=str(tmp_path / "a")), jobs=1)
     path = as_toml(tmp_path)
     program = str(Path(sys.executable).with_name("dahl-ident"))
     command = [program, "campaign", str(path), "--jobs", "2"]
     journal = tmp_path / "results" / "journal.jsonl"
     seen = 0
-    for _ in range(2):
+    for victim in (lambda driver: driver, worker_of):
         run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        until = time.monotonic() + 60.0
-        while run.poll() is None and time.monotonic() < until:
+        if victim is worker_of:  # meanwhile
+            undisturbed = di.campaign(
+                definition(tmp_path, output__folder=str(tmp_path / "a")), jobs=1
+            )
+        while run.poll() is None:
             now = len(journal.read_bytes().splitlines()) if journal.exists() else 0
             if now > seen:
-                run.send_signal(signal.SIGKILL)
+                os.kill(victim(run.pid), signal.SIGKILL)
                 seen = now
                 break
-            time.sleep(0.02)
-        run.wait(timeout=60)
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, timeout=120)
+            time.sleep(0.01)
+        run.wait(timeout=120)
+    assert run.returncode == 0
     table = pd.read_csv(tmp_path / "results" / "results.csv", dtype={"device": str})
     expected = undisturbed.table.drop(columns=SECONDS)
     pd.testing.assert_frame_equal(table.drop(columns=SECONDS), expected)
     keys = [json.loads(line)["key"] for line in journal.read_bytes().splitlines()]
     assert len(keys) == len(set(keys)) == 12, "what was finished is not repeated"
+
+
+def worker_of(driver: int) -> int:
+    """Return a process of the driver's pool: the youngest of its descendants."""
+    own = {driver}
+    for stat in sorted(Path("/proc").glob("[0-9]*/stat"), key=lambda p: int(p.parent.name)):
+        with contextlib.suppress(OSError):
+            if int(stat.read_text().rpartition(")")[2].split()[1]) in own:
+                own.add(int(stat.parent.name))
+    return max(own)
 
 
 CLUSTER = """
@@ -252,21 +350,21 @@ if __name__ == "__main__":
 """
 
 
-def test_a_dask_scheduler_reached_over_tcp_gives_the_serial_table(tmp_path: Path) -> None:
+def test_a_dask_scheduler_reached_over_tcp_gives_the_serial_table(
+    tmp_path: Path, run: Runner
+) -> None:
     make_tables(tmp_path, 3)
-    serial = di.campaign(definition(tmp_path, output__folder=str(tmp_path / "a")), jobs=1)
     (tmp_path / "cluster.py").write_text(CLUSTER)
     path = as_toml(tmp_path)
-    program = str(Path(sys.executable).with_name("dahl-ident"))
     with subprocess.Popen(
         [sys.executable, str(tmp_path / "cluster.py")], text=True,
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
     ) as cluster:  # fmt: skip
+        serial = di.campaign(definition(tmp_path, output__folder=str(tmp_path / "a")), jobs=1)
         assert cluster.stdout is not None
         address = cluster.stdout.readline().strip()
         assert address.startswith("tcp://127.0.0.1:")
-        command = [program, "campaign", str(path), "--scheduler", address, "--send-files"]
-        subprocess.run(command, check=True, capture_output=True, timeout=120)
+        run("campaign", str(path), "--scheduler", address, "--send-files")
         cluster.communicate("\n", timeout=60)
     table = pd.read_csv(tmp_path / "results" / "results.csv", dtype={"device": str})
     expected = serial.table.drop(columns=SECONDS)

@@ -12,6 +12,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.context import BaseContext
 from typing import Any, TypeVar
 
 from dahl_ident.campaigns.work import Job, Row, do, one_thread
@@ -78,7 +79,11 @@ class _Pools:
 
 def local_pool(workers: int) -> ProcessPoolExecutor:
     """Return a pool of processes with one numerical thread each."""
-    context = multiprocessing.get_context("spawn")
+    if "forkserver" in multiprocessing.get_all_start_methods():
+        context: BaseContext = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload(["dahl_ident.campaigns.worker", "pandas", "pint"])
+    else:  # Windows
+        context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(workers, mp_context=context, initializer=one_thread)
 
 

@@ -172,8 +172,8 @@ def campaign(
 
     Notes
     -----
-    Processes are started by "spawn", so a script must call this under
-    ``if __name__ == "__main__":``.
+    Processes are started anew (from a server of their own, on Windows by "spawn"), so a script
+    must call this under ``if __name__ == "__main__":``.
 
     Examples
     --------
