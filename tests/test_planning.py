@@ -287,6 +287,25 @@ class TestPlan:
         assert (plan.reached, plan.runs) == (True, 5)
         assert plan.seconds < 320.0
 
+    def test_an_expanded_uncertainty_is_wanted_by_name(self) -> None:
+        common: dict[str, Any] = {"ranges": NEAR, "limits": KNEE, "noise": 0.02, "draws": 20}
+        standard = di.plan(LINEAR, target={"f_max": 0.004}, **common)
+        expanded = di.plan(LINEAR, target={"U(f_max)": 0.008}, **common)
+        # k = 2.0000 at 95.45 % of a normal distribution
+        assert expanded.steps == standard.steps
+        told = expanded.expected
+        assert told["U(f_max)"].after == pytest.approx(2.0 * told["f_max"].after, rel=1e-4)
+        assert "U(...) expanded" in str(expanded)
+
+    def test_few_runs_widen_an_expanded_uncertainty(self) -> None:
+        plan = di.plan(
+            LINEAR, ranges=NEAR, limits={**KNEE, "time": 600}, noise=0.001, scatter=0.02, runs=4,
+            target=["U(f_max)"], draws=20, candidates=40,
+        )  # fmt: skip
+        told = plan.expected
+        # Student's t of three degrees of freedom: 3.31 at 95.45 %; scatter is nearly all
+        assert told["U(f_max)"].after == pytest.approx(3.31 * told["f_max"].after, rel=0.02)
+
     def test_a_driven_plant_is_planned_by_its_drive(self) -> None:
         plant = LINEAR + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
         plan = di.plan(

@@ -71,9 +71,9 @@ class Aim:
     target: Annotated[
         list[str] | None,
         _aim(
-            "Wanted relative standard uncertainty, f_max=0.02 or f_max/sigma=0.02, in the least "
-            "time; a name alone: least uncertainty in --time. Repeatable; by default all "
-            "parameters."
+            "Wanted relative standard uncertainty, f_max=0.02 or f_max/sigma=0.02, or expanded "
+            "one, 'U(f_max)=0.04', in the least time; a name alone: least uncertainty in --time. "
+            "Repeatable; by default all parameters."
         ),
     ] = None
     ranges: Annotated[

@@ -49,7 +49,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Expected:
-    """Predicted relative standard uncertainty of a quantity.
+    """Predicted relative standard uncertainty of a quantity; of ``"U(...)"`` the expanded one.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class Plan:
     expected : mapping of str to Expected
         Predicted uncertainty of every parameter and target; the ranges are not used.
     target : mapping of str to float
-        Relative standard uncertainties that were wanted; empty where time was given.
+        Relative uncertainties that were wanted; empty where time was given.
     reached : bool
         Whether all of them, and those of suspected parameters, are predicted to be reached.
     undetermined : tuple of str
@@ -306,7 +306,9 @@ class Plan:
                 f"{name:24}{e.value:>11.4g}{_percent(e.before):>11}{_percent(e.after):>11}"
                 f"{wanted:>11}"
             )
-        lines.append("Relative standard uncertainties.")
+        lines.append("Relative standard uncertainties; U(...) expanded, 95.45 %."
+                     if any(name.startswith("U(") for name in self.expected)
+                     else "Relative standard uncertainties.")  # fmt: skip
         lines += [f"{text}." for text in self.undetermined]
         lines.append(f"Assumed: {'; '.join(self.assumptions)}.")
         return "\n".join(lines)

@@ -11,6 +11,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray, non_negative_array, positive_number, whole_number
 from dahl_ident.data.fields import one_of
+from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError
@@ -32,6 +33,7 @@ from dahl_ident.planning.optimal_design import Exchange, Selection, continuous_d
 from dahl_ident.problem import Problem
 
 _POWER = re.compile(r"(?P<name>[A-Za-z_]\w*)(?:\^(?P<power>-?\d+(?:\.\d+)?))?")
+_EXPANDED = re.compile(r"U\((?P<quantity>.+)\)")
 _SEARCHED = 24  # draws that the search for levels averages over
 _POOL = 80
 _MOST_RUNS = 8
@@ -77,8 +79,9 @@ def plan(
         or lowest and highest, zero-to-peak, SI; ``time``: seconds for everything.
     target : mapping, sequence of str, or str, optional
         Mapping from a parameter, or a product of powers such as ``"f_max/sigma"``, to its wanted
-        relative standard uncertainty: the least time that reaches all. Names alone: their least
-        uncertainty in ``limits["time"]``. Left out: D-optimal in that time.
+        relative standard uncertainty, or from ``"U(f_max)"`` to its relative expanded uncertainty
+        (95.45 %): the least time that reaches all. Names alone: their least uncertainty in
+        ``limits["time"]``. Left out: D-optimal in that time.
     ranges : mapping of str to (float, float), optional
         Range that contains a parameter with 95 % probability. The search uses it, but the predicted
         uncertainty does not include it.
@@ -286,7 +289,7 @@ class Planner:
         }
         targets = None
         if q.wanted:
-            columns = [self.directions[name] / u for name, u in q.wanted.items()]
+            columns = [self.directions[n] * _least_factor(n) / u for n, u in q.wanted.items()]
             targets = np.stack(columns, axis=-1)
         self.main = Term(levels, self.before + self.prior, targets)
         self.suspected = self._suspected() if q.larger is not None else None
@@ -408,7 +411,7 @@ class Planner:
         """Return the largest ratio of an uncertainty to its target, suspects included."""
         worst = self._suspect_ratio(selection, runs)
         if self.question.numbers:
-            found = self.uncertainty(self.covariance(selection.levels, selection.cycles, runs))
+            found, _ = self._after(selection.levels, selection.cycles, runs)
             worst = max(
                 worst, *(_typical(found[name]) / u for name, u in self.question.wanted.items())
             )
@@ -507,26 +510,42 @@ class Planner:
     def expected(self, levels: Any, cycles: FloatArray, runs: int) -> dict[str, Expected]:
         """Return the expected uncertainty of each quantity after a design."""
         q = self.question
-        after = self.uncertainty(self.covariance(levels, cycles, runs))
+        after, shares = self._after(levels, cycles, runs)
         before = self.uncertainty(_inverse(self.before))
-        quiet = after
-        if q.scatter > 0.0:
-            term = Term(self.candidates.information(0.0), self.before)
-            M = Objective((term,), runs).only(levels).information(cycles)[0]
-            quiet = self.uncertainty(_inverse(M))
         values = dict(zip(q.knowledge.names, q.knowledge.values.T, strict=True))
         return {
             name: Expected(
                 value=float(np.median(_product(name, values))),
-                before=_typical(before[name]),
+                before=_least_factor(name) * _typical(before[name]),
                 after=_typical(u),
                 low=_shown(float(np.quantile(u, 0.1))),
                 high=_shown(float(np.quantile(u, 0.9))),
-                scatter_share=max(0.0, 1.0 - (_typical(quiet[name]) / _typical(u)) ** 2)
-                if np.isfinite(_typical(u)) else 0.0,
+                scatter_share=shares[name],
             )
             for name, u in after.items()
         }  # fmt: skip
+
+    def _after(
+        self, levels: Any, cycles: FloatArray, runs: int
+    ) -> tuple[dict[str, FloatArray], dict[str, float]]:
+        """Return every quantity's uncertainty at every draw, and the share of scatter in it.
+
+        Expanded uncertainties have the coverage factor of the runs' degrees of freedom; noise has
+        many.
+        """
+        found = self.uncertainty(self.covariance(levels, cycles, runs))
+        shares = dict.fromkeys(found, 0.0)
+        if self.question.scatter > 0.0:
+            term = Term(self.candidates.information(0.0), self.before)
+            M = Objective((term,), runs).only(levels).information(cycles)[0]
+            for name, quiet in self.uncertainty(_inverse(M)).items():
+                if np.isfinite(_typical(found[name])):
+                    shares[name] = max(0.0, 1.0 - (_typical(quiet) / _typical(found[name])) ** 2)
+        for name, share in shares.items():
+            if _EXPANDED.fullmatch(name):
+                dof = max(runs - 1, 1) / share**2 if share > 0.0 else np.inf
+                found[name] = coverage_factor(dof) * found[name]
+        return found, shares
 
     def logarithmic_grid(self, time: float, levels: int = _GRID_LEVELS) -> Any:
         """Return levels, cycles and runs of an even logarithmic grid, equal cycles at each.
@@ -565,9 +584,9 @@ class Planner:
         }
         for name, u in q.wanted.items() if q.numbers else ():
             if expected[name].after > 1.001 * u:
+                what = "" if _EXPANDED.fullmatch(name) else "a standard uncertainty of "
                 lost[name] = (
-                    f"{name} reaches a standard uncertainty of {_percent(expected[name].after)}, "
-                    f"not {_percent(u)}"
+                    f"{name} reaches {what}{_percent(expected[name].after)}, not {_percent(u)}"
                 )
         if self.suspected is not None and self._suspect_ratio(found.selection, found.runs) > 1.0:
             names = ", ".join(q.suspects)
@@ -661,6 +680,9 @@ def _direction(expression: str, parameters: Any, values: FloatArray) -> FloatArr
 
 def _powers(expression: str) -> list[tuple[str, float]]:
     """Return names and powers in a product such as ``sigma^2/f_max``."""
+    expanded = _EXPANDED.fullmatch(expression.replace(" ", ""))
+    if expanded:
+        expression = expanded["quantity"]
     found = []
     for place, part in enumerate(expression.replace(" ", "").split("/")):
         for factor in part.split("*"):
@@ -673,6 +695,11 @@ def _powers(expression: str) -> list[tuple[str, float]]:
             power = float(match["power"] or 1.0)
             found.append((match["name"], -power if place else power))
     return found
+
+
+def _least_factor(name: str) -> float:
+    """Return the coverage factor of many degrees of freedom for an expanded uncertainty, else 1."""
+    return coverage_factor(np.inf) if _EXPANDED.fullmatch(name) else 1.0
 
 
 def _product(expression: str, values: Mapping[str, FloatArray]) -> FloatArray:
