@@ -14,6 +14,8 @@
 from __future__ import annotations
 
 import argparse
+import itertools
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -274,6 +276,99 @@ def _joined(parts: Sequence[FrequencyResponse]) -> FrequencyResponse:
     return FrequencyResponse(**whole)
 
 
+# A measured damper
+
+KNOWN = {"f_max": (10.0, 1e3), "sigma": (1e4, 1e7), "damping": (200.0, 2e4)}
+EVENLY = (0, 3, 6, 9)
+
+
+def damper(folder: Path) -> str:
+    """Return what plans choose of ten measured levels of a damper on a crank, as a paragraph.
+
+    From a fit to two levels, the plan's most measured level among the others is added, twice; a fit
+    to the four predicts the other six, beside four evenly spaced levels and all choices of four.
+    """
+    from scipy.io import loadmat
+
+    levels = []
+    for i in range(1, 11):
+        content = loadmat(folder / f"ensaio.A.{i}.mat")
+        x, _, force = content["x_F"].T
+        time = np.arange(x.size) * content["Ts"].item()
+        record = Record(time, displacement=1e-3 * x, force=force)
+        levels.append(di.extract(record).select(harmonic=1))
+    model = LINEAR + di.Damper()
+    every = {c: _predicted(levels, c, model) for c in itertools.combinations(range(10), 4)}
+    errors = np.array([error for error, _, _ in every.values()])
+    lines = [
+        f"A measured damper ({len(levels)} levels of 2.9 to 9.1 mm, 0.8 to 1.2 Hz, Dahl and linear "
+        f"damper): the median relative error of all {len(every)} choices of four levels in the "
+        f"prediction of the others is {np.median(errors):.2%}, that of four evenly spaced ones "
+        f"{every[EVENLY][0]:.2%}."
+    ]
+    for suspects in (None, {"alpha": 0.2}):
+        chosen = [
+            every[_chosen(levels, pair, model, suspects)]
+            for pair in itertools.combinations(range(10), 2)
+        ]
+        own = np.array([error for error, _, _ in chosen])
+        inside, count = sum(i for _, i, _ in chosen), sum(n for _, _, n in chosen)
+        missed = "" if np.median(own) < every[EVENLY][0] else " (!)"
+        lines.append(
+            f"Plans {'with a suspected exponent' if suspects else 'for all parameters'} from fits "
+            f"to each pair of levels: {np.median(own):.2%}{missed}, smaller than evenly spaced in "
+            f"{np.mean(own < every[EVENLY][0]):.0%}; {inside} of {count} gains and phases lie in "
+            "their 95.45 % bands."
+        )
+    return " ".join(lines)
+
+
+def _chosen(
+    levels: Sequence[FrequencyResponse], pair: tuple[int, int], model: Model, suspects: Any
+) -> tuple[int, ...]:
+    chosen = list(pair)
+    while len(chosen) < 4:
+        fit = di.fit(_rows(levels, chosen), model, throw=False)
+        rest = [i for i in range(10) if i not in chosen]
+        options = [
+            (float(A[0]), float(levels[i].frequency_hz[0]))
+            for i in rest
+            if (A := levels[i].amplitude) is not None
+        ]
+        plan = di.plan(
+            fit, limits={"frequency_hz": (0.1, 3.0), "time": 600.0}, candidates=options, draws=30,
+            suspects=suspects, ranges=KNOWN,
+        )  # fmt: skip
+        best = max(plan.steps, key=lambda step: step.measured_cycles)
+        chosen.append(rest[int(np.argmin([abs(A - best.level) for A, _ in options]))])
+    return tuple(sorted(chosen))
+
+
+def _predicted(
+    levels: Sequence[FrequencyResponse], chosen: Sequence[int], model: Model
+) -> tuple[float, int, int]:
+    """Return the error of the other levels, and how many gains and phases lie in their bands."""
+    fit = di.fit(_rows(levels, chosen), model, throw=False)
+    other = _rows(levels, [i for i in range(10) if i not in chosen])
+    band = fit.predict(other.frequency_hz, amplitude=other.amplitude)
+    error = np.sqrt(np.mean(np.abs(other.response / band.response - 1.0) ** 2))
+    measured = (np.abs(other.response), np.angle(other.response))
+    inside = sum(
+        int(((low <= value) & (value <= high)).sum())
+        for value, (low, high) in zip(measured, (band.gain(), band.phase()), strict=True)
+    )
+    return float(error), inside, 2 * len(other.response)
+
+
+def _rows(levels: Sequence[FrequencyResponse], chosen: Sequence[int]) -> FrequencyResponse:
+    """Return some levels in one table, without covariances."""
+    columns = ("frequency_hz", "response", "amplitude")
+    whole: dict[str, Any] = {
+        n: np.concatenate([getattr(levels[i], n) for i in chosen]) for n in columns
+    }
+    return FrequencyResponse(**whole)
+
+
 def as_markdown(
     rows: Sequence[Row], records: Any, times: Sequence[tuple[float, float, float]], count: int
 ) -> str:
@@ -336,6 +431,9 @@ def main() -> None:
     seeds = range(2 if given.small else 10)
     times = [(off, *sequence(off, seed)) for off in (30.0, 1.0 / 30.0) for seed in seeds]
     page = as_markdown(rows, records, times, count)
+    measured = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent")) / "mr_damper"
+    if measured.is_dir():
+        page += f"\n{damper(measured)}\n"
     print(page)
     if given.write:
         given.write.write_text(page, encoding="utf-8")
