@@ -419,8 +419,9 @@ def as_markdown(outcomes: Sequence[Outcome], calibration: Calibration | None = N
         "|---|---|---|---|---|---|---|---|",
     ]
     lines += map(_row, outcomes)
-    bad = sum(bool(o.failures) for o in outcomes)
-    lines += ["", f"{len(outcomes) - bad} of {len(outcomes)} cells hold. Numbers in percent.", ""]
+    bad = [f"{o.name} ({'; '.join(o.failures)})" for o in outcomes if o.failures]
+    lines += ["", f"{len(outcomes) - len(bad)} of {len(outcomes)} cells hold. Numbers in percent."]
+    lines += [f"Not: {', '.join(bad)}.", ""] if bad else [""]
     if calibration is not None:
         lines += [str(calibration), ""]
     return "\n".join(lines)
