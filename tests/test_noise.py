@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import optimize, stats
 
 from dahl_ident import Dahl, FrequencyResponse
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.rows import Rows
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.fitting import solve_many
-from dahl_ident.noise import Student, bend
+from dahl_ident.noise import Measured, Student, bend, noise_for
 from dahl_ident.problem import Problem, ProblemBatch
 
 n = 8
@@ -171,6 +174,57 @@ def test_bend_keeps_direction_and_squares_to_the_loss() -> None:
     z = np.abs(y) ** 2
     np.testing.assert_allclose(np.abs(bent) ** 2, rho(z)[0], rtol=1e-12)
     np.testing.assert_allclose(np.angle(bent), np.angle(y), atol=1e-15)
+
+
+TWO_POINTS = FrequencyResponse(
+    [1.0, 1.0, 1.0, 1.0],
+    [3.0 + 4.0j, 0.2 - 0.1j, 6.0 + 8.0j, 0.5j],
+    [0.01, 0.01, 0.02, 0.02],
+    harmonic=[1, 3, 1, 3],
+)
+
+
+def test_weights_and_density_of_harmonics_are_those_of_their_own_fundamental() -> None:
+    noise = noise_for(Rows.of(TWO_POINTS), "relative")
+    np.testing.assert_allclose(noise.weights, [0.2, 0.2, 0.1, 0.1])
+    assert noise.log_area == pytest.approx(-4.0 * np.log(5.0 * 10.0))
+    np.testing.assert_allclose(noise_for(Rows.of(table()), None).weights, 1.0 / np.abs(MEASURED))
+
+
+@pytest.mark.parametrize("kind", ["relative", "absolute", "measured"])
+def test_replicates_have_the_residuals_that_were_asked_for(kind: str) -> None:
+    covariance = np.array([[0.5, 0.3], [0.3, 2.0]]) * np.array([1.0, 2.0, 3.0, 4.0])[:, None, None]
+    rows = Rows.of(replace(TWO_POINTS, covariance=covariance))
+    predicted = rows.response * (1.1 + 0.1j)
+    y = np.array([0.1 - 0.2j, 0.3 + 0.4j, -0.2j, 0.5])
+    measured = noise_for(rows, kind).replicate(predicted, y)
+    again = Rows.of(replace(TWO_POINTS, response=measured, covariance=covariance))
+    if kind == "relative":  # a residual refers to the fundamental that was measured
+        size = np.abs(rows.response[[0, 2]] / measured[[0, 2]])
+        y[[1, 3]] *= size
+    np.testing.assert_allclose(noise_for(again, kind).residual(predicted), y, rtol=1e-12)
+
+
+def test_weights_of_a_covariance_count_the_parts_that_have_one() -> None:
+    covariance = [[[0.5, 0.0], [0.0, 1.5]], [[0.25, 0.0], [0.0, 0.0]]]
+    mean = FrequencyResponse([1.0, 1.0], [1 + 1j, 0.5], [1.0, 1.0], covariance=covariance,
+                             harmonic=[1, 0], dof=6.0)  # fmt: skip
+    noise = noise_for(Rows.of(mean), None)
+    assert isinstance(noise, Measured)
+    np.testing.assert_allclose(noise.weights, [1.0, 2.0])
+    assert noise.tail is not None
+    z = np.array([3.0, 3.0])
+    np.testing.assert_allclose(noise.tail(z)[0], np.array([4.0, 5.0]) * np.log(1.5))
+
+
+def test_losses_have_their_own_derivatives() -> None:
+    rho, z, h = Student(np.array(5.0)), np.array([0.3, 2.0, 40.0]), 1e-5
+    _, slope, curvature = rho(z)
+    np.testing.assert_allclose(slope, (rho(z + h)[0] - rho(z - h)[0]) / (2.0 * h), rtol=1e-7)
+    np.testing.assert_allclose(curvature, (rho(z + h)[1] - rho(z - h)[1]) / (2.0 * h), rtol=1e-7)
+    y, d = np.array([0.3 - 0.2j, 3.0 + 4.0j]), np.array([1.0 + 2.0j, -0.5j])
+    (_, (bent,)), (up, _), (down, _) = (bend(y + s * h * d, [d], rho) for s in (0.0, 1.0, -1.0))
+    np.testing.assert_allclose(bent, (up - down) / (2.0 * h), rtol=1e-7)
 
 
 @pytest.mark.parametrize(
