@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring
 from dahl_ident.arrays import ComplexArray
 from dahl_ident.elements import Element
-from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum, Status, solve, solve_many
 from dahl_ident.problem import Problem, ProblemBatch
 from tests.random_problems import friction_and_spring
@@ -49,8 +48,7 @@ def test_microslip_beside_a_spring_determines_two_combinations() -> None:
     assert "sigma^2/f_max = " in found.message
     assert "f_max without bound" in found.message
     assert np.isinf(np.diagonal(found.covariance)).all()
-    with pytest.raises(FitError, match="No finite optimum: the fit improves as f_max grows"):
-        found.raise_unless_found()
+    assert "No finite optimum: the fit improves as f_max grows" in found.message
 
 
 def test_alpha_joins_the_combination() -> None:

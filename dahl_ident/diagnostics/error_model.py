@@ -188,14 +188,6 @@ class ErrorModel:
         """Return what takes each row's residuals to ln gain and phase, shape (n, 2, 2)."""
         return relative_units(self.problem, self.theta)
 
-    def share_of(self, name: str) -> float:
-        """Return the root mean square of a source's errors over the rows, in ln gain and phase."""
-        size = 0.0
-        for source, variance in zip(self.sources, self.variances, strict=True):
-            if source.name == name:
-                size += variance * source.mean_square
-        return float(np.sqrt(size))
-
 
 def relative_units(problem: Problem, theta: FloatArray) -> FloatArray:
     """Return what takes each row's residuals to ln gain and phase, shape (n, 2, 2)."""

@@ -137,12 +137,6 @@ def _starts(problem: Problem, view: StiffnessData) -> Starts:
     return Starts(found.table[order], found.theta[order])
 
 
-def best_starts(problem: Problem) -> FloatArray:
-    """Return the best start of each table of a problem, shape (S, P)."""
-    grid = _grid(problem, problem.stiffness_data)
-    return _vertices(grid, *grid.solved())
-
-
 def _vertices(grid: _Grid, cost: FloatArray, coefficients: FloatArray) -> FloatArray:
     """Return the best node of each table, (S, P); between nodes where there is one grid."""
     best = cost.argmin(axis=-1)[..., None]

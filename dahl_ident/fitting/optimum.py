@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.errors import FitError
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem
@@ -164,12 +163,6 @@ class Optimum:
         """Standard error of each value, by name."""
         errors = np.sqrt(np.diagonal(self.values_covariance))
         return MappingProxyType(dict(zip(self.names, errors.tolist(), strict=True)))
-
-    def raise_unless_found(self) -> Optimum:
-        """Return this optimum, or raise FitError with its message."""
-        if not self.success:
-            raise FitError(self.message)
-        return self
 
 
 @dataclass(frozen=True)

@@ -48,13 +48,6 @@ class Rational:
         """Return d(s)/n(s)."""
         return Rational(self.denominator, self.numerator)
 
-    def times_s(self, power: int) -> Rational:
-        """Return the function times s^power."""
-        up, down = max(power, 0), max(-power, 0)
-        return Rational(
-            np.append(self.numerator, np.zeros(up)), np.append(self.denominator, np.zeros(down))
-        )._without_common_zeros_at_0()
-
     def trimmed(self) -> Rational:
         """Return the function without leading coefficients that are rounding errors."""
         rate = _typical_rate(np.trim_zeros(self.denominator, "f"))
