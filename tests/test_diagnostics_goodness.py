@@ -281,6 +281,19 @@ class TestPhysics:
         assert any("at 1 Hz, 333 mm friction's fundamental is" in w for w in warnings)
         assert not judge(data).warnings
 
+    def test_units_that_were_mistaken(self) -> None:
+        """Micrometres taken for metres; peak-to-peak amplitudes beside nominal levels."""
+        data = table()
+        mistaken = replace(data, response=1e-6 * data.response, amplitude=1e6 * amplitudes(data))
+        (text, _) = judge(mistaken).warnings
+        assert text.startswith("sigma is 3")
+        assert judge(mistaken).warnings[1].startswith("x_c is 3.3")
+        assert "check the units of displacement and force" in text
+        peak = replace(data, level=amplitudes(data) / 2.0)
+        (text,) = judge(peak).warnings
+        assert "2 times its nominal level: peak-to-peak" in text
+        assert not judge(replace(data, level=amplitudes(data))).warnings
+
     def test_a_parameter_at_its_bound(self) -> None:
         model = Dahl() + Spring()
         (own,) = (p for p in model.parameters if p.name == "f_max")

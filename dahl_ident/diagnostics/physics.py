@@ -11,6 +11,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.row_names import row_names
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
+from dahl_ident.diagnostics.plausible_units import implausible_units
 from dahl_ident.diagnostics.third_harmonic import third_harmonic_share
 from dahl_ident.elements import Element
 from dahl_ident.fitting import Optimum
@@ -28,6 +29,7 @@ def physical_warnings(optimum: Optimum) -> Iterator[str]:
         yield optimum.message.removeprefix(Status.AT_BOUND.value).strip()
     yield from _beyond_friction_limit(optimum)
     yield from _not_a_sine(optimum)
+    yield from implausible_units(optimum)
 
 
 def _not_a_sine(optimum: Optimum) -> Iterator[str]:
