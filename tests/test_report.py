@@ -16,6 +16,7 @@ import dahl_ident as di
 from dahl_ident import report
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.reporting.document import Cell, Document, Section, Table
+from dahl_ident.reporting.html import html
 from dahl_ident.reporting.pdf import pdf
 from dahl_ident.reporting.settling import cycle_by_cycle
 from dahl_ident.results.chain_posterior import ChainPosterior
@@ -340,6 +341,25 @@ def test_pdf_shows_characters_that_its_font_lacks(fit: di.FitResult, tmp_path: P
     pypdf = pytest.importorskip("pypdf")
     place = report(fit, tmp_path / "r.pdf", title="pivot \u65e5 \u03a9")
     assert pypdf.PdfReader(place).pages[0].extract_text().startswith("pivot <U+65E5> \u03a9")
+
+
+@pytest.mark.parametrize(
+    ("title", "printed"),
+    [("a\ud800b\x00\n c", "a?b c"), ("W" * 5000, "W" * 200 + "..."), ("word " * 1000, "word word")],
+    ids=["half a character", "long", "many words"],
+)
+def test_titles_that_no_page_has_room_for(
+    fit: di.FitResult, tmp_path: Path, title: str, printed: str
+) -> None:
+    pypdf = pytest.importorskip("pypdf")
+    place = report(fit, tmp_path / "r.json", title=title)
+    found = json.loads(place.read_text(encoding="utf-8"))["title"]
+    assert found.startswith(printed)
+    whole = Document(title=found, status="trusted", verdict=("Holds.",), sections=())
+    assert printed in html(whole).decode()
+    page = pypdf.PdfReader(io.BytesIO(pdf(whole))).pages[0].extract_text()
+    assert page.replace("\n", "").startswith(printed)
+    assert page.endswith("Page 1 of 1")
 
 
 def test_files_and_the_files_that_those_were_made_from_are_listed(tmp_path: Path) -> None:

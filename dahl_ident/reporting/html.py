@@ -22,7 +22,7 @@ def html(document: Document) -> bytes:
         document=document,
         style=(room / "page.css").read_text(encoding="utf-8"),
         script=(room / "page.js").read_text(encoding="utf-8"),
-    ).encode()
+    ).encode(errors="replace")
 
 
 def _as_uri(picture: Picture) -> str:

@@ -32,7 +32,7 @@ def markdown(document: Document, folder: str) -> bytes:
     for section in _with_signature(document.sections):
         lines.append(f"## {_escaped(section.title)}")
         lines += [text for block in section.blocks if (text := _block(block, folder))]
-    return ("\n\n".join(lines) + "\n").encode()
+    return ("\n\n".join(lines) + "\n").encode(errors="replace")
 
 
 def _with_signature(sections: Sequence[Section]) -> Iterator[Section]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from dahl_ident.reporting.sections import Result, document
 from dahl_ident.results import ChainPosterior, FitResult, RecordFit
 
 SCHEMA = 2
+_LONGEST_TITLE = 200  # characters
 FORMATS = (".html", ".pdf", ".md", ".json")
 
 
@@ -101,7 +104,7 @@ def report(
         whole = document(checked, title=title, command=command, record=record, metadata=known)
     else:
         whole = overlay(checked, title=title, command=command, metadata=known)
-    whole = whole.numbered()
+    whole = replace(whole.numbered(), title=_one_line(whole.title))
     kind = place.suffix.lower()
     if kind == ".md":
         folder = place.with_name(f"{place.stem}_pictures")
@@ -124,6 +127,12 @@ def _checked(results: list[Any]) -> list[Result]:
                 "Posterior"
             )
     return results
+
+
+def _one_line(title: str) -> str:
+    """Return a title that every format can hold: no half characters, no control signs, not long."""
+    whole = re.sub(r"[\s\x00-\x1f\x7f]+", " ", title.encode(errors="replace").decode())
+    return whole if len(whole) <= _LONGEST_TITLE else f"{whole[:_LONGEST_TITLE]}..."
 
 
 def _on_one_table(results: Sequence[Result]) -> bool:
@@ -165,7 +174,7 @@ def machine_readable(whole: Document) -> bytes:
         **whole.facts,
     }
     known = plain_data(facts, not_finite=lambda _: None)
-    return json.dumps(known, indent=2, ensure_ascii=False, allow_nan=False).encode()
+    return json.dumps(known, indent=2, ensure_ascii=False, allow_nan=False).encode(errors="replace")
 
 
 def _pictures(whole: Document) -> list[Picture]:
