@@ -84,6 +84,9 @@ def fit(
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Print all sections, not only the first two.")
     ] = False,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Compare with other models of the friction.")
+    ] = False,
     record: Annotated[
         bool,
         typer.Option("--record", help="The files are records of any motion; each is a run."),
@@ -94,6 +97,7 @@ def fit(
     Example: dahl-ident datasets noisy -o - | dahl-ident fit -
     """
     from dahl_ident.data.storage import place_of
+    from dahl_ident.diagnostics.comparison import compare_models
     from dahl_ident.results.result import FORMATS
 
     writing.check([report, save], files, json=general.json)
@@ -110,6 +114,8 @@ def fit(
         console.write_json(as_json(result))
     elif report != STANDARD:
         console.write_wrapped(result.fit_report(details=verbose))
+        if compare:
+            console.write(str(compare_models(result)))
         if not verbose:
             console.write("-v prints tests of the residuals, other models and the solver's numbers")
     if report is not None:

@@ -1,30 +1,38 @@
-"""Comparison of models by Akaike's and Schwarz's criteria.
+"""Which model describes the data, and what friction is whatever the model.
 
-Both are -2 ln L plus a penalty for each parameter, 2 for AIC and ln(2n) for BIC; lower is better. A
-difference above 10 is clear, one below 2 means nothing. The lowest of several often belongs, by
-chance, to a model with too many parameters, so another model is called best only if it is clearly
-better than the one fitted. Criteria compare models but do not validate one: if none describes the
-data, the best of them does not either, and a model with negative damping is not physical.
+Candidates come from what the fit leaves: a mean force asks for two limits, a response that changes
+with frequency for a damper, any other misfit for another shape of loop. Each is judged by how it
+predicts tests that it was not fitted to (:mod:`dahl_ident.diagnostics.predictive_density`). Of
+those whose density is within one standard error of the highest the simplest is the best; so is
+the one fitted while nothing is higher than it by more than chance among many candidates makes.
+AIC and BIC are stated beside, and decide nothing: over harmonics whose covariance is tiny they
+prefer a model that spoils the fundamental. If no model describes the data, the best of them does
+not either, and one of negative damping is no mechanism's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from dahl_ident.diagnostics.formatting import listed, table, with_unit
+from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.physics import is_spring, negative_parameters
+from dahl_ident.diagnostics.predictive_density import PredictiveDensity, predictive_density
 from dahl_ident.diagnostics.verdicts import Fit
-from dahl_ident.elements import Element, Model, Spring
+from dahl_ident.elements import Damper, Element, Friction, Mass, Model, PowerDamper, Spring
+from dahl_ident.elements.element import Alternative
 from dahl_ident.errors import DahlIdentError, ValidationError
 from dahl_ident.fitting import Optimum, solve
 from dahl_ident.problem import Problem
 
-_PLAIN = 10.0
-_MEANS_NOTHING = 2.0
+_BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
+_RATES = 1.05  # highest over lowest frequency that can show a dependence on the rate
+_LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
 
 
 @dataclass(frozen=True)
@@ -37,10 +45,16 @@ class ComparedModel:
         What distinguishes it.
     optimum : Optimum
         Its estimate.
+    density : PredictiveDensity
+        How it predicts tests left out.
+    reason : str
+        What in the data speaks for trying it.
     """
 
     name: str
     optimum: Optimum
+    density: PredictiveDensity
+    reason: str = ""
 
     @property
     def aic(self) -> float:
@@ -61,6 +75,35 @@ class ComparedModel:
         known = [f"{n} = {with_unit(v, e, unit)}" for n, v, e, unit in rows if np.isfinite(e)]
         unknown = [name for name, error in o.stderr.items() if not np.isfinite(error)]
         return ", ".join(known + ([f"{listed(unknown)} not determined"] if unknown else []))
+
+    @cached_property
+    def meaning(self) -> dict[str, float]:
+        """What means the same in every law: force limit, stiffness at zero force, energies.
+
+        Of all elements with memory together: N, N/m, and joules lost in a cycle at the smallest,
+        the middle and the largest amplitude. Infinite where a law never slips.
+        """
+        problem = self.optimum.problem
+        values, A = parameter_values(self.optimum), problem.stiffness_data.amplitude
+        sizes = np.geomspace(A.min(), A.max(), _LEVELS)
+        omega = np.asarray(np.exp(np.mean(np.log(problem.stiffness_data.omega))))
+        limit, stiffness, energy = 0.0, 0.0, np.zeros(_LEVELS)
+        for element in problem.model.elements:
+            if not isinstance(element, Friction):
+                continue
+            own = [np.asarray(values[p.name]) for p in element.parameters]
+            with np.errstate(all="ignore"):
+                limit += float(np.mean(element.force_limits(own)))
+                contact = float(element.rest_stiffness(own))
+                if not contact:  # behind a gap
+                    contact = float(element.quasi_static_slope(np.zeros(()), 1.0, own))
+                stiffness += contact
+                energy += np.pi * sizes**2 * np.imag(element.stiffness(own, sizes, omega))
+        found = {"force limit": limit, "stiffness at zero force": stiffness}
+        return found | {
+            f"energy a cycle at {size:.2g} m": float(e)
+            for size, e in zip(sizes, energy, strict=True)
+        }
 
 
 @dataclass(frozen=True)
@@ -85,47 +128,65 @@ class ModelComparison:
     models: tuple[ComparedModel, ...]
     failed: Mapping[str, str]
 
-    @property
+    @cached_property
     def best(self) -> ComparedModel:
-        """The model with the lowest BIC if that is lower by more than 10, else the one fitted."""
-        return self._lowest if self._gain > _PLAIN else self.models[0]
-
-    @property
-    def _lowest(self) -> ComparedModel:
-        return min(self.models, key=lambda model: model.bic)
-
-    @property
-    def _gain(self) -> float:
-        """How far the lowest BIC is below that of the model fitted."""
-        return self.models[0].bic - self._lowest.bic
+        """The simplest model within one standard error of the highest predictive density."""
+        highest = max(self.models, key=lambda model: model.density.total)
+        alike = []
+        for model in self.models:
+            gain, error = highest.density.gain_over(model.density)
+            if gain <= max(error, _BY_CHANCE):
+                alike.append(model)
+        return min(alike, key=lambda model: (len(model.optimum.names), -model.density.total))
 
     @property
     def headline(self) -> str:
         """The verdict in a sentence or two."""
-        lowest = self._lowest
-        if self._gain < _MEANS_NOTHING:
+        first, best = self.models[0], self.best
+        if best is first:
             return "No model compared is better than the one fitted."
-        word = "clearly better" if self._gain > _PLAIN else "perhaps better"
-        aic = self.models[0].aic - lowest.aic
-        text = f"{lowest.name} would be {word} (AIC lower by {aic:.0f}, BIC by {self._gain:.0f})."
-        absurd = [f"There {warning}." for warning in negative_parameters(lowest.optimum)]
+        gain, error = best.density.gain_over(first.density)
+        text = (
+            f"{best.name} would be better: the log density of tests left out is higher by "
+            f"{gain:.0f} +- {error:.0f}."
+        )
+        absurd = [f"There {warning}." for warning in negative_parameters(best.optimum)]
         return " ".join([text, *absurd])
 
     def __str__(self) -> str:
-        head = ("model", "AIC", "BIC", "estimates")
-        aic, bic = (min(getattr(m, name) for m in self.models) for name in ("aic", "bic"))
-        rows = [
-            (
-                m.name,
-                f"{m.aic - aic:+.1f}",
-                f"{m.bic - bic:+.1f}",
-                m.estimates if m.optimum.success else f"{m.estimates} ({m.optimum.status.name})",
-            )
-            for m in self.models
-        ]
-        lines = [self.headline, table([head, *rows], left=(0, 3))]
+        lines = [self.headline, table([self.columns, *self.rows], left=(0, 1))]
+        lines.append(table([["", *(m.name for m in self.models)], *self.meanings]))
         lines += [f"{name} could not be fitted: {why}" for name, why in self.failed.items()]
         return "\n".join(lines)
+
+    columns = ("model", "reason", "misfit", "harmonics", "dof", "f_max", "sigma", "density")
+    """Of :attr:`rows`."""
+
+    @property
+    def rows(self) -> list[list[str]]:
+        """One row a model: misfits, degrees of freedom, changes, log density."""
+        first = self.models[0]
+        found = []
+        for m in self.models:
+            gain, error = m.density.gain_over(first.density)
+            changes = [
+                _change(m.meaning[key], first.meaning[key])
+                for key in ("force limit", "stiffness at zero force")
+            ]
+            mark = " (best)" if m is self.best else ""
+            found.append([
+                m.name, m.reason, _percent(m.density.misfit), _percent(m.density.harmonic_misfit),
+                str(m.optimum.dof), *changes,
+                ("0" if m is first else f"{gain:+.1f} +- {error:.1f}") + mark,
+            ])  # fmt: skip
+        return found
+
+    @property
+    def meanings(self) -> list[list[str]]:
+        """What means the same in every law, one row a quantity, one column a model."""
+        return [
+            [key, *(f"{m.meaning[key]:.3g}" for m in self.models)] for key in self.models[0].meaning
+        ]
 
     def to_frame(self) -> Any:
         """Return a pandas table: one row a model."""
@@ -135,9 +196,14 @@ class ModelComparison:
             [
                 {
                     "model": m.name,
+                    "reason": m.reason,
+                    "density": m.density.total,
+                    "misfit": m.density.misfit,
+                    "harmonic_misfit": m.density.harmonic_misfit,
                     "aic": m.aic,
                     "bic": m.bic,
                     "status": m.optimum.status.name,
+                    **m.meaning,
                     **dict(zip(m.optimum.names, m.optimum.values.tolist(), strict=True)),
                 }
                 for m in self.models
@@ -145,21 +211,33 @@ class ModelComparison:
         )
 
 
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.2g} %" if np.isfinite(share) else "-"
+
+
+def _change(value: float, before: float) -> str:
+    with np.errstate(all="ignore"):
+        ratio = np.float64(value) / before - 1.0
+    return f"{100.0 * ratio:+.2g} %" if np.isfinite(ratio) else "-"
+
+
 def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> ModelComparison:
-    """Fit other models to the same data and compare them by AIC and BIC.
+    """Fit other models to the same data and compare how they predict tests left out.
 
     Parameters
     ----------
     fit : FitResult
         From :func:`dahl_ident.fit`; its data, noise model, sensors and loss are used for all.
     models : mapping of str to Element, optional
-        Models to compare with, by a name for each. Left out: the exponent free (or 1, where it
-        was free), two Dahl elements in place of one, and a spring added.
+        Models to compare with, by a name for each. Left out: for a Dahl element another exponent,
+        two elements, two limits (where even harmonics are given), a gap, Bouc-Wen's and Iwan's
+        law; and a spring and, where the frequency changes, a mass and a damper added.
 
     Returns
     -------
     ModelComparison
-        Printed, a table; `best` is the model of the lowest BIC.
+        Printed, two tables; `best` is the simplest model within one standard error of the highest
+        predictive density.
 
     Examples
     --------
@@ -178,27 +256,102 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
             f"models is a {type(models).__name__}; expected a mapping of names to models, such as "
             "{'stiff': Dahl() + Spring()}"
         )
-    problem = fit.optimum.problem
-    fitted = [ComparedModel("as fitted", fit.optimum)]
-    failed = {}
-    for name, model in (_variants(problem.model) if models is None else models).items():
+    optimum, failed = fit.optimum, {}
+    fitted = [ComparedModel("as fitted", optimum, predictive_density(optimum))]
+    if models is None:
+        offered = dict(_candidates(optimum, fitted[0].density))
+    else:
+        offered = {name: ("", model) for name, model in models.items()}
+    for name, (reason, model) in offered.items():
         try:
-            other = Problem(problem.data, model, noise=problem.noise, sensors=problem.sensors)
-            fitted.append(ComparedModel(name, solve(other, loss=fit.optimum.loss)))
+            other = _solved(optimum, model, own=models is not None)
+            fitted.append(ComparedModel(name, other, predictive_density(other), reason))
         except DahlIdentError as exc:
             failed[name] = str(exc)
     return ModelComparison(tuple(fitted), failed)
 
 
-def _variants(model: Model) -> dict[str, Element]:
-    """Return the usual alternatives to a model."""
-    found: dict[str, Element] = {}
-    offers = [(e, e.alternatives()) for e in model.elements]
+def _solved(optimum: Optimum, model: Element, *, own: bool) -> Optimum:
+    """Return a candidate's optimum; limits at infinity are those of simpler candidates."""
+    problem = optimum.problem
+    other = Problem(problem.data, model, noise=problem.noise, sensors=problem.sensors)
+    return solve(other, loss=optimum.loss, limits=own)
+
+
+def _candidates(
+    optimum: Optimum, left: PredictiveDensity
+) -> Iterator[tuple[str, tuple[str, Element]]]:
+    """Yield the name of each candidate, its reason and the model."""
+    problem = optimum.problem
+    model, data = problem.model, problem.data
+    values = parameter_values(optimum)
+    misfit = f"{_percent(left.misfit)} of the fundamental left"
+    if np.isfinite(left.harmonic_misfit):
+        misfit += f", {_percent(left.harmonic_misfit)} in harmonics"
+    smallest = float(problem.stiffness_data.amplitude.min())
+    offers: list[tuple[Element, dict[str, Alternative]]] = []
+    for e in model.elements:
+        own = [values[p.name] for p in e.parameters]
+        known = np.all(np.isfinite(own)) and all(own[:2])
+        offers.append((e, e.alternatives(own, smallest) if known else {}))
+    even = _even(optimum)
     for name in dict.fromkeys(name for _, offered in offers for name in offered):
         taken = [offered[name] for _, offered in offers if name in offered]
-        if len(taken) > 1 and any(len(instead) > 1 for instead in taken):
+        if len(taken) > 1 and any(len(instead.elements) > 1 for instead in taken):
             continue  # more elements of one law in place of several would share their names
-        found[name] = Model(*(new for e, offered in offers for new in offered.get(name, (e,))))
+        asymmetric = any(instead.shows == "asymmetry" for instead in taken)
+        if asymmetric and not even:
+            continue
+        yield (
+            name,
+            (
+                even if asymmetric else misfit,
+                Model(*(n for e, o in offers for n in (o[name].elements if name in o else (e,)))),
+            ),
+        )
+    f = data.frequency_hz
+    added: dict[str, Element] = {}
     if not any(is_spring(e) for e in model.elements):
-        found["spring added"] = model + Spring()
-    return found
+        added["spring added"] = Spring()
+    if f.max() > _RATES * f.min():
+        kinds = {e.kind for e in model.elements}
+        power = PowerDamper().started((_force(optimum), 0.5, 1.0))
+        rated: tuple[Element, ...] = (Mass(), Damper(), power)
+        for element in rated:
+            if element.kind not in kinds:
+                added[f"{element.kind.replace('_', ' ')} added"] = element
+    span = f"{misfit}; frequencies from {f.min():.3g} to {f.max():.3g} Hz"
+    base = [e.started([values[p.name] for p in e.parameters]) for e in model.elements]
+    for name, element in added.items():
+        started = all(np.isfinite(values[p.name]) for p in model.parameters)
+        yield (
+            name,
+            (
+                misfit if name == "spring added" else span,
+                Model(*base, element)
+                if started and element.kind == "power_damper"
+                else model + element,
+            ),
+        )
+
+
+def _even(optimum: Optimum) -> str:
+    """Return how large mean force and even harmonics are, or "" where there are none."""
+    data = optimum.problem.data
+    size = np.sqrt(np.mean(np.abs(data.response[data.harmonic == 1]) ** 2))
+    for name, rows in (
+        ("mean force", data.harmonic == 0),
+        ("second harmonic", data.harmonic == 2),
+        ("even harmonics", (data.harmonic % 2 == 0) & (data.harmonic > 2)),
+    ):
+        if rows.any():
+            share = float(np.sqrt(np.mean(np.abs(data.response[rows]) ** 2)) / size)
+            return f"{name} {_percent(share)} of the fundamental"
+    return ""
+
+
+def _force(optimum: Optimum) -> float:
+    """Return a tenth of the typical force, where a damper starts."""
+    view = optimum.problem.stiffness_data
+    rows = view.harmonic == 1
+    return 0.1 * float(np.median(np.abs(view.stiffness[rows]) * view.amplitude[rows]))

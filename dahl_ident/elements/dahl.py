@@ -33,6 +33,7 @@ from dahl_ident.elements import (
     hysteresis,
     linear_dahl,
 )
+from dahl_ident.elements.backlash import Backlash
 from dahl_ident.elements.behaviour import (
     Asymptote,
     Combination,
@@ -40,8 +41,10 @@ from dahl_ident.elements.behaviour import (
     StiffnessGradient,
     UniversalCurve,
 )
-from dahl_ident.elements.element import Element
+from dahl_ident.elements.bouc_wen import BoucWen
+from dahl_ident.elements.element import Alternative, Element
 from dahl_ident.elements.friction import Friction
+from dahl_ident.elements.iwan import Iwan
 from dahl_ident.elements.parameter import Assumed, Parameter
 from dahl_ident.errors import ValidationError
 
@@ -384,13 +387,37 @@ class Dahl(Friction):
             )
         return tuple(found)
 
-    def alternatives(self) -> dict[str, tuple[Element, ...]]:
-        """Return the other exponent, and two elements."""
-        alpha = self.parameter("alpha")
-        name = "exponent 1" if alpha.free else "exponent free"
+    def alternatives(self, values: Sequence[float], smallest: float) -> dict[str, Alternative]:
+        """Return the other exponent, two elements, and the laws that real devices ask for."""
+        f_max, sigma = values[:2]
+        alpha, name = self.parameter("alpha"), self.name
+        exponent = "exponent 1" if alpha.free else "exponent free"
         other = alpha.fixed(1.0) if alpha.free else alpha.freed()
-        exponent = self.with_bound(tuple(other if p is alpha else p for p in self.parameters))
-        return {name: (exponent,), "two Dahl elements": (Dahl(name="early"), Dahl(name="late"))}
+        changed = self.with_bound(tuple(other if p is alpha else p for p in self.parameters))
+        two = [
+            Dahl(name=which).started((force * f_max, stiffness * sigma, 1.0))
+            for which, force, stiffness in (("early", 0.3, 0.6), ("late", 0.7, 0.4))
+        ]
+        found = {
+            exponent: Alternative((changed.started((f_max, sigma, 1.0, *values[3:])),)),
+            "two Dahl elements": Alternative(tuple(two)),
+        }
+        if alpha.free or alpha.value != 1.0:
+            return found
+        limits = Dahl(asymmetry=None, name=name).started((f_max, sigma, 1.0, 0.01))
+        if not isinstance(self, _AsymmetricDahl):
+            found["two limits"] = Alternative((limits,), "asymmetry")
+        gap = min(0.3 * f_max / sigma, smallest)
+        behind = self.started(values)
+        found["gap"] = Alternative((Backlash(behind).started((*values, gap)),))
+        found["Bouc-Wen"] = Alternative(
+            (BoucWen(name=name).started((sigma, sigma / f_max, sigma / f_max)),)
+        )
+        found["Iwan"] = Alternative((Iwan(name=name).started((f_max, sigma, 0.0, 0.5)),))
+        if not isinstance(self, _AsymmetricDahl):
+            both = Backlash(limits).started((f_max, sigma, 1.0, 0.01, gap))
+            found["two limits and gap"] = Alternative((both,), "asymmetry")
+        return found
 
     def universal_curve(self) -> UniversalCurve | None:
         """Return h(beta) = N/sigma of the linear Dahl model; None for another exponent."""

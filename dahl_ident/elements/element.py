@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,6 +45,22 @@ def _register(cls: type[Element]) -> None:
             f"{known.__qualname__} has already; choose another"
         )
     KINDS[cls.kind] = cls
+
+
+class Alternative(NamedTuple):
+    """Elements in place of one.
+
+    Attributes
+    ----------
+    elements : tuple of Element
+        In parallel.
+    shows : {"shape", "asymmetry"}
+        What of the data speaks for them: how force depends on amplitude and the odd harmonics,
+        or the mean force and the even harmonics.
+    """
+
+    elements: tuple[Element, ...]
+    shows: str = "shape"
 
 
 class Element(Behaviour):
@@ -94,9 +110,21 @@ class Element(Behaviour):
             for declared in type(self).parameters
         )
 
-    def alternatives(self) -> dict[str, tuple[Element, ...]]:
-        """Return the usual alternatives to this element, by a short name."""
+    def alternatives(self, values: Sequence[float], smallest: float) -> dict[str, Alternative]:
+        """Return, by a few words, what is tried in place of this element; started at `values`.
+
+        `smallest` is the smallest amplitude measured, m.
+        """
         return {}
+
+    def started(self, values: Sequence[float]) -> Self:
+        """Return this element with values to start from where it is free."""
+        return self.with_bound(
+            tuple(
+                replace(p, value=float(v), assumed=False) if p.free else p
+                for p, v in zip(self.parameters, values, strict=True)
+            )
+        )
 
     def tabulated(self) -> Element:
         """Return this element, or a faster variant of it for very many evaluations."""

@@ -51,6 +51,7 @@ _RESCALINGS = 100  # of the noise's scale; a handful is the rule
 _SAME_SCALE = 1e-9  # change of ln scale that ends them
 _LONGEST_SECANT = 20.0  # plain steps in one: where they shrink slowly, not where noise is all
 _STEPS = 80  # of a search; ten are the rule
+_BRIEF = 30  # steps where no limit counts
 _FIRST_LOOK, _HOPELESS = 15, 3.0  # steps at a limit, and how much higher it may then still be
 _PATIENCE = 1000  # steps where friction is so faint that each takes little
 _AT_LIMIT = 1e4  # tolerance factor: so far out, large terms cancel
@@ -67,6 +68,7 @@ def solve(
     method: str = "lm",
     loss: str = "linear",
     start: Mapping[str, float] | None = None,
+    limits: bool = True,
 ) -> Optimum:
     """Return the minimum of a problem's sum of squares, wherever it lies.
 
@@ -81,6 +83,9 @@ def solve(
         See :mod:`dahl_ident.fitting.losses`.
     start : mapping of str to float, optional
         One more start: values of some or all free parameters; the others are completed.
+    limits : bool, default True
+        Whether to go on to limits at infinity, and by other ways where nothing has converged.
+        Without, values that all free parameters have are the only start.
 
     Returns
     -------
@@ -111,7 +116,10 @@ def solve(
     """
     if method not in ("lm", "scipy"):
         raise ValidationError(f"method is {method!r}; expected lm or scipy")
-    search = _Search(problem, loss_named(loss), method=method)
+    search = _Search(problem, loss_named(loss), method=method, limits=limits)
+    own = [p.value for p in problem.parameters if p.value is not None]
+    if not limits and len(own) == len(problem.parameters):
+        return search.run(Starts(np.zeros(1, np.intp), problem.to_search(own)[None]))[0]
     found = own_starts(problem, resistant=loss != "linear")
     if start is not None:
         given = _completed(problem, start, found.theta[0])
@@ -200,8 +208,15 @@ class _Search:
     """One search for all tables of a problem: what its steps share."""
 
     def __init__(
-        self, problem: Problem, loss: Loss | None, method: str = "lm", tolerance: float = 1.0
+        self,
+        problem: Problem,
+        loss: Loss | None,
+        method: str = "lm",
+        tolerance: float = 1.0,
+        *,
+        limits: bool = True,
     ) -> None:
+        self.limits = limits
         self.problem, self.loss, self.method, self.tolerance = problem, loss, method, tolerance
         self.m = problem.n_residuals + len(problem.priors)
         P = len(problem.parameters)
@@ -250,6 +265,8 @@ class _Search:
         return optima(self.problem, ends, scale, self.loss, self.method, evaluations)
 
     def _search(self, begin: Starts, scale: float) -> Ends:
+        if not self.limits:
+            return Ends(self._descend(begin, scale, steps=_BRIEF))
         ends = Ends(self._descend(begin, scale))
         doubtful = ~ends.minima.converged | (self._friction_error(ends, scale) > DOUBTFUL)
         if doubtful.any():

@@ -250,6 +250,7 @@ def _goodness(fit: FitResult) -> Iterator[Block]:
         compared = compare_models(fit)
         yield Paragraph(f"Other models, for comparison. {compared.headline}")
         yield tables.comparison(compared)
+        yield tables.meanings(compared)
 
 
 def _extraction(data: FrequencyResponse, record: Record | None) -> Iterator[Section]:

@@ -170,16 +170,17 @@ def linearization(fit: FitResult) -> Table | None:
 def comparison(compared: ModelComparison) -> Table:
     """Return models side by side."""
     rows = tuple(
-        (
-            Cell(model.name),
-            number(model.aic, 6),
-            number(model.bic, 6),
-            Cell(model.optimum.status.name.lower().replace("_", " ")),
-            Cell(model.estimates),
-        )
-        for model in compared.models
+        (*map(Cell, row), Cell(model.estimates))
+        for row, model in zip(compared.rows, compared.models, strict=True)
     )
-    return Table("Models compared", ("model", "AIC", "BIC", "search", "estimates"), rows)
+    return Table("Models compared", (*compared.columns, "estimates"), rows)
+
+
+def meanings(compared: ModelComparison) -> Table:
+    """Return what means the same in every law."""
+    names = tuple(model.name for model in compared.models)
+    rows = tuple(tuple(map(Cell, row)) for row in compared.meanings)
+    return Table("What means the same in every law", ("quantity", *names), rows)
 
 
 def measured(data: FrequencyResponse) -> Table:

@@ -1,0 +1,79 @@
+"""Other laws beside the one fitted: which is chosen, by what, and what means the same in all."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.selection import choices
+from dahl_ident import Backlash, Dahl, FrequencyResponse, Spring, compare_models, fit
+from dahl_ident.diagnostics.predictive_density import _LeftOut, predictive_density
+from tests.command_line import Runner
+from tests.friction_tables import FRICTION, table
+
+
+@pytest.mark.parametrize("law", ["linear Dahl", "two limits", "gap"])
+def test_the_law_that_made_the_data_is_chosen(law: str) -> None:
+    assert [right for _, right in choices(law, 1, seed=5, amplitudes=8)] == [True]
+
+
+def test_tests_left_out_are_predicted_by_the_others() -> None:
+    """Against generalised least squares without the rows of each test."""
+    rng = np.random.default_rng(2)
+    X, y = rng.standard_normal((12, 2)), rng.standard_normal(12)
+    group, test = np.repeat([0, 1], 6), np.repeat(np.arange(4), 3)
+    found = _LeftOut(y, X, 2, 0, np.zeros(12), group)
+    densities = found.densities(test, robust=False)
+    variance = 1.0 / found.weight
+    for t in range(4):
+        out, rest = test == t, test != t
+        inverse = np.linalg.inv(X[rest].T @ (X[rest] / variance[rest, None]))
+        b = inverse @ (X[rest].T @ (y[rest] / variance[rest]))
+        covariance = np.diag(variance[out]) + X[out] @ inverse @ X[out].T
+        e = y[out] - X[out] @ b
+        expected = -0.5 * (
+            e @ np.linalg.solve(covariance, e)
+            + np.linalg.slogdet(covariance)[1]
+            + 3.0 * np.log(2.0 * np.pi)
+        )
+        assert densities[t] == pytest.approx(expected, rel=1e-9)
+
+
+def test_tiny_covariances_of_harmonics_do_not_rule() -> None:
+    """A third harmonic of 2 % beside the law, stated to 1e-6, makes no other law the better."""
+    data = table()
+    assert data.amplitude is not None
+    third = FRICTION.dynamic_stiffness(data.amplitude, harmonic=3) * 1.02
+    size = np.abs(data.response)
+    both = FrequencyResponse(
+        np.ones(60),
+        np.concatenate([data.response, third]),
+        np.tile(data.amplitude, 2),
+        harmonic=np.repeat([1, 3], 30),
+        covariance=np.concatenate([0.01 * size, 1e-6 * size])[:, None, None] ** 2 * np.eye(2),
+    )
+    density = predictive_density(fit(both, Dahl(), throw=False).optimum)
+    assert density.total < 60 * 2.0 * np.log(1e6)
+    assert np.isfinite(density.harmonic_misfit)
+
+
+def test_what_means_the_same_whatever_the_law() -> None:
+    found = compare_models(
+        fit(table(noise=1e-3), Dahl()), {"gap": Backlash(Dahl(), 1e-6), "spring": Spring()}
+    )
+    first, gap, spring = (model.meaning for model in found.models)
+    assert first["force limit"] == pytest.approx(0.1, rel=0.01)
+    assert gap["stiffness at zero force"] == pytest.approx(30.0, rel=0.01)
+    energies = [value for key, value in first.items() if key.startswith("energy")]
+    sizes = [float(key.split()[-2]) for key in first if key.startswith("energy")]
+    assert energies == pytest.approx(
+        [float(FRICTION.dissipated_energy(A)) for A in sizes], rel=0.05
+    )
+    assert spring["force limit"] == 0.0
+    assert "energy a cycle" in str(found)
+
+
+def test_the_command_prints_the_comparison(run: Runner) -> None:
+    result = run.line("dahl-ident datasets noisy -o - | dahl-ident fit - --compare")
+    assert "No model compared is better" in result.out
+    assert "force limit" in result.out
