@@ -194,7 +194,8 @@ class StructuredSources:
             """Return residuals for relative changes (k, n), shape (m, k)."""
             return -problem.residual_change(theta, changes * size).T
 
-        missed = np.abs(problem.data.response / size - 1.0)[self._fundamental]
+        own = self._fundamental
+        missed = np.abs(problem.data.response[own] / size[own] - 1.0)
         most = _MOST_DEPARTURE**2 * 0.5 * float(np.mean(missed**2))
         found = []
         for shape, changes in zip(self._shapes, self._changes, strict=True):
@@ -247,7 +248,8 @@ class StructuredSources:
         columns = np.zeros((n, 2, n))
         own = -self._problem.residual_change(theta, change).reshape(n, 2)
         columns[np.arange(n), :, np.arange(n)] = own
-        square = 0.5 * float(np.mean(np.abs(change / predicted) ** 2))
+        share = np.divide(change, predicted, out=np.zeros_like(change), where=predicted != 0.0)
+        square = 0.5 * float(np.mean(np.abs(share) ** 2))
         return Source(NOISE, columns.reshape(2 * n, n), square)
 
 

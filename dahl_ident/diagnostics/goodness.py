@@ -456,7 +456,8 @@ def _by_alpha(optimum: Optimum, name: str) -> ComplexArray:
     for i, parameter in enumerate(freed.parameters):
         theta[i] = known.get(parameter.name, np.log(parameter.value or 1.0))
     response, jacobian = freed.predict(theta), freed.prediction_jacobian(theta)
-    return np.asarray(jacobian[:, freed.names.index(name)] / response)
+    changes = jacobian[:, freed.names.index(name)]
+    return np.divide(changes, response, out=np.zeros_like(changes), where=response != 0.0)
 
 
 def _third_harmonic(optimum: Optimum, space: ResidualSpace) -> ThirdHarmonic | None:

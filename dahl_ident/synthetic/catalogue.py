@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dahl_ident.elements import Dahl, Damper, Mass, Spring
+from dahl_ident.elements import Backlash, Dahl, Damper, Mass, Spring
 from dahl_ident.synthetic.acquisition import Acquisition, Channel
 from dahl_ident.synthetic.excitation import SteppedSine
 from dahl_ident.synthetic.experiment import Experiment
@@ -194,6 +194,26 @@ DATA_SETS: dict[str, DataSet] = {
             identifiable=("delay",),
             not_identifiable=("f_max", "sigma", "force_gain"),
             caution="the phase depends on frequency, as no friction alone can do",
+        ),
+        DataSet(
+            "play_and_two_limits",
+            Experiment(
+                Backlash(Dahl(_F_MAX, _SIGMA, 1.0, asymmetry=0.15), 4e-4),
+                SteppedSine(
+                    _spread(0.15, 10.0, 8, unit=_X_C),
+                    order="ascending",
+                    settling_periods=4,
+                    num_periods=3,
+                ),
+                Acquisition(
+                    sample_rate_hz=64.0,
+                    displacement=Channel(noise_std=2e-7),
+                    force=Channel(noise_std=2e-4),
+                ),
+            ),
+            seed=13,
+            teaches="friction as devices have it: unequal limits behind a gap, found from loops",
+            identifiable=("f_max", "sigma", "asymmetry", "gap"),
         ),
         DataSet(
             "plant_recording",
