@@ -222,8 +222,10 @@ def test_losses_have_their_own_derivatives() -> None:
     _, slope, curvature = rho(z)
     np.testing.assert_allclose(slope, (rho(z + h)[0] - rho(z - h)[0]) / (2.0 * h), rtol=1e-7)
     np.testing.assert_allclose(curvature, (rho(z + h)[1] - rho(z - h)[1]) / (2.0 * h), rtol=1e-7)
-    y, d = np.array([0.3 - 0.2j, 3.0 + 4.0j]), np.array([1.0 + 2.0j, -0.5j])
-    (_, (bent,)), (up, _), (down, _) = (bend(y + s * h * d, [d], rho) for s in (0.0, 1.0, -1.0))
+    y: ComplexArray = np.array([0.3 - 0.2j, 3.0 + 4.0j])
+    d: ComplexArray = np.array([1.0 + 2.0j, -0.5j])
+    at: list[ComplexArray] = [y, np.add(y, h * d), np.subtract(y, h * d)]
+    (_, (bent,)), (up, _), (down, _) = (bend(one, [d], rho) for one in at)
     np.testing.assert_allclose(bent, (up - down) / (2.0 * h), rtol=1e-7)
 
 
