@@ -14,6 +14,7 @@ __all__ = [
     "DataWarning",
     "ExtractionError",
     "FitError",
+    "FitInterrupted",
     "MissingDependencyError",
     "ModelError",
     "MultipleSolutionsWarning",
@@ -175,6 +176,28 @@ class SamplingError(DahlIdentError, RuntimeError):
     def __init__(self, message: str, posterior: Any = None) -> None:
         super().__init__(message)
         self.posterior = posterior
+
+
+class FitInterrupted(KeyboardInterrupt):
+    """A fit to records was stopped from the keyboard; what was found so far is kept.
+
+    Parameters
+    ----------
+    message : str
+        What happened.
+    result : RecordFit
+        The best values so far, with status "not described", because no minimum was reached.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> issubclass(di.errors.FitInterrupted, KeyboardInterrupt)
+    True
+    """
+
+    def __init__(self, message: str, result: Any) -> None:
+        super().__init__(message)
+        self.result = result
 
 
 class MissingDependencyError(DahlIdentError, ImportError):

@@ -16,8 +16,9 @@ import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.correlated_residuals import autoregression, sandwich
 from dahl_ident.elements import Element, Model
-from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
+from dahl_ident.errors import DataError, FitError, FitInterrupted, ModelError, ValidationError
 from dahl_ident.problem.record_noise import drive_noise, excited, prediction_error_filter
+from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.results import RecordFit
 from dahl_ident.time_domain import ForcedMotion, Plant, band_limited, differentiated
 
@@ -250,6 +251,31 @@ def test_what_the_model_misses_from_place_to_place_is_in_the_budget() -> None:
     steady = di.fit(recorded(DAHL, "random", samples, 1e-3), di.Dahl())
     assert [row.source for row in steady.budget()["f_max"].rows] == ["noise"]
     assert steady.trusted
+
+
+def test_a_fit_that_is_stopped_keeps_what_it_found(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = recorded(DAHL, "random", 500, 1e-3)
+    own, calls = RecordProblem.predict, []
+
+    def predict(self: RecordProblem, *given: object, **how: object) -> object:
+        calls.append(given)
+        if len(calls) == 9:
+            raise KeyboardInterrupt
+        return own(self, *given, **how)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(RecordProblem, "predict", predict)
+    monkeypatch.setattr("dahl_ident.results.progress._PATIENCE", 0.0)
+    with pytest.raises(KeyboardInterrupt) as stop:
+        di.fit(record, di.Dahl(), progress=True, start={"f_max": 0.2, "sigma": 10.0})
+    monkeypatch.undo()
+    assert isinstance(stop.value, FitInterrupted)
+    so_far = stop.value.result
+    assert not so_far.success
+    assert so_far.status.value == "not described"
+    assert 0.09 < so_far.params["f_max"].value < 0.19
+    assert capsys.readouterr().out == ""
 
 
 def test_parts_that_are_left_out_are_predicted() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from dahl_ident.cli.files import written
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import STANDARD, Files, General, Reading, Writing, one_of
+from dahl_ident.errors import FitInterrupted
 
 if TYPE_CHECKING:
     from dahl_ident.results import ChainPosterior, FitResult, RecordFit
@@ -136,11 +138,13 @@ def _fit_records(
     from dahl_ident.data import read_record
     from dahl_ident.results import fit as fit_data
 
-    result = fit_data(
-        [read_record(name) for name in files],
-        throw=False,
-        **{k: v for k, v in {**model.keywords(), **estimating.keywords()}.items() if k in _TAKEN},
-    )
+    how = {k: v for k, v in {**model.keywords(), **estimating.keywords()}.items() if k in _TAKEN}
+    records = [read_record(name) for name in files]
+    try:
+        result = fit_data(records, throw=False, progress=sys.stderr.isatty(), **how)
+    except FitInterrupted as stop:
+        console.write(stop.result.fit_report())
+        raise
     if save is not None:
         result.save(save, overwrite=writing.overwrite)
     if general.json:

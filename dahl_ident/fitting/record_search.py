@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.errors import FitError, ModelError
+from dahl_ident.errors import FitError, FitInterrupted, ModelError
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
 from dahl_ident.fitting.record_start import record_starts, started_at
 from dahl_ident.problem import Quadratic
@@ -26,6 +26,10 @@ _EXACT = 1e-12  # share of variance left that is rounding
 _REPEATS = 12
 _SETTLED = 0.03  # step in standard errors that no longer matters
 _LOOSE = 1e4  # of the step at which a search of a long record has converged
+
+
+Tell = Callable[[int, float], None]
+"""Takes the number of evaluations and the share of variance left."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +54,37 @@ class RecordOptimum:
     evaluations: int
 
 
+class _Trace:
+    """Remembers the best values of a search, and tells how it goes."""
+
+    def __init__(self, tell: Tell | None) -> None:
+        self._tell, self._count = tell, 0
+        self._best: tuple[RecordProblem, FloatArray, float] | None = None
+
+    def __call__(self, problem: RecordProblem, theta: FloatArray, cost: float) -> None:
+        self._count += 1
+        if self._best is None or self._best[0] is not problem or cost < self._best[2]:
+            self._best = problem, theta.copy(), cost
+        if self._tell is not None:
+            self._tell(self._count, 2.0 * self._best[2] / problem.n_residuals)
+
+    def optimum(self, problem: RecordProblem) -> RecordOptimum | None:
+        """Return the best so far, None before the first evaluation."""
+        if self._best is None:
+            return None
+        part, theta, cost = self._best
+        values = part.values(theta)
+        if part.records is not problem.records:  # of a shortened problem
+            values = started_at(problem, values[: len(problem.free)].tolist())
+            part = problem
+        return RecordOptimum(part, values, cost, False, self._count)
+
+
 def solve_records(
-    problem: RecordProblem, *, start: Mapping[str, float] | None = None
+    problem: RecordProblem,
+    *,
+    start: Mapping[str, float] | None = None,
+    tell: Tell | None = None,
 ) -> RecordOptimum:
     """Return the least-squares estimate.
 
@@ -61,6 +94,8 @@ def solve_records(
         What to solve.
     start : mapping of str to float, optional
         Values that the search begins with; it then looks at no other start.
+    tell : callable, optional
+        Called after each evaluation with their number and the share of variance left.
 
     Returns
     -------
@@ -68,6 +103,8 @@ def solve_records(
 
     Raises
     ------
+    FitInterrupted
+        If stopped from the keyboard; its `result` is the best RecordOptimum so far.
     FitError
         If there are fewer samples than parameters, or no start gives a finite motion.
     ModelError
@@ -82,6 +119,22 @@ def solve_records(
         raise ModelError(
             f"start names {', '.join(unknown)}; the unknowns are {', '.join(problem.names)}"
         )
+    problem.watch = trace = _Trace(tell)
+    try:
+        found = _solved(problem, start)
+    except KeyboardInterrupt as stop:
+        so_far = trace.optimum(problem)
+        if so_far is None:
+            raise
+        so_far.problem.watch = None
+        raise FitInterrupted("the fit was stopped before it found a minimum", so_far) from stop
+    finally:
+        problem.watch = None
+    found.problem.watch = None  # of a weighted problem
+    return found
+
+
+def _solved(problem: RecordProblem, start: Mapping[str, float] | None) -> RecordOptimum:
     evaluations = 0
     if start is not None and all(p.name in start for p in problem.free):
         starts = started_at(problem, [start[p.name] for p in problem.free])[None]

@@ -8,7 +8,7 @@ sample, an offset and, for forces, a drift.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -52,6 +52,10 @@ class Prediction:
 
     output: FloatArray
     by: FloatArray
+
+
+Watch = Callable[["RecordProblem", FloatArray, float], None]
+"""Takes a problem, search coordinates and the cost there."""
 
 
 class RecordProblem:
@@ -125,6 +129,8 @@ class RecordProblem:
         self.whitening = np.ones(1)
         """Filter of the residuals; see :func:`~.record_noise.prediction_error_filter`."""
         self._guesses: list[FloatArray | None] = [None] * len(self.records)
+        self.watch: Watch | None = None
+        """Called after each evaluation of the cost."""
 
     def _check(self, record: Record, which: str) -> None:
         if len(record) < _SHORTEST:
@@ -185,13 +191,15 @@ class RecordProblem:
             energy = np.concatenate([[0.0], np.cumsum((wave - wave.mean()) ** 2)])
             start = int(np.argmax(energy[n:] - energy[:-n])) if n < wave.size else 0
             parts.append(cut(thin, slice(start, start + n)))
-        return RecordProblem(
+        other = RecordProblem(
             parts,
             self.model,
             output=self.output,
             excitation=self.excitation,
             substeps=self.substeps,
         )
+        other.watch = self.watch
+        return other
 
     def weighted(self, whitening: FloatArray) -> RecordProblem:
         """Return the same problem with filtered residuals."""
@@ -382,6 +390,8 @@ class RecordProblem:
             cost += 0.5 * float(residual @ residual)
             gradient -= jacobian.T @ residual
             hessian += jacobian.T @ jacobian
+        if self.watch is not None:
+            self.watch(self, theta, cost)
         return Quadratic(np.asarray(cost), gradient, hessian)
 
     @cached_property

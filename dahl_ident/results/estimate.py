@@ -53,6 +53,7 @@ def fit(
     excitation: Excitation = ...,
     substeps: int | None = ...,
     throw: bool = ...,
+    progress: bool = ...,
 ) -> RecordFit: ...
 def fit(
     data: FrequencyResponse | Record | Sequence[Record],
@@ -72,6 +73,7 @@ def fit(
     excitation: Excitation = "force",
     substeps: int | None = None,
     throw: bool = True,
+    progress: bool = False,
 ) -> FitResult | RecordFit:
     """Estimate a model's free parameters by least squares; no initial values are needed.
 
@@ -116,6 +118,8 @@ def fit(
     throw : bool, default True
         Raise where the data give no finite optimum; otherwise return what was found, with its
         `status`.
+    progress : bool, default False
+        Of records: show on the terminal how the search goes, once it has taken two seconds.
 
     Returns
     -------
@@ -124,6 +128,8 @@ def fit(
 
     Raises
     ------
+    FitInterrupted
+        If a fit of records was stopped from the keyboard; its `result` holds the best so far.
     FitError
         If there is no finite optimum and `throw`; the error's `result` holds what was found.
         Also if there are fewer numbers than parameters.
@@ -158,7 +164,7 @@ def fit(
         bound = as_model(model).with_free(free).with_fixed(fixed or {})
         return fit_records(
             records, bound, start=start, output=output, excitation=excitation,
-            substeps=substeps, throw=throw,
+            substeps=substeps, throw=throw, progress=progress,
         )  # fmt: skip
     problem = Problem(data, model, noise=noise, sensors=sensors, free=free, fixed=fixed)
     own = {

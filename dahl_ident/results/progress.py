@@ -1,8 +1,9 @@
-"""A bar on the terminal while a chain runs, with the time that is left."""
+"""A bar on the terminal while a chain or a long fit runs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from dahl_ident.bayes.chain import Chain, Listener, Settings
@@ -38,3 +39,29 @@ def progress_bar(settings: Settings) -> Iterator[Listener]:
             bar.update(task, completed=steps, total=None if total is None else max(total, steps))
 
         yield update
+
+
+_PATIENCE = 2.0  # s without a display
+
+
+@contextmanager
+def fit_progress() -> Iterator[Callable[[int, float], None]]:
+    """Yield a function of evaluations and share of variance left, which shows them after 2 s."""
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    began = time.monotonic()
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    task = bar.add_task("fitting")
+
+    def update(evaluations: int, share: float) -> None:
+        if time.monotonic() - began > _PATIENCE:
+            bar.start()
+        left = 100.0 * share**0.5
+        bar.update(task, description=f"fitting: {evaluations} evaluations, {left:.3g} % rms left")
+
+    try:
+        yield update
+    finally:
+        bar.stop()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -33,12 +34,13 @@ from dahl_ident.diagnostics.statements import doubted
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.elements import Element, Model
 from dahl_ident.elements.description import describe_model, model_from_description
-from dahl_ident.errors import DataError, FitError, ValidationError
+from dahl_ident.errors import DataError, FitError, FitInterrupted, ValidationError
 from dahl_ident.fitting.record_search import RecordOptimum, hold_model, solve_records
 from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.problem.record_problem import RecordProblem, cut
 from dahl_ident.results.fit_storage import check_digest, sealed
 from dahl_ident.results.hold_out import HeldOut, HoldOut
+from dahl_ident.results.progress import fit_progress
 from dahl_ident.results.result import Estimate, Result
 
 if TYPE_CHECKING:
@@ -547,7 +549,12 @@ class RecordFit(Result):
 
 
 def fit_records(
-    records: Sequence[Record], model: Element, *, throw: bool = True, **how: Any
+    records: Sequence[Record],
+    model: Element,
+    *,
+    throw: bool = True,
+    progress: bool = False,
+    **how: Any,
 ) -> RecordFit:
     """Return the fit of a model to records of any motion; see :func:`dahl_ident.fit`.
 
@@ -559,6 +566,8 @@ def fit_records(
         One element or a sum.
     throw : bool, default True
         Raise where the search does not converge.
+    progress : bool, default False
+        Show on the terminal how it goes, once it has taken two seconds.
     **how
         `start`; and `output`, `excitation` and `substeps` of
         :class:`dahl_ident.problem.record_problem.RecordProblem`.
@@ -568,7 +577,15 @@ def fit_records(
     RecordFit
     """
     start = how.pop("start", None)
-    optimum = solve_records(RecordProblem(records, model, **how), start=start)
+    problem = RecordProblem(records, model, **how)
+    try:
+        with fit_progress() if progress else nullcontext() as tell:
+            optimum = solve_records(problem, start=start, tell=tell)
+    except FitInterrupted as stop:
+        raise FitInterrupted(
+            f"{stop}; this exception's `result` holds the best values so far",
+            RecordFit(stop.result),
+        ) from stop
     if throw and not optimum.converged:
         raise FitError(
             "not converged: the search stopped before it found a minimum; give start=, or fix a "
