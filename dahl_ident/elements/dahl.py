@@ -51,7 +51,7 @@ from dahl_ident.errors import ValidationError
 if TYPE_CHECKING:
     import casadi as ca
 
-_EXPONENTS = (1e-9, 1e3)
+_EXPONENTS = (1e-9, 1e3)  # beyond them the loop is that of the limit, to rounding
 _ALPHA = Assumed(1.0)
 _AT_REST = 1e-30
 """Smaller beta are rest, to more digits than a number has."""

@@ -30,8 +30,8 @@ from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.recursion import stretches
 from dahl_ident.errors import ModelError
 
-_SERIES = 0.1
-_BISECTIONS = 200
+_SERIES = 0.1  # angle below which y - sin(y) loses digits
+_BISECTIONS = 200  # more than a number has digits
 
 
 class Masing(Friction):

@@ -35,7 +35,7 @@ from dahl_ident.errors import ModelError, ValidationError
 _BLOCK = 200  # loops computed together: their scratch arrays stay in the processor's cache
 _AT_REST = 1e-150  # smaller amplitudes are rest
 _SMALLEST = 1e-30  # m; the same for a velocity-dependent law
-_RATED_BLOCK = 64
+_RATED_BLOCK = 64  # velocity-dependent loops computed together: each solves a small linear system
 _SUBSTEPS, _FORCE_STEP = 4, 1e-6
 _FARTHEST = 1e9  # m; a law that has not slipped fully there never does
 _START = 60  # steps from rest to the start of a path: as fine as a cycle of 240

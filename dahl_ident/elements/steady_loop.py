@@ -40,7 +40,7 @@ _FINE, _COARSE = (24, 48), (10, 14)
 with which a tip is approached."""
 _DEEPEST = 18.0  # y beyond which L - F is rounding
 _SECTIONS = 16  # of a bracket, when the force is sought at which s vanishes
-_NEWTON_STEPS = 60
+_NEWTON_STEPS = 60  # three are the rule; more where bisection takes over
 _CLOSE, _CONVERGED = 1e-3, 1e-5  # last steps of y, with the coarse and the fine rule
 _OPEN = 1e-6  # of the path: a loop that misses it by more is not resolved
 

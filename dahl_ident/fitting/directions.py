@@ -19,7 +19,7 @@ from dahl_ident.problem import Problem
 from dahl_ident.problem.stiffness import StiffnessData
 
 Dimension = tuple[int, int, int]
-_STIFFNESS: Dimension = (1, -1, 0)
+_STIFFNESS: Dimension = (1, -1, 0)  # force over displacement
 
 
 @dataclass(frozen=True)

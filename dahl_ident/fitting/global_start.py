@@ -42,7 +42,7 @@ from dahl_ident.problem.stiffness import StiffnessData
 
 IntArray = NDArray[np.intp]
 
-_STEP = 0.01
+_STEP = 0.01  # of ln(A/length): tables are read at the nearest step
 _LOWEST, _NODES = -3200, 6400  # of ln(A/length) in a table, in steps
 _DECADE = np.log(10.0) / _STEP
 _FINE, _COARSE = 58, 230  # steps between nodes of the grid: four a decade, one a decade
@@ -51,9 +51,9 @@ _COMPUTED = 10  # steps between the amplitudes at which a table is computed; spl
 _AROUND_KNEE = 1e3  # how far a table is computed beyond the knee; power laws beyond that
 _NUMBERS = {"log": (0.25, 0.5, 1.0, 2.0, 4.0), "linear": (-1.0, -0.5, 0.0, 0.5, 1.0)}
 _DEPENDENT = 1e-12  # of a column's length that others leave
-_MOST_COMBINATIONS = 4000
+_MOST_COMBINATIONS = 4000  # nodes of all elements together: a limit on memory and time
 _MOST_OF_ONE = 1000  # of one element whose curves have to be computed node by node
-_MOST_STARTS = 4
+_MOST_STARTS = 4  # searches a table: a limit on their cost
 _HOPELESS = 100.0  # times the lowest sum of squares: no start, even with coarse nodes
 _AROUND = np.array([-1, 0, 1])
 
@@ -493,7 +493,7 @@ def _curve(
 
 
 _TABLES: dict[Hashable, ComplexArray] = {}
-_MOST_TABLES = 64
+_MOST_TABLES = 64  # 6 MB in all
 
 
 def _table(

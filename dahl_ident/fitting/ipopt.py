@@ -52,14 +52,14 @@ from dahl_ident.problem import Problem
 if TYPE_CHECKING:
     import casadi as ca
 
-_TOLERANCE = 1e-11
-_ITERATIONS = 300
+_TOLERANCE = 1e-11  # of the scaled gradient: well below the smallest step that a report shows
+_ITERATIONS = 300  # a limit for searches that do not end
 _LEAST_RESIDUAL = 1e-4  # of the largest change that a parameter's own size makes
-_ACTIVE = 1e-6
-_MOST_STARTS = 6
-_RESCALINGS = 30
-_SAME_SCALE = 1e-10
-_SAME_COST = 1e-6
+_ACTIVE = 1e-6  # an inequality nearer to its limit than this holds there
+_MOST_STARTS = 6  # the lowest minima of the global grid, and what the user gave
+_RESCALINGS = 30  # of the noise's scale; a handful is the rule
+_SAME_SCALE = 1e-10  # change of ln scale that ends them
+_SAME_COST = 1e-6  # of the cost unit: two ends this near are one optimum
 _WORDS = {
     "Maximum_Iterations_Exceeded": "it reached the maximum number of iterations",
     "Restoration_Failed": "it could not return to a point that satisfies the constraints",

@@ -28,15 +28,15 @@ Evaluate = Callable[[FloatArray, IntArray | None], Quadratic]
 """(theta (S, P), which of the problems they belong to, None for all) -> cost, gradient, Hessian."""
 
 _EPS = float(np.finfo(np.float64).eps)
-_FIRST_DAMPING = 1e-9
+_FIRST_DAMPING = 1e-9  # almost nothing: the first step is that of Gauss and Newton
 _GAUSS_NEWTON = 1e-3  # with more damping a short step says nothing
-_MOST_DAMPING = 1e12
+_MOST_DAMPING = 1e12  # steps are below rounding then
 _ROUNDING = 1e-12  # of a scaled Hessian's entries, with room
 _LONGEST_STEP = 2.0  # of a logarithm
-_NOISE_TOLERANCE = 1e-8
-_REMAINDER = 3e-7
+_NOISE_TOLERANCE = 1e-8  # of a standard deviation of the residuals
+_REMAINDER = 3e-7  # standard deviations that the last step may leave
 _LAST_STEP = 1e-6  # of a logarithm: the Hessian is that before the last step
-_ROUNDING_TOLERANCE = 1e-13
+_ROUNDING_TOLERANCE = 1e-13  # of the data, what rounding leaves of residuals
 _UNSEEN = 4.0 * _EPS  # relative change of a cost that may be rounding
 NEARLY = 1e-4  # relative difference of costs that are nearly alike
 

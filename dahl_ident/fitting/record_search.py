@@ -23,7 +23,7 @@ _GOOD = 0.01  # share of variance left at which no further start is tried
 _SLOW = 0.5  # correlation of neighbouring residuals that are weighted by their spectrum
 _DESCRIBED = 0.1  # share of variance left beyond which the model is wrong, not the drive noisy
 _EXACT = 1e-12  # share of variance left that is rounding
-_REPEATS = 12
+_REPEATS = 12  # a limit for weights that do not settle
 _SETTLED = 0.03  # step in standard errors that no longer matters
 _LOOSE = 1e4  # of the step at which a search of a long record has converged
 

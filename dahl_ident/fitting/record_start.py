@@ -22,8 +22,8 @@ from dahl_ident.problem.record_problem import RecordProblem
 _LENGTHS = np.geomspace(1e-3, 10.0, 13)  # of the largest displacement
 _SIGNED = np.geomspace(0.03, 30.0, 7)  # rates over the inverse of the largest displacement
 _LONGEST = 8192  # samples that the scan looks at
-_COMBINATIONS = 600
-_STARTS = 4
+_COMBINATIONS = 600  # linear solutions on the grid: a limit on their cost
+_STARTS = 4  # the best that are kept, as for tables
 _APART = 0.05  # in the logarithm of the misfit, or the starts are one
 _DECAY = 1e-3  # of a decay's largest amplitude in its spectrum: below, it has none
 _BAND = 1e-5  # of the drive's largest power: below, it has none

@@ -13,7 +13,7 @@ from dahl_ident.noise import bend
 from dahl_ident.problem import Problem
 
 _COST, _STEP, _SLOPE = 1e-13, 1e-10, 1e-14  # relative changes that end a search
-_EVALUATIONS = 300
+_EVALUATIONS = 300  # a limit for searches that do not end
 
 
 def minimise_by_scipy(

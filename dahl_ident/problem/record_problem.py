@@ -32,7 +32,7 @@ from dahl_ident.time_domain import (
 )
 
 Output = Literal["force", "motion"]
-_SHORTEST = 16
+_SHORTEST = 16  # samples from which noise can be estimated
 _PER_CYCLE = 100.0  # samples that a slow cycle keeps where a record is too long
 _SUBSTEP = 0.4  # rad of the fastest motion in a step of integration
 _POWER = 0.999  # share of the drive's power below its band's end

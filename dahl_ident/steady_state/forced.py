@@ -22,7 +22,7 @@ from dahl_ident.steady_state.plant import BoolArray, IntArray, flatten
 from dahl_ident.steady_state.roots import find_roots
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
-_REACH = (1e-290, 1e290)
+_REACH = (1e-290, 1e290)  # numbers end at 1e-308 and 1e308; squares of ratios stay inside
 
 
 @dataclass(frozen=True)
