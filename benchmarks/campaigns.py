@@ -340,7 +340,12 @@ def _dask(folder: Path, results: Path) -> tuple[pd.DataFrame, int]:
             os.kill(next(iter(workers.values())), signal.SIGKILL)
             lost += 1
 
+    patient = {  # a busy machine starts workers slowly; a cluster that gives them up never ends
+        "distributed.comm.timeouts.connect": "300s",
+        "distributed.comm.timeouts.tcp": "300s",
+    }
     with (
+        library("dask").config.set(patient),
         distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1",
             dashboard_address=None,
