@@ -217,9 +217,18 @@ def test_weights_of_a_covariance_count_the_parts_that_have_one() -> None:
     np.testing.assert_allclose(noise.tail(z)[0], np.array([4.0, 5.0]) * np.log(1.5))
 
 
+@pytest.mark.parametrize("kind", ["relative", "absolute"])
+def test_residuals_of_harmonics_have_their_own_derivatives(kind: str) -> None:
+    noise, h = noise_for(Rows.of(TWO_POINTS), kind), 1e-6
+    predicted, by = TWO_POINTS.response * (1.1 + 0.1j), np.array([1.0, -2.0j, 3.0 + 1.0j, 0.5])
+    up, down = (noise.residual(predicted + s * h * by) for s in (1.0, -1.0))
+    np.testing.assert_allclose(noise.change(predicted, by), (up - down) / (2.0 * h), rtol=1e-8)
+
+
 def test_losses_have_their_own_derivatives() -> None:
     rho, z, h = Student(np.array(5.0)), np.array([0.3, 2.0, 40.0]), 1e-5
-    _, slope, curvature = rho(z)
+    loss, slope, curvature = rho(z)
+    np.testing.assert_allclose(loss, 3.0 * np.log(1.0 + z / 5.0), rtol=1e-14)
     np.testing.assert_allclose(slope, (rho(z + h)[0] - rho(z - h)[0]) / (2.0 * h), rtol=1e-7)
     np.testing.assert_allclose(curvature, (rho(z + h)[1] - rho(z - h)[1]) / (2.0 * h), rtol=1e-7)
     y: ComplexArray = np.array([0.3 - 0.2j, 3.0 + 4.0j])
