@@ -298,7 +298,8 @@ def damper(folder: Path) -> str:
         record = Record(time, displacement=1e-3 * x, force=force)
         levels.append(di.extract(record).select(harmonic=1))
     model = LINEAR + di.Damper()
-    every = {c: _predicted(levels, c, model) for c in itertools.combinations(range(10), 4)}
+    fours: list[tuple[int, ...]] = list(itertools.combinations(range(10), 4))
+    every = {four: _predicted(levels, four, model) for four in fours}
     errors = np.array([error for error, _, _ in every.values()])
     lines = [
         f"A measured damper ({len(levels)} levels of 2.9 to 9.1 mm, 0.8 to 1.2 Hz, Dahl and linear "
