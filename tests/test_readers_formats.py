@@ -689,6 +689,12 @@ class TestHostileFiles:
             with pytest.raises(DataError, match="damaged: 8 bytes behind its array"):
                 read_record(tmp_path / name)
 
+    def test_an_archive_that_unpacks_to_more_than_its_limit(self, tmp_path: Path) -> None:
+        with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("x.npy", bytes(300_000_000))
+        with pytest.raises(DataError, match=r"the content would take 300 MB, and the file has"):
+            read_record(tmp_path / "a.npz")
+
     def test_objects_in_npz_are_not_run(self, tmp_path: Path) -> None:
         np.savez(tmp_path / "a.npz", a=np.array([{"x": 1}], dtype=object))
         with pytest.raises(DataError, match="the file is damaged: Object arrays cannot be loaded"):

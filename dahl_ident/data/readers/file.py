@@ -241,6 +241,8 @@ def _archive(file: File, suffix: str) -> str:
                 return "excel"
             if "mimetype" in names and b"opendocument.spreadsheet" in archive.read("mimetype"):
                 return "ods"
+    except DataError:  # a ValueError too
+        raise
     except ZIP_ERRORS:  # its reader will report the damage
         return {".ods": "ods", ".npz": "npz"}.get(suffix, "excel" if "xls" in suffix else "zip")
     if names and all(name.endswith(".npy") for name in names):
