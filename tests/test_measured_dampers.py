@@ -39,7 +39,7 @@ def estimated(records: list[Record], model: Element) -> tuple[dict[str, float], 
 
 
 def test_a_friction_damper_with_a_gap() -> None:
-    """Three whole tests at 0.5 Hz: stiffness and gap as others found them."""
+    """Three whole tests at 0.5 Hz: stiffness as others found it; the gap exceeds their 3 mm."""
     records = [
         read_record(f, displacement="displacement", force="friction force")
         for f in sorted((FOLDER / "brfd").glob("band30lb_0.5Hz_*.csv"))
