@@ -121,7 +121,7 @@ class Campaign:
 
 
 def campaign(
-    source: str | Path | Mapping[str, Any] | Definition,
+    source: str | Path | Mapping[str, Any],
     *,
     jobs: int | None = None,
     executor: Executor | None = None,
@@ -138,7 +138,7 @@ def campaign(
 
     Parameters
     ----------
-    source : path, mapping or Definition
+    source : path or mapping
         TOML file, or its content; see :mod:`dahl_ident.campaigns.definition`.
     jobs : int, optional
         Processes of this machine, with one numerical thread each; by default as many as there
@@ -191,8 +191,29 @@ def campaign(
     >>> campaign(definition, jobs=1).table[["device", "sigma"]].round(1).to_dict("list")
     {'device': ['clean', 'noisy'], 'sigma': [30.0, 30.0]}
     """
+    return run(
+        read_definition(source),
+        jobs=jobs,
+        executor=executor,
+        send_files=send_files,
+        dry_run=dry_run,
+        redo=redo,
+        progress=progress,
+    )
+
+
+def run(
+    definition: Definition,
+    *,
+    jobs: int | None,
+    executor: Executor | None,
+    send_files: bool,
+    dry_run: bool,
+    redo: bool,
+    progress: Callable[[int, int, Mapping[str, Any]], None] | None,
+) -> Campaign:
+    """Do what :func:`campaign` does, with a definition that was read already."""
     workers = default_workers() if jobs is None else whole_number(jobs, "jobs", 1)
-    definition = source if isinstance(source, Definition) else read_definition(source)
     folder = definition.folder
     if dry_run:
         keys = _keys(definition)

@@ -58,21 +58,20 @@ def campaign(
     """
     from dahl_ident.campaigns.definition import read_definition
     from dahl_ident.campaigns.population import USABLE
-    from dahl_ident.campaigns.run import campaign as run_campaign
+    from dahl_ident.campaigns.run import run
 
     read = read_definition(definition)
     _check_report(report, overwrite, covariate, order, read)
     with ExitStack() as stack:
-        options: dict[str, Any] = {"jobs": jobs}
+        options: dict[str, Any] = {"jobs": jobs, "executor": None}
         if scheduler is not None and not dry_run:
             client = stack.enter_context(_client(scheduler))
             workers = jobs or sum(client.ncores().values()) or 1
             options = {"jobs": workers, "executor": client.get_executor()}
         progress = stack.enter_context(_progress()) if sys.stderr.isatty() else _lines()
-        done = run_campaign(
-            read, **options, send_files=send_files, dry_run=dry_run, redo=redo,
-            progress=progress,
-        )  # fmt: skip
+        done = run(
+            read, **options, send_files=send_files, dry_run=dry_run, redo=redo, progress=progress
+        )
     if report is not None and not dry_run:
         place = done.report(
             report,
