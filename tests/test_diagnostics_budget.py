@@ -150,6 +150,19 @@ class TestBudget:
         with pytest.raises(FitError, match="no uncertainty budget"):
             budget(fit(table(n=1), Dahl(), throw=False).optimum)
 
+    def test_none_where_the_iteration_leaves_every_steady_response(self) -> None:
+        """Drives near the force limit, where the linearised model steps below it."""
+        phase = np.exp(-1j * np.radians([5.0, 20.0, 40.0]))
+        response = np.array([0.03, 0.04, 0.06]) * phase
+        data = FrequencyResponse(
+            np.ones(3), response, drive=np.array([0.02, 0.2, 0.4]), quantity="receptance",
+            controlled="force",
+        )  # fmt: skip
+        found = fit(data, Dahl())
+        assert found.stated_budget is None
+        with pytest.raises(FitError, match="no uncertainty budget"):
+            found.budget()
+
     def test_coverage_factor(self) -> None:
         assert coverage_factor(2.0, 0.95) == pytest.approx(stats.t(2).ppf(0.975))
         assert coverage_factor(np.inf) == pytest.approx(2.0, abs=1e-3)

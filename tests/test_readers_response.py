@@ -164,7 +164,7 @@ class TestForms:
         assert data.provenance is not None
         assert data.drive_factor_uncertainty == 0.02
         assert "uncertain by 2.00%" in repr(data)
-        with pytest.raises(UnitError, match="the drive is a voltage; give drive_factor"):
+        with pytest.raises(UnitError, match="the drive is a voltage; give the force for one"):
             read(columns)
         with pytest.raises(UnitError, match=r"drive_factor has the unit \[N/A\]; expected"):
             read(columns, columns={"drive_factor": "12.5 N/A"})

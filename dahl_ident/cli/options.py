@@ -148,6 +148,10 @@ class Reading:
         str | None,
         typer.Option(help='Force for one unit of drive, "12.5 N/V".', rich_help_panel=_READING),
     ] = None
+    drive_factor_uncertainty: Annotated[
+        float | None,
+        typer.Option(help="Its relative standard uncertainty.", rich_help_panel=_READING),
+    ] = None
     level: Annotated[
         str | None, typer.Option(help="Label for all rows.", rich_help_panel=_READING)
     ] = None

@@ -389,8 +389,8 @@ class Binding:
         text = self.map.drive_factor
         if text is None:
             raise UnitError(
-                f"{self.source.name}: the drive is a {kind}; give drive_factor, such as "
-                f"'12.5 N/{si_unit(kind)}'"
+                f"{self.source.name}: the drive is a {kind}; give the force for one unit of it, "
+                f"such as drive_factor='12.5 N/{si_unit(kind)}'"
             )
         value, _, motion = parse_quantity(text, (f"force_per_{kind}",), "drive_factor")
         self.motions["drive_factor"] = motion

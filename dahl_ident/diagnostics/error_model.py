@@ -313,6 +313,8 @@ def _estimated(
     last: FloatArray | None = None
     for step in range(_STEPS):
         y, J = rows.at(theta)
+        if not np.isfinite(y).all():
+            raise np.linalg.LinAlgError("a drive beyond the force limit has no steady response")
         level = float(y[:m] @ y[:m]) / max(dof, 1)
         rest = () if shared is None else shared.at(theta, J[:m])
         J = J if basis is None else J @ basis.matrix

@@ -188,8 +188,8 @@ def _answer(fit: FitResult, of: str) -> Iterator[Section]:
 
 def _budget(fit: FitResult) -> Iterator[Block]:
     """Yield the uncertainty budget; nothing if none can be stated."""
-    if fit.status != VerdictStatus.NOT_DESCRIBED and fit.errors is not None:
-        found = fit.budget()
+    found = fit.stated_budget
+    if fit.status != VerdictStatus.NOT_DESCRIBED and found is not None:
         yield tables.budget(found)
         yield budget_picture(found)
 
@@ -330,7 +330,7 @@ def fit_facts(fit: FitResult) -> dict[str, Any]:
             }
             for name, e in fit.params.items()
         },
-        "budget": None if fit.errors is None else fit.budget().to_dict(),
+        "budget": None if fit.stated_budget is None else fit.stated_budget.to_dict(),
         "priors": tables.priors(fit),
         "determined": [str(c) for c in known.combinations],
         "suspicious": [str(point) for point in left.suspicious],

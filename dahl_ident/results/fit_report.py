@@ -68,8 +68,8 @@ def _all(fit: JudgedFit, intervals: ConfidenceIntervals) -> Iterator[Section]:
     derived = [str(q) for q in fit.derived()]
     if derived:
         yield Section("Derived", derived)
-    if fit.errors is not None:
-        yield Section("Uncertainty budget", str(fit.budget()).splitlines())
+    if fit.stated_budget is not None:
+        yield Section("Uncertainty budget", str(fit.stated_budget).splitlines())
     correlations = _correlations(fit)
     if correlations:
         yield Section("Correlations", correlations)

@@ -34,7 +34,7 @@ from dahl_ident.diagnostics.intervals import (
 from dahl_ident.diagnostics.statements import statements, verdict_status
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.results.fit_numbers import FitNumbers
 from dahl_ident.units import Quantity
@@ -172,6 +172,14 @@ class JudgedFit(FitNumbers):
             share; then the combined and the expanded uncertainty.
         """
         return self._budget
+
+    @cached_property
+    def stated_budget(self) -> Budget | None:
+        """The uncertainty budget; None where there is nothing to state."""
+        try:
+            return self._budget
+        except FitError:
+            return None
 
     @property
     def findings(self) -> tuple[str, ...]:
