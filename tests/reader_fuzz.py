@@ -248,7 +248,9 @@ def judge(path: Path, name: str, kind: str) -> str:
                     return "refused"
                 continue
         outcome = "accepted"
-        notes = [n for n in (record.provenance or {}).get("notes", ()) if "not used" not in n]
+        known = record.provenance or {}  # a file that is parsed once warns once
+        said = [*said, *known.get("warnings", ())]
+        notes = [n for n in known.get("notes", ()) if "not used" not in n]
         if not said and not notes and _is_wrong(record, name, kind):
             return "silently wrong"
     with contextlib.suppress(DahlIdentError), warnings.catch_warnings():

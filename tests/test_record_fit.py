@@ -395,7 +395,7 @@ def test_report(tmp_path: Path, ending: str) -> None:
     else:
         for caption in ("Measured and fitted force", "Residuals over displacement"):
             assert caption in text
-    with pytest.raises(ValidationError, match="by themselves"):
+    with pytest.raises(ValidationError, match="reported separately"):
         di.report([fit, di.fit(di.load_dataset("noisy"), di.Dahl())], tmp_path / "other.html")
 
 

@@ -382,7 +382,7 @@ def test_whatever_is_accepted_is_right_or_refused(
 def test_what_numbers_cannot_hold_is_refused(
     plant: Element, frequency: float, drive: float
 ) -> None:
-    text = r"^point 0 \(1 such points\) has an amplitude of about .* outside 1e-290 to 1e\+290"
+    text = r"^point 0 \(1 such points\) has an amplitude of about .* outside the range of numbers"
     with pytest.raises(ValidationError, match=text):
         response(plant, frequency, drive)
 

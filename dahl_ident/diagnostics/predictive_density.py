@@ -84,6 +84,7 @@ def predictive_density(optimum: Optimum) -> PredictiveDensity:
     problem, data = optimum.problem, optimum.problem.data
     owner, test, run = _tests(optimum)
     size = np.abs(data.response)[owner]
+    size = np.where(size > 0.0, size, size.max())  # a row of nothing counts as the largest
     predicted = problem.predict(optimum.theta)
     missed = (data.response - predicted) / size
     fundamental = owner == np.arange(data.n)

@@ -54,7 +54,7 @@ def force_history(
     --------
     >>> x = np.array([0.0, 0.4, 1.4, 1.0])
     >>> force_history(x, 1.0, 1.0, 0.0, 0.8, 0.0).value.round(6) + 0.0
-    array([0.      , 0.      , 0.632121, 0.451188])
+    array([0.      , 0.      , 0.632121, 0.094043])
     """
     legs = stretches(displacement)
     limits = f_max * (1.0 + legs.heading * asymmetry)

@@ -50,6 +50,7 @@ _FINE_ENDS = (6, 4)  # coarse nodes at either end
 _COMPUTED = 10  # steps between the amplitudes at which a table is computed; splines between
 _AROUND_KNEE = 1e3  # how far a table is computed beyond the knee; power laws beyond that
 _NUMBERS = {"log": (0.25, 0.5, 1.0, 2.0, 4.0), "linear": (-1.0, -0.5, 0.0, 0.5, 1.0)}
+_LARGEST = 1e150  # weighted columns, whose squares are numbers still
 _DEPENDENT = 1e-12  # of a column's length that others leave
 _MOST_COMBINATIONS = 4000  # nodes of all elements together: a limit on memory and time
 _MOST_OF_ONE = 1000  # of one element whose curves have to be computed node by node
@@ -576,6 +577,9 @@ def _solve_linear(
     columns = (
         np.stack(np.broadcast_arrays(*own), axis=-2) if own else rest[..., None, :][..., :0, :]
     )
+    # a hardening law overflows at some nodes: no starts
+    usable = (np.abs(columns) < _LARGEST).all(axis=(-2, -1))
+    columns = np.where(usable[..., None, None], columns, 0.0)
     left = _projected(columns, Q[..., None, :, :])
     norm = np.sqrt((left * left).sum(axis=-1))
     left = left / np.where(norm > 0.0, norm, 1.0)[..., None]
@@ -585,7 +589,8 @@ def _solve_linear(
     coefficients = scaled[..., 0] / np.where(norm > 0.0, norm, np.inf)
     explained = target - (coefficients[..., None, :] @ columns)[..., 0, :]
     base = np.linalg.solve(R[..., None, :, :], (explained @ Q)[..., None])[..., 0]
-    return (rest * rest).sum(axis=-1), np.concatenate([base, coefficients], axis=-1)
+    cost = np.where(usable, (rest * rest).sum(axis=-1), np.inf)
+    return cost, np.concatenate([base, coefficients], axis=-1)
 
 
 def _factors(common: list[FloatArray], target: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -335,7 +335,8 @@ class Problem:
             r, J = rows[..., :1, :], rows[..., 1:, :]
             rows = np.concatenate([r, chart.swapaxes(-1, -2) @ J], axis=-2)
         if rho is None:
-            products = rows @ rows.swapaxes(-1, -2)
+            with np.errstate(over="ignore", invalid="ignore"):  # far out a law may overflow
+                products = rows @ rows.swapaxes(-1, -2)
             cost = 0.5 * products[..., 0, 0]
         else:
             m = self.n_residuals
