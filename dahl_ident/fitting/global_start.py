@@ -578,7 +578,7 @@ def _solve_linear(
         np.stack(np.broadcast_arrays(*own), axis=-2) if own else rest[..., None, :][..., :0, :]
     )
     # a hardening law overflows at some nodes: no starts
-    usable = (np.abs(columns) < _LARGEST).all(axis=(-2, -1))
+    usable = np.asarray((np.abs(columns) < _LARGEST).all(axis=(-2, -1)))
     columns = np.where(usable[..., None, None], columns, 0.0)
     left = _projected(columns, Q[..., None, :, :])
     norm = np.sqrt((left * left).sum(axis=-1))
