@@ -41,11 +41,16 @@ rooms: install  ## the order of the rooms
 unit: install  ## tests and doctests, warnings as errors
 	$(BIN)/pytest -n $(JOBS) --dist worksteal
 
-test-lowest: install  ## the same tests on the lowest declared versions
+# Without the longest, which depend on no version: printed pages, killed processes, damaged files,
+# statistics of many tables, the contract of the law that is integrated.
+SHORT := not test_docs and not test_readers_fuzz and not test_diagnostics_coverage \
+	and not killed and not (test_law_contract and lugre)
+
+test-lowest: install  ## the same tests, but for the longest, on the lowest declared versions
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python .venv-lowest
 	$(BIN)/uv pip install --quiet --python .venv-lowest/bin/python --resolution lowest-direct \
 		--editable ".[dev]"
-	.venv-lowest/bin/pytest -n $(JOBS) --dist worksteal
+	.venv-lowest/bin/pytest -n $(JOBS) --dist worksteal -k "$(SHORT)"
 
 examples: install  ## renew the outputs printed in README and manual
 	$(BIN)/python -m tests.examples

@@ -155,7 +155,7 @@ def test_the_least_misfit_is_least() -> None:
     matrix, right = columns * weights, Z * weights[:, 0]
     other = lsq_linear(
         np.concatenate([matrix.real, matrix.imag]), np.concatenate([right.real, right.imag]),
-        bounds=(0.0, np.inf), tol=1e-12,
+        bounds=(0.0, np.inf), tol=1e-12, method="bvls", max_iter=1000,
     )  # fmt: skip
     assert np.sqrt(2.0 * other.cost / 24) == pytest.approx(found.least_misfit, rel=1e-3)
     assert "leaves less than" in found.statement
