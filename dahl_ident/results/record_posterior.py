@@ -106,7 +106,7 @@ class RecordPosterior(ChainDraws):
         Parameters
         ----------
         record, initial
-            As for :meth:`dahl_ident.RecordFit.predict`.
+            As for ``RecordFit.predict``.
         size, seed : int, default 100 and 0
             Of the draws.
 
