@@ -35,6 +35,7 @@ def draw() -> plt.Figure:
         loops.set_title("1  drive it at several amplitudes")
 
         fit.plot_fit((gain, phase))
+        gain.legend(loc="lower left", frameon=False)  # above the axes is the title
         gain.set_xlabel("")
         gain.tick_params(labelbottom=False)
         gain.set_title("2  take gain and phase, fit")
