@@ -27,6 +27,7 @@ RUNS = "scatter between runs"
 LEVELS = "scatter between repeated levels"
 
 _LENGTH = 1.0  # of the model error, in ln A and ln omega
+_MOST_PLACES = 200  # rows beyond which a column for each costs seconds, cubic in their number
 _SMOOTH = 1e-3  # eigenvalue of the correlation, over the largest, that is negligible
 _MOST_SHAPES = 24  # of its eigenvectors; a decade of both amplitude and frequency takes 15
 _SAME_LEVEL = 0.02  # of ln A and ln f, within which rows repeat each other
@@ -93,7 +94,11 @@ class Shapes:
 
     @classmethod
     def of(cls, places: FloatArray, *, parallel: bool, unit: float = 1.0) -> Shapes:
-        """Return the eigenvectors that rows notice."""
+        """Return the eigenvectors that rows notice, from evenly chosen ones of many rows."""
+        if len(places) > _MOST_PLACES:
+            order = np.lexsort(places.T[::-1])
+            chosen = np.linspace(0, len(places) - 1, _MOST_PLACES).round().astype(int)
+            places = places[order[chosen]]
         values, vectors = np.linalg.eigh(_correlation(places, places, parallel))
         kept = np.flatnonzero(values > _SMOOTH * values[-1])[::-1][:_MOST_SHAPES]
         return cls(places, vectors[:, kept] / np.sqrt(values[kept]), parallel, unit)
@@ -254,8 +259,10 @@ class StructuredSources:
 
 
 def _moved(problem: Problem) -> Problem | None:
-    """Return the problem at levels a little higher; None where their noise is known or nothing."""
+    """Return the problem at levels a little higher; None where noise is known or rows are many."""
     data = problem.data
+    if data.n > _MOST_PLACES:
+        return None
     driven = data.controlled == "force"
     stated = problem.scale_known or problem.noise != "relative"
     if stated and not driven.any():
