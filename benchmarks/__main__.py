@@ -19,6 +19,7 @@ TOPICS = (
     "steady_state",
     "reading",
     "extraction",
+    "long_records",
     "fitting",
     "ipopt",
     "bayes",

@@ -303,6 +303,13 @@ class TestHdf5:
             for name, values, unit in (("time", TIME, "s"), ("x", X * 1e3, "mm"), ("F", F, b"N")):
                 root.create_dataset(f"rig/{name}", data=values).attrs["units"] = unit
         assert_the_run(read_record(tmp_path / "run.h5"))
+        with h5py.File(tmp_path / "run.h5", "a") as root:
+            root["rig/displacement [mm]"] = X * 1e3
+            root["rig/displacement (deg)"] = X
+            root["rig/position (mm)"] = X * 1e3
+        with pytest.raises(DataError, match=r"2 columns .* write one of rig/displacement"):
+            read_record(tmp_path / "run.h5", displacement="displacement")
+        assert_the_run(read_record(tmp_path / "run.h5", displacement="position"))
 
     def test_compound(self, tmp_path: Path) -> None:
         rows = np.array(list(zip(TIME, X, F, strict=True)), dtype=[(n, "f8") for n in "txF"])
@@ -731,6 +738,11 @@ class TestDictionaries:
             "force": "data[:,2] [N]",
         }
         assert_the_run(read_record(tmp_path / "run.npy", columns=columns))
+        rows = np.array(list(zip(TIME, X, F, strict=True)), dtype=[(n, "f8") for n in "txF"])
+        np.save(tmp_path / "run.npy", rows)
+        assert_the_run(
+            read_record(tmp_path / "run.npy", time="t [s]", displacement="x [m]", force="F [N]")
+        )
 
     def test_sdypy_there_and_back(self) -> None:
         record = Record(TIME, displacement=X, force=F)

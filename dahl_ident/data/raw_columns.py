@@ -129,6 +129,8 @@ class Source:
     def find(self, text: str) -> Channel:
         """Return the one channel that `text` names, with or without its unit in brackets.
 
+        The last part of a path is enough where it is the only one of its name.
+
         Raises
         ------
         DataError
@@ -144,6 +146,14 @@ class Source:
                 )
             if found:
                 return found[0]
+        last = [c for c in self.channels if plain(c.short or "") == plain(text)]
+        if len(last) > 1:
+            paths = listed([c.name for c in last], 20)
+            raise DataError(
+                f"{self.name}: {len(last)} columns are called {text!r}; write one of {paths}"
+            )
+        if last:
+            return last[0]
         name, unit = split_header(text)
         if unit is not None:
             channel = self.find(name)

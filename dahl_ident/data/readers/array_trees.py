@@ -46,6 +46,8 @@ def tree_source(
     channels: list[Channel] = []
     notes: list[str] = []
     for path, value, unit in leaves:
+        if unit is None:
+            path, unit = split_header(path)
         found = list(_channels(path, value, unit))
         channels += found
         if not found:
@@ -140,7 +142,8 @@ def read_npy(file: File) -> Source:
         raise DataError(
             f"{file.name}: the file is damaged: {left} bytes behind its array; were some added?"
         )
-    return tree_source(file, "NumPy .npy", _fields({"data": _numpy_array(array)}))
+    leaves = _fields({"data": _numpy_array(array)}, file if file.content is None else None)
+    return tree_source(file, "NumPy .npy", leaves)
 
 
 def _numpy_array(array: Any) -> NDArray[Any]:
@@ -149,10 +152,22 @@ def _numpy_array(array: Any) -> NDArray[Any]:
     return array
 
 
-def _fields(arrays: Mapping[str, NDArray[Any]]) -> Iterator[Leaf]:
-    """Walk through arrays, tables of named fields among them, units in brackets in names."""
+def _fields(arrays: Mapping[str, NDArray[Any]], mapped: File | None = None) -> Iterator[Leaf]:
+    """Walk through arrays, tables of named fields among them."""
     for path, array in arrays.items():
-        parts = {f"{path}.{n}": array[n] for n in array.dtype.names or ()} or {path: array}
-        for where, values in parts.items():
-            name, unit = split_header(where)
-            yield name, values, unit
+        for field in array.dtype.names or (None,):
+            values = array if field is None else array[field]
+            content = (
+                values if mapped is None or not values.ndim else _mapped(mapped, field, values)
+            )
+            yield path if field is None else f"{path}.{field}", content, None
+
+
+def _mapped(file: File, field: str | None, like: NDArray[Any]) -> Stored:
+    """Return a field of a .npy file; each part is a mapping of its own, which ends with it."""
+
+    def read(rows: slice) -> NDArray[Any]:
+        array = np.load(file.stream(), mmap_mode="r", allow_pickle=False)
+        return np.array((array if field is None else array[field])[rows])
+
+    return Stored(like.shape, like.dtype, read)

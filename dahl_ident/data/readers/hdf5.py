@@ -212,6 +212,9 @@ class _Tree:
             return where, np.asarray("".join(map(chr, codes))), None
         if item.dtype.names == ("real", "imag"):
             kind = np.dtype(np.complex128)
-            join = lambda a: a["real"].T + 1j * a["imag"].T  # noqa: E731
-            return where, self.stored(item, where, kind, join, turned=True), None
+            return where, self.stored(item, where, kind, _joined, turned=True), None
         return where, self.stored(item, where, item.dtype, np.transpose, turned=True), None
+
+
+def _joined(parts: NDArray[Any]) -> NDArray[Any]:
+    return np.asarray(parts["real"].T + 1j * parts["imag"].T)
