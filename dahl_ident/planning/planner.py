@@ -39,7 +39,6 @@ _POOL = 80
 _MOST_RUNS = 8
 _WEIGHTS = (0.0, 0.1, 0.25, 0.5, 0.75)  # of the suspected parameters, the least that is enough
 _TIMES = 20  # corrections of the time that reaches a target
-_WITHIN = 1.0 + 1e-9  # of a time: sums of cycles are rounded
 _CLOSE = 0.985  # fraction of the target at which the search stops
 _NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _UNKNOWN = 1e-2  # the same of a suspected parameter, which is known within a decade or so
@@ -439,14 +438,15 @@ class Planner:
         start: list[int] = []
         short, wide = 0.0, np.inf
         for _ in range(_TIMES):
-            found = self.solve(time, start) or found
+            latest = self.solve(time, start)
+            found = latest or found
             if (found is None or (found.ratio > 1.0 and best is None)) and time >= most:
                 return found
             if found is not None:
                 start = found.selection.levels.tolist()
-            if found is not None and found.seconds <= _WITHIN * time and found.ratio <= 1.0:
-                best = found if best is None or found.seconds < best.seconds else best
-                if found.ratio >= _CLOSE:
+            if latest is not None and latest.ratio <= 1.0:
+                best = latest if best is None or latest.seconds < best.seconds else best
+                if latest.ratio >= _CLOSE:
                     break
             else:
                 short = max(short, time)
