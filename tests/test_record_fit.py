@@ -160,6 +160,31 @@ def test_error_bars_cover(pole: float) -> None:
     assert binom.ppf(1e-4, runs, 0.95) <= inside, inside
 
 
+@pytest.mark.parametrize("noise", [1e-6, 1e-5])
+def test_noise_of_the_displacement_does_not_count_as_travel(noise: float) -> None:
+    # an encoder's noise at rest moves the model's friction by 7 standard uncertainties and more
+    runs, inside, t = 20, 0, np.arange(1500) / 100.0
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        goals = np.repeat(rng.uniform(-8e-3, 8e-3, 9), 2)[1:]  # move and rest in turn
+        x = np.interp(t, np.arange(goals.size), goals)
+        force = DAHL.force(x) + 1e-3 * rng.standard_normal(t.size)
+        measured = x + noise * rng.standard_normal(t.size)
+        record = di.Record(t, displacement=measured, force=force)
+        fit = di.fit(record, di.Dahl(), start={"f_max": 0.1, "sigma": 30.0})
+        assert fit.problem.displacement_noise == pytest.approx(noise, rel=0.3)
+        low, high = fit.conf_interval()["f_max"]
+        inside += low < 0.1 < high
+    assert binom.ppf(1e-4, runs, 0.95) <= inside, inside
+    assert "not counted as travel" in fit.verdict
+    sources = [row.source for row in fit.budget()["f_max"].rows]
+    assert sorted(sources) == ["noise", "noise in the displacement"]
+    again = RecordFit.from_json(fit.to_json())
+    assert again.verdict == fit.verdict
+    still = di.Record(t, displacement=x, force=force)
+    assert di.fit(still, di.Dahl()).problem.displacement_noise == 0.0
+
+
 def test_noise_in_the_drive_does_not_pass_for_stiffness() -> None:
     # a plant that nearly floats: slow noise in the measured force moves the model, not the plant
     rng = np.random.default_rng(3)

@@ -13,15 +13,17 @@ from dahl_ident.arrays import FloatArray, positive_array
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget, BudgetRow, ParameterBudget, coverage_factor
 from dahl_ident.diagnostics.correlated_residuals import sandwich
+from dahl_ident.problem.displacement_noise import LEADS
 from dahl_ident.problem.record_noise import drive_noise
 from dahl_ident.problem.record_problem import RecordProblem
 
 _SLIGHT = 1e-6  # relative: noise of the drive below does not count
+_MATTERS = 0.2  # standard errors that noise in the displacement may shift without being counted
 _STEP = 1e-5  # relative, of parameters, for slopes of derived quantities
 _BLOCKS = 20  # of all records together, from which the model error is estimated
 _LEVEL = 0.9995  # of chance, at which scatter between blocks is no noise
 NOISE, DRIVE, FORCE = "noise", "noise in the drive", "force calibration"
-MODEL = "model error"
+MODEL, DISPLACEMENT = "model error", "noise in the displacement"
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ def record_errors(
     of a record ask for parameters that scatter more than noise explains, the excess is the model
     error. What the model misses everywhere alike does not show. Noise in a measured drive makes
     the response look smaller than it is, by the noise's share of the drive's power within its
-    band; a calibration error of the force scales every force.
+    band; a calibration error of the force scales every force. Noise in a
+    measured displacement counts as far as it shifts the estimate.
 
     Parameters
     ----------
@@ -93,6 +96,10 @@ def record_errors(
     )
     if beyond is not None:
         found[MODEL] = beyond
+    if problem.output == "force":
+        change = _by_displacement(problem, values, jacobians)
+        if (np.abs(change) > _MATTERS * np.sqrt(covariance.diagonal()))[: len(problem.free)].any():
+            found[DISPLACEMENT] = np.outer(change, change)
     scale = np.zeros(values.size)
     for i, parameter in enumerate(problem.free):
         scale[i] = values[i] * parameter.dimension[0]
@@ -111,6 +118,31 @@ def record_errors(
     else:
         exact.insert(0, FORCE)
     return RecordErrors(found, effective, tuple(exact))
+
+
+def _by_displacement(
+    problem: RecordProblem, values: FloatArray, jacobians: Sequence[FloatArray]
+) -> FloatArray:
+    """Return the change of the estimate with the displacement's noise.
+
+    As large as that of as much noise again; or, with a dead band, from where in it the true
+    displacement may be.
+    """
+    noise = problem.displacement_noise
+    if noise:
+        ends = [problem.without_noise(noise, lead) for lead in LEADS[::2]]
+        share = 0.5
+    else:
+        ends, share = [problem, problem.with_more_noise(problem.estimated_noise)], 1.0
+    size = np.sqrt(sum((J**2).sum(axis=0) for J in jacobians))
+    size = np.where(size > 0.0, size, 1.0)
+    normal, right = np.zeros((values.size, values.size)), np.zeros(values.size)
+    for i, J in enumerate(jacobians):
+        low, high = (end.predict(values, i, derivatives=False).output for end in ends)
+        scaled = J / size
+        normal += scaled.T @ scaled
+        right += scaled.T @ (share * (high - low))
+    return np.asarray(np.linalg.pinv(normal, hermitian=True) @ right / size)
 
 
 def _model_error(

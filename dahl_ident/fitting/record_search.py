@@ -25,6 +25,7 @@ _DESCRIBED = 0.1  # share of variance left beyond which the model is wrong, not 
 _EXACT = 1e-12  # share of variance left that is rounding
 _REPEATS = 12  # a limit for weights that do not settle
 _SETTLED = 0.03  # step in standard errors that no longer matters
+_CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that is no chance
 _LOOSE = 1e4  # of the step at which a search of a long record has converged
 
 
@@ -153,7 +154,43 @@ def _solved(problem: RecordProblem, start: Mapping[str, float] | None) -> Record
         bool(best.converged[0]),
         evaluations + more,
     )
-    return _weighted(found) if problem.output == "motion" else found
+    return _weighted(found) if problem.output == "motion" else _without_noise(found)
+
+
+def _without_noise(plain: RecordOptimum) -> RecordOptimum:
+    """Return the estimate without the displacement's noise, where the residuals ask for it.
+
+    Noise that counts as travel moves the friction where the device rests. The dead band doubles
+    as long as a Gauss-Newton step then leaves smaller residuals.
+    """
+    problem, least = plain.problem, plain.cost
+    noise = problem.estimated_noise
+    if not plain.converged or not problem.with_memory or noise == 0.0:
+        return plain
+    theta = problem.theta(plain.values)
+    best, evaluations = problem, plain.evaluations
+    for _ in range(_REPEATS):
+        trial = problem.without_noise(noise)
+        found = trial.quadratic(theta)
+        evaluations += 1
+        left = float(found.cost) - 0.5 * float(
+            found.gradient @ np.linalg.pinv(found.hessian, hermitian=True) @ found.gradient
+        )
+        if not left < least:
+            break
+        best, least, noise = trial, left, 2.0 * noise
+    residuals = problem.split_residuals(plain.values)
+    slow = sum(float(e[1:] @ e[:-1]) for e in residuals) / sum(float(e @ e) for e in residuals)
+    by_chance = _CONFIRMED * 2.0 * least / problem.n_residuals * (1.0 + slow) / (1.0 - slow)
+    if best is problem or 2.0 * (plain.cost - least) < by_chance:
+        return plain
+    end = _descend(best, theta, _STEPS)
+    if not end.converged[0] or not end.cost[0] < plain.cost:
+        return plain
+    values = best.values(end.theta[0])
+    return RecordOptimum(
+        best, values, float(end.cost[0]), True, evaluations + int(end.evaluations[0])
+    )
 
 
 def _weighted(plain: RecordOptimum) -> RecordOptimum:

@@ -22,6 +22,7 @@ from dahl_ident.data import Record
 from dahl_ident.elements import Element, Parameter
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
+from dahl_ident.problem.displacement_noise import LEADS, noise_of, travelled
 from dahl_ident.problem.problem import Quadratic
 from dahl_ident.time_domain import (
     Excitation,
@@ -128,6 +129,9 @@ class RecordProblem:
         self.logarithmic = np.array([p.transform == "log" for p in self.parameters])
         self.whitening = np.ones(1)
         """Filter of the residuals; see :func:`~.record_noise.prediction_error_filter`."""
+        self.displacement_noise = 0.0
+        """Standard deviation of the displacement, m, within which no movement counts."""
+        self._paths: tuple[FloatArray, ...] | None = None
         self._guesses: list[FloatArray | None] = [None] * len(self.records)
         self.watch: Watch | None = None
         """Called after each evaluation of the cost."""
@@ -207,6 +211,26 @@ class RecordProblem:
         other.whitening = whitening
         return other
 
+    def without_noise(self, noise: float, lead: float = LEADS[1]) -> RecordProblem:
+        """Return the same problem, the displacement's noise not counted as travel.
+
+        For the output "force"; see :func:`~.displacement_noise.travelled`.
+        """
+        other = copy(self)
+        other.displacement_noise = noise
+        x = [np.asarray(record.displacement) for record in self.records] if noise else []
+        other._paths = tuple(travelled(wave, noise, lead) for wave in x) or None
+        return other
+
+    @property
+    def noise_travel(self) -> float:
+        """Travel that the displacement's noise would add, over the travel that counts."""
+        if self._paths is None:
+            return 0.0
+        measured = [np.abs(np.diff(np.asarray(r.displacement))).sum() for r in self.records]
+        counted = [np.abs(np.diff(path)).sum() for path in self._paths]
+        return float(sum(measured) / sum(counted) - 1.0)
+
     def filtered(self, waves: FloatArray) -> FloatArray:
         """Return residuals or derivatives, (n, ...), filtered; the first `order` are left out."""
         if self.whitening.size == 1:
@@ -233,14 +257,31 @@ class RecordProblem:
     @cached_property
     def motions(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], ...]:
         """Displacement, velocity and acceleration of each record, for the output "force"."""
-        found = []
-        for record in self.records:
-            x = np.asarray(record.displacement)
-            if all(e.rate_independent for e in self.model.elements):
-                found.append((x, np.zeros(0), np.zeros(0)))
-            else:
-                found.append((x, *differentiated(x, 1.0 / record.sample_rate)))
-        return tuple(found)
+        return self._motions_of([np.asarray(record.displacement) for record in self.records])
+
+    def _motions_of(
+        self, displacements: Sequence[FloatArray]
+    ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], ...]:
+        if all(e.rate_independent for e in self.model.elements):
+            return tuple((x, np.zeros(0), np.zeros(0)) for x in displacements)
+        return tuple(
+            (x, *differentiated(x, 1.0 / record.sample_rate))
+            for x, record in zip(displacements, self.records, strict=True)
+        )
+
+    @cached_property
+    def estimated_noise(self) -> float:
+        """Standard deviation of the displacements' white noise, m; see `displacement_noise`."""
+        return float(np.median([noise_of(x) for x, _, _ in self.motions]))
+
+    def with_more_noise(self, noise: float) -> RecordProblem:
+        """Return the same problem, white noise added to the displacements."""
+        rng = np.random.default_rng(0)
+        other = copy(self)
+        other.motions = self._motions_of(
+            [x + noise * rng.standard_normal(x.size) for x, _, _ in self.motions]
+        )
+        return other
 
     @cached_property
     def _plant(self) -> Plant:
@@ -295,6 +336,7 @@ class RecordProblem:
 
     def _force(self, values: FloatArray, number: int, *, derivatives: bool) -> Prediction:
         x, v, a = self.motions[number]
+        path = x if self._paths is None else self._paths[number]
         record = self.records[number]
         own = self.own(values, number)
         time = record.time - record.time[0]
@@ -304,9 +346,9 @@ class RecordProblem:
         memory, column = 0, 0
         first = len(self.free) + number * self.per_record
         for element, at in self.model.of(self.full_values(values)):
-            state = states[memory] if element.has_memory else 0.0
+            state, moved = (states[memory], path) if element.has_memory else (0.0, x)
             if derivatives:
-                found = element.force_history_gradient(at, x, v, state, acceleration=a)
+                found = element.force_history_gradient(at, moved, v, state, acceleration=a)
                 total = total + found.value
                 for parameter, slope in zip(element.parameters, found.by_parameter, strict=True):
                     if parameter.free:
@@ -315,7 +357,7 @@ class RecordProblem:
                 if element.has_memory:
                     by[:, first + memory] = found.by_state
             else:
-                total = total + element.force_history(at, x, v, state, acceleration=a)
+                total = total + element.force_history(at, moved, v, state, acceleration=a)
             memory += element.has_memory
         if derivatives:
             by[:, first + memory] = 1.0
