@@ -274,7 +274,7 @@ def test_what_the_model_misses_from_place_to_place_is_in_the_budget() -> None:
     assert fit.status.value == "approximate"
     assert fit.coverage_factor == pytest.approx(2.093, abs=1e-3)  # Student's t of 19
     steady = di.fit(recorded(DAHL, "random", samples, 1e-3), di.Dahl())
-    assert [row.source for row in steady.budget()["f_max"].rows] == ["noise"]
+    assert "model error" not in {row.source for row in steady.budget()["f_max"].rows}
     assert steady.trusted
 
 
