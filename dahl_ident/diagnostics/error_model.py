@@ -38,6 +38,13 @@ from dahl_ident.diagnostics.error_sources import (
     gain_and_phase,
     of_one_scale,
     relative_scatter,
+    run_deviations,
+)
+from dahl_ident.diagnostics.run_deviations import (
+    Linearization,
+    RunDeviations,
+    alike,
+    linearization,
 )
 from dahl_ident.diagnostics.variance_components import (
     Contrasts,
@@ -117,6 +124,10 @@ class ErrorModel:
     assumed: tuple[str, ...]
     linear: LinearModel
     projection: Projection
+    near: Linearization
+    """Residuals at the estimate, each run's at its own parameters."""
+    runs: RunDeviations | None = None
+    """How runs deviate from the estimate; None where they are alike."""
     basis: Basis | None = None
     """Changes of theta that the data determine at all; None where that is every one."""
 
@@ -173,10 +184,17 @@ class ErrorModel:
         total = sum(float(direction @ self.contributions[n] @ direction) for n in counted)
         return max(1.0, 2.0 * total**2 / spread)
 
+    @property
+    def runs_about_optimum(self) -> RunDeviations | None:
+        """How runs deviate from the optimum, in its parameters."""
+        columns = [self.names.index(name) for name in self.optimum.names]
+        moved = self.optimum.theta - self.theta[columns]
+        return None if self.runs is None else self.runs.about(moved, columns)
+
     def full_projection(self) -> tuple[FloatArray, FloatArray]:
         """Return P of the data's rows, compressed or not, and their residuals; (m, m) and (m,)."""
         m = self.problem.n_residuals
-        residuals = self.problem.residuals(self.theta)[:m]
+        residuals = self.near.y
         P, rotation = self.projection.P, self.linear.rotation
         if rotation is None:
             return P[:m, :m], residuals
@@ -277,9 +295,10 @@ class _Rows:
         wider = np.maximum(self._given, self._given**2 * by_data)
         self.std = np.where(self._ranges, wider, self._given)
 
-    def at(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def at(self, theta: FloatArray, near: Linearization) -> tuple[FloatArray, FloatArray]:
         """Return residuals and Jacobian: data, priors of sensors, ranges of exponents."""
         y, J = self._problem.residuals_and_jacobian(theta, tails=False)
+        y[: self.m], J[: self.m] = near.y, near.J
         weight = self._weight(y)
         select = self._select / self.std[:, None]
         y = np.concatenate([y * weight, select @ (theta - self.start)])
@@ -306,18 +325,21 @@ def _estimated(
 ) -> ErrorModel:
     rows = _Rows(optimum, problem, assumed)
     theta, m = rows.start, rows.m
-    basis = None if determined else _basis(rows.at(theta)[1])
+    near = linearization(problem, theta)
+    basis = None if determined else _basis(rows.at(theta, near)[1])
     noise: tuple[Source, ...] | None = None
     dof = problem.n_numbers - len(problem.names)
     tells = dof + len(assumed) >= _LEAST_DOF
     shared = StructuredSources(problem) if tells else None
     last: FloatArray | None = None
+    runs: RunDeviations | None = None
     for step in range(_STEPS):
-        y, J = rows.at(theta)
+        near = linearization(problem, theta, runs)
+        y, J = rows.at(theta, near)
         if not np.isfinite(y).all():
             raise np.linalg.LinAlgError("a drive beyond the force limit has no steady response")
         level = float(y[:m] @ y[:m]) / max(dof, 1)
-        rest = () if shared is None else shared.at(theta, J[:m])
+        rest = () if shared is None else shared.at(theta, replace(near, J=J[:m]))
         J = J if basis is None else J @ basis.matrix
         plain = (
             (*of_one_scale(problem), *relative_scatter(problem, theta))
@@ -339,14 +361,16 @@ def _estimated(
         move = -G @ linear.y
         covariance = G @ linear.covariance(found.variances) @ G.T
         std = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))  # below zero by rounding
-        if step == _STEPS - 1 or (step > 1 and np.all(np.abs(move) < _SETTLED * std)):
+        before, runs = runs, run_deviations(problem, sources, projection.effects())
+        settled = step > 1 and bool(np.all(np.abs(move) < _SETTLED * std))
+        if step == _STEPS - 1 or (settled and alike(before, runs)):
             break
         rows.widen(covariance)
         theta = theta + move * min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
     contributions = _by_source(problem, assumed, sources, linear, found, G)
     return ErrorModel(
         optimum, problem, theta, sources, found, contributions, tuple(assumed), linear, projection,
-        basis,
+        near, runs, basis,
     )  # fmt: skip
 
 

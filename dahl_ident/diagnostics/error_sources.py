@@ -13,12 +13,14 @@ or spring missing from the model; the part that the model's linear elements can 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.diagnostics.run_deviations import Linearization, RunDeviations
 from dahl_ident.problem import Problem
 
 NOISE = "noise"
@@ -189,15 +191,14 @@ class StructuredSources:
         self._rates = bool(np.ptp(self._places[:, 1]) > _LEAST_RATE_RANGE)
         self._moved = _moved(problem)
 
-    def at(self, theta: FloatArray, J: FloatArray) -> tuple[Source, ...]:
-        """Return the sources at theta; `J` is the data's Jacobian there."""
-        problem = self._problem
-        predicted = problem.predict(theta)
+    def at(self, theta: FloatArray, near: Linearization) -> tuple[Source, ...]:
+        """Return the sources at theta, their columns linearised where `near` is."""
+        problem, predicted, J = self._problem, near.predicted, near.J
         size = _sizes(problem, predicted)
 
         def columns(changes: ComplexArray) -> FloatArray:
             """Return residuals for relative changes (k, n), shape (m, k)."""
-            return -problem.residual_change(theta, changes * size).T
+            return near.change(changes * size).T
 
         own = self._fundamental
         missed = np.abs(problem.data.response[own] / size[own] - 1.0)
@@ -225,29 +226,28 @@ class StructuredSources:
             if self._rates
         ]
         if len(self._runs) >= _FEWEST:
-            share = self._runs.astype(np.complex128)
-            found.append(Source(RUNS, columns(share), 0.5, own="gain"))
-            turned = 1j * problem.stiffness_data.harmonic * share
-            found.append(Source(RUNS, columns(turned), 0.5, own="phase"))
+            share = self._runs * predicted
+            turned = 1j * problem.data.harmonic * share
+            found.append(Source(RUNS, near.change(share).T, 0.5, own="gain"))
+            found.append(Source(RUNS, near.change(turned).T, 0.5, own="phase"))
             each = np.repeat(self._runs, 2, axis=1).T
             found += [
                 Source(RUNS, each * J[:, i : i + 1], 0.0, own=problem.names[i])
                 for i in _scattering_parameters(problem)
             ]
         if self._moved is not None:
-            found.append(self._noise_of_levels(theta, predicted, self._moved))
+            found.append(self._noise_of_levels(theta, self._moved))
         if len(self._repeats) >= _FEWEST:
             shared = np.concatenate([self._repeats, 1j * self._repeats])
             found.append(Source(LEVELS, columns(shared), 1.0, own="both"))
         return tuple(found)
 
-    def _noise_of_levels(
-        self, theta: FloatArray, predicted: ComplexArray, moved: Problem
-    ) -> Source:
+    def _noise_of_levels(self, theta: FloatArray, moved: Problem) -> Source:
         """Return noise of the amplitudes, or drives, at which responses were measured.
 
         It counts in slip, where the response changes with amplitude, and not in microslip.
         """
+        predicted = self._problem.predict(theta)
         change = (moved.predict(theta) - predicted) / _STEP
         n = len(change)
         columns = np.zeros((n, 2, n))
@@ -256,6 +256,22 @@ class StructuredSources:
         share = np.divide(change, predicted, out=np.zeros_like(change), where=predicted != 0.0)
         square = 0.5 * float(np.mean(np.abs(share) ** 2))
         return Source(NOISE, columns.reshape(2 * n, n), square)
+
+
+def run_deviations(
+    problem: Problem, sources: Sequence[Source], effects: Sequence[FloatArray]
+) -> RunDeviations | None:
+    """Return how runs deviate, from the effects of each source; None where none scatters."""
+    shared = [(s.own, u) for s, u in zip(sources, effects, strict=True) if s.name == RUNS]
+    if not any(u.any() for _, u in shared):
+        return None
+    found = RunDeviations.none(np.asarray(problem.data.run), len(problem.names))
+    for own, u in shared:
+        if own in problem.names:
+            found.theta[:, problem.names.index(own)] = -u  # columns there are those of J
+        else:
+            (found.gain if own == "gain" else found.phase)[:] = u
+    return found
 
 
 def _moved(problem: Problem) -> Problem | None:

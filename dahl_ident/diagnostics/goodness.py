@@ -15,7 +15,7 @@ A fit can be statistically perfect and physically impossible; this gives a warni
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -23,6 +23,8 @@ import numpy as np
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray
+from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.formatting import p_text, with_unit
 from dahl_ident.diagnostics.misfit_explanations import (
     EXPLAINS,
@@ -107,6 +109,18 @@ class Scatter:
 
 
 @dataclass(frozen=True)
+class RunsDiffer:
+    """Scatter between runs beyond the noise: relative, of each quantity that scatters."""
+
+    scatter: Mapping[str, float]
+    p_value: float
+
+    def __str__(self) -> str:
+        parts = [f"{name} by {100.0 * size:.2g} %" for name, size in self.scatter.items()]
+        return f"the runs differ ({', '.join(parts)})"
+
+
+@dataclass(frozen=True)
 class Goodness:
     """Residuals after the fit, and what they mean.
 
@@ -139,6 +153,9 @@ class Goodness:
         What no mechanism does.
     flagged : tuple of str
         Rows that the extraction flagged, with the reason.
+    runs_differ : RunsDiffer or None
+        Where the scatter between runs exceeds the noise; the other tests are then of what is left
+        within the runs.
     sign : str
         The sign convention that explains data which the fit does not; empty where none does.
     apart : str
@@ -173,6 +190,7 @@ class Goodness:
     warnings: tuple[str, ...]
     flagged: tuple[str, ...]
     untested: bool
+    runs_differ: RunsDiffer | None = None
     sign: str = ""
     apart: str = ""
     neighbours: str = ""
@@ -183,9 +201,12 @@ class Goodness:
         return _FALSE_ALARM / max(len(self._tests), 1)
 
     @property
-    def _tests(self) -> list[ChiSquare | Stiffening | Trend | Runs | Exponent | ThirdHarmonic]:
+    def _tests(
+        self,
+    ) -> list[RunsDiffer | ChiSquare | Stiffening | Trend | Runs | Exponent | ThirdHarmonic]:
         """Every test that applies."""
-        first, last = (self.chi_square, self.stiffening), (self.exponent, self.third_harmonic)
+        first = (self.runs_differ, self.chi_square, self.stiffening)
+        last = (self.exponent, self.third_harmonic)
         every = (*first, *self.trends, *self.runs, *last)
         return [test for test in every if test is not None]
 
@@ -215,6 +236,8 @@ class Goodness:
 
     def _departures(self, level: float) -> Iterator[str]:
         """Yield every departure whose p-value is below `level`, those over frequency first."""
+        if self.runs_differ is not None:
+            yield str(self.runs_differ)
         found = [trend for trend in self.trends if trend.p_value < level]
         rate = [trend for trend in found if trend.covariate == "frequency"]
         if self.noise_share is not None and self.noise_share > _NO_SENSOR:
@@ -321,9 +344,14 @@ class Goodness:
         return "\n".join([self.headline, *(f"- {line}" for line in self.details)])
 
 
-def goodness(optimum: Optimum) -> Goodness:
-    """Return every test of an optimum's residuals, physical warnings, and what explains both."""
+def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
+    """Return every test of an optimum's residuals, physical warnings, and what explains both.
+
+    With `errors`, a scatter between runs that exceeds the noise is taken out first.
+    """
     found = _tested(optimum)
+    if errors is not None and found.objections:
+        found = _within_runs(optimum, errors) or found
     if optimum.method == "ipopt" or (optimum.success and not found.objections):
         return found  # another solver may have had constraints, which no trial would keep
     sign = sign_convention(optimum, lambda turned: not _tested(turned).objections)
@@ -358,9 +386,28 @@ def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
     )
 
 
-def _tested(optimum: Optimum) -> Goodness:
+def _within_runs(optimum: Optimum, errors: ErrorModel) -> Goodness | None:
+    """Return the tests of what is left where each run deviates; None where they do not."""
+    runs = errors.runs_about_optimum
+    if runs is None:
+        return None
+    every, within = ResidualSpace(optimum), ResidualSpace(optimum, runs)
+    explained = float(every.residuals @ every.residuals - within.residuals @ within.residuals)
+    p = every.tail(explained, every.dof - within.dof)
+    found = _tested(optimum, within)
+    if not p < found.level:
+        return None
+    scatter = {
+        s.own: v**0.5
+        for s, v in zip(errors.sources, errors.variances, strict=True)
+        if s.name == RUNS and v > 0.0
+    }
+    return replace(found, runs_differ=RunsDiffer(scatter, p))
+
+
+def _tested(optimum: Optimum, space: ResidualSpace | None = None) -> Goodness:
     """Return every test of an optimum's residuals, and physical warnings."""
-    space, problem = ResidualSpace(optimum), optimum.problem
+    space, problem = space or ResidualSpace(optimum), optimum.problem
     chi_square = _chi_square(optimum, space)
     return Goodness(
         rms_misfit(problem, optimum.theta),
@@ -391,10 +438,10 @@ def _untested(optimum: Optimum) -> bool:
 
 
 def _chi_square(optimum: Optimum, space: ResidualSpace) -> ChiSquare | None:
-    if not optimum.scale_known or optimum.dof <= 0:
+    if not optimum.scale_known or space.dof <= 0:
         return None
     value = float(space.residuals @ space.residuals)
-    return ChiSquare(value, optimum.dof, float(special.chdtrc(optimum.dof, value)))
+    return ChiSquare(value, space.dof, float(special.chdtrc(space.dof, value)))
 
 
 def _noise_share(optimum: Optimum) -> float | None:

@@ -16,9 +16,11 @@ from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.diagnostics.run_deviations import Linearization, RunDeviations, linearization
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import loss_named
 
@@ -112,15 +114,24 @@ class ResidualSpace(_Space):
 
     scale = 1.0
 
-    def __init__(self, optimum: Optimum) -> None:
+    def __init__(self, optimum: Optimum, runs: RunDeviations | None = None) -> None:
         self._optimum, self._problem = optimum, optimum.problem
         self.dof = optimum.dof
         m = optimum.problem.n_residuals
         scale = optimum.scale
         self._scale = scale if np.isfinite(scale) and scale > 0.0 else 1.0
         y, J = self._problem.residuals_and_jacobian(optimum.theta, self._scale, tails=False)
+        own = np.zeros((m, 0))
+        if runs is not None:
+            near = linearization(self._problem, optimum.theta, runs)
+            y[:m], J[:m] = near.residuals / self._scale, near.J / self._scale
+            own = _columns_of_runs(near, runs, self._problem.data.harmonic) / self._scale
+            self.dof -= _orthonormal(np.hstack([J[:m], own])).shape[1]
+            self.dof += _orthonormal(J[:m]).shape[1]
         self._column_weight, residual_weight = self._weights(y[:m])
-        self.basis = _orthonormal(np.vstack([self._column_weight[:, None] * J[:m], J[m:]]))[:m]
+        every = np.vstack([np.hstack([J[:m], own]), np.pad(J[m:], ((0, 0), (0, own.shape[1])))])
+        every[:m] *= self._column_weight[:, None]
+        self.basis = _orthonormal(every)[:m]
         r = residual_weight * y[:m] * (not optimum.is_exact)
         self.residuals = r - self.basis @ (self.basis.T @ r)
 
@@ -166,6 +177,23 @@ class ResidualSpace(_Space):
         if dof <= k or total <= explained:
             return np.nan
         return float(special.fdtrc(k, dof - k, explained / k / ((total - explained) / (dof - k))))
+
+
+def _columns_of_runs(
+    near: Linearization, runs: RunDeviations, harmonic: NDArray[np.integer]
+) -> FloatArray:
+    """Return what parameters, gain and phase of each run change, those that scatter, (m, k)."""
+    columns = []
+    for _, rows, _ in near.parts:
+        both = np.repeat(rows, 2)[:, None]
+        columns.append(near.J[:, np.ptp(runs.theta, axis=0) > 0.0] * both)
+        share = near.predicted * rows
+        turned = 1j * harmonic * share
+        if runs.gain.any():
+            columns.append(near.change(share[None]).T)
+        if runs.phase.any():
+            columns.append(near.change(turned[None]).T)
+    return np.hstack(columns)
 
 
 def _orthonormal(columns: FloatArray) -> FloatArray:

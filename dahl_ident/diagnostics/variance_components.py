@@ -122,11 +122,20 @@ class Projection:
     """V^-1 and the projection P of a linear model at given variances."""
 
     def __init__(self, model: LinearModel, variances: FloatArray) -> None:
+        self._model, self._variances = model, variances
         L = np.linalg.cholesky(model.covariance(variances))
         inverse_factor = linalg.lapack.dtrtri(L, lower=1)[0]
         Q, self._R = np.linalg.qr(inverse_factor @ model.J)
         self._explained = Q.T @ inverse_factor
         self.P = inverse_factor.T @ inverse_factor - self._explained.T @ self._explained
+
+    def effects(self) -> list[FloatArray]:
+        """Return the best linear prediction of each source's numbers: s_k Z_k' P y."""
+        weighted = self.P @ self._model.y
+        return [
+            s * (part * weighted if part.ndim == 1 else weighted @ part)
+            for s, part in zip(self._variances.tolist(), self._model.Z, strict=True)
+        ]
 
     def generalised_inverse(self) -> FloatArray:
         """Return G = (J' V^-1 J)^-1 J' V^-1, shape (P, m)."""
