@@ -112,6 +112,39 @@ class TestBudget:
             assert found.k > 3.0
         assert np.sqrt(np.mean(np.square(scatter))) == pytest.approx(0.05 / np.sqrt(3.0), rel=0.4)
 
+    @pytest.mark.parametrize("factors", [(1.0, 1.05), (0.95, 1.0, 1.08)])
+    @pytest.mark.parametrize("scatters", ["f_max", "sigma", "gain"])
+    def test_runs_that_differ_by_far_more_than_the_noise(
+        self, scatters: str, factors: tuple[float, ...]
+    ) -> None:
+        """What the deviations of runs do to second order is 0.1 %, ten times the noise."""
+        rng = np.random.default_rng(5)
+        A = np.geomspace(0.5, 40.0, 8) * X_C
+        limits = [0.1 * (f if scatters != "sigma" else 1.0) for f in factors]
+        slopes = [30.0 * (f if scatters != "f_max" else 1.0) for f in factors]
+        laws = [Dahl(*values) for values in zip(limits, slopes, strict=True)]
+        N = np.concatenate([law.describing_function(A) for law in laws])
+        size = 1e-4 * np.abs(N)
+        noise = size * (rng.standard_normal((2, N.size)).T @ [1.0, 1j])
+        run = np.repeat(factors, 8).astype(str)
+        data = FrequencyResponse(
+            np.ones(N.size), N + noise, np.tile(A, len(laws)), run=run,
+            covariance=size[:, None, None] ** 2 * np.eye(2),
+        )  # fmt: skip
+        found = fit(data, Dahl(alpha=1.0))
+        assert found.status == "approximate", found.verdict
+        assert found.goodness.objections == (str(found.goodness.runs_differ),)
+        assert found.goodness.chi_square is not None
+        assert found.goodness.chi_square.p_value > 1e-3
+        assert found.errors is not None
+        assert found.errors.runs is not None
+        f_max = found.errors.values["f_max"] * np.exp(found.errors.runs.theta[:, 0])
+        f_max *= np.exp(found.errors.runs.gain)
+        np.testing.assert_allclose(f_max, limits, rtol=1e-3)
+
+        wrong = fit(data, Dahl(alpha=0.9))
+        assert wrong.status == "not described"
+
     def test_a_stated_calibration_is_a_type_b_source(self) -> None:
         sensors = Sensors(force_gain=stats.norm(1.0, 0.02))
         found = budget(fit(table(n=12), Dahl(alpha=1.0), sensors=sensors).optimum)

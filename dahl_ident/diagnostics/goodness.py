@@ -49,6 +49,7 @@ _HINT = 0.05
 _FAR_MORE = 2.0  # scatter over what was measured
 _NO_SENSOR = 0.3  # noise over the response
 _LEAST_DOF = 6  # with fewer, no test of residuals of unknown scale applies
+_WORTH_NAMING = 0.1  # of the largest scatter: less is not mentioned
 _MOST_DEPARTURES = 3  # in the verdict; the details list all
 
 
@@ -110,13 +111,14 @@ class Scatter:
 
 @dataclass(frozen=True)
 class RunsDiffer:
-    """Scatter between runs beyond the noise: relative, of each quantity that scatters."""
+    """Scatter between runs beyond the noise: of ln gain, phase (rad), and ln of parameters."""
 
     scatter: Mapping[str, float]
     p_value: float
 
     def __str__(self) -> str:
-        parts = [f"{name} by {100.0 * size:.2g} %" for name, size in self.scatter.items()]
+        least = _WORTH_NAMING * max(self.scatter.values())
+        parts = [f"{n} by {_relative(n, s)}" for n, s in self.scatter.items() if s >= least]
         return f"the runs differ ({', '.join(parts)})"
 
 
@@ -398,11 +400,12 @@ def _within_runs(optimum: Optimum, errors: ErrorModel) -> Goodness | None:
     if not p < found.level:
         return None
     scatter = {
-        s.own: v**0.5
-        for s, v in zip(errors.sources, errors.variances, strict=True)
-        if s.name == RUNS and v > 0.0
+        source.own: v**0.5
+        for source, v in zip(errors.sources, errors.variances.tolist(), strict=True)
+        if source.name == RUNS and v > 0.0
     }
-    return replace(found, runs_differ=RunsDiffer(scatter, p))
+    warnings = tuple(physical_warnings(optimum, sum(scatter.values())))
+    return replace(found, warnings=warnings, runs_differ=RunsDiffer(scatter, p))
 
 
 def _tested(optimum: Optimum, space: ResidualSpace | None = None) -> Goodness:
@@ -425,6 +428,10 @@ def _tested(optimum: Optimum, space: ResidualSpace | None = None) -> Goodness:
         flagged_rows(problem.data),
         _untested(optimum),
     )
+
+
+def _relative(name: str, size: float) -> str:
+    return f"{np.degrees(size):.2g} deg" if name == "phase" else f"{100.0 * size:.2g} %"
 
 
 def _untested(optimum: Optimum) -> bool:

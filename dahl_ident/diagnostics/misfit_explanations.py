@@ -12,7 +12,7 @@ from math import comb
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.trends import covariates
 from dahl_ident.errors import DahlIdentError
@@ -61,8 +61,12 @@ TURNS = (
 
 def rms_misfit(problem: Problem, theta: FloatArray) -> float:
     """Return the root mean square of abs(measured - fitted)/abs(measured) of fundamentals."""
-    misfit = _misfit(problem, theta)
-    return float(np.sqrt(np.mean(misfit**2)))
+    return rms_misfit_of(problem, problem.predict(theta))
+
+
+def rms_misfit_of(problem: Problem, fitted: ComplexArray) -> float:
+    """Return the same for responses (n,) that were fitted in another way."""
+    return float(np.sqrt(np.mean(_misfit(problem, fitted) ** 2)))
 
 
 def sign_convention(optimum: Optimum, described: Callable[[Optimum], bool]) -> str:
@@ -72,13 +76,14 @@ def sign_convention(optimum: Optimum, described: Callable[[Optimum], bool]) -> s
     better with a turned sign as well, but not to the noise.
     """
     before = rms_misfit(optimum.problem, optimum.theta)
-    middle = float(np.median(_misfit(optimum.problem, optimum.theta)))
+    fitted = optimum.problem.predict(optimum.theta)
+    middle = float(np.median(_misfit(optimum.problem, fitted)))
     found = []
     for turn in TURNS:
         try:
             problem = _alike(optimum.problem, turn(optimum.problem.data))
             # single rows near a resonance may miss at a start: the median is not bent by them
-            first = float(np.median(_misfit(problem, starts(problem)[0])))
+            first = float(np.median(_misfit(problem, problem.predict(starts(problem)[0]))))
         except DahlIdentError:
             continue
         if first * _PROMISING < middle:
@@ -136,10 +141,10 @@ def percent(share: float) -> str:
     return f"{float(f'{100.0 * share:.2g}'):g} %"
 
 
-def _misfit(problem: Problem, theta: FloatArray) -> FloatArray:
+def _misfit(problem: Problem, fitted: ComplexArray) -> FloatArray:
     response, harmonic = problem.data.response, problem.data.harmonic
     rows = (harmonic == harmonic.min()) & (response != 0.0)
-    return np.asarray(np.abs(1.0 - problem.predict(theta)[rows] / response[rows]))
+    return np.asarray(np.abs(1.0 - fitted[rows] / response[rows]))
 
 
 def _alike(problem: Problem, data: FrequencyResponse) -> Problem:

@@ -22,12 +22,15 @@ _LEVEL = 1e-3
 _HARMONIC_SHARE = 0.1
 
 
-def physical_warnings(optimum: Optimum) -> Iterator[str]:
-    """Yield a sentence for everything in an estimate that physics forbids or that is unsafe."""
+def physical_warnings(optimum: Optimum, scatter: float = 0.0) -> Iterator[str]:
+    """Yield a sentence for everything in an estimate that physics forbids or that is unsafe.
+
+    `scatter` is the relative standard deviation of the force between runs.
+    """
     yield from negative_parameters(optimum)
     if optimum.status is Status.AT_BOUND:
         yield optimum.message.removeprefix(Status.AT_BOUND.value).strip()
-    yield from _beyond_friction_limit(optimum)
+    yield from _beyond_friction_limit(optimum, scatter)
     yield from _not_a_sine(optimum)
     yield from implausible_units(optimum)
 
@@ -63,7 +66,7 @@ def negative_parameters(optimum: Optimum) -> Iterator[str]:
             yield f"{parameter.name} is negative, {size}{within}"
 
 
-def _beyond_friction_limit(optimum: Optimum) -> Iterator[str]:
+def _beyond_friction_limit(optimum: Optimum, scatter: float) -> Iterator[str]:
     """Yield where friction's fundamental exceeds what slip can give, 4/pi of its force limits."""
     values = parameter_values(optimum)
     limit = 0.0
@@ -74,6 +77,7 @@ def _beyond_friction_limit(optimum: Optimum) -> Iterator[str]:
     if not 0.0 < limit < np.inf:
         return
     force, error = friction_force(optimum)
+    error = np.hypot(error, scatter * limit)
     excess = (force - limit) / error
     rows = np.flatnonzero(np.isfinite(excess))
     if not rows.size:

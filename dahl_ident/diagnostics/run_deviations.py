@@ -76,6 +76,8 @@ class Linearization:
         Their derivatives by theta.
     predicted : ndarray of complex, shape (n,)
         Responses, each run's at its own parameters.
+    fitted : ndarray of complex, shape (n,)
+        The same with each run's gain and phase.
     parts : sequence of (Problem, ndarray, ndarray)
         Problems, the rows (n,) that are theirs, and the theta of each.
     """
@@ -84,6 +86,7 @@ class Linearization:
     y: FloatArray
     J: FloatArray
     predicted: ComplexArray
+    fitted: ComplexArray
     parts: Sequence[tuple[Problem, NDArray[np.bool_], FloatArray]]
 
     def change(self, changes: ComplexArray) -> FloatArray:
@@ -102,8 +105,11 @@ def linearization(
     if runs is None:
         y, J = problem.residuals_and_jacobian(theta, tails=False)
         every = np.ones(m // 2, dtype=bool)
-        return Linearization(y[:m], y[:m], J[:m], problem.predict(theta), [(problem, every, theta)])
-    y, J, predicted = np.zeros((2, m)), np.zeros((m, len(theta))), np.zeros(m // 2, dtype=complex)
+        R = problem.predict(theta)
+        return Linearization(y[:m], y[:m], J[:m], R, R, [(problem, every, theta)])
+    residuals, y = np.zeros((2, m))
+    J = np.zeros((m, len(theta)))
+    predicted, fitted = np.zeros((2, m // 2), dtype=np.complex128)
     labels, parts = np.asarray(problem.data.run), []
     for label, shift, gain, phase in zip(
         runs.labels, runs.theta, runs.gain.tolist(), runs.phase.tolist(), strict=True
@@ -117,7 +123,8 @@ def linearization(
         at, by = part.residuals_and_jacobian(there, tails=False)
         at, by = at[: 2 * own.n], by[: 2 * own.n]
         predicted[rows] = part.predict(there)
+        fitted[rows] = predicted[rows] * np.exp(deviation)
         moved = part.residual_change(there, predicted[rows] * deviation)
-        y[:, both], J[both] = (at, at - by @ shift - moved), by
+        residuals[both], y[both], J[both] = at, at - by @ shift - moved, by
         parts.append((part, rows, there))
-    return Linearization(*y, J, predicted, parts)
+    return Linearization(residuals, y, J, predicted, fitted, parts)

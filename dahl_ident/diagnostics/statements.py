@@ -15,7 +15,7 @@ from dahl_ident.diagnostics.cross_validation import CrossValidation
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.goodness import Goodness
-from dahl_ident.diagnostics.misfit_explanations import rms_misfit
+from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Identifiability
 from dahl_ident.fitting import Optimum, solve
@@ -119,11 +119,14 @@ def _bands_hold(fit: Judged) -> bool:
 
 
 def _too_narrow(fit: Judged) -> str:
-    """Return what is wrong with bands that leave out most of the misfit; empty where they hold."""
+    """Return what is wrong with bands that leave out most of the misfit; empty where they hold.
+
+    The misfit is that within runs: a row that was held out has others of its run beside it.
+    """
     check, errors = fit.cross_validation, fit.errors
     if check is None or errors is None:
         return ""
-    misfit = rms_misfit(errors.problem, errors.theta)
+    misfit = rms_misfit_of(errors.problem, errors.near.fitted)
     if check.width >= _NARROWEST * misfit:
         return ""
     return (
