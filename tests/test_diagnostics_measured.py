@@ -13,6 +13,7 @@ from dahl_ident import (
     Damper,
     FitResult,
     FrequencyResponse,
+    Iwan,
     Mass,
     Spring,
     compare_models,
@@ -22,6 +23,7 @@ from dahl_ident import (
     read_record,
 )
 from dahl_ident.diagnostics import Verdict
+from dahl_ident.diagnostics.slip_density import slip_density
 from tests.test_readers_measured import BRAKE_REUSS
 
 FOLDER = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent"))
@@ -107,3 +109,19 @@ class TestBeam:
         assert found.optimum.values[0] == np.inf
         assert "f_max grows without bound at constant sigma^2/f_max" in found.verdict
         assert "sigma + stiffness" in found.identifiability.determined
+
+    @pytest.mark.parametrize("controlled", ["Force", "Response"])
+    def test_iwan_beside_the_mode(self, beam: FrequencyResponse, controlled: str) -> None:
+        """The mode stiffens while its loss rises, which no sum of Jenkins elements does."""
+        levels = [label for label in beam.levels if label.startswith(controlled)]
+        data = beam.select(level=levels)
+        data = data.select(rows=np.arange(data.n) % 8 == 0)
+        found = fit(data, Iwan(ratio=1.0) + Mass() + Damper(), throw=False)
+        assert found.verdict.startswith("Approximate.")
+        check = found.cross_validation
+        assert check is not None
+        assert check.inside >= 0.88 * check.count  # of 95 %: less happens once in 200 times
+        chi, bound = found.params["chi"], slip_density(data, Mass() + Damper()).least_misfit
+        assert -1.0 < chi.value <= 3.0
+        assert chi.stderr is not None
+        assert 0.2 < bound < found.goodness.rms_misfit < 0.4

@@ -6,8 +6,9 @@ import mpmath
 import numpy as np
 import pytest
 
-from dahl_ident import Damper, Iwan, Mass, MaxwellSlip, Spring, response
+from dahl_ident import Damper, FrequencyResponse, Iwan, Mass, MaxwellSlip, Spring, response
 from dahl_ident.errors import ValidationError
+from dahl_ident.problem import Problem
 from tests.test_response_of_any_law import all_amplitudes
 
 AT_REST = np.zeros(())
@@ -107,3 +108,20 @@ def test_response_beside_a_plant() -> None:
         np.testing.assert_allclose(
             np.ravel(ours.amplitude), all_amplitudes(plant, 0.6, drive), rtol=1e-8
         )
+
+
+def test_a_step_beyond_the_exponents_range_has_no_response() -> None:
+    """Searches may try it; other rows keep theirs."""
+    model = Iwan(ratio=1.0) + Mass() + Damper()
+    true = Iwan(10.0, 1e4, -0.5, 1.0) + Mass(1.0) + Damper(1.0)
+    f, drive = np.array([10.0, 15.0]), np.array([1.0, 2.0])
+    motion = response(true, f, drive)
+    data = FrequencyResponse(
+        f, motion.displacement / drive, drive=drive, quantity="receptance", controlled="force"
+    )
+    problem = Problem(data, model)
+    inside = problem.to_search([10.0, 1e4, -0.5, 1.0, 1.0])
+    beyond = inside + np.array([0.0, 0.0, -1.3, 0.0, 0.0])
+    found = problem.predict(np.array([inside, beyond]))
+    np.testing.assert_allclose(found[0], data.response, rtol=1e-9)
+    assert np.isnan(found[1]).all()

@@ -366,7 +366,8 @@ def _estimated(
         if step == _STEPS - 1 or (settled and alike(before, runs)):
             break
         rows.widen(covariance)
-        theta = theta + move * min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
+        move *= min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
+        theta = np.clip(theta + move, *problem.bounds())
     contributions = _by_source(problem, assumed, sources, linear, found, G)
     return ErrorModel(
         optimum, problem, theta, sources, found, contributions, tuple(assumed), linear, projection,

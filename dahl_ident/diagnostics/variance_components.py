@@ -189,6 +189,8 @@ class Contrasts:
         rest, count = self._model.outside
         if count:
             variance = self._model.outside_variance(variances)
+            if not variance > 0.0:
+                raise np.linalg.LinAlgError("the residuals outside the space have no variance")
             likelihood -= 0.5 * (count * np.log(variance) + rest / variance)
             gradient[0] += 0.5 * (rest / variance - count) / variance
             information[0, 0] += 0.5 * count / variance**2

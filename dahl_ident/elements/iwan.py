@@ -14,8 +14,9 @@ So N is that of a Jenkins element that slips at d_m, less
 
     P = (2 j/(pi k)) Int_0^t (A u/d_m)^g sin(theta) exp(-j k theta) dtheta,   u = sin^2(theta/2),
 
-times sigma/(1 + ratio), with t = pi or, where A > d_m, arccos(1 - 2 d_m/A). In microslip P is a
-constant times (A/d_m)^g, the loss in a cycle rises with the amplitude to the power chi + 3.
+times sigma/(1 + ratio), with t = pi or, where A > d_m, arccos(1 - 2 d_m/A). For k = 1 it is an
+incomplete beta function; other harmonics and the derivative by chi need Gauss points. In microslip
+P is a constant times (A/d_m)^g, the loss in a cycle rises with the amplitude to the power chi + 3.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import beta, betainc
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.behaviour import StiffnessGradient
@@ -36,6 +38,7 @@ _PLACES, _SHARES = _S**3, 1.5 * _WEIGHTS * _S**2
 _REST = 1e-100
 _SOFTENED = 0.01
 _NARROWEST = 1e-6
+_DEEP = 1e-8  # d_m/A below which the incomplete beta function is its series
 
 
 class Iwan(Masing):
@@ -118,11 +121,25 @@ class Iwan(Masing):
         harmonic: int = 1,
     ) -> ComplexArray:
         """Return F_k/X_1; `omega` does not matter."""
-        _, sigma, _, ratio = values
+        _, sigma, chi, ratio = values
         A = np.asarray(amplitude, dtype=np.float64) + 0.0 * omega
-        m = _onset(values) / np.maximum(A, _REST)
-        lost = _lost(m, np.asarray(values[2]) + 1.0, harmonic, derivative=False)[0]
+        m, g = _onset(values) / np.maximum(A, _REST), np.asarray(chi) + 1.0
+        if harmonic == 1:
+            lost = _lost_fundamental(m, g)
+        else:
+            lost = _lost(m, g, harmonic, derivative=False)[0]
         return np.asarray(sigma * (jenkins(m, harmonic)[0] - lost / (1.0 + ratio)))
+
+    def stiffness_slope(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Return F/X of the fundamental and its derivative by amplitude, unchecked."""
+        _, sigma, chi, ratio = values
+        A = np.maximum(np.asarray(amplitude, dtype=np.float64), _REST) + 0.0 * omega
+        m, g = _onset(values) / A, np.asarray(chi) + 1.0
+        (stick, by_m), lost = jenkins(m, 1), _lost_fundamental(m, g)
+        by_lnA = -(m * by_m * ratio + g * lost) / (1.0 + ratio)
+        return np.asarray(sigma * (stick - lost / (1.0 + ratio))), np.asarray(sigma * by_lnA / A)
 
     def stiffness_gradient(
         self,
@@ -174,6 +191,18 @@ def _onset(values: Sequence[FloatArray]) -> FloatArray:
     """Return d_m."""
     f_max, sigma, chi, ratio = values
     return np.asarray(f_max / sigma / (1.0 - 1.0 / ((1.0 + ratio) * (chi + 2.0))))
+
+
+def _lost_fundamental(m: FloatArray, g: FloatArray) -> ComplexArray:
+    """Return P of the fundamental at m = d_m/A."""
+    top = np.minimum(m, 1.0)
+    with np.errstate(under="ignore", over="ignore", invalid="ignore"):
+        rise = np.maximum(m, 1.0) ** -g
+        inside = beta(g + 1.5, 1.5) * betainc(g + 1.5, 1.5, top) * top**-g
+        near = top**1.5 * (1.0 / (g + 1.5) - 0.5 * top / (g + 2.5))
+    real = 8.0 / np.pi * rise * np.where(top < _DEEP, near, inside)
+    imag = 4.0 / np.pi * rise * top * (1.0 / (g + 1.0) - 2.0 * top / (g + 2.0))
+    return np.asarray(real + 1j * imag)
 
 
 def _lost(

@@ -135,6 +135,13 @@ class MaxwellSlip(Masing):
             by_d.append(np.broadcast_to(slope, shape))
         return StiffnessGradient(N, by_A, (*by_k, *by_d))
 
+    def stiffness_slope(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Return F/X of the fundamental and its derivative by amplitude, unchecked."""
+        found = self.stiffness_gradient(values, amplitude, omega)
+        return found.value, found.by_amplitude
+
     def rest_stiffness(self, values: Sequence[FloatArray]) -> FloatArray:
         """Return the sum of all stiffnesses."""
         return np.asarray(sum(np.asarray(k) for k in self._split(values)[0]))

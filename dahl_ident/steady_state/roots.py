@@ -50,7 +50,8 @@ def find_roots(plant: Plant, per_decade: int = _SCAN_PER_DECADE) -> Roots:
         with np.errstate(divide="ignore", over="ignore"):
             amplitude = np.where(resonant, np.nan, plant.drive / np.abs(plant.linear))
         return Roots(amplitude[:, None], (amplitude * plant.linear)[:, None])
-    known = np.isfinite(plant.linear)
+    low, high = _knees(plant.friction)
+    known = np.isfinite(plant.linear) & np.isfinite(low + high)[plant.vector]
     passive = known & plant.friction.unique & (plant.linear.imag >= -plant.rounding)
     single = passive & ~(resonant & (plant.drive >= plant.largest_friction()))
     amplitude = np.full(plant.drive.shape, np.nan)
@@ -94,12 +95,19 @@ class _Table(NamedTuple):
     sure_step: float  # steps of ln A, times kappa, after which linear corrections are exact
 
 
+def _knees(friction: Nonlinear) -> tuple[FloatArray, FloatArray]:
+    """Return the knees' decimal logarithms, one a vector; not finite beyond a law's range."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low, high = (np.atleast_1d(np.log10(knee)) for knee in friction.knees())
+    return low, high
+
+
 def _tabulate(friction: Nonlinear, points: int) -> _Table:
     """Return the friction force from deep microslip to deep slip of every element.
 
     A vector has about as many nodes as there are points to solve for it, within limits.
     """
-    low, high = (np.atleast_1d(np.log10(knee)) for knee in friction.knees())
+    low, high = (np.where(np.isfinite(knee), knee, 0.0) for knee in _knees(friction))
     low, high = low - 6.0, high + 5.0
     decades = float(np.max(high - low))
     fewest, most = (decades * n for n in _NODES_PER_DECADE)
