@@ -330,7 +330,7 @@ def _estimated(
     noise: tuple[Source, ...] | None = None
     dof = problem.n_numbers - len(problem.names)
     tells = dof + len(assumed) >= _LEAST_DOF
-    shared = StructuredSources(problem) if tells else None
+    shared = StructuredSources(problem, theta) if tells else None
     last: FloatArray | None = None
     runs: RunDeviations | None = None
     for step in range(_STEPS):

@@ -169,11 +169,15 @@ def relative_scatter(problem: Problem, theta: FloatArray) -> tuple[Source, ...]:
 
 
 class StructuredSources:
-    """The sources that several rows share, and noise of the amplitudes."""
+    """The sources that several rows share, and noise of the amplitudes.
 
-    def __init__(self, problem: Problem) -> None:
+    Their shapes are those of the model at `theta`. In measured ones the noise itself would be a
+    shape, and explain itself.
+    """
+
+    def __init__(self, problem: Problem, theta: FloatArray) -> None:
         self._problem = problem
-        view, data = problem.stiffness_data, problem.data
+        view, data = problem.predicted_stiffness(theta), problem.data
         self._places = places(view.amplitude, view.omega)
         self._fundamental = view.harmonic == 1
         self._repeats = _repeats(self._places, self._fundamental)

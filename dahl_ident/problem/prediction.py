@@ -88,18 +88,26 @@ class Predictor:
             for part, harmonic, forced in _parts(rows)
         ]
 
-    def as_stiffness(self, weights: FloatArray) -> StiffnessData:
-        """Return the data as dynamic stiffness; `weights` are those of the response."""
+    def as_stiffness(
+        self, weights: FloatArray, predicted: ComplexArray | None = None
+    ) -> StiffnessData:
+        """Return the data as dynamic stiffness; `weights` are those of the response.
+
+        With `predicted` responses in place of the measured ones, driven amplitudes are theirs too.
+        """
         rows = self._rows
-        ratio = rows.response / self._operator
+        response = rows.response if predicted is None else predicted
+        ratio = response / self._operator
         Z = ratio if self._exponent == 1 else 1.0 / ratio
         amplitude = self._guess
+        if predicted is not None and rows.drive is not None:
+            amplitude = np.where(rows.forced, rows.drive / np.abs(Z), amplitude)
         if not self._neutral:
             starts = [np.asarray(p.value) for p in self._sensors.parameters]
             Z = Z / measured_stiffness_factor(starts, rows.omega, rows.harmonic)
             amplitude = amplitude / starts[1]
         if rows.quantity != "dynamic_stiffness":
-            weights = weights * np.abs(rows.response / Z)
+            weights = weights * np.abs(response / Z)
         return StiffnessData(Z, amplitude, rows.omega, rows.harmonic, rows.orders, weights)
 
     def __call__(

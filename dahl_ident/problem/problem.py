@@ -269,6 +269,11 @@ class Problem:
         """The data as dynamic stiffness at known amplitudes, sensors at their starts."""
         return self._predictor.as_stiffness(self._noise.weights)
 
+    def predicted_stiffness(self, theta: ArrayLike) -> StiffnessData:
+        """Return what the model predicts as dynamic stiffness, without the data's noise."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self._predictor.as_stiffness(self._noise.weights, self.predict(theta))
+
     @property
     def rounding(self) -> FloatArray:
         """Size of residuals that may be rounding errors alone; no estimated scale is smaller."""
