@@ -11,6 +11,7 @@ from scipy import optimize, stats
 from dahl_ident import Dahl, FrequencyResponse, Sensors, Spring, fit
 from dahl_ident.diagnostics import ErrorModel, budget, error_model
 from dahl_ident.diagnostics.budget import coverage_factor
+from dahl_ident.diagnostics.error_sources import repeated_levels
 from dahl_ident.diagnostics.variance_components import LinearModel, variance_components
 from dahl_ident.errors import FitError
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
@@ -216,3 +217,32 @@ class TestEstimate:
         assert whole.linear.outside[1] > 0
         few = modelled(data.select(rows=np.arange(240) % 2 == 0))
         assert whole.stderr["sigma"] * 2.0**0.5 == pytest.approx(few.stderr["sigma"], rel=0.25)
+
+    @pytest.mark.parametrize("seed", [0, 1])
+    def test_no_source_explains_the_noise_of_a_dense_sweep(self, seed: int) -> None:
+        """1,200 numbers of 1 % noise: their variance is known to 4 %."""
+        found = modelled(table(beta=(0.01, 1.0), n=600, noise=0.01, seed=seed))
+        assert found.variances[0] == pytest.approx(1e-4, rel=4 * 0.041)
+        assert set(found.contributions) <= {"noise", "model error", "exponent"}
+        assert abs(found.values["f_max"] - 0.1) < 5.0 * found.stderr["f_max"] < 0.05
+
+
+class TestLevels:
+    @staticmethod
+    def repeated(A: np.ndarray) -> int:
+        """Return how many levels were measured more than once."""
+        data = FrequencyResponse(np.ones(A.size), np.full(A.size, 1.0 + 1.0j), A)
+        return int((np.bincount(repeated_levels(data)) > 1).sum())
+
+    @pytest.mark.parametrize("scatter", [0.0, 1e-4, 3e-3])
+    def test_amplitudes_that_agree_within_their_scatter_are_one(self, scatter: float) -> None:
+        rng = np.random.default_rng(3)
+        levels = np.repeat(np.geomspace(1e-4, 1e-2, 8), 4)
+        assert self.repeated(levels * np.exp(scatter * rng.standard_normal(32))) == 8
+
+    def test_a_dense_sweep_has_none(self) -> None:
+        rng = np.random.default_rng(4)
+        assert not any(self.repeated(np.geomspace(1e-4, 1e-2, n)) for n in (12, 300, 3000))
+        spread = [np.exp(rng.uniform(0.0, 4.6, n)) for n in 50 * [12, 30, 100, 300]]
+        alarms = sum(self.repeated(A) > 0 for A in spread)
+        assert stats.binomtest(alarms, len(spread), 0.01, alternative="greater").pvalue > 0.01

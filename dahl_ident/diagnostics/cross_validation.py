@@ -67,7 +67,7 @@ def cross_validation(errors: ErrorModel) -> CrossValidation | None:
     True
     """
     problem = errors.problem
-    tests = tests_of(problem.data, errors)
+    tests = tests_of(problem.data)
     if len(tests) < _FEWEST_TESTS:
         return None
     P, y = errors.full_projection()
@@ -102,15 +102,15 @@ def cross_validation(errors: ErrorModel) -> CrossValidation | None:
     )
 
 
-def tests_of(data: FrequencyResponse, errors: ErrorModel) -> list[NDArray[np.intp]]:
+def tests_of(data: FrequencyResponse) -> list[NDArray[np.intp]]:
     """Return the rows of each test: runs, else labelled levels, else repeats of one level."""
     for labels in (data.run, data.level):
         if labels is not None:
             names = np.unique(labels)
             if _FEWEST_TESTS <= len(names) < data.n:
                 return [np.flatnonzero(np.asarray(labels) == name) for name in names]
-    view = errors.problem.stiffness_data
-    return repeated_levels(view.amplitude, view.omega)
+    level = repeated_levels(data)
+    return np.split(np.argsort(level, kind="stable"), np.cumsum(np.bincount(level))[:-1])
 
 
 def _factor(errors: ErrorModel) -> float:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.run_deviations import Linearization, RunDeviations
 from dahl_ident.problem import Problem
 
@@ -32,7 +33,9 @@ _LENGTH = 1.0  # of the model error, in ln A and ln omega
 _MOST_PLACES = 200  # rows beyond which a column for each costs seconds, cubic in their number
 _SMOOTH = 1e-3  # eigenvalue of the correlation, over the largest, that is negligible
 _MOST_SHAPES = 24  # of its eigenvectors; a decade of both amplitude and frequency takes 15
-_SAME_LEVEL = 0.02  # of ln A and ln f, within which rows repeat each other
+_SAME_LEVEL = 0.02  # of ln A and ln f, beyond which the response is another
+_EQUAL = 1e-9  # of the same: one number, stored twice
+_BY_CHANCE = 0.01  # tables without repeats in which some seem to be
 _MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it leaves
 _LEAST_RATE_RANGE = np.log(2.0)  # of frequency, that tells speed from amplitude
 _STEP = 1e-5  # of ln A, for a slope
@@ -180,7 +183,7 @@ class StructuredSources:
         view, data = problem.predicted_stiffness(theta), problem.data
         self._places = places(view.amplitude, view.omega)
         self._fundamental = view.harmonic == 1
-        self._repeats = _repeats(self._places, self._fundamental)
+        self._repeats = _repeats(repeated_levels(data), self._fundamental)
         self._runs = (
             np.empty((0, data.n)) if data.run is None else _indicators(np.asarray(data.run))
         )
@@ -333,20 +336,58 @@ def _scattering_parameters(problem: Problem) -> list[int]:
     return found
 
 
-def _repeats(where: FloatArray, fundamental: FloatArray) -> FloatArray:
+def _repeats(level: NDArray[np.intp], fundamental: NDArray[np.bool_]) -> FloatArray:
     """Return which rows belong to each level that was measured more than once, (levels, n)."""
-    key = np.round(where / _SAME_LEVEL)
-    _, which, count = np.unique(key[fundamental], axis=0, return_inverse=True, return_counts=True)
-    own = np.zeros((int((count > 1).sum()), len(where)))
-    own[:, fundamental] = np.flatnonzero(count > 1)[:, None] == which
-    return own
+    count = np.bincount(level[fundamental])
+    return np.asarray((np.flatnonzero(count > 1)[:, None] == level) & fundamental, dtype=np.float64)
 
 
-def repeated_levels(amplitude: FloatArray, omega: FloatArray) -> list[NDArray[np.intp]]:
-    """Return the rows of each level, those of one amplitude and frequency together."""
-    key = np.round(places(amplitude, omega) / _SAME_LEVEL)
-    _, which = np.unique(key, axis=0, return_inverse=True)
-    return [np.flatnonzero(which == level) for level in range(int(which.max()) + 1)]
+def repeated_levels(data: FrequencyResponse) -> NDArray[np.intp]:
+    """Return the number of each row's level, shape (n,).
+
+    Rows are of one level where the frequency and what was held, drive or amplitude, agree as
+    closely as repeats do; not where a sweep is dense.
+    """
+    driven = data.controlled == "force"
+    held = np.ones(data.n)
+    for rows, column in ((driven, data.drive), (~driven, data.amplitude)):
+        if column is not None:
+            held[rows] = column[rows]
+    frequency = _agreeing(np.log(data.frequency_hz), np.zeros(data.n, dtype=np.intp))
+    return _agreeing(np.log(held), 2 * frequency + driven)
+
+
+def _agreeing(x: FloatArray, groups: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return a label for each value: one for values of a group that repeat one another.
+
+    Gaps between values without repeats are taken as exponential, with the mean that the larger of
+    them have; that all of the k smallest are below some size then has a probability. Gaps up to
+    the least likely such size are between repeats, if chance made it in one of a hundred tables.
+    """
+    order = np.lexsort((x, groups))
+    apart = np.diff(x[order])
+    joined = np.diff(groups[order]) == 0
+    gaps = np.sort(apart[joined & (apart > _EQUAL)])
+    small = gaps[gaps < _SAME_LEVEL]
+    k = np.arange(1, len(small) + 1)
+    larger = np.append(gaps, np.maximum(gaps[-1:], _SAME_LEVEL))  # a last one that ends the table
+    mean = np.maximum(np.cumsum(larger[::-1])[::-1][k] / (len(larger) - k) - small, _EQUAL)
+    unlikely = k * np.log(np.expm1(-larger[k] / mean) / np.expm1(-small / mean))
+    apart_at_most = _EQUAL
+    if unlikely.max(initial=0.0) > np.log(max(len(gaps), 1) / _BY_CHANCE):
+        apart_at_most = float(small[np.argmax(unlikely)])
+
+    def labelled(breaks: NDArray[np.bool_]) -> NDArray[np.intp]:
+        return np.concatenate([[0], np.cumsum(breaks)])
+
+    breaks = ~(joined & (apart <= apart_at_most))
+    label = labelled(breaks)
+    starts = np.flatnonzero(np.concatenate([[True], breaks]))
+    ends = np.append(starts[1:], len(x)) - 1
+    wide = (x[order][ends] - x[order][starts] > _SAME_LEVEL)[label[1:]]
+    found = np.empty(len(x), dtype=np.intp)
+    found[order] = labelled(breaks | (wide & (apart > _EQUAL)))
+    return found
 
 
 def _indicators(labels: NDArray[np.str_]) -> FloatArray:
