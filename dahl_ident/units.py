@@ -30,6 +30,7 @@ Quantity = Literal[
     "dynamic_stiffness",
     "mechanical_impedance",
     "apparent_mass",
+    "backbone",
 ]
 Dimension = tuple[tuple[str, float], ...]
 Marker = Literal["zero to peak", "rms", "peak to peak"]
@@ -46,6 +47,7 @@ SI_UNITS: dict[str, tuple[str, str]] = {
     "dynamic_stiffness": ("N/m", "N m/rad"),
     "mechanical_impedance": ("N s/m", "N m s/rad"),
     "apparent_mass": ("kg", "kg m^2"),
+    "backbone": ("1", "1"),
     "voltage": ("V", "V"),
     "current": ("A", "A"),
     "force_per_voltage": ("N/V", "N m/V"),
@@ -65,7 +67,8 @@ _ROTATION = {
     "N s/m": "N m s/rad",
     "kg": "kg m^2",
 }
-QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
+QUANTITIES: tuple[Quantity, ...] = tuple(q for q in get_args(Quantity) if q != "backbone")
+"""The six standard quantities, each a quotient of force and motion; a backbone is none."""
 MOTION_KINDS = ("displacement", "velocity", "acceleration")
 DRIVE_KINDS = ("force", "voltage", "current")
 MECHANICAL_KINDS = (*MOTION_KINDS, "force", *QUANTITIES, "force_per_voltage", "force_per_current")

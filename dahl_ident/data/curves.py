@@ -102,6 +102,22 @@ def draw(
     )
 
 
+def draw_backbone(
+    data: _Points, stds: tuple[FloatArray, FloatArray], ax: Any = None
+) -> tuple[Any, Any]:
+    """Draw natural frequency and damping ratio over amplitude, with their standard deviations."""
+    from dahl_ident.plots import plot_backbone
+
+    labels = ("natural frequency [Hz]", "damping ratio [1]")
+    values = (data.frequency_hz, data.response.imag)
+    return plot_backbone(
+        held_amplitude(data),
+        list(zip(labels, values, stds, strict=True)),
+        amplitude_label=held_label(data),
+        ax=ax,
+    )
+
+
 def draw_waveforms(time: FloatArray, frame: pd.DataFrame, kind: str, ax: Any = None) -> Any:
     """Draw waveforms or loops of a record's table; see :meth:`Record.plot`."""
     from dahl_ident.plots import plot_recorded_loops, plot_waveforms

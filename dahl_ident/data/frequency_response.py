@@ -102,7 +102,7 @@ class FrequencyResponse(Tabular):
     harmonic : int or (n,) array_like of int
         0 for the mean force, 1 for the fundamental, 2, 3, ... above it.
     quantity : str
-        One of the six standard quantities.
+        One of the six standard quantities; or "backbone", see :meth:`backbone`.
     motion : {"translation", "rotation"}
         Whether displacement is m or rad.
     drive_factor_uncertainty : float
@@ -185,7 +185,7 @@ class FrequencyResponse(Tabular):
             "run": spread(run, "run", n, run_labels),
             "controlled": spread(controlled, "controlled", n, controlled_words),
             "harmonic": spread(harmonic, "harmonic", n, harmonic_numbers),
-            "quantity": one_of(quantity, "quantity", QUANTITIES),
+            "quantity": one_of(quantity, "quantity", (*QUANTITIES, "backbone")),
             "motion": one_of(motion, "motion", MOTIONS),
             "drive_factor_uncertainty": finite_number(
                 non_negative_array(drive_factor_uncertainty, "drive_factor_uncertainty"),
@@ -212,6 +212,8 @@ class FrequencyResponse(Tabular):
             )
         if self.amplitude_std is not None and self.amplitude is None:
             raise ValidationError("amplitude_std is given without amplitude")
+        if self.quantity == "backbone":
+            self._check_backbone()
         if self.dof is not None and self.covariance is None:
             raise ValidationError("dof is given without the covariance that it belongs to")
         if self.amplitude_covariance is not None and (
@@ -239,6 +241,96 @@ class FrequencyResponse(Tabular):
             even = (self.covariance + self.covariance.swapaxes(1, 2)) / 2.0  # but for rounding
             object.__setattr__(self, "covariance", frozen_copy(even))
 
+    def _check_backbone(self) -> None:
+        if self.amplitude is None or self.covariance is None:
+            raise ValidationError(
+                "a backbone needs amplitudes, and standard deviations of the natural frequencies "
+                "and of the damping ratios"
+            )
+        wrong = np.flatnonzero((self.response.imag < 0.0) | (self.controlled == "force"))
+        if wrong.size:
+            raise ValidationError(
+                f"row {wrong[0]} has the damping ratio {self.response.imag[wrong[0]]:g} and "
+                f"controlled {self.controlled[wrong[0]]!r}; expected a ratio >= 0, and "
+                "'displacement', at whose amplitude the frequency was found"
+            )
+
+    @classmethod
+    def backbone(
+        cls,
+        amplitude: ArrayLike,
+        natural_frequency_hz: ArrayLike,
+        damping_ratio: ArrayLike,
+        *,
+        frequency_std: ArrayLike,
+        damping_ratio_std: ArrayLike,
+        **columns: Any,
+    ) -> FrequencyResponse:
+        r"""Return natural frequency and damping ratio against amplitude, as a table.
+
+        As tests with a phase-locked loop and modal analysis of ring-downs give them. The response
+        is ``Z/(2 m omega^2)``, Z the dynamic stiffness of mode and friction and m the modal mass:
+        at resonance its real part is zero, and its imaginary part the damping ratio. Its real part
+        is uncertain by that of the frequency, over the frequency.
+
+        Parameters
+        ----------
+        amplitude : (n,) array_like
+            Zero-to-peak displacement amplitude, m or rad.
+        natural_frequency_hz : (n,) array_like
+            Hz, where the force is in quadrature with the displacement.
+        damping_ratio : (n,) array_like
+            Of critical damping.
+        frequency_std, damping_ratio_std : (n,) array_like or float
+            Standard deviations.
+        **columns
+            Others of :class:`FrequencyResponse`, such as `run` and `motion`.
+
+        Returns
+        -------
+        FrequencyResponse
+            Of the quantity "backbone". A fit needs a model with a Mass of known value.
+
+        Raises
+        ------
+        ValidationError
+            If a column has the wrong shape or impossible values.
+
+        Examples
+        --------
+        >>> data = FrequencyResponse.backbone(
+        ...     [1e-4, 1e-3], [21.0, 20.0], [0.02, 0.03], frequency_std=0.01, damping_ratio_std=1e-3
+        ... )
+        >>> data.quantity, data.response.imag.tolist()
+        ('backbone', [0.02, 0.03])
+        """
+        frequency = positive_array(natural_frequency_hz, "natural_frequency_hz")
+        stds = [
+            np.broadcast_to(positive_array(given, name), frequency.shape)
+            for name, given in (
+                ("frequency_std", frequency_std), ("damping_ratio_std", damping_ratio_std)
+            )
+        ]  # fmt: skip
+        covariance = np.zeros((*frequency.shape, 2, 2))
+        covariance[..., 0, 0] = (stds[0] / frequency) ** 2
+        covariance[..., 1, 1] = stds[1] ** 2
+        return cls(
+            frequency, 1j * non_negative_array(damping_ratio, "damping_ratio"), amplitude,
+            covariance=covariance, quantity="backbone", **columns,
+        )  # fmt: skip
+
+    def with_mass(self, mass: float) -> FrequencyResponse:
+        """Return a backbone as dynamic stiffness of mode, friction and this mass, kg or kg m^2."""
+        if self.quantity != "backbone" or self.covariance is None:
+            raise ValidationError(f"this table is of {self.quantity}; expected a backbone")
+        factor = 2.0 * mass * self.omega**2
+        return replace(
+            self,
+            response=self.response * factor,
+            covariance=self.covariance * factor[:, None, None] ** 2,
+            quantity="dynamic_stiffness",
+        )
+
     def __len__(self) -> int:
         return self.frequency_hz.size
 
@@ -255,9 +347,14 @@ class FrequencyResponse(Tabular):
             if values is not None:
                 unit = si_unit(kind, self.motion)
                 lines.append((field, f"{extent(values, unit)}, zero to peak"))
+        if self.quantity == "backbone":
+            lines.append(("damping ratio", extent(self.response.imag, "1")))
+        else:
+            lines += [
+                ("gain", extent(self.gain, self.unit)),
+                ("phase", extent(np.degrees(self.phase), "deg")),
+            ]
         lines += [
-            ("gain", extent(self.gain, self.unit)),
-            ("phase", extent(np.degrees(self.phase), "deg")),
             ("controlled", listed(distinct(self.controlled))),
         ]
         if (self.harmonic != 1).any():
@@ -340,6 +437,10 @@ class FrequencyResponse(Tabular):
         one_of(quantity, "quantity", QUANTITIES)
         if quantity == self.quantity:
             return self
+        if self.quantity == "backbone":
+            raise ValidationError(
+                f"a backbone becomes {quantity} only with the modal mass: with_mass(mass).to(...)"
+            )
         if (self.harmonic != 1).any():
             raise ValidationError(
                 f"rows with harmonics {listed(np.unique(self.harmonic))} cannot become "
@@ -497,7 +598,13 @@ class FrequencyResponse(Tabular):
             "run": self.run,
             f"amplitude [{m}]": self.amplitude,
             f"drive [{si_unit('force', self.motion)}]": self.drive,
-            **(_polar(self) if polar else _rectangular(self)),
+            **(
+                _backbone(self)
+                if self.quantity == "backbone"
+                else _polar(self)
+                if polar
+                else _rectangular(self)
+            ),
             "dof": self.dof,
             f"amplitude_std [{m}]": self.amplitude_std,
         }
@@ -579,8 +686,10 @@ class FrequencyResponse(Tabular):
         >>> top.get_ylabel()
         'dynamic stiffness [N/m]'
         """
-        from dahl_ident.data.curves import draw
+        from dahl_ident.data.curves import draw, draw_backbone
 
+        if self.quantity == "backbone":
+            return draw_backbone(self, backbone_std(self), ax)
         return draw(self, ax)
 
 
@@ -591,6 +700,22 @@ def _rectangular(data: FrequencyResponse) -> dict[str, Any]:
         for name, i, j in (("real_real", 0, 0), ("real_imag", 0, 1), ("imag_imag", 1, 1)):
             columns[f"covariance_{name} [({r})^2]"] = data.covariance[:, i, j]
     return columns
+
+
+def _backbone(data: FrequencyResponse) -> dict[str, Any]:
+    frequency_std, damping_std = backbone_std(data)
+    return {
+        "damping_ratio": data.response.imag,
+        "frequency_std [Hz]": frequency_std,
+        "damping_ratio_std": damping_std,
+    }
+
+
+def backbone_std(data: FrequencyResponse) -> tuple[FloatArray, FloatArray]:
+    """Return the standard deviations of a backbone's frequencies, Hz, and damping ratios."""
+    assert data.covariance is not None  # a backbone has one
+    stds = np.sqrt(data.covariance[:, [0, 1], [0, 1]])
+    return data.frequency_hz * stds[:, 0], stds[:, 1]
 
 
 def _polar(data: FrequencyResponse) -> dict[str, Any]:

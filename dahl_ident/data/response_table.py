@@ -114,6 +114,8 @@ class _Table:
                 "(inspect proposes a column map), or give drive='0.2 N' or amplitude='5 um' for "
                 "the whole file"
             )
+        if bound.has("damping_ratio"):
+            return self._backbone(frequency_hz, amplitude)
         quantity, response = self._response(frequency_hz, amplitude, drive)
         harmonic = self._whole_numbers("harmonic")
         self._refuse_zero(response, harmonic)
@@ -143,6 +145,36 @@ class _Table:
         if self.options.passive:
             check_energy(source.name, data, bound.doubt_rows)
         return data
+
+    def _backbone(
+        self, frequency_hz: FloatArray, amplitude: FloatArray | None
+    ) -> FrequencyResponse:
+        """Return natural frequencies and damping ratios against amplitude."""
+        source = self.bound.source
+        frequency_std = self._scaled("frequency_std", "Hz", self._unit_text("frequency"))
+        ratio_std = self._scaled("damping_ratio_std", "1", "1")
+        if amplitude is None or frequency_std is None or ratio_std is None:
+            raise DataError(
+                f"{source.name}: a table of damping ratios is a backbone; expected the columns "
+                "amplitude, frequency_std and damping_ratio_std beside frequency and damping_ratio"
+            )
+        try:
+            return FrequencyResponse.backbone(
+                amplitude,
+                frequency_hz,
+                self._scaled("damping_ratio", "1", "1"),
+                frequency_std=frequency_std,
+                damping_ratio_std=ratio_std,
+                amplitude_std=self._scaled(
+                    "amplitude_std", si_unit("displacement", self.bound.motion()),
+                    self._error_unit("amplitude"),
+                ),
+                level=self._level(),
+                run=self._run(),
+                motion=self.bound.motion(),
+            )  # fmt: skip
+        except ValidationError as exc:
+            raise DataError(f"{source.name}: {exc}") from exc
 
     def _within_range(self) -> None:
         """Leave out the frequencies that the user does not want, before anything is judged."""

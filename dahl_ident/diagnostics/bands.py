@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
+from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, positive_array
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.confidence_levels import checked_levels
 from dahl_ident.diagnostics.error_model import ErrorModel
@@ -25,14 +25,16 @@ from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import Information
 from dahl_ident.diagnostics.parameters import values_at
 from dahl_ident.diagnostics.prediction_error import noise_near, prediction_error
-from dahl_ident.elements import Element
+from dahl_ident.elements import Element, Model
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.units import shown_unit
 
-_STEP = 1e-5  # relative, of parameters, for the slope of a knee
+_STEP = 1e-5  # relative, of parameters, for the slope of a knee; of frequencies, for a stiffness
+_RESONANT = 1e-12  # relative: a natural frequency is found
+_PASSES = 50
 
 
 @dataclass(frozen=True)
@@ -135,6 +137,39 @@ def response_band(
     return _combined_band(
         errors, R, by, known, seen.amplitude, seen.omega, seen.stiffness, of_a_test
     )
+
+
+def predicted_backbone(
+    optimum: Optimum, model: Model, amplitude: ArrayLike, errors: ErrorModel | None = None
+) -> FrequencyResponse:
+    """Return natural frequencies and damping ratios of the model with the estimates put in."""
+    A = np.atleast_1d(positive_array(amplitude, "amplitude"))
+    mass = sum(float(p.value or 0.0) for p in model.parameters if p.is_mass)
+    if mass == 0.0:
+        raise ModelError(f"{model!r} has no mass, and so no natural frequency; add Mass(value)")
+    omega = np.ones(A.shape)
+    for _ in range(_PASSES):
+        Z = model.dynamic_stiffness(A, omega)
+        square = omega**2 + Z.real / mass
+        if not (square > 0.0).all():
+            raise ModelError(
+                f"at the amplitude {A[np.argmin(square)]:.3g} no frequency makes the restoring "
+                "force balance the inertia; add Spring(), or give other amplitudes"
+            )
+        last, omega = omega, np.sqrt(square)
+        if (np.abs(omega - last) <= _RESONANT * omega).all():
+            break
+    f = omega / (2.0 * np.pi)
+    above, below = (model.dynamic_stiffness(A, omega * (1.0 + h)) for h in (_STEP, -_STEP))
+    slope = np.abs((above - below).real) / (2.0 * _STEP)
+    band = response_band(optimum, f, A, None, "dynamic_stiffness", errors, of_a_test=False)
+    critical = 2.0 * mass * omega**2
+    return FrequencyResponse.backbone(
+        A, f, model.dynamic_stiffness(A, omega).imag / critical,
+        frequency_std=np.maximum(f * band.real_std / slope, SMALLEST),
+        damping_ratio_std=np.maximum(band.imag_std / critical, SMALLEST),
+        motion=optimum.problem.data.motion,
+    )  # fmt: skip
 
 
 def _estimate(optimum: Optimum, errors: ErrorModel | None) -> tuple[Problem, FloatArray]:

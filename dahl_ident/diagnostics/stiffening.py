@@ -31,7 +31,6 @@ _BANDS = 8
 _NARROWEST = np.log(1.1)  # of a band, in the logarithm of the amplitude
 _FEWEST_ROWS = 3  # in a band
 _LEAST_DOF = 6
-_MASS = (1, -1, 2)  # powers of force, displacement and time
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
 
 def _is_free_mass(element: Element) -> bool:
     own = [element.parameter(label) for label in element.linear_parameters]
-    return element.is_linear and any(p.free and p.dimension == _MASS for p in own)
+    return element.is_linear and any(p.free and p.is_mass for p in own)
 
 
 def _bands(x: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:

@@ -123,6 +123,11 @@ class Parameter:
             )
         return found
 
+    @property
+    def is_mass(self) -> bool:
+        """Whether the unit is that of a mass."""
+        return _dimension(self.unit) == (1, -1, 2)
+
     def bound(self, name: str, given: float | None) -> Parameter:
         """Return this declaration as a parameter called `name`: fixed at a number, or free."""
         if given is None and self.value is None and self.free and name == self.name:

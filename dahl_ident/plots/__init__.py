@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from matplotlib.axes import Axes
 
+from dahl_ident.plots.backbone import plot_backbone
 from dahl_ident.plots.bench_time import plot_bench_time
 from dahl_ident.plots.budget import plot_budget
 from dahl_ident.plots.control_charts import plot_control_charts, plot_devices
@@ -29,6 +30,7 @@ __all__ = [
     "Axes",
     "Curve",
     "plot_amplitude_response",
+    "plot_backbone",
     "plot_bench_time",
     "plot_budget",
     "plot_control_charts",

@@ -12,7 +12,7 @@ from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Element
 from dahl_ident.errors import DataError
-from dahl_ident.problem.problem import Problem, checked_table
+from dahl_ident.problem.problem import Problem, as_response, checked_table
 from dahl_ident.sensors import Sensors
 
 
@@ -63,6 +63,7 @@ class ProblemBatch(Problem):
             raise DataError(f"data is {found}; expected a sequence of at least one")
         tables = [checked_table(table) for table in data]
         self._set_model(model, sensors, free, fixed, tables[0].motion)
+        tables = [as_response(table, self.model) for table in tables]
         self._set_rows(Rows.stack(tables), noise)
         self.tables = tuple(tables)
 

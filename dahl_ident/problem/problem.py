@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import Rows
-from dahl_ident.elements import Element, Parameter
+from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import DataError, ModelError, ValidationError
 from dahl_ident.noise import Measured, Rho, bend, correct_amplitude, noise_for
@@ -112,9 +112,10 @@ class Problem:
         free: Iterable[str] = (),
         fixed: Mapping[str, float] | None = None,
     ) -> None:
-        self.data = checked_table(data)
-        self._set_model(model, sensors, free, fixed, data.motion)
-        self._set_rows(Rows.of(data), noise)
+        table = checked_table(data)
+        self._set_model(model, sensors, free, fixed, table.motion)
+        self.data = as_response(table, self.model)
+        self._set_rows(Rows.of(self.data), noise)
 
     def _set_model(
         self,
@@ -543,6 +544,19 @@ def checked_table(data: object) -> FrequencyResponse:
         f"data is a {type(data).__name__}; expected a FrequencyResponse, as "
         "read_frequency_response gives it, or extract from a Record"
     )
+
+
+def as_response(data: FrequencyResponse, model: Model) -> FrequencyResponse:
+    """Return a table that a model predicts: a backbone with the model's mass."""
+    if data.quantity != "backbone":
+        return data
+    masses = [p for p in model.parameters if p.is_mass]
+    if not masses or any(p.free for p in masses):
+        raise ModelError(
+            f"natural frequencies and damping ratios determine {model!r} up to the mass; give the "
+            "modal mass in it, such as Mass(0.5)"
+        )
+    return data.with_mass(sum(float(p.value or 0.0) for p in masses))
 
 
 def _normal_moments(name: str, prior: Prior) -> tuple[float, float]:

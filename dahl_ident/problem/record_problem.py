@@ -114,7 +114,7 @@ class RecordProblem:
         self.model = as_model(model)
         self.excitation = excitation
         self.substeps = substeps
-        inertial = any(p.dimension == (1, -1, 2) for p in self.model.parameters)
+        inertial = any(p.is_mass for p in self.model.parameters)
         self.output: Output = output or ("motion" if inertial else "force")
         if self.output not in ("force", "motion"):
             raise ValidationError(f"output is {output!r}; expected force or motion")

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.bands import (
     DerivedQuantity,
     ResponseBand,
     derived,
     describing_function_band,
+    predicted_backbone,
     response_band,
 )
 from dahl_ident.diagnostics.bootstrap import REPLICATES, bootstrap_intervals
@@ -234,6 +236,26 @@ class JudgedFit(FitNumbers):
         return response_band(
             self._optimum, frequency_hz, amplitude, drive, quantity, self.errors, of_a_test=noise
         )
+
+    def backbone(self, amplitude: ArrayLike) -> FrequencyResponse:
+        """Return natural frequency and damping ratio of the estimate against amplitude.
+
+        Parameters
+        ----------
+        amplitude : array_like, shape (n,)
+            Displacement amplitude, m or rad.
+
+        Returns
+        -------
+        FrequencyResponse
+            Of the quantity "backbone"; its standard deviations are those of the device's.
+
+        Raises
+        ------
+        ModelError
+            If the model has no mass, or no natural frequency at an amplitude.
+        """
+        return predicted_backbone(self._optimum, self.model, amplitude, self.errors)
 
     def describing_function(self, amplitude: ArrayLike) -> ResponseBand:
         """Return N(A) of the friction alone, with bands that hold the device's.
