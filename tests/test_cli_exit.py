@@ -266,6 +266,8 @@ RECORD = "time [s],displacement [m],force [N]\n0,1,1\n1,2,2\n2,1,1\n"
          "volt.csv: drive_factor_uncertainty is given without drive_factor; give both"),
         (("extract", "r.csv", "--time", "time", "--sample-rate", "5"),
          "time and sample_rate are both given"),
+        (("fit", "r.csv"),
+         "r.csv: it holds waveforms (time [s], displacement [m], force [N]), and a table of"),
         (("fit", "levels.csv", "--level", "high"),
          "levels.csv: --level 'high' is given, but the table has its own levels"),
         (("fit", "t.csv", "--level", "high", "--level-from-name", "(t)"),
@@ -276,7 +278,7 @@ RECORD = "time [s],displacement [m],force [N]\n0,1,1\n1,2,2\n2,1,1\n"
          "--record-columns is given without --record"),
     ],
 )  # fmt: skip
-def test_an_option_without_effect_is_refused(
+def test_input_without_effect_or_of_another_kind_is_refused(
     run: Runner, arguments: tuple[str, ...], message: str
 ) -> None:
     Path("t.csv").write_text(TABLE.format(drive="", value=""), encoding="utf-8")

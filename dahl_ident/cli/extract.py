@@ -181,7 +181,7 @@ def _one_row_a_point(data: FrequencyResponse) -> FrequencyResponse:
 
 
 def show(data: FrequencyResponse) -> None:
-    """Print one row for each point, with its level where it has one, and its verdict."""
+    """Print one row for each point, with its run and level where it has them, and its verdict."""
     import numpy as np
 
     from dahl_ident.units import si_unit
@@ -190,6 +190,7 @@ def show(data: FrequencyResponse) -> None:
     assert points.amplitude is not None  # extraction measures it
     used = points.quality["num_periods"] - points.quality["settling_periods"]
     columns = {
+        "run": [] if points.run is None else [str(label) for label in points.run],
         "level": [] if points.level is None else [str(label) for label in points.level],
         "f [Hz]": [f"{f:.5g}" for f in points.frequency_hz],
         f"A [{si_unit('displacement', data.motion)}]": [f"{A:.4g}" for A in points.amplitude],

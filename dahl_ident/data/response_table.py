@@ -20,7 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
-from dahl_ident.data.column_map import RESPONSE_NAMES, Binding, ColumnMap, by_level, per_frequency
+from dahl_ident.data.column_map import (
+    RECORD_NAMES,
+    RESPONSE_NAMES,
+    Binding,
+    ColumnMap,
+    by_level,
+    per_frequency,
+)
 from dahl_ident.data.fields import CONTROLLED
 from dahl_ident.data.frequency_response import FrequencyResponse
 from dahl_ident.data.plausibility import (
@@ -29,7 +36,8 @@ from dahl_ident.data.plausibility import (
     check_phase_size,
     check_phase_unit,
 )
-from dahl_ident.data.raw_columns import Source
+from dahl_ident.data.raw_columns import Source, plain
+from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import (
     DRIVE_KINDS,
@@ -178,6 +186,7 @@ class _Table:
 
     def _within_range(self) -> None:
         """Leave out the frequencies that the user does not want, before anything is judged."""
+        self._refuse_waveforms()
         channel = self.bound.required("frequency")
         lengths = {c: self.bound.channel(c) for c in RESPONSE_NAMES}
         self.bound.same_length({r: c for r, c in lengths.items() if c is not None})
@@ -191,6 +200,20 @@ class _Table:
                 f"{self.bound.source.name}: no frequency lies from {low:g} to {high:g} Hz"
             )
         self.bound.source = self.bound.source.rows(keep)
+
+    def _refuse_waveforms(self) -> None:
+        """Say so where samples in time were given for responses."""
+        source = self.bound.source
+        if self.bound.has("frequency"):
+            return
+        held = {plain(c.short or c.name) for c in source.channels}
+        if all(held & set(RECORD_NAMES[role]) for role in ("time", "force")):
+            channels = listed([c.header for c in source.channels], 5)
+            raise DataError(
+                f"{source.name}: it holds waveforms ({channels}), and a table of responses at "
+                "some frequencies was expected. If they are sine tests, make such a table with "
+                "extract; any other motion is fitted as a record (on the command line --record)"
+            )
 
     def _hertz(self, values: FloatArray) -> FloatArray:
         channel = self.bound.required("frequency")
