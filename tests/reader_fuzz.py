@@ -58,7 +58,7 @@ def good_files() -> dict[str, tuple[str, bytes]]:
     """Return the extension and the bytes of one good file for each format."""
     frame = pd.DataFrame({"time [s]": TIME, "x [m]": X, "F [N]": F})
     csv = frame.to_csv(index=False, lineterminator="\n").encode()
-    files = {
+    return {
         "csv": (".csv", csv),
         "semicolon": (".txt", frame.to_csv(sep=";", decimal=",", index=False).encode()),
         "csv.gz": (".csv.gz", gzip.compress(csv, mtime=0)),
@@ -77,7 +77,6 @@ def good_files() -> dict[str, tuple[str, bytes]]:
         "matlab 4": (".mat", _matlab(format="4")),
         "xlsx": (".xlsx", _saved(lambda b: frame.to_excel(b, index=False))),
     }
-    return files  # noqa: RET504
 
 
 def _named() -> dict[str, Any]:

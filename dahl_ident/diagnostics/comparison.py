@@ -78,7 +78,7 @@ class ComparedModel:
 
     @cached_property
     def meaning(self) -> dict[str, float]:
-        """What means the same in every law: force limit, stiffness at zero force, energies.
+        """Quantities common to all laws: force limit, stiffness at zero force, energies.
 
         Of all elements with memory together: N, N/m, and joules lost in a cycle at the smallest,
         the middle and the largest amplitude. Infinite where a law never slips.
@@ -183,7 +183,7 @@ class ModelComparison:
 
     @property
     def meanings(self) -> list[list[str]]:
-        """What means the same in every law, one row a quantity, one column a model."""
+        """Quantities common to all laws, one row a quantity, one column a model."""
         return [
             [key, *(f"{m.meaning[key]:.3g}" for m in self.models)] for key in self.models[0].meaning
         ]

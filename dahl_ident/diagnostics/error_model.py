@@ -170,8 +170,9 @@ class ErrorModel:
         Satterthwaite's: 2 u^4 over the variance of u^2 that the variances' own errors make, no
         less than 1. `sources` leaves only these; infinite where all variances are known.
         """
-        direction = direction / (float(np.abs(direction @ self.inverse).max()) or 1.0)  # any length
         lever = direction @ self.inverse
+        length = float(np.abs(lever).max()) or 1.0  # any length of the direction will do
+        direction, lever = direction / length, lever / length
         shares = np.zeros(len(self.sources))
         for k, (source, part) in enumerate(zip(self.sources, self.linear.Z, strict=True)):
             if sources is None or source.name in sources:

@@ -95,8 +95,8 @@ def fundamental_share(fit: SineFit, segment: Segment, within: FloatArray) -> Flo
     """Return the fundamental's share of the power of each channel, offset and drift apart.
 
     `fit` may be one of block means; the power is that of the samples themselves, and `within`
-    the part of it that the segment's own means do not show. What is left counts by its degrees
-    of freedom, for a sine fits any few samples well.
+    the part of it that the segment's own means do not show. The residual power is divided
+    by its degrees of freedom, because a sine fits any few samples well.
     """
     sine = 0.5 * np.abs(fit.phasors(1)) ** 2
     drift = fit.coefficients[1] ** 2 / 3.0

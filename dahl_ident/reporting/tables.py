@@ -180,7 +180,7 @@ def meanings(compared: ModelComparison) -> Table:
     """Return what means the same in every law."""
     names = tuple(model.name for model in compared.models)
     rows = tuple(tuple(map(Cell, row)) for row in compared.meanings)
-    return Table("What means the same in every law", ("quantity", *names), rows)
+    return Table("Quantities common to all laws", ("quantity", *names), rows)
 
 
 def measured(data: FrequencyResponse) -> Table:
