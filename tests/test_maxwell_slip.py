@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import mpmath
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from dahl_ident import (
     FrequencyResponse,
     Mass,
     MaxwellSlip,
+    PowerDamper,
     Spring,
     fit,
     response,
@@ -135,9 +138,12 @@ def test_stiffnesses_are_estimated_at_given_and_at_free_slips() -> None:
         estimate = found.params[name]
         assert abs(estimate.value - true) < 4.0 * (estimate.stderr or 0.0) < 0.2
     two = MaxwellSlip([0.1, 1.0], [3.0, 1.0])
-    free = fit(table(two, noise=0.001), MaxwellSlip(2))
-    slips = sorted(free.params[f"slip_{i}"].value for i in (1, 2))
-    assert slips == pytest.approx([0.1, 1.0], rel=0.02)
+    exchanged = {"slip_1": 1.0, "slip_2": 0.1, "stiffness_1": 1.0, "stiffness_2": 3.0}
+    for start in (None, exchanged):  # slips rise, wherever the search began
+        free = fit(table(two, noise=0.001), MaxwellSlip(2), start=start)
+        assert [p.value for p in free.params.values()] == pytest.approx(
+            [3.0, 1.0, 0.1, 1.0], rel=0.02
+        )
 
 
 def test_the_least_misfit_is_least() -> None:
@@ -168,6 +174,22 @@ def test_loops_of_dahl_and_of_a_gap_are_no_sum_of_jenkins_elements() -> None:
     assert slip_density(table(Dahl(1.0, 6.0))).least_misfit > 0.05
     assert slip_density(table(Backlash(Jenkins(3.0, 0.3), 0.05))).least_misfit > 0.1
     assert slip_density(table(LAW)).least_misfit < 0.003
+
+
+@pytest.mark.parametrize(
+    ("truth", "said"),
+    [
+        (LAW, r"The best symmetric .* leaves 0\.\d+ % "),
+        (Dahl(1.0, 6.0, alpha=2.0), r"leaves less than 1\d % .*, more than this model\."),
+        (Dahl(1.0, 6.0) + PowerDamper(0.5, 0.5), r"leaves less than \d+ % .*: the rest is noise"),
+    ],
+)
+def test_the_verdict_says_what_such_laws_leave(truth: Element, said: str) -> None:
+    data = table(truth, noise=0.01)
+    found = fit(data, Dahl(), throw=False)
+    assert re.search(said, found.verdict)
+    bound = slip_density(data).least_misfit
+    assert f"{100.0 * bound:.2g} % (rms of the fundamental)" in found.verdict
 
 
 def test_the_density_is_refused_and_drawn() -> None:

@@ -38,9 +38,11 @@ from dahl_ident.diagnostics.misfit_explanations import (
 from dahl_ident.diagnostics.outliers import SuspiciousPoint, flagged_rows, suspicious_points
 from dahl_ident.diagnostics.physics import physical_warnings
 from dahl_ident.diagnostics.residual_space import ResidualSpace
+from dahl_ident.diagnostics.slip_density import bound_statement, least_misfit
 from dahl_ident.diagnostics.stiffening import Stiffening, stiffening
 from dahl_ident.diagnostics.trends import LEAST_RANGE, Runs, Trend, runs, trends
 from dahl_ident.elements import Parameter
+from dahl_ident.errors import DahlIdentError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
 
@@ -164,6 +166,8 @@ class Goodness:
         The suspicious rows, where they alone contradict the model.
     neighbours : str
         Where the suspicious rows lie, if they alone depart from the model, but side by side.
+    bound : str
+        Where the model does not describe the data: what parallel Jenkins elements would leave.
     untested : bool
         Whether the amplitudes give no more numbers than friction has free parameters, which then
         meet them whatever the mechanism is.
@@ -196,6 +200,7 @@ class Goodness:
     sign: str = ""
     apart: str = ""
     neighbours: str = ""
+    bound: str = ""
 
     @cached_property
     def level(self) -> float:
@@ -271,10 +276,10 @@ class Goodness:
         """The verdict in its parts, most serious first."""
         if self.cause:
             return tuple(filter(None, (self.cause, self._flaws)))
-        parts = (self._flaws, self.described, self._apart)
+        first = (self._flaws, self.described)
         if self.objections or not self.judged:
-            parts = (self.described, self._flaws, self._apart)
-        return tuple(filter(None, parts))
+            first = (self.described, self._flaws)
+        return tuple(filter(None, (*first, self._apart, self.bound)))
 
     @property
     def headline(self) -> str:
@@ -359,7 +364,22 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
     sign = sign_convention(optimum, lambda turned: not _tested(turned).objections)
     if sign:
         return replace(found, sign=sign, warnings=(*found.warnings, sign))
-    return _without_suspicious(optimum, found)
+    found = _without_suspicious(optimum, found)
+    return replace(found, bound=_bound(optimum, found.rms_misfit)) if found.objections else found
+
+
+def _bound(optimum: Optimum, misfit: float) -> str:
+    """Return the least misfit of parallel Jenkins elements in words; "" where it says nothing."""
+    problem = optimum.problem
+    few = (problem.data.harmonic == 1).sum() < _LEAST_DOF
+    if few or any(p.free for p in problem.sensors.parameters):
+        return ""
+    if all(e.is_linear for e in problem.model.elements):
+        return ""
+    try:
+        return bound_statement(least_misfit(problem.data, problem.model), misfit)
+    except DahlIdentError:
+        return ""
 
 
 def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:

@@ -143,7 +143,8 @@ def percent(share: float) -> str:
 
 def _misfit(problem: Problem, fitted: ComplexArray) -> FloatArray:
     response, harmonic = problem.data.response, problem.data.harmonic
-    rows = (harmonic == harmonic.min()) & (response != 0.0)
+    order = 1 if (harmonic == 1).any() else harmonic.min()
+    rows = (harmonic == order) & (response != 0.0)
     return np.asarray(np.abs(1.0 - fitted[rows] / response[rows]))
 
 

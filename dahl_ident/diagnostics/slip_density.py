@@ -11,8 +11,9 @@ solution and needs no initial values. Parallel masses, dampers and springs are l
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from scipy.optimize import nnls
@@ -30,6 +31,7 @@ _BELOW = 100.0  # below the smallest amplitude, where all elements slip alike
 _SMOOTHING = 10.0 ** np.arange(1.0, -6.5, -0.5)
 _ALLOWED = 1.05  # of the least misfit that a smooth density may leave
 _EXACT = 1e-4  # misfit that counts as none
+_FAR_LESS = 0.5  # of a model's misfit: such a law is worth naming
 
 
 @dataclass(frozen=True)
@@ -64,11 +66,7 @@ class SlipDensity:
     @property
     def statement(self) -> str:
         """The least misfit in words."""
-        return (
-            "No symmetric rate-independent law of parallel Jenkins elements leaves less than "
-            f"{100.0 * self.least_misfit:.2g} % (rms of the fundamental): the rest is noise, "
-            "rate, asymmetry, a gap, or a loop of another shape."
-        )
+        return bound_statement(self.least_misfit, self.least_misfit)
 
     def law(self) -> MaxwellSlip:
         """Return the density as an element: its Jenkins elements and the spring, as fixed values.
@@ -130,6 +128,59 @@ def slip_density(data: FrequencyResponse, beside: Element | None = None) -> Slip
     wrong = [e for e in linear if not e.is_linear]
     if wrong:
         raise ModelError(f"beside has {wrong[0]!r}; expected linear elements, such as Mass()")
+    system = _system(data, linear)
+    n = system.slip.size
+    _, least = _solved(system, 0.0)
+    found, misfit = next(
+        (pair for s in _SMOOTHING if (pair := _solved(system, s))[1]
+         <= max(_ALLOWED * least, _EXACT)),
+        _solved(system, 0.0),
+    )  # fmt: skip
+    beside_values = dict.fromkeys(system.names, 0.0)
+    for name, sign, value in zip(system.names, system.signs, found[n + 1 :], strict=True):
+        beside_values[name] += sign * float(value)
+    return SlipDensity(system.slip, found[:n], float(found[n]), beside_values, least, misfit)
+
+
+def least_misfit(data: FrequencyResponse, model: Element) -> float:
+    """Return the least misfit of parallel Jenkins elements in place of a model's friction.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> data = di.load_dataset("alpha_2")
+    >>> print(f"{least_misfit(data, di.Dahl()):.2f}")
+    0.16
+    """
+    return _solved(_system(data, [e for e in as_model(model).elements if e.is_linear]), 0.0)[1]
+
+
+def bound_statement(least: float, misfit: float) -> str:
+    """Return the least misfit of parallel Jenkins elements in words, beside a model's misfit."""
+    share = f"{100.0 * least:.2g} % (rms of the fundamental)"
+    if least < _FAR_LESS * misfit:
+        return (
+            "The best symmetric rate-independent law of parallel Jenkins elements (MaxwellSlip, "
+            f"Iwan) leaves {share}."
+        )
+    rest = ": the rest is noise, rate, asymmetry, a gap, or a loop of another shape"
+    return (
+        "No symmetric rate-independent law of parallel Jenkins elements leaves less than "
+        f"{share}{rest if least <= misfit else ', more than this model'}."
+    )
+
+
+class _System(NamedTuple):
+    """Non-negative coefficients times the columns of `matrix` should give `right`, relatively."""
+
+    slip: FloatArray  # of the first columns; the next is a spring, the others are `names`
+    matrix: ComplexArray
+    right: ComplexArray
+    names: list[str]
+    signs: list[float]
+
+
+def _system(data: FrequencyResponse, linear: Sequence[Element]) -> _System:
     rows = data.harmonic == 1
     if rows.sum() < 3:
         raise DataError(f"{int(rows.sum())} rows are fundamentals; a density needs at least three")
@@ -159,23 +210,12 @@ def slip_density(data: FrequencyResponse, beside: Element | None = None) -> Slip
                 names.append(p.name)
                 signs.append(sign)
     matrix: ComplexArray = np.concatenate(columns, axis=1) / np.abs(Z)[:, None]
-    right = target / np.abs(Z)
-    _, least = _solved(matrix, right, 0.0, slip.size)
-    found, misfit = next(
-        (pair for s in _SMOOTHING if (pair := _solved(matrix, right, s, slip.size))[1]
-         <= max(_ALLOWED * least, _EXACT)),
-        _solved(matrix, right, 0.0, slip.size),
-    )  # fmt: skip
-    beside_values = dict.fromkeys(names, 0.0)
-    for name, sign, value in zip(names, signs, found[n:], strict=True):
-        beside_values[name] += sign * float(value)
-    return SlipDensity(slip, found[: n - 1], float(found[n - 1]), beside_values, least, misfit)
+    return _System(slip, matrix, target / np.abs(Z), names, signs)
 
 
-def _solved(
-    matrix: ComplexArray, right: ComplexArray, smoothing: float, n: int
-) -> tuple[FloatArray, float]:
-    """Return non-negative coefficients and the misfit; the first `n` may not vary freely."""
+def _solved(system: _System, smoothing: float) -> tuple[FloatArray, float]:
+    """Return non-negative coefficients and the misfit; densities may not vary freely."""
+    matrix, right, n = system.matrix, system.right, system.slip.size
     size = np.linalg.norm(matrix, axis=0)
     scaled = matrix / size
     both = np.concatenate([scaled.real, scaled.imag])

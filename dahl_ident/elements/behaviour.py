@@ -153,6 +153,7 @@ class Behaviour(ABC):
     parameters: tuple[Parameter, ...] = ()
     linear_parameters: tuple[str, ...] = ()
     scale_parameters: tuple[str, ...] = ()
+    like_parts: tuple[tuple[str, ...], ...] = ()
     softens: bool = False
     holds_at_rest: bool = True
     _name: str | None = None

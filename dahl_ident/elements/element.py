@@ -91,6 +91,8 @@ class Element(Behaviour):
         Labels in each of which the force is proportional, the others held.
     scale_parameters : tuple of str
         Labels that scale the whole force when multiplied together by one factor.
+    like_parts : tuple of tuple of str
+        Labels of parts that could be exchanged; estimates are ordered by the first label of each.
     softens : bool
         True: Re N falls with the amplitude, whatever the values.
     holds_at_rest : bool

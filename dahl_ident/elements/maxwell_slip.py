@@ -25,7 +25,8 @@ class MaxwellSlip(Masing):
     ----------
     slips : int or array_like
         Slip displacements, m (rad in rotation), each > 0 and rising: fixed. Or how many there
-        are: free, `slip_1` to `slip_n`.
+        are: free, `slip_1` to `slip_n`, which rise in every
+        estimate.
     stiffnesses : array_like, optional
         Of the springs, N/m (N m/rad), > 0. Given: fixed; left out: free.
     name : str, optional
@@ -89,6 +90,7 @@ class MaxwellSlip(Masing):
             for i in range(n)
         )  # fmt: skip
         self.linear_parameters = self.scale_parameters = self.labels[:n]
+        self.like_parts = tuple(zip(self.labels[n:], self.labels[:n], strict=True))
 
     @classmethod
     def from_description(cls, rest: Mapping[str, Any], name: str | None) -> Element:

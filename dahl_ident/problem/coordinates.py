@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import FloatArray, positive_array, real_array
 from dahl_ident.elements import Element, Model, Parameter
@@ -75,7 +75,10 @@ class Coordinates:
 
 
 class Interchangeable:
-    """Like elements of a model, whose labels could switch: they are ordered by their knees."""
+    """Like elements of a model, and like parts of one, whose labels could switch.
+
+    Elements are ordered by their knees, parts by the first parameter of each.
+    """
 
     def __init__(self, model: Model, names: tuple[str, ...]) -> None:
         alike: dict[tuple[object, ...], list[Element]] = {}
@@ -91,10 +94,18 @@ class Interchangeable:
             np.array([[names.index(p.name) for p in e.parameters if p.free] for e in elements])
             for elements in self._sets
         ]
+        self._parts = []
+        for element in model.elements:
+            own = dict(zip(element.labels, element.parameters, strict=True))
+            parts = [[own[label] for label in part] for part in element.like_parts]
+            if parts and all(p.free for part in parts for p in part):
+                self._parts.append(np.array([[names.index(p.name) for p in q] for q in parts]))
 
     def in_order(self, theta: FloatArray, coordinates: Coordinates) -> FloatArray:
         """Return `theta` with the columns of like elements exchanged until the knees rise."""
-        array = theta.copy() if self._sets else theta
+        array = theta.copy() if self._sets or self._parts else theta
+        for columns in self._parts:
+            _exchange(array, columns, array[..., columns[:, 0]])
         for elements, columns in zip(self._sets, self._columns, strict=True):
             values = coordinates.to_values(array)
             knees = []
@@ -102,10 +113,15 @@ class Interchangeable:
                 free = iter(values[..., column] for column in own)
                 at = [next(free) if p.free else np.asarray(p.value) for p in element.parameters]
                 knees.append(np.broadcast_to(element.knee(at)[0], theta.shape[:-1]))
-            order = np.argsort(np.stack(knees, axis=-1), axis=-1)
-            for kind in columns.T:
-                array[..., kind] = np.take_along_axis(array[..., kind], order, axis=-1)
+            _exchange(array, columns, np.stack(knees, axis=-1))
         return array
+
+
+def _exchange(array: FloatArray, columns: NDArray[np.intp], key: FloatArray) -> None:
+    """Exchange the rows of `columns` in `array` until the key rises."""
+    order = np.argsort(key, axis=-1)
+    for kind in columns.T:
+        array[..., kind] = np.take_along_axis(array[..., kind], order, axis=-1)
 
 
 def with_changes(
