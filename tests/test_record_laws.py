@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import control
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -9,6 +10,7 @@ from scipy.integrate import solve_ivp
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, Model
+from dahl_ident.errors import ModelError
 from dahl_ident.time_domain import ForcedMotion, Plant, band_limited, differentiated
 from tests.test_forced_motion import multisine
 from tests.test_record_fit import RATE, trajectory
@@ -83,21 +85,63 @@ def test_force_from_displacement(truth: Element, model: Element, kind: str) -> N
     assert_recovered(di.fit(record, model, throw=False), truth)
 
 
-@pytest.mark.parametrize(("kind", "truth", "model"), PLANTS)
-def test_motion_from_force(kind: str, truth: Element, model: Element) -> None:
-    samples = 384
-    known = kind == "ring-down"  # no force is measured, so the mass has to be known
-    whole = Model(truth + di.Mass(0.3) + di.Spring(50.0))
+def driven(kind: str, whole: Model, samples: int, noise: float) -> di.Record:
+    """Return a record of a plant's displacement, noise in shares of its standard deviation."""
     wave = drive(kind, samples)
     forced = ForcedMotion(Plant(whole, "force"), band_limited(wave, 1 / RATE, 4), 1 / RATE)
     first = np.zeros(forced.plant.order)
-    first[0] = 2e-2 if known else 0.0
-    motion = forced.solve(np.zeros(0), first, np.tile(first, (samples, 1)))
-    x = motion[:, 0]
-    x = x + 1e-3 * x.std() * np.random.default_rng(1).standard_normal(samples)
-    record = di.Record(np.arange(samples) / RATE, displacement=x, force=wave)
+    first[0] = 2e-2 if kind == "ring-down" else 0.0
+    x = forced.solve(np.zeros(0), first, np.tile(first, (samples, 1)))[:, 0]
+    x = x + noise * x.std() * np.random.default_rng(1).standard_normal(samples)
+    return di.Record(np.arange(samples) / RATE, displacement=x, force=wave)
+
+
+@pytest.mark.parametrize(("kind", "truth", "model"), PLANTS)
+def test_motion_from_force(kind: str, truth: Element, model: Element) -> None:
+    known = kind == "ring-down"  # no force is measured, so the mass has to be known
+    whole = Model(truth + di.Mass(0.3) + di.Spring(50.0))
+    record = driven(kind, whole, 384, 1e-3)
     mass = di.Mass(0.3) if known else di.Mass()
     assert_recovered(di.fit(record, model + mass + di.Spring(), throw=False), whole)
+
+
+@pytest.mark.parametrize(
+    ("truth", "model", "noise"),
+    [
+        # a curved valley of stiffness and rates; starts with contacts too stiff for the interval
+        (di.BoucWen(300.0, 1500.0, 3000.0) + di.Damper(0.5), di.BoucWen() + di.Damper(), 1e-3),
+        (
+            di.Dahl(0.1, 300.0, asymmetry=0.2) + di.Damper(0.5),
+            di.Dahl(asymmetry=None) + di.Damper(),
+            5e-3,
+        ),
+    ],
+)
+def test_trapezoids_that_are_hard_to_search(truth: Element, model: Element, noise: float) -> None:
+    whole = Model(truth + di.Mass(0.3) + di.Spring(50.0))
+    fit = di.fit(driven("trapezoid", whole, 512, noise), model + di.Mass() + di.Spring())
+    assert fit.trusted, fit.verdict
+    for parameter in whole.parameters:
+        found = fit.params[parameter.name]
+        if found.vary:
+            error = abs(found.value - float(parameter.value or 0.0))
+            assert error < 4.5 * float(found.stderr or 0.0), found
+
+
+@pytest.mark.parametrize(
+    ("law", "reason"),
+    [
+        (di.Backlash(di.Dahl()), "position in the gap"),
+        (di.MaxwellSlip([1e-3]), "more than its present force"),
+        (di.Iwan(), "more than its present force"),
+        (di.LinearSystem(control.tf([1.0], [1.0, 2.0]), quantity="receptance"), "frequency domain"),
+    ],
+)
+def test_laws_without_an_equation_of_motion_say_why(law: Element, reason: str) -> None:
+    record = driven("multisine", Model(_DAHL[0] + di.Mass(0.3) + di.Spring(50.0)), 64, 1e-3)
+    with pytest.raises(ModelError, match=reason) as refusal:
+        di.fit(record, law + di.Mass())
+    assert type(law).__name__ in str(refusal.value)
 
 
 @pytest.mark.parametrize(("exponent", "accuracy"), [(1.5, 1e-8), (0.5, 1e-5)])

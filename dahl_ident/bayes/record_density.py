@@ -82,7 +82,8 @@ class RecordDensity:
     @property
     def centre(self) -> FloatArray:
         """Coordinates of the estimate."""
-        return self.problem.theta(self.values)[: len(self.names)]
+        own = self.values[: len(self.names)]
+        return np.where(self.logarithmic, np.log(np.where(self.logarithmic, own, 1.0)), own)
 
     @cached_property
     def root(self) -> FloatArray:

@@ -18,7 +18,7 @@ import numpy as np
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.fields import one_of
 from dahl_ident.data.quantities import DEFINITIONS, converted
-from dahl_ident.elements.behaviour import StiffnessGradient
+from dahl_ident.elements.behaviour import Mechanics, StiffnessGradient
 from dahl_ident.elements.element import Element, prefixed
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError, ValidationError
@@ -148,7 +148,16 @@ class LinearSystem(Element):
         acceleration: FloatArray | None = None,
     ) -> FloatArray:
         """Raise ModelError: a frequency response gives no force for a displacement history."""
-        raise ModelError(
+        raise self._no_time()
+
+    def mechanics(
+        self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
+    ) -> Mechanics:
+        """Raise ModelError, as :meth:`force_history`."""
+        raise self._no_time()
+
+    def _no_time(self) -> ModelError:
+        return ModelError(
             f"{self!r} is defined only in the frequency domain and has no force over time; build "
             "the model from Mass, Damper and Spring to simulate records"
         )

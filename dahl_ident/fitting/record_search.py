@@ -10,7 +10,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import FitError, FitInterrupted, ModelError
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
-from dahl_ident.fitting.record_start import record_starts, started_at
+from dahl_ident.fitting.record_start import MORE_STARTS, STARTS, record_starts, started_at
 from dahl_ident.problem import Quadratic
 from dahl_ident.problem.record_noise import prediction_error_filter, share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
@@ -138,15 +138,17 @@ def solve_records(
 def _solved(problem: RecordProblem, start: Mapping[str, float] | None) -> RecordOptimum:
     evaluations = 0
     if start is not None and all(p.name in start for p in problem.free):
-        starts = started_at(problem, [start[p.name] for p in problem.free])[None]
+        begin = [start[p.name] for p in problem.free]
     elif problem.n_residuals > 2 * _SHORT:
         part = problem.shortened(_SHORT)
-        first, evaluations = _best(part, _changed(record_starts(part), part, start))
-        values = part.values(first.theta[0])[: len(problem.free)]
-        starts = started_at(problem, values.tolist())[None]
+        first, evaluations = _searched(part, start)
+        begin = part.values(first.theta[0])[: len(problem.free)].tolist()
     else:
-        starts = record_starts(problem)
-    best, more = _best(problem, _changed(starts, problem, start))
+        begin = None
+    if begin is None:
+        best, more = _searched(problem, start)
+    else:
+        best, more = _best(problem, _changed(started_at(problem, begin)[None], problem, start))
     found = RecordOptimum(
         problem,
         problem.values(best.theta[0]),
@@ -280,6 +282,17 @@ def _changed(
     return starts
 
 
+def _searched(problem: RecordProblem, start: Mapping[str, float] | None) -> tuple[Minima, int]:
+    """Return the best end of searches from automatic starts, some of their values given."""
+    try:
+        return _best(problem, _changed(record_starts(problem), problem, start))
+    except FitError:
+        more = record_starts(problem, MORE_STARTS)[STARTS:]
+        if not len(more):
+            raise
+        return _best(problem, _changed(more, problem, start))
+
+
 def _best(problem: RecordProblem, starts: FloatArray) -> tuple[Minima, int]:
     """Return the best end of searches from the starts, in their order; few where one is good."""
     evaluations, best = 0, None
@@ -319,7 +332,7 @@ def _minimise(problem: RecordProblem, begin: FloatArray, enough: float, most: in
     return minimise(
         lambda at, _which: problem.quadratic(at),
         begin,
-        problem.logarithmic,
+        problem.relative,
         problem.n_residuals,
         tolerance_factor=_LOOSE,
         enough=enough,

@@ -23,26 +23,31 @@ _LENGTHS = np.geomspace(1e-3, 10.0, 13)  # of the largest displacement
 _SIGNED = np.geomspace(0.03, 30.0, 7)  # rates over the inverse of the largest displacement
 _LONGEST = 8192  # samples that the scan looks at
 _COMBINATIONS = 600  # linear solutions on the grid: a limit on their cost
-_STARTS = 4  # the best that are kept, as for tables
+STARTS = 4
+"""Starts that are tried at first, as for tables."""
+MORE_STARTS = 24
+"""Where no motion from those is finite: a contact too stiff for the samples' interval is one."""
 _APART = 0.05  # in the logarithm of the misfit, or the starts are one
 _DECAY = 1e-3  # of a decay's largest amplitude in its spectrum: below, it has none
 _BAND = 1e-5  # of the drive's largest power: below, it has none
 
 
-def record_starts(problem: RecordProblem) -> FloatArray:
+def record_starts(problem: RecordProblem, count: int = STARTS) -> FloatArray:
     """Return starts, best first, in the problem's values; shape (S, P).
 
     Parameters
     ----------
     problem : RecordProblem
         Its free parameters are started; values given to free parameters are kept.
+    count : int, default 4
+        How many, at most.
 
     Returns
     -------
     ndarray
     """
     with np.errstate(all="ignore"):  # laws far off may overflow; such combinations are left out
-        return _Scan(problem).starts()
+        return _Scan(problem).starts(count)
 
 
 class _Scan:
@@ -72,7 +77,7 @@ class _Scan:
         part = slice(start, start + n)
         return x[part], v[part], a[part], force[part]
 
-    def starts(self) -> FloatArray:
+    def starts(self, count: int) -> FloatArray:
         """Return the best starts of the scan."""
         elements = self.problem.model.elements
         choices = [list(self._choices(e)) for e in elements]
@@ -98,7 +103,7 @@ class _Scan:
         for misfit, values in found:
             if all(self._apart(values, other) for _, other in kept):
                 kept.append((misfit, values))
-            if len(kept) == _STARTS:
+            if len(kept) == count:
                 break
         return np.array([started_at(self.problem, values) for _, values in kept])
 

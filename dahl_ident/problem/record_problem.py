@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from dahl_ident.arrays import FloatArray
@@ -36,6 +37,7 @@ Output = Literal["force", "motion"]
 _SHORTEST = 16  # samples from which noise can be estimated
 _PER_CYCLE = 100.0  # samples that a slow cycle keeps where a record is too long
 _SUBSTEP = 0.4  # rad of the fastest motion in a step of integration
+_SMALL = 0.1  # of the motion's inverse size: rates below are searched as numbers
 _POWER = 0.999  # share of the drive's power below its band's end
 
 
@@ -127,6 +129,7 @@ class RecordProblem:
         self.parameters = (*self.free, *self._nuisance())
         self.names = [p.name for p in self.parameters]
         self.logarithmic = np.array([p.transform == "log" for p in self.parameters])
+        self._bend = self._bends()
         self.whitening = np.ones(1)
         """Filter of the residuals; see :func:`~.record_noise.prediction_error_filter`."""
         self.displacement_noise = 0.0
@@ -174,6 +177,30 @@ class RecordProblem:
                 found.append(Parameter(f"drift{tail}", "N/s", "slope of the measured force"))
             else:
                 found.append(Parameter(f"offset{tail}", unit, "constant in the measured motion"))
+        return found
+
+    def _bends(self) -> FloatArray:
+        """Return below which size a parameter is searched as a number, and not as a logarithm.
+
+        Rates such as those of Bouc-Wen may have either sign, but beyond a tenth of the motion's
+        inverse size they go with a stiffness in proportion. 0 for those that are searched in one
+        way alone.
+        """
+        time, length = 1.0, 1.0
+        wave = np.concatenate([y - y.mean() for y in (r.motion_samples for r in self.records)])
+        steps = float(np.std(np.diff(wave)))
+        if steps > 0.0:
+            time = float(np.std(wave)) / steps / self.records[0].sample_rate
+            order = ("displacement", "velocity", "acceleration").index(
+                self.records[0].motion_channel
+            )
+            length = float(np.std(wave)) * time**order
+        found = np.zeros(len(self.parameters))
+        for i, p in enumerate(self.free):
+            if p.transform == "linear" and not np.isfinite([p.lower, p.upper]).any():
+                force, by_length, by_time = p.dimension
+                if not force and (by_length or by_time):
+                    found[i] = _SMALL * length**by_length * time**by_time
         return found
 
     def shortened(self, samples: int) -> RecordProblem:
@@ -311,12 +338,26 @@ class RecordProblem:
 
     def values(self, theta: FloatArray) -> FloatArray:
         """Return the parameters' values from search coordinates."""
-        return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, theta, 0.0)), theta)
+        values = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, theta, 0.0)), theta)
+        bent = self._bend > 0.0
+        return np.where(bent, self._bend * np.sinh(np.where(bent, theta, 0.0)), values)
 
     def theta(self, values: FloatArray) -> FloatArray:
         """Return search coordinates from the parameters' values."""
         safe = np.where(self.logarithmic, np.maximum(values, 1e-300), 1.0)
-        return np.where(self.logarithmic, np.log(safe), values)
+        bend = np.where(self._bend > 0.0, self._bend, 1.0)
+        bent = np.where(self._bend > 0.0, np.arcsinh(values / bend), values)
+        return np.where(self.logarithmic, np.log(safe), bent)
+
+    @property
+    def relative(self) -> NDArray[np.bool_]:
+        """Coordinates whose steps are relative changes of the values."""
+        return np.asarray(self.logarithmic | (self._bend > 0.0))
+
+    def slopes(self, values: FloatArray) -> FloatArray:
+        """Return the derivatives of the parameters' values by their search coordinates."""
+        bent = np.where(self._bend > 0.0, np.hypot(values, self._bend), 1.0)
+        return np.where(self.logarithmic, values, bent)
 
     def full_values(self, values: FloatArray) -> list[float]:
         """Return the value of every parameter of the model, fixed ones included."""
@@ -419,7 +460,7 @@ class RecordProblem:
         P = theta.size
         cost, gradient, hessian = 0.0, np.zeros(P), np.zeros((P, P))
         values = self.values(theta)
-        chain = np.where(self.logarithmic, values, 1.0)
+        chain = self.slopes(values)
         if not np.isfinite(values).all():
             return Quadratic(np.asarray(np.inf), gradient, np.eye(P))
         for number, (y, size) in enumerate(zip(self.measured, self.sizes, strict=True)):
