@@ -6,8 +6,9 @@ Under x = A cos(theta), theta = omega t, the force obeys
 
 with F(2 pi) = F(0). Newton's method makes it linear, y' = -a y + r; Radau's implicit collocation
 (order 11, stable however fast the force follows the velocity) solves that panel by panel, and the
-periodic start closes the cycle. Panels are graded towards both turning points of each half cycle,
-where the force turns round and the speed passes through zero.
+periodic start closes the cycle. A law that is linear in its force takes one such step, and half of
+the cycle where both directions are alike. Panels are graded towards both turning points of each
+half cycle, where the force turns round and the speed passes through zero.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ _GRADING = 4.5  # panels at a turning point are 1e-4 of a half cycle
 _NEWTON_STEPS = 60
 _CONVERGED = 1e-12
 _STALLS, _ROUNDED = 9, 1e-9  # after so many steps, a change that may be rounding alone
+_SAME = 1e-13  # relative difference of slopes that is rounding
 _STEP = 1e-6  # of the force, for its derivative
 
 
@@ -82,41 +84,53 @@ def rated_loop(
     n = theta.size // 2
     travel = -amplitude[:, None] * np.sin(theta)
     velocity = omega[:, None] * travel
-    force = start[:, None] * np.cos(theta)
     size = np.abs(start)[:, None]
 
     def along(F: FloatArray) -> FloatArray:
-        down = slope(F[:, :n], -1.0, velocity[:, :n])
+        down = slope(F[:, :n], -1.0, velocity[:, :n]) + 0.0 * F[:, :n]
+        if F.shape[1] == n:
+            return down
         up = slope(F[:, n:], 1.0, velocity[:, n:])
-        return np.concatenate([down + 0.0 * F[:, :n], up + 0.0 * F[:, n:]], axis=1)
+        return np.concatenate([down, up + 0.0 * F[:, n:]], axis=1)
 
-    settled = np.zeros(len(amplitude), dtype=bool)
     with np.errstate(all="ignore"):  # a row that runs away becomes NaN
+        force = start[:, None] * np.cos(theta)
+        high, s, low = along(force + size), along(force), along(force - size)
+        rounding = _SAME * (np.abs(high) + np.abs(s) + np.abs(low))
+        linear = bool(np.all(np.abs(high + low - 2.0 * s) <= rounding))
+        # of an odd loop half a cycle is enough
+        back = slope(-force[:, :n], 1.0, -velocity[:, :n])
+        odd = linear and bool(np.all(np.abs(back - s[:, :n]) <= rounding[:, :n]))
+        cycle = slice(n if odd else None)
+        force, travel, sign = force[:, cycle], travel[:, cycle], -1.0 if odd else 1.0
         for iteration in range(_NEWTON_STEPS):
             s = along(force)
             largest = np.abs(force).max(axis=1)
-            h = _STEP * np.maximum(size, largest[:, None])
+            h = size if linear else _STEP * np.maximum(size, largest[:, None])
             by_force = (along(force + h) - along(force - h)) / (2.0 * h)
             moved, decay = _linear(
-                -travel * by_force, travel * (s - by_force * force), width, matrix
+                -travel * by_force, travel * (s - by_force * force), width, matrix, sign
             )
             change = np.max(np.abs(moved - force), axis=1)
             force = moved
             largest = np.abs(force).max(axis=1)
             settled = change <= (_CONVERGED if iteration < _STALLS else _ROUNDED) * largest
+            settled |= linear
             if np.all(settled | ~np.isfinite(largest)):
                 break
         force = np.where(settled[:, None], force, np.nan)
+        if odd:
+            force, decay = np.concatenate([force, -force], axis=1), decay**2
         return RatedLoop(theta, weight, velocity, force, along(force), decay)
 
 
 def _linear(
-    a: FloatArray, r: FloatArray, width: FloatArray, matrix: FloatArray
+    a: FloatArray, r: FloatArray, width: FloatArray, matrix: FloatArray, sign: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the periodic solution of y' = -a y + r at the nodes, and its decay over a cycle."""
+    """Return the solution of y' = -a y + r that ends at `sign` times its start, and its decay."""
     rows, m = a.shape[0], _STAGES
     panels = a.reshape(rows, -1, m)
-    step = width[:, None, None] * matrix
+    step = width[: panels.shape[1], None, None] * matrix
     system = np.eye(m) + step * panels[:, :, None, :]
     right = np.stack(
         [np.ones(panels.shape), np.einsum("pij,rpj->rpi", step, r.reshape(rows, -1, m))], axis=-1
@@ -127,7 +141,7 @@ def _linear(
     for i in range(panels.shape[1]):
         total_gain = keep[:, i, -1] * total_gain + gain[:, i, -1]
         total_keep = total_keep * keep[:, i, -1]
-    y = total_gain / (1.0 - total_keep)
+    y = total_gain / (sign - total_keep)
     found = np.empty(panels.shape)
     for i in range(panels.shape[1]):
         found[:, i] = keep[:, i] * y[:, None] + gain[:, i]
