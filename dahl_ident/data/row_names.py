@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 from dahl_ident.data.frequency_response import FrequencyResponse
@@ -19,8 +20,11 @@ def row_names(data: FrequencyResponse, rows: Sequence[int]) -> list[str]:
     >>> row_names(data, [0, 2])
     ['1 Hz, 670 µm (row 0)', '2 Hz, 2 mm']
     """
+    if not len(rows):
+        return []
     every = [_name(data, row) for row in range(data.n)]
-    return [f"{every[r]} (row {r})" if every.count(every[r]) > 1 else every[r] for r in rows]
+    count = Counter(every)
+    return [f"{every[r]} (row {r})" if count[every[r]] > 1 else every[r] for r in rows]
 
 
 def _name(data: FrequencyResponse, row: int) -> str:

@@ -20,13 +20,14 @@ Williams, *Gaussian Processes*, 2006, section 2.7.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.error_sources import (
@@ -192,17 +193,21 @@ class ErrorModel:
         moved = self.optimum.theta - self.theta[columns]
         return None if self.runs is None else self.runs.about(moved, columns)
 
-    def full_projection(self) -> tuple[FloatArray, FloatArray]:
-        """Return P of the data's rows, compressed or not, and their residuals; (m, m) and (m,)."""
-        m = self.problem.n_residuals
-        residuals = self.near.y
+    def projected(self) -> tuple[Callable[[NDArray[np.intp]], FloatArray], FloatArray]:
+        """Return what gives the block of P of some residuals, and P y of the data's; (m,)."""
+        m, residuals = self.problem.n_residuals, self.near.y
         P, rotation = self.projection.P, self.linear.rotation
         if rotation is None:
-            return P[:m, :m], residuals
+            return lambda rows: P[np.ix_(rows, rows)], P[:m, :m] @ residuals
         r = rotation.shape[1]
         outside = 1.0 / self.linear.outside_variance(self.variances)
         inner = P[:r, :r] - outside * np.eye(r)
-        return outside * np.eye(m) + rotation @ inner @ rotation.T, residuals
+
+        def block(rows: NDArray[np.intp]) -> FloatArray:
+            own = rotation[rows]
+            return np.asarray(outside * np.eye(len(rows)) + own @ inner @ own.T)
+
+        return block, outside * residuals + rotation @ (inner @ (rotation.T @ residuals))
 
     def relative_units(self) -> FloatArray:
         """Return what takes each row's residuals to ln gain and phase, shape (n, 2, 2)."""
@@ -298,8 +303,10 @@ class _Rows:
 
     def at(self, theta: FloatArray, near: Linearization) -> tuple[FloatArray, FloatArray]:
         """Return residuals and Jacobian: data, priors of sensors, ranges of exponents."""
-        y, J = self._problem.residuals_and_jacobian(theta, tails=False)
-        y[: self.m], J[: self.m] = near.y, near.J
+        y, J = near.y, near.J
+        if self._problem.priors:
+            own, by = self._problem.residuals_and_jacobian(theta, tails=False)
+            y, J = np.concatenate([y, own[self.m :]]), np.vstack([J, by[self.m :]])
         weight = self._weight(y)
         select = self._select / self.std[:, None]
         y = np.concatenate([y * weight, select @ (theta - self.start)])

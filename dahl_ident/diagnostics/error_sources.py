@@ -395,10 +395,11 @@ def _indicators(labels: NDArray[np.str_]) -> FloatArray:
 
 
 def _correlation(one: FloatArray, other: FloatArray, parallel: bool) -> FloatArray:
-    apart = (one[:, None, :] - other[None, :, :]) / _LENGTH
-    if parallel:
-        apart = apart[..., 1:]
-    return np.asarray(np.exp(-0.5 * np.sum(apart**2, axis=-1)))
+    squares = np.zeros((len(one), len(other)))
+    for axis in (1,) if parallel else (0, 1):
+        if np.ptp(np.concatenate([one[:, axis], other[:, axis]])) > 0.0:
+            squares += ((one[:, axis, None] - other[:, axis]) / _LENGTH) ** 2
+    return np.asarray(np.exp(-0.5 * squares))
 
 
 def _mean_square(changes: ComplexArray) -> float:

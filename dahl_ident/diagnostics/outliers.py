@@ -3,7 +3,8 @@
 A point is tested by letting it have a response of its own (the mean-shift test): how much of the
 sum of squares goes away with its two residuals, leverage included, against what noise would do.
 The most deviant point is set aside and the others are judged without it, so that outliers do not
-mask one another; up to a tenth of the points are set aside in this way. A robust fit is little
+mask one another; up to a tenth of the points are set aside in this way, of more than 500 points
+several at a time. A robust fit is little
 affected by outliers, so its residuals are tested directly. The level is 1 % for the whole table,
 divided by the number of points.
 """
@@ -24,6 +25,7 @@ from dahl_ident.fitting import Optimum
 
 _LEVEL = 0.01
 _SHARE = 0.1
+_ONE_BY_ONE = 500  # rows up to which each is set aside before the next is judged
 _LEAST_DOF = 4
 _GOOD = "good"
 
@@ -82,19 +84,18 @@ def suspicious_points(optimum: Optimum, space: ResidualSpace) -> tuple[Suspiciou
 
 def _standing_apart(optimum: Optimum, space: ResidualSpace) -> list[tuple[int, float, float]]:
     """Return row, deviation and p-value of points found one after the other."""
+    n = optimum.problem.data.n
+    at_once = 1 + n // _ONE_BY_ONE
     rows: list[int] = []
     found: list[tuple[int, float, float]] = []
-    accepted = 0
-    for _ in range(max(1, int(_SHARE * optimum.problem.data.n))):
-        step = _most_deviant(optimum, space, rows)
-        if step is None:
+    for _ in range(0, max(1, int(_SHARE * n)), at_once):
+        worst = _most_deviant(optimum, space, rows, at_once)
+        rows += [row for row, *_ in worst]
+        found += worst
+        if len(worst) < at_once:
             break
-        row, squares, p = step
-        rows.append(row)
-        found.append((row, float(np.sqrt(squares)), p))
-        if p < _LEVEL:
-            accepted = len(found)
-    return found[:accepted]
+    significant = [i for i, (*_, p) in enumerate(found, start=1) if p < _LEVEL]
+    return found[: max(significant, default=0)]
 
 
 def _beyond_noise(optimum: Optimum) -> list[tuple[int, float, float]]:
@@ -109,40 +110,46 @@ def _beyond_noise(optimum: Optimum) -> list[tuple[int, float, float]]:
 
 
 def _most_deviant(
-    optimum: Optimum, space: ResidualSpace, without: list[int]
-) -> tuple[int, float, float] | None:
-    """Return row, squared deviation and p-value of the worst point, some rows set aside."""
+    optimum: Optimum, space: ResidualSpace, without: list[int], count: int
+) -> list[tuple[int, float, float]]:
+    """Return row, deviation and p-value of the worst points, some rows set aside.
+
+    Each is judged without those before it, the effect of these few on the fit to many left out.
+    """
     m, n = space.residuals.size, space.residuals.size // 2
-    dof = space.dof - 2 * len(without)
-    if dof < _LEAST_DOF:
-        return None
-    keep = np.ones(m, dtype=np.bool_)
-    for row in without:
-        keep[2 * row : 2 * row + 2] = False
-    Q = np.linalg.qr(space.basis[keep])[0] if without else space.basis
+    keep = np.ones(n, dtype=np.bool_)
+    keep[without] = False
+    pairs = np.repeat(keep, 2)
+    Q = np.linalg.qr(space.basis[pairs])[0] if without else space.basis
     r = np.zeros(m)
-    r[keep] = space.residuals[keep] - Q @ (Q.T @ space.residuals[keep])
+    r[pairs] = space.residuals[pairs] - Q @ (Q.T @ space.residuals[pairs])
     lever = np.zeros((m, Q.shape[1]))
-    lever[keep] = Q
+    lever[pairs] = Q
     squares = _shifts(r, lever)
     squares[without] = -np.inf
-    row = int(np.argmax(squares))
-    explained, total = float(squares[row]), float(r @ r)
-    p = space.tail_of(explained, 2, total, dof)
-    variance = 1.0 if optimum.scale_known else (total - explained) / (dof - 2)
-    if not variance > 0.0:
-        return None
-    return row, explained / variance, min(1.0, (n - len(without)) * p)
+    total = float(r @ r)
+    found: list[tuple[int, float, float]] = []
+    for row in np.argsort(-squares, kind="stable")[:count].tolist():
+        aside = len(without) + len(found)
+        dof, explained = space.dof - 2 * aside, float(squares[row])
+        variance = 1.0 if optimum.scale_known else (total - explained) / max(dof - 2, 1)
+        if dof < _LEAST_DOF or not variance > 0.0:
+            break
+        p = min(1.0, (n - aside) * space.tail_of(explained, 2, total, dof))
+        found.append((row, float(np.sqrt(explained / variance)), p))
+        total -= explained
+    return found
 
 
 def _shifts(r: FloatArray, lever: FloatArray) -> FloatArray:
     """Return by how much the sum of squares falls without each point: r' (I - H)^-1 r."""
     pairs = r.reshape(-1, 2)
     Q = lever.reshape(len(pairs), 2, -1)
-    rest = np.eye(2) - Q @ Q.swapaxes(1, 2)
-    determinant = rest[:, 0, 0] * rest[:, 1, 1] - rest[:, 0, 1] ** 2
+    one, other = Q[:, 0], Q[:, 1]
+    xx, xy, yy = (1.0 - (one * one).sum(1), -(one * other).sum(1), 1.0 - (other * other).sum(1))
+    determinant = xx * yy - xy**2
     x, y = pairs.T
-    form = rest[:, 1, 1] * x**2 - 2.0 * rest[:, 0, 1] * x * y + rest[:, 0, 0] * y**2
+    form = yy * x**2 - 2.0 * xy * x * y + xx * y**2
     fixed = determinant < 1e-8  # a point that alone determines a parameter
     return np.where(fixed, 0.0, form / np.where(fixed, 1.0, determinant))
 

@@ -134,11 +134,11 @@ def _own(source: Source, errors: ErrorModel, slopes: ComplexArray) -> FloatArray
 
 def _noise(errors: ErrorModel, source: Source) -> FloatArray:
     """Return the covariance of ln gain and phase of each row by a noise of unit variance."""
-    columns, n = source.columns, errors.problem.n_residuals // 2
-    if columns.ndim == 1:
-        columns = np.diag(columns)
-    rows = columns.reshape(n, 2, -1)
-    units = errors.relative_units() @ rows
+    n, units = errors.problem.n_residuals // 2, errors.relative_units()
+    if source.columns.ndim == 1:
+        units = units * source.columns.reshape(n, 1, 2)
+    else:
+        units = units @ source.columns.reshape(n, 2, -1)
     return np.asarray(units @ units.swapaxes(1, 2))
 
 
