@@ -201,18 +201,18 @@ class _LeftOut:
         """Return the log density of each test."""
         found = np.empty(int(test.max()) + 1)
         order = np.argsort(test, kind="stable")
-        cuts = np.flatnonzero(np.diff(test[order])) + 1
-        for t, rows in enumerate(np.split(order, cuts)):
-            part = self.weighted[rows]
-            block = np.diag(self.weight[rows]) - part @ self.inverse @ part.T
+        count = np.bincount(test)
+        start = np.cumsum(count) - count
+        for size in np.unique(count).tolist():  # tests of one size at once
+            tests = np.flatnonzero(count == size)
+            rows = order[start[tests][:, None] + np.arange(size)]
+            part, weight = self.weighted[rows], self.weight[rows]
+            block = weight[:, :, None] * np.eye(size) - part @ self.inverse @ part.swapaxes(1, 2)
             values, vectors = np.linalg.eigh(block)
-            values = np.maximum(values, 1e-9 * self.weight[rows].max())
-            z = vectors.T @ (self.weight[rows] * self.left[rows])
-            square = float(np.sum(z * z / values))
-            loss = square
+            values = np.maximum(values, 1e-9 * weight.max(axis=1, keepdims=True))
+            z = np.einsum("tij,ti->tj", vectors, weight * self.left[rows])
+            loss = np.sum(z * z / values, axis=1)
             if robust:
-                loss = (_HEAVY + rows.size) * float(np.log1p(square / _HEAVY))
-            found[t] = 0.5 * float(np.log(values).sum()) - 0.5 * (
-                rows.size * np.log(2.0 * np.pi) + loss
-            )
+                loss = (_HEAVY + size) * np.log1p(loss / _HEAVY)
+            found[tests] = 0.5 * (np.log(values).sum(axis=1) - size * np.log(2.0 * np.pi) - loss)
         return found
