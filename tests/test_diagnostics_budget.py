@@ -12,7 +12,13 @@ from dahl_ident import Dahl, FrequencyResponse, Sensors, Spring, fit
 from dahl_ident.diagnostics import ErrorModel, budget, error_model
 from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.error_sources import repeated_levels
-from dahl_ident.diagnostics.variance_components import LinearModel, variance_components
+from dahl_ident.diagnostics.variance_components import (
+    Columns,
+    Contrasts,
+    LinearModel,
+    Projection,
+    variance_components,
+)
 from dahl_ident.errors import FitError
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
 
@@ -54,6 +60,30 @@ class TestVariances:
         best = optimize.minimize(minus_log_density, np.zeros(2), method="Nelder-Mead")
         found = variance_components(model, np.array([1.0, 0.0]))
         np.testing.assert_allclose(found.variances, np.exp(best.x), rtol=0.02)
+
+    @pytest.mark.parametrize("variances", [(1.0, 0.5, 2.0), (1.0, 0.0, 2.0), (0.1, 0.3, 0.0)])
+    def test_columns_give_what_dense_matrices_give(self, variances: tuple[float, ...]) -> None:
+        """A pair of residuals with a column of its own, turned to a diagonal source."""
+        rng = np.random.default_rng(5)
+        own = np.zeros((30, 2, 30))
+        own[np.arange(30), :, np.arange(30)] = rng.standard_normal((30, 2))
+        Z = [np.repeat(rng.uniform(1.0, 2.0, 30), 2), own.reshape(60, 30)]
+        Z = [np.append(z, np.zeros((1, *z.shape[1:])), axis=0) for z in Z]
+        J, last = rng.standard_normal((61, 3)), np.append(np.zeros(60), 1.0)
+        dense = LinearModel(
+            rng.standard_normal(61),
+            J,
+            last,
+            [*Z, rng.standard_normal((61, 4)) * (1.0 - last)[:, None]],
+        )
+        few = dense.turned(60, 1)
+        assert few.Z[1].ndim == 1
+        one, other = Contrasts(dense).at(np.array(variances)), Columns(few).at(np.array(variances))
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+        s = np.array(variances)
+        G, turned = (Projection(m, s).generalised_inverse() @ m.y for m in (dense, few))
+        np.testing.assert_allclose(G, turned, rtol=1e-9)
 
     def test_variances_many_decades_apart_keep_their_own_errors(self) -> None:
         """Two days apart by much more than the noise: one degree of freedom, 2 s^4 its variance."""

@@ -28,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.error_sources import (
@@ -48,10 +49,10 @@ from dahl_ident.diagnostics.run_deviations import (
     linearization,
 )
 from dahl_ident.diagnostics.variance_components import (
-    Contrasts,
     LinearModel,
     Projection,
     VarianceComponents,
+    likelihood,
     variance_components,
 )
 from dahl_ident.fitting import Optimum
@@ -200,7 +201,9 @@ class ErrorModel:
         if rotation is None:
             return lambda rows: P[np.ix_(rows, rows)], P[:m, :m] @ residuals
         r = rotation.shape[1]
-        outside = 1.0 / self.linear.outside_variance(self.variances)
+        outside = 0.0
+        if self.linear.outside[1]:
+            outside = 1.0 / self.linear.outside_variance(self.variances)
         inner = P[:r, :r] - outside * np.eye(r)
 
         def block(rows: NDArray[np.intp]) -> FloatArray:
@@ -391,8 +394,13 @@ def _linear(
 ) -> LinearModel:
     m, extra = problem.n_residuals, len(y) - problem.n_residuals
     known = np.concatenate([np.full(m, float(problem.scale_known)), np.ones(extra)])
-    Z = [np.concatenate([s.columns, np.zeros((extra, *s.columns.shape[1:]))]) for s in sources]
+    Z = [s.columns if s.columns.ndim < 3 else linalg.block_diag(*s.columns) for s in sources]
+    Z = [np.concatenate([z, np.zeros((extra, *z.shape[1:]))]) for z in Z]
     linear = LinearModel(y, J, known, Z)
+    of_rows = [k for k, s in enumerate(sources) if s.columns.ndim == 3]
+    alike = all(np.array_equal(z[0:m:2], z[1:m:2]) for z in Z if z.ndim == 1)
+    if len(of_rows) == 1 and alike:
+        return linear.turned(m, of_rows[0])
     return linear.compressed(m) if m > 2 * _FEW_ROWS else linear
 
 
@@ -411,7 +419,7 @@ def _supported(
     """
     every = (*noise, *rest)
     linear = _linear(problem, y, J, every)
-    contrasts = Contrasts(linear)
+    contrasts = likelihood(linear)
     upper = np.array([s.largest for s in every])
     scales = np.array([s.columns.ndim == 1 and not problem.scale_known for s in every])
     floor = np.where(scales, level, 0.0)

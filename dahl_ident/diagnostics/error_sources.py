@@ -50,8 +50,9 @@ class Source:
     ----------
     name : str
         As a budget lists it; several sources may share one.
-    columns : ndarray, shape (m, q) or (m,)
-        Residuals at unit variance; one dimension stands for a diagonal matrix.
+    columns : ndarray, shape (m, q), (m,) or (n, 2, 1)
+        Residuals at unit variance; one dimension stands for a diagonal matrix, three for a column
+        of each row's own.
     mean_square : float
         Of ln gain and phase over the rows, at unit variance.
     shapes : Shapes or None
@@ -256,13 +257,10 @@ class StructuredSources:
         """
         predicted = self._problem.predict(theta)
         change = (moved.predict(theta) - predicted) / _STEP
-        n = len(change)
-        columns = np.zeros((n, 2, n))
-        own = -self._problem.residual_change(theta, change).reshape(n, 2)
-        columns[np.arange(n), :, np.arange(n)] = own
+        columns = -self._problem.residual_change(theta, change).reshape(-1, 2, 1)
         share = np.divide(change, predicted, out=np.zeros_like(change), where=predicted != 0.0)
         square = 0.5 * float(np.mean(np.abs(share) ** 2))
-        return Source(NOISE, columns.reshape(2 * n, n), square)
+        return Source(NOISE, columns, square)
 
 
 def run_deviations(

@@ -25,6 +25,7 @@ _STEPS = 240
 _THETA = 2.0 * np.pi * np.arange(_STEPS) / _STEPS
 _CYCLES = 3
 _NEWTON_STEPS = 8
+_SETTLED = 1e-4  # change of X_3/A that ends the search
 _LONGEST = 0.1  # of one of them
 _SMALL = 1e-4  # third harmonic over the amplitude, for the derivative
 
@@ -57,6 +58,8 @@ def third_harmonic_share(optimum: Optimum) -> FloatArray:
     for _ in range(_NEWTON_STEPS):
         step = _newton_step(X, A, linear, friction)
         X += step * np.minimum(1.0, _LONGEST / np.maximum(np.abs(step), 1e-300))
+        if not (np.abs(step) > _SETTLED).any():
+            break
     return np.abs(X)
 
 

