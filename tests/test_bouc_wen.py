@@ -64,7 +64,7 @@ def test_check_values() -> None:
 
 
 @pytest.mark.parametrize("beta", [1e-9, 1e-3, 0.3, 3.0, 300.0, 1e5])
-@pytest.mark.parametrize("harmonic", [1, 3])
+@pytest.mark.parametrize("harmonic", [1, 3, 101])
 def test_equal_rates_are_linear_dahl(beta: float, harmonic: int) -> None:
     one = np.asarray(1.0)
     found = bouc_wen.stiffness_over_sigma(np.asarray(beta), one, one, harmonic)[0]

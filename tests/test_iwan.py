@@ -40,7 +40,7 @@ def random_laws(n: int, seed: int) -> list[tuple[Iwan, float]]:
 def test_harmonics_to_high_precision() -> None:
     with mpmath.workdps(25):
         for i, (law, A) in enumerate(random_laws(24, 3)):
-            k = (1, 3, 5, 7)[i % 4]
+            k = (1, 3, 7, 61)[i % 4]
             size = abs(complex(law.dynamic_stiffness(A)))
             assert abs(complex(law.dynamic_stiffness(A, harmonic=k)) - exact(law, A, k)) < (
                 1e-12 * size

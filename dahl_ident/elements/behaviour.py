@@ -27,9 +27,11 @@ if TYPE_CHECKING:
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
-_STEP = 1e-3
-_STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -2.0 / 3.0), (1.0, 2.0 / 3.0), (2.0, -1.0 / 12.0))
+STEP = 1e-3  # relative: truncation, its fourth power, and rounding are then both below 1e-12
+STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -2.0 / 3.0), (1.0, 2.0 / 3.0), (2.0, -1.0 / 12.0))
 """Central difference of fourth order: places and weights."""
+
+SOFTENED = 0.01  # share of the stiffness that is gone at the lower knee: seen in data of 1 % noise
 
 
 class StiffnessGradient(NamedTuple):
@@ -259,14 +261,14 @@ class Behaviour(ABC):
         value = force(at, state)
         slopes = []
         for i, size in enumerate(at):
-            step = _STEP * (abs(size) or 1.0)
-            moved = [(w, [*at[:i], size + k * step, *at[i + 1 :]]) for k, w in _STENCIL]
+            step = STEP * (abs(size) or 1.0)
+            moved = [(w, [*at[:i], size + k * step, *at[i + 1 :]]) for k, w in STENCIL]
             slopes.append(np.asarray(sum(w / step * force(v, state) for w, v in moved)))
-        step = _STEP * float(np.max(np.abs(value), initial=0.0)) or 1.0
+        step = STEP * float(np.max(np.abs(value), initial=0.0)) or 1.0
         by_state = np.zeros(value.shape)
         if self.has_memory:
             by_state = np.asarray(
-                sum(w / step * force(at, state + k * step) for k, w in _STENCIL), dtype=np.float64
+                sum(w / step * force(at, state + k * step) for k, w in STENCIL), dtype=np.float64
             )
         return HistoryGradient(value, by_state, tuple(slopes))
 
@@ -389,12 +391,12 @@ def central_differences(
 ) -> NDArray[Scalar]:
     """Return the derivative of a function of arrays by one of them, to fourth order."""
     size = np.asarray(arguments[index], dtype=np.float64)
-    step = _STEP * np.where(size == 0.0, 1.0, np.abs(size))
-    places = [place for place, _ in _STENCIL]
+    step = STEP * np.where(size == 0.0, 1.0, np.abs(size))
+    places = [place for place, _ in STENCIL]
     ndim = len(shape)
     stacked = size.reshape((1,) * (ndim - size.ndim) + size.shape)
     by = np.asarray(places).reshape((-1,) + (1,) * ndim) * step.reshape(stacked.shape)
     moved = [*arguments[:index], stacked + by, *arguments[index + 1 :]]
     values = np.broadcast_to(function(*moved), (len(places), *shape))
-    weights = np.asarray([weight for _, weight in _STENCIL])
+    weights = np.asarray([weight for _, weight in STENCIL])
     return np.asarray(np.tensordot(weights, values, axes=1) / step)

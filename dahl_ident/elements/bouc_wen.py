@@ -20,6 +20,7 @@ for odd k; even k vanish.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from math import exp, expm1, inf, log1p
 from typing import Any
 
@@ -31,10 +32,9 @@ from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.recursion import linear_recursion, stretches
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 _FADED = 42.0  # exp(-42) is below rounding
-_NEWTON = 60
-_SERIES = 0.02
+_NEWTON = 60  # at most; bisection alone takes 53 to rounding
+_SERIES = 0.02  # where the closed forms have lost 1e-12 to rounding; the next terms are 2e-14
 
 
 class BoucWen(Friction):
@@ -237,11 +237,12 @@ def stiffness_over_sigma(
     # E is 1 in microslip; beside the 1, only E - 1 is integrated, to keep its digits
     beside = np.where(end == np.pi, 1.0, 0.0)
     total = [np.zeros(shape, dtype=np.complex128) for _ in range(4)]
+    nodes, weights = _rule(harmonic)
     for start, stop, rate in ((np.zeros_like(turn), turn, p), (turn, end, q)):
         half = 0.5 * (stop - start)
-        theta = start + half * (1.0 + _NODES)
+        theta = start + half * (1.0 + nodes)
         gone = 2.0 * A * np.sin(0.5 * theta) ** 2
-        kernel = half * _WEIGHTS * np.sin(theta) * np.exp(-1j * harmonic * theta)
+        kernel = half * weights * np.sin(theta) * np.exp(-1j * harmonic * theta)
         growth = rate * (path - gone)
         total[0] += (kernel * np.where(beside > 0.0, np.expm1(growth), np.exp(growth))).sum(-1)
         wave = kernel * np.exp(growth)
@@ -381,6 +382,12 @@ def _leg(
     by[..., 1] = np.where(short, 0.0, by_rate)
     by[..., 2] = np.where(short, by_rate, moved * zero_by_p)
     return w, keep, by
+
+
+@lru_cache(maxsize=64)
+def _rule(harmonic: int) -> tuple[FloatArray, FloatArray]:
+    """Return Gauss points for each part of a branch; with fewer the harmonic loses digits."""
+    return np.polynomial.legendre.leggauss(32 + harmonic)
 
 
 def _mean_growth(y: FloatArray) -> FloatArray:

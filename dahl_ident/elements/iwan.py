@@ -22,22 +22,18 @@ P is a constant times (A/d_m)^g, the loss in a cycle rises with the amplitude to
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from scipy.special import beta, betainc
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.behaviour import StiffnessGradient
+from dahl_ident.elements.behaviour import SOFTENED, StiffnessGradient
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 
-# Gauss points over s with theta = t s^3, which smooths theta^(2 g) at the lower end
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
-_S = 0.5 * (1.0 + _NODES)
-_PLACES, _SHARES = _S**3, 1.5 * _WEIGHTS * _S**2
-_REST = 1e-100
-_SOFTENED = 0.01
-_NARROWEST = 1e-6
+_REST = 1e-100  # m, below every amplitude allowed: d_m/A does not overflow
+_NARROWEST = 1e-6  # of the onset: near chi = -1 the stiffness is never all there
 _DEEP = 1e-8  # d_m/A below which the incomplete beta function is its series
 
 
@@ -181,7 +177,7 @@ class Iwan(Masing):
     def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Return where 1 % of the stiffness is gone, and the onset of macroslip."""
         d = _onset(values)
-        softened = np.minimum(_SOFTENED * (1.0 + np.asarray(values[3])), 1.0)
+        softened = np.minimum(SOFTENED * (1.0 + np.asarray(values[3])), 1.0)
         with np.errstate(divide="ignore", over="ignore"):
             share = softened ** (1.0 / (np.asarray(values[2]) + 1.0))
         return d * np.maximum(share, _NARROWEST), d
@@ -205,6 +201,17 @@ def _lost_fundamental(m: FloatArray, g: FloatArray) -> ComplexArray:
     return np.asarray(real + 1j * imag)
 
 
+@lru_cache(maxsize=64)
+def _rule(harmonic: int) -> tuple[FloatArray, FloatArray]:
+    """Return Gauss points over s in theta = t s^3, which smooths theta^(2 g): theta/t, weights.
+
+    With fewer the harmonic loses digits.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(48 + 2 * harmonic)
+    s = 0.5 * (1.0 + nodes)
+    return s**3, 1.5 * weights * s**2
+
+
 def _lost(
     m: FloatArray, g: FloatArray, harmonic: int, *, derivative: bool
 ) -> tuple[ComplexArray, ComplexArray]:
@@ -214,11 +221,12 @@ def _lost(
         zero = np.zeros(shape, dtype=np.complex128)
         return zero, zero
     t = 2.0 * np.arcsin(np.sqrt(np.minimum(m, 1.0)))[..., None]
-    theta = t * _PLACES
+    places, shares = _rule(harmonic)
+    theta = t * places
     with np.errstate(under="ignore"):
         log_u = 2.0 * np.log(np.sin(0.5 * theta)) - np.log(np.asarray(m))[..., None]
         power = np.exp(np.asarray(g)[..., None] * log_u)
-    kernel = t * _SHARES * np.sin(theta)
+    kernel = t * shares * np.sin(theta)
     kernel = kernel * power
     real, imag = np.sin(harmonic * theta), np.cos(harmonic * theta)
     factor = 2.0 / (np.pi * harmonic)

@@ -18,16 +18,13 @@ import numpy as np
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.fields import one_of
 from dahl_ident.data.quantities import DEFINITIONS, converted
-from dahl_ident.elements.behaviour import Mechanics, StiffnessGradient
+from dahl_ident.elements.behaviour import STENCIL, STEP, Mechanics, StiffnessGradient
 from dahl_ident.elements.element import Element, prefixed
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.units import QUANTITIES, Quantity
 
 _FORCE_OVER_MOTION = ("dynamic_stiffness", "mechanical_impedance", "apparent_mass")
-_STEP = 1e-3
-_STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -2.0 / 3.0), (1.0, 2.0 / 3.0), (2.0, -1.0 / 12.0))
-"""Central difference of fourth order: places and weights."""
 
 
 class LinearSystem(Element):
@@ -282,10 +279,10 @@ class LinearSystem(Element):
                     f"{label} is exactly 0, which gives its derivative no step; start it from a "
                     "small number, or write the function with an offset"
                 )
-            step = _STEP * value
+            step = STEP * value
             terms = [
                 weight / step * self._curve(_moved(vector, i, place * step), omega)
-                for place, weight in _STENCIL
+                for place, weight in STENCIL
             ]
             rows.append(np.sum(terms, axis=0))
         return np.stack(rows)

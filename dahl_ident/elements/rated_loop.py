@@ -26,11 +26,11 @@ Slope = Callable[[FloatArray, float, FloatArray], FloatArray]
 
 _PANELS, _STAGES = 32, 6  # of a half cycle, and of a panel
 _GRADING = 4.5  # panels at a turning point are 1e-4 of a half cycle
-_NEWTON_STEPS = 60
-_CONVERGED = 1e-12
+_NEWTON_STEPS = 60  # at most; a loop that has not settled by then has no number
+_CONVERGED = 1e-12  # of the largest force: what the next step would change is below rounding
 _STALLS, _ROUNDED = 9, 1e-9  # after so many steps, a change that may be rounding alone
 _SAME = 1e-13  # relative difference of slopes that is rounding
-_STEP = 1e-6  # of the force, for its derivative
+FORCE_STEP = 1e-6  # of the force, for the derivative of the slope
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def rated_loop(
         for iteration in range(_NEWTON_STEPS):
             s = along(force)
             largest = np.abs(force).max(axis=1)
-            h = size if linear else _STEP * np.maximum(size, largest[:, None])
+            h = size if linear else FORCE_STEP * np.maximum(size, largest[:, None])
             by_force = (along(force + h) - along(force - h)) / (2.0 * h)
             moved, decay = _linear(
                 -travel * by_force, travel * (s - by_force * force), width, matrix, sign

@@ -22,13 +22,14 @@ from dahl_ident.arrays import (
 )
 from dahl_ident.elements import force_curve
 from dahl_ident.elements.behaviour import (
+    SOFTENED,
     HistoryGradient,
     Mechanics,
     StiffnessGradient,
     central_differences,
 )
 from dahl_ident.elements.element import Element, motion
-from dahl_ident.elements.rated_loop import RatedLoop, rated_loop
+from dahl_ident.elements.rated_loop import FORCE_STEP, RatedLoop, rated_loop
 from dahl_ident.elements.steady_loop import Loop, Rows, closed_loop, force_limit
 from dahl_ident.errors import ModelError, ValidationError
 
@@ -36,11 +37,10 @@ _BLOCK = 200  # loops computed together: their scratch arrays stay in the proces
 _AT_REST = 1e-150  # smaller amplitudes are rest
 _SMALLEST = 1e-30  # m; the same for a velocity-dependent law
 _RATED_BLOCK = 64  # velocity-dependent loops computed together: each solves a small linear system
-_SUBSTEPS, _FORCE_STEP = 4, 1e-6
+_SUBSTEPS = 4  # of a step between samples: the error of second order falls by 16
 _FARTHEST = 1e9  # m; a law that has not slipped fully there never does
 _START = 60  # steps from rest to the start of a path: as fine as a cycle of 240
 _FORCE_UNIT, _LENGTH_UNIT = 32.0, 2.0**-7  # units in which a law should have the same form
-_SOFTENED = 0.01  # share of the stiffness that is gone at the lower knee
 
 
 class SlopeLaw(Element):
@@ -279,7 +279,7 @@ class SlopeLaw(Element):
         ):
             heading = -1.0 if step < 0.0 else 1.0
             for _ in range(_SUBSTEPS):
-                h = _FORCE_STEP * max(abs(force), abs(step))
+                h = FORCE_STEP * max(abs(force), abs(step))
                 low, s, high = (
                     float(self.slope(force + d, heading, speed, values)) for d in (-h, 0.0, h)
                 )
@@ -334,7 +334,7 @@ class SlopeLaw(Element):
             N = np.abs(self.stiffness(columns, A, np.zeros(())))
             lost = np.abs(N / N[..., :1] - 1.0)
         known = np.isfinite(lost) & (lost < 1.0)
-        low = A[np.argmax(lost > _SOFTENED, axis=-1)]
+        low = A[np.argmax(lost > SOFTENED, axis=-1)]
         high = A[known.shape[-1] - 1 - np.argmax(known[..., ::-1], axis=-1)]
         return np.asarray(low), np.asarray(high)
 
