@@ -23,11 +23,13 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.behaviour import StiffnessGradient
 
 _RULES = tuple(np.polynomial.legendre.leggauss(n) for n in (16, 32))
+"""Gauss points before and behind the gap; with 10 and 28 the ninth harmonic errs by 1e-8."""
+
 _FADED = 42.0  # exp(-42) is below rounding
 _SMALLEST = 1e-12  # D/A that counts as contact
 _BLOCK = 128  # amplitudes in one pass: their arrays stay in the processor's cache
 HIGHEST = 9  # harmonic that the Gauss points resolve
-_F_MAX, _SIGMA, _ASYMMETRY, _GAP, _AMPLITUDE = range(5)
+_F_MAX, _SIGMA, _ASYMMETRY, _GAP, _AMPLITUDE = range(5)  # rows of the arguments
 
 
 def stiffness_gradient(
