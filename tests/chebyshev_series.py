@@ -74,7 +74,8 @@ def coefficients(function: Callable[[Any], Any]) -> tuple[float, ...]:
 
 def module() -> str:
     """Return the text of dahl_ident/elements/casadi_series.py."""
-    lines = [f"LOW, HIGH = {LOW:.1f}, {HIGH:.1f}\n"]
+    why = "of beta: no series then has more than 28 terms"
+    lines = [f"LOW, HIGH = {LOW:.1f}, {HIGH:.1f}  # {why}\n"]
     for name, function in SERIES.items():
         terms = "".join(f"    {c!r},\n" for c in coefficients(function))
         lines.append(f'\n{name} = (\n{terms})\n"""{function.__doc__}"""\n')

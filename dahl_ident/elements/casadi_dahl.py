@@ -37,8 +37,8 @@ from dahl_ident.elements import general_dahl
 if TYPE_CHECKING:
     import casadi as ca
 
-_LEAST_BETA = 1e-200
-_NEWTON_STEPS = 6
+_LEAST_BETA = 1e-200  # stands for rest: 0 has no logarithm
+_NEWTON_STEPS = 6  # four reach rounding; both derivatives, taken through the steps, lag behind
 _DEEPEST = 42.0
 """ln(z_0/z) beyond which the margin z to full slip is negligible."""
 
@@ -232,8 +232,8 @@ def _log_ratio(x: ca.SX) -> ca.SX:
     return ca.if_else(is_small, series, -ca.log1p(-far) / far)
 
 
-_SINHC = tuple(1.0 / factorial(2 * k + 1) for k in range(10))
-_ATANHC = tuple(1.0 / (2 * k + 1) for k in range(10))
+_SINHC = tuple(1.0 / factorial(2 * k + 1) for k in range(10))  # in t^2 < 1; the last is 8e-18
+_ATANHC = tuple(1.0 / (2 * k + 1) for k in range(10))  # in t^2 < 1/49; the last term is 3e-17
 
 
 def _horner(coefficients: Sequence[float], t: ca.SX) -> ca.SX:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-LOW, HIGH = 1.0, 8.0
+LOW, HIGH = 1.0, 8.0  # of beta: no series then has more than 28 terms
 
 STIFFNESS_BELOW = (
     0.8549974078173799,

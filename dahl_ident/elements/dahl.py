@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     import casadi as ca
 
 _EXPONENTS = (1e-9, 1e3)  # beyond them the loop is that of the limit, to rounding
-_ALPHA = Assumed(1.0)
+_ALPHA = Assumed(1.0)  # linear Dahl, the law of the closed forms; a user may give another
 _AT_REST = 1e-30
 """Smaller beta are rest, to more digits than a number has."""
 _NO_LOSS, _MICROSLIP, _GROSS_SLIP = 1e9, 1e5, 1e-16

@@ -15,8 +15,8 @@ from dahl_ident.elements.steady_loop import ONE, Slope, branch_limit
 
 _BELOW, _ABOVE = 400, 720  # panels for forces against and with the motion
 _DEEPEST = 18.0  # y beyond which the law slips fully
-_GAUSS = np.polynomial.legendre.leggauss(4)
-_ROW = np.zeros(1, dtype=np.intp)
+_GAUSS = np.polynomial.legendre.leggauss(4)  # per panel; of 8th order, rounding on 400 panels
+_ROW = np.zeros(1, dtype=np.intp)  # the one set of parameters
 
 
 class ForceCurve:

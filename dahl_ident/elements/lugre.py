@@ -21,7 +21,7 @@ from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.recursion import linear_recursion
 
-_FAR = 1e12
+_FAR = 1e12  # of the data's speeds: exp(-(v/stribeck_speed)^2) is 0 or 1 to every digit
 
 
 class LuGre(Friction):

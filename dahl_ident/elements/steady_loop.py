@@ -162,7 +162,7 @@ class Groups(NamedTuple):
     of: Rows
 
 
-ONE = Groups(np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp))
+ONE = Groups(np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp))  # a row that is its own group
 
 
 def _same(rising: Slope, falling: Slope, top: FloatArray, rows: Rows) -> bool:
