@@ -110,12 +110,11 @@ class TestBeam:
         assert "f_max grows without bound at constant sigma^2/f_max" in found.verdict
         assert "sigma + stiffness" in found.identifiability.determined
 
-    @pytest.mark.parametrize("controlled", ["Force", "Response"])
-    def test_iwan_beside_the_mode(self, beam: FrequencyResponse, controlled: str) -> None:
+    def test_iwan_beside_the_mode(self, beam: FrequencyResponse) -> None:
         """The mode stiffens while its loss rises, which no sum of Jenkins elements does."""
-        levels = [label for label in beam.levels if label.startswith(controlled)]
+        levels = [label for label in beam.levels if label.startswith("Response")]
         data = beam.select(level=levels)
-        data = data.select(rows=np.arange(data.n) % (16 if controlled == "Force" else 8) == 0)
+        data = data.select(rows=np.arange(data.n) % 8 == 0)
         found = fit(data, Iwan(ratio=1.0) + Mass() + Damper(), throw=False)
         assert found.verdict.startswith("Approximate.")
         check = found.cross_validation
