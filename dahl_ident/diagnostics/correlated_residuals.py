@@ -37,7 +37,8 @@ def sandwich(
     Returns
     -------
     covariance : ndarray, shape (P, P)
-        Infinite where J'J is singular.
+        Infinite variances where a parameter has no effect; all infinite if J'J of the others is
+        singular.
     effective : float
         Samples, divided by the mean ratio of a parameter's variance to what it would be if the
         residuals were not correlated.
@@ -60,16 +61,21 @@ def sandwich(
     middle = np.zeros((P, P))
     for J, e in zip(jacobians, residuals, strict=True):
         scaled = J / size
-        normal += scaled.T @ scaled
-        middle += _correlated(scaled, e)
-    lowest = np.linalg.eigvalsh(normal)[0]
-    if not lowest > 1e-15:
+        own = np.flatnonzero((J != 0.0).any(axis=0))  # other records' states and offsets are not
+        normal[np.ix_(own, own)] += scaled[:, own].T @ scaled[:, own]
+        middle[np.ix_(own, own)] += _correlated(scaled[:, own], e)
+    found = np.zeros((P, P))
+    found[np.diag_indices(P)] = np.inf
+    seen = np.flatnonzero(normal.diagonal() > 0.0)
+    part = np.ix_(seen, seen)
+    if not np.linalg.eigvalsh(normal[part]).min(initial=1.0) > 1e-15:
         return np.full((P, P), np.inf), float(samples)
-    inverse = np.linalg.inv(normal)
+    inverse = np.linalg.inv(normal[part])
     white = inverse * variance
-    covariance = inverse @ middle @ inverse
+    covariance = inverse @ middle[part] @ inverse
     ratio = float(np.mean(covariance.diagonal() / white.diagonal())) if variance > 0.0 else 1.0
-    return covariance / np.outer(size, size), samples / max(ratio, 1e-300)
+    found[part] = covariance / np.outer(size[seen], size[seen])
+    return found, samples / max(ratio, 1e-300)
 
 
 def autoregression(

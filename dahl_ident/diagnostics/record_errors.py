@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from dahl_ident.arrays import FloatArray, positive_array
@@ -157,8 +158,13 @@ def _model_error(
     it exceeds noise is judged for each of the first `count` parameters.
     """
     samples = sum(e.size for e in residuals)
-    if samples < _BLOCKS * _BLOCKS or not np.isfinite(noise).all() or not noise.any():
+    seen = np.flatnonzero(np.isfinite(noise.diagonal()))
+    if samples < _BLOCKS * _BLOCKS or not noise[np.ix_(seen, seen)].any():
         return None
+    if seen.size < len(noise):
+        own, inside = [J[:, seen] for J in jacobians], noise[np.ix_(seen, seen)]
+        found = _model_error(own, residuals, inside, int((seen < count).sum()))
+        return None if found is None else _embedded(found, seen, len(noise))
     size = np.sqrt(noise.diagonal())
     scores, parts = [], []
     for J, e in zip(jacobians, residuals, strict=True):
@@ -179,6 +185,12 @@ def _model_error(
     values, vectors = np.linalg.eigh(between - correlation)
     beyond = (vectors * np.maximum(values, 0.0)) @ vectors.T
     return np.asarray(beyond * np.outer(size, size))
+
+
+def _embedded(part: FloatArray, places: NDArray[np.intp], size: int) -> FloatArray:
+    whole = np.zeros((size, size))
+    whole[np.ix_(places, places)] = part
+    return whole
 
 
 def record_budget(problem: RecordProblem, values: FloatArray, errors: RecordErrors) -> Budget:
@@ -245,13 +257,14 @@ def record_derived(
         return np.array(found)
 
     centre = quantities(values)
-    slopes = np.zeros((centre.size, values.size))
-    for i in range(len(problem.free)):
+    count = len(problem.free)
+    slopes = np.zeros((centre.size, count))
+    for i in range(count):
         step = np.zeros(values.size)
         step[i] = _STEP * abs(values[i])
         if step[i] > 0.0:
             slopes[:, i] = (quantities(values + step) - quantities(values - step)) / (2 * step[i])
-    errors = np.sqrt(np.einsum("ij,jk,ik->i", slopes, covariance, slopes))
+    errors = np.sqrt(np.einsum("ij,jk,ik->i", slopes, covariance[:count, :count], slopes))
     return tuple(
         DerivedQuantity(name, unit, a, float(v), float(e))
         for (name, unit, a), v, e in zip(labels, centre, errors, strict=True)

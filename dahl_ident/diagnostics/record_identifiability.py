@@ -52,7 +52,10 @@ def undetermined(
         near = np.mean(np.concatenate([p.path < 2.0 * low for p in paths])) if paths else np.nan
         for parameter in element.parameters:
             error = stderr.get(parameter.name)
-            if error is None or error <= _UNCERTAIN * abs(float(parameter.value or 0.0)):
+            # a parameter that may be zero, such as an asymmetry, is known beside its bounds
+            limit = min(parameter.upper, -parameter.lower) if parameter.lower < 0.0 else 0.0
+            size = limit if np.isfinite(limit) else 0.0
+            if error is None or error <= _UNCERTAIN * max(size, abs(float(parameter.value or 0.0))):
                 continue
             start = f"{parameter.name} is not determined (standard uncertainty {error:.2g} "
             start += f"{parameter.unit})".replace(" )", ")")
