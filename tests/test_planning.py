@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,9 @@ import dahl_ident as di
 from benchmarks import planning
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics import departures, error_sources
+from dahl_ident.diagnostics.bands import problem_at
+from dahl_ident.diagnostics.prediction_error import prediction_error
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import solve_many
 from dahl_ident.planning import Plan
@@ -73,8 +78,13 @@ class TestContinuousDesign:
             other = design.seconds * rng.lognormal(0.0, 0.5, 40) + rng.exponential(0.02, 40)
             assert objective.at(other * (10.0 / other.sum())).value <= design.value + 1e-4
 
-    def test_the_gradient_is_that_of_the_value(self) -> None:
-        objective = _objective(3, 6, 3, targets=2, scatter=0.2)
+    @pytest.mark.parametrize(
+        "change",
+        [{}, {"starts": np.array([0, 1])}, {"targets": None}, {"targets": None, "departures": 1}],
+    )
+    def test_the_gradient_is_that_of_the_value(self, change: dict[str, Any]) -> None:
+        objective = _objective(3, 6, 3, targets=3, scatter=0.2)
+        objective = replace(objective, terms=(replace(objective.terms[0], **change),))
         cycles = np.random.default_rng(1).uniform(1.0, 9.0, 6)
         gradient = objective.gradient(objective.at(cycles))
         for k in range(6):
@@ -93,6 +103,56 @@ class TestContinuousDesign:
         shared = np.tile(np.eye(2), (5, 1))
         V = np.diag(np.repeat(1.0 / cycles, 2)) + 0.4**2 * shared @ shared.T
         assert found[0] == pytest.approx(J.T @ np.linalg.inv(V) @ J, rel=1e-9)
+
+
+class TestModelError:
+    def _fit(self) -> Any:
+        """Return a fit of Dahl friction to one with another exponent: 5 % of model error."""
+        A = np.geomspace(0.2, 5.0, 12) * X_C
+        exact = di.Dahl(F_MAX, SIGMA, alpha=1.6).describing_function(A)
+        noise = np.random.default_rng(5).standard_normal((2, 12))
+        return di.fit(FrequencyResponse(np.ones(12), exact * np.exp(0.002 * noise.T @ [1, 1j]), A),
+                      LINEAR)  # fmt: skip
+
+    def test_departures_predict_what_kriging_does(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(departures, "_NEGLIGIBLE", 1e-9)
+        monkeypatch.setattr(error_sources, "_SMOOTH", 1e-9)
+        errors = self._fit().errors
+        A, omega = np.geomspace(0.3, 4.0, 4) * X_C, np.full(4, 2.0 * np.pi)
+        there = problem_at(errors.problem, omega / (2.0 * np.pi), A, None, None)
+        R = there.predict(errors.theta)
+        slopes = there.prediction_jacobian(errors.theta) / R[:, None]
+        found = departures.departures(errors, slopes, A, omega, R)
+        assert found is not None
+        assert not found.assumed
+        lever = np.concatenate([np.stack([slopes.real, slopes.imag], 1), found.columns], axis=-1)
+        covariance = lever @ np.linalg.inv(found.information) @ lever.swapaxes(1, 2)
+        expected = prediction_error(errors, slopes, A, omega, R, of_a_test=False).covariance
+        # shapes of one process, cut off at different places
+        assert np.trace(covariance, axis1=1, axis2=2) == pytest.approx(
+            np.trace(expected, axis1=1, axis2=2), rel=0.02
+        )
+        own = np.linalg.inv(found.information)[:2, :2]
+        assert own == pytest.approx(errors.covariance, rel=0.02)
+
+    def test_levels_are_spread_by_the_model_error(self) -> None:
+        fit, limits = self._fit(), {**KNEE, "time": 60}
+        plan = di.plan(fit, limits=limits, target="response", candidates=25)
+        alone = di.plan(LINEAR, ranges=NEAR, noise=0.002, limits=limits, candidates=25)
+        assert len(plan.steps) > len(alone.steps) + 1
+        assert "the model errs as the earlier data show" in str(plan)
+        told, found = plan.expected["f_max"], fit.params["f_max"]
+        # the fit cuts the shapes off by its own rows
+        assert told.before == pytest.approx(found.stderr / found.value, rel=0.15)
+        assert told.after > 2.0 * alone.expected["f_max"].after
+
+    def test_time_that_does_not_help_is_not_spent(self) -> None:
+        plan = di.plan(
+            LINEAR, ranges=NEAR, limits=KNEE, noise=0.01, scatter=0.02, runs=1,
+            target={"f_max": 0.01}, draws=20, candidates=30,
+        )  # fmt: skip
+        assert not plan.reached
+        assert plan.seconds < 200.0
 
 
 class TestLevelsWithFixedCosts:
@@ -164,7 +224,7 @@ class TestPlan:
 
     def test_it_beats_a_logarithmic_grid(self) -> None:
         plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 25}, noise=0.02, target="f_max")
-        even = plan.planner.expected(*plan.planner.logarithmic_grid(25.0))
+        even = plan.planner.forecast.expected(*plan.planner.search.logarithmic_grid(25.0))
         assert even["f_max"].after > 1.5 * plan.expected["f_max"].after
 
     def test_a_target_is_reached_in_the_least_time(self) -> None:
@@ -345,11 +405,13 @@ class TestPlan:
         with pytest.raises(ValidationError, match="at least ten samples a cycle: 50"):
             plan.write_waveform(tmp_path / "coarse.csv", 10.0)
 
-    def test_text_picture_and_data(self) -> None:
+    def test_text_picture_and_data(self, tmp_path: Path) -> None:
         plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 20}, noise=0.02, draws=10)
         assert f"{len(plan.steps)} levels in" in str(plan)
         assert plan.to_frame()["seconds"].sum() == pytest.approx(plan.seconds)
         assert list(plan.budget().index) == ["f_max", "sigma"]
+        saved = json.loads(plan.save(tmp_path / "plan.json").read_text())
+        assert saved["expected"]["f_max"]["before"] is None  # nothing is known before
         axis = plan.plot()
         assert len(axis.lines) == 4
 

@@ -20,7 +20,7 @@ Williams, *Gaussian Processes*, 2006, section 2.7.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
@@ -126,6 +126,8 @@ class ErrorModel:
     assumed: tuple[str, ...]
     linear: LinearModel
     projection: Projection
+    jacobian: FloatArray
+    """Derivatives of the residuals of data and priors by theta, shape (M, Q)."""
     near: Linearization
     """Residuals at the estimate, each run's at its own parameters."""
     runs: RunDeviations | None = None
@@ -142,6 +144,11 @@ class ErrorModel:
     def names(self) -> tuple[str, ...]:
         """Free parameters and assumed exponents."""
         return self.problem.names
+
+    @property
+    def tells_noise_apart(self) -> bool:
+        """Whether there are enough residuals to tell a model error from noise."""
+        return _tells(self.problem, self.assumed)
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -340,8 +347,7 @@ def _estimated(
     basis = None if determined else _basis(rows.at(theta, near)[1])
     noise: tuple[Source, ...] | None = None
     dof = problem.n_numbers - len(problem.names)
-    tells = dof + len(assumed) >= _LEAST_DOF
-    shared = StructuredSources(problem, theta) if tells else None
+    shared = StructuredSources(problem, theta) if _tells(problem, assumed) else None
     last: FloatArray | None = None
     runs: RunDeviations | None = None
     for step in range(_STEPS):
@@ -351,6 +357,7 @@ def _estimated(
             raise np.linalg.LinAlgError("a drive beyond the force limit has no steady response")
         level = float(y[:m] @ y[:m]) / max(dof, 1)
         rest = () if shared is None else shared.at(theta, replace(near, J=J[:m]))
+        whole = J
         J = J if basis is None else J @ basis.matrix
         plain = (
             (*of_one_scale(problem), *relative_scatter(problem, theta))
@@ -382,16 +389,21 @@ def _estimated(
     contributions = _by_source(problem, assumed, sources, linear, found, G)
     return ErrorModel(
         optimum, problem, theta, sources, found, contributions, tuple(assumed), linear, projection,
-        near, runs, basis,
+        whole, near, runs, basis,
     )  # fmt: skip
+
+
+def _tells(problem: Problem, assumed: Collection[str]) -> bool:
+    return problem.n_numbers - len(problem.names) + len(assumed) >= _LEAST_DOF
 
 
 _Found = tuple[tuple[Source, ...], LinearModel, VarianceComponents]
 
 
-def _linear(
+def linear_model(
     problem: Problem, y: FloatArray, J: FloatArray, sources: tuple[Source, ...]
 ) -> LinearModel:
+    """Return residuals of data and priors with the sources' columns, compressed if many."""
     m, extra = problem.n_residuals, len(y) - problem.n_residuals
     known = np.concatenate([np.full(m, float(problem.scale_known)), np.ones(extra)])
     Z = [s.columns if s.columns.ndim < 3 else linalg.block_diag(*s.columns) for s in sources]
@@ -418,7 +430,7 @@ def _supported(
     Also the variances with all sources, to start from at the next estimate.
     """
     every = (*noise, *rest)
-    linear = _linear(problem, y, J, every)
+    linear = linear_model(problem, y, J, every)
     contrasts = likelihood(linear)
     upper = np.array([s.largest for s in every])
     scales = np.array([s.columns.ndim == 1 and not problem.scale_known for s in every])
@@ -463,7 +475,7 @@ def _kind_of_noise(
         if not trial:
             continue
         sources = (*trial, *rest)
-        linear = _linear(problem, y, J, sources)
+        linear = linear_model(problem, y, J, sources)
         own = np.array([s.columns.ndim == 1 for s in sources])
         upper = np.array([s.largest for s in sources])
         other = variance_components(linear, np.where(own, level, 0.0), upper)

@@ -131,7 +131,7 @@ def places(amplitude: FloatArray, omega: FloatArray) -> FloatArray:
 
 def of_one_scale(problem: Problem) -> tuple[Source, ...]:
     """Return noise of one scale: unknown, or beyond that of the data's covariance."""
-    return (Source(NOISE, np.ones(problem.n_residuals), _unit_noise(problem)),)
+    return (Source(NOISE, np.ones(problem.n_residuals), unit_noise(problem)),)
 
 
 def gain_and_phase(problem: Problem) -> tuple[Source, ...]:
@@ -176,10 +176,12 @@ class StructuredSources:
     """The sources that several rows share, and noise of the amplitudes.
 
     Their shapes are those of the model at `theta`. In measured ones the noise itself would be a
-    shape, and explain itself.
+    shape, and explain itself. `beside`, (k, 2), are further places where they are needed.
     """
 
-    def __init__(self, problem: Problem, theta: FloatArray) -> None:
+    def __init__(
+        self, problem: Problem, theta: FloatArray, beside: FloatArray | None = None
+    ) -> None:
         self._problem = problem
         view, data = problem.predicted_stiffness(theta), problem.data
         self._places = places(view.amplitude, view.omega)
@@ -189,9 +191,10 @@ class StructuredSources:
             np.empty((0, data.n)) if data.run is None else _indicators(np.asarray(data.run))
         )
         unit = float(np.abs(view.stiffness[self._fundamental]).max(initial=0.0)) or 1.0
+        every = self._places if beside is None else np.vstack([self._places, beside])
         self._shapes = (
-            Shapes.of(self._places, parallel=False),
-            Shapes.of(self._places, parallel=True, unit=unit),
+            Shapes.of(every, parallel=False),
+            Shapes.of(every, parallel=True, unit=unit),
         )
         stiffness = np.where(self._fundamental, view.stiffness, np.inf)
         self._changes = [shape.changes(self._places, stiffness) for shape in self._shapes]
@@ -227,7 +230,7 @@ class StructuredSources:
             Source(
                 MODEL_ERROR,
                 J[:, i : i + 1] * change,
-                float(np.mean((J[:, i] * change[:, 0]) ** 2)) * _unit_noise(problem),
+                float(np.mean((J[:, i] * change[:, 0]) ** 2)) * unit_noise(problem),
                 rate_of=(problem.names[i], centre),
             )
             for i in _scattering_parameters(problem)
@@ -405,7 +408,7 @@ def _mean_square(changes: ComplexArray) -> float:
     return 0.5 * float(np.sum(np.abs(changes) ** 2, axis=0).mean())
 
 
-def _unit_noise(problem: Problem) -> float:
+def unit_noise(problem: Problem) -> float:
     """Return the mean square of ln gain and phase that residuals of unit variance are."""
     weights = problem.stiffness_data.weights * np.abs(problem.stiffness_data.stiffness)
     return float(np.mean(1.0 / np.maximum(weights, 1e-150) ** 2))

@@ -15,6 +15,7 @@ Rasmussen and Williams, *Gaussian Processes*, 2006, section 2.7.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -71,23 +72,10 @@ def prediction_error(
     for source, part, variance in zip(
         errors.sources, errors.linear.Z, errors.variances.tolist(), strict=True
     ):
-        shapes = source.shapes
-        if source.rate_of is not None:
-            name, centre = source.rate_of
-            away = (where.sum(axis=1) - centre)[:, None, None]
-            changes = _parts(slopes[:, [errors.names.index(name)]]) * away
-            here.append(changes)
-            c += variance * changes @ part.T
-            continue
-        if shapes is None or (shapes.parallel and stiffness is None):
-            here.append(None)
-            continue
-        ratio = np.ones(n, dtype=np.complex128) if stiffness is None else stiffness
-        changes = _parts(shapes.changes(where, ratio).T)
-        if source.absorbed is not None:
-            changes = changes - _parts(slopes) @ source.absorbed
+        changes = changes_there(source, errors.names, slopes, where, stiffness)
         here.append(changes)
-        c += variance * changes @ part.T
+        if changes is not None:
+            c += variance * changes @ part.T
     lever = c @ errors.projection.P - _parts(slopes) @ errors.inverse  # (n, 2, m)
     covariance = (lever * errors.linear.known) @ lever.swapaxes(1, 2)
     squares = np.zeros((len(errors.sources), n))
@@ -117,6 +105,26 @@ def prediction_error(
     with np.errstate(divide="ignore", invalid="ignore"):
         dof = np.where(spread > 0.0, 2.0 * total**2 / spread, np.inf)
     return PredictionError(lever @ errors.linear.y, covariance, np.maximum(dof, _LEAST_DOF))
+
+
+def changes_there(
+    source: Source,
+    names: Sequence[str],
+    slopes: ComplexArray,
+    where: FloatArray,
+    stiffness: ComplexArray | None,
+) -> FloatArray | None:
+    """Return ln gain and phase that a source makes at other places, (n, 2, q), if it does."""
+    shapes, n = source.shapes, len(slopes)
+    if source.rate_of is not None:
+        name, centre = source.rate_of
+        away = (where.sum(axis=1) - centre)[:, None, None]
+        return np.asarray(_parts(slopes[:, [names.index(name)]]) * away)
+    if shapes is None or (shapes.parallel and stiffness is None):
+        return None
+    ratio = np.ones(n, dtype=np.complex128) if stiffness is None else stiffness
+    changes = _parts(shapes.changes(where, ratio).T)
+    return changes if source.absorbed is None else changes - _parts(slopes) @ source.absorbed
 
 
 def _parts(relative: ComplexArray) -> FloatArray:

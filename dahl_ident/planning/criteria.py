@@ -10,7 +10,8 @@ on the parameters, and R equal runs give R S. S is a concave function of the cyc
 complement), and every criterion here is the mean over draws of the logarithm of a concave,
 homogeneous function of the information, so that the best design is a convex problem:
 
-- D: ln det(M)/P;
+- D: ln det(M)/P; with departures of the model among the parameters, that of the others
+  alone, -ln det((M^{-1})_PP) (D_s-optimality);
 - targets: -ln(sum_t (c_t' M^{-1} c_t / u_t^2)^q)/q; with one target c-optimality, with several
   close to the largest ratio of variance to target.
 
@@ -68,12 +69,6 @@ class LevelInformation:
         """Return the information of some candidates."""
         return replace(self, packed=self.packed[candidates])
 
-    def thinned(self, draws: NDArray[np.intp]) -> LevelInformation:
-        """Return the information at some of the draws."""
-        kept = self.packed.reshape(-1, self.draws, self.size**2)[:, draws]
-        packed = np.ascontiguousarray(kept).reshape(len(self.packed), -1)
-        return replace(self, packed=packed, draws=len(draws))
-
     def of_run(self, total: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return S of packed sums (..., S Q Q), and what takes dS back to them, (..., P, Q)."""
         Q, P = self.size, self.parameters
@@ -99,30 +94,44 @@ class Term:
         Of the candidates.
     known : ndarray, shape (S, P, P)
         Information before the plan.
-    targets : ndarray, shape (S, P, T), or None
+    targets : ndarray, shape (S, P, C), or None
         Directions over their wanted standard uncertainties; None: D-optimality.
+    starts : ndarray of int, shape (T,), or None
+        First column of each target, whose variances are added; None: a column each.
     weight : float
         In the sum of the terms.
+    departures : int
+        Number of parameters, the last ones, whose uncertainty does not matter by itself.
     """
 
     levels: LevelInformation
     known: FloatArray
     targets: FloatArray | None = None
+    starts: NDArray[np.intp] | None = None
     weight: float = 1.0
+    departures: int = 0
 
     def value_and_slope(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the mean over draws and its derivative by M times S; (...), (..., S, P, P)."""
         inverse = np.linalg.inv(M)
         if self.targets is None:
-            P = M.shape[-1]
-            return np.linalg.slogdet(M)[1].mean(axis=-1) / P, inverse / P
+            P = M.shape[-1] - self.departures
+            if not self.departures:
+                return np.linalg.slogdet(M)[1].mean(axis=-1) / P, inverse / P
+            own, ahead = inverse[..., :P, :P], inverse[..., :P, :]
+            slope = ahead.swapaxes(-1, -2) @ np.linalg.inv(own) @ ahead
+            return -np.linalg.slogdet(own)[1].mean(axis=-1) / P, slope / P
         moved = inverse @ self.targets
-        h = np.einsum("...spt,spt->...st", moved, self.targets)
-        top = h.max(axis=-1, keepdims=True)
-        powers = (h / top) ** (_POWER - 1.0)
-        total = (powers * h / top).sum(axis=-1)
+        h = np.einsum("...spc,spc->...sc", moved, self.targets)
+        starts = np.arange(h.shape[-1]) if self.starts is None else self.starts
+        sums = np.add.reduceat(h, starts, axis=-1)
+        top = sums.max(axis=-1, keepdims=True)
+        powers = (sums / top) ** (_POWER - 1.0)
+        total = (powers * sums / top).sum(axis=-1)
         value = -(np.log(top[..., 0]) + np.log(total) / _POWER).mean(axis=-1)
-        share = powers / (total[..., None] * top)
+        share = np.repeat(
+            powers / (total[..., None] * top), np.diff([*starts, h.shape[-1]]), axis=-1
+        )
         return value, (moved * share[..., None, :]) @ moved.swapaxes(-1, -2)
 
 
@@ -159,17 +168,6 @@ class Objective:
         chosen = np.asarray(candidates, dtype=np.intp)
         terms = tuple(replace(t, levels=t.levels.only(chosen)) for t in self.terms)
         return replace(self, terms=terms)
-
-    def thinned(self, most: int) -> Objective:
-        """Return the objective averaged over at most so many of the draws."""
-        terms = []
-        for term in self.terms:
-            S = term.levels.draws
-            kept = np.unique(np.linspace(0, S - 1, min(S, most)).astype(np.intp))
-            targets = None if term.targets is None else term.targets[kept]
-            levels = term.levels.thinned(kept)
-            terms.append(replace(term, levels=levels, known=term.known[kept], targets=targets))
-        return replace(self, terms=tuple(terms))
 
     def information(self, cycles: FloatArray) -> list[FloatArray]:
         """Return the information of every term, shape (S, P, P) each."""

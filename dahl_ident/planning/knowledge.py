@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray, finite_array
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.departures import noise_of_rows, scatter_of_runs
+from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError
@@ -52,6 +54,10 @@ class Knowledge:
         Cycles that such a row averages, if the data state it; else 1.
     problem : Problem or None
         Of the earlier data.
+    scatter : float
+        Standard deviation of ln gain and phase between runs in the earlier data.
+    errors : ErrorModel or None
+        Of an earlier fit.
     """
 
     model: Model
@@ -65,6 +71,8 @@ class Knowledge:
     row_noise: float | None = None
     row_cycles: float = 1.0
     problem: Problem | None = None
+    scatter: float = 0.0
+    errors: ErrorModel | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -161,14 +169,42 @@ def _of_fit(optimum: Any, ranges: Ranges, draws: int, rng: np.random.Generator) 
                 f"plan: the fit does not determine {name}; give ranges={{{name!r}: (low, high)}}, "
                 "or plan from the model with ranges="
             )
+    prior = _leaned_on(problem.parameters, centre, std)
+    errors = error_model(optimum)
+    if errors is not None:
+        return _of_errors(errors, prior, draws, rng)
     theta = np.where(finite, theta, centre)
     scale = optimum.scale if np.isfinite(optimum.scale) else 1.0
     covariance = np.linalg.inv(problem.information(theta, scale) + np.diag(1.0 / std**2))
     # a range counts only where the data say nothing; elsewhere the estimate is the centre
     drawn = rng.multivariate_normal(theta, covariance, draws, method="eigh")
     drawn = _within(drawn, problem.parameters)
-    prior = _leaned_on(problem.parameters, centre, std)
     return _with_data(problem, np.vstack([drawn, theta]), scale, prior, at=draws)
+
+
+def _of_errors(
+    errors: ErrorModel, leaned: FloatArray, draws: int, rng: np.random.Generator
+) -> Knowledge:
+    """Return the knowledge from a fit with all its sources of error."""
+    given = errors.optimum.problem
+    model, assumed = _with_assumed(given.model)
+    kept = [i for i, name in enumerate(errors.names) if name in (*given.names, *assumed)]
+    parameters = tuple(errors.problem.parameters[i] for i in kept)
+    names = [p.name for p in parameters]
+    prior = np.zeros(len(kept))
+    prior[[names.index(name) for name in given.names]] = leaned
+    part = np.ix_(kept, kept)
+    drawn = rng.multivariate_normal(
+        errors.theta[kept], errors.covariance[part], draws, method="eigh"
+    )
+    known = np.linalg.inv(errors.covariance)[part]
+    stated, cycles = _row_noise(errors.problem, 0.0)
+    return Knowledge(
+        model, given.sensors, given.data.motion, parameters, _within(drawn, parameters),
+        np.broadcast_to(known, (draws, *known.shape)), np.diag(prior), tuple(assumed),
+        float(np.hypot(stated, noise_of_rows(errors))), cycles, errors.problem,
+        scatter_of_runs(errors), errors,
+    )  # fmt: skip
 
 
 def _of_posterior(posterior: Any, ranges: Ranges, draws: int, seed: int) -> Knowledge:

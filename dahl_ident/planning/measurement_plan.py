@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -54,7 +54,7 @@ class Expected:
     Attributes
     ----------
     value : float
-        Median over the draws.
+        Median over the draws; NaN of the response.
     before, after : float
         Relative standard uncertainty from the earlier data, and with the plan's data; inf where
         nothing is known. Geometric mean over the draws.
@@ -73,9 +73,8 @@ class Expected:
 
 
 class _Planner(Protocol):
-    def solve(self, time: float, start: Sequence[int] = ()) -> Any: ...
-    def expected(self, levels: Any, cycles: FloatArray, runs: int) -> dict[str, Expected]: ...
-    def logarithmic_grid(self, time: float, levels: int = 10) -> Any: ...
+    forecast: Any
+    search: Any
 
 
 @dataclass(frozen=True)
@@ -241,7 +240,9 @@ class Plan:
         Path
         """
         place = place_of(path, "a plan", (".json",))
-        text = json.dumps(plain_data(self.to_dict()), indent=2, allow_nan=False)
+        text = json.dumps(
+            plain_data(self.to_dict(), not_finite=lambda _: None), indent=2, allow_nan=False
+        )
         write_whole(place, text.encode(), overwrite=overwrite)
         return place
 
@@ -256,15 +257,17 @@ class Plan:
         planned = {name: np.full(len(times), np.nan) for name in names}
         even = {name: np.full(len(times), np.nan) for name in names}
         for i, time in enumerate(times.tolist()):
-            found = self.planner.solve(time)
+            found = self.planner.search.solve(time)
             if found is not None:
                 selection = found.selection
-                told = self.planner.expected(selection.levels, selection.cycles, found.runs)
+                told = self.planner.forecast.expected(
+                    selection.levels, selection.cycles, found.runs
+                )
                 for name in names:
                     planned[name][i] = told[name].after
-            grid = self.planner.logarithmic_grid(time)
+            grid = self.planner.search.logarithmic_grid(time)
             if grid is not None:
-                told = self.planner.expected(*grid)
+                told = self.planner.forecast.expected(*grid)
                 for name in names:
                     even[name][i] = told[name].after
         return {name: (times, planned[name], even[name]) for name in names}
@@ -302,9 +305,9 @@ class Plan:
         lines += ["", f"{'':24}{'value':>11}{'before':>11}{'after':>11}{'wanted':>11}"]
         for name, e in self.expected.items():
             wanted = _percent(self.target[name]) if name in self.target else ""
+            value = f"{e.value:.4g}" if np.isfinite(e.value) else ""
             lines.append(
-                f"{name:24}{e.value:>11.4g}{_percent(e.before):>11}{_percent(e.after):>11}"
-                f"{wanted:>11}"
+                f"{name:24}{value:>11}{_percent(e.before):>11}{_percent(e.after):>11}{wanted:>11}"
             )
         lines.append("Relative standard uncertainties; U(...) expanded, 95.45 %."
                      if any(name.startswith("U(") for name in self.expected)

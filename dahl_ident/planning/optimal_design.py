@@ -24,7 +24,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
 from dahl_ident.planning.criteria import Objective
 
-_IMPROVES = 1e-4  # least improvement of the logarithm by a change of the levels
+_IMPROVES = 1e-3  # least improvement of the logarithm by a change of the levels
 _ROUNDS = 12
 _TRIED = 3  # candidates whose times are optimised after a first look at all
 _MOST_LEVELS = 24
