@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -75,14 +76,14 @@ def scenarios() -> list[Scenario]:
         found.append(
             Scenario(
                 f"force from displacement, {noise}", di.Dahl() + di.Spring(), spring,
-                lambda seed, pole=pole: force_record(seed, pole), False,  # type: ignore[misc]
+                partial(force_record, pole=pole), False,
             )
         )  # fmt: skip
         found.append(
             Scenario(
                 f"motion from force, {noise}",
                 di.Dahl() + di.Mass() + di.Damper() + di.Spring(), plant,
-                lambda seed, pole=pole: motion_record(seed, pole), True,  # type: ignore[misc]
+                partial(motion_record, pole=pole), True,
             )
         )  # fmt: skip
     return found

@@ -283,10 +283,9 @@ class ForcedMotion:
         by = np.empty((order, width, n))
         # casadi stores a matrix column by column
         rows = [*after, *(by[i, j] for j in range(width) for i in range(order))]
-        several = np.ndim(length) > 0
         for start in range(0, n, BLOCK):
             b = slice(start, start + BLOCK)
-            part = length[b] if several else length  # type: ignore[index]
+            part = length[b] if isinstance(length, np.ndarray) else length
             found = evaluate(*y[:, b], *stages[:, b], part, direction[b], *sides[:, b], *values)
             for row, entry in zip(rows, found, strict=True):
                 row[b] = entry

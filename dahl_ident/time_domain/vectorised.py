@@ -7,6 +7,7 @@ as array operations, in blocks that stay in cache, the same expression takes a f
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -108,11 +109,12 @@ def vectorised(inputs: Sequence[ca.SX], outputs: ca.SX) -> Evaluator:
             form = _BINARY.get(code) or _UNARY.get(code)
             if form is None:
                 raise ModelError(
-                    f"the law has the operation {ca.Function.__name__} {code}, which cannot be "
+                    f"the law has casadi's operation {code}, which cannot be "
                     "evaluated on arrays; use arithmetic, exp, log, sqrt, abs, sign or tanh"
                 )
             lines.append(f"    w{target[0]} = " + form.format(*(f"w{i}" for i in source)))
     lines.append("    return out")
-    space: dict[str, object] = {"np": np}
+    space: dict[str, Any] = {"np": np}
     exec(compile("\n".join(lines), "<vectorised expression>", "exec"), space)
-    return space["evaluate"]  # type: ignore[return-value]
+    found: Evaluator = space["evaluate"]
+    return found
