@@ -255,7 +255,13 @@ class TestUnusualTables:
 
     @pytest.mark.parametrize(
         "footer",
-        ["End of data\n", "\nMean,0.1,0.2\nMax,1,2\n", "*** end ***", "Checked by: A. Hill"],
+        [
+            "End of data\n",
+            ",,\n,,\n",
+            "\nMean,0.1,0.2\nMax,1,2\n",
+            "*** end ***",
+            "Checked by: A. Hill",
+        ],
     )
     def test_lines_below_the_table(self, tmp_path: Path, footer: str) -> None:
         record = read_record(written(tmp_path, PLAIN + footer))
@@ -335,7 +341,18 @@ class TestRefusal:
             ("a,b,c,d\n1,2,3\n", "no header line"),
             (PLAIN + "2,3\n", r"the last line has 2 fields, '2,3', where the others have 3"),
             (PLAIN + "2;3\n", "the last line has 1 fields, '2;3'"),
-            (PLAIN + "#DIV/0!,2,3\n", "line 5: the line begins as a comment and has numbers"),
+            (PLAIN + "#DIV/0!,2,3\n", "line 5: the line begins as a comment, yet its cells"),
+            (PLAIN + "#DIV/0!,#DIV/0!,3\n2,3,4\n", "line 5: the line begins as a comment, yet"),
+            (PLAIN + "#REF!,2\n2,3,4\n", "line 5: the line begins as a comment, yet"),
+            ("# " + PLAIN + "# " + PLAIN, "line 6: the header is repeated above this line"),
+            (
+                "# " + PLAIN + "# " + PLAIN.replace("mm", "um"),
+                r"line 5: '# time \[s\],x \[um\],F \[kN\]' names the columns again, with other",
+            ),
+            (
+                "# time,x,F\n# s,mm,kN\n0,1,1\n1,2,2\n# time,x,F\n# s,um,kN\n0,1,1\n",
+                "line 6: '# s,um,kN' names the columns again",
+            ),
             (PLAIN.replace("\n0,1,1", "\n#DIV/0!,1,1"), "line 2: the line begins as a comment"),
             (PLAIN + PLAIN, "line 6: the header is repeated above this line .2 records in one"),
             (PLAIN + "Sunday;too\nX,1,2\n", "line 5, column"),

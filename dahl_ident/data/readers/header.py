@@ -91,7 +91,7 @@ def header(above: Sequence[Sequence[str]], width: int, filled: int | None = None
         lines.insert(0, [*cells, *[""] * (width - len(cells))])
     if not lines:
         return Header((), (), 0)
-    k = next((k for k in range(len(lines) - 1, 0, -1) if _are_units(lines[k])), None)
+    k = next((k for k in range(len(lines) - 1, 0, -1) if are_units(lines[k])), None)
     if k is None:
         split = [[split_header(cell) for cell in line] for line in reversed(lines)]
         named = max(split, key=lambda cells: sum(unit is not None for _, unit in cells))
@@ -122,7 +122,8 @@ def _bare(cell: str) -> str | None:
     return "1" if text == "-" else text or None
 
 
-def _are_units(cells: Sequence[str]) -> bool:
+def are_units(cells: Sequence[str]) -> bool:
+    """Return whether each cell is empty or a unit, and some is one."""
     try:
         found = [parse_unit(unit) for cell in cells if (unit := _bare(cell)) is not None]
     except UnitError:

@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dahl_ident.data.column_names import split_header
 from dahl_ident.data.raw_columns import Channel, Source, plain
 from dahl_ident.data.readers.file import MOST_CHANNELS, utf8
-from dahl_ident.data.readers.header import CELL, Header, best_run, header, named_channels
+from dahl_ident.data.readers.header import CELL, Header, are_units, best_run, header, named_channels
 from dahl_ident.data.storage import METADATA_MARK, read_metadata
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
@@ -41,6 +42,7 @@ _LONGEST_LINE = 1 << 18
 _MOST_COMMENTS = 20_000
 _MANY_LINES = 50  # from which decimals of one length are a format, not chance
 _FOOTER_LINES = 20
+_ERROR_VALUE = re.compile(r"\s*#(?:N/A|DIV/0!|[A-Z]{2,9}[!?])\s*")  # of a spreadsheet
 _FOOTER = re.compile(r"\s*[\"']?[^\W\d_]{2}|\s*(?:\*\*|==|--)", re.UNICODE)
 _SUMMARIES = ("min", "max", "mean", "average", "avg", "std", "rms", "sum", "total", "median")
 _MISSING = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "n/a", "#N/A", "null", "1.#QNAN"]
@@ -57,7 +59,8 @@ _LAST_DIALECTS = ((":", "."), (":", ","))  # a colon also stands in times of day
 class _Layout:
     """Delimiter (None: blanks), decimal mark, first line of numbers, fields in it, header.
 
-    `repeated` is the line above the numbers, by which a second header in the file is known.
+    `repeated` is the line above the numbers, by which a second header in the file is known;
+    `comments` are all lines above them where the header is in comments.
     """
 
     delimiter: str | None
@@ -67,6 +70,7 @@ class _Layout:
     width: int
     header: Header
     repeated: bytes = b""
+    comments: tuple[str, ...] = ()
 
 
 def read_text_table(data: bytes, name: str, sha256: str | None = None) -> Source:
@@ -210,12 +214,14 @@ def _in_dialect(
     row = rows[start] or []
     filled = max((i + 1 for i, cell in enumerate(row) if cell.strip()), default=run.width)
     found = header([row for row in rows[:start] if row is not None], run.width, filled)
+    comments: tuple[str, ...] = ()
     if not found.names:
         found = header(_commented(lines[:start], delimiter), run.width, filled)
-        repeated = "" if found.names else repeated
+        comments = tuple(text.strip() for _, text in lines[:start]) if found.names else ()
+        repeated = next((text for text in reversed(comments) if text), "")
     layout = _Layout(
         delimiter, mark, start + 1, lines[start][0], run.width, found,
-        repeated.encode() if found.names else b"",
+        repeated.encode() if found.names else b"", comments,
     )  # fmt: skip
     return (bool(found.names), run.score), layout
 
@@ -254,15 +260,22 @@ def _body(data: bytes, layout: _Layout, name: str) -> tuple[bytes, list[int], li
     first_comment = _first_comment(data, layout)
     if first_comment is not None:
         raise DataError(_not_a_comment(name, *first_comment))
-    if any(body.find(mark) >= 0 for mark in (b"#", b"%", b"//", b"!")):
+    commented = any(body.find(mark) >= 0 for mark in (b"#", b"%", b"//", b"!"))
+    if commented:
         for found in _COMMENT_LINE.finditer(body):
-            if _looks_like_data(found[0].decode("utf-8", "replace"), layout):
-                line = layout.line + len(_LINE_END.findall(body, 0, found.start()))
-                raise DataError(_not_a_comment(name, line, found[0].decode("utf-8", "replace")))
-        body = _COMMENT_LINE.sub(b"", body)
+            text = found[0].decode("utf-8", "replace")
+            line = layout.line + len(_LINE_END.findall(body, 0, found.start()))
+            if _looks_like_data(text, layout):
+                raise DataError(_not_a_comment(name, line, text))
+            if _is_another_header(text, layout):
+                raise DataError(
+                    f"{name}, line {line}: {text.strip()[:60]!r} names the columns again, with "
+                    "other units or in another order; expected one header. Split the file there"
+                )
     body, footers = _without_footers(body, layout)
     notes = [f"left out below the table: {text.strip()[:60]!r}" for text in footers]
     body, runs = _without_repeated_headers(body, layout)
+    body = _COMMENT_LINE.sub(b"", body) if commented else body
     if runs:
         rows = listed([i + 1 for i in runs])
         notes.append(f"the header is repeated in the file: new runs begin at rows {rows}")
@@ -282,23 +295,37 @@ def _first_comment(data: bytes, layout: _Layout) -> tuple[int, str] | None:
 
 
 def _looks_like_data(text: str, layout: _Layout) -> bool:
-    """Return whether a line that begins as a comment has numbers in all its other fields."""
+    """Return whether a line that begins as a comment has an error value or numbers in its cells."""
     cells = _split(text, layout.delimiter)
+    if len(cells) > 1 and _ERROR_VALUE.fullmatch(cells[0]):
+        return True
     others = [cell for cell in cells[1:] if cell.strip()]
     numeric = [CELL[layout.mark].fullmatch(cell) is not None for cell in others]
     return len(cells) == layout.width and bool(numeric) and all(numeric)
 
 
+def _is_another_header(text: str, layout: _Layout) -> bool:
+    """Return whether a comment is a header that differs from the first one, in comments too."""
+    if not layout.comments or text.strip() in layout.comments:
+        return False
+    cells = next(iter(_commented([(0, text)], layout.delimiter)), [""])
+    names, units = zip(*(split_header(cell) for cell in cells), strict=True)
+    known = sorted(plain(name) for name in layout.header.names if name)
+    return sorted(plain(name) for name in names if name) == known or (
+        len(cells) == layout.header.cells > 1 and not any(units) and are_units(cells)
+    )
+
+
 def _not_a_comment(name: str, line: int, text: str) -> str:
     return (
-        f"{name}, line {line}: the line begins as a comment and has numbers in its other fields, "
+        f"{name}, line {line}: the line begins as a comment, yet its cells look like data, "
         f"{text.strip()[:40]!r}; expected a measured number in each. Delete the line, or put a "
         "number there"
     )
 
 
 def _without_footers(body: bytes, layout: _Layout) -> tuple[bytes, list[str]]:
-    """Blank the lines of words below the table: "End of data", "Mean,0.1,0.2"."""
+    """Blank the lines of words or nothing below the table: "End of data", "Mean,0.1,0.2", ",,"."""
     footers: list[str] = []
     end = len(body.rstrip())
     for _ in range(_FOOTER_LINES):
@@ -313,6 +340,8 @@ def _without_footers(body: bytes, layout: _Layout) -> tuple[bytes, list[str]]:
 
 def _is_footer(text: str, layout: _Layout) -> bool:
     cells = _split(text, layout.delimiter)
+    if not any(cell.strip() for cell in cells):
+        return True  # a spreadsheet's empty rows, of delimiters alone
     if not _FOOTER.match(text) or cells[0].strip() in _MISSING:
         return False
     numbers = [cell for cell in cells if CELL[layout.mark].fullmatch(cell)]
