@@ -36,8 +36,7 @@ def real_array(value: ArrayLike, name: str) -> FloatArray:
     ValidationError
         If the values are complex, truth values, text, dates or ragged.
     """
-    if np.ma.is_masked(value):
-        raise ValidationError(f"{name}: some values are masked; leave these rows out")
+    refuse_masked(value, name)
     try:
         array = np.asarray(value)
     except ValueError as exc:
@@ -50,6 +49,12 @@ def real_array(value: ArrayLike, name: str) -> FloatArray:
     if array.dtype.kind not in "fiu":
         raise ValidationError(f"{name}: expected real numbers, got dtype {array.dtype}")
     return array.astype(np.float64, copy=False)
+
+
+def refuse_masked(value: ArrayLike, name: str) -> None:
+    """Refuse an array of which numpy masks some values."""
+    if np.ma.is_masked(value):
+        raise ValidationError(f"{name}: some values are masked; leave these rows out")
 
 
 def finite_array(value: ArrayLike, name: str) -> FloatArray:

@@ -16,7 +16,7 @@ from dahl_ident.cli.console import in_options
         ),
         ("or lower min_share= if it is noise", "or lower --min-share if it is noise"),
         ("give frequency=1.25, or leave it out", "give --frequency 1.25, or leave it out"),
-        ("it: di.fit(record, model)", "it: dahl-ident fit"),
+        ("it: di.fit(record, model)", "it: dahl-ident fit --record"),
         ("a = b, x=", "a = b, --x"),
         (
             "Name it with columns={'gain': ...}",

@@ -594,6 +594,11 @@ class TestLvmStrictly:
         with pytest.raises(DataError, match="numbers behind a blank line"):
             self.read(tmp_path, head + "\n".join(blank) + "\n")
 
+    @pytest.mark.parametrize("count", ["6_4", "\u00b2", "1" * 30])
+    def test_what_is_no_number_of_samples(self, tmp_path: Path, count: str) -> None:
+        with pytest.raises(DataError, match="is no number of samples"):
+            self.read(tmp_path, self.text(self.rows()).replace("\t64\t64", f"\t{count}\t64"))
+
     @pytest.mark.parametrize("odd", ["1_000", "0x10", "1,5", "--"])
     def test_what_is_no_number(self, tmp_path: Path, odd: str) -> None:
         rows = self.rows()
@@ -680,7 +685,14 @@ class TestHostileFiles:
         assert "struct (struct<a: int64>) is not used" in repr(record)
 
     @pytest.mark.parametrize(
-        "content", ["[" * 100_000, '{"a": ' * 50_000, "1" * 10_000, '{"a": 1}']
+        "content",
+        [
+            "[" * 100_000,
+            '{"a": ' * 50_000,
+            "1" * 10_000,
+            '{"a": 1}',
+            '{"time [s]":[0,1],"x [m]":[0,1],"F [N]":[0,1],"F [N]":[1,2]}',
+        ],
     )
     def test_json_that_is_no_table(self, tmp_path: Path, content: str) -> None:
         (tmp_path / "a.json").write_text(content)
@@ -719,6 +731,14 @@ class TestDictionaries:
                 ("time", TIME, "s"), ("x", X, "m"), ("F", F, "N"))},
             {"columns": ["time [s]", "x [mm]", "F [kN]"], "data": cells()},
             [dict(zip(("time [s]", "x [mm]", "F [kN]"), row, strict=True)) for row in cells()],
+            [["time [s]", "x [mm]", "F [kN]"], *cells()],
+            {"columns": ["time", "x", "F"], "units": ["s", "mm", "kN"], "rows": cells()},
+            {"units": {"x": "mm", "F": "kN", "time": "s"},
+             "data": [dict(zip(("time", "x", "F"), row, strict=True)) for row in cells()]},
+            [{"name": n, "values": v, "unit": u} for n, v, u in (
+                ("time", TIME, "s"), ("x", X, "m"), ("F", F, "N"))],
+            {n: {str(i): row[k] for i, row in enumerate(cells())}  # as pandas writes it
+             for k, n in enumerate(("time [s]", "x [mm]", "F [kN]"))},
             [{"name": "x", "data": X, "fs": 128.0, "unit_str": "m"},
              {"name": "F", "data": F, "fs": 128, "unit_str": "N"}],
         ],
@@ -757,6 +777,7 @@ class TestDictionaries:
         ("change", "message"),
         [
             ({"fs": None}, "has fs = None and no time"),
+            ({"data": np.ma.array(range(64), mask=X < 0)}, "row 18, column 'x': the cell is empty"),
             ({"name": "F"}, "several channels are called F"),
             ({"time": [0.0, 1.0], "fs": None}, "64 values at 2 times"),
             ({"fs": 100.0}, "sampled at different times"),

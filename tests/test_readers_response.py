@@ -423,7 +423,7 @@ class TestSilentErrors:
         with pytest.warns(DataWarning, match="gain varies by 33% at 1 Hz, .* in radians"):
             read_frequency_response(self.table([9, 8, 7, 6], [0.1, 0.2, 0.3, 0.4]))
 
-    @pytest.mark.parametrize("code", [-9999.0, 9999.0, 1e30])
+    @pytest.mark.parametrize("code", [-9999.0, 9999.0, 1e30, -32768.0])
     def test_marks_of_missing_values(self, code: float) -> None:
         table = self.table([9, 8, 7, 6, 5], [5.0, 8.0, 9.0, 12.0, 13.0])
         table.loc[2, "phase_deg"] = code
@@ -438,6 +438,9 @@ class TestSilentErrors:
             FrequencyResponse([1.0, 1.0], [1j, 1j], masked)
         with pytest.raises(ValidationError, match="response: some values are masked"):
             FrequencyResponse([1.0, 1.0], np.ma.array([1j, 2j], mask=[True, False]), [1.0, 1.0])
+        runs = np.ma.array(["a", "b"], mask=[True, False])
+        with pytest.raises(ValidationError, match="run: some values are masked"):
+            FrequencyResponse([1.0, 1.0], [1j, 1j], [1.0, 1.0], run=runs)
 
     @pytest.mark.parametrize(("unit", "expected"), [("m/V", 0.5), ("mm/V", 0.5e-3), ("V/m", 2.0)])
     def test_gain_for_a_drive(self, unit: str, expected: float) -> None:

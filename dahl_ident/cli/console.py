@@ -68,7 +68,7 @@ def in_options(message: str) -> str:
 
     message = re.sub(r"columns=(\{(?:[^{}]|\{[^{}]*\})*\})", _column_map, message)
     message = re.sub(r"(?<![\w.(-])([a-z]+(?:_[a-z]+)*)=(True\b|['\"\w]?)", option, message)
-    return message.replace("di.fit(record, model)", "dahl-ident fit")
+    return message.replace("di.fit(record, model)", "dahl-ident fit --record")
 
 
 def _column_map(found: re.Match[str]) -> str:

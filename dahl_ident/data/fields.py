@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dahl_ident.arrays import FloatArray, finite_array, non_negative_array, real_array
+from dahl_ident.arrays import (
+    FloatArray,
+    finite_array,
+    non_negative_array,
+    real_array,
+    refuse_masked,
+)
 from dahl_ident.errors import ValidationError
 
 CONTROLLED = ("displacement", "force")
@@ -53,6 +59,7 @@ def column(
     """Return a checked read-only ``(n, *shape)`` array, or None for None."""
     if value is None:
         return None
+    refuse_masked(value, name)
     array = check(value, name)
     if array.shape != (n, *shape):
         raise ValidationError(
@@ -72,8 +79,6 @@ def spread(
 
 def complex_values(value: ArrayLike, name: str) -> NDArray[np.complex128]:
     """Return finite complex numbers."""
-    if np.ma.is_masked(value):
-        raise ValidationError(f"{name}: some values are masked; leave these rows out")
     array = np.asarray(value)
     if array.dtype.kind not in "cfiu":
         raise ValidationError(f"{name}: expected complex numbers, got dtype {array.dtype}")

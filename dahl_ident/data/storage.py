@@ -82,8 +82,7 @@ def refuse_existing(path: Path) -> None:
         raise DataError(f"{path} is a folder; give the path of a file in it")
     if path.exists():
         raise DataError(
-            f"{path}: the file exists already; give another name, or replace it with "
-            "overwrite=True (on the command line --overwrite)"
+            f"{path}: the file exists already; give another name, or replace it with overwrite=True"
         )
 
 

@@ -1,10 +1,11 @@
 """Columns by name: JSON, and the time series of SDyPy (its enhancement proposal 5).
 
-JSON may hold an object of columns, ``{"time [s]": [...], "x [mm]": [...]}``, whose units may
-stand beside them under ``"units"`` or in ``{"values": [...], "unit": "mm"}``; a list of rows,
-``[{"time [s]": 0.0, "x [mm]": 1.0}, ...]``; ``{"columns": [...], "data": [[...], ...]}`` as
-pandas writes it; or a list of channels with ``name``, ``data``, ``unit_str`` and either ``fs`` or
-``time``, as SDyPy has them.
+JSON may hold an object of columns, ``{"time [s]": [...], "x [mm]": [...]}``, or a list of them,
+``[{"name": "x", "values": [...], "unit": "mm"}, ...]``; a list of rows, ``[{"time [s]": 0.0,
+"x [mm]": 1.0}, ...]`` or ``[["time [s]", "x [mm]"], [0.0, 1.0], ...]``; ``{"columns": [...],
+"data": [[...], ...]}`` and ``{"x [mm]": {"0": 1.0, ...}}`` as pandas writes them; or a list of
+channels with ``name``, ``data``, ``unit_str`` and either ``fs`` or ``time``, as SDyPy has them.
+Units may stand in the names, in each column, or beside them all under ``"units"``.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
 _VALUES, _UNITS = ("values", "data"), ("unit", "unit_str", "units")
+_TABLES = ("channels", "signals", "columns", "data", "rows")
 
 
 def read_json(file: File) -> Source:
@@ -34,10 +36,20 @@ def read_json(file: File) -> Source:
         If it is no JSON, or holds neither columns nor rows nor channels.
     """
     try:
-        content = json.loads(utf8(file.data).decode("utf-8", "replace"))
+        text = utf8(file.data).decode("utf-8", "replace")
+        content = json.loads(text, object_pairs_hook=_without_repeated_names)
     except (ValueError, RecursionError) as exc:
         raise DataError(f"{file.name}: not a JSON file: {exc}") from exc
     return dictionary_source(content, file.name, "JSON", file.sha256)
+
+
+def _without_repeated_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"one object has the name {twice[:60]!r} twice")
+    return found
 
 
 def dictionary_source(
@@ -62,17 +74,23 @@ def is_channels(content: Any) -> bool:
     )
 
 
-def _channels(content: Any, name: str) -> Iterator[Channel]:
-    if is_channels(content):
+def _channels(content: Any, name: str, units: Any = None) -> Iterator[Channel]:
+    """Yield the columns; `units` are by their names, or in the order of a list of names."""
+    if is_channels(content) and any({"fs", "time"} & c.keys() for c in content):
         yield from _sdypy(content, name)
-    elif isinstance(content, list) and content and all(isinstance(r, dict) for r in content):
+    elif _is_list_of(dict, content) and all(_is_column(c) and "name" in c for c in content):
+        for column in content:
+            yield from _columns({str(column["name"]): column}, name, units)
+    elif _is_list_of(dict, content):
         keys = list(dict.fromkeys(key for row in content for key in row))
         if len(keys) > MOST_CHANNELS:
             raise DataError(f"{name}: {len(keys)} columns; at most {MOST_CHANNELS} are read")
-        for key in keys:
-            yield _channel(key, [row.get(key) for row in content], None, name)
+        columns = {key: [row.get(key) for row in content] for key in keys}
+        yield from _columns(columns, name, units)
+    elif _is_list_of(list, content) and all(isinstance(cell, str) for cell in content[0]):
+        yield from _columns(_upright(content[0], content[1:], name), name, units)
     elif isinstance(content, dict):
-        yield from _columns(content, name)
+        yield from _tables(content, name, units)
     else:
         raise DataError(
             f"{name}: found a {type(content).__name__}; expected an object of columns, a list of "
@@ -80,29 +98,60 @@ def _channels(content: Any, name: str) -> Iterator[Channel]:
         )
 
 
-def _columns(content: dict[str, Any], name: str) -> Iterator[Channel]:
-    if "columns" in content and isinstance(content.get("data"), list):
-        labels, rows = content["columns"], content["data"]
-        if not isinstance(labels, list) or any(
-            not isinstance(row, list) or len(row) != len(labels) for row in rows
-        ):
-            raise DataError(f"{name}: the rows of data differ in length from columns")
-        content = {str(k): [row[i] for row in rows] for i, k in enumerate(labels)} | {
-            "units": content.get("units", {})
-        }
-    for key in ("channels", "signals", "data"):
-        if isinstance(content.get(key), (list, dict)) and not _is_flat(content[key]):
-            yield from _channels(content[key], name)
+def _is_list_of(kind: type, content: Any) -> bool:
+    return isinstance(content, list) and bool(content) and all(isinstance(c, kind) for c in content)
+
+
+def _is_column(content: dict[str, Any]) -> bool:
+    return any(isinstance(content.get(key), list) for key in _VALUES)
+
+
+def _upright(labels: Any, rows: list[Any], name: str) -> dict[str, Any]:
+    """Return the columns of a list of rows."""
+    if not isinstance(labels, list) or any(
+        not isinstance(row, list) or len(row) != len(labels) for row in rows
+    ):
+        raise DataError(f"{name}: the rows of data differ in length from columns")
+    if len({str(label) for label in labels}) < len(labels):
+        raise DataError(f"{name}: several columns have one name in {listed(map(str, labels), 20)}")
+    return {str(label): [row[i] for row in rows] for i, label in enumerate(labels)}
+
+
+def _tables(content: dict[str, Any], name: str, units: Any) -> Iterator[Channel]:
+    """Yield the columns of an object, or of the table in it."""
+    units = content.get("units", units)
+    rows = next(
+        (content[key] for key in ("data", "rows") if _is_list_of(list, content.get(key))), None
+    )
+    if "columns" in content and rows is not None:
+        columns = _upright(content["columns"], rows, name)
+        if isinstance(units, list) and len(units) == len(columns):
+            units = dict(zip(columns, units, strict=True))
+        yield from _columns(columns, name, units)
+        return
+    for key in _TABLES:
+        table = content.get(key)
+        if isinstance(table, (list, dict)) and not _is_flat(table):
+            yield from _channels(table, name, units)
             return
-    given = content.get("units")
-    units = given if isinstance(given, dict) else {}
+    yield from _columns(content, name, units)
+
+
+def _columns(content: dict[str, Any], name: str, units: Any) -> Iterator[Channel]:
+    known = units if isinstance(units, dict) else {}
+    index: Any = None
     for key, value in content.items():
         if isinstance(value, dict) and any(v in value for v in _VALUES):
             values = next(value[v] for v in _VALUES if v in value)
-            unit = next((value[u] for u in _UNITS if u in value), None)
+            unit = next((value[u] for u in _UNITS if u in value), known.get(key))
             yield _channel(key, values, unit, name)
+        elif isinstance(value, dict) and value and all(row.isdecimal() for row in value):
+            index = index or value.keys()
+            if value.keys() != index:
+                raise DataError(f"{name}: column {key!r} has other rows than the columns before it")
+            yield _channel(key, [value[row] for row in index], known.get(key), name)
         elif isinstance(value, list):
-            yield _channel(key, value, units.get(key), name)
+            yield _channel(key, value, known.get(key), name)
 
 
 def _is_flat(value: Any) -> bool:
@@ -119,7 +168,9 @@ def _channel(key: Any, values: Any, unit: Any, name: str) -> Channel:
 def _array(values: Any, what: str) -> NDArray[Any]:
     """Return numbers, or text where some cell is none; None is an empty cell."""
     if isinstance(values, np.ndarray):
-        array: NDArray[Any] = np.ma.filled(values, np.nan) if np.ma.isMA(values) else values
+        array: NDArray[Any] = values
+        if np.ma.is_masked(values) and values.dtype.kind in "fiu":
+            array = np.ma.filled(np.ma.asarray(values, np.float64), np.nan)
         if array.ndim != 1 or array.dtype.kind not in "fiubU":
             raise DataError(f"{what} has the shape {array.shape}; expected a list of numbers")
         return array

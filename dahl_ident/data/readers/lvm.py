@@ -7,6 +7,7 @@ samples that its header says; a lost line would move all later samples in time.
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -140,17 +141,17 @@ def _number(file: File, line: int, cell: str, mark: str) -> float:
 
 def _check_samples(file: File, segment: dict[str, Any], rows: int) -> None:
     """Refuse a segment with fewer or more samples than its header says."""
-    for value in segment.get("Samples", []):
-        if value.strip().isdigit() and int(value) > rows:
-            raise DataError(
-                f"{file.name}: a segment has {rows} samples where its header says {value.strip()}; "
-                "the file looks cut off"
-            )
-    stated = [int(v) for v in segment.get("Samples", []) if v.strip().isdigit()]
-    if stated and max(stated) != rows:
+    stated = [value.strip() for value in segment.get("Samples", []) if value.strip()]
+    unread = [value for value in stated if not re.fullmatch("[0-9]{1,18}", value)]
+    if unread:
         raise DataError(
-            f"{file.name}: a segment has {rows} samples where its header says {max(stated)}; the "
-            "file is damaged"
+            f"{file.name}: the LVM file is damaged: {unread[0][:40]!r} is no number of samples"
+        )
+    most = max(map(int, stated), default=rows)
+    if most != rows:
+        raise DataError(
+            f"{file.name}: a segment has {rows} samples where its header says {most}; the file "
+            f"{'looks cut off' if rows < most else 'is damaged'}"
         )
 
 
@@ -182,8 +183,7 @@ def _of_channels(values: list[str], count: int, columns: str) -> list[str]:
 def _floats(values: list[str]) -> list[float]:
     found = []
     for value in values:
-        try:
-            found.append(float(value.strip().replace(",", ".")))
-        except ValueError:
-            continue
+        with contextlib.suppress(ValueError):
+            if "_" not in value:
+                found.append(float(value.strip().replace(",", ".")))
     return found
