@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -152,3 +153,13 @@ def test_a_fit_is_told_on_few_lines_and_wrapped(
     verdict = narrow[1 : narrow.index("Parameters")]
     assert max(map(len, verdict)) <= 60
     assert all(line.startswith("    ") for line in verdict)
+
+
+def test_patterns_name_files(run: Runner, tmp_path: Path) -> None:
+    """Quoted patterns, which some shells pass on as they are."""
+    for run_name in ("a", "b"):
+        table().select(run=run_name).save(tmp_path / f"day_{run_name}.csv")
+    outcome = run("fit", str(tmp_path / "day_*.csv"), "--runs", "c")
+    assert (outcome.status, "the data have a, b" in outcome.err) == (1, True)
+    outcome = run("fit", str(tmp_path / "none*"))
+    assert (outcome.status, "no file matches this pattern" in outcome.err) == (1, True)

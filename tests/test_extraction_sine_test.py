@@ -48,12 +48,13 @@ def strokes(seed: int) -> FloatArray:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize("kind", ["wide", "narrow", "strokes"])
+@pytest.mark.parametrize("kind", ["wide", "narrow", "strokes", "there and back"])
 def test_any_other_motion_is_refused_and_the_route_named(kind: str, seed: int) -> None:
     x = {
         "wide": lambda: random_motion(seed, 1.0, 5.0),
         "narrow": lambda: random_motion(seed, 2.0, 3.0),
         "strokes": lambda: strokes(seed),
+        "there and back": lambda: np.cumsum(np.clip(np.linspace(3, -3 - seed, 4000), -1, 1)) / RATE,
     }[kind]()
     with pytest.raises(ExtractionError, match=r"^not a sine test: ") as refused:
         extract(record(x))

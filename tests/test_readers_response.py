@@ -418,10 +418,14 @@ class TestSilentErrors:
     def test_one_phase_against_all_others(self) -> None:
         with pytest.warns(DataWarning, match="creates energy: row 2"):
             read_frequency_response(self.table([9, 8, 7, 6], [5.0, -8.0, 9.0, 12.0]))
+        with pytest.warns(DataWarning, match="creates energy: row 3"):
+            read_frequency_response(self.table([9, 8, 7], [5.0, 9.0, -8.0]))
 
     def test_small_radians_under_degrees(self) -> None:
         with pytest.warns(DataWarning, match="gain varies by 33% at 1 Hz, .* in radians"):
             read_frequency_response(self.table([9, 8, 7, 6], [0.1, 0.2, 0.3, 0.4]))
+        with pytest.warns(DataWarning, match="gain varies by 33% at 1 Hz, .* in radians"):
+            read_frequency_response(self.table([9, 8, 6], [0.1, 0.2, 0.3]))
 
     @pytest.mark.parametrize("code", [-9999.0, 9999.0, 1e30, -32768.0])
     def test_marks_of_missing_values(self, code: float) -> None:

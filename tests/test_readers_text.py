@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dahl_ident.data import FrequencyResponse, Record, read_frequency_response, read_record
+from dahl_ident.data import FrequencyResponse, Record, inspect, read_frequency_response, read_record
 from dahl_ident.errors import DataError, DataWarning, UnitError
 
 TIME, X, F = [0.0, 0.5, 1.0], [1e-3, 2.5e-3, -3e-3], [1000.0, 2000.0, 3500.0]
@@ -240,18 +240,25 @@ class TestUnusualTables:
             read_record(written(tmp_path, text))
 
     @pytest.mark.parametrize(
-        "stamp", ["2024-03-31T12:00:{:06.3f}", "2024-03-31 12:00:{:06.3f}Z", "12:00:{:06.3f}"]
-    )
+        "stamp", ["2024-03-31T12:00:{:06.3f}", "2024-03-31 12:00:{:06.3f}Z", "12:00:{:06.3f}",
+                  "2024-03-31T12:00:{:06.3f}+0200"]
+    )  # fmt: skip
     def test_time_stamps(self, tmp_path: Path, stamp: str) -> None:
         rows = [f"{stamp.format(t)},{i},{i}" for i, t in enumerate((58.5, 59.0, 59.75))]
         record = read_record(written(tmp_path, "\n".join(["time,x [mm],F [N]", *rows])))
         np.testing.assert_allclose(record.time, [0.0, 0.5, 1.25], atol=1e-9)
         assert "time counted from the stamp" in repr(record)
+        proposal = written(tmp_path, inspect(tmp_path / "run.csv").column_map, "map.toml")
+        assert read_record(tmp_path / "run.csv", columns=proposal).n == 3
 
     def test_time_stamps_that_are_none(self, tmp_path: Path) -> None:
         text = "time,x [mm],F [N]\n12:00:01,1,1\n12:00:61,1,1\n"
         with pytest.raises(DataError, match="line 3, column 'time': '12:00:61' is no time stamp"):
             read_record(written(tmp_path, text))
+        zones = (
+            "timestamp,x [mm],F [N]\n2024-03-31T01:59:59+01:00,1,1\n2024-03-31T03:00:00+02:00,2,2\n"
+        )
+        assert read_record(written(tmp_path, zones)).time.tolist() == [0.0, 1.0]
 
     @pytest.mark.parametrize(
         "footer",
@@ -292,9 +299,14 @@ class TestUnusualTables:
         for good in (force, np.sign(force), np.clip(3.0 * force, -1.0, 1.0), np.round(force, 1)):
             assert read_record(written(tmp_path, text(good))).n == 400
         force[115:135] = force[115]
-        with pytest.warns(DataWarning, match=r"jumps, from line 117 \(1 such places\)"):
+        with pytest.warns(DataWarning, match=r"goes on, from line 117 \(1 such places\)"):
             record = read_record(written(tmp_path, text(force)))
         assert "the force repeats one value" in repr(record)
+        noisy = np.cos(2 * np.pi * t) + 0.05 * np.random.default_rng(0).standard_normal(t.size)
+        for place in (110, 250, 390):
+            noisy[place : place + 10] = noisy[place]
+        with pytest.warns(DataWarning, match=r"goes on, from line 112 \(3 such places\)"):
+            read_record(written(tmp_path, text(noisy)))
 
     def test_a_line_of_brackets_takes_linear_time(self, tmp_path: Path) -> None:
         start = time.process_time()

@@ -20,11 +20,18 @@ STANDARD = "-"
 _READING = "Reading"
 
 
-def _existing(files: list[str]) -> list[str]:
-    """Refuse files that do not exist, before heavy libraries are loaded."""
-    for file in files:
-        if file != STANDARD and not Path(file).exists() and not glob.has_magic(file):
-            raise DataError(f"{file}: the file cannot be read: No such file or directory")
+def _existing(patterns: list[str]) -> list[str]:
+    """Return the files of all patterns; refuse absent ones before heavy libraries are loaded."""
+    files: list[str] = []
+    for pattern in patterns:
+        if pattern == STANDARD or Path(pattern).exists():
+            files.append(pattern)
+        elif glob.has_magic(pattern):
+            from dahl_ident.extraction.sources import matching
+
+            files += matching(pattern)
+        else:
+            raise DataError(f"{pattern}: the file cannot be read: No such file or directory")
     return files
 
 
@@ -57,7 +64,7 @@ def _is_range(text: str | None) -> str | None:
 
 Files = Annotated[
     list[str],
-    typer.Argument(help="Files to read; - is standard input.", callback=_existing),
+    typer.Argument(help="Files to read, or patterns; - is standard input.", callback=_existing),
 ]
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
 

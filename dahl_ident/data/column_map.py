@@ -51,7 +51,7 @@ from dahl_ident.units import (
 _SHOWN = 10  # rows that a warning names
 # Names under which a column is found without a map.
 RECORD_NAMES: dict[str, tuple[str, ...]] = {
-    "time": ("time", "t", "time_s"),
+    "time": ("time", "t", "time_s", "timestamp"),
     "displacement": ("displacement", "disp", "position", "x"),
     "velocity": ("velocity", "vel", "v"),
     "acceleration": ("acceleration", "accel", "acc", "a"),

@@ -23,8 +23,9 @@ Doubt = Callable[[NDArray[np.bool_], str], None]
 _SIGNIFICANT = 0.00135  # one-sided; three standard deviations of a normal distribution
 _ASSUMED_ERROR = 0.1  # of the gain, where no covariance is known
 _MISMATCH = 0.1
-_FEWEST_ROWS, _FEW_ROWS = 4, 0.26  # rows to compare, and the share of them that may be wrong
+_FEWEST_ROWS, _FEW_ROWS = 3, 0.26  # rows to compare, and the share of them that may be wrong
 _STUCK_SAMPLES, _STUCK_TRAVEL = 8, 0.02  # samples of one value, and share of the motion's range
+_SELDOM, _MOSTLY = 0.01, 0.5  # shares of a signal that repeats no value, and of one that holds it
 _SMALL_PHASE = 0.1  # rad, for a gain that falls to nothing
 
 
@@ -103,7 +104,7 @@ def _against_the_others(part: FrequencyResponse) -> NDArray[np.bool_]:
     """Return the rows whose phase is as large as that of nearly all others, with opposite sign."""
     sine = part.response.imag / part.gain
     against = sine < 0.0
-    if part.n < _FEWEST_ROWS or against.mean() > _FEW_ROWS:
+    if part.n < _FEWEST_ROWS or against.sum() > max(1.0, _FEW_ROWS * part.n):
         return np.zeros(part.n, dtype=bool)
     return np.asarray(sine < -0.5 * np.median(sine[~against]))
 
@@ -131,25 +132,32 @@ def check_phase_size(data: FrequencyResponse, doubt: Doubt) -> None:
 
 
 def stuck_samples(motion: FloatArray, force: FloatArray) -> NDArray[np.intp]:
-    """Return where the force stays at one value while the motion continues, and then jumps.
+    """Return where the force stays at one value while the motion continues.
 
-    This is typical of a converter that sticks. Dry friction and a coarse converter also keep a
-    value, but leave it by no more than their usual steps.
+    Dry friction and a coarse converter keep a value as well, but leave it by no more than their
+    usual steps. A converter that sticks jumps afterwards; or it keeps a value within the range of
+    a signal that else hardly ever repeats one, because of its noise.
     """
     if force.size < 2 or force.size != motion.size:
         return np.zeros(0, dtype=np.intp)
     same = np.concatenate([[False], np.diff(force) == 0.0, [False]]).view(np.int8)
     starts, stops = np.flatnonzero(np.diff(same) == 1), np.flatnonzero(np.diff(same) == -1)
-    inside = (stops - starts >= _STUCK_SAMPLES) & (stops + 1 < force.size)
-    starts, stops = starts[inside], stops[inside]
+    long = stops - starts >= _STUCK_SAMPLES
+    starts, stops = starts[long], stops[long]
     travel = np.abs(motion[[(starts + stops) // 2, stops]] - motion[starts]).max(axis=0)
     moved = travel > _STUCK_TRAVEL * np.ptp(motion)
     starts, stops = starts[moved], stops[moved]
-    if not starts.size:
-        return np.asarray(starts)
     steps = np.abs(np.diff(force))
+    if not starts.size or not steps.any():
+        return np.zeros(0, dtype=np.intp)
     usual = np.quantile(steps[steps > 0.0], 0.95)
-    return np.asarray(starts[np.abs(force[stops + 1] - force[stops]) > 5.0 * usual])
+    jumps = np.append(steps, 0.0)[stops] > 5.0 * usual
+    held, repeated = np.sum(stops - starts), np.sum(steps == 0.0)
+    if repeated - held < _SELDOM * force.size and held < _MOSTLY * force.size:
+        value, place, count = np.unique(force[starts], return_index=True, return_counts=True)
+        once = (count == 1) & (value > force.min()) & (value < force.max())
+        jumps[place[once]] = True
+    return np.asarray(starts[jumps])
 
 
 def creates_energy(loss: FloatArray, std: FloatArray, dof: FloatArray) -> NDArray[np.bool_]:

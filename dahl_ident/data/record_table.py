@@ -17,7 +17,10 @@ from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS, si_unit
 
-_STAMP = re.compile(r"\s*(?P<date>\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d{1,9})?Z?")
+_STAMP = re.compile(
+    r"\s*(?P<stamp>(?P<date>\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)"
+    r"(?:Z|(?P<sign>[-+])(?P<hours>\d\d):?(?P<minutes>\d\d))?\s*"
+)
 _DRIVE_UNITS: dict[str, DriveUnit] = {"voltage": "V", "current": "A"}
 
 
@@ -71,8 +74,8 @@ def record_from(
     if stuck.size:
         first = f"{bound.source.row_name(int(stuck[0]))} ({stuck.size} such places)"
         bound.doubt(
-            "the force repeats one value while the motion goes on, and then jumps, from "
-            f"{first}: does a converter stick?"
+            f"the force repeats one value while the motion goes on, from {first}: does a "
+            "converter stick?"
         )
     try:
         return Record(**values, motion=bound.motion(), provenance=bound.provenance())
@@ -117,7 +120,7 @@ def _numeric(channel: Channel) -> FloatArray:
 
 def _samples(bound: Binding, role: str, channel: Channel) -> FloatArray:
     """Return SI samples; for a drive in V or A, volts or amperes."""
-    if role == "time" and channel.kind == "U" and _STAMP.match(str(channel.values.flat[0])):
+    if role == "time" and is_stamped(channel):
         return _seconds(bound, channel)
     values = bound.numbers(role, channel)
     unit = bound.unit(role, channel)
@@ -136,22 +139,30 @@ def _samples(bound: Binding, role: str, channel: Channel) -> FloatArray:
     return samples
 
 
+def is_stamped(channel: Channel) -> bool:
+    """Return whether a channel holds time stamps, which need no unit."""
+    return channel.kind == "U" and _STAMP.match(str(channel.values.flat[0])) is not None
+
+
 def _seconds(bound: Binding, channel: Channel) -> FloatArray:
     """Return the time since the first stamp: ISO 8601, or times of one day."""
     nanoseconds = np.empty(channel.size, dtype=np.int64)
     for i, cell in enumerate(channel.values.flat):
-        text = str(cell).strip().removesuffix("Z")
-        found = _STAMP.fullmatch(text)
-        stamp = "" if found is None else text if found["date"] else f"1970-01-01T{text}"
+        found = _STAMP.fullmatch(str(cell))
+        text = "" if found is None else found["stamp"]
+        stamp = text if found is None or found["date"] else f"1970-01-01T{text}"
         moment: Any = np.datetime64("NaT")
         with contextlib.suppress(ValueError):
             moment = np.datetime64(stamp.replace(" ", "T").replace(",", "."), "ns")
-        if np.isnat(moment):
+        if found is None or np.isnat(moment):
             raise DataError(
                 f"{bound.source.where(channel, i)}: {str(cell)[:40]!r} is no time stamp such as "
                 "2024-03-31T12:00:00.5 or 12:00:00.5"
             )
         nanoseconds[i] = moment.astype(np.int64)
+        if found["sign"]:  # local time, ahead of UTC by so much
+            ahead = (60 * int(found["hours"]) + int(found["minutes"])) * 60_000_000_000
+            nanoseconds[i] -= -ahead if found["sign"] == "-" else ahead
     time = np.asarray((nanoseconds - nanoseconds[0]) * 1e-9)
     _require_increasing(bound.source, channel, time)
     bound.notes.append(f"time counted from the stamp {str(channel.values.flat[0]).strip()}")

@@ -45,9 +45,9 @@ def not_a_sine_test(motion: FloatArray, runs: Sequence[Cycles], covered: float) 
     unlike = period > _PERIOD_CHANGE or amplitude > _AMPLITUDE_CHANGE
     if pairs >= _FEWEST_PAIRS and not unlike:
         return ""
-    line = _strongest_share(motion)
+    line, turns = _strongest_line(motion)
     in_noise = pairs >= _FEWEST_PAIRS and (covered > 0.0 or noise > _NOISY)
-    if line > (_SINE_IN_NOISE if in_noise else _ONE_LINE):
+    if line > (_SINE_IN_NOISE if in_noise else _ONE_LINE) and turns > 1:
         return ""
     power = f"its strongest line has {100.0 * line:.2g} % of the power"
     if pairs < _FEWEST_PAIRS:
@@ -86,12 +86,15 @@ def _median(values: FloatArray, weights: FloatArray) -> float:
     return float(values[order][np.searchsorted(below, 0.5 * below[-1])])
 
 
-def _strongest_share(motion: FloatArray) -> float:
-    """Return the share of the power near the strongest line of the middle of the record."""
+def _strongest_line(motion: FloatArray) -> tuple[float, int]:
+    """Return the share of the power near the strongest line, and its periods in what is seen.
+
+    The middle of the record is seen; a drift from its start to its end is the first line.
+    """
     start = max(0, (motion.size - _SPECTRUM_OF) // 2)
     part = motion[start : start + _SPECTRUM_OF]
     power = np.abs(np.fft.rfft(part - part.mean())[1:]) ** 2
     total = float(power.sum())
     strongest = int(np.argmax(power))
     near = power[max(strongest - _BESIDE, 0) : strongest + _BESIDE + 1]
-    return float(near.sum()) / total if total else 1.0
+    return (float(near.sum()) / total if total else 1.0), strongest + 1

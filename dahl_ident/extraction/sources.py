@@ -233,7 +233,7 @@ def _named(records: Records) -> list[tuple[str | None, Record | PathLike]]:
             named.append((str(name), found[0]))
     elif isinstance(records, str | Path):
         found = _files(records)
-        if found == [records]:
+        if found == [str(records)]:
             return [(None, records)]
         named = list(zip(_labels(found), found, strict=True))
     else:
@@ -245,19 +245,24 @@ def _named(records: Records) -> list[tuple[str | None, Record | PathLike]]:
 
 
 def _files(source: Record | PathLike) -> list[Record | PathLike]:
-    """Return a record or a file by itself, or the files that a pattern matches, in order."""
+    """Return a record by itself, or the files that a path or pattern names."""
     if isinstance(source, Record):
         return [source]
     if not isinstance(source, str | Path):
         raise ValidationError(
             f"records holds a {type(source).__name__}; expected records, paths or patterns"
         )
-    if not _PATTERN.search(str(source)) or Path(source).exists():
-        return [source]
-    found = sorted(glob(str(source), recursive=True))  # noqa: PTH207 # may be absolute
+    return [*matching(str(source))]
+
+
+def matching(pattern: str) -> list[str]:
+    """Return the files that a pattern matches, in order; a path without one by itself."""
+    if not _PATTERN.search(pattern) or Path(pattern).exists():
+        return [pattern]
+    found = sorted(glob(pattern, recursive=True))  # noqa: PTH207 # may be absolute
     if not found:
-        raise DataError(f"{source}: no file matches this pattern")
-    return list(found)
+        raise DataError(f"{pattern}: no file matches this pattern")
+    return found
 
 
 def _labels(sources: Sequence[Record | PathLike]) -> list[str]:

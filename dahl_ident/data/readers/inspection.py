@@ -13,6 +13,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.data.column_map import RECORD_NAMES, RESPONSE_NAMES
 from dahl_ident.data.raw_columns import Channel, Source, plain
 from dahl_ident.data.record import gaps, is_even, sample_rate
+from dahl_ident.data.record_table import is_stamped
 from dahl_ident.data.tabular import as_html, as_text, extent, listed
 from dahl_ident.errors import UnitError
 from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS, QUANTITIES, kind_of, parse_unit
@@ -211,7 +212,7 @@ def _of_kind(channel: Channel, kinds: tuple[str, ...]) -> bool:
 def _entry(role: str, path: str, channel: Channel) -> Iterator[str]:
     yield f"[{role}]"
     yield f"column = {json.dumps(path, ensure_ascii=False)}"
-    if role in _NO_UNIT:
+    if role in _NO_UNIT or (role == "time" and is_stamped(channel)):
         return
     unit = channel.unit or channel.unit_in_name
     if unit is None:
