@@ -83,7 +83,7 @@ def test_what_is_no_record_and_what_is_not_there(folder: Path) -> None:
     with pytest.raises(ValidationError, match=r"records\['a'\] names 3 files"):
         extract({"a": str(folder / "*.csv")})
     (folder / "noise.csv").write_text("t [s],x [m],F [N]\n" + "0,0,0\n1,1,1\n")
-    with pytest.raises(ExtractionError, match=r"noise\.csv: no segment"):
+    with pytest.raises(ExtractionError, match=r"noise\.csv: not a sine test"):
         extract([folder / "low.csv", folder / "noise.csv"])
     with pytest.raises(ValidationError, match="jobs is 0"):
         extract(record(1e-3), jobs=0)

@@ -51,7 +51,7 @@ def not_a_sine_test(motion: FloatArray, runs: Sequence[Cycles], covered: float) 
         return ""
     power = f"its strongest line has {100.0 * line:.2g} % of the power"
     if pairs < _FEWEST_PAIRS:
-        return f"not a sine test: the motion has no consecutive cycles, and {power}"
+        return f"not a sine test: the motion has no two consecutive cycles, and {power}"
     return (
         f"not a sine test: neighbouring cycles of the motion differ by {100.0 * period:.2g} % in "
         f"period and {100.0 * amplitude:.2g} % in amplitude (median), and {power}"
