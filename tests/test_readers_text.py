@@ -318,7 +318,8 @@ class TestUnusualTables:
 
     def test_damaged_comments_of_this_package(self, tmp_path: Path) -> None:
         for comment in ("[" * 100_000, '{"quality": 3}', '{"text": [1]}', '{"drive_factor": "x"}',
-                        '{"unknown": 1}'):  # fmt: skip
+                        '{"unknown": 1}', '{"provenance": {"warnings": 5}}',
+                        '{"provenance": {"parts": [{"notes": [1]}]}}'):  # fmt: skip
             with pytest.raises(DataError, match="line 1: the comment after 'dahl_ident:'"):
                 read_record(written(tmp_path, f"# dahl_ident: {comment}\n{PLAIN}"))
 

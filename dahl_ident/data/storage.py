@@ -160,13 +160,14 @@ def read_metadata(text: Any) -> dict[str, Any]:
     """
     try:
         content = json.loads(text)
+        known = isinstance(content, dict) and all(
+            _KNOWN_METADATA.get(key, lambda _: False)(value) for key, value in content.items()
+        )
     except (RecursionError, TypeError) as exc:
         raise ValueError("the comment of this package is no JSON text") from exc
-    if not isinstance(content, dict) or not all(
-        _KNOWN_METADATA.get(key, lambda _: False)(value) for key, value in content.items()
-    ):
+    if not known:
         raise ValueError("the comment of this package holds something else than it wrote")
-    return content
+    return dict(content)
 
 
 def _is_words(value: Any) -> bool:
@@ -174,13 +175,23 @@ def _is_words(value: Any) -> bool:
 
 
 def _is_number(value: Any) -> bool:
-    return value is None or (isinstance(value, (int, float)) and 0 <= value < 1e90)
+    return value is None or (type(value) in (int, float) and 0 <= value < 1e90)
+
+
+def _is_provenance(value: Any) -> bool:
+    """Return whether a value is the provenance of data, or of what they were made from."""
+    return isinstance(value, dict) and (
+        all(_is_words(value[key]) for key in ("notes", "warnings") if key in value)
+        and isinstance(value.get("parts", []), list)
+        and all(_is_provenance(part) for part in value.get("parts", []))
+        and (value.get("origin") is None or _is_provenance(value["origin"]))
+    )
 
 
 _KNOWN_METADATA: dict[str, Callable[[Any], bool]] = {
     "quality": lambda v: isinstance(v, dict) and set(map(str, v.values())) <= set("biufU"),
     "text": _is_words,
-    "provenance": lambda v: v is None or isinstance(v, dict),
+    "provenance": lambda v: v is None or _is_provenance(v),
     "drive_factor": _is_number,
     "drive_factor_uncertainty": _is_number,
 }

@@ -51,7 +51,8 @@ def not_a_sine_test(motion: FloatArray, runs: Sequence[Cycles], covered: float) 
         return ""
     power = f"its strongest line has {100.0 * line:.2g} % of the power"
     if pairs < _FEWEST_PAIRS:
-        return f"not a sine test: the motion has no two consecutive cycles, and {power}"
+        short = ", or a record too short for one" if turns < _FEWEST_PAIRS else ""
+        return f"not a sine test{short}: the motion has no two consecutive cycles, and {power}"
     return (
         f"not a sine test: neighbouring cycles of the motion differ by {100.0 * period:.2g} % in "
         f"period and {100.0 * amplitude:.2g} % in amplitude (median), and {power}"
@@ -97,4 +98,4 @@ def _strongest_line(motion: FloatArray) -> tuple[float, int]:
     total = float(power.sum())
     strongest = int(np.argmax(power))
     near = power[max(strongest - _BESIDE, 0) : strongest + _BESIDE + 1]
-    return (float(near.sum()) / total if total else 1.0), strongest + 1
+    return (float(near.sum()) / total, strongest + 1) if total else (1.0, motion.size)
