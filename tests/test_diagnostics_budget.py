@@ -80,7 +80,7 @@ class TestVariances:
         assert few.Z[1].ndim == 1
         one, other = Contrasts(dense).at(np.array(variances)), Columns(few).at(np.array(variances))
         for a, b in zip(one, other, strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=1e-9, atol=1e-9)
         s = np.array(variances)
         G, turned = (Projection(m, s).generalised_inverse() @ m.y for m in (dense, few))
         np.testing.assert_allclose(G, turned, rtol=1e-9)

@@ -207,6 +207,10 @@ class TestMany:
         assert list(frame) == columns.split()
         np.testing.assert_array_equal(frame["sigma"], many.values[:, 1])
         np.testing.assert_array_equal(frame["sigma_stderr_noise"], many.stderr_noise[:, 1])
+        combined = many.to_frame(combined=True)
+        own = [fit(one, Dahl()).params["sigma"] for one in many.tables]
+        np.testing.assert_allclose(combined["sigma_estimate"], [p.value for p in own], rtol=1e-4)
+        np.testing.assert_allclose(combined["sigma_stderr"], [p.stderr for p in own], rtol=1e-3)
         assert repr(many) == "<FitBatch: 3 tables, free f_max, sigma; 3 converged>"
 
     def test_tables_must_agree(self) -> None:

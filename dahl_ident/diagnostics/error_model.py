@@ -28,7 +28,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.error_sources import (
@@ -52,6 +51,7 @@ from dahl_ident.diagnostics.variance_components import (
     LinearModel,
     Projection,
     VarianceComponents,
+    block_diagonal,
     likelihood,
     variance_components,
 )
@@ -406,12 +406,12 @@ def linear_model(
     """Return residuals of data and priors with the sources' columns, compressed if many."""
     m, extra = problem.n_residuals, len(y) - problem.n_residuals
     known = np.concatenate([np.full(m, float(problem.scale_known)), np.ones(extra)])
-    Z = [s.columns if s.columns.ndim < 3 else linalg.block_diag(*s.columns) for s in sources]
+    Z = [s.columns if s.columns.ndim < 3 else block_diagonal(s.columns) for s in sources]
     Z = [np.concatenate([z, np.zeros((extra, *z.shape[1:]))]) for z in Z]
     linear = LinearModel(y, J, known, Z)
     of_rows = [k for k, s in enumerate(sources) if s.columns.ndim == 3]
     alike = all(np.array_equal(z[0:m:2], z[1:m:2]) for z in Z if z.ndim == 1)
-    if len(of_rows) == 1 and alike:
+    if m > _FEW_ROWS and len(of_rows) == 1 and alike:
         return linear.turned(m, of_rows[0])
     return linear.compressed(m) if m > 2 * _FEW_ROWS else linear
 

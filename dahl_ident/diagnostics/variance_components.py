@@ -103,7 +103,7 @@ class LinearModel:
         Z[source] = np.concatenate(
             [np.column_stack([size, 0.0 * size]).ravel(), self.known[rows:] * 0.0]
         )
-        rotation = linalg.block_diag(*turn.swapaxes(1, 2))
+        rotation = block_diagonal(turn.swapaxes(1, 2))
         return replace(self, y=turned(self.y), J=turned(self.J), Z=Z, rotation=rotation)
 
     def outside_variance(self, variances: FloatArray) -> float:
@@ -164,6 +164,14 @@ class Projection:
     def generalised_inverse(self) -> FloatArray:
         """Return G = (J' V^-1 J)^-1 J' V^-1, shape (P, m)."""
         return np.asarray(linalg.solve_triangular(self._R, self._explained))
+
+
+def block_diagonal(blocks: FloatArray) -> FloatArray:
+    """Return the matrix (n i, n j) of blocks (n, i, j)."""
+    n, i, j = blocks.shape
+    found = np.zeros((n, i, n, j))
+    found[np.arange(n), :, np.arange(n)] = blocks
+    return found.reshape(n * i, n * j)
 
 
 class State(NamedTuple):
