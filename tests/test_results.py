@@ -210,7 +210,9 @@ class TestMany:
         combined = many.to_frame(combined=True)
         own = [fit(one, Dahl()).params["sigma"] for one in many.tables]
         np.testing.assert_allclose(combined["sigma_estimate"], [p.value for p in own], rtol=1e-4)
-        np.testing.assert_allclose(combined["sigma_stderr"], [p.stderr or 0.0 for p in own], rtol=1e-3)
+        np.testing.assert_allclose(
+            combined["sigma_stderr"], [p.stderr or 0.0 for p in own], rtol=1e-3
+        )
         assert repr(many) == "<FitBatch: 3 tables, free f_max, sigma; 3 converged>"
 
     def test_tables_must_agree(self) -> None:
