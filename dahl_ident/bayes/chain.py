@@ -19,9 +19,9 @@ from dahl_ident.bayes.decorrelation import Decorrelation
 from dahl_ident.bayes.moves import moves_for
 from dahl_ident.bayes.priors import JointPrior
 
-_FIRST_CHECK = 200
-_GROWTH = 1.25
-_ROUND = 50
+_FIRST_CHECK = 200  # steps: three times WARM_UP and LENGTH at an autocorrelation time of 1
+_GROWTH = 1.25  # from check to check: at most a quarter more steps than are needed
+_ROUND = 50  # steps: checks are at round numbers
 _PIECE = 50  # steps between two calls of the listener, at least
 _PIECES = 20  # one piece adds at most this fraction of the chain
 

@@ -34,7 +34,7 @@ from dahl_ident.elements.description import describe_model
 from dahl_ident.errors import ModelError, SamplingError
 
 FORMAT = "dahl_ident chain"
-VERSION = 1
+VERSION = 1  # of the layout of the file; files of other layouts are refused
 _SHARE = 20.0  # ratio of the time spent sampling to the time spent writing
 
 Identity = Mapping[str, str]

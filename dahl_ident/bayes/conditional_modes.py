@@ -22,7 +22,7 @@ from dahl_ident.bayes.density import Density
 from dahl_ident.problem import Problem
 from dahl_ident.sensors import Sensors
 
-_STEPS = 25
+_STEPS = 25  # at most; a mode that is not found by then is the best point so far
 _NEAR = 0.1  # length of a step, in standard deviations, at which the mode is near enough
 _DAMPING = (1e-3, 0.2, 8.0)  # first; factors after a success and after a failure
 _SLOPE = 1e-4  # of a search coordinate, for slopes of the decorrelation

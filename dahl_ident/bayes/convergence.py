@@ -15,10 +15,10 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 
-WINDOW = 5.0
+WINDOW = 5.0  # times tau, of Sokal's window: shorter cuts tau off, longer adds noise; as in emcee
 WARM_UP = 10.0  # autocorrelation times until the chain is independent of its start
 LENGTH = 50.0  # autocorrelation times needed for a reliable estimate of tau
-R_HAT = 1.01
+R_HAT = 1.01  # as Vehtari et al. (2021) recommend; the older 1.1 passes chains that differ
 
 
 @dataclass(frozen=True)

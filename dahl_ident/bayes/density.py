@@ -29,7 +29,7 @@ from dahl_ident.problem import Problem
 
 LIKELIHOODS = ("gaussian", "student_t", "none")
 SCALE = "noise_scale"
-TAIL_DOF = 4.0
+TAIL_DOF = 4.0  # of Student's t: heavy tails for outliers, yet a finite variance
 _FARTHEST = 300.0  # of ln s
 
 

@@ -32,7 +32,7 @@ Proposal = Callable[[FloatArray, FloatArray, Random], tuple[FloatArray, FloatArr
 _JITTER = 1e-5  # relative, of the step: keeps walkers off a lattice
 _JUMP = 0.1  # part of the steps that go all the way
 _TAIL = 2.0  # degrees of freedom of the independent proposals: few, to reach far tails
-_SNOOKER = 1.7
+_SNOOKER = 1.7  # mean of the factors of ter Braak and Vrugt (2008), as in emcee
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from scipy.special import gammaincc, gammainccinv, gammaln
 from dahl_ident.arrays import FloatArray
 
 _ATOMS = 256  # groups of similar S that represent all points in quantiles
-_BISECTIONS = 50
+BISECTIONS = 50  # to rounding: 2^-50 of a bracket
 
 
 def ln_scale_draws(squares: FloatArray, rows: int, random: np.random.Generator) -> FloatArray:
@@ -56,7 +56,7 @@ class ScalePosterior:
         # a quantile of the mixture lies between the same of the parts of least and largest S
         alone = -0.5 * np.log(gammainccinv(self.rows, probabilities))
         low, high = (alone + 0.5 * np.log(0.5 * S) for S in (squares.min(), squares.max()))
-        for _ in range(_BISECTIONS):
+        for _ in range(BISECTIONS):
             ln_s = 0.5 * (low + high)
             below = gammaincc(self.rows, 0.5 * squares * np.exp(-2.0 * ln_s)[:, None]) @ weights
             under = below < probabilities

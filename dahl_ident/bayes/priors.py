@@ -32,8 +32,8 @@ from dahl_ident.elements import Parameter
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.problem import Problem
 
-_DECADES = 1e5
-_WIDER = 10.0
+_DECADES = 1e5  # beyond the data's sizes, either way: as data far from the knee leave open
+_WIDER = 10.0  # a gain that is farther from 1 is a mistake; times an estimate, for its bounds
 _BEYOND = 5.0  # times a declared range that a default prior reaches beyond it
 _RESONANCE = 1e3  # factor by which the parts of a plant may exceed their sum
 _TAIL = 1e-10  # of a distribution of unbounded support that lies beyond its `limits`

@@ -30,12 +30,12 @@ from scipy.special import logsumexp
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.lattice import Box, Lattice, LogDensity, Slicer
+from dahl_ident.bayes.noise_scale import BISECTIONS
 
-POINTS = 9
+POINTS = 9  # of a panel: smooth densities take few panels, narrow ones not many useless nodes
 _FIRST = 2.0  # standard deviations from the centre to the first wall
-_GROWTH = 2.5
+_GROWTH = 2.5  # from wall to wall outwards: few panels, and none far wider than the density within
 _FARTHEST = 40.0  # below the peak's logarithm, where panels end
-_BISECTIONS = 50
 _STEP = {0: 1.0, 1: 0.5, 2: 0.75}  # of the lattice, by its axes
 _FINER, _REFINEMENTS = 0.6, 5  # by which an axis is refined until its error is small enough
 _LATTICE_SHARE = 0.3  # of the tolerance
@@ -133,7 +133,7 @@ class Marginal:
         panel = np.searchsorted(self._below[1:-1], probabilities)
         rest = probabilities - self._below[panel]
         low, high = self.low[panel], self.high[panel]
-        for _ in range(_BISECTIONS):
+        for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)
             under = self._within(panel, middle) < rest
             low, high = np.where(under, middle, low), np.where(under, high, middle)

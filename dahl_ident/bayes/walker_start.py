@@ -21,11 +21,11 @@ from dahl_ident.fitting import Optimum, solve
 from dahl_ident.problem import Problem
 from dahl_ident.sensors import Sensors
 
-_WIDER = 2.0
-_TRIES = 60
+_WIDER = 2.0  # times the posterior's spread: R-hat needs starts wider than the posterior
+_TRIES = 60  # each 0.8 as wide as the last: in the end a millionth of the posterior
 _INSIDE = 1e-3  # of the prior's width, kept from its ends
-_PRIOR_DRAWS = 4096
-_POSITIONS = 5
+_PRIOR_DRAWS = 4096  # 98 % find a region that holds 1e-3 of the prior
+_POSITIONS = 5  # of the offending parameter, each of which takes a fit of the others
 _EXACT = 1e-13  # relative noise below which a fit is exact to rounding
 
 

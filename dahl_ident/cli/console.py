@@ -23,11 +23,11 @@ from dahl_ident.cli.options import STANDARD
 if TYPE_CHECKING:
     from rich.console import Console
 
-BAD_INPUT = 1
-WRONG_USE = 2
-NOT_TRUSTED = 3
-_NARROWEST = 40
-INTERRUPTED = 130
+BAD_INPUT = 1  # exit status, as are the others; the one of any uncaught error
+WRONG_USE = 2  # as click has it for unknown options
+NOT_TRUSTED = 3  # the first that is free
+_NARROWEST = 40  # columns; in narrower windows indented lines would hold a word or two
+INTERRUPTED = 130  # as shells have it: 128 and the number of SIGINT
 
 
 @dataclass

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from dahl_ident.results.result import Result
 
 _ESTIMATING = "Estimating"
-_LEVEL = 0.9545
 _TAKEN = ("model", "free", "fixed", "start")  # by a fit of records
 ReportPlace = Annotated[
     str | None,
@@ -212,7 +211,9 @@ def write_report_beside(
 
 def as_json(result: FitResult) -> dict[str, Any]:
     """Return a fit as plain data."""
-    limits = result.conf_interval().at(_LEVEL)
+    from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
+
+    limits = result.conf_interval().at(CONFIDENCE)
     return {
         "status": str(result.status),
         "trusted": result.trusted,

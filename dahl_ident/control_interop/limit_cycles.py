@@ -33,15 +33,15 @@ from dahl_ident.elements.element import Element, Model, as_model
 from dahl_ident.elements.linear_system import LinearSystem, check_system
 from dahl_ident.errors import ModelError, ValidationError
 
-_AMPLITUDES_PER_DECADE = 60
-_FREQUENCIES_PER_DECADE = 400
-_BEYOND_KNEES = (1e-6, 1e8)
-_BEYOND_ROOTS = 1e3
-_AROUND_RESONANCE = np.geomspace(0.01, 300.0, 60)
-_PAIRS_AT_ONCE = 2**20
-_STEP = 1e-5
-_NEWTON_STEPS = 40
-_RESIDUAL = 1e-6
+_AMPLITUDES_PER_DECADE = 60  # 4 % apart: N is smooth, and crossings are sought between
+_FREQUENCIES_PER_DECADE = 400  # 0.6 % apart; sharper resonances get more of their own
+_BEYOND_KNEES = (1e-6, 1e8)  # there N has reached its limits, sigma and a force over A
+_BEYOND_ROOTS = 1e3  # beyond all poles and zeros L is a power of the frequency
+_AROUND_RESONANCE = np.geomspace(0.01, 300.0, 60)  # times |Re| of a pole, its half width
+_PAIRS_AT_ONCE = 2**20  # of segments: 16 MB for each complex array
+_STEP = 1e-5  # relative, of the frequency: truncation 1e-10, rounding 2e-11
+_NEWTON_STEPS = 40  # of at most 0.5 in a logarithm: almost nine decades
+_RESIDUAL = 1e-6  # of ln(-L/N): where Newton's method converges, far less is left
 
 
 @dataclass(frozen=True)

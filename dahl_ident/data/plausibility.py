@@ -22,7 +22,7 @@ Doubt = Callable[[NDArray[np.bool_], str], None]
 """What warns of the rows that are marked, with a message, if there are any."""
 _SIGNIFICANT = 0.00135  # one-sided; three standard deviations of a normal distribution
 _ASSUMED_ERROR = 0.1  # of the gain, where no covariance is known
-_MISMATCH = 0.1
+_MISMATCH = 0.1  # of a logarithm: rms for zero to peak is 0.35; also a fall of the gain
 _FEWEST_ROWS, _FEW_ROWS = 3, 0.26  # rows to compare, and the share of them that may be wrong
 _STUCK_SAMPLES, _STUCK_TRAVEL = 8, 0.02  # samples of one value, and share of the motion's range
 _SELDOM, _MOSTLY = 0.01, 0.5  # shares of a signal that repeats no value, and of one that holds it

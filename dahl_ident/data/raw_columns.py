@@ -24,9 +24,11 @@ _CODES = (
     999.0, 9999.0, 99999.0, 999999.0, 999.9, 9999.9, 999.99, 9999.99,
     32767.0, 32768.0, 2147483647.0, 2147483648.0,  # ends of whole numbers
 )  # fmt: skip
+"""Marks of missing values in files of loggers, with either sign."""
+
 _SMALLEST_OVERFLOW = 1e30  # instruments write 1e30, 9.9e37 and the like
 _CODE_RATIO = 5.0  # ratio of a missing-value mark to all measured numbers
-_FEWEST_FOR_CODES = 4
+_FEWEST_FOR_CODES = 4  # of fewer values, one far from the others may be measured
 
 
 @dataclass(frozen=True)

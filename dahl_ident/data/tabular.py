@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Lines = Sequence[tuple[str, str]]
-_SHOWN = 8
+_SHOWN = 8  # items that fit into a line of a message
 
 
 def as_text(title: str, lines: Lines) -> str:

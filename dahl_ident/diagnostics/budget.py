@@ -15,13 +15,13 @@ from scipy import special
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.combinations import candidates, runaway
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.error_sources import LEVELS, MODEL_ERROR, NOISE, RUNS
 from dahl_ident.diagnostics.formatting import listed, rounded, table
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 
-CONFIDENCE = 0.9545
 _DETERMINED = 0.25  # u of a logarithm
 _OUTSIDE = 1e-3  # share of a direction that the data may leave open, from rounding
 # What rounding leaves where a source has no part: variances relative to the combined one.

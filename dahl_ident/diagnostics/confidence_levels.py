@@ -17,7 +17,8 @@ from dahl_ident.arrays import FloatArray, array_between
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Optimum
 
-LEVELS = (0.6827, 0.9545, 0.9973)
+CONFIDENCE = 0.9545  # of intervals that are stated alone: k = 2, as JCGM 100 has U
+LEVELS = (0.6827, CONFIDENCE, 0.9973)  # one, two and three standard deviations
 
 
 def checked_levels(levels: Sequence[float] | float) -> FloatArray:

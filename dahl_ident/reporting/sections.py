@@ -9,6 +9,7 @@ from typing import Any
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.diagnostics.budget import taken_as_exact
 from dahl_ident.diagnostics.comparison import compare_models
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
 from dahl_ident.diagnostics.formatting import listed
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.reporting import posterior_sections, provenance, tables
@@ -233,7 +234,7 @@ def _details(
 def _parameters(fit: FitResult, drawn: Sequence[ChainPosterior]) -> Iterator[Block]:
     for method in ("wald", "profile"):
         fit.conf_interval(method)
-    intervals = fit.intervals_run(tables.LEVEL)
+    intervals = fit.intervals_run(CONFIDENCE)
     yield tables.parameters(fit, intervals, drawn)
     by_note: dict[str, list[str]] = {}
     for found in intervals:
@@ -308,7 +309,7 @@ def _origin(data: FrequencyResponse, command: str | None, *, typed: bool) -> Ite
 def fit_facts(fit: FitResult) -> dict[str, Any]:
     """Return a fit for machines."""
     known, left = fit.identifiability, fit.goodness
-    intervals = fit.conf_interval().at(tables.LEVEL)
+    intervals = fit.conf_interval().at(CONFIDENCE)
     return {
         "model": repr(fit.problem.model),
         "equations": list(_model(fit)),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dahl_ident.diagnostics.confidence_levels import percent
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, percent
 from dahl_ident.diagnostics.formatting import interval, rounded
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Verdict
@@ -23,12 +23,11 @@ if TYPE_CHECKING:
     from dahl_ident.results.chain_posterior import ChainPosterior
 
 _LINEARIZATION_ROWS = 9
-LEVEL = 0.9545
 
 
 def answer(fit: FitResult, *, described: bool) -> Table:
     """Return every free parameter with its interval; unusable numbers are struck."""
-    limits = fit.conf_interval().at(LEVEL)
+    limits = fit.conf_interval().at(CONFIDENCE)
     rows = []
     for name in fit.var_names:
         estimate, judged = fit.params[name], fit.identifiability.parameters[name]
@@ -56,8 +55,8 @@ def answer(fit: FitResult, *, described: bool) -> Table:
             )
         )
     header = (
-        "parameter", "estimate", "standard uncertainty u", f"{percent(LEVEL)} interval", "unit",
-        "description", "what the data say",
+        "parameter", "estimate", "standard uncertainty u", f"{percent(CONFIDENCE)} interval",
+        "unit", "description", "what the data say",
     )  # fmt: skip
     crossed = any(cell.struck for row in rows for cell in row)
     hint = ". Numbers that are crossed out must not be used" if crossed else ""
@@ -86,7 +85,9 @@ def budget(found: Budget) -> Table:
         "parameter", "source", "type", "standard uncertainty u", "unit", "degrees of freedom",
         "share", "k", "U = k u",
     )  # fmt: skip
-    return Table(f"Uncertainty budget; k is for {percent(LEVEL)} coverage", header, tuple(rows))
+    return Table(
+        f"Uncertainty budget; k is for {percent(CONFIDENCE)} coverage", header, tuple(rows)
+    )
 
 
 def _dof(dof: float) -> Cell:
@@ -110,7 +111,7 @@ def parameters(
     fit: FitResult, intervals: Sequence[ConfidenceIntervals], drawn: Sequence[ChainPosterior]
 ) -> Table:
     """Return every parameter with its intervals, one column a method."""
-    at = [one.at(LEVEL) for one in intervals]
+    at = [one.at(CONFIDENCE) for one in intervals]
     rows = []
     for name, estimate in fit.params.items():
         value, error = rounded(estimate.value, estimate.stderr)
@@ -126,7 +127,7 @@ def parameters(
         row += [Cell(credible_interval(posterior, name)) for posterior in drawn]
         rows.append((*row, Cell(estimate.description)))
     methods = [*(method_name(one) for one in intervals), *("posterior" for _ in drawn)]
-    columns = (f"{method} {percent(LEVEL)}" for method in methods)
+    columns = (f"{method} {percent(CONFIDENCE)}" for method in methods)
     header = ("parameter", "estimate", "standard error", "unit", *columns, "description")
     return Table("Estimates and intervals, one column a method", header, tuple(rows))
 
@@ -141,7 +142,7 @@ def credible_interval(posterior: ChainPosterior, name: str) -> str:
     if name not in posterior.names:
         return "-"
     values = posterior.values[:, posterior.names.index(name)]
-    lower, upper = np.quantile(values, [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL])
+    lower, upper = np.quantile(values, [0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE])
     return interval(float(lower), float(upper), "")
 
 

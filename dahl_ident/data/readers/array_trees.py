@@ -24,7 +24,7 @@ from dahl_ident.data.readers.file import MOST_CHANNELS, File
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
-_WIDEST = 64
+_WIDEST = 64  # columns; a matrix with more both ways is a map or a picture
 Leaf = tuple[str, Any, str | None]  # path, array or Stored, unit
 _NUMPY_ERRORS = (
     ValueError, OSError, EOFError, KeyError, TypeError, SyntaxError, MemoryError, OverflowError,

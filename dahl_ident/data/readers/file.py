@@ -31,7 +31,7 @@ ZIP_ERRORS = (
     RuntimeError,
 )  # fmt: skip
 """What Python's reader of archives raises on damaged ones."""
-_UNPACKED_BYTES = 1 << 28
+_UNPACKED_BYTES = 1 << 28  # 256 MB: more than most tables, less than a computer's memory
 _UNPACKED_RATIO = 8  # text and samples of a converter rarely pack better
 
 _TEXT = ("text", "uff", "lvm", "json")

@@ -37,7 +37,7 @@ _RESPONSE_UNITS: dict[str, tuple[str, ...]] = {
     "phase": ("angle",),
     "level": (),
 }
-_FEW_GAPS = 5
+_FEW_GAPS = 5  # that are listed; of more, number, longest and first say more
 _NO_UNIT = ("level",)
 _PROPOSED_NAMES = RESPONSE_NAMES | {"frequency": (*RESPONSE_NAMES["frequency"], "f")}
 

@@ -26,7 +26,7 @@ from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError, DataWarning
 from dahl_ident.units import parse_unit
 
-_TIME_RESPONSE, _FRF = 1, 4
+_TIME_RESPONSE, _FRF = 1, 4  # function types of data set 58
 _LEAD_IN = struct.Struct("<4sIIQQ")  # of a TDMS segment: tag, contents, version, and two sizes
 _LONGEST_METADATA = 1 << 24  # bytes of a segment that are looked at
 _LONGEST_SEGMENT = 1 << 48  # bytes; more means that the segment was never closed

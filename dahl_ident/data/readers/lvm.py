@@ -22,7 +22,7 @@ from dahl_ident.errors import DataError
 _END = "***End_of_Header***"
 _SPECIAL = ("***Start_Special***", "***End_Special***")
 _SEPARATORS = {"tab": "\t", "comma": ",", "semicolon": ";"}
-_MOST_SEGMENTS = 1000
+_MOST_SEGMENTS = 1000  # the time to read grows with their square
 Lines = list[tuple[int, str]]
 
 

@@ -26,15 +26,15 @@ _TYPES = {
     1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
     16: "u1", 17: "u2", 18: "u4",
 }  # fmt: skip
-_MATRIX, _COMPRESSED, _UTF8 = 14, 15, 16
-_CELL, _STRUCT, _OBJECT, _CHAR = 1, 2, 3, 4
+_MATRIX, _COMPRESSED, _UTF8 = 14, 15, 16  # types of elements, in the format
+_CELL, _STRUCT, _OBJECT, _CHAR = 1, 2, 3, 4  # classes of arrays, in the format
 _CLASSES = {
     6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8",
 }  # fmt: skip
 _NOT_READ = {5: "sparse matrix", 16: "function handle", 17: "object"}
-_COMPLEX, _LOGICAL = 0x0800, 0x0200
+_COMPLEX, _LOGICAL = 0x0800, 0x0200  # flags of an array, in the format
 _LEVEL_4 = ("f8", "f4", "i4", "i2", "u2", "u1")
-_MOST_DIMENSIONS = 32
+_MOST_DIMENSIONS = 32  # that an array of NumPy 1 may have; damaged files claim any number
 
 
 class _DamagedError(Exception):

@@ -28,8 +28,8 @@ from dahl_ident.errors import DataError
 if TYPE_CHECKING:
     import pandas as pd
 
-_HEAD_ROWS = 400
-_MEGABYTES, _SECONDS = 1000, 30
+_HEAD_ROWS = 400  # looked at as text, which takes long, to find the table
+_MEGABYTES, _SECONDS = 1000, 30  # that reading may take: a small archive can unpack to anything
 _ENDINGS = {"excel": ".xlsx", "ods": ".ods"}
 
 

@@ -36,12 +36,12 @@ _LINE_END = re.compile(rb"\r\n|\n|\r")
 _BEFORE_BRACKET = re.compile(r"(?<=[^\s\])])[ \t]+(?=[\[(])")  # "time [s]" is one field
 # what stands in brackets is bounded, so that a line of brackets takes linear time
 _BLANK_SEPARATED = re.compile(r"(?:\[[^\]]{0,60}\]|\([^)]{0,60}\)|\S)+")
-_HEAD_BYTES = 1 << 15
+_HEAD_BYTES = 1 << 15  # from the first numbers on: hundreds of lines show the format
 _HEAD_LINES = 4  # of numbers, however wide
-_LONGEST_LINE = 1 << 18
-_MOST_COMMENTS = 20_000
+_LONGEST_LINE = 1 << 18  # bytes: 10,000 columns and more; beyond, it is no text table
+_MOST_COMMENTS = 20_000  # lines before the first numbers: a limit on time for other texts
 _MANY_LINES = 50  # from which decimals of one length are a format, not chance
-_FOOTER_LINES = 20
+_FOOTER_LINES = 20  # that are left out at most; more text after the numbers is an error
 _ERROR_VALUE = re.compile(r"\s*#(?:N/A|DIV/0!|[A-Z]{2,9}[!?])\s*")  # of a spreadsheet
 _FOOTER = re.compile(r"\s*[\"']?[^\W\d_]{2}|\s*(?:\*\*|==|--)", re.UNICODE)
 _SUMMARIES = ("min", "max", "mean", "average", "avg", "std", "rms", "sum", "total", "median")
