@@ -69,6 +69,7 @@ validation: install  ## long statistical checks, written into docs/validation
 	$(BIN)/python -m benchmarks.campaigns
 	$(BIN)/python -m benchmarks.uncertainty --write docs/validation/uncertainty.md
 	$(BIN)/python -m benchmarks.planning --write docs/validation/planning.md
+	$(BIN)/python -m benchmarks.laws --write docs/validation/laws.md
 
 fuzz: install  ## thousands of damaged files of every format, and the table of what became of them
 	$(BIN)/python -m tests.reader_fuzz

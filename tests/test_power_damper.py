@@ -99,3 +99,11 @@ def test_force_description_and_refusals() -> None:
         law.force([0.0, 1.0])
     with pytest.raises(ValidationError, match="exponent is"):
         PowerDamper(1.0, 3.5)
+
+
+def test_a_driven_plant_at_several_frequencies_has_the_amplitudes_of_each_alone() -> None:
+    plant = PowerDamper(1.0, 0.5) + Mass(0.05) + Spring(1.0)
+    f, drive = np.array([0.1, 0.5, 1.5]), np.array([0.2, 1.0, 3.0])
+    together = response(plant, f, drive).amplitude
+    alone = [response(plant, one, u).amplitude for one, u in zip(f, drive, strict=True)]
+    np.testing.assert_allclose(together, np.ravel(alone), rtol=1e-9)

@@ -50,8 +50,10 @@ def find_roots(plant: Plant, per_decade: int = _SCAN_PER_DECADE) -> Roots:
         with np.errstate(divide="ignore", over="ignore"):
             amplitude = np.where(resonant, np.nan, plant.drive / np.abs(plant.linear))
         return Roots(amplitude[:, None], (amplitude * plant.linear)[:, None])
-    low, high = _knees(plant.friction)
-    known = np.isfinite(plant.linear) & np.isfinite(low + high)[plant.vector]
+    known = np.isfinite(plant.linear)
+    if plant.friction.unique:
+        sound = np.isfinite(np.add(*_knees(plant.friction)))
+        known &= sound[plant.vector] if sound.size > 1 else sound
     passive = known & plant.friction.unique & (plant.linear.imag >= -plant.rounding)
     single = passive & ~(resonant & (plant.drive >= plant.largest_friction()))
     amplitude = np.full(plant.drive.shape, np.nan)
