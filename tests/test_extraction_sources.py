@@ -76,6 +76,8 @@ def test_rows_are_the_same_for_all_records() -> None:
 def test_what_is_no_record_and_what_is_not_there(folder: Path) -> None:
     with pytest.raises(DataError, match=r"nothing\*\.csv: no file matches this pattern"):
         extract(str(folder / "nothing*.csv"))
+    with pytest.raises(DataError, match=r"low\.csv: the file is named twice"):
+        extract([folder / "low.csv", str(folder / "*.csv")])
     with pytest.raises(ValidationError, match="records is empty"):
         extract([])
     with pytest.raises(ValidationError, match="records holds a int"):

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import whole_number
 from dahl_ident.data import FrequencyResponse, Record
-from dahl_ident.data.readers import record_pieces, run_names
+from dahl_ident.data.readers import record_pieces, refuse_repeated, run_names
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.extraction.from_record import record_response
 from dahl_ident.extraction.plateaus import Mode
@@ -186,6 +186,7 @@ class Task:
 
 def extract_all(tasks: Sequence[Task], how: Mapping[str, Any], jobs: int = 1) -> FrequencyResponse:
     """Return the points of all tasks in one table; `how` holds the other words of `extract`."""
+    refuse_repeated([task.source for task in tasks])
     jobs = min(whole_number(jobs, "jobs", 1), len(tasks))
     if jobs == 1:
         parts = [_extracted(task, how) for task in tasks]

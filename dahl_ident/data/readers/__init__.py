@@ -131,6 +131,7 @@ def read_frequency_response(
     paths = [path] if isinstance(path, (str, Path)) or _is_frame(path) else [*path]
     if not paths:
         raise DataError("no file to read; expected at least one path")
+    refuse_repeated(paths)
     mapped = column_map(
         columns,
         quantity=quantity,
@@ -416,6 +417,23 @@ def run_names(paths: Sequence[PathLike | pd.DataFrame]) -> list[str]:
         if len(set(labels)) == len(paths):
             return labels
     return [str(path) for path in paths]
+
+
+def refuse_repeated(sources: Sequence[Any]) -> None:
+    """Refuse a file that is named twice, whose rows would count twice.
+
+    Raises
+    ------
+    DataError
+        Naming the file.
+    """
+    seen: set[Path] = set()
+    for source in sources:
+        if isinstance(source, (str, Path)):
+            place = Path(source).resolve()
+            if place in seen:
+                raise DataError(f"{source}: the file is named twice; expected each file once")
+            seen.add(place)
 
 
 def groups_in_name(path: PathLike | pd.DataFrame, expression: str | None) -> dict[str, Any]:
