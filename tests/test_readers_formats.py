@@ -254,6 +254,13 @@ class TestMatlab:
         assert "nothing" not in names
         assert 'column = "sweep.levels[*].H"' not in contents.column_map  # H is no usual name
 
+    def test_single_numbers_are_no_channels_of_a_record(self, tmp_path: Path) -> None:
+        content = {"T": 0.25, "f": 4.0, "time": TIME, "x": X, "F": F}
+        savemat(tmp_path / "a.mat", content)
+        proposed = inspect(tmp_path / "a.mat").column_map
+        assert re.findall(r'column = "(\w+)"', proposed) == ["time", "x", "F"]
+        assert "even, 64 samples" in inspect(tmp_path / "a.mat").sampling
+
     def test_no_such_path(self, matlab: Path) -> None:
         with pytest.raises(DataError, match=r"no column is called 'rig.run.q'; there are .*rig"):
             read_record(matlab, time="rig.run.q", displacement="rig.run.x", force="rig.run.F")

@@ -344,6 +344,8 @@ class TestRefusal:
         [
             ("", "the file is empty"),
             (" \n\n", "the file is empty"),
+            ("# c\n" * 21_000 + PLAIN, "the first 20000 lines are comments or blank"),
+            ("\n" * 21_000 + PLAIN, "the first 20000 lines are comments or blank"),
             ("just some words\nand more words\n", "no table of numbers found"),
             ("1\n2\n3\n", "no table of numbers found"),
             ("0,1,1\n0.5,2.5,2\n", "no header line; expected names and units above the numbers"),

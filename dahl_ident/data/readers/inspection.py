@@ -119,7 +119,7 @@ def _sampling(source: Source) -> tuple[str, tuple[str, ...]]:
     by_name = [c for c in source.channels if _named(c, "time", RECORD_NAMES)]
     by_unit = [c for c in source.channels if _of_kind(c, ("time",))]
     for channel in by_name or by_unit:
-        if channel.values.dtype.kind not in "fiu":
+        if channel.values.dtype.kind not in "fiu" or channel.size < 2:
             continue
         try:
             time = channel.values * parse_unit(channel.unit or "s").factor
@@ -158,6 +158,8 @@ def _named(channel: Channel, role: str, names: Mapping[str, tuple[str, ...]]) ->
 def _proposal(source: Source) -> str:
     """Return a column map in TOML: roles by name first, by unit where no name claims them."""
     groups = _patterns(source)
+    if any(channel.size > 1 for channel in groups.values()):  # single numbers are settings
+        groups = {path: channel for path, channel in groups.items() if channel.size > 1}
     response = _is_response(groups.values())
     names = _PROPOSED_NAMES if response else RECORD_NAMES
     units = _RESPONSE_UNITS if response else _RECORD_UNITS

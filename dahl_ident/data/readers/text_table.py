@@ -124,12 +124,15 @@ def _head(data: bytes, name: str) -> list[tuple[int, str]]:
             break
         lines.append((start, data[start : end.start()].decode("utf-8", "replace")))
         start = end.end()
-        if not numbers and _COMMENT.match(lines[-1][1]) is None:
+        if not numbers and lines[-1][1].strip() and _COMMENT.match(lines[-1][1]) is None:
             numbers, first = start, len(lines)
         if numbers and start > numbers + _HEAD_BYTES and len(lines) >= first + _HEAD_LINES:
             break
-        if len(lines) > _MOST_COMMENTS:
-            break
+        if not numbers and len(lines) > _MOST_COMMENTS:
+            raise DataError(
+                f"{name}: the first {_MOST_COMMENTS} lines are comments or blank; expected a table "
+                "of numbers after fewer"
+            )
     else:
         if len(data) - start > _LONGEST_LINE:
             raise DataError(_too_long(name, len(lines) + 1))
