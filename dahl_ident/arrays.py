@@ -12,6 +12,9 @@ from dahl_ident.errors import ValidationError
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+TINY = float(np.finfo(np.float64).tiny)
+"""Stands for 0 in quotients, so that they are finite."""
+
 SMALLEST, LARGEST = 1e-90, 1e90
 """Allowed magnitudes: squares, products and ratios of such numbers remain representable."""
 

@@ -132,7 +132,7 @@ _COMMON_PART = re.compile(
     r"(\s*[*/]\s*|\s+|)(?:\(([^()]+)\)|([A-Za-z]+|\N{DEGREE SIGN}|1\b))(?:\^(-?\d))?"
 )
 _TOKEN = re.compile(r"[A-Za-zµμ°%Ω_]\w*|\b1\b|(?<![\d(])\^-?\d(?!\d)|[*/() ]")
-_LONGEST = 60
+_LONGEST = 60  # characters; longer text in brackets is a remark
 
 
 @dataclass(frozen=True, slots=True)

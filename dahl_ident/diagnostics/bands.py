@@ -34,7 +34,7 @@ from dahl_ident.units import shown_unit
 
 _STEP = 1e-5  # relative, of parameters, for the slope of a knee; of frequencies, for a stiffness
 _RESONANT = 1e-12  # relative: a natural frequency is found
-_PASSES = 50
+_PASSES = 50  # at most; one is enough unless the stiffness depends on the frequency
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,8 @@ from dahl_ident.fitting import Optimum, solve_many
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import ProblemBatch
 
-REPLICATES = 4999
-_FEWEST = 99
+REPLICATES = 4999  # seven of them lie beyond either limit of the 99.73 % interval
+_FEWEST = 99  # with fewer a tail of 1 % holds no replicate
 _AT_LIMIT = 0.01  # of the replicates, from which on the tails cannot be distinguished
 
 

@@ -16,10 +16,9 @@ from scipy import fft
 from scipy.linalg import solve_toeplitz, toeplitz
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.problem.record_noise import HIGHEST_ORDER, SAMPLES_PER_ORDER
 
-_HIGHEST_ORDER = 60
-_SAMPLES_PER_ORDER = 20
-_CORRECTIONS = 4
+_CORRECTIONS = 4  # each changes less, by the ratio of parameters to samples
 
 
 def sandwich(
@@ -98,7 +97,7 @@ def autoregression(
     variance : float
     """
     n = residual.size
-    highest = int(min(_HIGHEST_ORDER, n // _SAMPLES_PER_ORDER))
+    highest = int(min(HIGHEST_ORDER, n // SAMPLES_PER_ORDER))
     spectrum = np.abs(fft.rfft(residual, 2 * n)) ** 2
     seen = fft.irfft(spectrum)[: highest + 1] / n
     model = _chosen(seen, n)

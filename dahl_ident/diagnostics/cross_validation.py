@@ -21,9 +21,9 @@ from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.error_sources import repeated_levels
 
-_FEWEST_TESTS = 3
+_FEWEST_TESTS = 3  # two leave one from which to predict, which shows no scatter
 _MOST_TESTS = 500
-_CONFIDENCE = 0.95
+_CONFIDENCE = 0.95  # of the bands: one value in twenty is outside by chance
 
 
 @dataclass(frozen=True)

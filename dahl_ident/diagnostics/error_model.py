@@ -60,7 +60,7 @@ from dahl_ident.problem import Problem
 
 EXPONENT = "exponent"
 DRIVE = "drive factor"
-_STEPS = 6
+_STEPS = 6  # linearisations at most; the last counts, settled or not
 _SETTLED = 0.02  # of a standard deviation that an iteration still moves an estimate
 _LONGEST_STEP = 0.7  # of a logarithm, in one iteration: the model is linearised
 _ASKED_FOR = {MODEL_ERROR: 0.3, NOISE: 0.5}  # rise of the log-likelihood that a source takes

@@ -39,18 +39,17 @@ from dahl_ident.diagnostics.outliers import SuspiciousPoint, flagged_rows, suspi
 from dahl_ident.diagnostics.physics import physical_warnings
 from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.diagnostics.slip_density import bound_statement, least_misfit
-from dahl_ident.diagnostics.stiffening import Stiffening, stiffening
+from dahl_ident.diagnostics.stiffening import LEAST_DOF, Stiffening, stiffening
 from dahl_ident.diagnostics.trends import LEAST_RANGE, Runs, Trend, runs, trends
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
 
-_FALSE_ALARM = 0.01
-_HINT = 0.05
+_FALSE_ALARM = 0.01  # of all tests together: one sound data set in a hundred is doubted
+_HINT = 0.05  # the same of hints, which doubt nothing
 _FAR_MORE = 2.0  # scatter over what was measured
 _NO_SENSOR = 0.3  # noise over the response
-_LEAST_DOF = 6  # with fewer, no test of residuals of unknown scale applies
 _WORTH_NAMING = 0.1  # of the largest scatter: less is not mentioned
 _MOST_DEPARTURES = 3  # in the verdict; the details list all
 
@@ -229,7 +228,7 @@ class Goodness:
 
     @property
     def _enough_points(self) -> bool:
-        return self.noise_share in (None, 0.0) or self.dof >= _LEAST_DOF
+        return self.noise_share in (None, 0.0) or self.dof >= LEAST_DOF
 
     @cached_property
     def objections(self) -> tuple[str, ...]:
@@ -371,7 +370,7 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
 def _bound(optimum: Optimum, misfit: float) -> str:
     """Return the least misfit of parallel Jenkins elements in words; "" where it says nothing."""
     problem = optimum.problem
-    few = (problem.data.harmonic == 1).sum() < _LEAST_DOF
+    few = (problem.data.harmonic == 1).sum() < LEAST_DOF
     if few or any(p.free for p in problem.sensors.parameters):
         return ""
     if all(e.is_linear for e in problem.model.elements):

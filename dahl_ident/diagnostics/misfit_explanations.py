@@ -22,7 +22,7 @@ from dahl_ident.problem import Problem
 
 EXPLAINS = 3.0  # times lower misfit
 _PROMISING = 1.5  # the same, at the start of a search
-_BY_CHANCE = 0.01
+_BY_CHANCE = 0.01  # probability that rows at random lie as close together
 _RANGE = 5  # values, of which the first and the last are ends
 
 

@@ -23,10 +23,10 @@ from dahl_ident.data.row_names import row_names
 from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.fitting import Optimum
 
-_LEVEL = 0.01
-_SHARE = 0.1
+_LEVEL = 0.01  # false-alarm rate, of the worst of all points
+_SHARE = 0.1  # of the rows: if more stand out, model or noise is wrong, not single rows
 _ONE_BY_ONE = 500  # rows up to which each is set aside before the next is judged
-_LEAST_DOF = 4
+_LEAST_DOF = 4  # without the suspected rows; fewer do not show the noise
 _GOOD = "good"
 
 

@@ -18,8 +18,8 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.status import Status
 from dahl_ident.units import shown_unit
 
-_LEVEL = 1e-3
-_HARMONIC_SHARE = 0.1
+_LEVEL = 1e-3  # false-alarm rate, low: such a fit is called physically impossible
+_HARMONIC_SHARE = 0.1  # of the fundamental; describing functions assume a pure sine
 
 
 def physical_warnings(optimum: Optimum, scatter: float = 0.0) -> Iterator[str]:

@@ -26,7 +26,7 @@ from dahl_ident.diagnostics.error_model import ErrorModel, relative_units
 from dahl_ident.diagnostics.error_sources import NOISE, Source, places
 from dahl_ident.problem import Problem
 
-_LEAST_DOF = 1.0
+_LEAST_DOF = 1.0  # with fewer, quantiles of Student's t are beyond all use
 
 
 class PredictionError(NamedTuple):

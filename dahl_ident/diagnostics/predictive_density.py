@@ -24,7 +24,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.fitting import Optimum
 
 _EXACT = 1e-5  # relative errors that count as none
-_ROUNDS = 30
+_ROUNDS = 30  # fixed-point steps of the variances, without a test of convergence
 _HEAVY = 4.0  # degrees of freedom of the density beside a robust loss
 
 

@@ -26,9 +26,9 @@ from dahl_ident.elements.masing import jenkins
 from dahl_ident.errors import DataError, ModelError
 from dahl_ident.problem import Problem
 
-_PER_DECADE = 48
+_PER_DECADE = 48  # 5 % apart
 _BELOW = 100.0  # below the smallest amplitude, where all elements slip alike
-_SMOOTHING = 10.0 ** np.arange(1.0, -6.5, -0.5)
+_SMOOTHING = 10.0 ** np.arange(1.0, -6.5, -0.5)  # tried from the smoothest on
 _ALLOWED = 1.05  # of the least misfit that a smooth density may leave
 _EXACT = 1e-4  # misfit that counts as none
 _FAR_LESS = 0.5  # of a model's misfit: such a law is worth naming

@@ -24,7 +24,7 @@ _TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
 _NARROWEST = 0.7  # half width of 95 % bands over the rms misfit, which for noise is 1.4
 _ENOUGH_HELD_OUT = 16  # values, of which 80 % in bands of 95 % happen once in 100 times
-_DOUBTS_SHOWN = 5
+_DOUBTS_SHOWN = 5  # more would hide the verdict
 _CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chance
 
 

@@ -27,10 +27,10 @@ from dahl_ident.elements import Element
 from dahl_ident.fitting import Optimum
 from dahl_ident.units import shown_unit
 
-_BANDS = 8
+_BANDS = 8  # of the range of amplitudes: few, so that each holds rows for a mean
 _NARROWEST = np.log(1.1)  # of a band, in the logarithm of the amplitude
 _FEWEST_ROWS = 3  # in a band
-_LEAST_DOF = 6
+LEAST_DOF = 6  # with fewer, no test of residuals of unknown scale applies
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
         square = view.omega[rows] ** 2
         design = np.column_stack([design, square / square.mean() - 1.0])
     dof = len(rows) - design.shape[1]
-    if count < 2 or dof < _LEAST_DOF:
+    if count < 2 or dof < LEAST_DOF:
         return None
     stiffness = friction_stiffness(optimum, with_springs=True).real[rows]
     values, covariance = _weighted_means(design, stiffness, view.weights[rows], dof)

@@ -21,10 +21,10 @@ from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.elements import Element
 from dahl_ident.fitting import Optimum
 
-_STEPS = 240
-_THETA = 2.0 * np.pi * np.arange(_STEPS) / _STEPS
-_CYCLES = 3
-_NEWTON_STEPS = 8
+_STEPS = 240  # samples of a cycle: 80 of its third harmonic
+_THETA = 2.0 * np.pi * np.arange(_STEPS) / _STEPS  # their phases
+_CYCLES = 3  # that a path is run through, until memory has faded
+_NEWTON_STEPS = 8  # of at most _LONGEST: up to 0.8 of the fundamental
 _SETTLED = 1e-4  # change of X_3/A that ends the search
 _LONGEST = 0.1  # of one of them
 _SMALL = 1e-4  # third harmonic over the amplitude, for the derivative

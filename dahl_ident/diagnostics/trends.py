@@ -29,8 +29,8 @@ from dahl_ident.units import shown_unit
 _DEGREES = {"amplitude": 3, "drive": 3, "frequency": 2}
 _SAME = 0.01  # of the covariate's logarithm: values closer than this are one
 LEAST_RANGE = np.log(1.05)  # of a covariate that varies
-_LEAST_DOF_PER_COLUMN = 3
-_FEWEST_SIGNS = 10
+_LEAST_DOF_PER_COLUMN = 3  # for each shape; with fewer, tests find little
+_FEWEST_SIGNS = 10  # of each kind on average, for the number of runs to be normal
 _STEEPEST = np.log(10.0)  # change of a logarithm that is worth a number
 _FARTHEST = 9.0  # departure that is
 

@@ -24,7 +24,7 @@ from scipy import linalg
 
 from dahl_ident.arrays import FloatArray
 
-_STEPS = 40
+_STEPS = 40  # at most; the likelihood rises in each, so the last is the best
 _FEW = 3  # residuals over columns of sources beyond which columns are quicker
 _LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.02)  # of a scoring step, until the likelihood rises
 _CLOSE = 1e-3  # rise of the log-likelihood that no longer matters

@@ -34,8 +34,8 @@ from dahl_ident.diagnostics.information import Information, shares
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval
 from dahl_ident.fitting import Optimum, Status
 
-IDENTIFIED_BELOW = 0.25
-NOT_IDENTIFIED_ABOVE = 1.0
+IDENTIFIED_BELOW = 0.25  # u of a logarithm: 95 % within a factor of 1.6
+NOT_IDENTIFIED_ABOVE = 1.0  # the same: a factor of 7, hardly an order of magnitude
 _SIZE_THAT_MATTERS = 0.1  # of the response, for parameters that may be zero
 _BY_RANGE = 0.1  # u of a logarithm that the exponent's assumed range makes, not the data
 _MEASURE = "measure more points, or use a model that misses less"

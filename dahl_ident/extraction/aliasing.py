@@ -18,7 +18,7 @@ from dahl_ident.extraction.sine_fit import SineFit
 
 _CLEAR = 9.0  # power over that of noise, of a harmonic that is seen
 _SEEN_FROM = 1.0 / 3.0  # of the fitted orders: the powers of low ones differ
-_FLATTEST, _STEEPEST = 1.0, 3.0
+_FLATTEST, _STEEPEST = 1.0, 3.0  # powers of the order: jumps of the force, and of its curvature
 _FIRST = 3  # harmonic of friction beside the fundamental
 _STAYS = 0.01  # of an alias, that matters
 

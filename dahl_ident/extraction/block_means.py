@@ -18,7 +18,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.extraction.sine_fit import Segment
 
-BLOCKS_PER_CYCLE = 256
+BLOCKS_PER_CYCLE = 256  # means lose 3e-5 of the fundamental, 0.2 % of the ninth harmonic
 _EVEN = 0.05  # of a step, by which a sample may be off an even grid
 _TOGETHER = 1 << 18  # samples: what is computed of them stays in the cache
 

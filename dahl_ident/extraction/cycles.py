@@ -24,16 +24,16 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 _THRESHOLD = 0.3  # of the amplitude; sine noise may be a tenth of it
 _QUANTILES = (0.995, 0.9, 0.7)  # for the amplitude; the next where a part of a lobe misleads
 _QUIET = 1.5  # half cycles: a longer time within the threshold may hold another level
-_FEWEST_SAMPLES = 16
+_FEWEST_SAMPLES = 16  # of a quiet part that is searched for cycles of its own
 _ALIKE = 0.1  # relative difference of periods, and cycles off a whole number, of one sine
 _MOST_BRIDGED = 10.0  # cycles
-_DEEPEST = 12
+_DEEPEST = 12  # quiet parts within quiet parts: each below _THRESHOLD of the last, in all 5e-7
 _SAMPLED = 50_000  # samples that the quantiles are taken from
-_FEWEST_A_CYCLE = 3
+_FEWEST_A_CYCLE = 3  # samples, as many as mean and phasor have numbers
 _NOISIEST_CUT = 0.05  # noise of the log amplitude that a cycle of known frequency may have
-_FEWEST_CUTS = 3
+_FEWEST_CUTS = 3  # that averaging leaves: fewer do not show whether a level is held
 _NOISIEST_CROSSING = 0.1  # noise of the log amplitude that a cycle between crossings may have
-_GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+_GOLDEN = 0.5 * (5.0**0.5 - 1.0)  # its multiples are spread most evenly
 _TOGETHER = 100_000  # samples: what is computed of them stays in the cache
 _HOLE = 1.0 / 3.0  # of a cycle without samples: its amplitude is not known
 

@@ -17,13 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import TINY, FloatArray
+from dahl_ident.extraction.plateaus import AMPLITUDE_TOLERANCE, FREQUENCY_TOLERANCE
 from dahl_ident.extraction.point import Point
 
-_AMPLITUDE_TOLERANCE = 0.02  # as within a plateau
-_FREQUENCY_TOLERANCE = 0.01
 _APART = 3.0  # cycles that may be missing between two parts
-_TINY = float(np.finfo(np.float64).tiny)
 _MEANS = (
     "bias_real", "bias_imag", "displacement_share", "force_share", "displacement_distortion",
     "asymmetry", "displacement_steps", "force_steps", "displacement_clipped", "force_clipped",
@@ -43,8 +41,8 @@ def _one_level(a: Point, b: Point) -> bool:
         not (a.sweep or b.sweep)
         and a.harmonic == b.harmonic
         and apart < _APART + b.quality["settling_periods"]
-        and abs(np.log(b.amplitude / a.amplitude)) < _AMPLITUDE_TOLERANCE
-        and abs(np.log(b.frequency_hz / a.frequency_hz)) < _FREQUENCY_TOLERANCE
+        and abs(np.log(b.amplitude / a.amplitude)) < AMPLITUDE_TOLERANCE
+        and abs(np.log(b.frequency_hz / a.frequency_hz)) < FREQUENCY_TOLERANCE
     )
 
 
@@ -96,7 +94,7 @@ def _both(a: Point, b: Point) -> Point:
 
 def _dof(own: list[FloatArray], dof: list[FloatArray]) -> FloatArray:
     """Return the degrees of freedom of a sum of variances, as Welch and Satterthwaite have it."""
-    shares = [np.trace(joint[:, 1:, 1:], axis1=1, axis2=2) + _TINY for joint in own]
+    shares = [np.trace(joint[:, 1:, 1:], axis1=1, axis2=2) + TINY for joint in own]
     total = shares[0] + shares[1]
     spread = sum((s / total) ** 2 / d for s, d in zip(shares, dof, strict=True))
     return np.asarray(1.0 / spread)

@@ -25,12 +25,12 @@ from dahl_ident.extraction.cycles import Cycles
 
 Mode = Literal["auto", "steps", "sweep"]
 MODES: tuple[Mode, ...] = ("auto", "steps", "sweep")
-_AMPLITUDE_TOLERANCE = 0.02
-_FREQUENCY_TOLERANCE = 0.01
+AMPLITUDE_TOLERANCE = 0.02  # of a logarithm, within a plateau: steps of level are larger
+FREQUENCY_TOLERANCE = 0.01  # the same
 _UNSTEADY = 5.0  # times wider tolerances, of groups of cycles that a drive varies
-_NOISE_FACTOR = 6.0
+_NOISE_FACTOR = 6.0  # standard deviations of a cycle: noise alone splits no plateau
 _WIDEST = 0.3  # tolerance that noise makes
-_LEAST_NOISE = 1e-12
+_LEAST_NOISE = 1e-12  # of a log amplitude: inverse squares, as weights, stay finite
 _NOISIEST = 0.2  # noise of a cycle's log amplitude above which it is no cycle
 _EDGE_TOLERANCE = 0.005  # of the amplitude: cycles at the ends of a plateau that stray more go
 _MOSTLY_HELD = 0.5  # plateaus over cycles that change smoothly: with less it is a sweep
@@ -145,7 +145,7 @@ def find_spans(runs: Sequence[Cycles], mode: Mode, fewest: int, window: int | No
 def _tolerances(noise: float) -> tuple[float, float]:
     """Return how much log amplitude and log frequency may vary within a plateau."""
     widened = min(_NOISE_FACTOR * noise, _WIDEST)
-    return max(_AMPLITUDE_TOLERANCE, widened), max(_FREQUENCY_TOLERANCE, widened / np.pi)
+    return max(AMPLITUDE_TOLERANCE, widened), max(FREQUENCY_TOLERANCE, widened / np.pi)
 
 
 def _change(values: FloatArray) -> float:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.data.plausibility import creates_energy
 from dahl_ident.errors import ExtractionError
 from dahl_ident.extraction.aliasing import alias_error, aliases_unseen
@@ -60,7 +60,6 @@ _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 _DISTORTED = 0.02  # from which the fundamental alone misses percents of the loss
 _MOVING_MEAN = 0.02  # of the amplitude, over the segment, where the force is controlled
 _BEYOND_NOISE = 5.0  # standard errors of a drift in white noise
-_TINY = np.finfo(np.float64).tiny
 _ROUNDING = 1e-9  # of the response
 _ALIASED = 0.01  # of the fundamental, above which aliases are reported
 _LOOKED_AT = 10_000  # samples from which their residual is taken
@@ -455,7 +454,7 @@ def _harmonic(phasors: _Phasors, k: int) -> tuple[complex, FloatArray, FloatArra
     own_part = 0.5 * force * np.eye(2) if k else np.diag([force, 0.0])
     covariance = own_part + relative * (np.outer(along, along) + k**2 * np.outer(across, across))
     referred = relative * (1.0 + k**2) * abs(N) ** 2
-    own = force / max(force + referred, _TINY)
+    own = force / max(force + referred, TINY)
     dof = 1.0 / (own**2 / noise.dof + (1.0 - own) ** 2 / phasors.noise[0].dof)
     return N, covariance, -along * relative * A, dof
 
@@ -480,7 +479,7 @@ def _point(phasors: _Phasors, cycles: int, dropped: int, steps: FloatArray) -> P
     transient, bias = phasors.transient, _bias(phasors)
     lagging = _lag(phasors) if phasors.fit.trending else np.zeros(len(response))
     only_mean = np.where(np.equal(phasors.harmonics, 0), 2.0, 1.0)  # whose variance is one number
-    error = np.maximum(np.sqrt(0.5 * only_mean * np.trace(covariance, axis1=1, axis2=2)), _TINY)
+    error = np.maximum(np.sqrt(0.5 * only_mean * np.trace(covariance, axis1=1, axis2=2)), TINY)
     excess = np.abs(bias) / (_TOLERATED * error)
     forgotten = (excess <= 1.0) | (not transient.significant)
     missing = np.where(forgotten, 0.0, np.ceil(np.log(np.maximum(excess, 1.0)) / transient.rate))

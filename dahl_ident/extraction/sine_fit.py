@@ -24,7 +24,7 @@ from functools import cached_property
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.errors import ExtractionError
 
 FEWEST_CYCLES = 2  # that a fit with offset and drift needs
@@ -37,8 +37,7 @@ _KEPT = 2_000_000  # entries of columns that are kept rather than computed twice
 _BLOCKS_PER_CYCLE = 64  # block means that lose 4e-4 of the fundamental
 _FEWEST_SAMPLES = 2  # that have a phase from one to the next
 _LEAST_WEIGHT = 1e-6  # of a cycle beside the strongest
-_TINY = float(np.finfo(np.float64).tiny)
-_MAX_STEPS = 20
+_MAX_STEPS = 20  # at most: without convergence by then the start was wrong
 _TRACKED = 0.1  # phase error that is left to the four-parameter fit, rad
 _STEP_TOLERANCE = 1e-4  # phase at the ends of the segment, rad; its square is the error left
 
@@ -279,7 +278,7 @@ def _phase_error(segment: Segment, degree: int) -> Polynomial:
     counts = np.diff(starts, append=theta.size)
     sums = np.add.reduceat(motion * np.exp(-1j * theta), starts)
     at = np.add.reduceat(segment.tau, starts) / counts
-    weights = np.abs(sums) + _LEAST_WEIGHT * np.abs(sums).max() + _TINY
+    weights = np.abs(sums) + _LEAST_WEIGHT * np.abs(sums).max() + TINY
     bend = Polynomial.fit(at, np.unwrap(np.angle(sums)), degree, w=weights).convert()
     return bend - bend(0.0)
 

@@ -20,7 +20,7 @@ ROUTE = (
     "di.fit(record, model)"
 )
 _PERIOD_CHANGE = 0.03  # limit from one cycle to the next (median by energy) of a sine measurement
-_AMPLITUDE_CHANGE = 0.1
+_AMPLITUDE_CHANGE = 0.1  # the same of the amplitude, which resonances change faster
 _FEWEST_PAIRS = 2  # of cycles, that show how alike they are
 _NOISY = 0.03  # of a cycle's log amplitude
 _SINE_IN_NOISE = 0.3  # of the power near the strongest line, where noise spoils the cycles

@@ -25,7 +25,7 @@ from functools import cache
 
 import numpy as np
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.elements import Dahl
 from dahl_ident.extraction.line_noise import powers
 from dahl_ident.extraction.sine_fit import (
@@ -43,7 +43,6 @@ _REFINEMENTS = 5  # of the grid of rates, by 5 each
 _RATE_SPREAD = 1.0  # standard deviation of ln(rate) about what the phase says
 _FADED = 28.0  # decrements after which a departure of 1 is 1e-12
 _SLOW_LINES = 24  # from which the noise of D_0 is judged
-_TINY = np.finfo(np.float64).tiny
 MOST_CYCLES = 256  # that D_0 and the rate are estimated from
 
 
@@ -163,7 +162,7 @@ class _SlowLines:
         decaying = self.tones @ decay
         power = np.abs(decaying) ** 2
         level = float(np.mean(self.p * np.abs(lines - departure * decaying) ** 2)) / decay.size
-        return max(level * float(np.sum(power / self.p) / np.sum(power)), _TINY)
+        return max(level * float(np.sum(power / self.p) / np.sum(power)), TINY)
 
 
 def _friction_rate(response: complex) -> float:

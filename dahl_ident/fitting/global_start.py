@@ -44,7 +44,7 @@ IntArray = NDArray[np.intp]
 
 _STEP = 0.01  # of ln(A/length): tables are read at the nearest step
 _LOWEST, _NODES = -3200, 6400  # of ln(A/length) in a table, in steps
-_DECADE = np.log(10.0) / _STEP
+_DECADE = np.log(10.0) / _STEP  # in steps
 _FINE, _COARSE = 58, 230  # steps between nodes of the grid: four a decade, one a decade
 _FINE_ENDS = (6, 4)  # coarse nodes at either end
 _COMPUTED = 10  # steps between the amplitudes at which a table is computed; splines between
@@ -56,7 +56,7 @@ _MOST_COMBINATIONS = 4000  # nodes of all elements together: a limit on memory a
 _MOST_OF_ONE = 1000  # of one element whose curves have to be computed node by node
 _MOST_STARTS = 4  # searches a table: a limit on their cost
 _HOPELESS = 100.0  # times the lowest sum of squares: no start, even with coarse nodes
-_AROUND = np.array([-1, 0, 1])
+_AROUND = np.array([-1, 0, 1])  # a node and its neighbours, for a parabola
 
 
 class Starts(NamedTuple):

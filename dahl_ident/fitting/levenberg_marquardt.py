@@ -27,7 +27,7 @@ BoolArray = NDArray[np.bool_]
 Evaluate = Callable[[FloatArray, IntArray | None], Quadratic]
 """(theta (S, P), which of the problems they belong to, None for all) -> cost, gradient, Hessian."""
 
-_EPS = float(np.finfo(np.float64).eps)
+_EPS = float(np.finfo(np.float64).eps)  # distance from 1 to the next number
 _FIRST_DAMPING = 1e-9  # almost nothing: the first step is that of Gauss and Newton
 _GAUSS_NEWTON = 1e-3  # with more damping a short step says nothing
 _MOST_DAMPING = 1e12  # steps are below rounding then

@@ -15,7 +15,7 @@ from dahl_ident.problem import Quadratic
 from dahl_ident.problem.record_noise import prediction_error_filter, share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
-_STEPS = 60
+_STEPS = 60  # at most; a search without convergence is no estimate
 _SHORT = 8192  # samples with which a long record is begun
 _ROUGH = 15  # steps after which the noise is known well enough to say what a step is worth
 _WORTHLESS = 1e-5  # fall of the cost, in units of the noise's variance

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import FloatArray
 
 LEAST_CYCLES = 2  # measured at a level: a single cycle does not show its noise
-_LEAST_SETTLING = 1
+_LEAST_SETTLING = 1  # cycle: no change of level is instant
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,10 @@ from dahl_ident.problem import Problem
 CONTROLLED = ("displacement", "force")
 _LIMITS = ("displacement", "force", "speed", "frequency_hz", "time")
 _CERTAIN = 0.95  # fraction of the draws that stay within a limit
-_FREQUENCIES = 12
+_FREQUENCIES = 12  # at most: six a decade of the default range
 _BELOW, _ABOVE = 0.03, 30.0  # range of amplitudes over the knee where no limit is given
 _SOFTEST = 3e-3  # of the largest drive
-_STEP = 1e-4
+_STEP = 1e-4  # relative, of the frequency: truncation 1e-8, rounding 1e-12
 _CHECKED_DRAWS = 25  # at which the number of steady amplitudes is counted
 
 

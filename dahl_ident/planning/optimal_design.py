@@ -25,10 +25,9 @@ from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
 from dahl_ident.planning.criteria import Objective
 
 _IMPROVES = 1e-3  # least improvement of the logarithm by a change of the levels
-_ROUNDS = 12
+_ROUNDS = 12  # at most; a round without improvement is the last
 _TRIED = 3  # candidates whose times are optimised after a first look at all
-_MOST_LEVELS = 24
-_NEGLIGIBLE = 1e-6
+_MOST_LEVELS = 24  # an optimum of six parameters takes at most 21 (Caratheodory)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from dahl_ident.planning.question import Question, larger_model, noise_of, targe
 
 _NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
-_RELAXED = 10.0
+_RELAXED = 10.0  # times: a limit that prevents nothing then hardly helps
 
 
 def plan(

@@ -13,8 +13,8 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError
 from dahl_ident.plots import style
 
-_WIDE = 3.0
-_QUANTILES = (0.16, 0.5, 0.84)
+_WIDE = 3.0  # half a decade; narrower, logarithmic ticks are hard to read
+_QUANTILES = (0.16, 0.5, 0.84)  # median, and one standard deviation to either side
 
 
 def plot_corner(

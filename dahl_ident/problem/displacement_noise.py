@@ -13,7 +13,7 @@ from scipy.special import comb
 from dahl_ident.arrays import FloatArray
 
 _ORDER = 4  # of the differences, which leave little of any motion
-_BLOCKS = 50
+_BLOCKS = 50  # some of which see little of the motion
 _QUIET = 0.25  # quantile of the blocks
 _MEDIAN = 0.6745  # of a normal variable's absolute value, in standard deviations
 _HALF_BAND = 4.0  # standard deviations to either side

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 
-_HIGHEST_ORDER = 60
-_SAMPLES_PER_ORDER = 20
+HIGHEST_ORDER = 60  # of autoregressions: a limit on time, far above what sensors ask for
+SAMPLES_PER_ORDER = 20  # with fewer, the coefficients follow the noise
 _BAND = 1e-4  # of the drive's largest power: below, the drive is not in its band
 _OUTSIDE = 0.1  # share of frequencies outside the band needed to estimate the noise
 
@@ -40,7 +40,7 @@ def prediction_error_filter(residuals: Sequence[FloatArray]) -> FloatArray:
     True
     """
     shortest = min(e.size for e in residuals)
-    highest = min(_HIGHEST_ORDER, shortest // _SAMPLES_PER_ORDER)
+    highest = min(HIGHEST_ORDER, shortest // SAMPLES_PER_ORDER)
     lags = [np.lib.stride_tricks.sliding_window_view(e, highest + 1)[:, ::-1] for e in residuals]
     n = sum(len(rows) for rows in lags)
     products = np.zeros((highest + 1, highest + 1))

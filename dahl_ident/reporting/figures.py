@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from dahl_ident.diagnostics.budget import Budget
     from dahl_ident.results import FitResult
 
-_MARKED_BETA = (0.3, 1.0, 2.2, 5.0, 20.0)
+_MARKED_BETA = (0.3, 1.0, 2.2, 5.0, 20.0)  # spread over the curve from stick to slip
 _LEVELS, _POINTS = 5, 160  # of the plant's response over levels
 _APART = 1.2  # of the largest frequency over the smallest
 _STRAIGHT = 1.5  # log of a profile's range beyond which its axis is logarithmic

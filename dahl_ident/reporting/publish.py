@@ -23,7 +23,7 @@ from dahl_ident.reporting.record_report import record_document
 from dahl_ident.reporting.sections import Result, document
 from dahl_ident.results import ChainPosterior, FitResult, RecordFit
 
-SCHEMA = 2
+SCHEMA = 2  # of the JSON report: it rises when readers have to change
 _LONGEST_TITLE = 200  # characters
 FORMATS = (".html", ".pdf", ".md", ".json")
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from dahl_ident.results import FitResult
     from dahl_ident.results.chain_posterior import ChainPosterior
 
-_LINEARIZATION_ROWS = 9
+_LINEARIZATION_ROWS = 9  # few enough to read, from the smallest amplitude to the largest
 
 
 def answer(fit: FitResult, *, described: bool) -> Table:

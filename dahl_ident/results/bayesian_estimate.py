@@ -41,8 +41,8 @@ from dahl_ident.results.record_fit import RecordFit
 from dahl_ident.results.record_posterior import RecordPosterior
 from dahl_ident.sensors import Sensors
 
-_LEAST_STEPS = 20
-_MOST_AXES = 3
+_LEAST_STEPS = 20  # with fewer no autocorrelation can be estimated
+_MOST_AXES = 3  # the number of points is a power of the number of axes
 METHODS = ("mcmc", "grid")
 
 

@@ -18,7 +18,7 @@ from dahl_ident.plots import (
 from dahl_ident.results.judged_fit import JudgedFit
 from dahl_ident.units import si_unit
 
-_POINTS = 200
+_POINTS = 200  # of a curve that looks smooth
 
 
 def draw_fit(fit: JudgedFit, ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:

@@ -13,7 +13,7 @@ from dahl_ident.diagnostics.formatting import interval, rounded, table, with_uni
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals
 from dahl_ident.results.judged_fit import JudgedFit
 
-_CORRELATED = 0.1
+_CORRELATED = 0.1  # smaller correlations change an uncertainty by less than 0.5 %
 _BRIEF = 15  # lines that a reader takes in at a glance
 _NOISE = {
     "measured": "measured: the data's covariance, scale known",

@@ -26,8 +26,8 @@ from dahl_ident.problem import Problem
 from dahl_ident.sensors import EXACT, Sensors
 
 SCHEMA = "dahl_ident.fit_result"
-VERSION = 2
-_FIRST_WITH_DIGEST = 2
+VERSION = 2  # of the layout; older ones are read
+_FIRST_WITH_DIGEST = 2  # version from which on files have a digest
 _SAME = 1e-6  # relative: what versions of numerical libraries never change
 
 _COLUMNS = (

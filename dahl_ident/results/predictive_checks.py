@@ -23,7 +23,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.bayes.density import TAIL_DOF, Density
 from dahl_ident.data import FrequencyResponse
 
-_MISFIT = 0.01
+_MISFIT = 0.01  # false-alarm rate of one check
 _MEANING = {
     "size": "the residuals are larger than the noise that the data state",
     "largest": "single rows lie farther off than the noise explains",

@@ -15,7 +15,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.priors import JointPrior, ParameterPrior
 
-_NEARLY_AS_WIDE = 0.5
+_NEARLY_AS_WIDE = 0.5  # of the width: the data have not even halved it
 _END = 0.01  # of the prior's probability that counts as its end
 
 

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from dahl_ident.plots import Axes
 
 SCHEMA = "dahl_ident.record_fit"
-_SCHEMA_VERSION = 1
+_SCHEMA_VERSION = 1  # of the layout; later ones are refused
 _CHANNELS = ("displacement", "velocity", "acceleration", "force", "drive")
 _WELL = 1e-3  # share of variance left at which structure in the residuals does not matter
 _FAIRLY = 0.1  # share of variance left beyond which the model does not describe the records

@@ -25,7 +25,7 @@ from dahl_ident.results.predictive_checks import PredictiveCheck, predictive_che
 from dahl_ident.results.result import Estimate
 from dahl_ident.units import Quantity
 
-_CHECK_DRAWS = 1000
+_CHECK_DRAWS = 1000  # a share of 1 % has an error of 0.3 %
 
 
 class ResponsePosterior(Posterior):

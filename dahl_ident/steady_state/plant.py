@@ -18,7 +18,7 @@ IntArray = NDArray[np.intp]
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 _Values = list[Sequence[FloatArray]]
 
-EPS = float(np.finfo(np.float64).eps)
+EPS = float(np.finfo(np.float64).eps)  # distance from 1 to the next number
 _ROUNDING = 8.0 * EPS  # of k - m omega^2 and its like, relative to the terms' sizes
 _LARGEST = 1e300  # represents an unbounded amplitude
 _REACH = 40  # decades of amplitude, m, to both sides, that are searched where N has no bounds

@@ -24,8 +24,8 @@ from dahl_ident.steady_state.plant import EPS, BoolArray, IntArray, Nonlinear, P
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
-_NODES_PER_DECADE = (4, 180)
-_SCAN_PER_DECADE = 128
+_NODES_PER_DECADE = (4, 180)  # fewest for few points, most for many: beyond, tables only cost
+_SCAN_PER_DECADE = 128  # 1.8 % apart: closer pairs of roots may be missed
 _SCAN_CELLS = 2**15  # points times nodes of the scan that are processed at once
 _CHUNK = 4096  # points solved together: their scratch arrays stay in the processor's cache
 

@@ -22,7 +22,7 @@ from dahl_ident.synthetic.checks import non_negative_number
 from dahl_ident.synthetic.mechanism import Signal
 from dahl_ident.synthetic.randomness import Draws
 
-_FILTER_OVERSAMPLING = 16
+_FILTER_OVERSAMPLING = 16  # points a sample: the signal is taken as linear between
 _WAVEFORM_FAULTS = (
     "noise_std", "flicker_std", "hum_amplitude", "offset", "drift", "resolution", "limit",
 )  # fmt: skip

@@ -12,7 +12,7 @@ from dahl_ident.synthetic.excitation import SteppedSine
 from dahl_ident.synthetic.experiment import Experiment
 from dahl_ident.synthetic.table_errors import Table
 
-_F_MAX, _SIGMA = 0.1, 30.0
+_F_MAX, _SIGMA = 0.1, 30.0  # N and N/m, as in the plant of Fig. 7
 _X_C = _F_MAX / _SIGMA
 
 
@@ -70,8 +70,8 @@ def _friction(
     return Experiment(Dahl(_F_MAX, _SIGMA, alpha), steps, table=table)
 
 
-_PLANT = Dahl(_F_MAX, _SIGMA, 1.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
-_ONE_PERCENT = Table(force_std=0.01)
+_PLANT = Dahl(_F_MAX, _SIGMA, 1.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)  # Fig. 7
+_ONE_PERCENT = Table(force_std=0.01)  # noise
 _BOTH = ("f_max", "sigma")
 _ALL_OF_PLANT = ("f_max", "sigma", "mass", "damping", "stiffness")
 

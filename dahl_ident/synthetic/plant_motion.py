@@ -39,12 +39,12 @@ from dahl_ident.synthetic.waveform import Segment, Waveform
 
 Progress = Callable[[float], None]
 
-_TOLERANCE = 1e-11
-_SHORTEST = 2.0**-30
+_TOLERANCE = 1e-11  # of the peak, in one interval: a thousand of them leave 1e-8
+_SHORTEST = 2.0**-30  # of the longest interval: only a motion without bounds asks for less
 _ROOM_TO_GROW = 2.0**-11  # the last coefficients go as the 11th power of the length
-_NEWTON_STEPS = 12
-_NOISE = 1e-13
-_BEYOND_BOUNDS = 1e100
+_NEWTON_STEPS = 12  # at most; then the interval is too long
+_NOISE = 1e-13  # of the peak: speeds below are rounding
+_BEYOND_BOUNDS = 1e100  # m: far beyond any plant, and its square is still a number
 
 
 def simulate_plant(

@@ -11,7 +11,7 @@ from typing import Any
 from dahl_ident.data import FrequencyResponse, Record, read_frequency_response, read_record
 from dahl_ident.errors import DataError
 
-_PACKAGE = Path(__file__).parents[1]
+_PACKAGE = Path(__file__).parents[1]  # the folder dahl_ident
 _PLACES = (_PACKAGE / "datasets" / "synthetic", _PACKAGE.parent / "datasets" / "synthetic")
 
 

@@ -12,8 +12,8 @@ from numpy.polynomial import chebyshev
 
 from dahl_ident.arrays import FloatArray
 
-DEGREE = 12
-_ANGLES = np.pi * np.arange(DEGREE, -1, -1) / DEGREE
+DEGREE = 12  # high: few intervals for a tolerance of 1e-11
+_ANGLES = np.pi * np.arange(DEGREE, -1, -1) / DEGREE  # of Chebyshev's extreme points
 NODES = 0.5 * (1.0 + np.cos(_ANGLES))
 """Places in an interval [0, 1], both ends included, rising."""
 
@@ -35,7 +35,7 @@ INTEGRATION = _integration()
 DERIVATIVE = np.array([np.pad(chebyshev.chebder(c), (0, 1)) for c in TO_COEFFICIENTS.T]).T
 """Matrix from the values at the nodes to the coefficients of the derivative by 2 tau - 1."""
 
-FINE = np.linspace(0.0, 1.0, 4 * DEGREE + 1)
+FINE = np.linspace(0.0, 1.0, 4 * DEGREE + 1)  # four a node: no reversal is missed between
 FINE_DERIVATIVE = chebyshev.chebvander(2.0 * FINE - 1.0, DEGREE) @ DERIVATIVE
 """Matrix from the values at the nodes to the derivative on a fine grid over [0, 1]."""
 

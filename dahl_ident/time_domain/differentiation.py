@@ -7,7 +7,7 @@ from scipy.signal import savgol_filter
 
 from dahl_ident.arrays import FloatArray
 
-_DEGREE = 4
+_DEGREE = 4  # of the polynomials: the acceleration is one of second degree
 _POWER = 0.9999  # share of the velocity's power below the band's end
 _MARGIN = 2.0  # the filter passes this times the band
 

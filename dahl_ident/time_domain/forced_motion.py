@@ -26,15 +26,15 @@ from dahl_ident.time_domain.plant import Plant
 from dahl_ident.time_domain.runge_kutta import PLACES
 from dahl_ident.time_domain.vectorised import BLOCK
 
-_PLACES = np.array(PLACES[:6])
+_PLACES = np.array(PLACES[:6])  # of the drive: the seventh stage is at the second's
 _PIECES = 6  # parts that a step is divided into at most
 _LOCATING = 8  # Newton steps for a passage through zero, at most
 _LOCATED = 1e-9  # of a step: the error of the next Newton step is below rounding
-_PASSES = 50
+_PASSES = 50  # at most; corrections shrink or the search ends
 _GROWTHS = 3  # passes in which the correction may grow
-_SEGMENT = 32
-_TOLERANCE = 1e-11
-_POWERS = np.arange(8)
+_SEGMENT = 32  # samples, within which motions stay near a wrong start
+_TOLERANCE = 1e-11  # of the largest motion: the next pass changes rounding alone
+_POWERS = np.arange(8)  # of time, in the drive's polynomial over a step
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import casadi as ca
 import numpy as np
 
-_ROOT = float(np.sqrt(21.0))
+_ROOT = float(np.sqrt(21.0))  # in Luther's coefficients
 PLACES = (0.0, 1.0, 0.5, 2.0 / 3.0, (7.0 - _ROOT) / 14.0, (7.0 + _ROOT) / 14.0, 1.0)
 """Where in the step the stages are."""
 _STAGES = (
@@ -49,7 +49,9 @@ _STAGES = (
         )
     ),
 )
-_WEIGHTS = tuple(v / 180.0 for v in (9.0, 0.0, 64.0, 0.0, 49.0, 49.0, 9.0))
+"""Weights of the earlier slopes in each stage, as Luther (1968) has them."""
+
+_WEIGHTS = tuple(v / 180.0 for v in (9.0, 0.0, 64.0, 0.0, 49.0, 49.0, 9.0))  # of slopes
 
 
 def step(
