@@ -34,6 +34,7 @@ _MOST_PLACES = 200  # rows beyond which a column for each costs seconds, cubic i
 _SMOOTH = 1e-3  # eigenvalue of the correlation, over the largest, that is negligible
 _MOST_SHAPES = 24  # of its eigenvectors; a decade of both amplitude and frequency takes 15
 _SAME_LEVEL = 0.02  # of ln A and ln f, beyond which the response is another
+_MOST_LEVELS = 50  # with an error each: the cost is cubic in their number
 _EQUAL = 1e-9  # of the same: one number, stored twice
 _BY_CHANCE = 0.01  # tables without repeats in which some seem to be
 _MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it leaves
@@ -303,14 +304,18 @@ def _moved(problem: Problem) -> Problem | None:
 def _sizes(problem: Problem, predicted: ComplexArray) -> ComplexArray:
     """Return what a departure is relative to: the row's response, a harmonic's fundamental."""
     data = problem.data
-    size = predicted.copy()
-    for row in np.flatnonzero(data.harmonic != 1):
-        same = (data.harmonic == 1) & (data.frequency_hz == data.frequency_hz[row])
-        if data.amplitude is not None:
-            same &= data.amplitude == data.amplitude[row]
-        if same.any():
-            phase = predicted[row] / (abs(predicted[row]) or 1.0)
-            size[row] = abs(predicted[same][0]) * phase
+    first = data.harmonic == 1
+    if first.all():
+        return predicted.copy()
+    held = np.ones(data.n) if data.amplitude is None else data.amplitude
+    _, which = np.unique(np.column_stack([data.frequency_hz, held]), axis=0, return_inverse=True)
+    which = which.ravel()
+    partner = np.full(which.max() + 1, -1)
+    partner[which[first][::-1]] = np.flatnonzero(first)[::-1]  # the first of several
+    rows = ~first & (partner[which] >= 0)
+    own, size = predicted[rows], predicted.copy()
+    phase = np.divide(own, np.abs(own), out=np.zeros_like(own), where=own != 0.0)
+    size[rows] = np.abs(predicted[partner[which[rows]]]) * phase
     return size
 
 
@@ -338,9 +343,15 @@ def _scattering_parameters(problem: Problem) -> list[int]:
 
 
 def _repeats(level: NDArray[np.intp], fundamental: NDArray[np.bool_]) -> FloatArray:
-    """Return which rows belong to each level that was measured more than once, (levels, n)."""
-    count = np.bincount(level[fundamental])
-    return np.asarray((np.flatnonzero(count > 1)[:, None] == level) & fundamental, dtype=np.float64)
+    """Return which rows belong to each level that was measured more than once, (levels, n).
+
+    Of very many levels, neighbours share what is then the scatter of their mean.
+    """
+    repeated = np.flatnonzero(np.bincount(level[fundamental], minlength=level.max() + 1) > 1)
+    groups = min(len(repeated), _MOST_LEVELS)
+    own = np.full(level.max() + 1, -1)
+    own[repeated] = np.arange(len(repeated)) * groups // max(len(repeated), 1)
+    return np.asarray((np.arange(groups)[:, None] == own[level]) & fundamental, dtype=np.float64)
 
 
 def repeated_levels(data: FrequencyResponse) -> NDArray[np.intp]:
