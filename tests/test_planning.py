@@ -458,10 +458,13 @@ class TestProof:
         spent, oracle = planning.sequence(off, seed=0)
         assert spent <= planning.SEQUENCE * oracle
 
-    def test_whole_waveforms_give_what_was_predicted(self) -> None:
-        _, told, got = planning.waveforms(30)
-        # of 30 records the error of a standard deviation is 13 %
-        assert got == pytest.approx(told, rel=0.4)
+    def test_whole_experiments_give_what_was_predicted(self) -> None:
+        scenario = planning.scenarios()[1]
+        plan = scenario.plan(50.0, None)
+        got = planning.achieved(scenario, planning.Design.of(plan), 30, 0, whole=True)
+        for name, error in got.items():
+            # of 30 records the error of a standard deviation is 13 %
+            assert error == pytest.approx(plan.expected[name].after, rel=0.4)
 
 
 def _errors(plan: Plan, truth: di.Model, noise: float, count: int) -> FloatArray:
