@@ -23,19 +23,19 @@ class DataSet:
     Attributes
     ----------
     name : str
-        What ``load_dataset`` calls it; its files bear this name.
+        Name for ``load_dataset``, and of its files.
     experiment : Experiment
         How it was made.
     seed : int
-        With which random numbers.
+        Of its random numbers.
     teaches : str
-        Why it is there, in a line.
+        What it demonstrates, in one line.
     identifiable : tuple of str
         Parameters that the data determine (standard deviation of the logarithm below 0.25).
     not_identifiable : tuple of str
         Parameters that they do not; a fit has to say so.
     caution : str
-        The flaw that an honest analysis names, or an empty string.
+        The flaw of the data that an analysis has to report, or an empty string.
     """
 
     name: str
@@ -82,21 +82,21 @@ DATA_SETS: dict[str, DataSet] = {
             "clean",
             _friction((0.1, 10.0), Table()),
             seed=1,
-            teaches="friction alone about its knee, without noise: an estimate is exact",
+            teaches="friction alone around its knee, without noise: the estimate is exact",
             identifiable=_BOTH,
         ),
         DataSet(
             "noisy",
             _friction((0.1, 10.0), _ONE_PERCENT),
             seed=2,
-            teaches="the same with 1 % noise: what every estimate should look like",
+            teaches="the same with 1 % noise: what a good measurement looks like",
             identifiable=_BOTH,
         ),
         DataSet(
             "microslip",
             _friction((0.0002, 0.002), _ONE_PERCENT),
             seed=3,
-            teaches="small amplitudes alone show sigma at once, f_max only through the loss",
+            teaches="small amplitudes alone determine sigma well, f_max only through the loss",
             identifiable=("sigma",),
             not_identifiable=("f_max",),
         ),
@@ -108,7 +108,7 @@ DATA_SETS: dict[str, DataSet] = {
                 table=Table(force_std=0.03),
             ),
             seed=4,
-            teaches="strokes beyond 10,000 x_c: f_max shows at once, sigma drowns in 3 % noise",
+            teaches="strokes beyond 10,000 x_c determine f_max; sigma's effect is below 3 % noise",
             identifiable=("f_max",),
             not_identifiable=("sigma",),
         ),
@@ -116,7 +116,7 @@ DATA_SETS: dict[str, DataSet] = {
             "alpha_2",
             _friction((0.1, 30.0), _ONE_PERCENT, alpha=2.0, levels=40),
             seed=5,
-            teaches="friction that no linear Dahl model fits: free alpha, and compare",
+            teaches="friction that no linear Dahl model fits: free alpha and compare the models",
             identifiable=("f_max", "sigma", "alpha"),
         ),
         DataSet(
@@ -131,7 +131,7 @@ DATA_SETS: dict[str, DataSet] = {
                 table=Table(displacement_std=0.01),
             ),
             seed=12,
-            teaches="a plant driven by force, from stuck to sliding: linear elements come along",
+            teaches="a plant driven by force, from stick to slip: friction with linear elements",
             identifiable=_ALL_OF_PLANT,
         ),
         DataSet(
@@ -153,7 +153,7 @@ DATA_SETS: dict[str, DataSet] = {
                 ),
             ),
             seed=7,
-            teaches="descending levels without time to settle: the loss of small ones is corrupt",
+            teaches="descending levels without time to settle: the loss at small ones is biased",
             identifiable=_BOTH,
             caution="the small levels have not settled",
         ),
@@ -190,7 +190,7 @@ DATA_SETS: dict[str, DataSet] = {
                 _ONE_PERCENT,
             ),
             seed=10,
-            teaches="displacement 2 ms late, force 20 % high: the delay shows, the gain does not",
+            teaches="displacement 2 ms late, force 20 % high: the delay is found, the gain is not",
             identifiable=("delay",),
             not_identifiable=("f_max", "sigma", "force_gain"),
             caution="the phase depends on frequency, as no friction alone can do",
@@ -212,7 +212,7 @@ DATA_SETS: dict[str, DataSet] = {
                 ),
             ),
             seed=13,
-            teaches="friction as devices have it: unequal limits behind a gap, found from loops",
+            teaches="friction with unequal limits behind a gap, estimated from hysteresis loops",
             identifiable=("f_max", "sigma", "asymmetry", "gap"),
         ),
         DataSet(

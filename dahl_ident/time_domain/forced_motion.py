@@ -86,7 +86,7 @@ class ForcedMotion:
         first : ndarray, shape (order,)
             State at the first sample.
         guess : ndarray, shape (n, order)
-            Of the motion; a better one saves passes.
+            Of the motion; a better guess takes fewer passes.
 
         Returns
         -------
