@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 
-HIGHEST_ORDER = 60  # of autoregressions: a limit on time, far above what sensors ask for
+HIGHEST_ORDER = 60  # of autoregressions: a limit on time; Akaike's criterion chooses below
 SAMPLES_PER_ORDER = 20  # with fewer, the coefficients follow the noise
 _BAND = 1e-4  # of the drive's largest power: below, the drive is not in its band
 _OUTSIDE = 0.1  # share of frequencies outside the band needed to estimate the noise
