@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring, fit
+from dahl_ident import (
+    Backlash,
+    Dahl,
+    Damper,
+    FrequencyResponse,
+    Mass,
+    PowerDamper,
+    Sensors,
+    Spring,
+    fit,
+)
 from dahl_ident.diagnostics import Verdict, identifiability
 from dahl_ident.diagnostics.information import Information, shares
 from dahl_ident.results import FitResult
@@ -99,6 +109,19 @@ class TestVerdicts:
             assert "drive" not in found[name].text
             assert "the free stiffness" in found[name].text
             assert "measure the spring and fix stiffness" in found[name].text
+
+    def test_amplitudes_within_the_gap_do_not_show_it(self) -> None:
+        law = Backlash(Dahl(F_MAX, SIGMA), 10.0 * X_C)
+        data = table(model=law + Spring(SIGMA), beta=(1.0, 4.9))
+        found = fit(data, Backlash(Dahl()) + Spring(), throw=False)
+        assert found.verdict.startswith("Not determined.")
+        assert {"f_max", "sigma", "gap"} <= set(found.identifiability.named(NOT))
+
+    def test_one_amplitude_at_one_frequency_shows_no_exponent(self) -> None:
+        data = table(model=PowerDamper(2.0, 0.5), beta=(1.0, 1.0), n=8)
+        found = fit(data, PowerDamper(), throw=False)
+        assert found.verdict.startswith("Not determined. Nothing is determined")
+        assert found.identifiability.named(NOT) == ["coefficient", "exponent"]
 
     def test_one_unknown_makes_no_combination(self) -> None:
         """With sigma known, f_max/sigma says no more than f_max, which its profile leaves open."""
