@@ -19,14 +19,19 @@ from dahl_ident.cli.options import STANDARD, Files, General, Reading, Writing, o
 from dahl_ident.errors import FitInterrupted
 
 if TYPE_CHECKING:
-    from dahl_ident.results import ChainPosterior, FitResult, RecordFit
+    from dahl_ident.data import Record
+    from dahl_ident.results import ChainPosterior, FitResult, RecordFit, RecordPosterior
     from dahl_ident.results.result import Result
 
 _ESTIMATING = "Estimating"
-_TAKEN = ("model", "free", "fixed", "start")  # by a fit of records
+TAKEN = ("model", "free", "fixed", "start")  # by a fit of records
 ReportPlace = Annotated[
     str | None,
     typer.Option(help="Report to write: .html, .pdf, .md or .json; - is HTML on standard output."),
+]
+
+AsRecords = Annotated[
+    bool, typer.Option("--record", help="The files are records of any motion; each is a run.")
 ]
 
 
@@ -88,10 +93,7 @@ def fit(
     compare: Annotated[
         bool, typer.Option("--compare", help="Compare with other models of the friction.")
     ] = False,
-    record: Annotated[
-        bool,
-        typer.Option("--record", help="The files are records of any motion; each is a run."),
-    ] = False,
+    record: AsRecords = False,
 ) -> None:
     """Estimate a model's parameters, and state whether the data determine them.
 
@@ -124,6 +126,13 @@ def fit(
     finish(result)
 
 
+def read_records(files: list[str]) -> list[Record]:
+    """Return the records of the files, each a run."""
+    from dahl_ident.data import read_record
+
+    return [read_record(name) for name in files]
+
+
 def _fit_records(
     files: list[str],
     general: General,
@@ -134,13 +143,11 @@ def _fit_records(
     save: Path | None,
 ) -> None:
     """Fit records of any motion sample by sample."""
-    from dahl_ident.data import read_record
     from dahl_ident.results import fit as fit_data
 
-    how = {k: v for k, v in {**model.keywords(), **estimating.keywords()}.items() if k in _TAKEN}
-    records = [read_record(name) for name in files]
+    how = {k: v for k, v in {**model.keywords(), **estimating.keywords()}.items() if k in TAKEN}
     try:
-        result = fit_data(records, throw=False, progress=sys.stderr.isatty(), **how)
+        result = fit_data(read_records(files), throw=False, progress=sys.stderr.isatty(), **how)
     except FitInterrupted as stop:
         console.write(stop.result.fit_report())
         raise
@@ -182,7 +189,7 @@ def check_reports(*places: str | None) -> None:
 
 
 def write_report(
-    results: Sequence[FitResult | ChainPosterior | RecordFit],
+    results: Sequence[FitResult | ChainPosterior | RecordFit | RecordPosterior],
     place: str,
     writing: Writing,
     **how: Any,
@@ -201,7 +208,9 @@ def write_report(
 
 
 def write_report_beside(
-    results: Sequence[FitResult | ChainPosterior | RecordFit], place: str, writing: Writing
+    results: Sequence[FitResult | ChainPosterior | RecordFit | RecordPosterior],
+    place: str,
+    writing: Writing,
 ) -> None:
     """Write a report in addition to other output, and print its path."""
     written_to = write_report(results, place, writing)

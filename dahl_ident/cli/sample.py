@@ -11,7 +11,15 @@ import typer
 
 from dahl_ident.cli import console
 from dahl_ident.cli.distributions import prior
-from dahl_ident.cli.fit import ReportPlace, check_reports, finish, write_report_beside
+from dahl_ident.cli.fit import (
+    TAKEN,
+    AsRecords,
+    ReportPlace,
+    check_reports,
+    finish,
+    read_records,
+    write_report_beside,
+)
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import STANDARD, Files, General, Reading, Writing, one_of
@@ -114,18 +122,22 @@ def sample(
     sampling: Sampling,
     writing: Writing,
     report: ReportPlace = None,
+    record: AsRecords = False,
 ) -> None:
     """Sample the posterior of the parameters.
 
     Example: dahl-ident datasets noisy -o - | dahl-ident sample - --prior f_max=0.01:1
     """
-    from dahl_ident.results import ChainPosterior
+    from dahl_ident.results import GridPosterior
     from dahl_ident.results.bayesian_estimate import posterior as estimate_posterior
 
     writing.check([report], files, json=general.json)
     check_reports(report)
     sampling.check(report)
-    data, plant, how = reading.read(files), model.keywords(), sampling.keywords()
+    plant, how = model.keywords(), sampling.keywords()
+    data = read_records(files) if record else reading.read(files)
+    if record:
+        plant, how = _for_records(plant, how)
     try:
         posterior = estimate_posterior(data, **plant, **how)
     except KeyboardInterrupt:
@@ -135,9 +147,28 @@ def sample(
         console.write_json(posterior.to_dict())
     elif report != STANDARD:
         console.write_wrapped(str(posterior))
-    if report is not None and isinstance(posterior, ChainPosterior):
+    if report is not None and not isinstance(posterior, GridPosterior):
         write_report_beside([posterior], report, writing)
     finish(posterior)
+
+
+def _for_records(
+    plant: dict[str, Any], how: dict[str, Any]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the options that a posterior of records takes; others that were given are refused."""
+    own, usual = {**plant, **how}, Sampling()
+    refused = [
+        f"--{name}"
+        for name in ("method", "noise", "likelihood")
+        if own[name] != getattr(usual, name)
+    ]
+    if refused:
+        raise ValidationError(
+            f"{', '.join(refused)} is given together with --record; a posterior of records takes "
+            "none of them"
+        )
+    chain = [n for n in ("priors", *_CHAIN, "progress") if n in how]
+    return {n: plant[n] for n in TAKEN if n in plant}, {n: how[n] for n in chain}
 
 
 def _kept(chain: Path | None) -> str:

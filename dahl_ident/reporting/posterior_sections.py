@@ -19,32 +19,32 @@ from dahl_ident.reporting.document import (
     Table,
     number,
 )
-from dahl_ident.results.chain_posterior import ChainPosterior
+from dahl_ident.results.chain_draws import ChainDraws
 from dahl_ident.results.posterior_base import QUANTILES
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-def sections(posterior: ChainPosterior) -> Iterator[Section]:
+def sections(posterior: ChainDraws) -> Iterator[Section]:
     """Yield numbers and pictures of a posterior."""
     yield Section("Posterior", tuple(_numbers(posterior)), details=True)
     pictures = (_corner(posterior), _trace(posterior))
     yield Section("Pictures of the posterior", pictures, details=True)
 
 
-def verdict(posterior: ChainPosterior) -> list[str]:
+def verdict(posterior: ChainDraws) -> list[str]:
     """Return whether it can be used, which parameters the prior determines, and misfits."""
     return [f"Posterior: {posterior.message}", *posterior.findings]
 
 
-def answer(posterior: ChainPosterior) -> Iterator[Block]:
+def answer(posterior: ChainDraws) -> Iterator[Block]:
     """Yield the summary of a posterior and its priors; the numbers are struck if not trusted."""
     yield _summary(posterior)
     yield Bullets(tuple(f"Prior of {name}: {text}" for name, text in posterior.priors.items()))
 
 
-def _summary(posterior: ChainPosterior) -> Table:
+def _summary(posterior: ChainDraws) -> Table:
     columns = ["mean", "std", *QUANTILES, "mcse", "ess", "r_hat"]
     rows = tuple(
         (Cell(str(name)), Cell(str(row["unit"]) or "-"), *_row(row))
@@ -55,7 +55,7 @@ def _summary(posterior: ChainPosterior) -> Table:
     return Table("Posterior of each parameter", ("parameter", "unit", *columns), rows)
 
 
-def _numbers(posterior: ChainPosterior) -> Iterator[Block]:
+def _numbers(posterior: ChainDraws) -> Iterator[Block]:
     yield Paragraph(posterior.message)
     yield _summary(posterior)
     yield Paragraph(
@@ -81,7 +81,7 @@ def _row(row: pd.Series[Any]) -> Iterator[Cell]:
         yield number(row[name], digits) if np.isfinite(row[name]) else Cell("-")
 
 
-def _corner(posterior: ChainPosterior) -> Picture:
+def _corner(posterior: ChainDraws) -> Picture:
     correlation = np.corrcoef(posterior.values.T).reshape(len(posterior.names), -1)
     i, j = np.unravel_index(np.argmax(np.abs(np.triu(correlation, 1))), correlation.shape)
     finding = (
@@ -98,7 +98,7 @@ def _corner(posterior: ChainPosterior) -> Picture:
     )
 
 
-def _trace(posterior: ChainPosterior) -> Picture:
+def _trace(posterior: ChainDraws) -> Picture:
     return Picture(
         "trace",
         "Paths of the walkers; the shaded warm-up is not used in any result.",

@@ -21,15 +21,16 @@ from dahl_ident.reporting.metadata import metadata_of
 from dahl_ident.reporting.overlay import overlay
 from dahl_ident.reporting.record_report import record_document
 from dahl_ident.reporting.sections import Result, document
-from dahl_ident.results import ChainPosterior, FitResult, RecordFit
+from dahl_ident.results import ChainPosterior, FitResult, RecordFit, RecordPosterior
 
 SCHEMA = 2  # of the JSON report: it rises when readers have to change
 _LONGEST_TITLE = 200  # characters
+RecordResult = RecordFit | RecordPosterior
 FORMATS = (".html", ".pdf", ".md", ".json")
 
 
 def report(
-    results: Result | RecordFit | Sequence[Result | RecordFit],
+    results: Result | RecordResult | Sequence[Result | RecordResult],
     path: str | Path,
     *,
     title: str | None = None,
@@ -45,7 +46,7 @@ def report(
 
     Parameters
     ----------
-    results : FitResult, ChainPosterior, RecordFit, or sequence of them
+    results : FitResult, ChainPosterior, RecordFit, RecordPosterior, or sequence of them
         The results to report. Results on different data have to be fits. Fits to records are
         reported separately.
     path : path
@@ -92,7 +93,7 @@ def report(
         refuse_existing(place)
     given = list(results) if isinstance(results, Sequence) else [results]
     known = metadata_of(metadata)
-    of_records = [result for result in given if isinstance(result, RecordFit)]
+    of_records = [result for result in given if isinstance(result, (RecordFit, RecordPosterior))]
     if of_records:
         if len(of_records) < len(given) or record is not None:
             raise ValidationError(

@@ -10,7 +10,7 @@ import numpy as np
 
 from dahl_ident.diagnostics.formatting import interval, rounded
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
-from dahl_ident.reporting import provenance, tables
+from dahl_ident.reporting import posterior_sections, provenance, tables
 from dahl_ident.reporting.document import (
     MARKS,
     Block,
@@ -27,7 +27,7 @@ from dahl_ident.reporting.document import (
 )
 from dahl_ident.reporting.figures import budget_picture
 from dahl_ident.reporting.metadata import Metadata
-from dahl_ident.results import RecordFit
+from dahl_ident.results import RecordFit, RecordPosterior
 from dahl_ident.version import __version__
 
 if TYPE_CHECKING:
@@ -40,13 +40,15 @@ _OUTPUTS = {
 
 
 def record_document(
-    fits: Sequence[RecordFit],
+    results: Sequence[RecordFit | RecordPosterior],
     *,
     title: str | None = None,
     command: str | None = None,
     metadata: Metadata | None = None,
 ) -> Document:
-    """Return the report on one or several fits to records."""
+    """Return the report on one or several fits to records, and posteriors around them."""
+    drawn = [result for result in results if isinstance(result, RecordPosterior)]
+    fits = list(dict.fromkeys(r.fit if isinstance(r, RecordPosterior) else r for r in results))
     given = metadata or Metadata()
     several = len(fits) > 1
     front: list[Section] = []
@@ -63,6 +65,9 @@ def record_document(
         front.append(Section(f"Pictures{of}", tuple(_pictures(fit, number))))
         lines = (*fit.goodness.lines, *(f"Derived: {quantity}" for quantity in fit.derived()))
         details.append(Section(f"Goodness of fit{of}", (Bullets(lines),), details=True))
+    for one in drawn:
+        front.append(Section("Posterior", tuple(posterior_sections.answer(one))))
+        details += posterior_sections.sections(one)
     first = fits[0]
     files = [
         {"file": str(p["file"]), "sha256": str(p.get("sha256", "")), "read": True}
@@ -86,17 +91,18 @@ def record_document(
     order = list(MARKS)
     return Document(
         title=title or given.title or f"Friction identified from {name}",
-        status=max((str(fit.status) for fit in fits), key=order.index),
+        status=max((str(r.status) for r in (*fits, *drawn)), key=order.index),
         verdict=tuple(
             f"{fit.problem.model!r}: {line}" if several and i == 0 else line
             for fit in fits
             for i, line in enumerate(fit.statements)
-        ),
+        )
+        + tuple(line for one in drawn for line in posterior_sections.verdict(one)),
         header=tuple(header.items()),
         sections=(*front, *details, Section("Origin", tuple(origin), details=True)),
         facts={
             "fits": [],
-            "posteriors": [],
+            "posteriors": [one.to_dict() for one in drawn],
             "record_fits": [_facts(fit) for fit in fits],
             "files": files,
             "metadata": vars(given),
