@@ -176,6 +176,21 @@ class TestBudget:
         wrong = fit(data, Dahl(alpha=0.9))
         assert wrong.status == "not described"
 
+    def test_amplitudes_that_the_response_was_divided_by(self) -> None:
+        """An error of 5 % there is one of the stiffness in microslip, and none in slip."""
+        A = np.geomspace(0.05, 20.0, 24) * X_C
+        off, stated = [], []
+        for seed in range(40):
+            error = np.abs(relative_noise(24, 0.05, seed))
+            N = FRICTION.describing_function(A) / error * relative_noise(24, 0.002, 100 + seed)
+            found = modelled(FrequencyResponse(np.ones(24), N, A * error), Dahl(alpha=1.0))
+            values, errors = found.values, found.stderr
+            off.append([np.log(values["f_max"] / 0.1), np.log(values["sigma"] / 30.0)])
+            stated.append([errors["f_max"] / 0.1, errors["sigma"] / 30.0])
+        scatter, u = np.std(off, axis=0), np.sqrt(np.mean(np.square(stated), axis=0))
+        np.testing.assert_allclose(u, scatter, rtol=0.3)  # 11 % is one standard deviation
+        assert u[0] < 0.002  # the limit is known from slip
+
     def test_a_stated_calibration_is_a_type_b_source(self) -> None:
         sensors = Sensors(force_gain=stats.norm(1.0, 0.02))
         found = budget(fit(table(n=12), Dahl(alpha=1.0), sensors=sensors).optimum)
@@ -217,9 +232,9 @@ class TestBudget:
     def test_none_where_the_iteration_leaves_every_steady_response(self) -> None:
         """Drives near the force limit, where the linearised model steps below it."""
         phase = np.exp(-1j * np.radians([5.0, 20.0, 40.0]))
-        response = np.array([0.03, 0.04, 0.06]) * phase
+        response = np.array([0.03, 0.04, 0.08]) * phase
         data = FrequencyResponse(
-            np.ones(3), response, drive=np.array([0.02, 0.2, 0.4]), quantity="receptance",
+            np.ones(3), response, drive=np.array([0.02, 0.38, 0.4]), quantity="receptance",
             controlled="force",
         )  # fmt: skip
         found = fit(data, Dahl())

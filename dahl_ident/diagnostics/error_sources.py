@@ -13,7 +13,7 @@ or spring missing from the model; the part that the model's linear elements can 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,6 +40,7 @@ _BY_CHANCE = 0.01  # tables without repeats in which some seem to be
 _MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it leaves
 _LEAST_RATE_RANGE = np.log(2.0)  # of frequency, that tells speed from amplitude
 _STEP = 1e-5  # of ln A, for a slope
+_COMPLIANCES = ("receptance", "mobility", "accelerance")  # motion over force
 _FEWEST = 2  # runs, or repeated levels, that show a scatter
 
 
@@ -248,23 +249,27 @@ class StructuredSources:
                 for i in _scattering_parameters(problem)
             ]
         if self._moved is not None:
-            found.append(self._noise_of_levels(theta, self._moved))
+            found += self._noise_of_levels(theta, self._moved)
         if len(self._repeats) >= _FEWEST:
             shared = np.concatenate([self._repeats, 1j * self._repeats])
             found.append(Source(LEVELS, columns(shared), 1.0, own="both"))
         return tuple(found)
 
-    def _noise_of_levels(self, theta: FloatArray, moved: Problem) -> Source:
-        """Return noise of the amplitudes, or drives, at which responses were measured.
+    def _noise_of_levels(self, theta: FloatArray, moved: Problem) -> Iterator[Source]:
+        """Yield noise of the amplitudes, or drives, at which responses were measured.
 
-        It counts in slip, where the response changes with amplitude, and not in microslip.
+        The first counts in slip, where the response changes with amplitude, and not in microslip.
+        The second is that of a level which the response was made with: divided by a measured
+        amplitude, a stiffness is off by as much in microslip, and right in slip.
         """
         predicted = self._problem.predict(theta)
-        change = (moved.predict(theta) - predicted) / _STEP
-        columns = -self._problem.residual_change(theta, change).reshape(-1, 2, 1)
-        share = np.divide(change, predicted, out=np.zeros_like(change), where=predicted != 0.0)
-        square = 0.5 * float(np.mean(np.abs(share) ** 2))
-        return Source(NOISE, columns, square)
+        by_level = (moved.predict(theta) - predicted) / _STEP
+        data = self._problem.data
+        divided = (data.controlled == "force") == (data.quantity in _COMPLIANCES)
+        for change in (by_level, by_level + np.where(divided, predicted, -predicted)):
+            columns = -self._problem.residual_change(theta, change).reshape(-1, 2, 1)
+            share = np.divide(change, predicted, out=np.zeros_like(change), where=predicted != 0.0)
+            yield Source(NOISE, columns, 0.5 * float(np.mean(np.abs(share) ** 2)))
 
 
 def run_deviations(
