@@ -33,7 +33,7 @@ def estimated(records: list[Record], model: Element) -> tuple[dict[str, float], 
     """Return the estimates, and the share of the force's rms that is left."""
     problem = RecordProblem(records, model, output="force")
     found = solve_records(problem)
-    left = np.concatenate(problem.split_residuals(found.values))
+    left = np.concatenate(found.problem.split_residuals(found.values))
     share = np.sqrt(np.mean(left**2) / np.mean(np.concatenate(problem.measured) ** 2))
     return dict(zip(problem.names, found.values.tolist(), strict=True)), float(share)
 
