@@ -117,6 +117,13 @@ class TestVerdicts:
         assert found.verdict.startswith("Not determined.")
         assert {"f_max", "sigma", "gap"} <= set(found.identifiability.named(NOT))
 
+    def test_fundamentals_do_not_show_the_sign_of_an_asymmetry(self) -> None:
+        data = table(model=Dahl(F_MAX, SIGMA, asymmetry=0.35), noise=0.003)
+        found = fit(data, Dahl(alpha=1.0, asymmetry=None), throw=False)
+        assert found.status == "not determined"
+        assert "asymmetry: its size is 0.3" in found.verdict
+        assert "measure the mean force or even harmonics too" in found.verdict
+
     def test_one_amplitude_at_one_frequency_shows_no_exponent(self) -> None:
         data = table(model=PowerDamper(2.0, 0.5), beta=(1.0, 1.0), n=8)
         found = fit(data, PowerDamper(), throw=False)

@@ -43,6 +43,7 @@ _REMEDY = {
     EXPONENT: "give it if it is known, or measure on both sides of the knee",
     RUNS: "measure on more days or mountings",
 }
+_NO_DIFFERENCE = 1.0  # of -2 ln L, between two values of which neither is the likelier
 _VECTOR_PART = 0.05  # component of the undetermined direction worth naming
 
 
@@ -237,7 +238,8 @@ def judged(
         for name, f, p in zip(problem.names, fisher, profile, strict=True)
     }
     beyond = {} if errors is None else _lost_beyond_noise(errors, verdicts, natural)
-    verdicts |= dict.fromkeys(beyond, Verdict.NOT_IDENTIFIED)
+    blind = _signs_unseen(optimum)
+    verdicts |= dict.fromkeys((*beyond, *blind), Verdict.NOT_IDENTIFIED)
     if errors is not None:
         for name, size in zip(problem.names, natural.tolist(), strict=True):
             u = float(errors.covariance[(errors.names.index(name),) * 2]) ** 0.5 / size
@@ -254,6 +256,8 @@ def judged(
         if name in beyond and errors is not None:
             shown = with_unit(errors.values[name], errors.stderr[name], unit)
             text = f"{name}: {shown}, not determined, {beyond[name]}"
+        if name in blind:
+            text = f"{name}: {blind[name]}"
         parameters[name] = ParameterVerdict(
             name, unit, verdicts[name], float(fisher[i]), float(profile[i]), limits, text
         )
@@ -280,6 +284,26 @@ def _lost_beyond_noise(
         ranged = source == EXPONENT and u > _BY_RANGE and parts[source] > 0.5 * (u * size) ** 2
         if verdicts[name] is not Verdict.NOT_IDENTIFIED and (u > NOT_IDENTIFIED_ABOVE or ranged):
             found[name] = f"because of {source}: {_REMEDY.get(source, _MEASURE)}"
+    return found
+
+
+def _signs_unseen(optimum: Optimum) -> dict[str, str]:
+    """Return what is said of friction parameters whose sign the data do not show, by name."""
+    problem, found = optimum.problem, {}
+    y = problem.residuals(optimum.theta, optimum.scale or 1.0)
+    for i in problem.friction_columns.tolist():
+        parameter, turned = problem.parameters[i], optimum.theta.copy()
+        turned[i] = -turned[i]
+        error = optimum.stderr[parameter.name]
+        if parameter.transform == "log" or not abs(turned[i]) > error:
+            continue
+        other = problem.residuals(turned, optimum.scale or 1.0)
+        if abs(float(other @ other - y @ y)) < _NO_DIFFERENCE:
+            size = with_unit(abs(float(optimum.values[i])), error, parameter.unit)
+            found[parameter.name] = (
+                f"its size is {size}, its sign is not determined: the fundamental is the same for "
+                "either; measure the mean force or even harmonics too"
+            )
     return found
 
 
