@@ -377,7 +377,8 @@ def _population(folder: Path, devices: int, records: int) -> str:
     names = ("mean of ln f_max", "scatter between devices", "scatter between runs",
              "change with temperature")  # fmt: skip
     rows: list[Row] = [
-        ("usable fits", "all", f"{usable} of {len(table)}", usable == len(table)),
+        ("usable fits", "99 %: tests find fault with noise in one table of 100",
+         f"{usable} of {len(table)}", usable >= 0.99 * len(table)),
         *((f"{name}: groups whose 95.45 % interval holds the truth", f"at least {least}",
            f"{hit} of {len(groups)}", bool(hit >= least))
           for name, hit in zip(names, hits, strict=True)),
