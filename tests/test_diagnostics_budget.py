@@ -232,9 +232,9 @@ class TestBudget:
     def test_none_where_the_iteration_leaves_every_steady_response(self) -> None:
         """Drives near the force limit, where the linearised model steps below it."""
         phase = np.exp(-1j * np.radians([5.0, 20.0, 40.0]))
-        response = np.array([0.03, 0.04, 0.08]) * phase
+        response = np.array([0.03, 0.035, 0.1]) * phase
         data = FrequencyResponse(
-            np.ones(3), response, drive=np.array([0.02, 0.38, 0.4]), quantity="receptance",
+            np.ones(3), response, drive=np.array([0.1, 0.3, 0.4]), quantity="receptance",
             controlled="force",
         )  # fmt: skip
         found = fit(data, Dahl())

@@ -31,6 +31,10 @@ def test_noise_alone_does_not_hold() -> None:
     assert found.covered[0] > 0.7
 
 
+def test_a_gap_is_not_taken_for_noise_of_the_amplitudes() -> None:
+    assert uncertainty.judge(of("backlash of 0.05 x_c"), tables=8).failures == []
+
+
 def test_every_cell_draws_its_truth() -> None:
     cells = uncertainty.cells()
     assert len({cell.name for cell in cells}) == len(cells)

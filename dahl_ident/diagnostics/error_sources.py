@@ -41,6 +41,7 @@ _MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it l
 _LEAST_RATE_RANGE = np.log(2.0)  # of frequency, that tells speed from amplitude
 _STEP = 1e-5  # of ln A, for a slope
 _COMPLIANCES = ("receptance", "mobility", "accelerance")  # motion over force
+_MOST_LEVEL_NOISE = 0.05  # of ln A: sensors scatter less; more of it would hide a wrong model
 _FEWEST = 2  # runs, or repeated levels, that show a scatter
 
 
@@ -266,10 +267,12 @@ class StructuredSources:
         by_level = (moved.predict(theta) - predicted) / _STEP
         data = self._problem.data
         divided = (data.controlled == "force") == (data.quantity in _COMPLIANCES)
-        for change in (by_level, by_level + np.where(divided, predicted, -predicted)):
+        by_both = by_level + np.where(divided, predicted, -predicted)
+        for change, most in ((by_level, np.inf), (by_both, _MOST_LEVEL_NOISE)):
             columns = -self._problem.residual_change(theta, change).reshape(-1, 2, 1)
             share = np.divide(change, predicted, out=np.zeros_like(change), where=predicted != 0.0)
-            yield Source(NOISE, columns, 0.5 * float(np.mean(np.abs(share) ** 2)))
+            square = 0.5 * float(np.mean(np.abs(share) ** 2))
+            yield Source(NOISE, columns, square, largest=most**2)
 
 
 def run_deviations(
