@@ -190,8 +190,8 @@ def show(data: FrequencyResponse) -> None:
     assert points.amplitude is not None  # extraction measures it
     used = points.quality["num_periods"] - points.quality["settling_periods"]
     columns = {
-        "run": [] if points.run is None else [str(label) for label in points.run],
         "level": [] if points.level is None else [str(label) for label in points.level],
+        "run": [] if points.run is None else [str(label) for label in points.run],
         "f [Hz]": [f"{f:.5g}" for f in points.frequency_hz],
         f"A [{si_unit('displacement', data.motion)}]": [f"{A:.4g}" for A in points.amplitude],
         "gain": [f"{g:.4g}" for g in points.gain],
