@@ -198,7 +198,7 @@ class TestProfile:
         result = fit(hidden, Dahl() + Spring(), throw=False)
         q2 = thresholds(result.optimum, np.array(LEVELS)) ** 2
         for name in ("f_max", "sigma", "stiffness"):
-            for interval, target in zip(result.conf_interval()[name], q2, strict=True):
+            for interval, target in zip(result.conf_interval("profile")[name], q2, strict=True):
                 for limit in interval[1:]:
                     if 0.0 < limit < np.inf:
                         held = fit(result.data, Dahl() + Spring(), fixed={name: limit}, throw=False)

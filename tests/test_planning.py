@@ -258,8 +258,9 @@ class TestPlan:
         after = di.plan(fit, limits=KNEE, target=target, noise=0.02)
         before = di.plan(LINEAR, ranges=NEAR, limits=KNEE, target=target, noise=0.02)
         assert after.seconds < before.seconds
+        assert fit.errors is not None
         assert after.expected["sigma"].before == pytest.approx(
-            fit.optimum.stderr["sigma"] / fit.params["sigma"].value, rel=0.05
+            fit.errors.stderr["sigma"] / fit.errors.values["sigma"], rel=0.05
         )
         # what is missing is f_max: the plan goes where it shows
         assert max(step.level for step in after.steps) > 2.0 * X_C

@@ -132,18 +132,32 @@ def _by_displacement(
     noise = problem.displacement_noise
     if noise:
         ends = [problem.without_noise(noise, lead) for lead in LEADS[::2]]
-        share = 0.5
-    else:
-        ends, share = [problem, problem.with_more_noise(problem.estimated_noise)], 1.0
+        return 0.5 * _moved(ends, values, jacobians)[0]
+    noise = problem.estimated_noise
+    change, left = _moved([problem, problem.with_more_noise(noise)], values, jacobians)
+    residuals = sum(float(e @ e) for e in problem.split_residuals(values))
+    if left <= residuals:
+        return change
+    # rough motion looks like noise, but so much noise would leave larger residuals
+    noise *= (residuals / left) ** 0.5
+    return _moved([problem, problem.with_more_noise(noise)], values, jacobians)[0]
+
+
+def _moved(
+    ends: Sequence[RecordProblem], values: FloatArray, jacobians: Sequence[FloatArray]
+) -> tuple[FloatArray, float]:
+    """Return the estimate's change between two problems, and the sum of squares it leaves."""
     size = np.sqrt(sum((J**2).sum(axis=0) for J in jacobians))
     size = np.where(size > 0.0, size, 1.0)
-    normal, right = np.zeros((values.size, values.size)), np.zeros(values.size)
+    normal, right, square = np.zeros((values.size, values.size)), np.zeros(values.size), 0.0
     for i, J in enumerate(jacobians):
         low, high = (end.predict(values, i, derivatives=False).output for end in ends)
         scaled = J / size
         normal += scaled.T @ scaled
-        right += scaled.T @ (share * (high - low))
-    return np.asarray(np.linalg.pinv(normal, hermitian=True) @ right / size)
+        right += scaled.T @ (high - low)
+        square += float((high - low) @ (high - low))
+    change = np.asarray(np.linalg.pinv(normal, hermitian=True) @ right)
+    return change / size, square - float(change @ right)
 
 
 def _model_error(
