@@ -168,7 +168,9 @@ def test_derivatives_are_those_of_the_values(k: int) -> None:
     smooth = np.abs(beta / onset - 1.0) > 0.3
     for analytic, values in ((by_ln_beta, along_beta), (by_alpha, along_alpha)):
         slope = spectral_slope(values, nodes, wide)
-        assert np.max((np.abs(analytic - slope) / np.abs(slope))[smooth]) < 1e-8
+        # differences of values hold their rounding, the more the more nodes
+        rounding = np.finfo(float).eps * nodes.size**2 * np.abs(values).max(axis=-1) / wide
+        assert np.all((np.abs(analytic - slope) < 1e-8 * np.abs(slope) + rounding)[smooth])
 
 
 @given(beta=BETAS, alpha=ALPHAS)

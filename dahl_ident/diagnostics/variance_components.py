@@ -385,10 +385,13 @@ def _projected(
 def _scaled(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the information of variances in units of their own size, and these units.
 
-    Variances of runs and of noise may lie many decades apart.
+    Variances of runs and of noise may lie many decades apart. Where rounding leaves no information
+    on one, its unit is 0.
     """
-    size = 1.0 / np.sqrt(np.maximum(np.diagonal(information), np.finfo(float).tiny))
-    return information * np.outer(size, size), size
+    own = np.diagonal(information)
+    known = own > np.finfo(float).tiny
+    size = known / np.sqrt(np.where(known, own, 1.0))
+    return np.clip(information * np.outer(size, size), -1.0, 1.0), size
 
 
 def _along(
