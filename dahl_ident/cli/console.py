@@ -50,7 +50,7 @@ def begin(typed: Sequence[str]) -> None:
         # the name of a file, or a unit, may hold what the terminal's encoding does not
         sys.stdout.reconfigure(errors="backslashreplace")
     # setattr, because this function ignores file and line
-    setattr(warnings, "showwarning", show)  # noqa: B010
+    setattr(warnings, "showwarning", show)  # noqa: B010 - an assignment fails the type check
 
 
 def in_options(message: str) -> str:

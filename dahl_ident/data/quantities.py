@@ -37,6 +37,8 @@ DEFINITIONS: dict[Quantity, Definition] = {
     "mechanical_impedance": Definition(-1, 1),
     "apparent_mass": Definition(-2, 1),
 }
+COMPLIANCES = tuple(name for name, of in DEFINITIONS.items() if of.exponent < 0)
+"""Motion over force."""
 _POWERS_OF_J = (1.0 + 0.0j, 1.0j, -1.0 + 0.0j, -1.0j)  # exact, where (1j)**n rounds
 
 

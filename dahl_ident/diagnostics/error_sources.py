@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.data.quantities import COMPLIANCES
 from dahl_ident.diagnostics.run_deviations import Linearization, RunDeviations
 from dahl_ident.problem import Problem
 
@@ -40,7 +41,6 @@ _BY_CHANCE = 0.01  # tables without repeats in which some seem to be
 _MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it leaves
 _LEAST_RATE_RANGE = np.log(2.0)  # of frequency, that tells speed from amplitude
 _STEP = 1e-5  # of ln A, for a slope
-_COMPLIANCES = ("receptance", "mobility", "accelerance")  # motion over force
 _MOST_LEVEL_NOISE = 0.05  # of ln A: sensors scatter less; more of it would hide a wrong model
 _FEWEST = 2  # runs, or repeated levels, that show a scatter
 
@@ -266,7 +266,7 @@ class StructuredSources:
         predicted = self._problem.predict(theta)
         by_level = (moved.predict(theta) - predicted) / _STEP
         data = self._problem.data
-        divided = (data.controlled == "force") == (data.quantity in _COMPLIANCES)
+        divided = (data.controlled == "force") == (data.quantity in COMPLIANCES)
         by_both = by_level + np.where(divided, predicted, -predicted)
         for change, most in ((by_level, np.inf), (by_both, _MOST_LEVEL_NOISE)):
             columns = -self._problem.residual_change(theta, change).reshape(-1, 2, 1)

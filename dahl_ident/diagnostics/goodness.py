@@ -157,8 +157,8 @@ class Goodness:
     flagged : tuple of str
         Rows that the extraction flagged, with the reason.
     runs_differ : RunsDiffer or None
-        Where the scatter between runs exceeds the noise; the other tests are then of what is left
-        within the runs.
+        Where the scatter between runs exceeds the noise. The other tests then judge the residuals
+        within runs.
     sign : str
         The sign convention that explains data which the fit does not; empty where none does.
     apart : str
@@ -408,7 +408,7 @@ def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
 
 
 def _within_runs(optimum: Optimum, errors: ErrorModel) -> Goodness | None:
-    """Return the tests of what is left where each run deviates; None where they do not."""
+    """Return the tests of the residuals within runs; None where the runs do not differ."""
     runs = errors.runs_about_optimum
     if runs is None:
         return None

@@ -19,6 +19,7 @@ from numpy.polynomial import legendre
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.quantities import COMPLIANCES
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.physics import is_spring
@@ -177,7 +178,7 @@ def _friction_parts(optimum: Optimum) -> tuple[ComplexArray, ComplexArray]:
             stiffness += part.real
         if not element.is_linear:
             loss += 1j * part.imag
-    inverted = problem.data.quantity in ("receptance", "mobility", "accelerance")
+    inverted = problem.data.quantity in COMPLIANCES
     sign = -1.0 if inverted else 1.0
     with np.errstate(divide="ignore", invalid="ignore"):
         parts = sign * stiffness / total, sign * loss / total

@@ -290,14 +290,13 @@ def _lost_beyond_noise(
 def _signs_unseen(optimum: Optimum) -> dict[str, str]:
     """Return what is said of friction parameters whose sign the data do not show, by name."""
     problem, found = optimum.problem, {}
-    y = problem.residuals(optimum.theta, optimum.scale or 1.0)
     for i in problem.friction_columns.tolist():
         parameter, turned = problem.parameters[i], optimum.theta.copy()
         turned[i] = -turned[i]
         error = optimum.stderr[parameter.name]
         if parameter.transform == "log" or not abs(turned[i]) > error:
             continue
-        other = problem.residuals(turned, optimum.scale or 1.0)
+        y, other = problem.residuals(np.array([optimum.theta, turned]), optimum.scale or 1.0)
         if abs(float(other @ other - y @ y)) < _NO_DIFFERENCE:
             size = with_unit(abs(float(optimum.values[i])), error, parameter.unit)
             found[parameter.name] = (

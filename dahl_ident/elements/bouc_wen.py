@@ -255,10 +255,10 @@ def stiffness_over_sigma(
         for sum_, move in zip(total[1:], moves, strict=True):
             sum_ += (wave * move).sum(-1)
     factor = 2j / (np.pi * harmonic)
-    total = [factor * t for t in total]
+    value, along_A, along_q, along_p = (factor * t for t in total)
     if harmonic == 1:
-        total[0] += beside[..., 0]
-    return tuple(total)  # type: ignore[return-value]
+        value += beside[..., 0]
+    return value, along_A, along_q, along_p
 
 
 def loop_force(theta: FloatArray, A: float, sigma: float, q: float, p: float) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -184,7 +184,7 @@ def _without_noise(plain: RecordOptimum) -> RecordOptimum:
             break
         best, least, noise = trial, left, 2.0 * noise
     residuals = problem.split_residuals(plain.values)
-    slow = sum(float(e[1:] @ e[:-1]) for e in residuals) / sum(float(e @ e) for e in residuals)
+    slow = _correlation(residuals)
     by_chance = _CONFIRMED * 2.0 * least / problem.n_residuals * (1.0 + slow) / (1.0 - slow)
     if best is problem or 2.0 * (plain.cost - least) < by_chance:
         return plain
@@ -197,6 +197,11 @@ def _without_noise(plain: RecordOptimum) -> RecordOptimum:
     )
 
 
+def _correlation(residuals: Sequence[FloatArray]) -> float:
+    """Return the correlation of residuals with those one sample later."""
+    return sum(float(e[1:] @ e[:-1]) for e in residuals) / sum(float(e @ e) for e in residuals)
+
+
 def _weighted(plain: RecordOptimum) -> RecordOptimum:
     """Return the estimate with residuals weighted by their spectrum, where they are slow.
 
@@ -207,7 +212,7 @@ def _weighted(plain: RecordOptimum) -> RecordOptimum:
     """
     problem = plain.problem
     residuals = problem.split_residuals(plain.values)
-    slow = sum(float(e[1:] @ e[:-1]) for e in residuals) / sum(float(e @ e) for e in residuals)
+    slow = _correlation(residuals)
     share = 2.0 * plain.cost / problem.n_residuals
     if not plain.converged or slow < _SLOW or not _EXACT < share < _DESCRIBED:
         return plain
