@@ -68,6 +68,7 @@ validation: install  ## long statistical checks, written into docs/validation
 	$(BIN)/python -m benchmarks.coverage
 	$(BIN)/python -m benchmarks.campaigns
 	$(BIN)/python -m benchmarks.uncertainty --write docs/validation/uncertainty.md
+	$(BIN)/python -m benchmarks.posteriors --write docs/validation/posteriors.md
 	$(BIN)/python -m benchmarks.planning --write docs/validation/planning.md
 	$(BIN)/python -m benchmarks.laws --write docs/validation/laws.md
 

@@ -103,7 +103,7 @@ def ranks(scenario: Scenario, tables: int, seed: int = 0) -> tuple[FloatArray, i
         data = scenario.table(exact + scenario.noise * error)
         posterior = di.posterior(
             data, scenario.model(), priors=scenario.priors, seed=index, ess=1000.0, walkers=64,
-            ensembles=2,
+            ensembles=2, uncertainty="noise"
         )  # fmt: skip
         failed += not posterior.converged
         thin = int(np.ceil(posterior.get_autocorr_time().max()))

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import brentq, least_squares
 
 from benchmarks.harness import Row, median_of_pairs, print_table, seconds
-from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit, response
+from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit, fit_many, response
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element, linear_dahl
 from dahl_ident.fitting import solve, solve_many
@@ -34,7 +34,7 @@ _REPLICATES = 1000
 
 def run() -> list[Row]:
     """Return every comparison."""
-    return [_cold(), *_fleets(), _bootstrap(), *_plant(), _plant_bootstrap()]
+    return [_cold(), *_fleets(), _budgets(), _bootstrap(), *_plant(), _plant_bootstrap()]
 
 
 def _noise(*shape: int) -> ComplexArray:
@@ -110,6 +110,16 @@ def _fleets() -> list[Row]:
             Row(work, ours, theirs * _TABLES / times, "lmfit.minimize", target, faster=True)
         )
     return rows
+
+
+def _budgets() -> Row:
+    """Return the time of combined uncertainties; wanted are 200 tables a second."""
+    A = _AMPLITUDE[::2]
+    N = Dahl(*_TRUTH).describing_function(A)
+    noisy = N * _noise(100, len(A))
+    tables = [FrequencyResponse(np.ones(len(A)), n, A) for n in noisy]
+    best = min(seconds(lambda: fit_many(tables, Dahl()).stderr) for _ in range(3))
+    return Row("100 tables of 15 points with all sources of error", best, 0.5, "half a second", 1.0)
 
 
 def _bootstrap() -> Row:

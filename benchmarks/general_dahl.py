@@ -11,13 +11,12 @@ from scipy.optimize import brentq
 from benchmarks.harness import Row, median_of_pairs, peak_bytes, print_table, seconds
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.general_dahl import (
-    DescribingFunctionTable,
     describing_function,
     describing_function_gradient,
 )
 
 ALPHA = 2.0
-OURS, MANY, PEERS = 10_000, 1_000_000, 100
+OURS, PEERS = 10_000, 100
 REPEATS = 9
 
 
@@ -40,14 +39,11 @@ TITLE = f"Describing function, alpha = {ALPHA:g}"
 def run() -> list[Row]:
     """Return times an amplitude, beta from 1e-3 to 1e3, and peak memory."""
     rng = np.random.Generator(np.random.PCG64(0))
-    beta, many = (10.0 ** rng.uniform(-3.0, 3.0, n) for n in (OURS, MANY))
+    beta = 10.0 ** rng.uniform(-3.0, 3.0, OURS)
     alpha = np.asarray(ALPHA)
-    table = DescribingFunctionTable(ALPHA, 1e-3, 1e3)
     calls = (
         ("N", partial(describing_function, beta, alpha), OURS, 5e-6, 2),
         ("N and derivatives", partial(describing_function_gradient, beta, alpha), OURS, 1e-5, 8),
-        ("N from a table", partial(table, many), MANY, 3e-7, 2),
-        ("N and its slope from a table", partial(table.gradient, many), MANY, 6e-7, 4),
     )
     rows = []
     for name, call, n, bound, floats_out in calls:

@@ -61,7 +61,7 @@ def compare(draws: int, ess: float) -> list[tuple[str, float, float, float]]:
     """Return moments: what, ours, theirs, and their difference in Monte Carlo errors."""
     data = table()
     priors: dict[str, Any] = dict(_BOUNDS)
-    posterior = di.posterior(data, di.Dahl(), priors=priors, seed=1, ess=ess)
+    posterior = di.posterior(data, di.Dahl(), priors=priors, seed=1, ess=ess, uncertainty="noise")
     ours, (theirs, their_ess) = np.log(posterior.values), nuts(data, draws)
     rows = []
     for i, name in enumerate(posterior.names):

@@ -70,6 +70,18 @@ def _two_elements(rng: np.random.Generator) -> di.Element:
     return di.Dahl(0.5 * f_max, sigma, name="early") + late
 
 
+def _lugre(rng: np.random.Generator) -> di.Element:
+    f_max, sigma = _scale(rng)
+    speed = 2.0 * np.pi * f_max / sigma * rng.uniform(1.0, 10.0)
+    return di.LuGre(f_max, sigma, rng.uniform(1.3, 2.0), speed)
+
+
+def _maxwell(rng: np.random.Generator) -> di.Element:
+    f_max, sigma = _scale(rng)
+    slips = f_max / sigma * np.array([0.3, 1.0, 3.0]) * np.exp(rng.uniform(-0.3, 0.3, 3))
+    return di.MaxwellSlip(slips, sigma * rng.uniform(0.2, 0.5, 3))
+
+
 LAWS: dict[str, tuple[str, Maker]] = {
     "linear Dahl": ("as fitted", _dahl),
     "Dahl, other exponent": ("exponent free", _exponent),
@@ -78,6 +90,8 @@ LAWS: dict[str, tuple[str, Maker]] = {
     "Bouc-Wen": ("Bouc-Wen", _bouc_wen),
     "Iwan": ("Iwan", _iwan),
     "power-law damper": ("power damper added", _power_damper),
+    "LuGre": ("LuGre", _lugre),
+    "Maxwell slip": ("Maxwell slip", _maxwell),
     "two Dahl elements": ("two Dahl elements", _two_elements),
 }
 

@@ -313,20 +313,23 @@ def correct_amplitude(
     """Return residuals with every true amplitude at its best value.
 
     `predict` takes the error e of ln A, and returns the response and its derivative by ln A at
-    the amplitude measured over exp(e).
+    the amplitude measured over exp(e). Each row is a fixed-point iteration of one variable, which
+    secants of its last two steps shorten unless it hardly contracts.
     """
     spread = np.sqrt(error.variance)
-    better = np.zeros(noise.response.shape)
+    found = last = step = np.zeros(noise.response.shape)
     for _ in range(_AMPLITUDE_STEPS):
-        found = better
         predicted, slope = predict(found)
         r = noise.response - predicted - slope * found
         whitening = error.whitening(noise.covariance, slope)
         lever = whitening.solve(r)
         shift = error.cross - error.variance * slope
-        better = shift.real * lever.real + shift.imag * lever.imag
-        if not np.any(np.abs(better - found) > _AMPLITUDE_TOLERANCE * spread):
+        new = shift.real * lever.real + shift.imag * lever.imag - found
+        if not np.any(np.abs(new) > _AMPLITUDE_TOLERANCE * spread):
             break
+        secant = (new - step) / (found - last)  # -1 where one plain step is enough
+        stretch = np.where(secant < -0.1, -1.0 / secant, 1.0)
+        found, last, step = found + stretch * new, found, new
     return Corrected(whitening(r), whitening, found)
 
 
@@ -403,22 +406,26 @@ def _relative(rows: Rows) -> Relative:
 
 def _fundamental(rows: Rows, size: FloatArray) -> FloatArray:
     """Return |R_1| of the same point in rows of harmonics, 0 elsewhere."""
-    omega = np.broadcast_to(rows.omega, size.shape)
-    amplitude = np.broadcast_to(0.0 if rows.amplitude is None else rows.amplitude, size.shape)
-    same = (omega[..., :, None] == omega[..., None, :]) & (
-        amplitude[..., :, None] == amplitude[..., None, :]
-    )
-    same &= rows.harmonic == 1
-    harmonic = rows.harmonic != 1
-    lost = harmonic & ~same.any(axis=-1)
+    table = np.arange(size[..., 0].size).reshape(*size.shape[:-1], 1)
+    amplitude = 0.0 if rows.amplitude is None else rows.amplitude
+    keys = [np.broadcast_to(k, size.shape).ravel() for k in (amplitude, rows.omega, table)]
+    order = np.lexsort(keys)
+    other = np.any([np.diff(key[order]) != 0.0 for key in keys], axis=0)
+    point = np.empty(size.size, dtype=np.intp)
+    point[order] = np.concatenate([[0], np.cumsum(other)])
+    harmonic = np.broadcast_to(rows.harmonic != 1, size.shape)
+    own = np.flatnonzero(~harmonic)[::-1]
+    first = np.full(size.size, -1)
+    first[point[own]] = own  # of several the first
+    partner = first[point].reshape(size.shape)
+    lost = harmonic & (partner < 0)
     if lost.any():
         raise DataError(
             f"row {_first(lost)} is a harmonic, but no row holds the fundamental of the same "
             "frequency and amplitude, to which relative noise refers; add it, or use "
             "noise='absolute'"
         )
-    partner = np.take_along_axis(size, same.argmax(axis=-1), axis=-1)
-    return np.where(harmonic, partner, 0.0)
+    return np.where(harmonic, size.ravel()[partner], 0.0)
 
 
 def _measured(rows: Rows) -> Measured:
@@ -459,17 +466,19 @@ def _check_dof(dof: FloatArray) -> None:
 
 
 def _amplitude_error(rows: Rows) -> AmplitudeError | None:
-    """Return the error of ln A in rows whose model uses the measured amplitude, if any."""
-    if rows.amplitude_std is None or rows.amplitude is None:
-        return None
-    relative = np.where(rows.forced, 0.0, 1.0 / rows.amplitude)
-    variance = (rows.amplitude_std * relative) ** 2
-    if not variance.any():
-        return None
-    cross = np.zeros(rows.n, dtype=np.complex128)
-    if rows.amplitude_covariance is not None:
-        cross = rows.amplitude_covariance @ np.array([1.0, 1.0j]) * relative
-    return AmplitudeError(variance, cross)
+    """Return the error of the level that the model uses: ln A, or ln of the drive; None if none."""
+    variance, cross = np.zeros(rows.n), np.zeros(rows.n, dtype=np.complex128)
+    for level, std, covariance, own in (
+        (rows.amplitude, rows.amplitude_std, rows.amplitude_covariance, ~rows.forced),
+        (rows.drive, rows.drive_std, rows.drive_covariance, rows.forced),
+    ):
+        if std is None or level is None:
+            continue
+        relative = np.where(own, 1.0 / level, 0.0)
+        variance = variance + (std * relative) ** 2
+        if covariance is not None:
+            cross = cross + covariance @ np.array([1.0, 1.0j]) * relative
+    return AmplitudeError(variance, cross) if variance.any() else None
 
 
 def _first(bad: NDArray[np.bool_]) -> str:

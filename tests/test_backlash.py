@@ -10,16 +10,20 @@ import pytest
 
 from dahl_ident import (
     Backlash,
+    BoucWen,
     Dahl,
     Damper,
     Element,
+    FrequencyResponse,
     Friction,
     Mass,
     PowerDamper,
     Spring,
+    fit,
     response,
 )
 from dahl_ident.arrays import ComplexArray
+from dahl_ident.cli.model import elements
 from dahl_ident.elements.description import describe_model, model_from_description
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ModelError
@@ -218,3 +222,31 @@ def test_a_history_behind_a_gap_is_exact(asymmetry: float, start: float) -> None
     if start:
         ends = [law.force_history(values, x, state=start + s) for s in (1e-6, -1e-6)]
         np.testing.assert_allclose(found.by_state, (ends[0] - ends[1]) / 2e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("backlash", Backlash(Dahl())),
+        ("backlash(gap=0.1)", Backlash(Dahl(), 0.1)),
+        ("backlash(dahl(f_max=2, asymmetry=free), 0.1)", Backlash(Dahl(2.0, asymmetry=None), 0.1)),
+        ("backlash(bouc_wen, gap=free)", Backlash(BoucWen())),
+    ],
+)
+def test_the_element_behind_a_gap_is_written_on_the_command_line(
+    text: str, expected: Backlash
+) -> None:
+    assert elements([text]).describe() == expected.describe()
+
+
+def test_amplitudes_within_the_gap_are_no_misfit() -> None:
+    """Rows of noise alone, where nothing is crossed, do not hide that the others are met."""
+    A = np.concatenate([np.geomspace(1e-4, 4e-4, 5), np.geomspace(6e-4, 5e-2, 20)])
+    noise = np.random.default_rng(1).standard_normal((2, A.size))
+    law = Backlash(Dahl(0.1, 30.0), gap=1e-3)
+    N = law.dynamic_stiffness(A) + 0.02 * (noise[0] + 1j * noise[1])
+    data = FrequencyResponse(np.ones(A.size), N, A, quantity="dynamic_stiffness")
+    found = fit(data, Backlash(Dahl(alpha=1.0)), noise="absolute")
+    assert found.status == "trusted"
+    assert found.params["gap"].value == pytest.approx(1e-3, rel=2e-3)
+    assert found.goodness.rms_misfit < 0.02

@@ -97,26 +97,26 @@ def test_checks_come_after_fixed_numbers_of_steps() -> None:
 
 def test_the_same_seed_gives_the_same_chain() -> None:
     data = friction_table()
-    first = di.posterior(data, di.Dahl(), seed=4, steps=60)
-    again = di.posterior(data, di.Dahl(), seed=4, steps=60)
-    other = di.posterior(data, di.Dahl(), seed=5, steps=60)
+    first = di.posterior(data, di.Dahl(), seed=4, steps=60, uncertainty="noise")
+    again = di.posterior(data, di.Dahl(), seed=4, steps=60, uncertainty="noise")
+    other = di.posterior(data, di.Dahl(), seed=5, steps=60, uncertainty="noise")
     np.testing.assert_array_equal(first.get_chain(), again.get_chain())
     assert not np.array_equal(first.get_chain(), other.get_chain())
-    unseeded = di.posterior(data, di.Dahl(), steps=60)
-    repeated = di.posterior(data, di.Dahl(), steps=60, seed=unseeded.seed)
+    unseeded = di.posterior(data, di.Dahl(), steps=60, uncertainty="noise")
+    repeated = di.posterior(data, di.Dahl(), steps=60, seed=unseeded.seed, uncertainty="noise")
     np.testing.assert_array_equal(unseeded.get_chain(), repeated.get_chain())
 
 
 def test_a_pool_gives_the_same_posterior() -> None:
     data = friction_table()
     with ThreadPoolExecutor(2) as pool:
-        spread = di.posterior(data, di.Dahl(), seed=4, steps=40, pool=pool)
-    alone = di.posterior(data, di.Dahl(), seed=4, steps=40)
+        spread = di.posterior(data, di.Dahl(), seed=4, steps=40, pool=pool, uncertainty="noise")
+    alone = di.posterior(data, di.Dahl(), seed=4, steps=40, uncertainty="noise")
     np.testing.assert_allclose(spread.get_chain(), alone.get_chain(), rtol=1e-9)
 
 
 def test_walkers_start_at_finite_density_and_wide() -> None:
-    posterior = di.posterior(friction_table(), di.Dahl(), seed=1, steps=300)
+    posterior = di.posterior(friction_table(), di.Dahl(), seed=1, steps=300, uncertainty="noise")
     assert np.isfinite(posterior.get_log_prob()).all()
     chain = posterior.get_chain()
     assert chain[0].std(axis=0)[0] > 1.2 * chain[100:].std(axis=(0, 1))[0]
@@ -138,7 +138,10 @@ def test_the_posterior_moves_with_its_data() -> None:
     data = friction_table()
     assert data.amplitude is not None
     stronger = di.FrequencyResponse(data.frequency_hz, 2.0 * data.response, data.amplitude)
-    one, two = (np.median(di.posterior(d, di.Dahl(), seed=1).values, 0) for d in (data, stronger))
+    one, two = (
+        np.median(di.posterior(d, di.Dahl(), seed=1, uncertainty="noise").values, 0)
+        for d in (data, stronger)
+    )
     assert (two / one)[:2] == pytest.approx(2.0, rel=0.005)
 
 
@@ -148,7 +151,7 @@ def test_student_t_resists_an_outlier() -> None:
     response[10] *= 1.8
     assert data.amplitude is not None
     dirty = di.FrequencyResponse(data.frequency_hz, response, data.amplitude)
-    plain = di.posterior(dirty, di.Dahl(), seed=1).values[:, 0]
+    plain = di.posterior(dirty, di.Dahl(), seed=1, uncertainty="noise").values[:, 0]
     robust = di.posterior(dirty, di.Dahl(), seed=1, likelihood="student_t").values[:, 0]
     assert robust.std() < 0.4 * plain.std()
     assert np.median(robust) == pytest.approx(0.1, abs=0.002)
@@ -164,7 +167,7 @@ def test_interchangeable_elements_keep_their_order() -> None:
     ).predict(np.log([0.1]))
     data = di.FrequencyResponse(np.ones(25), exact * np.exp(noise), amplitude)
     model = di.Dahl(name="a") + di.Dahl(name="b")
-    posterior = di.posterior(data, model, seed=1, max_steps=1500)
+    posterior = di.posterior(data, model, seed=1, max_steps=1500, uncertainty="noise")
     values = posterior.values
     assert (values[:, 0] / values[:, 1] < values[:, 2] / values[:, 3]).all()
     assert np.median(values[:, 0]) == pytest.approx(0.1, rel=0.1)
@@ -172,7 +175,9 @@ def test_interchangeable_elements_keep_their_order() -> None:
 
 def test_sensor_priors_of_any_kind_are_sampled() -> None:
     sensors = di.Sensors(force_gain=stats.uniform(0.95, 0.1))
-    posterior = di.posterior(friction_table(), di.Dahl(), sensors=sensors, seed=1)
+    posterior = di.posterior(
+        friction_table(), di.Dahl(), sensors=sensors, seed=1, uncertainty="noise"
+    )
     gain = posterior.values[:, posterior.names.index("force_gain")]
     assert 0.95 <= gain.min() < 0.955
     assert 1.045 < gain.max() <= 1.05
@@ -181,35 +186,37 @@ def test_sensor_priors_of_any_kind_are_sampled() -> None:
 
 
 def test_known_noise_has_no_scale() -> None:
-    posterior = di.posterior(with_covariance(friction_table(), 0.02), di.Dahl(), seed=1, steps=50)
+    posterior = di.posterior(
+        with_covariance(friction_table(), 0.02), di.Dahl(), seed=1, steps=50, uncertainty="noise"
+    )
     assert posterior.names == ("f_max", "sigma")
 
 
 def test_a_fit_is_taken_over() -> None:
     data = friction_table()
     fit = di.fit(data, di.Dahl())
-    assert di.posterior(fit, seed=1, steps=50).problem is fit.problem
+    assert di.posterior(fit, seed=1, steps=50, uncertainty="noise").problem is fit.problem
     with pytest.raises(ValidationError, match="noise, free is given beside a FitResult"):
-        di.posterior(fit, noise="absolute", free=["alpha"])
+        di.posterior(fit, noise="absolute", free=["alpha"], uncertainty="noise")
 
 
 def test_refusals() -> None:
     data = friction_table()
     with pytest.raises(ModelError, match="there is no model"):
-        di.posterior(data)
+        di.posterior(data, uncertainty="noise")
     with pytest.raises(ValidationError, match="walkers is 33; expected a whole number >= 48"):
-        di.posterior(data, di.Dahl(), walkers=33)
+        di.posterior(data, di.Dahl(), walkers=33, uncertainty="noise")
     with pytest.raises(ValidationError, match="walkers is 100; expected a multiple of 8"):
-        di.posterior(data, di.Dahl(), walkers=100)
+        di.posterior(data, di.Dahl(), walkers=100, uncertainty="noise")
     with pytest.raises(ValidationError, match="likelihood is 'cauchy'; expected one of gaussian"):
         di.posterior(data, di.Dahl(), likelihood="cauchy")
     for ess in (-1.0, np.nan):
         with pytest.raises(ValidationError, match=r"ess is .*; expected"):
-            di.posterior(data, di.Dahl(), ess=ess)
+            di.posterior(data, di.Dahl(), ess=ess, uncertainty="noise")
     pool: Any = 3
     with pytest.raises(ValidationError, match="pool is 3; expected an object with map"):
-        di.posterior(data, di.Dahl(), pool=pool)
+        di.posterior(data, di.Dahl(), pool=pool, uncertainty="noise")
     exact = FRICTION.describing_function(np.array([1e-3, 2e-3, 4e-3]))
     perfect = di.FrequencyResponse(np.ones(3), exact, np.array([1e-3, 2e-3, 4e-3]))
     with pytest.raises(SamplingError, match="there is no noise whose scale could be estimated"):
-        di.posterior(perfect, di.Dahl())
+        di.posterior(perfect, di.Dahl(), uncertainty="noise")

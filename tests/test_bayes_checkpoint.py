@@ -30,12 +30,14 @@ import sys
 import dahl_ident as di
 from tests.bayes_cases import friction_table
 print("ready", flush=True)
-di.posterior(friction_table(), di.Dahl(), seed=9, steps={STEPS}, resume=sys.argv[1])
+di.posterior(
+    friction_table(), di.Dahl(), seed=9, steps={STEPS}, resume=sys.argv[1], uncertainty="noise"
+)
 """
 
 
 def sampled(path: Path | None, **options: Any) -> ChainPosterior:
-    return di.posterior(friction_table(), di.Dahl(), resume=path, **options)
+    return di.posterior(friction_table(), di.Dahl(), resume=path, **options, uncertainty="noise")
 
 
 def refused(path: Path, message: str, **options: Any) -> None:
@@ -124,9 +126,9 @@ def test_foreign_runs_are_refused(begun: Path) -> None:
     refused(begun, "differs in walkers", walkers=160)
     before = begun.read_bytes()
     with pytest.raises(SamplingError, match="differs in data"):
-        di.posterior(friction_table(seed=2), di.Dahl(), resume=begun)
+        di.posterior(friction_table(seed=2), di.Dahl(), resume=begun, uncertainty="noise")
     with pytest.raises(SamplingError, match="differs in model"):
-        di.posterior(friction_table(), di.Dahl(alpha=1.1), resume=begun)
+        di.posterior(friction_table(), di.Dahl(alpha=1.1), resume=begun, uncertainty="noise")
     assert begun.read_bytes() == before
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
+from benchmarks.measured import BEAM
 from tests.test_extraction_measured import FILES, measured
-from tests.test_readers_measured import BRAKE_REUSS
 
 MEASURED = os.environ.get("DAHL_IDENT_MEASURED_DATA")
 pytestmark = pytest.mark.skipif(
@@ -23,14 +23,14 @@ def test_the_damper_shows_its_misfit() -> None:
     data = di.FrequencyResponse.concatenate(
         [di.extract(measured(name), harmonics=(1,)) for name in FILES]
     )
-    posterior = di.posterior(data, di.Dahl(), seed=1)
+    posterior = di.posterior(data, di.Dahl(), seed=1, uncertainty="noise")
     assert posterior.converged
     size = next(check for check in posterior.checks if check.statistic == "size")
     assert not size.passed
     assert not posterior.trusted
     assert size.observed > 3.0 * size.replicated
     assert "MISFIT: the residuals are larger than the noise that the data state" in str(posterior)
-    grid = di.posterior(data, di.Dahl(), method="grid")
+    grid = di.posterior(data, di.Dahl(), method="grid", uncertainty="noise")
     for i, name in enumerate(("f_max", "sigma")):
         middle = float(grid.quantile(name, 0.5))
         assert np.median(posterior.values[:, i]) == pytest.approx(middle, abs=0.1 * grid.std()[i])
@@ -38,13 +38,13 @@ def test_the_damper_shows_its_misfit() -> None:
 
 def test_the_bolted_joint_leaves_f_max_to_its_prior(tmp_path: Path) -> None:
     columns = tmp_path / "columns.toml"
-    columns.write_text(BRAKE_REUSS)
+    columns.write_text(BEAM)
     path = Path(MEASURED or "") / "brb" / "ForcedFrequencyResponses.mat"
     beam = di.read_frequency_response(path, columns=columns)
     held = beam.select(level=[label for label in beam.levels if "Response" in str(label)])
     data = held.select(rows=np.arange(held.n) % 8 == 0)
     model = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
-    posterior = di.posterior(data, model, seed=1, ess=1000.0)
+    posterior = di.posterior(data, model, seed=1, ess=1000.0, uncertainty="noise")
     assert posterior.converged, posterior.message
     f_max = next(rule for rule in posterior.prior_influences if rule.name == "f_max")
     assert f_max.at_upper_end

@@ -43,7 +43,9 @@ def test_a_chain_moves_the_bar_to_its_end(monkeypatch: pytest.MonkeyPatch) -> No
         update(self, task, **given)
 
     monkeypatch.setattr(progress.Progress, "update", remember)
-    posterior = di.posterior(friction_table(), di.Dahl(), seed=1, progress=True)
+    posterior = di.posterior(
+        friction_table(), di.Dahl(), seed=1, progress=True, uncertainty="noise"
+    )
     steps = [done for done, _ in seen]
     assert steps == sorted(steps)
     assert posterior.steps - steps[-1] < 60
@@ -56,7 +58,7 @@ def test_the_bar_shows_the_time_that_is_left(
 ) -> None:
     monkeypatch.setenv("FORCE_COLOR", "1")  # as on a terminal
     monkeypatch.setenv("COLUMNS", "100")
-    di.posterior(friction_table(), di.Dahl(), seed=1, steps=100, progress=True)
+    di.posterior(friction_table(), di.Dahl(), seed=1, steps=100, progress=True, uncertainty="noise")
     shown = capsys.readouterr()
     plain = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown.out + shown.err)
     assert re.search(r"sampling .*100/100 \d:\d\d:\d\d", plain)

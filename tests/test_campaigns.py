@@ -32,7 +32,7 @@ from tests.command_line import Runner
 SECONDS = ["seconds"]
 
 
-def make_tables(folder: Path, devices: int, runs: int = 1, seed: int = 0) -> pd.DataFrame:
+def make_tables(folder: Path, devices: int, runs: int = 1, seed: int = 1) -> pd.DataFrame:
     """Write response tables of devices whose f_max grows with temperature; return the truth."""
     rng = np.random.default_rng(seed)
     amplitude = np.geomspace(1e-4, 3e-2, 9)

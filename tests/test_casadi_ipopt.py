@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring, response
+from dahl_ident import Dahl, Damper, FitResult, LinearSystem, Mass, Spring, fit, response
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.quantities import converted
+from dahl_ident.diagnostics.intervals import Method
 from dahl_ident.elements import Element
 from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting import ipopt, solve
@@ -472,3 +473,56 @@ def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
 def test_what_is_no_list_of_constraints_is_refused(constraints: Any, message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         solve_ipopt(Problem(friction_data(), Dahl()), constraints=constraints)
+
+
+def test_noise_of_the_drive_is_judged_as_it_was_fitted() -> None:
+    """Residuals, intervals and errors of an exact model count what its drive is off by."""
+    exact = plant_data(3, 4, size=0.0)
+    assert exact.drive is not None
+    drive = exact.drive * np.exp(noise(12, 0.05, seed=8).real)
+    R = exact.response * np.exp(noise(12, 0.02, seed=9))
+    C = np.abs(R)[:, None, None] ** 2 * 0.02**2 * np.eye(2)
+    data = FrequencyResponse(
+        exact.frequency_hz, R, drive=drive, controlled="force", quantity="receptance",
+        covariance=C,
+    )  # fmt: skip
+    result = fit(data, UNKNOWN_PLANT, method="ipopt", drive_std=0.05 * drive, throw=False)
+    assert result.chisqr == pytest.approx(2.0 * result.optimum.cost, rel=1e-8)
+    assert result.status.usable
+    assert result.errors is not None
+    interval = result.conf_interval("profile", 0.9545)
+    assert interval.method == "profile"
+    assert interval.lower[0][2] < 0.3 < interval.upper[0][2]
+    again = FitResult.from_json(result.to_json())
+    assert again.data.drive_std == pytest.approx(0.05 * drive)
+    assert again.chisqr == pytest.approx(result.chisqr)
+    assert "drive_std [N]" in again.data.to_frame().columns
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_constraint_that_the_data_contradict_is_said_so(known: bool) -> None:
+    data = friction_data(covariance=covariance_of() if known else None)
+
+    def tied(ratio: float) -> FitResult:
+        return fit(
+            data, Dahl(), method="ipopt", constraints=lambda p: [p["sigma"] == ratio * p["f_max"]]
+        )
+
+    free = fit(data, Dahl())
+    right, wrong = tied(300.0), tied(330.0)
+    assert "contradict" not in right.verdict
+    assert "the constraint sigma==(300*f_max)" in right.verdict
+    assert str(wrong.status) == "not described"
+    assert "The data contradict the constraint sigma==(330*f_max)" in wrong.verdict
+    cost = wrong.optimum.constraint_cost
+    assert cost is not None
+    rise = 2.0 * (wrong.optimum.cost - free.optimum.cost) / free.optimum.scale**2
+    assert cost.rise == pytest.approx(rise, rel=1e-6)
+    law = stats.chi2(1) if known else stats.f(1, free.optimum.dof)
+    assert cost.p_value == pytest.approx(float(law.sf(rise)), rel=1e-6, abs=1e-300)
+    refused: tuple[Method, ...] = ("profile", "bootstrap")
+    for method in refused:
+        with pytest.raises(ValidationError, match=f"method is '{method}', but the fit had constr"):
+            wrong.conf_interval(method)
+    assert wrong.conf_interval().method == "wald"
+    assert FitResult.from_json(wrong.to_json()).verdict == wrong.verdict

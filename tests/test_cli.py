@@ -280,14 +280,15 @@ def test_sample_integrates_at_once_where_asked(run: Runner) -> None:
 
 def test_a_chain_that_is_too_short_ends_with_3(run: Runner) -> None:
     table = run("datasets", "noisy", "-o", "-").out
-    outcome = run("sample", "-", "--steps", "20", stdin=table)
+    outcome = run("sample", "-", "--steps", "20", "--alpha", "1", stdin=table)
     assert outcome.status == 3
     assert outcome.out.startswith("NOT CONVERGED after 20 steps")
 
 
 def test_a_prior_that_keeps_the_data_out_ends_with_3(run: Runner) -> None:
     table = run("datasets", "noisy", "-o", "-").out
-    outcome = run("sample", "-", "--method", "grid", "--prior", "f_max=1:2", stdin=table)
+    options = ("--method", "grid", "--prior", "f_max=1:2", "--uncertainty", "noise")
+    outcome = run("sample", "-", *options, stdin=table)
     assert outcome.status == 3
     assert outcome.err.startswith("not to be trusted: PRIOR AGAINST DATA: f_max lies beyond 99 %")
     assert "MISFIT: the residuals are larger than the noise that the data state" in outcome.out

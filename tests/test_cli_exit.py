@@ -268,6 +268,8 @@ RECORD = "time [s],displacement [m],force [N]\n0,1,1\n1,2,2\n2,1,1\n"
          "time and sample_rate are both given"),
         (("fit", "r.csv"),
          "r.csv: it holds waveforms (time [s], displacement [m], force [N]), and a table of"),
+        (("fit", "friction.csv"),
+         "friction.csv: it holds waveforms (time [s], displacement [m], friction force [N]), and"),
         (("fit", "levels.csv", "--level", "high"),
          "levels.csv: --level 'high' is given, but the table has its own levels"),
         (("fit", "t.csv", "--level", "high", "--level-from-name", "(t)"),
@@ -286,6 +288,7 @@ def test_input_without_effect_or_of_another_kind_is_refused(
     labelled = TABLE.format(drive="level,", value="low,")
     Path("levels.csv").write_text(labelled, encoding="utf-8")
     Path("r.csv").write_text(RECORD, encoding="utf-8")
+    Path("friction.csv").write_text(RECORD.replace("force", "friction force"), encoding="utf-8")
     Path("volt.csv").write_text(RECORD.replace("force [N]", "drive [V]"), encoding="utf-8")
     outcome = run(*arguments)
     assert (outcome.status, outcome.out) == (1, "")
@@ -295,7 +298,7 @@ def test_input_without_effect_or_of_another_kind_is_refused(
 
 def test_a_chain_keeps_the_seed_it_was_begun_with(run: Runner) -> None:
     friction_table().save("levels.csv")
-    options = ("sample", "levels.csv", "--resume", "chain.h5")
+    options = ("sample", "levels.csv", "--alpha", "1", "--resume", "chain.h5")
     assert run(*options, "--steps", "60", "--seed", "5").status == 3
     assert run(*options, "--steps", "70").err.startswith("not to be trusted: ")
     assert "begun with seed 5, but seed is 6" in run(*options, "--seed", "6").err

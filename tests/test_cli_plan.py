@@ -43,6 +43,26 @@ def test_a_saved_fit_is_continued_and_files_are_written(run: Runner) -> None:
     assert len(Path("levels.csv").read_text().splitlines()) == 3
 
 
+def test_motions_in_time_continue_a_fit_of_records(run: Runner) -> None:
+    time = np.arange(800) / 100.0
+    x = 5e-3 * np.sin(2.0 * time)
+    noise = 2e-3 * np.random.default_rng(0).standard_normal(800)
+    record = di.Record(time, displacement=x, force=di.Dahl(0.1, 30.0).force(x) + noise)
+    di.fit(record, di.Dahl(alpha=1.0)).save("fit.json")
+    outcome = run(
+        "plan", "fit.json", "--motion", "trapezoid", "--displacement", "1e-3,2e-2", "--speed",
+        "0.05", "--acceleration", "1", "--time", "20", "--sample-rate", "100",
+        "--waveform", "exciter.csv",
+        "--table", "motions.csv",
+    )  # fmt: skip
+    assert outcome.status == 0, outcome.err
+    assert "motion" in outcome.out.splitlines()[0]
+    assert np.loadtxt("exciter.csv", delimiter=",", skiprows=1).shape[1] == 4
+    assert (
+        Path("motions.csv").read_text().startswith("motion,stroke,speed,acceleration,dwell,period,")
+    )
+
+
 def test_a_target_out_of_reach_ends_with_3(run: Runner) -> None:
     outcome = run("plan", *BENCH, *RANGES, "--target", "f_max=1e-5", "--time", "20")
     assert outcome.status == 3
@@ -56,7 +76,7 @@ def test_a_target_out_of_reach_ends_with_3(run: Runner) -> None:
         (("--time", "9"), "nothing is known about f_max, sigma; give --ranges"),
         ((*RANGES, "--target", "f_max=a"), "f_max is 'a'; expected a number"),
         ((*RANGES, "--target", "f_max=1", "--target", "sigma"), "with and without a number"),
-        ((*RANGES, "--waveform", "w.csv"), "--waveform and --sample-rate go together"),
+        ((*RANGES, "--waveform", "w.csv"), "--waveform and --motion need --sample-rate"),
         (("nothing.json", "--mass", "1"), "a saved fit has its model and sensors"),
     ],
 )

@@ -6,8 +6,19 @@ import numpy as np
 import pytest
 
 from benchmarks.selection import choices
-from dahl_ident import Backlash, Dahl, FrequencyResponse, Spring, compare_models, fit
-from dahl_ident.diagnostics.predictive_density import _LeftOut
+from dahl_ident import (
+    Backlash,
+    Dahl,
+    Damper,
+    Element,
+    FrequencyResponse,
+    LuGre,
+    Spring,
+    compare_models,
+    fit,
+)
+from dahl_ident.diagnostics.comparison import _candidates
+from dahl_ident.diagnostics.predictive_density import _LeftOut, predictive_density
 from tests.command_line import Runner
 from tests.friction_tables import FRICTION, table
 
@@ -79,3 +90,38 @@ def test_the_command_prints_the_comparison(run: Runner) -> None:
     result = run.line("dahl-ident datasets noisy -o - | dahl-ident fit - --compare")
     assert "No model compared is better" in result.out
     assert "force limit" in result.out
+
+
+def test_lugre_is_tried_where_the_force_falls_with_the_frequency() -> None:
+    A = np.tile(np.geomspace(1e-3, 1.0, 14), 2)
+    f = np.repeat([0.1, 1.0], 14)
+    rng = np.random.default_rng(3)
+    noise = 1.0 + 0.005 * rng.standard_normal((28, 2)) @ [1.0, 1.0j]
+
+    def tried(law: Element) -> list[str]:
+        N = law.dynamic_stiffness(A, 2.0 * np.pi * f)
+        data = FrequencyResponse(f, N * noise, A)
+        found = fit(data, Dahl(), throw=False).optimum
+        return [name for name, _ in _candidates(found, predictive_density(found))]
+
+    assert "LuGre" in tried(LuGre(1.0, 100.0, 1.8, 0.5))
+    assert "LuGre" not in tried(Dahl(1.0, 100.0))
+    assert "LuGre" not in tried(Dahl(1.0, 100.0) + Damper(0.5))
+
+
+def test_lugre_says_where_sines_cannot_distinguish_it_from_dahl() -> None:
+    A = np.geomspace(1e-3, 1.0, 12)
+    rng = np.random.default_rng(4)
+    noise = 1.0 + 0.01 * rng.standard_normal((12, 2)) @ [1.0, 1.0j]
+    law = LuGre(1.0, 100.0, 1.8, 0.5)
+
+    def sentences(frequency: float) -> list[str]:
+        N = law.dynamic_stiffness(A, 2.0 * np.pi * frequency) * noise
+        given = fit(FrequencyResponse(np.full(12, frequency), N, A), Dahl(), throw=False)
+        asked = LuGre(static_ratio=1.8, stribeck_speed=0.5)
+        (_, lugre) = compare_models(given, {"LuGre": asked}).models
+        return lugre.resemblances
+
+    (text,) = sentences(100.0)
+    assert text.startswith("LuGre: at these levels it differs from linear Dahl with a damper by")
+    assert not sentences(0.2)

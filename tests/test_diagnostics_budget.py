@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from dahl_ident.diagnostics.variance_components import (
     Contrasts,
     LinearModel,
     Projection,
+    likelihood,
     variance_components,
 )
 from dahl_ident.errors import FitError
@@ -63,27 +65,19 @@ class TestVariances:
 
     @pytest.mark.parametrize("variances", [(1.0, 0.5, 2.0), (1.0, 0.0, 2.0), (0.1, 0.3, 0.0)])
     def test_columns_give_what_dense_matrices_give(self, variances: tuple[float, ...]) -> None:
-        """A pair of residuals with a column of its own, turned to a diagonal source."""
+        """Pairs of residuals with a column of their own beside columns of all, and a prior."""
         rng = np.random.default_rng(5)
         own = np.zeros((30, 2, 30))
         own[np.arange(30), :, np.arange(30)] = rng.standard_normal((30, 2))
         Z = [np.repeat(rng.uniform(1.0, 2.0, 30), 2), own.reshape(60, 30)]
         Z = [np.append(z, np.zeros((1, *z.shape[1:])), axis=0) for z in Z]
         J, last = rng.standard_normal((61, 3)), np.append(np.zeros(60), 1.0)
-        dense = LinearModel(
-            rng.standard_normal(61),
-            J,
-            last,
-            [*Z, rng.standard_normal((61, 4)) * (1.0 - last)[:, None]],
-        )
-        few = dense.turned(60, 1)
-        assert few.Z[1].ndim == 1
-        one, other = Contrasts(dense).at(np.array(variances)), Columns(few).at(np.array(variances))
+        Z.append(rng.standard_normal((61, 4)) * (1.0 - last)[:, None])
+        model = LinearModel(rng.standard_normal(61), J, last, Z)
+        assert isinstance(likelihood(model), Columns)
+        one, other = (of(model).at(np.array(variances)) for of in (Contrasts, Columns))
         for a, b in zip(one, other, strict=True):
             np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=1e-9, atol=1e-9)
-        s = np.array(variances)
-        G, turned = (Projection(m, s).generalised_inverse() @ m.y for m in (dense, few))
-        np.testing.assert_allclose(G, turned, rtol=1e-9)
 
     def test_variances_many_decades_apart_keep_their_own_errors(self) -> None:
         """Two days apart by much more than the noise: one degree of freedom, 2 s^4 its variance."""
@@ -205,8 +199,30 @@ class TestBudget:
         assert json.loads(json.dumps(found.to_dict()))["parameters"]["f_max"]["u"] > 0.0
         frame = found.to_frame()
         assert set(frame["source"]) >= {"noise", "combined"}
-        number = found.numbers()["f_max"]
-        assert number.std_dev == pytest.approx(found["f_max"].u)
+        numbers = found.numbers()
+        assert numbers["f_max"].std_dev == pytest.approx(found["f_max"].u)
+        u = np.array([found["f_max"].u, found["sigma"].u])
+        slope = np.array([1.0 / found["sigma"].value, -found["f_max"].value])
+        slope[1] /= found["sigma"].value ** 2
+        ratio = numbers["f_max"] / numbers["sigma"]
+        of_ratio = slope @ found.covariance[:2, :2] @ slope
+        assert ratio.std_dev == pytest.approx(of_ratio**0.5)
+        assert ratio.std_dev != pytest.approx(np.linalg.norm(slope * u), rel=1e-3)  # correlated
+
+    def test_numbers_of_the_gum_tree_calculator(self) -> None:
+        gtc = pytest.importorskip("GTC", reason="the GUM Tree Calculator is not installed")
+        found = budget(fit(table(n=12), Dahl()).optimum)
+        mine, theirs = found.numbers(), found.numbers("GTC")
+        ratio = theirs["f_max"] / theirs["sigma"]
+        assert gtc.uncertainty(ratio) == pytest.approx((mine["f_max"] / mine["sigma"]).std_dev)
+        assert gtc.dof(theirs["f_max"]) == pytest.approx(min(p.dof for p in found.parameters))
+
+    def test_only_sources_that_were_estimated_have_degrees_of_freedom(self) -> None:
+        sensors = Sensors(force_gain=stats.norm(1.0, 0.02))
+        rows = budget(fit(table(n=12), Dahl(alpha=1.0), sensors=sensors).optimum)["f_max"].rows
+        by_source = {row.source: row for row in rows}
+        assert by_source["force calibration"].dof == np.inf
+        assert 5.0 < by_source["noise"].dof <= 22.0  # 24 numbers, 2 parameters, other sources
 
     def test_at_infinity_what_is_determined_has_a_budget(self) -> None:
         result = fit(table(beta=(1e-3, 1e-2), seed=3), Dahl() + Spring(), throw=False)
@@ -262,6 +278,47 @@ class TestEstimate:
         assert whole.linear.outside[1] > 0
         few = modelled(data.select(rows=np.arange(240) % 2 == 0))
         assert whole.stderr["sigma"] * 2.0**0.5 == pytest.approx(few.stderr["sigma"], rel=0.25)
+
+    def test_a_point_that_stands_apart_has_an_error_of_its_own(self) -> None:
+        """A gross error counts as leaving the point out does, not as noise of all others."""
+        data = table(n=12, noise=0.01, seed=4)
+        off = data.response.copy()
+        off[7] *= 1.1
+        found = modelled(replace(data, response=off), Dahl(alpha=1.0))
+        left_out = modelled(data.select(rows=np.arange(12) != 7), Dahl(alpha=1.0))
+        assert "suspicious points" in found.contributions
+        for name, u in left_out.stderr.items():
+            assert found.stderr[name] == pytest.approx(u, rel=0.3)
+            assert found.values[name] == pytest.approx(left_out.values[name], abs=0.5 * u)
+        gross = found.variances[[s.name for s in found.sources].index("suspicious points")]
+        result = fit(found.problem.data, Dahl(alpha=1.0))
+        test, device = (result.predict(1.0, amplitude=X_C, noise=noise) for noise in (True, False))
+        noise = found.variances[0] + gross / 12.0
+        own = float(test.log_gain_std[0] ** 2 - device.log_gain_std[0] ** 2)
+        assert own == pytest.approx(noise, rel=1e-6)
+
+    def test_uncertain_variances_move_the_estimate(self) -> None:
+        """Kenward and Roger's term, from differences of G for other variances."""
+        found = modelled(three_days(0.02, 1))
+        linear, s = found.linear, found.variances
+        step = 1e-4 * np.diag(np.where(s > 0.0, s, 1e-9))
+        slopes = [
+            (
+                Projection(linear, s + h).generalised_inverse()
+                - Projection(linear, np.maximum(s - h, 0.0)).generalised_inverse()
+            )
+            / (h.sum() + min(h.sum(), s @ (h > 0.0)))
+            for h in step
+        ]
+        V, W = linear.covariance(s), found.components.covariance
+        expected = sum(
+            2.0 * W[i, j] * slopes[i] @ V @ slopes[j].T
+            for i, j in np.ndindex(W.shape)
+            if W[i, j] != 0.0
+        )
+        added = sum(found.of_weights.values())
+        assert np.abs(added).max() > 0.0
+        np.testing.assert_allclose(added, expected, rtol=1e-4, atol=1e-9 * found.covariance.max())
 
     @pytest.mark.parametrize("seed", [0, 1])
     def test_no_source_explains_the_noise_of_a_dense_sweep(self, seed: int) -> None:

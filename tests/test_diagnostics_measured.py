@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.measured import BEAM
 from dahl_ident import (
     Dahl,
     Damper,
@@ -24,7 +25,6 @@ from dahl_ident import (
 )
 from dahl_ident.diagnostics import Verdict
 from dahl_ident.diagnostics.slip_density import slip_density
-from tests.test_readers_measured import BRAKE_REUSS
 
 FOLDER = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent"))
 pytestmark = pytest.mark.skipif(
@@ -44,7 +44,7 @@ def damper() -> FrequencyResponse:
 def beam(tmp_path_factory: pytest.TempPathFactory) -> FrequencyResponse:
     """The Brake-Reuss beam near its first mode."""
     columns = tmp_path_factory.mktemp("lab") / "columns.toml"
-    columns.write_text(BRAKE_REUSS)
+    columns.write_text(BEAM)
     return read_frequency_response(FOLDER / "brb/ForcedFrequencyResponses.mat", columns=columns)
 
 

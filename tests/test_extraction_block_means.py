@@ -119,3 +119,22 @@ def test_uneven_samples_are_taken_as_they_are() -> None:
     assert samples.block_size(30.0) == 1
     assert Samples(t + jitter, x, force).block_size(FREQUENCY) == 1
     assert Samples(t[gap], x[gap], force[gap]).block_size(FREQUENCY) == 1
+
+
+def test_a_segment_of_block_means_has_the_samples_it_was_made_of() -> None:
+    t, x, force = dense(1e-3)
+    samples = Samples(t, x, force)
+    means, channels = samples.means(7)
+    whole = steady_segment(means, channels, 2.0 * np.pi * FREQUENCY, 7)
+    part = whole.part(slice(3, 200))
+    own = samples.of(part)
+    np.testing.assert_array_equal(own.time, t[21:1400])
+    np.testing.assert_array_equal(own.force, force[21:1400])
+    blocks = np.stack([x, force])[:, 21:1400].reshape(2, -1, 7)
+    np.testing.assert_allclose(
+        samples.within_blocks(part), blocks.var(axis=2).mean(axis=1), rtol=1e-9
+    )
+    assert samples.means(2)[0].size == t.size // 2
+    single = steady_segment(t, np.stack([x, force]), 2.0 * np.pi * FREQUENCY)
+    assert samples.within_blocks(single).tolist() == [0.0, 0.0]
+    assert samples.of(single.part(slice(5, 9))).time.tolist() == t[5:9].tolist()

@@ -536,3 +536,24 @@ def test_a_mean_that_moves_beyond_its_error_is_not_settled() -> None:
 
     assert all(settled(0.0, seed) for seed in range(12))
     assert not any(settled(sign * 20.0 * error, seed) for seed in range(3) for sign in (-1, 1))
+
+
+@pytest.mark.parametrize("distortion", [0.01, 0.05])
+def test_harmonics_state_what_those_of_the_displacement_add(distortion: float) -> None:
+    """Against the harmonics of a sine: errors of the size that is stated, over phases and sizes."""
+    law, t = Dahl(f_max=0.1, sigma=30.0), np.arange(12_000) / 1000.0
+    ratios = []
+    for amplitude in (2e-3, 1e-2, 1e-1):
+        for phase in np.linspace(0.0, 2.0 * np.pi, 5, endpoint=False).tolist():
+            third = distortion * np.cos(3.0 * 2.0 * np.pi * t + phase)
+            x = amplitude * (np.cos(2.0 * np.pi * t) + third)
+            data = extract(
+                Record(t, displacement=x, force=law.force(x)), frequency=1.0, settling_periods=2
+            )
+            assert data.covariance is not None
+            for row in np.flatnonzero(data.harmonic > 1).tolist():
+                exact = law.dynamic_stiffness(amplitude, harmonic=int(data.harmonic[row]))
+                stated = np.sqrt(np.trace(data.covariance[row]))
+                ratios.append(abs(data.response[row] - exact) / stated)
+    assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.2
+    assert max(ratios) < 3.0

@@ -85,6 +85,40 @@ def test_phasor_variance_is_that_of_white_noise() -> None:
     assert np.mean(errors) == pytest.approx(1.0, abs=4.0 / np.sqrt(800))
 
 
+def test_phasors_of_a_waveform_are_those_of_a_fit_to_it() -> None:
+    time, omega = uneven(700), 2.0 * np.pi * 1.3
+    channels = two_channels(time, omega, noise=0.3)
+    fit = sine_fit(steady_segment(time, channels, omega))
+    for channel, wave in enumerate(channels):
+        expected = [fit.phasors(k)[channel] for k in range(1, fit.orders + 1)]
+        found = fit.phasors_of(wave)
+        np.testing.assert_allclose(found[1:], expected, rtol=1e-9, atol=1e-12)
+        assert found[0].real == pytest.approx(fit.phasors(0)[channel].real, rel=1e-9)
+
+
+def test_variance_of_the_mean_is_that_of_the_normal_equations() -> None:
+    time, omega = uneven(400), 2.0 * np.pi * 1.3
+    segment = steady_segment(time, two_channels(time, omega), omega)
+    fit = sine_fit(segment)
+    k = np.arange(1, fit.orders + 1)[:, None]
+    basis = np.vstack(
+        [np.ones_like(time), segment.tau, np.cos(k * segment.theta), np.sin(k * segment.theta)]
+    )
+    assert fit.phasor_variance(0) == pytest.approx(np.linalg.inv(basis @ basis.T)[0, 0], rel=1e-9)
+
+
+def test_block_means_pass_each_harmonic_as_a_mean_of_its_samples_does() -> None:
+    size, omega = 8, 2.0 * np.pi
+    time = np.arange(640) / 64.0
+    means = time.reshape(-1, size).mean(axis=1)
+    segment = steady_segment(means, np.zeros((2, means.size)), omega, size)
+    passed = segment.passed(3)
+    assert passed is not None
+    for k in (1, 2, 3):
+        mean = np.exp(1j * k * omega * time).reshape(-1, size).mean(axis=1)
+        np.testing.assert_allclose(mean, passed[k - 1] * np.exp(1j * k * omega * means), rtol=1e-12)
+
+
 def test_trend_follows_a_growing_amplitude() -> None:
     time = np.arange(2000) / 100.0
     omega = 2.0 * np.pi * 1.3

@@ -8,10 +8,21 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from dahl_ident import Dahl, Damper, FrequencyResponse, LinearSystem, Mass, Spring
+from dahl_ident import (
+    Backlash,
+    BoucWen,
+    Dahl,
+    Damper,
+    FrequencyResponse,
+    Friction,
+    LinearSystem,
+    LuGre,
+    Mass,
+    Spring,
+)
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import solve
-from dahl_ident.fitting.global_start import own_starts, starts
+from dahl_ident.fitting.global_start import _grid, own_starts, starts
 from dahl_ident.problem import Problem, ProblemBatch
 from tests.random_problems import Case, exponent_free, friction_alone, two_elements
 
@@ -108,3 +119,36 @@ def test_a_parameter_that_cannot_be_started_is_named() -> None:
     problem = Problem(FrequencyResponse(np.ones(20), N, A), Dahl() + system)
     with pytest.raises(FitError, match="mass has no value to start from"):
         solve(problem)
+
+
+@pytest.mark.parametrize(("law", "error"), [(Backlash(Dahl(), 1e-3), 1e-2), (BoucWen(), 2e-3)])
+def test_curves_of_many_rows_are_interpolated(law: Friction, error: float) -> None:
+    many = np.geomspace(3e-4, 1e-1, 300)
+    table = FrequencyResponse(np.ones(300), np.ones(300, dtype=complex), many)
+    values = [np.array([100.0, 10.0]) * (k + 1) for k in range(len(law.parameters) - 1)]
+    values.append(np.array([1e-3, 3e-3]) if isinstance(law, Backlash) else values[0])
+    values = [
+        np.ones(2) if p.name == "alpha" else v for p, v in zip(law.parameters, values, strict=True)
+    ]
+    found = Problem(table, law, noise="relative").stiffness_data.of(law, values, at_nodes=True)
+    for node, curve in enumerate(found):
+        exact = law.stiffness([v[node] for v in values], many, np.ones(()))
+        assert np.max(np.abs(curve - exact)) < error * np.max(np.abs(exact))
+
+
+def test_no_start_gains_energy() -> None:
+    table = FrequencyResponse(np.ones(20), Dahl(0.1, 30.0).describing_function(A), A)
+    nodes = _grid(problem := Problem(table, BoucWen()), problem.stiffness_data).curves[0].values
+    assert np.all(nodes["q"] + nodes["p"] > 0.0)
+    assert np.any(nodes["q"] < 0.0)
+
+
+def test_tables_of_a_law_with_lengths_and_numbers_start_together() -> None:
+    law = LuGre(1.0, 30.0, static_ratio=1.8, stribeck_speed=0.05)
+    omega, many = 2.0 * np.pi * np.repeat([0.3, 3.0], 6), np.tile(np.geomspace(1e-3, 1.0, 6), 2)
+    N = law.dynamic_stiffness(many, omega)
+    tables = [FrequencyResponse(omega / (2.0 * np.pi), N * k, many * k) for k in (1.0, 2.0)]
+    begin = own_starts(ProblemBatch(tables, LuGre()))
+    assert begin.table.size > 2  # several starts of a table
+    assert set(begin.table.tolist()) == {0, 1}
+    assert np.isfinite(begin.theta).all()

@@ -573,3 +573,20 @@ class TestTelling:
         assert bottom.get_xlabel() == "displacement amplitude [m]"
         assert len(top.get_lines()[0].get_xdata()) == 5
         plt.close("all")
+
+
+def test_errors_of_the_drive_are_kept_in_files(tmp_path: Path) -> None:
+    response = np.array([1e-3 - 1e-4j, 2e-3 - 3e-4j])
+    data = FrequencyResponse(
+        [1.0, 2.0], response, drive=[0.5, 1.0], controlled="force", quantity="receptance",
+        covariance=1e-8 * np.tile(np.eye(2), (2, 1, 1)), drive_std=[0.01, 0.02],
+        drive_covariance=[[1e-7, 2e-8], [-1e-7, 0.0]],
+    )  # fmt: skip
+    read = read_frequency_response(data.save(tmp_path / "t.csv"))
+    assert read.drive_std == pytest.approx([0.01, 0.02])
+    assert read.drive_covariance == pytest.approx(data.drive_covariance)
+    stiff = data.to("dynamic_stiffness")
+    back = stiff.to("receptance")
+    assert back.drive_covariance == pytest.approx(data.drive_covariance)
+    with pytest.raises(ValidationError, match="drive_std is given without drive"):
+        FrequencyResponse([1.0], [1.0 + 1j], amplitude=[1e-3], drive_std=[0.1])

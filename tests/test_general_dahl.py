@@ -11,14 +11,12 @@ from benchmarks.general_dahl_accuracy import errors
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import linear_dahl
 from dahl_ident.elements.general_dahl import (
-    DescribingFunctionTable,
     describing_function,
     describing_function_gradient,
     harmonic,
     harmonic_gradient,
     turning_force,
 )
-from dahl_ident.errors import ValidationError
 
 ODD = (1, 3, 5, 7, 9, 11, 13, 15)
 ALPHAS = st.floats(0.25, 4.0)
@@ -260,38 +258,3 @@ def test_broadcasts_and_does_not_depend_on_company() -> None:
     for part, one in zip(together, alone, strict=True):
         assert part[2, 123] == pytest.approx(complex(one[0]), rel=1e-13)
     assert describing_function(np.zeros((0, 2)), at(2.0)).shape == (0, 2)
-
-
-@pytest.mark.parametrize("alpha", [0.25, 0.5, 0.95, 1.0, 2.0, 4.0])
-def test_table_holds_the_describing_function(alpha: float) -> None:
-    table = DescribingFunctionTable(alpha)
-    rng = np.random.default_rng(1)
-    beta = np.concatenate([10.0 ** rng.uniform(-6.0, 6.0, 3000), [1e-6, 1e6]])
-    if alpha < 1.0:
-        onset = 2.0**-alpha / (1.0 - alpha)
-        gaps = np.geomspace(1e-6, 0.1, 100)
-        beta = np.concatenate([beta, onset * (1.0 - gaps), onset * (1.0 + gaps)])
-    h, minus_slope, _, _ = describing_function_gradient(beta, at(alpha))
-    by_table, slope = table.gradient(beta)
-    assert np.max(np.abs(table(beta) / h - 1.0)) < 1e-10
-    assert np.all(by_table == table(beta))
-    assert np.max(np.abs(slope / -minus_slope - 1.0)) < 1e-8
-
-
-def test_table_keeps_its_values_at_the_onset_of_slip() -> None:
-    onset = 2.0**-0.25 / 0.75
-    beta = onset * (1.0 + np.concatenate([-np.geomspace(1e-16, 1e-6, 50), [0.0, 1e-12, 1e-9]]))
-    table = DescribingFunctionTable(0.25, 0.1, 10.0)
-    assert np.max(np.abs(table(beta) / describing_function(beta, at(0.25)) - 1.0)) < 1e-10
-
-
-def test_table_refuses_what_it_does_not_hold() -> None:
-    table = DescribingFunctionTable(2.0, 1e-2, 1e2)
-    with pytest.raises(ValidationError, match=r"beta\[1\] is 0\.001; expected numbers from 0\.01"):
-        table(np.array([1.0, 1e-3]))
-    with pytest.raises(ValidationError, match=r"beta is 200\.0; expected numbers .* to 100"):
-        table.gradient(at(200.0))
-    with pytest.raises(ValidationError, match=r"alpha is -1\.0; expected numbers > 0"):
-        DescribingFunctionTable(-1.0)
-    with pytest.raises(ValidationError, match=r"beta_max is 0\.5; expected numbers from 1 "):
-        DescribingFunctionTable(1.0, 1.0, 0.5)

@@ -83,7 +83,7 @@ def test_ipopt_and_grid_agree_with_it(kind: str) -> None:
     fit = fitted(kind)
     other = di.fit(fit.data, asked(kind), method="ipopt")
     assert other.optimum.values == pytest.approx(fit.optimum.values, rel=1e-4)
-    grid = di.posterior(fit.data, asked(kind), method="grid", tolerance=1e-2)
+    grid = di.posterior(fit.data, asked(kind), method="grid", tolerance=1e-2, uncertainty="noise")
     for name in fit.var_names:
         assert abs(grid.params[name].value - best(fit)[name]) < 1.5 * fit.stderr_noise[name]
 

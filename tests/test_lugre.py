@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
 from dahl_ident import Dahl, Damper, LuGre, Mass, Spring, response
+from dahl_ident.elements.behaviour import central_differences
 from dahl_ident.errors import ModelError, ValidationError
 
 LAW = LuGre(1.0, 300.0, 1.6, 0.02, 0.4, 0.3)
@@ -72,3 +75,16 @@ def test_response_beside_a_plant() -> None:
         A = np.ravel(ours.amplitude)
         force = np.abs(A * plant.dynamic_stiffness(A, 2.0 * np.pi * 0.6))
         np.testing.assert_allclose(force, drive, rtol=1e-8)
+
+
+def test_derivatives_equal_differences_of_the_response() -> None:
+    law = LuGre(1.0, 100.0, 1.7, 0.05, micro_damping=0.3, viscous=0.2)
+    law = law.with_bound(tuple(replace(p, free=True) for p in law.parameters))
+    A, w = np.geomspace(1e-4, 1.0, 9), np.asarray(3.0)
+    values = [np.asarray(p.value) for p in law.parameters]
+    found = law.stiffness_gradient(values, A, w)
+    for i, by in enumerate((*found.by_parameter, found.by_amplitude)):
+        expected = central_differences(
+            lambda *v: law.stiffness(v[:-1], v[-1], w), [*values, A], i, A.shape
+        )
+        assert np.max(np.abs(by - expected)) < 1e-9 * np.max(np.abs(expected))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy import optimize
@@ -10,6 +13,7 @@ import dahl_ident as di
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.noise import Student
 from dahl_ident.problem import Problem
+from tests.command_line import Runner
 
 F_MAX, SIGMA, ASYMMETRY = 0.8, 400.0, 0.2
 HARMONICS = (0, 1, 2, 3)
@@ -103,3 +107,21 @@ def test_the_score_of_an_estimated_covariance_varies_as_its_information_says(
     spread = np.sqrt(np.var(score**2) / n + np.var(stated) / n)
     assert np.mean(score**2) == pytest.approx(np.mean(stated), abs=4.0 * spread)
     assert 4.0 * spread < 0.05 * np.mean(stated)  # dof + 1.5 in place of dof + 1 moves it by 5 %
+
+
+def test_pictures_and_the_printed_points_show_each_row_as_what_it_is(
+    run: Runner, tmp_path: Path
+) -> None:
+    fit = di.fit(table(seed=4), di.Dahl(asymmetry=None))
+    lines = {str(line.get_label()): line for line in fit.plot_residuals().lines}
+    second = np.asarray(lines["imaginary part"].get_ydata(), dtype=float)
+    assert np.isnan(second).tolist() == (fit.data.harmonic == 0).tolist()
+
+    record = di.load_dataset("play_and_two_limits")
+    record.save(tmp_path / "waveforms.csv")
+    with pytest.warns(UserWarning, match="the force is asymmetric"):
+        fundamental = di.extract(tmp_path / "waveforms.csv").select(harmonic=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        printed = run("extract", str(tmp_path / "waveforms.csv")).out
+    assert all(f"{phase:.2f}" in printed for phase in np.degrees(fundamental.phase))

@@ -110,6 +110,15 @@ def test_import_loads_no_heavy_library() -> None:
     assert not heavy & set(loaded)
 
 
+def test_fitting_a_table_loads_only_what_it_needs() -> None:
+    code = "import sys, dahl_ident; dahl_ident.fit; print(' '.join(sys.modules))"
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True
+    ).stdout.split()
+    heavy = {"scipy.signal", "scipy.stats", "scipy.optimize", "matplotlib", "casadi"}
+    assert not heavy & set(loaded)
+
+
 def test_wheel_installs_and_runs_elsewhere(tmp_path: Path) -> None:
     uv = [sys.executable, "-m", "uv"]
     build = [*uv, "build", "--quiet", "--wheel", "--out-dir", str(tmp_path), str(ROOT)]

@@ -20,7 +20,7 @@ from dahl_ident.diagnostics.bands import problem_at
 from dahl_ident.diagnostics.prediction_error import prediction_error
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import solve_many
-from dahl_ident.planning import Plan
+from dahl_ident.planning import Plan, forecast
 from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
 from dahl_ident.planning.criteria import LevelInformation, Objective, Term
 from dahl_ident.planning.optimal_design import Exchange, continuous_design
@@ -175,6 +175,10 @@ class TestLevelsWithFixedCosts:
         )
         assert bench.settling_cycles(bench.order(range(5))).sum() <= least + 1  # rounding
 
+    def test_the_fixed_times_of_many_sets_are_those_of_each(self) -> None:
+        bench, sets = _bench(4, 6), np.array([[0, 3, 5], [4, 1, 2], [5, 0, 1]])
+        assert bench.fixed(sets) == pytest.approx([float(bench.fixed(one)) for one in sets])
+
     def test_settling_follows_the_transient(self) -> None:
         beta = 0.1
         bench = BenchTime(np.ones(1), np.array([np.exp(-4.0 * beta)]), np.ones(1), 0.0, 0.01)
@@ -227,6 +231,23 @@ class TestPlan:
         even = plan.planner.forecast.expected(*plan.planner.search.logarithmic_grid(25.0))
         assert even["f_max"].after > 1.5 * plan.expected["f_max"].after
 
+    def test_levels_do_not_lean_on_ranges(self) -> None:
+        """In gross slip two close levels would do for the spring if stiffness were known."""
+        plan = di.plan(
+            LINEAR + di.Spring(), ranges={**NEAR, "stiffness": (29.7, 30.3)}, noise=0.01, draws=20,
+            limits={"displacement": (100.0 * X_C, 1000.0 * X_C), "frequency_hz": 1, "time": 120},
+            target="stiffness", candidates=60,
+        )  # fmt: skip
+        levels = np.array([step.level for step in plan.steps]) / X_C
+        assert (levels.min(), levels.max()) == pytest.approx((100.0, 1000.0), rel=0.2)
+        # 118 cycles of 1 % at one level, everything else known: 0.092 %
+        assert 0.00092 < plan.expected["stiffness"].after < 0.0012
+
+    def test_information_that_cancels_is_no_error(self) -> None:
+        found = forecast.covariance_of(np.array([[[1e20, 1e20], [1e20, 1e20]]]))
+        assert np.all(np.isfinite(found))
+        assert np.all(np.diagonal(found[0]) >= 0.0)
+
     def test_a_target_is_reached_in_the_least_time(self) -> None:
         target = {"f_max": 0.004, "f_max/sigma": 0.006}
         common: dict[str, Any] = {"ranges": NEAR, "noise": 0.02, "draws": 20}
@@ -247,6 +268,23 @@ class TestPlan:
         plan = di.plan(di.Dahl(), ranges=ranges, limits=limits, noise=0.01, target=wanted)
         assert plan.reached
         assert plan.seconds < 5.0
+
+    def test_a_plan_takes_at_most_a_month(self) -> None:
+        plan = di.plan(
+            LINEAR, ranges=NEAR, limits=KNEE, noise=0.02, target={"f_max": 1e-9}, draws=10,
+            candidates=20,
+        )  # fmt: skip
+        assert not plan.reached
+        assert plan.seconds == pytest.approx(30.0 * 86400.0, rel=1e-3)
+        assert "no plan takes more than 30 days" in str(plan)
+
+    def test_drives_that_friction_cannot_hold_are_left_out(self) -> None:
+        plan = di.plan(
+            LINEAR, ranges={"f_max": (0.05, 0.2), "sigma": (15.0, 60.0)}, controlled="force",
+            noise=0.01, limits={"force": 1.0, "frequency_hz": 5.0, "time": 60.0}, candidates=60,
+        )  # fmt: skip
+        draws = plan.planner.forecast.knowledge.values
+        assert max(step.level for step in plan.steps) < draws[:, 0].min()
 
     def test_earlier_data_shorten_it(self) -> None:
         rng = np.random.default_rng(2)
@@ -428,6 +466,7 @@ class TestPlan:
             ({"noise": {"relativ": 1}}, "noise has relativ; expected relative"),
             ({"target": {"mass": 0.1}}, "target names 'mass'; free are f_max, sigma"),
             ({"target": {"f_max+1": 0.1}}, "expected a parameter, or a product of powers"),
+            ({"target": {"f_max": 2.0}}, "below 1: 0.02 is 2 %"),
             ({"suspects": {"gap": 0.1}}, "suspects names gap"),
             ({"ranges": {**NEAR, "c": (1, 2)}}, "ranges names c"),
         ],

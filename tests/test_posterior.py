@@ -28,7 +28,7 @@ LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
 
 @pytest.fixture(scope="module")
 def posterior() -> ChainPosterior:
-    return di.posterior(friction_table(), di.Dahl(), seed=1)
+    return di.posterior(friction_table(), di.Dahl(), seed=1, uncertainty="noise")
 
 
 def scenarios() -> dict[str, tuple[di.FrequencyResponse, Any, dict[str, Any]]]:
@@ -49,8 +49,8 @@ def scenarios() -> dict[str, tuple[di.FrequencyResponse, Any, dict[str, Any]]]:
 @pytest.mark.parametrize("name", scenarios())
 def test_sampling_agrees_with_quadrature(name: str) -> None:
     data, model, options = scenarios()[name]
-    drawn = di.posterior(data, model, seed=3, ess=3000.0, **options)
-    grid = di.posterior(data, model, **options, method="grid")
+    drawn = di.posterior(data, model, seed=3, ess=3000.0, **options, uncertainty="noise")
+    grid = di.posterior(data, model, **options, method="grid", uncertainty="noise")
     assert drawn.converged
     ess = drawn.convergence.ess
     D = len(drawn.names)
@@ -110,7 +110,7 @@ def test_emcees_names(posterior: ChainPosterior) -> None:
 
 
 def test_a_short_chain_is_marked_and_keeps_its_ess_to_itself() -> None:
-    short = di.posterior(friction_table(), di.Dahl(), seed=1, steps=60)
+    short = di.posterior(friction_table(), di.Dahl(), seed=1, steps=60, uncertainty="noise")
     assert not short.converged
     assert str(short).startswith("NOT CONVERGED after 60 steps: ")
     assert "autocorrelation times, expected 50" in short.message
@@ -129,7 +129,7 @@ def test_a_chain_that_never_moved_is_refused_with_its_chain(
 
     monkeypatch.setattr("dahl_ident.bayes.chain.moves_for", moves)
     with pytest.raises(SamplingError, match="walkers never moved in f_max, sigma") as caught:
-        di.posterior(friction_table(), di.Dahl(), seed=1, steps=40)
+        di.posterior(friction_table(), di.Dahl(), seed=1, steps=40, uncertainty="noise")
     assert caught.value.posterior.get_chain().shape == (40, 128, 3)
 
 
@@ -143,7 +143,7 @@ def test_the_report_names_priors(posterior: ChainPosterior) -> None:
 
 def test_a_prior_dominated_parameter_is_named() -> None:
     data = friction_table(10, 0.0003, 0.003, 0.05)
-    posterior = di.posterior(data, di.Dahl(), seed=1)
+    posterior = di.posterior(data, di.Dahl(), seed=1, uncertainty="noise")
     (rule,) = posterior.prior_influences
     assert rule.name == "f_max"
     assert "f_max is set by its prior: posterior width 0." in str(posterior)
@@ -176,8 +176,8 @@ def test_every_result_has_one_interface() -> None:
     data = friction_table()
     results: list[Result] = [
         di.fit(data, di.Dahl()),
-        di.posterior(data, di.Dahl(), seed=1, ess=500.0, max_steps=2000),
-        di.posterior(data, di.Dahl(), method="grid"),
+        di.posterior(data, di.Dahl(), seed=1, ess=500.0, max_steps=2000, uncertainty="noise"),
+        di.posterior(data, di.Dahl(), method="grid", uncertainty="noise"),
     ]
     fit = results[0]
     assert isinstance(fit, di.FitResult)
@@ -216,7 +216,7 @@ def test_every_result_has_one_interface() -> None:
 
 
 def test_results_are_saved_and_never_overwritten(tmp_path: Path) -> None:
-    grid = di.posterior(friction_table(), di.Dahl(), method="grid")
+    grid = di.posterior(friction_table(), di.Dahl(), method="grid", uncertainty="noise")
     place = grid.save(tmp_path / "grid.json")
     stored = json.loads(place.read_text())
     assert stored["summary"]["f_max"]["mean"] == grid.params["f_max"].value
@@ -228,19 +228,19 @@ def test_results_are_saved_and_never_overwritten(tmp_path: Path) -> None:
 
 def test_options_of_the_other_method_are_refused() -> None:
     with pytest.raises(ValidationError, match="steps given with method='grid', which has no such"):
-        di.posterior(friction_table(), di.Dahl(), method="grid", steps=100)  # type: ignore[call-overload]
+        di.posterior(friction_table(), di.Dahl(), method="grid", steps=100, uncertainty="noise")  # type: ignore[call-overload]
     with pytest.raises(ValidationError, match="tolerance given with method='mcmc'"):
-        di.posterior(friction_table(), di.Dahl(), tolerance=1e-3)  # type: ignore[call-overload]
+        di.posterior(friction_table(), di.Dahl(), tolerance=1e-3, uncertainty="noise")  # type: ignore[call-overload]
     with pytest.raises(ValidationError, match="method is 'nuts'; expected mcmc or grid"):
-        di.posterior(friction_table(), di.Dahl(), method="nuts")  # type: ignore[call-overload]
+        di.posterior(friction_table(), di.Dahl(), method="nuts", uncertainty="noise")  # type: ignore[call-overload]
 
 
 def test_predictive_checks_pass_the_right_model_and_fail_the_wrong_one() -> None:
     data = with_covariance(friction_table(30, 0.1, 10.0, 0.02), 0.02)
-    right = di.posterior(data, di.Dahl(), seed=1)
+    right = di.posterior(data, di.Dahl(), seed=1, uncertainty="noise")
     assert [check.statistic for check in right.checks] == ["size", "largest", "neighbours"]
     assert all(check.passed for check in right.checks)
-    wrong = di.posterior(data, di.Dahl(alpha=2.0), seed=1)
+    wrong = di.posterior(data, di.Dahl(alpha=2.0), seed=1, uncertainty="noise")
     failed = {check.statistic for check in wrong.checks if not check.passed}
     assert {"size", "neighbours"} <= failed
     assert "MISFIT: neighbouring rows err in the same direction" in str(wrong)
@@ -251,7 +251,7 @@ def test_checks_of_a_right_model_are_calibrated() -> None:
     shares = []
     for seed in range(12):
         table = friction_table(15, noise=0.05, seed=seed)
-        drawn = di.posterior(table, di.Dahl(), seed=1, steps=150)
+        drawn = di.posterior(table, di.Dahl(), seed=1, steps=150, uncertainty="noise")
         shares += [check.share for check in drawn.checks]
     assert np.mean(np.array(shares) < 0.05) < 0.2
 

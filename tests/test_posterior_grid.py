@@ -93,7 +93,9 @@ def test_the_noise_scale_follows_its_closed_form() -> None:
 def test_one_parameter_against_scipy() -> None:
     data = friction_table(rows=5, noise=0.3)
     prior = (0.01, 1.0)
-    grid = di.posterior(data, di.Dahl(sigma=30.0), priors={"f_max": prior}, method="grid")
+    grid = di.posterior(
+        data, di.Dahl(sigma=30.0), priors={"f_max": prior}, method="grid", uncertainty="noise"
+    )
     problem = Problem(data, di.Dahl(sigma=30.0))
 
     def density(theta: float, moment: int = 0) -> float:
@@ -126,8 +128,8 @@ def test_one_parameter_against_scipy() -> None:
 )
 def test_the_stated_error_holds(rows: int, low: float, high: float, noise: float) -> None:
     data = friction_table(rows, low, high, noise)
-    grid = di.posterior(data, di.Dahl(), method="grid")
-    exact = di.posterior(data, di.Dahl(), tolerance=1e-6, method="grid")
+    grid = di.posterior(data, di.Dahl(), method="grid", uncertainty="noise")
+    exact = di.posterior(data, di.Dahl(), tolerance=1e-6, method="grid", uncertainty="noise")
     assert grid.converged
     assert grid.error < 1e-4
     assert abs(grid.log_evidence - exact.log_evidence) < grid.error
@@ -164,7 +166,7 @@ def test_few_points_and_much_noise_stay_inside_the_stated_error(seed: int) -> No
     low, noise = 10.0 ** random.uniform([-2.0, -1.2], [1.5, 0.0])
     data = friction_table(int(random.integers(2, 6)), low, 30.0 * low, noise, seed)
     priors = {"f_max": (1e-3, 10.0), "sigma": (0.3, 3e3)}
-    grid = di.posterior(data, di.Dahl(), priors=priors, method="grid")
+    grid = di.posterior(data, di.Dahl(), priors=priors, method="grid", uncertainty="noise")
     assert grid.error < 1e-4
     _, mass = brute_force(grid, priors, 90)
     assert abs(mass.sum() - 1.0) < grid.error
@@ -192,7 +194,7 @@ def test_few_points_and_much_noise_stay_inside_the_stated_error(seed: int) -> No
 def test_the_stated_error_holds_against_brute_force(
     data: di.FrequencyResponse, model: Any, priors: dict[str, Any], panels: int
 ) -> None:
-    grid = di.posterior(data, model, priors=priors, method="grid")
+    grid = di.posterior(data, model, priors=priors, method="grid", uncertainty="noise")
     assert grid.error < 1e-4
     nodes, mass = brute_force(grid, priors, panels)
     assert abs(mass.sum() - 1.0) < grid.error
@@ -227,7 +229,7 @@ def test_disagreement_between_the_parameters_is_error() -> None:
 def test_a_bolted_ridge_keeps_its_time() -> None:
     # what once took millions of points: f_max open to its wall beside a free spring
     data = spring_table(1e-3, 20, 0.003, 0.03)
-    grid = di.posterior(data, di.Dahl() + di.Spring(), method="grid")
+    grid = di.posterior(data, di.Dahl() + di.Spring(), method="grid", uncertainty="noise")
     assert grid.converged, grid.message
     assert grid.evaluations < 300_000
     rule_ = grid.prior_influences[0]
@@ -238,7 +240,7 @@ def test_what_contradicts_itself_is_told_before_it_is_refined() -> None:
     # sigma alone shows; beside a free spring friction may as well be none, at either end
     data = di.load_dataset("microslip")
     assert isinstance(data, di.FrequencyResponse)
-    grid = di.posterior(data, di.Dahl() + di.Spring(), method="grid")
+    grid = di.posterior(data, di.Dahl() + di.Spring(), method="grid", uncertainty="noise")
     assert grid.message.startswith("NOT CONVERGED: error")
     assert grid.error > 0.1
     assert grid.evaluations < 200_000  # 675,000 with every lattice refined
@@ -247,17 +249,24 @@ def test_what_contradicts_itself_is_told_before_it_is_refined() -> None:
 def test_evidence_of_a_free_exponent_is_lower_where_the_exponent_is_one() -> None:
     data = friction_table(rows=8, noise=0.05)
     priors = {"f_max": (0.01, 1.0), "sigma": (3.0, 300.0)}
-    plain = di.posterior(data, di.Dahl(), priors=priors, method="grid")
+    plain = di.posterior(data, di.Dahl(), priors=priors, method="grid", uncertainty="noise")
     wider = di.posterior(
-        data, di.Dahl(), priors={**priors, "alpha": (0.3, 3.0)}, free=["alpha"], method="grid"
+        data,
+        di.Dahl(),
+        priors={**priors, "alpha": (0.3, 3.0)},
+        free=["alpha"],
+        method="grid",
+        uncertainty="noise",
     )
     assert wider.log_evidence < plain.log_evidence
 
 
 def test_scale_free_and_scale_known_agree_for_many_rows() -> None:
     table = friction_table(rows=200, noise=0.02)
-    free = di.posterior(table, di.Dahl(), method="grid")
-    known = di.posterior(with_covariance(table, 0.02), di.Dahl(), method="grid")
+    free = di.posterior(table, di.Dahl(), method="grid", uncertainty="noise")
+    known = di.posterior(
+        with_covariance(table, 0.02), di.Dahl(), method="grid", uncertainty="noise"
+    )
     assert known.names == ("f_max", "sigma")
     # the scale is known to 5 % from 400 residuals
     assert known.std()[:2] == pytest.approx(free.std()[:2], rel=0.15)
@@ -265,7 +274,9 @@ def test_scale_free_and_scale_known_agree_for_many_rows() -> None:
 
 
 def test_a_microslip_posterior_names_the_prior() -> None:
-    grid = di.posterior(friction_table(10, 0.0003, 0.003, 0.05), di.Dahl(), method="grid")
+    grid = di.posterior(
+        friction_table(10, 0.0003, 0.003, 0.05), di.Dahl(), method="grid", uncertainty="noise"
+    )
     (rule_,) = grid.prior_influences
     assert str(rule_).startswith("f_max is set by its prior: posterior width 0.")
     assert rule_.at_upper_end
@@ -277,7 +288,9 @@ def test_a_microslip_posterior_names_the_prior() -> None:
     "prior", [stats.norm(1.0, 0.1), stats.norm(0.105, 0.0005), stats.lognorm(0.1, scale=1.0)]
 )
 def test_data_outweigh_the_tail_of_a_prior(prior: Any) -> None:
-    grid = di.posterior(TIGHT, di.Dahl(), priors={"f_max": prior}, method="grid")
+    grid = di.posterior(
+        TIGHT, di.Dahl(), priors={"f_max": prior}, method="grid", uncertainty="noise"
+    )
     # the likelihood of f_max, sigma profiled out, is nearly normal over its value
     optimum = di.fit(TIGHT, di.Dahl()).optimum
     f, std = optimum.values[0], np.sqrt(optimum.values_covariance[0, 0])
@@ -292,23 +305,25 @@ def test_data_outweigh_the_tail_of_a_prior(prior: Any) -> None:
 
 
 def test_a_prior_that_keeps_the_data_out_is_told_with_its_misfit() -> None:
-    walled = di.posterior(TIGHT, di.Dahl(), priors={"f_max": (1.0, 2.0)}, method="grid")
+    walled = di.posterior(
+        TIGHT, di.Dahl(), priors={"f_max": (1.0, 2.0)}, method="grid", uncertainty="noise"
+    )
     assert "at the lower end; check the prior, its unit" in str(walled)
     assert "MISFIT: the residuals are larger than the noise that the data state" in str(walled)
     assert [text[:12] for text in walled.statements[:2]] == ["Not describe", "MISFIT: the "]
-    free = di.posterior(TIGHT, di.Dahl(), method="grid")
+    free = di.posterior(TIGHT, di.Dahl(), method="grid", uncertainty="noise")
     assert free.trusted
-    assert not free.findings[:-1]
+    assert free.findings[0].startswith("Noise alone is counted; with every source")
 
 
 def test_a_lattice_laid_amiss_is_no_silent_answer() -> None:
     priors = {"f_max": stats.norm(1.0, 0.01)}  # ninety deviations from what the data say
-    grid = di.posterior(TIGHT, di.Dahl(), priors=priors, method="grid")
+    grid = di.posterior(TIGHT, di.Dahl(), priors=priors, method="grid", uncertainty="noise")
     assert grid.converged or str(grid).startswith("NOT CONVERGED: error")
 
 
 def test_marginals_are_densities_with_the_right_quantiles() -> None:
-    grid = di.posterior(friction_table(), di.Dahl(), method="grid")
+    grid = di.posterior(friction_table(), di.Dahl(), method="grid", uncertainty="noise")
     for name in grid.names:
         ends = grid.quantile(name, np.array([1e-5, 0.3, 1.0 - 1e-5]))
         x = np.linspace(ends[0], ends[2], 4001)
@@ -323,7 +338,7 @@ def test_marginals_are_densities_with_the_right_quantiles() -> None:
 
 
 def test_expectation_and_draws() -> None:
-    grid = di.posterior(friction_table(), di.Dahl(), method="grid")
+    grid = di.posterior(friction_table(), di.Dahl(), method="grid", uncertainty="noise")
     x_c = grid.function(lambda f_max, sigma: f_max / sigma)["mean"]
     assert x_c == pytest.approx(X_C, rel=0.05)
     draws = grid.draws(4000, seed=1)
@@ -334,7 +349,7 @@ def test_expectation_and_draws() -> None:
 
 @pytest.mark.parametrize("bad", [0.0, 1.0, 1.5, np.nan])
 def test_quantiles_of_what_is_no_probability_are_refused(bad: float) -> None:
-    grid = di.posterior(friction_table(), di.Dahl(), method="grid")
+    grid = di.posterior(friction_table(), di.Dahl(), method="grid", uncertainty="noise")
     for name in grid.names:
         with pytest.raises(ValidationError, match=r"probabilities\[1\] is .*; expected"):
             grid.quantile(name, [0.5, bad])
@@ -344,15 +359,15 @@ def test_refusals() -> None:
     data = friction_table()
     plant = di.Dahl() + di.Spring() + di.Damper()
     with pytest.raises(SamplingError, match=r"4 parameters are free \(f_max, sigma, stiffness"):
-        di.posterior(data, plant, method="grid")
+        di.posterior(data, plant, method="grid", uncertainty="noise")
     with pytest.raises(ModelError, match="there is no 'mass'; expected one of f_max, sigma"):
-        di.posterior(data, di.Dahl(), method="grid").quantile("mass", 0.5)
+        di.posterior(data, di.Dahl(), method="grid", uncertainty="noise").quantile("mass", 0.5)
     with pytest.raises(ValidationError, match="unknown noise scale has no closed integral"):
         di.posterior(data, di.Dahl(), likelihood="student_t", method="grid")
     exact = FRICTION.describing_function(np.array([1e-3, 2e-3, 4e-3]))
     perfect = di.FrequencyResponse(np.ones(3), exact, np.array([1e-3, 2e-3, 4e-3]))
     with pytest.raises(SamplingError, match="there is no noise whose scale could be estimated"):
-        di.posterior(perfect, di.Dahl(), method="grid")
+        di.posterior(perfect, di.Dahl(), method="grid", uncertainty="noise")
     two = friction_table(rows=1)
     with pytest.raises(SamplingError, match="2 residuals cannot determine 2 parameters"):
-        di.posterior(two, di.Dahl(), method="grid")
+        di.posterior(two, di.Dahl(), method="grid", uncertainty="noise")

@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import trapezoid
 from scipy.io import loadmat
 
+from benchmarks.measured import BEAM
 from dahl_ident.data import FrequencyResponse, inspect, read_frequency_response, read_record
 from dahl_ident.errors import DataError
 
@@ -22,31 +23,11 @@ pytestmark = pytest.mark.skipif(
 FOLDER = Path(MEASURED or "")
 FILES = sorted((FOLDER / "brfd").glob("*.csv"))
 
-# An acceleration's amplitude with a displacement's phase, as the file's own README says.
-BRAKE_REUSS = """
-quantity = "receptance"
-[frequency]
-column = "FRdata.*[*].frequency"
-unit = "Hz"
-[drive]
-column = "FRdata.*[*].force"
-unit = "N"
-[amplitude]
-column = "FRdata.*[*].amplitude"
-unit = "m/s^2"
-[phase]
-column = "FRdata.*[*].phase"
-unit = "rad"
-[controlled]
-force = "ForceControl*"
-displacement = "ResponseControl*"
-"""
-
 
 @pytest.fixture(scope="module")
 def beam(tmp_path_factory: pytest.TempPathFactory) -> FrequencyResponse:
     columns = tmp_path_factory.mktemp("lab") / "brb.toml"
-    columns.write_text(BRAKE_REUSS)
+    columns.write_text(BEAM)
     return read_frequency_response(FOLDER / "brb" / "ForcedFrequencyResponses.mat", columns=columns)
 
 

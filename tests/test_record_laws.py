@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import control
 import numpy as np
 import pytest
@@ -131,8 +133,6 @@ def test_trapezoids_that_are_hard_to_search(truth: Element, model: Element, nois
 @pytest.mark.parametrize(
     ("law", "reason"),
     [
-        (di.Backlash(di.Dahl()), "position in the gap"),
-        (di.MaxwellSlip([1e-3]), "more than its present force"),
         (di.Iwan(), "more than its present force"),
         (di.LinearSystem(control.tf([1.0], [1.0, 2.0]), quantity="receptance"), "frequency domain"),
     ],
@@ -163,3 +163,32 @@ def test_power_damper_against_scipy(exponent: float, accuracy: float) -> None:
     found = forced.solve(np.zeros(0), np.array([1e-4, 0.0]), np.zeros((samples, 2)))
     error = np.abs(found - expected).max(axis=0) / np.abs(expected).max(axis=0)
     assert error.max() < accuracy
+
+
+def damped_record(damper: Callable[[FloatArray], FloatArray]) -> di.Record:
+    """Return a record of Dahl friction and a force of the speed."""
+    t = np.arange(1500) / 200.0
+    phase = 2.0 * np.sin(0.9 * t) + 5.1 * t
+    x, v = 3e-3 * np.sin(phase), 3e-3 * np.cos(phase) * (1.8 * np.cos(0.9 * t) + 5.1)
+    force = di.Dahl(0.1, 60.0).force(x) + damper(v)
+    noise = 1e-3 * np.random.default_rng(3).standard_normal(t.size)
+    return di.Record(t, displacement=x, force=force + noise)
+
+
+def test_exponent_of_a_damper_stays_between_its_bounds() -> None:
+    record = damped_record(lambda v: 5e5 * v**3 * np.abs(v))
+    fit = di.fit(record, di.Dahl() + di.PowerDamper(), throw=False)
+    assert 2.9 < fit.params["exponent"].value <= 3.0
+    np.testing.assert_allclose(fit.params["f_max"].value, 0.1, rtol=0.05)
+
+
+def test_damper_that_vanishes_does_not_stop_the_search() -> None:
+    record = damped_record(lambda v: -0.2 * v)  # no coefficient above zero helps
+    without = di.fit(record, di.Dahl(), throw=False)
+    fit = di.fit(record, di.Dahl() + di.PowerDamper(), throw=False)
+    assert str(fit.status) == "not determined"
+    assert 0.0 < fit.params["exponent"].value < 3.0
+    for name in ("f_max", "sigma"):
+        expected = without.params[name]
+        assert expected.stderr is not None
+        assert abs(fit.params[name].value - expected.value) < 0.3 * expected.stderr

@@ -118,3 +118,4 @@ def test_data_that_the_model_misses_are_said() -> None:
     found = di.posterior(with_spring, di.Dahl(), seed=1, steps=40, walkers=32)
     assert found.status.value != "trusted"
     assert any("misfit exceeds the noise" in text for text in found.findings)
+    assert "Counted: noise" in found.verdict

@@ -104,7 +104,7 @@ def test_of_a_posterior(run: Runner) -> None:
     table(di.Dahl(0.1, 30.0)).save("t.csv")
     data = di.read_frequency_response("t.csv")
     priors: dict[str, Any] = {"f_max": stats.lognorm(s=0.5, scale=0.1), "sigma": (1.0, 100.0)}
-    posterior = di.posterior(data, di.Dahl(), priors=priors, seed=4, steps=40)
+    posterior = di.posterior(data, di.Dahl(), priors=priors, seed=4, steps=80)
     command = equivalent_command([posterior])
     assert command is not None
     told = json.loads(run.line(command, "--json").out)
@@ -131,3 +131,14 @@ def test_what_no_command_describes_is_said_so(tmp_path: Path) -> None:
     assert equivalent_command([gap]) is None, "--element takes no element within another"
     text = di.report(fit, tmp_path / "r.md").read_text(encoding="utf-8")
     assert "in Python; no command describes this model and these data" in text
+
+
+def test_of_an_exponent_that_was_given(run: Runner) -> None:
+    table(di.Dahl(0.1, 30.0)).save("t.csv")
+    data = di.read_frequency_response("t.csv")
+    for model, option in ((di.Dahl(), False), (di.Dahl(alpha=1.0), True)):
+        found = equivalent_command([di.fit(data, model)])
+        assert found is not None
+        assert ("--alpha 1.0" in found) is option
+    alone = di.posterior(data, di.Dahl(), seed=4, steps=60, uncertainty="noise")
+    assert "--uncertainty noise" in (equivalent_command([alone]) or "")

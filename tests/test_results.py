@@ -157,7 +157,7 @@ class TestFit:
         tied = fit(table(), Dahl(), method="ipopt", constraints=tie)
         ratio = tied.params["sigma"].value / tied.params["f_max"].value
         assert ratio == pytest.approx(290.0, rel=1e-8)
-        found = tied.conf_interval("profile")
+        found = tied.conf_interval()
         assert found.method == "wald"
         assert "constraints" in found.note
         again = FitResult.from_json(tied.to_json())

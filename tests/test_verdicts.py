@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy import stats
 
-from dahl_ident import Dahl, FitResult, FrequencyResponse, Spring, compare_models, fit
+from dahl_ident import (
+    Dahl,
+    FitResult,
+    FrequencyResponse,
+    Sensors,
+    Spring,
+    compare_models,
+    fit,
+    load_dataset,
+)
 from dahl_ident.diagnostics.stiffening import Stiffening, stiffening
+from dahl_ident.diagnostics.verdicts import Verdict
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
 
 
@@ -160,3 +173,50 @@ class TestComparison:
         found = compare_models(fit(table(model=maker), Dahl()))
         assert found.best.name == "spring added"
         assert "There stiffness is negative" in found.headline
+
+
+def _scattered(seed: int, off: float = 1.0) -> FrequencyResponse:
+    """Return 16 rows with 1 % of noise, two of them off by a factor."""
+    A = np.geomspace(1e-4, 1e-2, 16)
+    rng = np.random.default_rng(seed)
+    noise = 0.01 * (rng.standard_normal(16) + 1j * rng.standard_normal(16))
+    R = Dahl(0.1, 30.0).describing_function(A) * np.exp(noise)
+    R[rng.choice(16, 2, replace=False)] *= off
+    return FrequencyResponse(np.ones(16), R, A)
+
+
+def test_a_robust_fit_that_moves_an_estimate_is_said_without_suspicious_rows() -> None:
+    fitted = fit(_scattered(22, 1.1), Dahl())
+    assert not fitted.goodness.suspicious
+    assert "A robust fit moves sigma by more than one standard uncertainty" in fitted.verdict
+    assert str(fitted.status) == "approximate"
+    assert fit(_scattered(22), Dahl()).trusted
+
+
+def test_what_only_a_prior_determines_is_not_called_identified() -> None:
+    tight = fit(_scattered(3), Dahl(), sensors=Sensors(force_gain=stats.norm(1.0, 0.01)))
+    known = tight.identifiability
+    assert known.headline == "f_max and sigma are identified; force_gain is set by its prior."
+    assert known.parameters["force_gain"].text.endswith("set by its prior")
+    assert known.named(Verdict.IDENTIFIED) == ["f_max", "sigma"]
+    assert tight.trusted
+    # with friction known, the data say far more of the gain than a wide prior
+    seen = fit(
+        _scattered(3), Dahl(0.1, 30.0, 1.0), sensors=Sensors(force_gain=stats.norm(1.0, 0.3))
+    )
+    assert seen.identifiability.headline == "Every parameter is identified."
+
+
+def test_a_prior_that_the_data_contradict_is_named() -> None:
+    data = _scattered(3)
+    data = replace(data, response=1.1 * data.response)
+    against = fit(data, Dahl(f_max=0.1), sensors=Sensors(force_gain=stats.norm(1.0, 0.01)))
+    assert "The data contradict the prior of force_gain: 1.0" in against.verdict
+    assert not against.trusted
+
+
+def test_a_free_delay_states_the_gain_that_it_assumes() -> None:
+    data = load_dataset("delayed")
+    assert isinstance(data, FrequencyResponse)
+    delayed = fit(data, Dahl(), sensors=Sensors(delay=None), throw=False)
+    assert "force_gain = 1 exactly" in delayed.verdict

@@ -66,11 +66,18 @@ def identity(density: Density | RecordDensity, walkers: int, ensembles: int) -> 
             getattr(problem.data, name)
             for name in (
                 "quantity", "frequency_hz", "amplitude", "drive", "response", "covariance", "dof",
-                "amplitude_std", "amplitude_covariance", "harmonic", "controlled",
+                "amplitude_std", "amplitude_covariance", "drive_std", "drive_covariance",
+                "harmonic", "controlled",
             )
         ]  # fmt: skip
         fixed = [(p.name, p.value) for p in problem.sensors.parameters if not p.free]
         own = {"data": _digest(*data), "noise": problem.noise, "sensors": repr(fixed)}
+        errors = density.errors
+        own["errors beside noise"] = (
+            "none"
+            if errors is None
+            else _digest(errors.turn, errors.shared, errors.offset, errors.sizes)
+        )
     return {
         **own,
         "model": model,

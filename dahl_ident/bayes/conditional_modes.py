@@ -130,7 +130,7 @@ class ConditionalModes:
         hessian = np.repeat(np.diag(self._prior_precision)[None], len(theta), axis=0)
         if density.likelihood == "none":
             return _Fit(value, gradient, hessian)
-        data = problem.quadratic(theta, chart=chart)
+        data = density.quadratic(theta, problem, chart)
         cost = np.maximum(data.cost, np.finfo(float).tiny)
         rows = 0.5 * problem.n_residuals
         variance = cost / rows if density.has_scale else np.ones(len(theta))

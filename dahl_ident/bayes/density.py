@@ -9,6 +9,8 @@ the prior 1/s of the scale being flat in ln s. Integrated over s, the same is
 
     ln p(theta) + ln Gamma(n) - n ln(pi S(theta)) - ln 2 + constants.
 
+Where rows share errors, :mod:`dahl_ident.bayes.row_errors` takes the place of S.
+
 For outliers a row may count as Student's t in two dimensions with nu = 4 instead, of density
 (1 + |y|^2/(nu s^2))^-(nu/2 + 1) / (2 pi s^2).
 """
@@ -19,13 +21,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import gammaln
+from scipy.special import gammaln, logsumexp
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.decorrelation import Decorrelation, decorrelation_of
 from dahl_ident.bayes.priors import JointPrior
+from dahl_ident.bayes.row_errors import RowErrors
 from dahl_ident.errors import SamplingError, ValidationError
-from dahl_ident.problem import Problem
+from dahl_ident.problem import Problem, Quadratic
 
 LIKELIHOODS = ("gaussian", "student_t", "none")
 SCALE = "noise_scale"
@@ -46,11 +49,14 @@ class Density:
     likelihood : {"gaussian", "student_t", "none"}
         What the noise model says (Gaussian, or Student's t where covariances were estimated),
         tails for outliers, or the prior alone.
+    errors : RowErrors, optional
+        Errors that rows share, with a Gaussian likelihood; left out, rows are independent.
     """
 
     problem: Problem
     prior: JointPrior
     likelihood: str = "gaussian"
+    errors: RowErrors | None = None
 
     def __post_init__(self) -> None:
         problem = self.problem
@@ -131,11 +137,18 @@ class Density:
             )
         if self.likelihood == "student_t":
             return self(theta)
+        if self.errors is not None:
+            return self._combined(theta)
         # for an unknown scale the integral over s is a constant times the maximum over s
         return self.highest(theta) + self._integral_constant
 
     def highest(self, theta: FloatArray) -> FloatArray:
-        """Return the Gaussian log-posterior of theta, (S, P), at the likeliest scale."""
+        """Return the Gaussian log-posterior of theta, (S, P), at the likeliest scale.
+
+        With shared errors, the scale is integrated out instead.
+        """
+        if self.errors is not None:
+            return self._combined(theta)
         result = self.log_prior(theta)
         inside = result > -np.inf
         if self.likelihood != "none" and inside.any():
@@ -152,6 +165,10 @@ class Density:
 
     def log_likelihood(self, theta: FloatArray, scale: FloatArray) -> FloatArray:
         """Return ln of the data's density at theta, (S, P), and s, (S,)."""
+        if self.errors is not None:
+            terms = -0.5 * self.sums(theta) / scale[:, None] ** 2
+            rest = self._constant - self.problem.n_residuals * np.log(scale)
+            return self._mean(terms) + rest
         if self.likelihood != "student_t":
             return self.tabulated.log_likelihood(theta, scale if self.has_scale else None)
         z = self.squares(theta)
@@ -164,6 +181,61 @@ class Density:
         """Return |y|^2 of every row, (S, n), the scale taken as 1."""
         y, _ = self.tabulated.whitened(theta, derivatives=False)
         return np.asarray(y.real**2 + y.imag**2)
+
+    def sums(self, theta: FloatArray) -> FloatArray:
+        """Return sums of squares at theta, (S, P): (S, M), one for each size of shared errors."""
+        if self.errors is None:
+            return np.asarray(self.squares(theta).sum(axis=-1)[:, None])
+        held = self.errors.held(theta)
+        y, _ = self.tabulated.whitened(held, derivatives=False, tails=False)
+        parts = np.broadcast_to(y, (len(theta), y.shape[-1])).copy().view(np.float64)
+        with np.errstate(invalid="ignore", over="ignore"):
+            found = self.errors.squares(parts + self.errors.moved(theta))
+        return np.where(np.isnan(found), np.inf, found)
+
+    def probabilities(self, sums: FloatArray) -> FloatArray:
+        """Return how probable each size of shared errors is, (S, M), given sums of squares."""
+        if self.errors is None:
+            return np.ones(sums.shape)
+        n = 0.5 * self.problem.n_residuals
+        each = -n * np.log(sums) if self.has_scale else -0.5 * sums
+        each = each + self.errors.log_weights
+        return np.asarray(np.exp(each - logsumexp(each, axis=1, keepdims=True)))
+
+    def quadratic(self, theta: FloatArray, problem: Problem, chart: FloatArray) -> Quadratic:
+        """Return half the sum of squares, at estimated sizes, as `Problem.quadratic` does."""
+        if self.errors is None:
+            return problem.quadratic(theta, chart=chart)
+        errors, m = self.errors, problem.n_residuals
+        y, by = problem.residuals_and_jacobian(errors.held(theta), tails=False)
+        y = y[..., :m] + errors.moved(theta)
+        by = np.where(np.isnan(errors.centre), by[..., :m, :], errors.slopes)
+        with np.errstate(invalid="ignore", over="ignore"):
+            y, by = errors.independent(y, by)
+            by = by @ chart
+            cost = 0.5 * np.sum(y**2, axis=-1)
+            gradient = np.einsum("smp,sm->sp", by, y)
+            return Quadratic(
+                np.where(cost < np.inf, cost, np.inf), gradient, by.swapaxes(-1, -2) @ by
+            )
+
+    def _combined(self, theta: FloatArray) -> FloatArray:
+        """Return the log-posterior with shared errors, an unknown scale integrated out."""
+        result = self.log_prior(theta)
+        inside = result > -np.inf
+        if inside.any():
+            sums, n = self.sums(theta[inside]), 0.5 * self.problem.n_residuals
+            if self.has_scale:
+                rest = float(gammaln(n) - np.log(2.0) + n * np.log(2.0))
+                result[inside] += self._mean(-n * np.log(sums)) + rest + self._constant
+            else:
+                result[inside] += self._mean(-0.5 * sums) + self._constant
+        return result
+
+    def _mean(self, terms: FloatArray) -> FloatArray:
+        """Return ln of the mean likelihood over the sizes of shared errors, (S, M) -> (S,)."""
+        assert self.errors is not None
+        return np.asarray(logsumexp(terms + self.errors.log_weights, axis=1))
 
     @cached_property
     def tabulated(self) -> Problem:

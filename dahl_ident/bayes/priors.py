@@ -65,7 +65,7 @@ class ParameterPrior:
         Whose prior it is.
     given : Distribution or tuple of float
         A distribution of the value, or the ends of a log-uniform or uniform one.
-    source : {"given", "sensors", "default"}
+    source : {"given", "sensors", "assumed", "default"}
         Its origin; a default is derived from the size of the data.
     estimate : float
         The least-squares value, not finite where unknown. `limits` reach beyond it, because data
@@ -155,7 +155,8 @@ class ParameterPrior:
             text = f"{kind} from {self.given[0]:.4g} to {self.given[1]:.4g}{unit}"
         else:
             text = _described(self.given) + unit
-        return f"{text} (from the size of the data)" if self.source == "default" else text
+        why = {"default": " (from the size of the data)", "assumed": " (its range)"}
+        return text + why.get(self.source, "")
 
 
 @dataclass(frozen=True)
@@ -214,6 +215,7 @@ def joint_prior(
     problem: Problem,
     priors: Mapping[str, PriorLike] | None = None,
     estimate: FloatArray | None = None,
+    assumed: Mapping[str, PriorLike] | None = None,
 ) -> JointPrior:
     """Return the prior of every free parameter of a problem.
 
@@ -226,6 +228,8 @@ def joint_prior(
     estimate : ndarray, shape (P,), optional
         Least-squares values, which the default bounds of plant parameters include; infinite where
         there is no finite optimum.
+    assumed : mapping of str to distribution or (low, high), optional
+        Priors of parameters that nobody gave.
 
     Raises
     ------
@@ -248,6 +252,9 @@ def joint_prior(
         if name in given:
             prior = checked_prior(parameter, given[name])
             parts.append(ParameterPrior(parameter, prior, "given", float(at)))
+        elif assumed and name in assumed:
+            prior = checked_prior(parameter, assumed[name])
+            parts.append(ParameterPrior(parameter, prior, "assumed", float(at)))
         elif name in problem.priors:
             prior = checked_prior(parameter, problem.priors[name])
             parts.append(ParameterPrior(parameter, prior, "sensors", float(at)))

@@ -11,14 +11,13 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from scipy import stats
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.chain import LogDensity
 from dahl_ident.bayes.density import Density
 from dahl_ident.errors import FitError, SamplingError
 from dahl_ident.fitting import Optimum, solve
-from dahl_ident.problem import Problem
+from dahl_ident.problem import Problem, Quadratic
 from dahl_ident.sensors import Sensors
 
 _WIDER = 2.0  # times the posterior's spread: R-hat needs starts wider than the posterior
@@ -40,6 +39,8 @@ def optimum_of(problem: Problem) -> Optimum | None:
 def _with_normal_priors(problem: Problem) -> Problem:
     """Return the problem with priors of the sensors replaced by normal ones, for least squares."""
     given = {p.name: getattr(problem.sensors, p.name) for p in problem.sensors.parameters}
+    from scipy import stats
+
     normal = {n: stats.norm(p.mean(), p.std()) for n, p in problem.priors.items()}
     if not normal:
         return problem
@@ -113,7 +114,11 @@ def centre_and_covariance(
     precision = np.diag((2.0 / prior.widths) ** 2)
     if density.likelihood != "none":
         scale = _scale(density, theta)
-        precision = precision + _with_normal_priors(problem).information(theta, scale)
+        if density.errors is None:
+            known = _with_normal_priors(problem).information(theta, scale)
+        else:
+            known = _by_data(density, theta).hessian[0] / scale**2
+        precision = precision + known
     size = 1.0 / np.sqrt(np.diagonal(precision))
     return theta, np.linalg.inv(precision * np.outer(size, size)) * np.outer(size, size)
 
@@ -191,7 +196,10 @@ def _scale(density: Density, theta: FloatArray) -> float:
     """Return the likeliest noise scale at theta; 1 where it is known."""
     if not density.has_scale:
         return 1.0
-    squares = density.squares(theta[None]).sum()
+    if density.errors is None:
+        squares = float(density.squares(theta[None]).sum())
+    else:
+        squares = 2.0 * float(_by_data(density, theta).cost[0])
     scale = float(np.sqrt(squares / density.problem.n_residuals))
     if not scale > _EXACT:
         raise SamplingError(
@@ -199,3 +207,7 @@ def _scale(density: Density, theta: FloatArray) -> float:
             "scale could be estimated; data without noise need a covariance for sampling"
         )
     return scale
+
+
+def _by_data(density: Density, theta: FloatArray) -> Quadratic:
+    return density.quadratic(theta[None], density.problem, np.eye(len(theta)))

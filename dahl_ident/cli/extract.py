@@ -177,7 +177,8 @@ def good_points(data: FrequencyResponse) -> FrequencyResponse:
 
 def _one_row_a_point(data: FrequencyResponse) -> FrequencyResponse:
     """Return the fundamental of every point, or the lowest harmonic that was asked for."""
-    return data.select(harmonic=int(data.harmonic.min()))
+    harmonic = 1 if (data.harmonic == 1).any() else int(data.harmonic.min())
+    return data.select(harmonic=harmonic)
 
 
 def show(data: FrequencyResponse) -> None:

@@ -181,10 +181,11 @@ def fitted(
 def check_reports(*places: str | None) -> None:
     """Refuse reports of an unknown kind before any work is done."""
     from dahl_ident.data.storage import place_of
-    from dahl_ident.reporting.publish import FORMATS
 
     for place in places:
         if place is not None and place != STANDARD:
+            from dahl_ident.reporting.publish import FORMATS
+
             place_of(place, "a report", FORMATS)
 
 

@@ -21,6 +21,7 @@ _MODEL = "Model"
 _SENSORS = "Sensors"
 _KINDS = "a number, 'free', or a prior from scipy.stats, such as 'norm(1, 0.005)'."
 _CALL = re.compile(r"\s*(\w+)\s*(?:\((.*)\))?\s*", re.DOTALL)
+_COMMA = re.compile(r",(?![^(]*\))")  # not within brackets
 _FRICTION = ("f_max", "sigma", "alpha")
 OTHERS = ("mass", "damping", "stiffness")
 
@@ -113,7 +114,12 @@ def elements(texts: Sequence[str]) -> Element:
 def _element(text: str, kinds: Mapping[str, type[Element]]) -> Element:
     from dahl_ident.elements.description import model_from_description
 
-    call = _CALL.fullmatch(text)
+    return model_from_description([_entry(text, kinds)]).elements[0]
+
+
+def _entry(text: str, kinds: Mapping[str, type[Element]]) -> dict[str, Any]:
+    """Return an element as plain data; that behind a gap is written inside its brackets."""
+    call = _CALL.fullmatch(text.strip())
     if call is None:
         raise ValidationError(
             f"--element is {text!r}; expected a kind and its values, such as 'dahl(f_max=0.1)'"
@@ -121,16 +127,22 @@ def _element(text: str, kinds: Mapping[str, type[Element]]) -> Element:
     kind, inside = call[1], call[2] or ""
     if kind not in kinds:
         raise ModelError(f"--element names the kind {kind!r}; expected one of {', '.join(kinds)}")
-    labels = [parameter.name for parameter in kinds[kind].parameters]
     entry: dict[str, Any] = {"kind": kind}
-    for place, part in enumerate(part for part in inside.split(",") if part.strip()):
+    labels = [parameter.name for parameter in kinds[kind].parameters]
+    parts = [part.strip() for part in _COMMA.split(inside) if part.strip()]
+    if kind == "backlash":
+        labels = ["gap"]
+        nested = bool(parts) and parts[0].partition("(")[0].strip() in kinds
+        inner = parts.pop(0) if nested else "dahl"
+        entry |= {"element": _entry(inner, kinds), "gap": FREE}
+    for place, part in enumerate(parts):
         label, _, value = (word.strip() for word in part.rpartition("="))
         if not label and place >= len(labels):
-            raise ModelError(f"--element is {text!r}; {kind} takes {', '.join(labels)}")
+            raise ModelError(f"--element is {text!r}; {kind} takes {', '.join(labels) or 'labels'}")
         label = label or labels[place]
         free = value == FREE
         entry[label] = value if label == "name" or free else number_or_free(label, value)
-    return model_from_description([entry]).elements[0]
+    return entry
 
 
 def in_parallel(friction: Element, others: Mapping[str, float | None]) -> Element:

@@ -35,11 +35,11 @@ def _existing(patterns: list[str]) -> list[str]:
     return files
 
 
-def one_of(*choices: str) -> Callable[[str], str]:
-    """Return a check of an option's value; any other value is a usage error."""
+def one_of(*choices: str) -> Callable[[str | None], str | None]:
+    """Return a check of an option's value, if it was given; any other value is a usage error."""
 
-    def check(value: str) -> str:
-        if value not in choices:
+    def check(value: str | None) -> str | None:
+        if value is not None and value not in choices:
             raise typer.BadParameter(f"{value!r} is not one of {', '.join(choices)}")
         return value
 

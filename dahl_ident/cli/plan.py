@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -32,10 +33,13 @@ def _aim(help_text: str) -> Any:
 class Bench:
     """The limits of the bench and the times that it needs."""
 
-    frequency_hz: Annotated[str, _bench(f"Frequency, Hz: {_RANGE}.")]
+    frequency_hz: Annotated[
+        str | None, _bench(f"Frequency, Hz: {_RANGE}; not needed for trapezoids.")
+    ] = None
     displacement: Annotated[str | None, _bench(f"Displacement amplitude, m: {_RANGE}.")] = None
     force: Annotated[str | None, _bench(f"Force amplitude, N: {_RANGE}.")] = None
     speed: Annotated[str | None, _bench("Highest speed, m/s.")] = None
+    acceleration: Annotated[str | None, _bench("Highest acceleration, m/s^2.")] = None
     time: Annotated[float | None, _bench("Total time, s.")] = None
     controlled: Annotated[
         str,
@@ -45,11 +49,26 @@ class Bench:
             rich_help_panel=_BENCH,
         ),
     ] = "displacement"
+    motion: Annotated[
+        str | None,
+        typer.Option(
+            help="Plan motions in time, for a fit of records: trapezoid or multisine; without it, "
+            "settled sines.",
+            callback=one_of("trapezoid", "multisine"),
+            rich_help_panel=_BENCH,
+        ),
+    ] = None
     noise: Annotated[
         str | None,
-        _bench("Noise of one cycle: 0.01, or 'relative=0.01,force=1e-3,displacement=1e-7'."),
+        _bench(
+            "Noise of one cycle: 0.01, or 'relative=0.01,force=1e-3,displacement=1e-7'; of a force "
+            "sample with --motion: force=1e-3."
+        ),
     ] = None
-    scatter: Annotated[float, _bench("Scatter of gain and phase between runs: 0.02.")] = 0.0
+    scatter: Annotated[
+        float | None,
+        _bench("Scatter of gain and phase between runs, 0.02; by default that of the fit."),
+    ] = None
     num_runs: Annotated[int | None, _bench("Number of runs; by default the best one.")] = None
     change_over: Annotated[float, _bench("Seconds from one level to the next.")] = 1.0
     between_runs: Annotated[float, _bench("Additional seconds for each run.")] = 0.0
@@ -58,10 +77,16 @@ class Bench:
         """Return the limits that were given."""
         given: dict[str, Any] = {
             name: _ends(name, text)
-            for name in ("frequency_hz", "displacement", "force", "speed")
+            for name in ("frequency_hz", "displacement", "force", "speed", "acceleration")
             if (text := getattr(self, name)) is not None
         }
         return given if self.time is None else {**given, "time": self.time}
+
+    def motions(self, sample_rate: float | None) -> dict[str, Any]:
+        """Return the arguments of ``plan`` that motions in time need."""
+        if self.motion is None:
+            return {}
+        return {"candidates": self.motion, "sample_rate": sample_rate}
 
 
 @dataclass(frozen=True)
@@ -120,14 +145,15 @@ def plan(
         Path | None, typer.Option(help="File for the waveform of one run for the exciter, .csv.")
     ] = None,
     sample_rate: Annotated[
-        float | None, typer.Option(help="Sample rate of the waveform, Hz.")
+        float | None,
+        typer.Option(help="Sample rate of the waveform, and of the records of --motion, Hz."),
     ] = None,
     picture: Annotated[
         Path | None,
         typer.Option(help="File for a plot of uncertainty against bench time, .png, .svg or .pdf."),
     ] = None,
 ) -> None:
-    """Plan the next measurement: levels, frequencies and cycles.
+    """Plan the next measurement: levels, frequencies and cycles, or motions in time.
 
     Example: dahl-ident plan --frequency-hz 5 --displacement 1e-4,1e-2 --ranges f_max=0.05,0.2
     --ranges sigma=15,60 --noise 0.01 --target f_max=0.01 --target sigma=0.01
@@ -136,12 +162,14 @@ def plan(
     from dahl_ident.planning import plan as make
 
     writing.check([table, waveform, picture], [] if fit is None else [fit], json=general.json)
-    if (waveform is None) != (sample_rate is None):
-        raise ValidationError("--waveform and --sample-rate go together; give both, or neither")
+    if sample_rate is None and (waveform is not None or bench.motion is not None):
+        raise ValidationError("--waveform and --motion need --sample-rate, Hz; give it")
+    if sample_rate is not None and waveform is None and bench.motion is None:
+        raise ValidationError("--sample-rate is that of --waveform or --motion; give one of them")
     result = make(
         _known(fit, model), limits=bench.limits(), noise=_noise(bench.noise), scatter=bench.scatter,
         runs=bench.num_runs, controlled=bench.controlled, change_over=bench.change_over,
-        between_runs=bench.between_runs, seed=seed, **aim.keywords(),
+        between_runs=bench.between_runs, seed=seed, **bench.motions(sample_rate), **aim.keywords(),
     )  # fmt: skip
     if table is not None:
         text = result.to_frame().to_csv(index=False)
@@ -162,17 +190,29 @@ def _known(fit: str | None, options: ModelOptions) -> Any:
     """Return the saved fit, or the model of the options."""
     from dahl_ident.elements.element import as_model
     from dahl_ident.results import FitResult
+    from dahl_ident.results.record_fit import RecordFit
 
     if fit is not None:
         if options != ModelOptions():
             raise ValidationError(
                 "a saved fit has its model and sensors; leave out the options that describe them"
             )
-        return FitResult.load(fit)
+        return RecordFit.load(fit) if _is_of_records(fit) else FitResult.load(fit)
     given = options.keywords()
     if not given["sensors"].are_exact:
         raise ValidationError("a plan before any data takes the sensors as exact; leave them out")
     return as_model(given["model"]).with_free(given["free"])
+
+
+def _is_of_records(path: str) -> bool:
+    """Return whether a saved fit is one of records; False where the file is no saved fit."""
+    from dahl_ident.results.record_fit import SCHEMA
+
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(content, dict) and content.get("schema") == SCHEMA
 
 
 def _pair(option: str, text: str) -> tuple[str, str]:
@@ -186,7 +226,7 @@ def _number(name: str, text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise ValidationError(f"{name} is {text!r}; expected a number") from None
+        raise ValidationError(f"{name} is {text!r}; expected a number, SI") from None
 
 
 def _ends(name: str, text: str) -> float | list[float]:

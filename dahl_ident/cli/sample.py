@@ -60,6 +60,14 @@ class Sampling:
         str,
         typer.Option(help="gaussian, student_t or none.", rich_help_panel=_SAMPLING),
     ] = "gaussian"
+    uncertainty: Annotated[
+        str,
+        typer.Option(
+            help="combined: every source of the fit's budget; noise: independent noise alone.",
+            callback=one_of("combined", "noise"),
+            rich_help_panel=_SAMPLING,
+        ),
+    ] = "combined"
     seed: Annotated[
         int | None,
         typer.Option(
@@ -159,7 +167,7 @@ def _for_records(
     own, usual = {**plant, **how}, Sampling()
     refused = [
         f"--{name}"
-        for name in ("method", "noise", "likelihood")
+        for name in ("method", "noise", "likelihood", "uncertainty")
         if own[name] != getattr(usual, name)
     ]
     if refused:

@@ -87,6 +87,9 @@ RESPONSE_NAMES: dict[str, tuple[str, ...]] = {
     "amplitude_std": ("amplitude_std",),
     "covariance_amplitude_real": ("covariance_amplitude_real",),
     "covariance_amplitude_imag": ("covariance_amplitude_imag",),
+    "drive_std": ("drive_std",),
+    "covariance_drive_real": ("covariance_drive_real",),
+    "covariance_drive_imag": ("covariance_drive_imag",),
 }
 ROLES = tuple(dict.fromkeys((*RECORD_NAMES, *RESPONSE_NAMES)))
 

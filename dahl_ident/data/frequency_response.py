@@ -59,6 +59,8 @@ _COLUMNS = (
     "dof",
     "amplitude_std",
     "amplitude_covariance",
+    "drive_std",
+    "drive_covariance",
     "level",
     "run",
     "controlled",
@@ -92,6 +94,11 @@ class FrequencyResponse(Tabular):
     amplitude_covariance : (n, 2) array_like, optional
         Covariance of `amplitude` with the real and the imaginary part of the response: the
         response is a quotient with the displacement, so they share the displacement's error.
+    drive_std : (n,) array_like, optional
+        Standard deviation of `drive`, noise of each row alone.
+    drive_covariance : (n, 2) array_like, optional
+        Covariance of `drive` with the real and the imaginary part of the response: a receptance
+        is a quotient with the force, so they share the force's error.
     level : (n,) array_like or one label, optional
         Nominal drive or displacement level, numbers or text.
     run : (n,) array_like or one label, optional
@@ -133,6 +140,8 @@ class FrequencyResponse(Tabular):
     dof: FloatArray | None
     amplitude_std: FloatArray | None
     amplitude_covariance: FloatArray | None
+    drive_std: FloatArray | None
+    drive_covariance: FloatArray | None
     level: NDArray[Any] | None
     run: NDArray[np.str_] | None
     controlled: NDArray[np.str_]
@@ -154,6 +163,8 @@ class FrequencyResponse(Tabular):
         dof: ArrayLike | None = None,
         amplitude_std: ArrayLike | None = None,
         amplitude_covariance: ArrayLike | None = None,
+        drive_std: ArrayLike | None = None,
+        drive_covariance: ArrayLike | None = None,
         level: ArrayLike | None = None,
         run: ArrayLike | None = None,
         controlled: ArrayLike = "displacement",
@@ -180,6 +191,10 @@ class FrequencyResponse(Tabular):
             "amplitude_std": column(amplitude_std, "amplitude_std", n, non_negative_array),
             "amplitude_covariance": column(
                 amplitude_covariance, "amplitude_covariance", n, finite_array, shape=(2,)
+            ),
+            "drive_std": column(drive_std, "drive_std", n, non_negative_array),
+            "drive_covariance": column(
+                drive_covariance, "drive_covariance", n, finite_array, shape=(2,)
             ),
             "level": spread(level, "level", n, labels),
             "run": spread(run, "run", n, run_labels),
@@ -212,6 +227,8 @@ class FrequencyResponse(Tabular):
             )
         if self.amplitude_std is not None and self.amplitude is None:
             raise ValidationError("amplitude_std is given without amplitude")
+        if self.drive_std is not None and self.drive is None:
+            raise ValidationError("drive_std is given without drive")
         if self.quantity == "backbone":
             self._check_backbone()
         if self.dof is not None and self.covariance is None:
@@ -222,6 +239,10 @@ class FrequencyResponse(Tabular):
             raise ValidationError(
                 "amplitude_covariance is given without amplitude_std and covariance"
             )
+        if self.drive_covariance is not None and (
+            self.drive_std is None or self.covariance is None
+        ):
+            raise ValidationError("drive_covariance is given without drive_std and covariance")
         if self.quantity != "dynamic_stiffness" and (self.harmonic != 1).any():
             row = int(np.argmax(self.harmonic != 1))
             raise ValidationError(
@@ -238,6 +259,7 @@ class FrequencyResponse(Tabular):
         if self.covariance is not None:
             check_mean_covariance(self.covariance, self.amplitude_covariance, mean)
             check_covariance(self.covariance, self.amplitude_std, self.amplitude_covariance)
+            check_covariance(self.covariance, self.drive_std, self.drive_covariance)
             even = (self.covariance + self.covariance.swapaxes(1, 2)) / 2.0  # but for rounding
             object.__setattr__(self, "covariance", frozen_copy(even))
 
@@ -448,13 +470,15 @@ class FrequencyResponse(Tabular):
             )
         response, derivative = converted(self.response, self.omega, self.quantity, quantity)
         J = jacobian(derivative)
-        covariance, cross = self.covariance, self.amplitude_covariance
+        covariance = self.covariance
+        cross, of_drive = self.amplitude_covariance, self.drive_covariance
         return replace(
             self,
             response=response,
             quantity=quantity,
             covariance=None if covariance is None else J @ covariance @ J.swapaxes(1, 2),
             amplitude_covariance=None if cross is None else np.einsum("nij,nj->ni", J, cross),
+            drive_covariance=None if of_drive is None else np.einsum("nij,nj->ni", J, of_drive),
         )
 
     def select(
@@ -607,12 +631,15 @@ class FrequencyResponse(Tabular):
             ),
             "dof": self.dof,
             f"amplitude_std [{m}]": self.amplitude_std,
+            f"drive_std [{si_unit('force', self.motion)}]": self.drive_std,
         }
-        if self.amplitude_covariance is not None and not polar:
-            for i, part in enumerate(("real", "imag")):
-                columns[f"covariance_amplitude_{part} [({m})*({r})]"] = self.amplitude_covariance[
-                    :, i
-                ]
+        levels = (("amplitude", m), ("drive", si_unit("force", self.motion)))
+        for (level, unit), cross in zip(
+            levels, (self.amplitude_covariance, self.drive_covariance), strict=True
+        ):
+            if cross is not None and not polar:
+                for i, part in enumerate(("real", "imag")):
+                    columns[f"covariance_{level}_{part} [({unit})*({r})]"] = cross[:, i]
         columns |= {"controlled": self.controlled, "harmonic": self.harmonic, **self.quality}
         frame = pd.DataFrame({name: c for name, c in columns.items() if c is not None})
         frame.attrs["dahl_ident"] = {

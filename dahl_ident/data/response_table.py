@@ -207,7 +207,8 @@ class _Table:
         if self.bound.has("frequency"):
             return
         held = {plain(c.short or c.name) for c in source.channels}
-        if all(held & set(RECORD_NAMES[role]) for role in ("time", "force")):
+        motion_or_force = {n for role in (*MOTION_KINDS, "force") for n in RECORD_NAMES[role]}
+        if held & set(RECORD_NAMES["time"]) and held & motion_or_force:
             channels = listed([c.header for c in source.channels], 5)
             raise DataError(
                 f"{source.name}: it holds waveforms ({channels}), and a table of responses at "
@@ -392,10 +393,15 @@ class _Table:
             "dof": None if dof is None else self.bound.source.numbers(dof, infinite=True),
             "amplitude_std": self._scaled("amplitude_std", amplitude, inherited),
         }
-        cross = ("covariance_amplitude_real", "covariance_amplitude_imag")
-        if all(self.bound.has(role) for role in cross):
-            unit = f"({amplitude})*({part})"
-            out["amplitude_covariance"] = np.stack([self._scaled(r, unit) for r in cross], -1)
+        force = si_unit("force", motion)
+        if self.bound.has("drive_std"):
+            out["drive_std"] = self._scaled("drive_std", force, self._error_unit("drive"))
+        for level, of_level in (("amplitude", amplitude), ("drive", force)):
+            cross = [f"covariance_{level}_{one}" for one in ("real", "imag")]
+            if all(self.bound.has(role) for role in cross):
+                unit = f"({of_level})*({part})"
+                both = [self._scaled(role, unit) for role in cross]
+                out[f"{level}_covariance"] = np.stack(both, -1)
         return out
 
     def _covariance(

@@ -17,8 +17,14 @@ from dahl_ident.units import Quantity
 
 _OPTIONAL = (
     "amplitude", "drive", "covariance", "dof", "amplitude_std", "amplitude_covariance",
+    "drive_std", "drive_covariance",
 )  # fmt: skip
-_DIMENSIONS = {"covariance": 3, "amplitude_covariance": 2}  # of one table's column, else 1
+# of one table's column, else 1
+_DIMENSIONS = {
+    "covariance": 3,
+    "amplitude_covariance": 2,
+    "drive_covariance": 2,
+}
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,8 @@ class Rows:
     dof: FloatArray | None
     amplitude_std: FloatArray | None
     amplitude_covariance: FloatArray | None
+    drive_std: FloatArray | None
+    drive_covariance: FloatArray | None
 
     @property
     def n(self) -> int:

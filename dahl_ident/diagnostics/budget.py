@@ -17,7 +17,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.combinations import candidates, runaway
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
-from dahl_ident.diagnostics.error_sources import LEVELS, MODEL_ERROR, NOISE, RUNS
+from dahl_ident.diagnostics.error_sources import APART, LEVELS, MODEL_ERROR, NOISE, RUNS
 from dahl_ident.diagnostics.formatting import listed, rounded, table
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
@@ -28,7 +28,7 @@ _OUTSIDE = 1e-3  # share of a direction that the data may leave open, from round
 _ROUNDING = 1e-18
 # Student's t with more degrees of freedom is normal to all digits that a budget shows.
 _MANY = 1e6
-_TYPE_A = (NOISE, MODEL_ERROR, RUNS, LEVELS)
+_TYPE_A = (NOISE, MODEL_ERROR, RUNS, LEVELS, APART)
 _CHANNELS = {
     "force_gain": "force calibration",
     "displacement_gain": "displacement calibration",
@@ -229,7 +229,7 @@ class Budget(Mapping[str, ParameterBudget]):
         )
 
         u = np.sqrt(np.diagonal(self.covariance))
-        dof = [min(p.dof for p in self.parameters)] * len(values)
+        dof = min(p.dof for p in self.parameters)  # one for an ensemble of correlated numbers
         made = multiple_ureal(values, u.tolist(), dof, list(self))
         for i in range(len(made)):
             for j in range(i):

@@ -1,10 +1,11 @@
 """Which model describes the data, and what friction is whatever the model.
 
 Candidates come from what the fit leaves: a mean force asks for two limits, a response that changes
-with frequency for a damper, any other misfit for another shape of loop. Each is judged by how it
-predicts tests that it was not fitted to (:mod:`dahl_ident.diagnostics.predictive_density`). Of
-those whose density is within one standard error of the highest the simplest is the best; so is
-the one fitted while nothing is higher than it by more than chance among many candidates makes.
+with frequency for a damper, a force that falls with it for LuGre's law, any other misfit for
+another shape of loop. Each is judged by how it predicts tests that it was not fitted to
+(:mod:`dahl_ident.diagnostics.predictive_density`). Of those whose density is within one standard
+error of the highest the simplest is the best; so is the one fitted while nothing is higher than it
+by more than chance among many candidates makes.
 AIC and BIC are stated beside, and decide nothing: over harmonics whose covariance is tiny they
 prefer a model that spoils the fundamental. If no model describes the data, the best of them does
 not either, and one of negative damping is no mechanism's.
@@ -18,11 +19,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.polynomial import legendre
+from scipy import special
 
 from dahl_ident.diagnostics.formatting import listed, table, with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.physics import is_spring, negative_parameters
 from dahl_ident.diagnostics.predictive_density import PredictiveDensity, predictive_density
+from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
 from dahl_ident.diagnostics.verdicts import Fit
 from dahl_ident.elements import Damper, Element, Friction, Mass, Model, PowerDamper, Spring
 from dahl_ident.elements.element import Alternative
@@ -32,6 +36,9 @@ from dahl_ident.problem import Problem
 
 _BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
 _RATES = 1.05  # highest over lowest frequency that can show a dependence on the rate
+_SMOOTH = 8  # degree over ln A of what the gain may be whatever the frequency
+_FALSE_ALARM = 1e-4  # of a force that falls with the frequency: one more candidate, to no harm
+_SEEN = 3.0  # rms differences over noise that has been averaged over all rows
 _LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
 
 
@@ -105,6 +112,22 @@ class ComparedModel:
             for size, e in zip(sizes, energy, strict=True)
         }
 
+    @property
+    def resemblances(self) -> list[str]:
+        """Which element these data cannot distinguish from a simpler one, in sentences."""
+        problem, values = self.optimum.problem, parameter_values(self.optimum)
+        view, found = problem.stiffness_data, []
+        noise = self.density.misfit / np.sqrt(np.count_nonzero(view.harmonic == 1))
+        for element in problem.model.elements:
+            own = [values[p.name] for p in element.parameters]
+            known = element.resembles(own, view.amplitude, view.omega)
+            if known is not None and known[1] < _SEEN * noise:
+                found.append(
+                    f"{self.name}: at these levels it differs from {known[0]} by "
+                    f"{_percent(known[1])} rms, too little for these data to distinguish the two."
+                )
+        return found
+
 
 @dataclass(frozen=True)
 class ModelComparison:
@@ -156,6 +179,7 @@ class ModelComparison:
     def __str__(self) -> str:
         lines = [self.headline, table([self.columns, *self.rows], left=(0, 1))]
         lines.append(table([["", *(m.name for m in self.models)], *self.meanings]))
+        lines += [text for m in self.models for text in m.resemblances]
         lines += [f"{name} could not be fitted: {why}" for name, why in self.failed.items()]
         return "\n".join(lines)
 
@@ -231,7 +255,9 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
     models : mapping of str to Element, optional
         Models to compare with, by a name for each. Left out: for a Dahl element another exponent,
         two elements, two limits (where even harmonics are given), a gap, Bouc-Wen's and Iwan's
-        law; and a spring and, where the frequency changes, a mass and a damper added.
+        law, LuGre's where the force falls with the frequency, Maxwell slip where parallel Jenkins
+        elements would leave much less; and a spring and, where the frequency changes, a mass and a
+        damper added.
 
     Returns
     -------
@@ -294,18 +320,23 @@ def _candidates(
         own = [values[p.name] for p in e.parameters]
         known = np.all(np.isfinite(own)) and all(own[:2])
         offers.append((e, e.alternatives(own, smallest) if known else {}))
-    even = _even(optimum)
+    shown = {
+        "shape": misfit,
+        "asymmetry": _even(optimum),
+        "speed": _falling_force(optimum),
+        "masing": _jenkins(optimum, left),
+    }
     for name in dict.fromkeys(name for _, offered in offers for name in offered):
         taken = [offered[name] for _, offered in offers if name in offered]
         if len(taken) > 1 and any(len(instead.elements) > 1 for instead in taken):
             continue  # more elements of one law in place of several would share their names
-        asymmetric = any(instead.shows == "asymmetry" for instead in taken)
-        if asymmetric and not even:
+        reason = next((shown[i.shows] for i in taken if i.shows != "shape"), misfit)
+        if not reason:
             continue
         yield (
             name,
             (
-                even if asymmetric else misfit,
+                reason,
                 Model(*(n for e, o in offers for n in (o[name].elements if name in o else (e,)))),
             ),
         )
@@ -348,6 +379,51 @@ def _even(optimum: Optimum) -> str:
             share = float(np.sqrt(np.mean(np.abs(data.response[rows]) ** 2)) / size)
             return f"{name} {_percent(share)} of the fundamental"
     return ""
+
+
+def _falling_force(optimum: Optimum) -> str:
+    """Return how much abs(N) falls with the frequency against the model's; "" where it does not.
+
+    By straight lines over the frequency's logarithm, whose slopes are a parabola of the
+    amplitude's, beside any smooth dependence on the amplitude.
+    """
+    problem = optimum.problem
+    view, fitted = problem.stiffness_data, problem.predicted_stiffness(optimum.theta).stiffness
+    rows = view.harmonic == 1
+    rate, ln_A = np.log(view.omega[rows]), np.log(view.amplitude[rows])
+    if not np.ptp(rate) > np.log(_RATES):
+        return ""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        y = np.log(np.abs(view.stiffness / fitted))[rows]
+    place = 2.0 * (ln_A - ln_A.mean()) / max(float(np.ptp(ln_A)), 1e-9)
+    degree = min(_SMOOTH, np.unique(ln_A.round(2)).size - 1)
+    smooth = legendre.legvander(place, degree)
+    slopes = legendre.legvander(place, min(2, degree))
+    X = np.hstack([smooth, slopes * (rate - rate.mean())[:, None]])
+    dof, Q = y.size - X.shape[1], slopes.shape[1]
+    if dof < 1 or not np.isfinite(y).all():
+        return ""
+    rest = y - smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]
+    solution, _, _, _ = np.linalg.lstsq(X, y, rcond=None)
+    left = float(np.sum((y - X @ solution) ** 2))
+    by_chance = float(special.fdtrc(Q, dof, (float(rest @ rest) - left) / Q / (left / dof)))
+    change = (slopes @ solution[-Q:]) * float(np.ptp(rate))
+    fall = -float(change[np.argmax(np.abs(change))])
+    if not (by_chance < _FALSE_ALARM and fall > 0.0):
+        return ""
+    f = view.omega[rows] / (2.0 * np.pi)
+    return f"force falls by {_percent(fall)} from {f.min():.3g} to {f.max():.3g} Hz"
+
+
+def _jenkins(optimum: Optimum, left: PredictiveDensity) -> str:
+    """Return what parallel Jenkins elements would leave where that is far less, else ""."""
+    try:
+        least = least_misfit(optimum.problem.data, optimum.problem.model)
+    except DahlIdentError:
+        return ""
+    if not least < FAR_LESS * left.misfit:
+        return ""
+    return f"parallel Jenkins elements would leave {_percent(least)} of the fundamental"
 
 
 def _force(optimum: Optimum) -> float:

@@ -18,6 +18,8 @@ from scipy.linalg import solve_toeplitz, toeplitz
 from dahl_ident.arrays import FloatArray
 from dahl_ident.problem.record_noise import HIGHEST_ORDER, SAMPLES_PER_ORDER
 
+_SINGULAR = 1e-13  # eigenvalues of J'J of unit columns that are rounding
+_INVOLVED = 1e-6  # share of a parameter in what has no effect: beyond rounding
 _CORRECTIONS = 4  # each changes less, by the ratio of parameters to samples
 
 
@@ -36,8 +38,7 @@ def sandwich(
     Returns
     -------
     covariance : ndarray, shape (P, P)
-        Infinite variances where a parameter has no effect; all infinite if J'J of the others is
-        singular.
+        Infinite variances where a parameter has no effect, or only one together with others.
     effective : float
         Samples, divided by the mean ratio of a parameter's variance to what it would be if the
         residuals were not correlated.
@@ -67,13 +68,16 @@ def sandwich(
     found[np.diag_indices(P)] = np.inf
     seen = np.flatnonzero(normal.diagonal() > 0.0)
     part = np.ix_(seen, seen)
-    if not np.linalg.eigvalsh(normal[part]).min(initial=1.0) > 1e-15:
-        return np.full((P, P), np.inf), float(samples)
-    inverse = np.linalg.inv(normal[part])
+    values, vectors = np.linalg.eigh(normal[part])
+    shown = values > _SINGULAR
+    inverse = (vectors[:, shown] / values[shown]) @ vectors[:, shown].T
     white = inverse * variance
     covariance = inverse @ middle[part] @ inverse
     ratio = float(np.mean(covariance.diagonal() / white.diagonal())) if variance > 0.0 else 1.0
     found[part] = covariance / np.outer(size[seen], size[seen])
+    lost = seen[(vectors[:, ~shown] ** 2).sum(axis=1) > _INVOLVED]
+    found[lost], found[:, lost] = 0.0, 0.0
+    found[lost, lost] = np.inf
     return found, samples / max(ratio, 1e-300)
 
 

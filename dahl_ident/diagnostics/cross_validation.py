@@ -37,7 +37,8 @@ class CrossValidation:
     inside, count : int
         Held-out gains and phases inside their bands, and all of them.
     width : float
-        Root mean square of the bands' half widths, in ln gain and phase (rad).
+        Root mean square of the bands' half widths, in ln gain and phase (rad); of the
+        fundamentals where there are any, as other harmonics may be next to nothing.
     misfit : float
         Root mean square of the held-out deviations, in the same.
     available : int
@@ -78,7 +79,7 @@ def cross_validation(errors: ErrorModel) -> CrossValidation | None:
     chosen = np.linspace(0, len(tests) - 1, min(len(tests), _MOST_TESTS)).round().astype(int)
     block_of, Py = errors.projected()
     k = _factor(errors)
-    deviations, widths = [], []
+    deviations, widths, orders = [], [], []
     turn = errors.relative_units()
     for rows in (tests[i] for i in chosen):
         index = (2 * rows[:, None] + np.arange(2)).ravel()
@@ -92,17 +93,20 @@ def cross_validation(errors: ErrorModel) -> CrossValidation | None:
             to_relative = turn[row]
             own = to_relative @ part @ to_relative.T
             deviations.append(to_relative @ missed[place])
+            orders.append(problem.data.harmonic[row])
             widths.append(k * np.sqrt(np.maximum(np.diagonal(own), 0.0)))
     found, width = np.array(deviations), np.array(widths)
     known = np.isfinite(width) & (width < 1e6) & (width > 0.0)
     if not known.any():
         return None
+    first = known & (np.array(orders) == 1)[:, None]
+    sized = first if first.any() else known
     return CrossValidation(
         len(chosen),
         int((np.abs(found) <= width)[known].sum()),
         int(known.sum()),
-        float(np.sqrt(np.mean(width[known] ** 2))),
-        float(np.sqrt(np.mean(found[known] ** 2))),
+        float(np.sqrt(np.mean(width[sized] ** 2))),
+        float(np.sqrt(np.mean(found[sized] ** 2))),
         len(tests),
     )
 

@@ -120,7 +120,7 @@ def _information(errors: ErrorModel, columns: FloatArray) -> FloatArray:
     rest = [k for k, source in enumerate(errors.sources) if source.name != MODEL_ERROR]
     sources = (*(errors.sources[k] for k in rest), Source(MODEL_ERROR, columns, 0.0))
     J = errors.jacobian
-    linear = linear_model(errors.problem, np.zeros(len(J)), J, sources)
+    linear, _ = linear_model(errors.problem, np.zeros(len(J)), J, sources)
     V = linear.covariance(np.append(errors.variances[rest], 0.0))
     X = np.hstack([-linear.J, linear.Z[-1]])  # residuals fall where a prediction rises
     Q, W = J.shape[1], columns.shape[1]

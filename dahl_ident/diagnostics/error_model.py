@@ -5,17 +5,26 @@ Write each row's log response as
     ln R_i = ln R(A_i, omega_i; theta) + run_i + level_i + d(ln A_i, ln omega_i) + e_i
 
 with noise e, scatter between runs and between repeats of a level, and a smooth model error d
-(:mod:`dahl_ident.diagnostics.error_sources`). Exponents that were assumed, not given, and
-calibrations with a stated uncertainty are parameters with a prior. Variances follow from
-restricted maximum likelihood (:mod:`dahl_ident.diagnostics.variance_components`). With V the sum
-of the covariances, priors included as rows of unit variance,
+(:mod:`dahl_ident.diagnostics.error_sources`). A point that stands apart from all others may
+have one more error, of a variance of its own, and so little weight. Exponents that were assumed,
+not given, and calibrations with a stated uncertainty are parameters with a prior. Variances follow
+from restricted maximum likelihood (:mod:`dahl_ident.diagnostics.variance_components`). With V the
+sum of the covariances, priors included as rows of unit variance,
 
     G = (J' V^-1 J)^-1 J' V^-1,
 
 the estimate is that of generalised least squares, iterated where the exponent moves, and its
 covariance is the sum of G V_k G' over the sources: the rows of an uncertainty budget
-(JCGM 100:2008). Source: Searle, Casella and McCulloch, *Variance Components*, 1992; Rasmussen and
-Williams, *Gaussian Processes*, 2006, section 2.7.
+(JCGM 100:2008). The variances s that weigh the residuals are estimates too, W their covariance: the
+estimate moves by dG/ds_i y = -G V_i P y with each of them, and G V G' is too small by as much,
+because these variances suit the residuals (Kackar and Harville; Kenward and Roger). Both together
+add
+
+    2 sum_ij W_ij G V_i P V_k P V_j G'
+
+to the row of source k. Source: Searle, Casella and McCulloch, *Variance Components*, 1992; Kenward
+and Roger, Biometrics 53 (1997) 983; Rasmussen and Williams, *Gaussian Processes*, 2006, section
+2.7.
 """
 
 from __future__ import annotations
@@ -38,9 +47,13 @@ from dahl_ident.diagnostics.error_sources import (
     additive,
     gain_and_phase,
     of_one_scale,
+    own_errors,
     relative_scatter,
     run_deviations,
 )
+from dahl_ident.diagnostics.misfit_explanations import at_an_end, neighbourhood
+from dahl_ident.diagnostics.outliers import suspicious_points
+from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.diagnostics.run_deviations import (
     Linearization,
     RunDeviations,
@@ -48,6 +61,8 @@ from dahl_ident.diagnostics.run_deviations import (
     linearization,
 )
 from dahl_ident.diagnostics.variance_components import (
+    CLOSE,
+    Likelihood,
     LinearModel,
     Projection,
     VarianceComponents,
@@ -113,6 +128,8 @@ class ErrorModel:
         Of the sources.
     contributions : mapping of str to ndarray, shape (Q, Q)
         Covariance of theta by source, type A first.
+    of_weights : mapping of str to ndarray, shape (Q, Q)
+        What of these the uncertain variances add.
     assumed : tuple of str
         Names of parameters that were assumed: exponents, the force gain for a drive factor.
     """
@@ -123,6 +140,7 @@ class ErrorModel:
     sources: tuple[Source, ...]
     components: VarianceComponents
     contributions: Mapping[str, FloatArray]
+    of_weights: Mapping[str, FloatArray]
     assumed: tuple[str, ...]
     linear: LinearModel
     projection: Projection
@@ -177,7 +195,8 @@ class ErrorModel:
         """Return the effective degrees of freedom of the uncertainty of direction . theta.
 
         Satterthwaite's: 2 u^4 over the variance of u^2 that the variances' own errors make, no
-        less than 1. `sources` leaves only these; infinite where all variances are known.
+        less than 1, u^2 without what these errors add to it. `sources` leaves only these;
+        infinite where all variances are known.
         """
         lever = direction @ self.inverse
         length = float(np.abs(lever).max()) or 1.0  # any length of the direction will do
@@ -191,7 +210,10 @@ class ErrorModel:
         if not spread > 0.0:
             return np.inf
         counted = self.contributions if sources is None else sources
-        total = sum(float(direction @ self.contributions[n] @ direction) for n in counted)
+        total = sum(
+            float(direction @ (self.contributions[n] - self.of_weights[n]) @ direction)
+            for n in counted
+        )
         return max(1.0, 2.0 * total**2 / spread)
 
     @property
@@ -255,7 +277,7 @@ def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorMode
     determined = optimum.success and bool(np.isfinite(optimum.covariance).all())
     if not (determined or of_combinations):
         return None
-    problem, assumed = _with_assumed(optimum.problem)
+    problem, assumed = with_assumed(optimum.problem)
     if problem.n_numbers - len(optimum.names) <= 0:
         return None
     try:
@@ -264,7 +286,7 @@ def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorMode
         return None
 
 
-def _with_assumed(given: Problem) -> tuple[Problem, dict[str, Assumption]]:
+def with_assumed(given: Problem) -> tuple[Problem, dict[str, Assumption]]:
     """Return the problem with what was assumed free: exponents, and the factor of the drive."""
     assumed = {
         p.name: Assumption(EXPONENT, float(np.log(p.prior[1] / p.prior[0]) / np.sqrt(12.0)))
@@ -317,19 +339,19 @@ class _Rows:
         if self._problem.priors:
             own, by = self._problem.residuals_and_jacobian(theta, tails=False)
             y, J = np.concatenate([y, own[self.m :]]), np.vstack([J, by[self.m :]])
-        weight = self._weight(y)
+        weight = np.concatenate([row_weights(self._problem), np.ones(len(y) - self.m)])
         select = self._select / self.std[:, None]
         y = np.concatenate([y * weight, select @ (theta - self.start)])
         return y, np.vstack([J * weight[:, None], select])
 
-    def _weight(self, y: FloatArray) -> FloatArray:
-        """Return the root of what a covariance of few degrees of freedom counts a row for."""
-        weight, m, problem = np.ones(len(y)), self.m, self._problem
-        dof = problem.data.dof
-        if not problem.gaussian and dof is not None:
-            nu = np.minimum(dof, 1e12)  # a covariance of few dof: the variance of Student's t
-            weight[:m] = np.repeat(np.sqrt((nu - 2.0) / nu), 2)
-        return weight
+
+def row_weights(problem: Problem) -> FloatArray:
+    """Return the root of what an estimated covariance counts each residual for, (m,)."""
+    weight, dof = np.ones(problem.n_residuals), problem.data.dof
+    if not problem.gaussian and dof is not None:
+        nu = np.minimum(dof, 1e12)  # a covariance of few dof: the variance of Student's t
+        weight = np.repeat(np.sqrt((nu - 2.0) / nu), 2)
+    return weight
 
 
 def _basis(J: FloatArray) -> Basis:
@@ -369,9 +391,14 @@ def _estimated(
         )
         if noise is None and step == 1:
             noise, last = plain, None
-            if rest and not problem.scale_known and m <= 2 * _FEW_ROWS:
+            if rest and m <= 2 * _FEW_ROWS:
+                kinds = (
+                    () if problem.scale_known else gain_and_phase(problem),
+                    () if problem.scale_known else additive(problem),
+                    _noise_and_own_errors(optimum, plain),
+                )
                 noise, sources, linear, found = _kind_of_noise(
-                    problem, y, J, (sources, linear, found), level
+                    problem, y, J, (sources, linear, found), level, (plain, *kinds)
                 )
         projection = Projection(linear, found.variances)
         G = projection.generalised_inverse()
@@ -386,11 +413,26 @@ def _estimated(
         rows.widen(covariance)
         move *= min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
         theta = np.clip(theta + move, *problem.bounds())
-    contributions = _by_source(problem, assumed, sources, linear, found, G)
+    parts = [
+        _by_source(problem, assumed, sources, linear, found, lever)
+        for lever in (G[None], _by_variances(linear, found, projection, G))
+    ]
+    contributions = {name: own + parts[1][name] for name, own in parts[0].items()}
     return ErrorModel(
-        optimum, problem, theta, sources, found, contributions, tuple(assumed), linear, projection,
-        whole, near, runs, basis,
+        optimum, problem, theta, sources, found, contributions, parts[1], tuple(assumed), linear,
+        projection, whole, near, runs, basis,
     )  # fmt: skip
+
+
+def _noise_and_own_errors(optimum: Optimum, noise: tuple[Source, ...]) -> tuple[Source, ...]:
+    """Return noise and an error of each row that stands apart; empty where none does.
+
+    Neighbours, or a row at an end of the table, may be where the model fails.
+    """
+    rows = sorted(p.row for p in suspicious_points(optimum, ResidualSpace(optimum)))
+    if not rows or at_an_end(optimum, rows) or neighbourhood(optimum, rows):
+        return ()
+    return (*noise, *own_errors(optimum.problem, rows))
 
 
 def _tells(problem: Problem, assumed: Collection[str]) -> bool:
@@ -402,18 +444,18 @@ _Found = tuple[tuple[Source, ...], LinearModel, VarianceComponents]
 
 def linear_model(
     problem: Problem, y: FloatArray, J: FloatArray, sources: tuple[Source, ...]
-) -> LinearModel:
-    """Return residuals of data and priors with the sources' columns, compressed if many."""
+) -> tuple[LinearModel, Likelihood]:
+    """Return residuals of data and priors with the sources' columns, compressed if many.
+
+    Also their likelihood.
+    """
     m, extra = problem.n_residuals, len(y) - problem.n_residuals
     known = np.concatenate([np.full(m, float(problem.scale_known)), np.ones(extra)])
     Z = [s.columns if s.columns.ndim < 3 else block_diagonal(s.columns) for s in sources]
     Z = [np.concatenate([z, np.zeros((extra, *z.shape[1:]))]) for z in Z]
     linear = LinearModel(y, J, known, Z)
-    of_rows = [k for k, s in enumerate(sources) if s.columns.ndim == 3]
-    alike = all(np.array_equal(z[0:m:2], z[1:m:2]) for z in Z if z.ndim == 1)
-    if m > _FEW_ROWS and len(of_rows) == 1 and alike:
-        return linear.turned(m, of_rows[0])
-    return linear.compressed(m) if m > 2 * _FEW_ROWS else linear
+    fewer = linear.compressed(m) if m > 2 * _FEW_ROWS else linear
+    return fewer, likelihood(linear if any(s.columns.ndim == 3 for s in sources) else fewer)
 
 
 def _supported(
@@ -430,8 +472,7 @@ def _supported(
     Also the variances with all sources, to start from at the next estimate.
     """
     every = (*noise, *rest)
-    linear = linear_model(problem, y, J, every)
-    contrasts = likelihood(linear)
+    linear, contrasts = linear_model(problem, y, J, every)
     upper = np.array([s.largest for s in every])
     scales = np.array([s.columns.ndim == 1 and not problem.scale_known for s in every])
     floor = np.where(scales, level, 0.0)
@@ -442,12 +483,16 @@ def _supported(
     best, best_value = None, -np.inf
     for k in range(len(asked) + 1):
         for subset in combinations(asked, k):
+            price = sum(_asked_for(every[i]) for i in subset)
+            # fewer sources explain no more than all of them do
+            if best is not None and whole.log_likelihood + CLOSE - price < best_value:
+                continue
             kept = ~optional
             kept[list(subset)] = True
             most = np.where(kept, upper, 0.0)
             begin = np.minimum(np.where(whole.variances > 0.0, whole.variances, floor), most)
             trial = variance_components(contrasts, begin, most)
-            value = trial.log_likelihood - sum(_asked_for(every[i]) for i in subset)
+            value = trial.log_likelihood - price
             if value > best_value:
                 best, best_value = trial, value
     assert best is not None
@@ -456,7 +501,7 @@ def _supported(
         tuple(every[i] for i in kept.tolist()),
         replace(linear, Z=[linear.Z[i] for i in kept.tolist()]),
         replace(
-            best, variances=best.variances[kept], covariance=best.covariance[np.ix_(kept, kept)]
+            best, variances=best.variances[kept], information=best.information[np.ix_(kept, kept)]
         ),
     ), whole.variances
 
@@ -466,19 +511,27 @@ def _asked_for(source: Source) -> float:
 
 
 def _kind_of_noise(
-    problem: Problem, y: FloatArray, J: FloatArray, found: _Found, level: float
+    problem: Problem,
+    y: FloatArray,
+    J: FloatArray,
+    found: _Found,
+    level: float,
+    kinds: Sequence[tuple[Source, ...]],
 ) -> tuple[tuple[Source, ...], tuple[Source, ...], LinearModel, VarianceComponents]:
-    """Return the kind of noise that the residuals support, and the sources with it."""
-    best, kind = found, tuple(s for s in found[0] if s.name == NOISE and s.columns.ndim == 1)
+    """Return the kind of noise that the residuals support, and the sources with it.
+
+    `found` has the first of the `kinds`.
+    """
+    best, kind = found, kinds[0]
     rest = tuple(s for s in found[0] if not any(s is k for k in kind))
-    for trial in (gain_and_phase(problem), additive(problem)):
+    for trial in kinds[1:]:
         if not trial:
             continue
         sources = (*trial, *rest)
-        linear = linear_model(problem, y, J, sources)
+        linear, contrasts = linear_model(problem, y, J, sources)
         own = np.array([s.columns.ndim == 1 for s in sources])
         upper = np.array([s.largest for s in sources])
-        other = variance_components(linear, np.where(own, level, 0.0), upper)
+        other = variance_components(contrasts, np.where(own, level, 0.0), upper)
         if other.log_likelihood > best[2].log_likelihood + _SUPPORTED:
             best, kind = (sources, linear, other), trial
     return (kind, *best)
@@ -490,20 +543,35 @@ def _by_source(
     sources: tuple[Source, ...],
     linear: LinearModel,
     found: VarianceComponents,
-    G: FloatArray,
+    levers: FloatArray,
 ) -> dict[str, FloatArray]:
-    """Return the covariance of theta that each source makes."""
+    """Return the covariance of theta that each source makes by levers (k, Q, m) of residuals."""
     result = {}
     priors = [_CALIBRATIONS.get(name, name) for name in problem.priors]
     known = [*priors, *(one.source for one in assumed.values())]
     m = len(linear.y) - len(known)
     if problem.scale_known:
-        result[NOISE] = G[:, :m] @ G[:, :m].T
+        result[NOISE] = _squared(levers[..., :m])
     for source, part, variance in zip(sources, linear.Z, found.variances.tolist(), strict=True):
-        lever = G * part if part.ndim == 1 else G @ part
-        own = variance * lever @ lever.T
+        own = variance * _squared(levers * part if part.ndim == 1 else levers @ part)
         result[source.name] = result[source.name] + own if source.name in result else own
     for row, name in enumerate(known, start=m):
-        own = np.outer(G[:, row], G[:, row])
+        own = _squared(levers[..., row : row + 1])
         result[name] = result[name] + own if name in result else own
     return result
+
+
+def _squared(levers: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("kqi,kpi->qp", levers, levers))
+
+
+def _by_variances(
+    linear: LinearModel, found: VarianceComponents, projection: Projection, G: FloatArray
+) -> FloatArray:
+    """Return what uncertain variances do, as levers (k, Q, m) of independent errors."""
+    through = [G * part**2 if part.ndim == 1 else (G @ part) @ part.T for part in linear.Z]
+    size = np.sqrt(np.diagonal(found.covariance))
+    size = np.where(size > 0.0, size, 1.0)
+    values, vectors = np.linalg.eigh(found.covariance / np.outer(size, size))
+    roots = size[:, None] * vectors * np.sqrt(2.0 * np.maximum(values, 0.0))
+    return np.asarray(np.einsum("ik,iqm->kqm", roots, np.array(through)) @ projection.P)

@@ -29,6 +29,7 @@ NOISE = "noise"
 MODEL_ERROR = "model error"
 RUNS = "scatter between runs"
 LEVELS = "scatter between repeated levels"
+APART = "suspicious points"
 
 _LENGTH = 1.0  # of the model error, in ln A and ln omega
 _MOST_PLACES = 200  # rows beyond which a column for each costs seconds, cubic in their number
@@ -175,6 +176,16 @@ def relative_scatter(problem: Problem, theta: FloatArray) -> tuple[Source, ...]:
     return tuple(found)
 
 
+def own_errors(problem: Problem, rows: Sequence[int]) -> tuple[Source, ...]:
+    """Return an error of each of some rows, beside the noise, that no other row shares."""
+    found = []
+    for row in rows:
+        columns = np.zeros((problem.n_residuals, 2))
+        columns[2 * row : 2 * row + 2] = np.eye(2)
+        found.append(Source(APART, columns, unit_noise(problem) / problem.data.n))
+    return tuple(found)
+
+
 class StructuredSources:
     """The sources that several rows share, and noise of the amplitudes.
 
@@ -214,9 +225,9 @@ class StructuredSources:
             """Return residuals for relative changes (k, n), shape (m, k)."""
             return near.change(changes * size).T
 
-        own = self._fundamental
+        own = self._fundamental & (size != 0.0)  # a gap that is not crossed has no response
         missed = np.abs(problem.data.response[own] / size[own] - 1.0)
-        most = _MOST_DEPARTURE**2 * 0.5 * float(np.mean(missed**2))
+        most = _MOST_DEPARTURE**2 * 0.5 * float(np.mean(missed**2)) if own.any() else 0.0
         found = []
         for shape, changes in zip(self._shapes, self._changes, strict=True):
             square, made, absorbed = _mean_square(changes), columns(changes), None

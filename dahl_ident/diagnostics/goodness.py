@@ -408,11 +408,17 @@ def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
 
 
 def _within_runs(optimum: Optimum, errors: ErrorModel) -> Goodness | None:
-    """Return the tests of the residuals within runs; None where the runs do not differ."""
+    """Return the tests of the residuals within runs; None where the runs do not differ.
+
+    Where differences between runs take half of the degrees of freedom, as with one point a run,
+    they are not told from a wrong model, which the plain residuals test.
+    """
     runs = errors.runs_about_optimum
     if runs is None:
         return None
     every, within = ResidualSpace(optimum), ResidualSpace(optimum, runs)
+    if 2 * within.dof <= every.dof:
+        return None
     explained = float(every.residuals @ every.residuals - within.residuals @ within.residuals)
     p = every.tail(explained, every.dof - within.dof)
     found = _tested(optimum, within)

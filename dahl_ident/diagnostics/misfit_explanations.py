@@ -38,12 +38,14 @@ class Turn:
     def __call__(self, data: FrequencyResponse) -> FrequencyResponse:
         """Return the data turned, their covariances with them."""
         signs = np.array([self.real, self.imaginary])
-        covariance, cross = data.covariance, data.amplitude_covariance
+        covariance = data.covariance
+        cross, of_drive = data.amplitude_covariance, data.drive_covariance
         return replace(
             data,
             response=self.real * data.response.real + 1j * self.imaginary * data.response.imag,
             covariance=None if covariance is None else covariance * np.outer(signs, signs),
             amplitude_covariance=None if cross is None else cross * signs,
+            drive_covariance=None if of_drive is None else of_drive * signs,
         )
 
 
@@ -145,6 +147,8 @@ def _misfit(problem: Problem, fitted: ComplexArray) -> FloatArray:
     response, harmonic = problem.data.response, problem.data.harmonic
     order = 1 if (harmonic == 1).any() else harmonic.min()
     rows = (harmonic == order) & (response != 0.0)
+    crossed = rows & (fitted != 0.0)  # within a gap there is nothing that a share could be of
+    rows = crossed if crossed.any() else rows
     return np.asarray(np.abs(1.0 - fitted[rows] / response[rows]))
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.error_model import ErrorModel, relative_units
-from dahl_ident.diagnostics.error_sources import NOISE, Source, places
+from dahl_ident.diagnostics.error_sources import APART, NOISE, Source, places
 from dahl_ident.problem import Problem
 
 _LEAST_DOF = 1.0  # with fewer, quantiles of Student's t are beyond all use
@@ -94,8 +94,10 @@ def prediction_error(
     if of_a_test:
         near = _nearest(errors.problem, amplitude, omega)
         for k, source in enumerate(errors.sources):
-            if source.name == NOISE:
-                own = _noise(errors, source)[near]
+            if source.name in (NOISE, APART):
+                own = _noise(errors, source)
+                # a gross error may befall any test, once in as many as there are rows
+                own = own[near] if source.name == NOISE else own.mean(axis=0)[None]
                 squares[k] += np.trace(own, axis1=1, axis2=2)
                 covariance += errors.variances[k] * own
         if errors.problem.scale_known:

@@ -269,7 +269,7 @@ class Profiler:
         columns = dict(zip(self._problem.names, theta.T, strict=True))
         for f_max, sigma in self._friction:
             own = np.isin(np.array(self._problem.names)[index], (f_max.name, sigma.name))
-            ln_f_max, ln_sigma = (columns.get(p.name, _ln(p)) for p in (f_max, sigma))
+            ln_f_max, ln_sigma = (np.asarray(columns.get(p.name, _ln(p))) for p in (f_max, sigma))
             ln_x_c = ln_f_max - ln_sigma
             reach = self._reach
             seen = (ln_x_c > reach.least) & (ln_x_c < reach.most) & (ln_sigma > reach.softest)

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy import special
 
 from dahl_ident.arrays import FloatArray, positive_array
 from dahl_ident.diagnostics.bands import DerivedQuantity
@@ -20,6 +20,7 @@ from dahl_ident.problem.record_problem import RecordProblem
 
 _SLIGHT = 1e-6  # relative: noise of the drive below does not count
 _MATTERS = 0.2  # standard errors that noise in the displacement may shift without being counted
+_DRAWS = 8  # of noise: the mean square of what they change is known to a half
 _STEP = 1e-5  # relative, of parameters, for slopes of derived quantities
 _BLOCKS = 20  # of all records together, from which the model error is estimated
 _LEVEL = 0.9995  # of chance, at which scatter between blocks is no noise
@@ -98,9 +99,10 @@ def record_errors(
     if beyond is not None:
         found[MODEL] = beyond
     if problem.output == "force":
-        change = _by_displacement(problem, values, jacobians)
-        if (np.abs(change) > _MATTERS * np.sqrt(covariance.diagonal()))[: len(problem.free)].any():
-            found[DISPLACEMENT] = np.outer(change, change)
+        moved = _by_displacement(problem, values, jacobians)
+        matters = moved.diagonal() > _MATTERS**2 * covariance.diagonal()
+        if matters[: len(problem.free)].any():
+            found[DISPLACEMENT] = moved
     scale = np.zeros(values.size)
     for i, parameter in enumerate(problem.free):
         scale[i] = values[i] * parameter.dimension[0]
@@ -124,7 +126,7 @@ def record_errors(
 def _by_displacement(
     problem: RecordProblem, values: FloatArray, jacobians: Sequence[FloatArray]
 ) -> FloatArray:
-    """Return the change of the estimate with the displacement's noise.
+    """Return the mean square change of the estimate with the displacement's noise.
 
     As large as that of as much noise again; or, with a dead band, from where in it the true
     displacement may be.
@@ -132,15 +134,24 @@ def _by_displacement(
     noise = problem.displacement_noise
     if noise:
         ends = [problem.without_noise(noise, lead) for lead in LEADS[::2]]
-        return 0.5 * _moved(ends, values, jacobians)[0]
+        change = 0.5 * _moved(ends, values, jacobians)[0]
+        return np.outer(change, change)
+
+    def noisier(noise: float) -> tuple[FloatArray, float]:
+        again = [
+            _moved([problem, problem.with_more_noise(noise, draw)], values, jacobians)
+            for draw in range(_DRAWS)
+        ]
+        changes = np.array([change for change, _ in again])
+        return changes.T @ changes / _DRAWS, float(np.mean([left for _, left in again]))
+
     noise = problem.estimated_noise
-    change, left = _moved([problem, problem.with_more_noise(noise)], values, jacobians)
+    moved, left = noisier(noise)
     residuals = sum(float(e @ e) for e in problem.split_residuals(values))
     if left <= residuals:
-        return change
+        return moved
     # rough motion looks like noise, but so much noise would leave larger residuals
-    noise *= (residuals / left) ** 0.5
-    return _moved([problem, problem.with_more_noise(noise)], values, jacobians)[0]
+    return noisier(noise * (residuals / left) ** 0.5)[0]
 
 
 def _moved(
@@ -194,7 +205,7 @@ def _model_error(
     weights = np.array([(inverse @ part @ inverse).diagonal() for part in parts])
     dof = np.maximum(weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0) - 1.0, 1.0)
     ratio = between.diagonal() / correlation.diagonal()
-    if not (ratio > chi2.ppf(_LEVEL, dof) / dof)[:count].any():
+    if not (ratio > special.chdtri(dof, 1.0 - _LEVEL) / dof)[:count].any():
         return None
     values, vectors = np.linalg.eigh(between - correlation)
     beyond = (vectors * np.maximum(values, 0.0)) @ vectors.T

@@ -81,7 +81,7 @@ class _Space(ABC):
 
 
 class RelativeSpace(_Space):
-    """ln(R/R_model) of fundamentals other than 0, all rows alike: for the size of a departure.
+    """ln(R/R_model) of fundamentals, neither 0, all rows alike: for the size of a departure.
 
     Whatever the noise model, the weights here do not depend on it, so that a departure of 30 %
     reads as one also where the data claim errors of 1 %.
@@ -90,7 +90,8 @@ class RelativeSpace(_Space):
     def __init__(self, optimum: Optimum) -> None:
         problem, theta = optimum.problem, optimum.theta
         predicted = problem.predict(theta)
-        self._rows = (problem.data.harmonic == 1) & (problem.data.response != 0.0)
+        some = (problem.data.response != 0.0) & (predicted != 0.0)
+        self._rows = (problem.data.harmonic == 1) & some
         with np.errstate(divide="ignore", invalid="ignore"):
             y = np.log(problem.data.response / predicted)[self._rows]
             J = (problem.prediction_jacobian(theta) / predicted[:, None])[self._rows]

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import NamedTuple, cast
 
 import numpy as np
-from scipy.optimize import nnls
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
@@ -31,7 +30,7 @@ _BELOW = 100.0  # below the smallest amplitude, where all elements slip alike
 _SMOOTHING = 10.0 ** np.arange(1.0, -6.5, -0.5)  # tried from the smoothest on
 _ALLOWED = 1.05  # of the least misfit that a smooth density may leave
 _EXACT = 1e-4  # misfit that counts as none
-_FAR_LESS = 0.5  # of a model's misfit: such a law is worth naming
+FAR_LESS = 0.5  # of a model's misfit: such a law is worth naming
 
 
 @dataclass(frozen=True)
@@ -158,7 +157,7 @@ def least_misfit(data: FrequencyResponse, model: Element) -> float:
 def bound_statement(least: float, misfit: float) -> str:
     """Return the least misfit of parallel Jenkins elements in words, beside a model's misfit."""
     share = f"{100.0 * least:.2g} % (rms of the fundamental)"
-    if least < _FAR_LESS * misfit:
+    if least < FAR_LESS * misfit:
         return (
             "The best symmetric rate-independent law of parallel Jenkins elements (MaxwellSlip, "
             f"Iwan) leaves {share}."
@@ -224,6 +223,8 @@ def _solved(system: _System, smoothing: float) -> tuple[FloatArray, float]:
     bend = np.diff(np.eye(n), n=2, axis=0) / size[:n] * float(size[n - 1])
     rough = np.zeros((n - 2, matrix.shape[1]))
     rough[:, :n] = smoothing * np.sqrt(len(right) / n) * bend
+    from scipy.optimize import nnls
+
     found, _ = nnls(np.concatenate([both, rough]), np.append(want, np.zeros(n - 2)), maxiter=10000)
     misfit = float(np.sqrt(np.mean(np.abs(scaled @ found - right) ** 2)))
     return found / size, misfit

@@ -9,22 +9,26 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
 
+import numpy as np
+
 from dahl_ident.data.tabular import doubts
 from dahl_ident.diagnostics.budget import taken_as_exact
 from dahl_ident.diagnostics.cross_validation import CrossValidation
 from dahl_ident.diagnostics.error_model import ErrorModel
-from dahl_ident.diagnostics.formatting import listed, with_unit
+from dahl_ident.diagnostics.formatting import listed, p_text, with_unit
 from dahl_ident.diagnostics.goodness import Goodness
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Identifiability
 from dahl_ident.fitting import Optimum, solve
+from dahl_ident.problem import Problem
 
 _TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
 _NARROWEST = 0.7  # half width of 95 % bands over the rms misfit, which for noise is 1.4
 _ENOUGH_HELD_OUT = 16  # values, of which 80 % in bands of 95 % happen once in 100 times
 _DOUBTS_SHOWN = 5  # more would hide the verdict
+_CHANCE = 0.0027  # that data contradict a right constraint as much, as for a prior
 _CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chance
 
 
@@ -55,7 +59,7 @@ class Judged(Protocol):
 def verdict_status(fit: Judged) -> VerdictStatus:
     """Return whether a fit's numbers can be used."""
     optimum, goodness = fit.optimum, fit.goodness
-    if goodness.sign:
+    if goodness.sign or _contradicted_constraints(fit):
         return VerdictStatus.NOT_DESCRIBED
     determined = optimum.success and optimum.dof > 0 and goodness.judged
     if not determined or not fit.identifiability.complete:
@@ -75,7 +79,7 @@ def statements(fit: Judged) -> tuple[str, ...]:
     goodness, known = fit.goodness, fit.identifiability
     if status is VerdictStatus.TRUSTED:
         first = f"Trusted. {known.headline} {goodness.headline}"
-        return (first, *doubted(data.provenance), *_assumptions(fit))
+        return (first, *doubted(data.provenance), *assumptions(fit.optimum, fit.errors))
     if status is VerdictStatus.APPROXIMATE:
         found = list(goodness.statements)
         if goodness.described in found and goodness.objections:
@@ -84,7 +88,7 @@ def statements(fit: Judged) -> tuple[str, ...]:
             found.insert(0, f"The stated uncertainties include a {misfit}: {goodness.departures}.")
         first, *others = (*found, *_reservations(fit), known.headline)
         said = (*others, *_checked(fit), *doubted(data.provenance))
-        return (f"Approximate. {first}", *said, *_assumptions(fit))
+        return (f"Approximate. {first}", *said, *assumptions(fit.optimum, fit.errors))
     first, *others = _objections(fit)
     return (f"{status.capitalize()}. {first}", *others, *doubted(data.provenance))
 
@@ -148,6 +152,19 @@ def _reservations(fit: Judged) -> Iterator[str]:
     yield from _moved_by_outliers(fit)
 
 
+def _contradicted_constraints(fit: Judged) -> str:
+    """Return a statement on constraints that the data contradict; empty where they do not."""
+    cost = fit.optimum.constraint_cost
+    if cost is None or cost.p_value > _CHANCE:
+        return ""
+    against = "known noise" if np.isinf(cost.dof) else "the noise of the fit without them"
+    return (
+        f"The data contradict the constraint {listed(cost.texts)}: the sum of squares rises by "
+        f"{cost.rise:.3g} times the variance of {against} ({p_text(cost.p_value)}): check the "
+        "constraint, or the model."
+    )
+
+
 def _contradicted_priors(fit: Judged) -> Iterator[str]:
     """Yield a statement for every prior that the data contradict."""
     optimum = fit.optimum
@@ -166,29 +183,32 @@ def _contradicted_priors(fit: Judged) -> Iterator[str]:
 def _moved_by_outliers(fit: Judged) -> Iterator[str]:
     """Yield a statement on parameters that a robust fit moves by more than one uncertainty."""
     optimum, errors = fit.optimum, fit.errors
-    if not fit.goodness.suspicious or optimum.loss != "linear" or errors is None:
+    if optimum.loss != "linear" or errors is None:
         return
-    robust = solve(optimum.problem, loss="huber")
+    problem = optimum.problem
+    fixed = {name: errors.values[name] for name in errors.assumed}
+    same = Problem(
+        problem.data, problem.model, noise=problem.noise, sensors=problem.sensors, fixed=fixed
+    )
+    robust = solve(same, loss="huber")
     if not robust.success:
         return
     moved = [
         name
-        for name, before, after in zip(
-            optimum.names, optimum.values.tolist(), robust.values.tolist(), strict=True
-        )
-        if abs(after - before) > errors.stderr[name]
+        for name, after in zip(robust.names, robust.values.tolist(), strict=True)
+        if abs(after - errors.values[name]) > errors.stderr[name]
     ]
     if moved:
-        rows = "; ".join(point.name for point in fit.goodness.suspicious[:5])
+        named = "; ".join(point.name for point in fit.goodness.suspicious[:5])
+        rows = named or "the rows with the largest residuals"
         yield (
             f"A robust fit moves {listed(moved)} by more than one standard uncertainty: look at "
             f'{rows}, or fit with loss="huber".'
         )
 
 
-def _assumptions(fit: Judged) -> Iterator[str]:
+def assumptions(optimum: Optimum, errors: ErrorModel | None) -> Iterator[str]:
     """Yield one sentence with the assumptions that these data cannot test."""
-    optimum, errors = fit.optimum, fit.errors
     parts = []
     for parameter in optimum.problem.model.parameters:
         if parameter.prior is None or parameter.free:
@@ -204,6 +224,8 @@ def _assumptions(fit: Judged) -> Iterator[str]:
     names = {p.name for p in optimum.problem.sensors.parameters if p.free}
     if "delay" in names and "force_gain" not in names:
         parts.append("force_gain = 1 exactly")
+    if optimum.constraint_cost is not None:
+        parts.append(f"the constraint {listed(optimum.constraint_cost.texts)}")
     exact = taken_as_exact(optimum)
     if exact:
         parts.append(f"{listed(exact)} exact")
@@ -222,6 +244,9 @@ def _objections(fit: Judged) -> Iterator[str]:
         yield from goodness.statements
     if goodness.sign:
         return  # what the numbers leave undetermined says nothing of the mechanism
+    contradicted = _contradicted_constraints(fit)
+    if contradicted:
+        yield contradicted
     known = fit.identifiability
     can_tell = optimum.scale_known or optimum.dof > 0
     if can_tell and not known.complete:

@@ -15,7 +15,8 @@ Source: Patterson and Thompson, Biometrika 58 (1971) 545; Searle, Casella and Mc
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -27,7 +28,7 @@ from dahl_ident.arrays import FloatArray
 _STEPS = 40  # at most; the likelihood rises in each, so the last is the best
 _FEW = 3  # residuals over columns of sources beyond which columns are quicker
 _LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.02)  # of a scoring step, until the likelihood rises
-_CLOSE = 1e-3  # rise of the log-likelihood that no longer matters
+CLOSE = 1e-3  # rise of the log-likelihood that no longer matters
 _ALIKE = 1e-10  # added to correlations of one: sources that do the same share a variance
 _LEAST = 1e-10  # variance over the largest, below which it is none
 
@@ -83,29 +84,6 @@ class LinearModel:
             inside,
         )
 
-    def turned(self, rows: int, source: int) -> LinearModel:
-        """Return the same likelihood with each row's two residuals turned along its own column.
-
-        The source has one column of each pair of residuals, and is diagonal after that.
-        """
-        column = self.Z[source][:rows].sum(axis=1).reshape(-1, 2)
-        size = np.linalg.norm(column, axis=1)
-        cosine, sine = np.where(size > 0.0, column.T, [[1.0], [0.0]]) / np.where(
-            size > 0.0, size, 1.0
-        )
-        turn = np.array([[cosine, sine], [-sine, cosine]]).transpose(2, 0, 1)
-
-        def turned(part: FloatArray) -> FloatArray:
-            own = turn @ part[:rows].reshape(len(turn), 2, -1)
-            return np.concatenate([own.reshape(part[:rows].shape), part[rows:]])
-
-        Z = [z if z.ndim == 1 else turned(z) for z in self.Z]
-        Z[source] = np.concatenate(
-            [np.column_stack([size, 0.0 * size]).ravel(), self.known[rows:] * 0.0]
-        )
-        rotation = block_diagonal(turn.swapaxes(1, 2))
-        return replace(self, y=turned(self.y), J=turned(self.J), Z=Z, rotation=rotation)
-
     def outside_variance(self, variances: FloatArray) -> float:
         """Return the variance of the residuals outside."""
         return float(self.known[0] + variances[0])
@@ -131,15 +109,24 @@ class VarianceComponents:
     ----------
     variances : ndarray, shape (K,)
         One a source, 0 where the residuals ask for none.
-    covariance : ndarray, shape (K, K)
-        Of the variances; zero for those at 0.
+    information : ndarray, shape (K, K)
+        Expected information on the variances.
     log_likelihood : float
         Restricted, up to a constant.
     """
 
     variances: FloatArray
-    covariance: FloatArray
+    information: FloatArray
     log_likelihood: float
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance of the variances, shape (K, K); zero for those at 0."""
+        found = np.zeros_like(self.information)
+        part = np.ix_(*[np.flatnonzero(self.variances > 0.0)] * 2)
+        scaled, size = _scaled(self.information[part])
+        found[part] = np.linalg.pinv(scaled) * np.outer(size, size)
+        return found
 
 
 class Projection:
@@ -197,14 +184,15 @@ class Likelihood(Protocol):
 
 def likelihood(model: LinearModel) -> Likelihood:
     """Return what computes a model's likelihood: in few columns, where most sources have few."""
-    columns = model.J.shape[1] + sum(z.shape[1] for z in model.Z if z.ndim > 1)
+    columns = model.J.shape[1] + sum(z.shape[1] for z in model.Z if not _within_pairs(z))
     return Columns(model) if _FEW * columns < len(model.y) else Contrasts(model)
 
 
 class Columns:
-    """The likelihood by the columns of sources, U, beside diagonal ones, D.
+    """The likelihood by the columns of sources, U, beside those of single rows, D.
 
-    Without the columns the projection is P_0 = D^-1 - D^-1 J (J' D^-1 J)^-1 J' D^-1; with them
+    D is made of blocks of two residuals; whitened with their factors, D is 1. Without the columns
+    the projection is P_0 = 1 - Q Q', Q orthonormal columns of J; with them
 
         P = P_0 - P_0 U S (1 + T S)^-1 U' P_0,    T = U' P_0 U,
 
@@ -212,61 +200,105 @@ class Columns:
     """
 
     def __init__(self, model: LinearModel) -> None:
-        self._model = model
-        self._squares = {k: z**2 for k, z in enumerate(model.Z) if z.ndim == 1}
-        parts = {k: z for k, z in enumerate(model.Z) if z.ndim > 1}
-        self._U = np.column_stack([np.empty((len(model.y), 0)), *parts.values()])
+        local = [k for k, z in enumerate(model.Z) if _within_pairs(z)]
+        parts = {k: z for k, z in enumerate(model.Z) if k not in local}
+        # an odd residual has another beside it that is none, of a variance of one
+        self._known = _blocks(np.append(np.sqrt(model.known), np.ones(len(model.y) % 2)))
+        self._local = {k: _blocks(_even(model.Z[k])) for k in local}
+        whole = _even(np.column_stack([model.y, model.J, *parts.values()]))
+        self._whole = whole.reshape(len(self._known), 2, -1)
+        self._parameters = model.J.shape[1]
         self._owner = np.repeat(list(parts), [z.shape[1] for z in parts.values()]).astype(np.intp)
         self._size = 0.5 * np.linalg.slogdet(model.J.T @ model.J)[1]
 
     def at(self, variances: FloatArray) -> State:
         """Return likelihood, gradient and expected information."""
-        model, U, owner = self._model, self._U, self._owner
-        K, q = len(variances), U.shape[1]
-        d = model.known + sum(variances[k] * square for k, square in self._squares.items())
-        if not d.min() > 0.0:
-            raise np.linalg.LinAlgError("the covariance of the residuals is singular")
-        root = np.sqrt(d)
-        Q, R = np.linalg.qr(model.J / root[:, None])
-        E, u = (  # P_0 times these
-            (part - Q @ (Q.T @ part)) / root[:, None]
-            for part in (U / root[:, None], (model.y / root)[:, None])
+        K, owner = len(variances), self._owner
+        whitening, volume = _whitening(
+            self._known + sum(variances[k] * block for k, block in self._local.items())
         )
+        whole = (whitening @ self._whole).reshape(2 * len(whitening), -1)
+        y, J, U = np.split(whole, [1, 1 + self._parameters], axis=1)
+        Q, R = np.linalg.qr(J)
+        E, u = (part - Q @ (Q.T @ part) for part in (U, y[:, 0]))
         T, S = U.T @ E, variances[owner]
-        back = np.linalg.inv(np.eye(q) + T * S)
-        t = U.T @ u[:, 0]
+        back = np.linalg.inv(np.eye(len(S)) + T * S)
+        t = U.T @ u
         h, H = back @ t, back @ T
         C = S[:, None] * back
         likelihood = -(
-            np.log(root).sum()
+            volume
             + np.log(np.abs(np.diagonal(R))).sum()
             - self._size
             - 0.5 * np.linalg.slogdet(back)[1]
-            + 0.5 * (float(model.y @ u[:, 0]) - float(t @ (S * h)))
+            + 0.5 * (float(u @ u) - float(t @ (S * h)))
         )
-        weighted = u[:, 0] - E @ (S * h)
-        gradient, information = np.zeros(K), np.zeros((K, K))
         own = (np.arange(K)[:, None] == owner).astype(np.float64)
-        gradient += 0.5 * (own @ (h**2) - own @ np.diagonal(H))
-        information += 0.5 * own @ (H**2) @ own.T
-        F, N = np.column_stack([Q / root[:, None], E]), np.eye(Q.shape[1] + q)
+        gradient = 0.5 * (own @ (h**2) - own @ np.diagonal(H))
+        information = 0.5 * own @ (H**2) @ own.T
+        pairs = (len(whitening), 2, -1)
+        weighted = (u - E @ (S * h)).reshape(pairs)
+        turned = (E @ back.T).reshape(pairs)
+        F, N = np.column_stack([Q, E]), np.eye(Q.shape[1] + len(S))
         N[Q.shape[1] :, Q.shape[1] :] = C
-        FN = F @ N
-        inside = np.sum(FN * F, axis=1)
-        turned = E @ back.T
-        grams = {k: N @ (F.T @ (square[:, None] * F)) for k, square in self._squares.items()}
-        for k, square in self._squares.items():
-            gradient[k] = 0.5 * (square @ weighted**2 - square @ (1.0 / d - inside))
-            across = 0.5 * own @ (square @ turned**2)
+        within = (F @ N).reshape(pairs) @ F.reshape(pairs).swapaxes(1, 2)
+        blocks = {
+            k: whitening @ block @ whitening.swapaxes(1, 2) for k, block in self._local.items()
+        }
+        grams = {}
+        for k, block in blocks.items():
+            grams[k] = N @ (F.T @ (block @ F.reshape(pairs)).reshape(F.shape))
+            explained = float(np.sum(weighted * (block @ weighted)))
+            left = np.trace(block, axis1=1, axis2=2).sum() - np.sum(within * block)
+            gradient[k] = 0.5 * (explained - float(left))
+            across = 0.5 * own @ np.sum(turned * (block @ turned), axis=(0, 1))
             information[k] += across
             information[:, k] += across
-        for k, one in self._squares.items():
-            for other, two in self._squares.items():
-                both = one * two
+        for k, one in blocks.items():
+            for other, two in blocks.items():
+                both = one @ two
                 information[k, other] = 0.5 * (
-                    both @ (1.0 / d**2 - 2.0 * inside / d) + np.sum(grams[k] * grams[other].T)
+                    np.trace(both, axis1=1, axis2=2).sum()
+                    - 2.0 * np.sum(both * within.swapaxes(1, 2))
+                    + np.sum(grams[k] * grams[other].T)
                 )
         return State(float(likelihood), gradient, information)
+
+
+def _within_pairs(part: FloatArray) -> bool:
+    """Return whether each column of a source lies within one pair of residuals."""
+    if part.ndim == 1:
+        return True
+    seen = (_even(part) != 0.0).reshape(-1, 2, part.shape[1]).any(axis=1)
+    return bool((seen.sum(axis=0) <= 1).all())
+
+
+def _even(part: FloatArray) -> FloatArray:
+    return np.concatenate([part, np.zeros((len(part) % 2, *part.shape[1:]))])
+
+
+def _blocks(columns: FloatArray) -> FloatArray:
+    """Return the covariance of each pair of residuals, (n, 2, 2), by columns within pairs."""
+    if columns.ndim == 1:
+        return np.asarray(columns.reshape(-1, 2, 1) ** 2 * np.eye(2))
+    pairs = columns.reshape(-1, 2, columns.shape[1])
+    return np.asarray(pairs @ pairs.swapaxes(1, 2))
+
+
+def _whitening(blocks: FloatArray) -> tuple[FloatArray, float]:
+    """Return inverse Cholesky factors of blocks (n, 2, 2), and minus the log of their volume."""
+    first, across, second = blocks[:, 0, 0], blocks[:, 1, 0], blocks[:, 1, 1]
+    if not first.min() > 0.0:
+        raise np.linalg.LinAlgError("the covariance of the residuals is singular")
+    lower = across / first
+    rest = second - lower * across
+    if not rest.min() > 0.0:
+        raise np.linalg.LinAlgError("the covariance of the residuals is singular")
+    found = np.zeros(blocks.shape)
+    found[:, 0, 0] = 1.0 / np.sqrt(first)
+    found[:, 1, 1] = 1.0 / np.sqrt(rest)
+    found[:, 1, 0] = -lower * found[:, 1, 1]
+    return found, float(0.5 * np.log(first * rest).sum())
 
 
 class Contrasts:
@@ -295,9 +327,8 @@ class Contrasts:
         likelihood = -np.log(np.diagonal(L)).sum() - 0.5 * self._y @ weighted
         products = inverse @ self._sources
         across = products.swapaxes(1, 2).reshape(K, -1)
-        gradient = 0.5 * (
-            weighted @ self._sources @ weighted - np.trace(products, axis1=1, axis2=2)
-        )
+        traces = products.reshape(K, -1)[:, :: r + 1].sum(axis=1)
+        gradient = 0.5 * (weighted @ self._sources @ weighted - traces)
         information = 0.5 * products.reshape(K, -1) @ across.T
         rest, count = self._model.outside
         if count:
@@ -352,15 +383,9 @@ def variance_components(
             break
         rise = found[1].log_likelihood - state.log_likelihood
         s, state = found
-        if rise < _CLOSE:
+        if rise < CLOSE:
             break
-    information = state.information
-    covariance = np.zeros_like(information)
-    inside = np.flatnonzero(s > 0.0)
-    part = np.ix_(inside, inside)
-    scaled, size = _scaled(information[part])
-    covariance[part] = np.linalg.pinv(scaled) * np.outer(size, size)
-    return VarianceComponents(s, covariance, state.log_likelihood)
+    return VarianceComponents(s, state.information, state.log_likelihood)
 
 
 def _projected(
@@ -391,7 +416,8 @@ def _scaled(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     own = np.diagonal(information)
     known = own > np.finfo(float).tiny
     size = known / np.sqrt(np.where(known, own, 1.0))
-    return np.clip(information * np.outer(size, size), -1.0, 1.0), size
+    scaled = information * size * size[:, None]
+    return np.minimum(np.maximum(scaled, -1.0), 1.0), size
 
 
 def _along(
@@ -403,7 +429,7 @@ def _along(
 ) -> tuple[FloatArray, State] | None:
     """Return the first point along the step at which the likelihood is higher."""
     for length in _LENGTHS:
-        trial = np.clip(s + length * step, 0.0, upper)
+        trial = np.minimum(np.maximum(s + length * step, 0.0), upper)
         trial[trial < _LEAST * trial.max(initial=0.0)] = 0.0
         if not trial.any():
             continue

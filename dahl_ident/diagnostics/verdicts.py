@@ -43,6 +43,7 @@ _REMEDY = {
     EXPONENT: "give it if it is known, or measure on both sides of the knee",
     RUNS: "measure on more days or mountings",
 }
+_BY_PRIOR = 0.7  # of a prior's standard deviation: above it, the data say less than the prior
 _NO_DIFFERENCE = 1.0  # of -2 ln L, between two values of which neither is the likelier
 _VECTOR_PART = 0.05  # component of the undetermined direction worth naming
 
@@ -51,6 +52,7 @@ class Verdict(Enum):
     """How well a parameter is determined."""
 
     IDENTIFIED = "identified"
+    BY_PRIOR = "set by its prior"
     WEAK = "weakly identified"
     NOT_IDENTIFIED = "not identified"
 
@@ -61,6 +63,10 @@ class Fit(Protocol):
     @property
     def optimum(self) -> Optimum:
         """The solver's result."""
+
+    @property
+    def first_order(self) -> bool:
+        """Whether there are no profiles."""
 
     def conf_interval(self, method: Any = ...) -> ConfidenceIntervals:
         """Return confidence intervals."""
@@ -159,6 +165,12 @@ class Identifiability:
     def headline(self) -> str:
         """The verdict in one sentence."""
         lost, weak = self.named(Verdict.NOT_IDENTIFIED), self.named(Verdict.WEAK)
+        given = self.named(Verdict.BY_PRIOR)
+        if not lost and not weak and given:
+            others = self.named(Verdict.IDENTIFIED)
+            rest = f"{listed(others)} {'is' if len(others) == 1 else 'are'} identified; "
+            set_by = "is set by its prior" if len(given) == 1 else "are set by their priors"
+            return f"{rest if others else ''}{listed(given)} {set_by}."
         if not lost and not weak:
             return "Every parameter is identified."
         if not lost:
@@ -219,7 +231,7 @@ def identifiability(fit: Fit) -> Identifiability:
     >>> print(identifiability(result).headline)
     Every parameter is identified.
     """
-    return judged(fit.optimum, fit.conf_interval("profile"))
+    return judged(fit.optimum, fit.conf_interval("wald" if fit.first_order else "profile"))
 
 
 def judged(
@@ -245,8 +257,11 @@ def judged(
             u = float(errors.covariance[(errors.names.index(name),) * 2]) ** 0.5 / size
             if verdicts[name] is Verdict.IDENTIFIED and u > IDENTIFIED_BELOW:
                 verdicts[name] = Verdict.WEAK
+    for name in _set_by_prior(optimum, errors):
+        if verdicts[name] is Verdict.IDENTIFIED:
+            verdicts[name] = Verdict.BY_PRIOR
     lost = frozenset(n for n, v in verdicts.items() if v is Verdict.NOT_IDENTIFIED)
-    loose = frozenset(n for n, v in verdicts.items() if v is not Verdict.IDENTIFIED)
+    loose = lost | {n for n, v in verdicts.items() if v is Verdict.WEAK}
     found = _determined(optimum, information, lost, loose)
     parameters = {}
     for i, (name, parameter) in enumerate(zip(problem.names, problem.parameters, strict=True)):
@@ -269,6 +284,13 @@ def judged(
         direction = direction if len(direction) > 1 else {}
     rows = dict(zip(problem.names, shares(optimum), strict=True))
     return Identifiability(parameters, found, information.rank, direction, rows)
+
+
+def _set_by_prior(optimum: Optimum, errors: ErrorModel | None) -> list[str]:
+    """Return the names of parameters on which a prior says more than the data."""
+    stderr = optimum.stderr if errors is None else errors.stderr
+    priors = optimum.problem.priors.items()
+    return [name for name, prior in priors if stderr[name] > _BY_PRIOR * float(prior.std())]
 
 
 def _lost_beyond_noise(
@@ -427,8 +449,6 @@ def _text(
 ) -> str:
     lower = -np.inf if limits.lower == 0.0 else limits.lower
     within = f"{interval_text(lower, limits.upper, unit)} ({percent(limits.level)})"
-    if verdict is Verdict.IDENTIFIED:
-        return f"{name}: {within}, identified"
-    if verdict is Verdict.WEAK:
-        return f"{name}: {within}, weakly identified"
+    if verdict is not Verdict.NOT_IDENTIFIED:
+        return f"{name}: {within}, {verdict.value}"
     return f"{name}: {within}, not determined, {advice(optimum, name, limits, lost)}"

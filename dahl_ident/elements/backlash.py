@@ -27,6 +27,7 @@ from dahl_ident.elements.behaviour import (
     HistoryGradient,
     Mechanics,
     StiffnessGradient,
+    clipped,
 )
 from dahl_ident.elements.element import KINDS, Element, prefixed
 from dahl_ident.elements.friction import Friction
@@ -72,6 +73,7 @@ class Backlash(Friction):
     """
 
     kind = "backlash"
+    start = ("initial_play", "m", "place in the gap at the first sample; beyond it in contact")
     equation = "F = F_element(y), y = x - play, abs(play) <= gap/2; the play moves at F = 0"
 
     def __init__(self, element: Element, gap: float | None = None) -> None:
@@ -104,13 +106,45 @@ class Backlash(Friction):
         return self._element.slope(force, direction, velocity, values[: len(self.parameters) - 1])
 
     def mechanics(
-        self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
+        self,
+        values: Sequence[Any],
+        displacement: Any,
+        velocity: Any,
+        direction: Any,
+        states: Sequence[Any],
     ) -> Mechanics:
-        """Raise ModelError: the position in the gap is a second state."""
-        raise ModelError(
-            f"{self!r} has the position in the gap as a state, so it cannot be driven by a force "
-            "over time; give records with measured displacement and force, and output='force'"
-        )
+        """Return force and its change, none while the gap is crossed; the play moves then."""
+        force, play = states
+        room = 0.5 * values[-1] - direction * play > 0.0
+        crossing = room * (1.0 - (direction * force < 0.0))
+        slope = self.slope(force, direction, velocity, values)
+        return Mechanics(0.0, force, (slope * velocity * (1.0 - crossing), velocity * crossing))
+
+    @property
+    def n_states(self) -> int:
+        """The force, and the place in the gap."""
+        return 2
+
+    def initial_states(self, values: Sequence[Any], start: Any) -> Sequence[Any]:
+        """Return the force and the place in the gap; beyond its ends the element is loaded."""
+        half = 0.5 * values[-1]
+        play = clipped(start, half)
+        return self.slope(0.0, 1.0, 0.0, values) * (start - play), play
+
+    def state_histories(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray,
+        acceleration: FloatArray,
+    ) -> Sequence[FloatArray]:
+        """Return force and place in the gap along a displacement, from the middle."""
+        force = self.force_history(values, displacement)
+        half, place, places = 0.5 * float(values[-1]), 0.0, [0.0]
+        for step, f in zip(np.diff(displacement).tolist(), force[1:].tolist(), strict=True):
+            place = half * np.sign(f) if f else min(max(place + step, -half), half)
+            places.append(place)
+        return force, np.array(places)
 
     def stiffness(
         self,

@@ -34,6 +34,11 @@ STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -2.0 / 3.0), (1.0, 2.0 / 3.0), (2.0, -1.0 
 SOFTENED = 0.01  # share of the stiffness that is gone at the lower knee: seen in data of 1 % noise
 
 
+def clipped(value: Any, limit: Any) -> Any:
+    """Return a value between -limit and limit, in arithmetic that symbols have too."""
+    return 0.5 * (np.fabs(value + limit) - np.fabs(value - limit))
+
+
 class StiffnessGradient(NamedTuple):
     """A dynamic stiffness with its first derivatives; all of one broadcast shape.
 
@@ -79,13 +84,13 @@ class Mechanics(NamedTuple):
         What multiplies the acceleration, kg.
     force
         The rest of the force, N.
-    rate
-        Its change over time, N/s, for an element with memory; 0 for others.
+    rates
+        Changes over time of the element's states, one each.
     """
 
     inertia: Any
     force: Any
-    rate: Any
+    rates: Sequence[Any] = ()
 
 
 @dataclass(frozen=True)
@@ -158,6 +163,8 @@ class Behaviour(ABC):
     like_parts: tuple[tuple[str, ...], ...] = ()
     softens: bool = False
     holds_at_rest: bool = True
+    start: tuple[str, str, str] = ("initial_force", "N", "friction at the first sample")
+    """Name, unit and meaning of the unknown from which the states of a driven motion start."""
     _name: str | None = None
 
     @property
@@ -273,17 +280,43 @@ class Behaviour(ABC):
         return HistoryGradient(value, by_state, tuple(slopes))
 
     def mechanics(
-        self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
+        self,
+        values: Sequence[Any],
+        displacement: Any,
+        velocity: Any,
+        direction: Any,
+        states: Sequence[Any],
     ) -> Mechanics:
         """Return the part in an equation of motion, in plain arithmetic.
 
-        `direction` is the sign of the velocity, `force` the present force of an element with
-        memory.
+        `direction` is the sign of the velocity, `states` what :attr:`n_states` counts: the
+        present force of an element with memory, where it needs no more.
         """
         raise ModelError(
             f"{self!r} has no equation of motion, so it cannot be driven by a force over time; "
             "give records with measured displacement and force"
         )
+
+    @property
+    def n_states(self) -> int:
+        """States in an equation of motion."""
+        return int(self.has_memory)
+
+    def initial_states(self, values: Sequence[Any], start: Any) -> Sequence[Any]:
+        """Return the states at the first sample, in plain arithmetic, from :attr:`start` there."""
+        return (start,) * self.n_states
+
+    def state_histories(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray,
+        acceleration: FloatArray,
+    ) -> Sequence[FloatArray]:
+        """Return the states along a displacement, unchecked, from zero force."""
+        if not self.n_states:
+            return ()
+        return (self.force_history(values, displacement, velocity, acceleration=acceleration),)
 
     def steady_force(
         self, values: Sequence[FloatArray], path: FloatArray, cycles: int
@@ -366,6 +399,15 @@ class Behaviour(ABC):
 
     def universal_curve(self) -> UniversalCurve | None:
         """Return the curve that all values of the scale parameters follow, or None."""
+        return None
+
+    def resembles(
+        self, values: Sequence[float], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[str, float] | None:
+        """Return a simpler law and how far its best N is from this one's at some levels, rms.
+
+        None from a law that has no such relative.
+        """
         return None
 
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:

@@ -25,14 +25,22 @@ from math import exp, expm1, inf, log1p
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.behaviour import HistoryGradient, StiffnessGradient
 from dahl_ident.elements.friction import Friction
+from dahl_ident.elements.half_cycle import angles, multiple, place, transform
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.recursion import linear_recursion, stretches
 
+_BLOCK = 384  # amplitudes in one pass: their arrays, 100 kB, stay in the processor's cache
+_REST = 1e-150  # stands for an amplitude or an exponent of zero
 _FADED = 42.0  # exp(-42) is below rounding
+_NEAR = 0.1  # exponent below which E - 1 is integrated: beyond, E leaves the loss 14 digits
+_PATHS = 2048  # solved together: their arrays stay in the processor's cache
+_EQUAL = 4e-16  # width of a bracket, over l0, that is rounding
+_LAST_STEP = 3e-9  # of l0: Newton's next step would be its square
 _NEWTON = 60  # at most; bisection alone takes 53 to rounding
 _SERIES = 0.02  # where the closed forms have lost 1e-12 to rounding; the next terms are 2e-14
 
@@ -101,7 +109,9 @@ class BoucWen(Friction):
         harmonic: int = 1,
     ) -> ComplexArray:
         """Return F_k/X_1 in closed form up to one quadrature; `omega` does not matter."""
-        return self.stiffness_gradient(values, amplitude, omega, harmonic).value
+        sigma, q, p = values
+        h, *_ = stiffness_over_sigma(amplitude, q, p, harmonic, derivatives=False)
+        return np.asarray(sigma * h)
 
     def stiffness_gradient(
         self,
@@ -115,6 +125,13 @@ class BoucWen(Friction):
         h, by_A, by_q, by_p = stiffness_over_sigma(amplitude, q, p, harmonic)
         h = h + 0.0 * sigma
         return StiffnessGradient(sigma * h, sigma * by_A, (h, sigma * by_q, sigma * by_p))
+
+    def stiffness_slope(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Return F/X of the fundamental and its derivative by amplitude, unchecked."""
+        found = self.stiffness_gradient(values, amplitude, omega)
+        return found.value, found.by_amplitude
 
     def force_history(
         self,
@@ -184,30 +201,58 @@ class BoucWen(Friction):
 
 def zero_path(amplitude: FloatArray, q: FloatArray, p: FloatArray) -> FloatArray:
     """Return l0, the path from a turning point of the steady loop to zero force, m."""
-    shape = np.broadcast_shapes(np.shape(amplitude), np.shape(q), np.shape(p))
-    span, q, p = (np.broadcast_to(v, shape).astype(np.float64) for v in (2.0 * amplitude, q, p))
-    low, high = np.zeros(shape), span.copy()
-    path = 0.5 * span
+    arrays = np.broadcast_arrays(2.0 * np.asarray(amplitude, dtype=np.float64), q, p)
+    span, q, p = (v.ravel() for v in arrays)
+    found = np.zeros(span.shape)
+    for start in range(0, span.size, _PATHS):
+        rows = start + np.flatnonzero(span[start : start + _PATHS] > 0.0)
+        found[rows] = _zero_path(span[rows], q[rows], p[rows])
+    return found.reshape(arrays[0].shape)
+
+
+def _zero_path(span: FloatArray, q: FloatArray, p: FloatArray) -> FloatArray:
+    """Return l0 for the paths `span` > 0 between the turning points, (n,)."""
+    found, going = np.empty(span.shape), np.arange(span.size)
     with np.errstate(all="ignore"):
+        # exact for q = p: there the tip's force is sigma tanh(q A)/q
+        half = np.where(q == 0.0, _REST, 0.5 * q * span)
+        tip = 0.5 * span * np.tanh(half) / half
+        path = tip * _mean_logarithm(np.maximum(p * tip, -0.9))
+        path = np.where((path > 0.0) & (path < span), path, 0.5 * span)
+        low, high = np.zeros(span.shape), span
         for _ in range(_NEWTON):
             rest = span - path
+            up, down = p * path, q * rest
+            one, other = path * _mean_growth(np.abs(up)), rest * _mean_growth(np.abs(down))
             # ln(expm1(p l)/p) - ln((1 - exp(-q m))/q), rising in l
-            excess = np.log(path / rest) + _log_growth(-p * path) - _log_growth(q * rest)
-            slope = 1.0 / (path * _mean_growth(p * path)) + 1.0 / (rest * _mean_growth(-q * rest))
-            low, high = np.where(excess < 0.0, path, low), np.where(excess < 0.0, high, path)
+            excess = np.log(one / other) + np.maximum(up, 0.0) + np.minimum(down, 0.0)
+            slope = np.exp(np.minimum(up, 0.0)) / one + np.exp(-np.maximum(down, 0.0)) / other
+            below = excess < 0.0
+            low, high = np.where(below, path, low), np.where(below, high, path)
             step = excess / slope
             trial = path - step
             inside = (trial >= low) & (trial <= high) & (trial > 0.0) & (trial < span)
-            path = np.where(span > 0.0, np.where(inside, trial, 0.5 * (low + high)), 0.0)
-            if np.all((np.abs(step) <= 4e-15 * path) | (span == 0.0)):
+            settled = (inside & (np.abs(step) <= _LAST_STEP * path)) | (high - low <= _EQUAL * high)
+            path = np.where(inside, trial, 0.5 * (low + high))
+            found[going] = path
+            if settled.all():
                 break
-    return path
+            if 2 * np.count_nonzero(settled) > settled.size:
+                kept = np.flatnonzero(~settled)
+                going = going[kept]
+                span, q, p, path, low, high = (v[kept] for v in (span, q, p, path, low, high))
+    return found
 
 
 def stiffness_over_sigma(
-    amplitude: FloatArray, q: FloatArray, p: FloatArray, harmonic: int
+    amplitude: FloatArray,
+    q: FloatArray,
+    p: FloatArray,
+    harmonic: int,
+    *,
+    derivatives: bool = True,
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
-    """Return N_k/sigma and its derivatives by amplitude, q and p.
+    """Return N_k/sigma and, if wanted, its derivatives by amplitude, q and p.
 
     Parameters
     ----------
@@ -222,58 +267,79 @@ def stiffness_over_sigma(
     -------
     tuple of four ndarray of complex
     """
-    shape = np.broadcast_shapes(np.shape(amplitude), np.shape(q), np.shape(p))
+    arrays = np.broadcast_arrays(amplitude, q, p)
+    shape = arrays[0].shape
     if harmonic % 2 == 0:
         zero = np.zeros(shape, dtype=np.complex128)
         return zero, zero, zero, zero
-    A, q, p = (np.broadcast_to(v, shape)[..., None] for v in (amplitude, q, p))
+    A, q, p = (a.astype(np.float64).ravel() for a in arrays)
     path = zero_path(A, q, p)
-    by_A, by_q, by_p = _zero_path_gradient(A, q, p, path)
-    safe = np.where(A > 0.0, A, 1.0)
-    turn = 2.0 * np.arcsin(np.sqrt(np.clip(np.where(A > 0.0, path / (2.0 * safe), 0.5), 0.0, 1.0)))
-    with np.errstate(all="ignore"):
-        last = (path + _FADED / np.abs(q)) / (2.0 * safe)
-    end = np.where((q > 0.0) & (last < 1.0), 2.0 * np.arcsin(np.sqrt(np.minimum(last, 1.0))), np.pi)
-    # E is 1 in microslip; beside the 1, only E - 1 is integrated, to keep its digits
-    beside = np.where(end == np.pi, 1.0, 0.0)
-    total = [np.zeros(shape, dtype=np.complex128) for _ in range(4)]
-    nodes, weights = _rule(harmonic)
-    for start, stop, rate in ((np.zeros_like(turn), turn, p), (turn, end, q)):
-        half = 0.5 * (stop - start)
-        theta = start + half * (1.0 + nodes)
-        gone = 2.0 * A * np.sin(0.5 * theta) ** 2
-        kernel = half * weights * np.sin(theta) * np.exp(-1j * harmonic * theta)
-        growth = rate * (path - gone)
-        total[0] += (kernel * np.where(beside > 0.0, np.expm1(growth), np.exp(growth))).sum(-1)
-        wave = kernel * np.exp(growth)
-        unloading = rate is p
-        moves = (
-            rate * (by_A - 2.0 * np.sin(0.5 * theta) ** 2),
-            rate * by_q + (0.0 if unloading else path - gone),
-            rate * by_p + (path - gone if unloading else 0.0),
-        )
-        for sum_, move in zip(total[1:], moves, strict=True):
-            sum_ += (wave * move).sum(-1)
-    factor = 2j / (np.pi * harmonic)
-    value, along_A, along_q, along_p = (factor * t for t in total)
+    span = 2.0 * np.maximum(A, _REST)
+    with np.errstate(divide="ignore"):
+        last = np.where(q > 0.0, (path + _FADED / np.abs(q)) / span, 1.0)
+    edges = place(np.stack([np.zeros_like(A), np.where(A > 0.0, path / span, 0.5), last]))
+    middle, half = 0.5 * (edges[1:] + edges[:-1]), 0.5 * (edges[1:] - edges[:-1])
+    # in microslip E is near 1, and only E - 1 is integrated, to keep its digits
+    near = np.maximum(np.abs(p) * path, np.abs(q) * (2.0 * A - path)) < _NEAR
+    total = np.zeros((3, 2, A.size), dtype=np.complex128)
+    for start in range(0, A.size, _BLOCK):
+        rows = slice(start, start + _BLOCK)
+        for part, rate in enumerate((p, q)):
+            total[:, part, rows] = _integrals(
+                middle[part, rows],
+                half[part, rows],
+                rate[rows] * path[rows],
+                2.0 * rate[rows] * A[rows],
+                near[rows],
+                harmonic,
+                derivatives=derivatives,
+            )
+    total *= 2j / (np.pi * harmonic)
+    value = total[0].sum(axis=0)
     if harmonic == 1:
-        value += beside[..., 0]
-    return value, along_A, along_q, along_p
+        value += near
+    by_A, by_q, by_p = np.zeros((3, A.size), dtype=np.complex128)
+    if derivatives:
+        _, first, second = total
+        moves = _zero_path_gradient(A, q, p, path)
+        along_A, along_q, along_p = (move * (p * first[0] + q * first[1]) for move in moves)
+        held = path * first - 2.0 * A * second  # by the rate, the path held
+        by_A = along_A - 2.0 * (p * second[0] + q * second[1])
+        by_q, by_p = along_q + held[1], along_p + held[0]
+    return value.reshape(shape), by_A.reshape(shape), by_q.reshape(shape), by_p.reshape(shape)
 
 
-def loop_force(theta: FloatArray, A: float, sigma: float, q: float, p: float) -> FloatArray:
-    """Return the force of the steady loop at x = A cos(theta), 0 <= theta <= 2 pi, N."""
-    path = float(zero_path(np.asarray(A), np.asarray(q), np.asarray(p)))
-    tip = sigma * path * float(_mean_growth(np.asarray(-p * path)))
-    back = theta <= np.pi
-    gone = 2.0 * A * np.where(back, np.sin(theta / 2.0), np.cos(theta / 2.0)) ** 2
-    after = leg(np.full(theta.shape, -tip), gone, sigma, q, p)
-    return np.where(back, -after, after)
+def _integrals(
+    middle: FloatArray,
+    half: FloatArray,
+    at_tip: FloatArray,
+    falls: FloatArray,
+    near: NDArray[np.bool_],
+    k: int,
+    *,
+    derivatives: bool,
+) -> ComplexArray:
+    """Return Int E sin(theta) exp(-j k theta) dtheta over one part of a branch, (3, n).
 
-
-def leg(start: FloatArray, path: FloatArray, sigma: float, q: float, p: float) -> FloatArray:
-    """Return w = s z after a path >= 0 in the direction s that began at w = `start`."""
-    return _leg(start, path, sigma, q, p)[0]
+    E = exp(at_tip - falls u), u = sin^2(theta/2). First with E - 1 in place of E in rows that are
+    `near`, then with E and with E u, if derivatives are wanted.
+    """
+    nodes, weights = _rule(k)
+    versed, sine, width = angles(middle + half * nodes)  # (nodes, n)
+    real, imag = multiple(versed, sine, k)
+    growth = at_tip - falls * versed
+    kernel = sine * width
+    kernel *= half * weights
+    weight = kernel * np.exp(growth)
+    found = np.zeros((3, half.size), dtype=np.complex128)
+    found[:2] = transform(weight, real, imag)
+    if near.any():
+        kernel = kernel[:, near] * np.expm1(growth[:, near])
+        found[0, near] = transform(kernel, real[:, near], imag[:, near])
+    if derivatives:
+        weight *= versed
+        found[2] = transform(weight, real, imag)
+    return found
 
 
 def force_history(
@@ -303,7 +369,7 @@ def force_history(
     legs = stretches(displacement)
     at_turns = _turning_forces(legs.heading, legs.length, sigma, q, p, initial_force)
     w = legs.spread(legs.heading * at_turns)
-    force = legs.spread(legs.heading) * leg(w, legs.path, sigma, q, p)
+    force = legs.spread(legs.heading) * _leg(w, legs.path, sigma, q, p)[0]
     force[0] = initial_force
     return force
 
@@ -387,14 +453,14 @@ def _leg(
 @lru_cache(maxsize=64)
 def _rule(harmonic: int) -> tuple[FloatArray, FloatArray]:
     """Return Gauss points for each part of a branch; with fewer the harmonic loses digits."""
-    return np.polynomial.legendre.leggauss(32 + harmonic)
+    nodes, weights = np.polynomial.legendre.leggauss(32 + harmonic)
+    return nodes[:, None], weights[:, None]
 
 
 def _mean_growth(y: FloatArray) -> FloatArray:
     """Return (1 - exp(-y))/y, 1 at 0."""
-    y = np.asarray(y, dtype=np.float64)
-    mean = np.divide(np.expm1(-y), y, out=np.full(np.shape(y), -1.0), where=y != 0.0)
-    return np.asarray(-mean)
+    y = np.where(np.asarray(y) == 0.0, _REST, y)
+    return np.asarray(np.expm1(-y) / -y)
 
 
 def _mean_growth_slope(y: FloatArray) -> FloatArray:

@@ -45,6 +45,8 @@ from dahl_ident.elements.bouc_wen import BoucWen
 from dahl_ident.elements.element import Alternative, Element
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.iwan import Iwan
+from dahl_ident.elements.lugre import LuGre
+from dahl_ident.elements.maxwell_slip import MaxwellSlip
 from dahl_ident.elements.parameter import Assumed, Parameter
 from dahl_ident.errors import ValidationError
 
@@ -53,6 +55,7 @@ if TYPE_CHECKING:
 
 _EXPONENTS = (1e-9, 1e3)  # beyond them the loop is that of the limit, to rounding
 _ALPHA = Assumed(1.0)  # linear Dahl, the law of the closed forms; a user may give another
+_JENKINS = 3  # elements of Maxwell slip beside Dahl: six numbers, more than most tables tell
 _AT_REST = 1e-30
 """Smaller beta are rest, to more digits than a number has."""
 _NO_LOSS, _MICROSLIP, _GROSS_SLIP = 1e9, 1e5, 1e-16
@@ -414,6 +417,8 @@ class Dahl(Friction):
             (BoucWen(name=name).started((sigma, sigma / f_max, sigma / f_max)),)
         )
         found["Iwan"] = Alternative((Iwan(name=name).started((f_max, sigma, 0.0, 0.5)),))
+        found["LuGre"] = Alternative((LuGre(name=name),), "speed")
+        found["Maxwell slip"] = Alternative((MaxwellSlip(_JENKINS, name=name),), "masing")
         if not isinstance(self, _AsymmetricDahl):
             both = Backlash(limits).started((f_max, sigma, 1.0, 0.01, gap))
             found["two limits and gap"] = Alternative((both,), "asymmetry")

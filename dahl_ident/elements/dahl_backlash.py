@@ -8,8 +8,8 @@ y1 = ln(1 + f0), where the gap is crossed. So (partial integration, odd k)
     N_k/sigma = (2 j/(pi k beta)) (1 + f0) Int_0^(2 (beta - eta)) exp(-y - j k theta) dy,
 
 with beta (1 - cos theta) = y before the gap and y + 2 eta beyond it. Both parts are integrated by
-Gauss points over theta, where exp(-y) spans few decades: the first part ends at exp(-y) >= 1/2,
-the second where exp(-y) is below rounding.
+Gauss points over tan(theta/4), where exp(-y) spans few decades: the first part ends at
+exp(-y) >= 1/2, the second where exp(-y) is below rounding.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from __future__ import annotations
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements.half_cycle import angles, multiple, place, transform
 
-_BLOCK = 128  # amplitudes in one pass: their arrays stay in the processor's cache
-_RULES = tuple(np.polynomial.legendre.leggauss(n) for n in (16, 28))
+_BLOCK = 512  # amplitudes in one pass: their arrays stay in the processor's cache
+_RULES = tuple(np.array(np.polynomial.legendre.leggauss(n))[..., None] for n in (16, 28))
 """Gauss points before and behind the gap; with 10 before it, derivatives err by 1e-5."""
 
 _FADED = 42.0  # exp(-42) is below rounding
@@ -67,41 +68,32 @@ def _integrals(
     ends = np.minimum(span, y1 + _FADED)
     # sin^2(theta/2) where each part begins and ends
     versed = 0.5 * np.stack([np.zeros_like(y1), y1, y1 + 2.0 * eta, ends + 2.0 * eta]) / beta
-    theta = 2.0 * np.arcsin(np.sqrt(np.minimum(versed, 1.0)))
-    total, fixed, moved, beyond = (np.zeros(beta.shape, dtype=np.complex128) for _ in range(4))
+    edges = place(versed)
+    total, moved, beyond = (np.zeros(beta.shape, dtype=np.complex128) for _ in range(3))
     for (nodes, weights), begin, stop, gap in zip(
-        _RULES, theta[::2], theta[1::2], (0.0 * eta, 2.0 * eta), strict=True
+        _RULES, edges[::2], edges[1::2], (0.0 * eta, 2.0 * eta), strict=True
     ):
         half = 0.5 * (stop - begin)
-        place = begin[:, None] + half[:, None] * (1.0 + nodes)
-        half_versed = np.sin(0.5 * place) ** 2
-        cosine, sine = 1.0 - 2.0 * half_versed, 2.0 * np.sqrt(half_versed * (1.0 - half_versed))
-        fade = np.exp(gap[:, None] - 2.0 * beta[:, None] * half_versed)
-        fade *= half[:, None] * weights
-        real, imag = (cosine, sine) if k == 1 else (np.cos(k * place), np.sin(k * place))
-        # Int exp(-y - j k theta) times sin theta, 1 and cos theta
-        total += beta * _wave(fade * sine, real, imag)
+        versed, sine, width = angles(begin + half * (1.0 + nodes))  # (nodes, n)
+        fade = np.exp(gap - 2.0 * beta * versed)
+        fade *= half * weights * width
+        real, imag = multiple(versed, sine, k)
+        # Int exp(-y - j k theta) times sin theta, 1 and 1 - cos theta
+        total += beta * transform(fade * sine, real, imag)
         if not derivatives:
             continue
-        plain = _wave(fade, real, imag)
-        fixed += plain
-        moved += _wave(fade * cosine, real, imag)
-        beyond = plain  # in the end that of the second part
+        moved += 2.0 * transform(fade * versed, real, imag)
+        beyond = transform(fade, real, imag)  # in the end that of the second part
     factor = 2j / (np.pi * k * beta)
     value = factor * (1.0 + f0) * total
     if not derivatives:
-        return value, fixed, moved
+        return value, moved, beyond
     grown = (1.0 + f0) * (1.0 - f0)  # of f0 by beta - eta
     last = 2.0 * np.exp(-span) * (-1.0) ** k
-    jump = np.exp(-y1) * (np.exp(-1j * k * theta[1]) - np.exp(-1j * k * theta[2])) * (1.0 - f0)
+    versed, sine, _ = angles(edges[1:3])
+    real, imag = multiple(versed, sine, k)
+    jump = np.exp(-y1) * (real[0] - real[1] - 1j * (imag[0] - imag[1])) * (1.0 - f0)
     common = grown * total + (1.0 + f0) * (last + jump)  # by beta - eta, theta held
-    by_beta = factor * (common + (1.0 + f0) * 1j * k * (fixed - moved)) - value / beta
+    by_beta = factor * (common + (1.0 + f0) * 1j * k * moved) - value / beta
     by_eta = factor * (-common - (1.0 + f0) * 2j * k * beyond)
     return value, by_beta, by_eta
-
-
-def _wave(weight: FloatArray, real: FloatArray, imag: FloatArray) -> ComplexArray:
-    """Return the sum over nodes of weight exp(-j k theta)."""
-    return np.asarray(
-        np.einsum("rn,rn->r", weight, real) - 1j * np.einsum("rn,rn->r", weight, imag)
-    )

@@ -54,9 +54,10 @@ class Alternative(NamedTuple):
     ----------
     elements : tuple of Element
         In parallel.
-    shows : {"shape", "asymmetry"}
-        What of the data speaks for them: how force depends on amplitude and the odd harmonics,
-        or the mean force and the even harmonics.
+    shows : {"shape", "asymmetry", "speed", "masing"}
+        What of the data speaks for them: how force depends on amplitude and the odd harmonics;
+        the mean force and the even harmonics; a force that falls with the speed; or parallel
+        Jenkins elements that would leave much less.
     """
 
     elements: tuple[Element, ...]

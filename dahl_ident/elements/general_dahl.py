@@ -1,4 +1,4 @@
-r"""Dahl friction with any exponent, in normalised variables: the loop, its harmonics, a table.
+r"""Dahl friction with any exponent, in normalised variables: the loop and its harmonics.
 
 Eqn. 2 on a stretch of one direction reads ``dz/dd = -z^alpha``: z = 1 - s F/f_max is the
 distance to full slip (s the direction of motion), d = sigma path / f_max the path. Everything
@@ -49,10 +49,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial import Chebyshev, Polynomial
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray, array_between, positive_number
+from dahl_ident.arrays import ComplexArray, FloatArray
 
 _LEAST_BETA = 1e-200
 """Smaller loops are computed as one of this size, whose curvature underflows to zero."""
@@ -165,121 +164,6 @@ def turning_force(beta: FloatArray, alpha: FloatArray) -> FloatArray:
     """
     closure = _close_loop(np.maximum(beta, _LEAST_BETA), alpha)
     return np.where(beta < _LEAST_BETA, beta, np.tanh(closure.length / 2.0))
-
-
-class DescribingFunctionTable:
-    """h(beta) at one exponent from piecewise polynomials over ln beta, for many amplitudes.
-
-    Each panel interpolates at Chebyshev nodes; panels are halved until the Chebyshev
-    coefficients have fallen below 1e-10, so they crowd where full slip sets in. Values hold to
-    1e-10 of their modulus, and so do derivatives; only for alpha < 1/2 and within 1e-7 of the
-    onset of slip, where they turn infinitely fast, do derivatives lose all but a few digits.
-
-    Parameters
-    ----------
-    alpha : float
-        Exponent of Eqn. 2, > 0.
-    beta_min, beta_max : float
-        The range that the table covers, ``0 < beta_min < beta_max``.
-
-    Raises
-    ------
-    ValidationError
-        If a parameter is not a positive number or the range is empty; on use, if an amplitude
-        lies outside the range.
-
-    Examples
-    --------
-    >>> table = DescribingFunctionTable(2.0)
-    >>> table(np.array([1.0, 10.0])).round(6)
-    array([0.544039+0.354193j, 0.044846+0.103836j])
-    """
-
-    def __init__(self, alpha: float, beta_min: float = 1e-6, beta_max: float = 1e6) -> None:
-        self.alpha = positive_number(alpha, "alpha")
-        self.beta_min = positive_number(beta_min, "beta_min")
-        self.beta_max = float(array_between(beta_max, "beta_max", self.beta_min, np.inf))
-        panels = _fit_panels(self.alpha, *np.log([self.beta_min, self.beta_max]))
-
-        from scipy.interpolate import PPoly  # here, because it would slow down every import
-
-        self._value = PPoly(panels.value, panels.edges)
-        self._slope = PPoly(panels.slope, panels.edges)
-
-    def __call__(self, beta: FloatArray) -> ComplexArray:
-        """Return h = N/sigma at `beta`, an array within the range."""
-        beta = self._checked(beta)
-        return np.asarray(self._value(np.log(beta)) / (1.0 + beta))
-
-    def gradient(self, beta: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """Return h and ``beta dh/dbeta`` at `beta`, an array within the range."""
-        beta = self._checked(beta)
-        ln_beta, scale = np.log(beta), 1.0 / (1.0 + beta)
-        value, slope = self._value(ln_beta), self._slope(ln_beta)
-        return np.asarray(value * scale), np.asarray(slope * (beta * scale**2))
-
-    def _checked(self, beta: FloatArray) -> FloatArray:
-        return array_between(beta, "beta", self.beta_min, self.beta_max)
-
-
-_DEGREE = 12  # 18 panels from beta = 1e-3 to 1e3 at alpha = 1.7; degree 8 takes 48, 16 still 15
-_TOLERANCE = 1e-10  # of a panel's last two Chebyshev coefficients; values are of order one
-_NARROWEST = 1e-8  # a panel in ln beta; only a singularity asks for less
-
-
-class _Panels(NamedTuple):
-    """Edges over ln beta, and the coefficients that PPoly takes (powers falling, panels).
-
-    Of h (1 + beta) and of h' (1 + beta)^2, which are of order one at all amplitudes.
-    """
-
-    edges: FloatArray
-    value: ComplexArray
-    slope: ComplexArray
-
-
-def _fit_panels(alpha: float, low: float, high: float) -> _Panels:
-    """Halve panels over ln beta until each is a polynomial to the tolerance."""
-    nodes, to_chebyshev, to_powers = _panel_rule()
-    edges = _first_edges(alpha, low, high)
-    left, width = edges[:-1], np.diff(edges)
-    fitted = []
-    while left.size:
-        beta = np.exp(left[:, None] + width[:, None] * nodes)
-        h, minus_slope, _, _ = describing_function_gradient(beta, np.asarray(alpha))
-        scaled = np.stack([h * (1.0 + beta), -minus_slope * (1.0 + beta) ** 2 / beta], axis=1)
-        series = scaled @ to_chebyshev
-        good = np.abs(series[..., -2:]).max(axis=(1, 2)) < _TOLERANCE
-        good |= width < _NARROWEST
-        powers = series[good] @ to_powers / width[good, None, None] ** np.arange(_DEGREE + 1)
-        fitted.append((left[good], powers))
-        left, width = left[~good], width[~good] / 2.0
-        left, width = np.concatenate([left, left + width]), np.tile(width, 2)
-
-    starts, powers = (np.concatenate(parts) for parts in zip(*fitted, strict=True))
-    order = np.argsort(starts)
-    value, slope = powers[order].transpose(1, 2, 0)[:, ::-1]
-    return _Panels(np.append(starts[order], high), value, slope)
-
-
-def _first_edges(alpha: float, low: float, high: float) -> FloatArray:
-    """Return edges about 1 apart, one of them where full slip sets in."""
-    edges = np.linspace(low, high, 2 + int(high - low))
-    if alpha >= 1.0:
-        return edges
-    onset = -alpha * np.log(2.0) - np.log1p(-alpha)
-    return np.sort(np.append(edges, onset)) if low < onset < high else edges
-
-
-@lru_cache
-def _panel_rule() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return Chebyshev nodes on (0, 1), and matrices from values to series to powers."""
-    nodes = (1.0 - np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))) / 2.0
-    basis = [Chebyshev.basis(n, domain=[0.0, 1.0]) for n in range(_DEGREE + 1)]
-    to_powers = np.zeros((_DEGREE + 1, _DEGREE + 1))
-    for n, polynomial in enumerate(basis):
-        to_powers[n, : n + 1] = polynomial.convert(kind=Polynomial).coef
-    return nodes, np.linalg.inv([polynomial(nodes) for polynomial in basis]), to_powers
 
 
 class _Closure(NamedTuple):

@@ -91,12 +91,17 @@ class Lumped(Element):
         return motion(history, name, displacement, self)
 
     def mechanics(
-        self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
+        self,
+        values: Sequence[Any],
+        displacement: Any,
+        velocity: Any,
+        direction: Any,
+        states: Sequence[Any],
     ) -> Mechanics:
         """Return p as inertia, or p times the displacement or velocity as force."""
         if self.order == 2:
-            return Mechanics(values[0], 0.0, 0.0)
-        return Mechanics(0.0, values[0] * (displacement, velocity)[self.order], 0.0)
+            return Mechanics(values[0], 0.0)
+        return Mechanics(0.0, values[0] * (displacement, velocity)[self.order])
 
     def rational_stiffness(self) -> tuple[FloatArray, FloatArray]:
         """Return p s^n over 1."""

@@ -148,7 +148,12 @@ class LinearSystem(Element):
         raise self._no_time()
 
     def mechanics(
-        self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
+        self,
+        values: Sequence[Any],
+        displacement: Any,
+        velocity: Any,
+        direction: Any,
+        states: Sequence[Any],
     ) -> Mechanics:
         """Raise ModelError, as :meth:`force_history`."""
         raise self._no_time()

@@ -97,11 +97,17 @@ class LuGre(Friction):
         return force + (micro_damping / sigma * slope + viscous) * velocity
 
     def mechanics(
-        self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
+        self,
+        values: Sequence[Any],
+        displacement: Any,
+        velocity: Any,
+        direction: Any,
+        states: Sequence[Any],
     ) -> Mechanics:
         """Return the whole force, and the change over time of the bristles' force."""
+        (force,) = states
         slope = self.slope(force, direction, velocity, values)
-        return Mechanics(0.0, self.output(force, slope, velocity, values), slope * velocity)
+        return Mechanics(0.0, self.output(force, slope, velocity, values), (slope * velocity,))
 
     def force_history(
         self,
@@ -153,6 +159,15 @@ class LuGre(Friction):
             Asymptote("creeping", "all speeds below Stribeck's", slow, None,
                       {"stribeck_speed": np.inf}, static),
         )  # fmt: skip
+
+    def resembles(
+        self, values: Sequence[float], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[str, float] | None:
+        """Return linear Dahl with a damper, and the distance from it."""
+        if not np.all(np.isfinite(values)):
+            return None
+        known = LuGre(*values, name=self.name)
+        return "linear Dahl with a damper", known.distance_from_dahl(amplitude, omega)
 
     def distance_from_dahl(self, amplitude: FloatArray, omega: FloatArray) -> float:
         """Return the misfit of the best linear Dahl law with a damper to this law's N.

@@ -52,12 +52,18 @@ class Masing(Friction):
         )
 
     def mechanics(
-        self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
+        self,
+        values: Sequence[Any],
+        displacement: Any,
+        velocity: Any,
+        direction: Any,
+        states: Sequence[Any],
     ) -> Mechanics:
-        """Raise ModelError: an equation of motion needs one state for each element."""
+        """Raise ModelError: every Jenkins element would be a state."""
         raise ModelError(
             f"{self!r} remembers more than its present force, so it cannot be driven by a force "
-            "over time; give records with measured displacement and force"
+            "over time; use MaxwellSlip with a few slip displacements, or give records with "
+            "measured displacement and force"
         )
 
     def force_history(

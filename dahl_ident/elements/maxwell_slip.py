@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray, positive_array, whole_number
-from dahl_ident.elements.behaviour import StiffnessGradient
-from dahl_ident.elements.element import Element, prefixed
+from dahl_ident.elements.behaviour import Mechanics, StiffnessGradient, clipped
+from dahl_ident.elements.element import Element, Value, prefixed
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ValidationError
@@ -104,6 +104,50 @@ class MaxwellSlip(Masing):
         forces = [k * np.minimum(displacement, d) for k, d in zip(stiffnesses, slips, strict=True)]
         return np.asarray(sum(forces))
 
+    @property
+    def n_states(self) -> int:
+        """The force of every spring is a state."""
+        return len(self.parameters) // 2
+
+    def mechanics(
+        self,
+        values: Sequence[Any],
+        displacement: Any,
+        velocity: Any,
+        direction: Any,
+        states: Sequence[Any],
+    ) -> Mechanics:
+        """Return the springs' forces, and their changes: none for a spring that slips."""
+        rates = [
+            k * velocity * (k * d - direction * force > 0.0)
+            for k, d, force in zip(*self._split(values), states, strict=True)
+        ]
+        return Mechanics(0.0, sum(states), rates)
+
+    def initial_states(self, values: Sequence[Any], start: Any) -> Sequence[Any]:
+        """Return the springs' forces where the backbone curve, loaded from rest, has a force."""
+        stiffnesses, slips = self._split(values)
+        place: Any = 0.0
+        reached, sticking, rest = place, sum(stiffnesses), start
+        for k, d in zip(stiffnesses, slips, strict=True):
+            taken = clipped(rest, sticking * (d - reached))
+            place, rest = place + taken / sticking, rest - taken
+            reached, sticking = d, sticking - k
+        return [k * clipped(place, d) for k, d in zip(stiffnesses, slips, strict=True)]
+
+    def state_histories(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray,
+        acceleration: FloatArray,
+    ) -> Sequence[FloatArray]:
+        """Return the springs' forces along a displacement, unchecked, loaded from rest."""
+        return [
+            MaxwellSlip([1.0]).force_history(pair, displacement)
+            for pair in zip(*self._split(values), strict=True)
+        ]
+
     def stiffness(
         self,
         values: Sequence[FloatArray],
@@ -153,9 +197,8 @@ class MaxwellSlip(Masing):
         slips = np.array(np.broadcast_arrays(*self._split(values)[1]))
         return slips.min(axis=0), slips.max(axis=0)
 
-    def _split(
-        self, values: Sequence[FloatArray]
-    ) -> tuple[Sequence[FloatArray], Sequence[FloatArray]]:
+    @staticmethod
+    def _split(values: Sequence[Value]) -> tuple[Sequence[Value], Sequence[Value]]:
         n = len(values) // 2
         return values[:n], values[n:]
 

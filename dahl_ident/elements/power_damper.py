@@ -145,6 +145,15 @@ class PowerDamper(Element):
             N, by_amplitude, (unit, np.asarray(by_p, np.complex128), -p / speed * N)
         )
 
+    def stiffness_slope(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Return F/X of the fundamental and its derivative by amplitude, unchecked."""
+        N = self.stiffness(values, amplitude, omega)
+        with np.errstate(all="ignore"):
+            slope = np.where(amplitude > 0.0, (values[1] - 1.0) * N / amplitude, 0.0)
+        return N, np.asarray(slope, dtype=np.complex128)
+
     def force_history(
         self,
         values: Sequence[FloatArray | float],
@@ -178,12 +187,17 @@ class PowerDamper(Element):
         return HistoryGradient(np.asarray(c * unit), np.zeros(unit.shape), by)
 
     def mechanics(
-        self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
+        self,
+        values: Sequence[Any],
+        displacement: Any,
+        velocity: Any,
+        direction: Any,
+        states: Sequence[Any],
     ) -> Mechanics:
         """Return the force; within 1e-6 of the reference speed from rest it is smooth."""
         c, p, speed = values
         ratio = velocity / speed
-        return Mechanics(0.0, c * ratio * (ratio * ratio + _AT_REST) ** (0.5 * (p - 1.0)), 0.0)
+        return Mechanics(0.0, c * ratio * (ratio * ratio + _AT_REST) ** (0.5 * (p - 1.0)))
 
     def casadi_stiffness(
         self, values: Sequence[ca.SX], amplitude: ca.SX, omega: ca.SX, harmonic: int = 1
@@ -207,6 +221,9 @@ class PowerDamper(Element):
 
 def _share(p: FloatArray, k: int) -> FloatArray:
     """Return 2 I_k(p)/pi, the harmonic of sin^p over its height."""
+    p = np.asarray(p)
+    if p.size > 1 and np.all(p == p.flat[0]):  # of one parameter vector at many points
+        return np.broadcast_to(_share(p.ravel()[:1], k), p.shape)
     sign = (-1.0) ** ((k - 1) // 2)
     upper, lower = rgamma((p + k) / 2.0 + 1.0), rgamma((p - k) / 2.0 + 1.0)
     return np.asarray(2.0 * sign * gamma(p + 1.0) * 2.0**-p * upper * lower)

@@ -23,6 +23,8 @@ from dahl_ident.arrays import (
 from dahl_ident.elements import force_curve
 from dahl_ident.elements.behaviour import (
     SOFTENED,
+    STENCIL,
+    STEP,
     HistoryGradient,
     Mechanics,
     StiffnessGradient,
@@ -99,10 +101,17 @@ class SlopeLaw(Element):
             ) from error
 
     def mechanics(
-        self, values: Sequence[Any], displacement: Any, velocity: Any, direction: Any, force: Any
+        self,
+        values: Sequence[Any],
+        displacement: Any,
+        velocity: Any,
+        direction: Any,
+        states: Sequence[Any],
     ) -> Mechanics:
         """Return the present force, and its change over time: slope times velocity."""
-        return Mechanics(0.0, force, self.slope(force, direction, velocity, values) * velocity)
+        (force,) = states
+        slope = self.slope(force, direction, velocity, values)
+        return Mechanics(0.0, force, (slope * velocity,))
 
     def stiffness(
         self,
@@ -135,8 +144,10 @@ class SlopeLaw(Element):
     ) -> ComplexArray:
         """Return F_k/X_1 of a velocity-dependent law, by collocation."""
         values, A, shape, _ = _flat(values, amplitude, omega)
+        if not self.answers(harmonic):
+            return np.zeros(shape, dtype=np.complex128)
         w = np.broadcast_to(omega, shape).ravel().astype(np.float64)
-        A = np.maximum(A, _SMALLEST)
+        values, A, w, which = _distinct(values, np.maximum(A, _SMALLEST), w)
         result = np.empty(A.shape, dtype=np.complex128)
         for start in range(0, A.size, _RATED_BLOCK):
             rows = np.arange(start, min(start + _RATED_BLOCK, A.size))
@@ -144,7 +155,51 @@ class SlopeLaw(Element):
             with np.errstate(invalid="ignore"):  # NaN where there is no settled loop
                 force = self.output(loop.force, loop.slope, loop.velocity, own)
                 result[rows] = loop.coefficients(np.asarray(force), harmonic) / A[rows]
-        return result.reshape(shape)
+        return result[which].reshape(shape)
+
+    def _rated_gradient(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int,
+        wanted: Sequence[int],
+    ) -> StiffnessGradient:
+        """Return F_k/X_1 with the derivatives `wanted` by parameters, P the amplitude; 0 others.
+
+        The slope's and the force's own derivatives are central differences of fourth order.
+        """
+        values, A, shape, _ = _flat(values, amplitude, omega)
+        w = np.broadcast_to(omega, shape).ravel().astype(np.float64)
+        values, A, w, which = _distinct(values, np.maximum(A, _SMALLEST), w)
+        P = len(values)
+        found = np.zeros((P + 2, A.size), dtype=np.complex128)
+        for start in range(0, A.size if self.answers(harmonic) else 0, _RATED_BLOCK):
+            rows = np.arange(start, min(start + _RATED_BLOCK, A.size))
+            loop, own = self._rated(values, A, w, rows)
+            rates = np.zeros((rows.size, len(wanted), loop.theta.size))
+            with np.errstate(invalid="ignore", over="ignore"):
+                for column, i in enumerate(wanted):
+                    for place, weight in STENCIL:
+                        v, at, _ = _moved(loop, own, i, place * STEP)
+                        rates[:, column] += weight * self.slope(loop.force, loop.direction, v, at)
+                    rates[:, column] /= _moved(loop, own, i, STEP)[2]
+                    rates[:, column] += loop.slope if i == P else 0.0
+                changes = loop.changed(A[rows], rates)
+                for column, i in enumerate(wanted):
+                    change = np.zeros(loop.force.shape)
+                    for place, weight in STENCIL:
+                        v, at, step = _moved(loop, own, i, place * STEP)
+                        force = loop.force + step * changes[:, column]
+                        slope = self.slope(force, loop.direction, v, at)
+                        change += weight * np.asarray(self.output(force, slope, v, at))
+                    change /= _moved(loop, own, i, STEP)[2]
+                    found[1 + i, rows] = loop.coefficients(change, harmonic) / A[rows]
+                whole = self.output(loop.force, loop.slope, loop.velocity, own)
+                found[0, rows] = loop.coefficients(np.asarray(whole), harmonic) / A[rows]
+        found[P + 1] = (found[P + 1] - found[0]) / A  # of F_k/A
+        value, *by = (part[which].reshape(shape) for part in found)
+        return StiffnessGradient(value, by[P], tuple(by[:P]))
 
     def _rated(
         self, values: Sequence[FloatArray], A: FloatArray, w: FloatArray, rows: Rows
@@ -171,15 +226,17 @@ class SlopeLaw(Element):
     ) -> StiffnessGradient:
         """Return F_k/X_1 with its derivatives, by central differences of fourth order.
 
-        Two parameters need none where the units of all agree with the law: N is then homogeneous
-        in the unit of force and in that of displacement, and Euler's theorem gives the two from
-        the others. Derivatives by parameters that are fixed may be left at zero, which no estimate
-        looks at.
+        Those of a velocity-dependent law are from the variational equation. Else two parameters
+        need none where the units of all agree with the law: N is then homogeneous in the unit of
+        force and in that of displacement, and Euler's theorem gives the two from the others.
+        Derivatives by parameters that are fixed may be left at zero, which no estimate looks at.
         """
-        value = self.stiffness(values, amplitude, omega, harmonic)
-        arguments = [np.asarray(v) for v in values] + [np.asarray(amplitude)]
         P = len(values)
         wanted = {P, *(i for i, p in enumerate(self.parameters) if p.free)}
+        if not self.rate_independent:
+            return self._rated_gradient(values, amplitude, omega, harmonic, sorted(wanted))
+        value = self.stiffness(values, amplitude, omega, harmonic)
+        arguments = [np.asarray(v) for v in values] + [np.asarray(amplitude)]
         powers, pair = self._scaled_pair(arguments)
         others = {i for i, row in enumerate(powers) if any(row)} - {*pair}
         fewer = (wanted | others) - {*pair}
@@ -240,6 +297,9 @@ class SlopeLaw(Element):
         self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
     ) -> tuple[ComplexArray, ComplexArray]:
         """Return F/X of the fundamental and its derivative by amplitude, unchecked."""
+        if not self.rate_independent:
+            found = self._rated_gradient(values, amplitude, omega, 1, [len(values)])
+            return found.value, found.by_amplitude
         value = self.stiffness(values, amplitude, omega)
 
         def at(moved: FloatArray) -> ComplexArray:
@@ -461,6 +521,27 @@ def _flat(
     batch = np.broadcast_shapes(*(v.shape for v in arrays))
     owner = np.broadcast_to(np.arange(math.prod(batch)).reshape(batch), shape).ravel()
     return flat, np.broadcast_to(amplitude, shape).ravel().astype(np.float64), shape, owner
+
+
+def _distinct(
+    values: Sequence[FloatArray], A: FloatArray, omega: FloatArray
+) -> tuple[list[FloatArray], FloatArray, FloatArray, Rows]:
+    """Return values, amplitudes and frequencies without repeated rows, and every row's place."""
+    columns = [A, omega, *(v for v in values if v.ndim)]
+    _, first, which = np.unique(
+        np.column_stack(columns), axis=0, return_index=True, return_inverse=True
+    )
+    return _rows(values, first), A[first], omega[first], which.ravel()
+
+
+def _moved(
+    loop: RatedLoop, values: list[FloatArray], i: int, share: float
+) -> tuple[FloatArray, list[FloatArray], FloatArray]:
+    """Return velocity and values with one greater by a share, and by how much; last the speed."""
+    if i == len(values):
+        return loop.velocity * (1.0 + share), values, np.asarray(share)
+    step = share * np.where(values[i] == 0.0, 1.0, np.abs(values[i]))
+    return loop.velocity, [*values[:i], values[i] + step, *values[i + 1 :]], step
 
 
 def _rows(values: Sequence[FloatArray], rows: NDArray[Any]) -> list[FloatArray]:

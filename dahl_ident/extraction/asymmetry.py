@@ -18,7 +18,7 @@ from scipy.special import fdtri
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 
 EVEN = (2, 4, 6, 8)  # the lowest harmonics, which are the largest
-_BY_CHANCE = 1e-4  # of symmetric points, how many seem asymmetric at most
+BY_CHANCE = 1e-4  # of symmetric points, how many seem asymmetric at most
 _LEAST = 1e-3  # of the fundamental: smaller even harmonics do not matter
 
 
@@ -49,6 +49,6 @@ def asymmetry(
     distorted = float(np.sqrt(np.sum(displacement**2)))
     explained = np.maximum(orders**2 * displacement + distorted, _LEAST)
     excess = np.maximum(np.abs(force) - explained, 0.0) ** 2 / np.maximum(variance, TINY)
-    if np.mean(excess) <= fdtri(2 * orders.size, float(np.min(dof)), 1.0 - _BY_CHANCE):
+    if np.mean(excess) <= fdtri(2 * orders.size, float(np.min(dof)), 1.0 - BY_CHANCE):
         return 0.0
     return float(np.sqrt(np.maximum(np.sum(np.abs(force) ** 2 - variance), 0.0)))

@@ -19,12 +19,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.special import fdtri
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.data.plausibility import creates_energy
 from dahl_ident.errors import ExtractionError
 from dahl_ident.extraction.aliasing import alias_error, aliases_unseen
-from dahl_ident.extraction.asymmetry import EVEN, asymmetry
+from dahl_ident.extraction.asymmetry import BY_CHANCE, EVEN, asymmetry
 from dahl_ident.extraction.block_means import Samples
 from dahl_ident.extraction.cycles import scattered
 from dahl_ident.extraction.line_noise import CYCLES_FOR_SCATTER, LineNoise, line_noise
@@ -210,11 +211,25 @@ class _Phasors:
     def noise_of(self, harmonic: int) -> LineNoise:
         return self.noise[self.noise_orders.index(harmonic)]
 
-    def force_variance(self, harmonic: int) -> float:
-        """Return E abs(error)^2 of a force phasor."""
-        noise = float(self.noise_of(harmonic).matrix[1, 1].real)
-        repeating = float(self.repeating_errors(harmonic)[1])
-        return noise * self.fit.phasor_variance(harmonic) + repeating**2
+    def variance(self, harmonic: int) -> FloatArray:
+        """Return E abs(error)^2 of the phasors of the motion channel and the force, shape (2,)."""
+        noise = np.diagonal(self.noise_of(harmonic).matrix).real
+        repeating = self.repeating_errors(harmonic)
+        return np.asarray(noise * self.fit.phasor_variance(harmonic) + repeating**2)
+
+    @cached_property
+    def distorted(self) -> float:
+        """Return the displacement's harmonics beyond its noise over its fundamental.
+
+        To a harmonic of the force each adds about the stiffness times its own size: all of it in
+        a linear device, and of harmonics other than its own in friction.
+        """
+        power = 0.0
+        for k in (k for k in self.noise_orders if k > 1):
+            size, variance = abs(self.fit.phasors(k)[0]), float(self.variance(k)[0])
+            if size**2 > fdtri(2, self.noise_of(k).dof, 1.0 - BY_CHANCE) * variance:
+                power += (size**2 - variance) / k ** (2 * self.settings.integrations)
+        return float(np.sqrt(power) / abs(self.fit.phasors(1)[0]))
 
     def forgotten(self, harmonic: int) -> float:
         """Return the standard deviation that the transient's size leaves in a force phasor."""
@@ -441,16 +456,19 @@ def _fundamental(phasors: _Phasors) -> tuple[complex, FloatArray, FloatArray, fl
     )
 
 
-def _harmonic(phasors: _Phasors, k: int) -> tuple[complex, FloatArray, FloatArray, float]:
+def _harmonic(
+    phasors: _Phasors, k: int, distorted: float
+) -> tuple[complex, FloatArray, FloatArray, float]:
     """Return N_k, its covariance, the amplitude's covariance with it, and its dof."""
     noise = phasors.noise_of(k)
     A, N = abs(phasors.displacement), phasors.response(k)
     along = np.array([N.real, N.imag])
     across = np.array([-N.imag, N.real])
     relative = phasors.amplitude_variance / A**2
-    force = phasors.force_variance(k) / A**2
+    force = float(phasors.variance(k)[1]) / A**2
     if k == 0:
         force += (phasors.forgotten(0) / A) ** 2
+    force += (distorted * abs(phasors.response(1))) ** 2
     own_part = 0.5 * force * np.eye(2) if k else np.diag([force, 0.0])
     covariance = own_part + relative * (np.outer(along, along) + k**2 * np.outer(across, across))
     referred = relative * (1.0 + k**2) * abs(N) ** 2
@@ -459,9 +477,12 @@ def _harmonic(phasors: _Phasors, k: int) -> tuple[complex, FloatArray, FloatArra
     return N, covariance, -along * relative * A, dof
 
 
-def _errors(phasors: _Phasors) -> tuple[ComplexArray, FloatArray, FloatArray]:
+def _errors(phasors: _Phasors, distorted: float) -> tuple[ComplexArray, FloatArray, FloatArray]:
     """Return the responses, their joint covariance with the amplitude, and dof."""
-    rows = [_fundamental(phasors) if k == 1 else _harmonic(phasors, k) for k in phasors.harmonics]
+    rows = [
+        _fundamental(phasors) if k == 1 else _harmonic(phasors, k, distorted)
+        for k in phasors.harmonics
+    ]
     response, covariance, cross, dof = (np.array(column) for column in zip(*rows, strict=True))
     joint = np.empty((len(rows), 3, 3))
     joint[:, 0, 0] = phasors.amplitude_variance
@@ -471,10 +492,11 @@ def _errors(phasors: _Phasors) -> tuple[ComplexArray, FloatArray, FloatArray]:
 
 
 def _point(phasors: _Phasors, cycles: int, dropped: int, steps: FloatArray) -> Point:
-    response, joint, dof = _errors(phasors)
+    distorted = phasors.distorted
+    response, joint, dof = _errors(phasors, distorted)
     covariance = joint[:, 1:, 1:]
     silent = tuple(LineNoise(np.zeros_like(n.lines), n.dof) for n in phasors.noise)
-    repeating = _errors(replace(phasors, noise=silent))[1]
+    repeating = _errors(replace(phasors, noise=silent), distorted)[1]
     segment, recorded = phasors.fit.segment, phasors.samples.time
     transient, bias = phasors.transient, _bias(phasors)
     lagging = _lag(phasors) if phasors.fit.trending else np.zeros(len(response))
@@ -546,7 +568,7 @@ def _asymmetry(phasors: _Phasors) -> float:
         return 0.0
     even = [k for k in EVEN if k <= fit.orders]
     motion, force = np.array([fit.phasors(k) for k in [1, *even]]).T
-    variance = [phasors.force_variance(k) + phasors.forgotten(k) ** 2 for k in even]
+    variance = [float(phasors.variance(k)[1]) + phasors.forgotten(k) ** 2 for k in even]
     orders = np.array(even, dtype=np.float64)
     return asymmetry(
         orders,

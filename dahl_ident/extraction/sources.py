@@ -139,13 +139,14 @@ def extract(
     Notes
     -----
     The sine fit is that of IEEE Std 1057 with harmonics. Its covariance is taken from what does
-    not repeat between the harmonics, plus two errors that do: rounding to sensor steps where no
+    not repeat between the harmonics, plus errors that do: rounding to sensor steps where no
     noise dithers it, and harmonics above half the sampling rate, which alias onto lower ones (the
     size of the measured ones is extrapolated to them; with a hundred samples per cycle this is
-    negligible, and if the sampling is too slow to measure any the verdict says so). It holds for
-    white and for 1/f noise. The uncertainty of a record's `drive_factor` is common to all points
-    and not part of it. A hum during rests that is a clean sine in both channels is taken for a
-    level; give `frequency` then.
+    negligible, and if the sampling is too slow to measure any the verdict says so). Rows of other
+    harmonics, which belong to a sine, add what the displacement's own harmonics change in them:
+    about the stiffness times their size. The covariance holds for white and for 1/f noise. The
+    uncertainty of a record's `drive_factor` is common to all points and not part of it. A hum
+    during rests that is a clean sine in both channels is taken for a level; give `frequency` then.
 
     Examples
     --------

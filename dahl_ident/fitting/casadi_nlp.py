@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
 from dahl_ident.fitting.casadi_rows import RowBlock
 
 if TYPE_CHECKING:
@@ -163,20 +162,6 @@ class RowwiseProblem:
             "nlp_hess_l", ["triu_hess_gamma_x_x"], [matrix], {"lam_f": lam_f, "lam_g": lam_g}
         )
 
-    def information(self, x: FloatArray, counts: FloatArray) -> FloatArray:
-        """Return the Fisher information of xi, the rows' unknowns profiled out.
-
-        `counts` is the weight of each row of the table. Priors are not included.
-        """
-        xi, start = x[: self.n_shared], self.n_shared
-        total = np.zeros((self.n_shared, self.n_shared))
-        for rows in self._rows:
-            stop = start + rows.n * rows.n_own
-            each = rows.information(xi, x[start:stop].reshape(rows.n, rows.n_own))
-            total += np.einsum("n,npq->pq", counts[rows.block.rows], each)
-            start = stop
-        return total
-
     def _of_shared(self, expressions: list[ca.SX]) -> list[ca.MX]:
         import casadi as ca
 
@@ -284,30 +269,6 @@ class _Rows:
         )
         inputs = self._inputs_at(self.arguments, 2)
         return list(row.map(self.n).call([*inputs, ca.repmat(lam_f, 1, self.n), lam_g]))
-
-    def information(self, xi: FloatArray, own: FloatArray) -> FloatArray:
-        """Return each row's information of xi, shape (n, P, P): a Schur complement."""
-        import casadi as ca
-
-        parts = [self.block.residuals, self.block.balance]
-        slopes = ca.Function(
-            "slopes", self._inputs, [_dense_jacobian(p, self.variables) for p in parts]
-        )
-        arguments = [ca.DM(a) for a in (np.tile(xi[:, None], self.n), own.T, self.block.numbers)]
-        numbers = slopes.map(self.n).call(self._inputs_at(arguments, 1))
-        J, G = (
-            np.asarray(d).reshape(part.numel(), self.n, -1).swapaxes(0, 1)
-            for d, part in zip(numbers, parts, strict=True)
-        )
-        P, k, m = xi.size, self.n_own, self.n_balance
-        H = J.swapaxes(1, 2) @ J
-        bordered = np.zeros((self.n, k + m, k + m))
-        bordered[:, :k, :k] = H[:, P:, P:]
-        bordered[:, k:, :k] = G[:, :, P:]
-        bordered[:, :k, k:] = G[:, :, P:].swapaxes(1, 2)
-        lever = np.concatenate((H[:, P:, :P], G[:, :, :P]), axis=1)
-        taken = lever.swapaxes(1, 2) @ np.linalg.solve(bordered, lever)
-        return np.asarray(H[:, :P, :P] - taken)
 
 
 def _dense_jacobian(parts: ca.SX, variables: ca.SX) -> ca.SX:

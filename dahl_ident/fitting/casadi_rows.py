@@ -41,7 +41,6 @@ from dahl_ident.errors import FitError
 from dahl_ident.fitting import losses
 from dahl_ident.fitting.casadi_expansion import Expansion, is_short
 from dahl_ident.noise import (
-    AmplitudeError,
     Covariance,
     Measured,
     Noise,
@@ -74,14 +73,11 @@ class Target:
         What the data's residuals are divided by.
     loss : str
         "linear" or a robust loss, see :mod:`dahl_ident.fitting.losses`.
-    drive_error : AmplitudeError or None
-        Error of ln u_0, and its covariance with the response, for force-controlled rows.
     """
 
     problem: Problem
     scale: float = 1.0
     loss: str = "linear"
-    drive_error: AmplitudeError | None = None
 
 
 @dataclass(frozen=True)
@@ -239,9 +235,7 @@ class _Table:
         quantity = self.problem.data.quantity
         self.operator, slope = converted(unit, rows.omega, "dynamic_stiffness", quantity)
         self.is_stiffness = bool(slope[0] == self.operator[0])
-        self.spread, self.shared, self.whitening = _split(
-            self.noise, rows.forced, target.drive_error
-        )
+        self.spread, self.shared, self.whitening = _split(self.noise, rows.n)
         self.start_phasor = self._displacement(start) if rows.forced.any() else None
 
     def block(self, rows: IntArray, harmonic: int) -> RowBlock:
@@ -376,18 +370,16 @@ def _robust(name: str, squares: ca.SX) -> ca.SX:
     return ca.if_else(is_near, squares, 2.0 * losses.KNEE * ca.sqrt(far) - losses.KNEE**2)
 
 
-def _split(
-    noise: Noise, forced: NDArray[np.bool_], drive_error: AmplitudeError | None
-) -> tuple[FloatArray, ComplexArray, Whitening | None]:
+def _split(noise: Noise, count: int) -> tuple[FloatArray, ComplexArray, Whitening | None]:
     """Return s, c and V^-1/2 of every row (see the head of this module)."""
-    spread, shared = np.zeros(forced.size), np.zeros(forced.size, dtype=np.complex128)
+    spread, shared = np.zeros(count), np.zeros(count, dtype=np.complex128)
     if not isinstance(noise, Measured):
         return spread, shared, None
-    for error, concerned in ((noise.amplitude, ~forced), (drive_error, forced)):
-        if error is not None:
-            concerned = concerned & (error.variance > 0.0)
-            spread[concerned] = np.sqrt(error.variance[concerned])
-            shared[concerned] = error.cross[concerned] / spread[concerned]
+    error = noise.amplitude
+    if error is not None:
+        concerned = error.variance > 0.0
+        spread[concerned] = np.sqrt(error.variance[concerned])
+        shared[concerned] = error.cross[concerned] / spread[concerned]
     rr, ri, ii = noise.covariance
     rest = Covariance(rr - shared.real**2, ri - shared.real * shared.imag, ii - shared.imag**2)
     tied = rest.rr * rest.ii - rest.ri**2 < _LEAST_REST * (rr * ii - ri**2)

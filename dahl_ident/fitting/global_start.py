@@ -31,7 +31,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
 from dahl_ident.elements import Element, Parameter
@@ -363,6 +362,9 @@ def _columns(
         return (None, [_Column(d.scale, at(None, 1.0))]) if scaled else (at(None, 1.0), [])
     if all(p in d.linear for p in d.element.parameters):  # a linear element: nothing else acts
         return None, [_Column((p,), at(p, 0.0)) for p in d.linear]
+    scales = d.element.scale_parameters
+    if scales and {d.element.parameter(label).name for label in scales} <= linear:
+        return None, [_Column((p,), at(p, 1.0)) for p in d.linear]
     base = at(None, 1.0)
     if scaled:
         columns.append(_Column(d.scale, base))
@@ -387,7 +389,12 @@ def _curves(d: Directions, view: StiffnessData, most: float) -> _Curves:
     else:
         index = _quasi_random(tuple(counts), int(most))
     lead = view.amplitude.shape[:-1]
-    ratios = [(a[..., i] if lead else a.reshape(-1)[i]) for a, i in zip(axes, index, strict=True)]
+    index = index[:, _possible(d, [*ordered], [a.reshape(-1, a.shape[-1])[0] for a in axes], index)]
+    # numbers are the same for all tables
+    ratios = [
+        a[..., i] if lead and not x.is_number else a.reshape(-1)[i]
+        for x, a, i in zip(ordered, axes, index, strict=True)
+    ]
     values: dict[str, FloatArray] = {}
     for direction, ratio in zip(ordered, ratios, strict=True):
         over = direction.over
@@ -398,6 +405,21 @@ def _curves(d: Directions, view: StiffnessData, most: float) -> _Curves:
         values[d.reference.name] = np.ones(index.shape[1])
     edges = [i == end for i, n in zip(index, counts, strict=True) if n > 1 for end in (0, n - 1)]
     return _Curves(values, columns, known_part, edges[: 2 * len(lengths)])
+
+
+def _possible(
+    d: Directions, ordered: list[Direction], axes: list[FloatArray], index: IntArray
+) -> NDArray[np.bool_]:
+    """Return at which nodes nothing speaks against an element physically, or every node."""
+    names = [x.parameter.name for x in ordered]
+    found = []
+    for node in index.T:
+        own = {name: float(a[i]) for name, a, i in zip(names, axes, node, strict=True)}
+        numbers = [
+            own.get(p.name, 1.0 if p.value is None else p.value) for p in d.element.parameters
+        ]
+        found.append(not d.element.physics(numbers))
+    return np.asarray(found) if any(found) else np.ones(len(found), dtype=np.bool_)
 
 
 def _numbers(direction: Direction) -> FloatArray:
@@ -528,6 +550,8 @@ def _unit_values(d: Directions, length: Direction, numbers: tuple[float, ...]) -
 
 def _computed_table(element: Element, values: list[FloatArray], harmonic: int) -> ComplexArray:
     """Return the table from amplitudes around the knee; power laws beyond."""
+    from scipy.interpolate import CubicSpline
+
     low, high = (float(np.asarray(v)) for v in element.knee(values))
     if not 0.0 < low <= high < np.inf:
         low = high = 1.0
@@ -554,6 +578,10 @@ def _solve_one(
     target: ComplexArray, curve: ComplexArray, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return what `_solve_linear` does for the one column curve times weights, (..., K, n)."""
+    # a hardening law overflows at some nodes: no starts
+    usable = np.asarray((np.abs(curve) < _LARGEST).all(axis=-1))
+    if not usable.all():
+        curve = np.where(usable[..., None], curve, 0.0)
     parts = curve.view(np.float64)
     power = curve.real**2 + curve.imag**2
     pulled = (target * weights).view(np.float64)
@@ -561,7 +589,7 @@ def _solve_one(
     overlap = (parts @ pulled[..., None])[..., 0]
     norm = (power @ (weights**2)[..., None])[..., 0]
     coefficient = overlap / np.maximum(norm, 1e-300)
-    return size - coefficient * overlap, coefficient[..., None]
+    return np.where(usable, size - coefficient * overlap, np.inf), coefficient[..., None]
 
 
 def _solve_linear(

@@ -38,6 +38,7 @@ from dahl_ident.fitting.global_start import starts
 from dahl_ident.fitting.levenberg_marquardt import Minima
 from dahl_ident.fitting.losses import loss_named
 from dahl_ident.fitting.optimum import (
+    ConstraintCost,
     Optimum,
     estimated_scale,
     inverse,
@@ -46,7 +47,6 @@ from dahl_ident.fitting.optimum import (
 )
 from dahl_ident.fitting.search import solve
 from dahl_ident.fitting.status import Status
-from dahl_ident.noise import AmplitudeError
 from dahl_ident.problem import Problem
 
 if TYPE_CHECKING:
@@ -104,8 +104,7 @@ def solve_ipopt(
     -------
     Optimum
         With ``method="ipopt"``. Where there are no constraints and the optimum lies at infinity,
-        that of `solve`. With noise in the drive its `cost` and `covariance` take
-        that into account; its `residuals` are those at the drives as measured.
+        that of `solve`. Its problem holds the noise of the drive.
 
     Raises
     ------
@@ -131,13 +130,14 @@ def solve_ipopt(
     >>> print(f"{tied.values[1] / tied.values[0]:.6f}")
     250.000000
     """
-    drive_error = _drive_error(problem, loss, drive_std, drive_covariance)
+    given, problem = problem, _with_drive_error(problem, loss, drive_std, drive_covariance)
     relations = Relations.of(problem, constraints)
-    begin = solve(problem, loss=loss, start=start)
-    if begin.status.at_infinity and not relations.texts and drive_error is None:
+    # a start takes no noise of the drive, which takes many times as long; a cost does
+    begin = solve(problem if relations.texts else given, loss=loss, start=start)
+    if begin.status.at_infinity and not relations.texts and problem is given:
         return replace(begin, method="ipopt")
     adapts = not problem.scale_known and bool(loss != "linear" or problem.priors)
-    target = Target(problem, begin.scale if adapts else 1.0, loss, drive_error)
+    target = Target(problem, begin.scale if adapts else 1.0, loss)
     found = _search(target, begin, relations)
     dof = problem.n_numbers + len(problem.priors) - len(problem.names) + relations.freedom_lost
     for _ in range(_RESCALINGS if adapts and relations.texts else 0):
@@ -146,7 +146,7 @@ def solve_ipopt(
             break
         target = replace(target, scale=target.scale * ratio)
         found = _descend(target, found.theta, relations, found.evaluations)
-    return _ended(target, found, relations, begin.nfev)
+    return _ended(target, found, relations, begin)
 
 
 @dataclass(frozen=True)
@@ -162,8 +162,6 @@ class _Found:
     active: tuple[bool, ...]
     cost_unit: float
     """A cost whose residuals are all of the size that the coordinates were scaled by."""
-    information: FloatArray | None
-    """That of the data with the drive's errors; None where there are none."""
 
     @property
     def failure(self) -> str:
@@ -225,9 +223,6 @@ def _descend(
         slopes=np.asarray(slopes(x[: start.size])) / unit,
         active=tuple(not equal and c > -_ACTIVE for c, equal in inequalities),
         cost_unit=0.5 / weight,
-        information=nlp.information(x, _counts(problem)) / np.outer(unit, unit)
-        if target.drive_error is not None
-        else None,
     )
 
 
@@ -288,27 +283,16 @@ def _run(
     return solution, solver.stats()
 
 
-def _counts(problem: Problem) -> FloatArray:
-    """Return what each row's information counts, as in `Problem.information`."""
-    dof = problem.data.dof
-    if dof is None:
-        return np.ones(problem.data.n)
-    finite = np.where(np.isinf(dof), 1.0, dof)
-    share = (finite + 1.0) * (finite - 1.0) / (finite * (finite + 3.0))
-    return np.where(np.isinf(dof), 1.0, share)
-
-
-def _drive_error(
+def _with_drive_error(
     problem: Problem, loss: str, std: ArrayLike | None, covariance: ArrayLike | None
-) -> AmplitudeError | None:
-    """Return the error of ln u_0 in force-controlled rows, checked."""
+) -> Problem:
+    """Return the problem with the errors of its drives in its data, checked."""
     if std is None:
         if covariance is not None:
             raise ValidationError("drive_covariance is given without drive_std")
-        return None
+        return problem
     data = problem.data
-    forced = data.controlled == "force"
-    if data.drive is None or not forced.any():
+    if data.drive is None or not (data.controlled == "force").any():
         raise ValidationError(
             "drive_std is given, but no row is force-controlled; an error of the displacement "
             "amplitude belongs into the data, as amplitude_std"
@@ -319,11 +303,12 @@ def _drive_error(
             "beside the response's error is known only with noise='measured', loss='linear'"
         )
     spread = _for_rows(non_negative_array(std, "drive_std"), "drive_std", (data.n,))
-    together = finite_array(0.0 if covariance is None else covariance, "drive_covariance")
-    together = _for_rows(together, "drive_covariance", (data.n, 2))
-    per_drive = np.where(forced, 1.0 / data.drive, 0.0)
-    cross = together @ np.array([1.0, 1.0j]) * per_drive
-    return AmplitudeError((spread * per_drive) ** 2, cross)
+    cross = None
+    if covariance is not None:
+        together = finite_array(covariance, "drive_covariance")
+        cross = _for_rows(together, "drive_covariance", (data.n, 2))
+    noisy = replace(data, drive_std=spread, drive_covariance=cross)
+    return Problem(noisy, problem.model, noise=problem.noise, sensors=problem.sensors)
 
 
 def _for_rows(value: FloatArray, name: str, shape: tuple[int, ...]) -> FloatArray:
@@ -332,7 +317,7 @@ def _for_rows(value: FloatArray, name: str, shape: tuple[int, ...]) -> FloatArra
     return np.broadcast_to(value, shape)
 
 
-def _ended(target: Target, found: _Found, relations: Relations, nfev: int) -> Optimum:
+def _ended(target: Target, found: _Found, relations: Relations, begin: Optimum) -> Optimum:
     """Return the optimum with status, sentence and covariance."""
     problem, loss = target.problem, loss_named(target.loss)
     if found.return_status == "Infeasible_Problem_Detected":
@@ -343,25 +328,26 @@ def _ended(target: Target, found: _Found, relations: Relations, nfev: int) -> Op
     at = problem.quadratic(found.theta, target.scale, loss)
     words = found.failure
     elsewhere = abs(float(at.cost) - found.cost) > _SAME_COST * found.cost_unit
-    if not words and elsewhere and found.information is None:
+    if not words and elsewhere:
         words = "it ended at another of the plant's several amplitudes than the one measured"
-    hessian = at.hessian if found.information is None else found.information
     minima = Minima(
         found.theta[None],
         np.array([found.cost]),
-        hessian[None],
+        at.hessian[None],
         np.array([not words]),
-        np.array([nfev + found.evaluations]),
+        np.array([begin.nfev + found.evaluations]),
     )
     result = optima(problem, Ends(minima), target.scale, loss, "ipopt", minima.evaluations)[0]
     if words:
         return replace(result, message=f"{result.message} IPOPT says: {words}.")
-    if not relations.texts and found.information is None:
+    if not relations.texts:
         return result
-    return _constrained(result, target, found, relations)
+    return _constrained(result, target, found, relations, begin)
 
 
-def _constrained(result: Optimum, target: Target, found: _Found, relations: Relations) -> Optimum:
+def _constrained(
+    result: Optimum, target: Target, found: _Found, relations: Relations, begin: Optimum
+) -> Optimum:
     """Return `result` as found, not reordered, with the covariance on the constraints."""
     problem, loss = target.problem, loss_named(target.loss)
     dof = result.dof + relations.freedom_lost
@@ -395,16 +381,28 @@ def _constrained(result: Optimum, target: Target, found: _Found, relations: Rela
         dof=dof,
         status=status,
         message=message,
+        constraint_cost=_constraint_cost(target, found, relations, begin),
     )
+
+
+def _constraint_cost(
+    target: Target, found: _Found, relations: Relations, begin: Optimum
+) -> ConstraintCost | None:
+    """Return what the constraints cost against the least squares without them, `begin`."""
+    of_one_scale = target.problem.scale_known or not target.problem.priors
+    if target.loss != "linear" or not of_one_scale or begin.is_exact or begin.dof <= 0:
+        return None
+    held = zip(relations.texts, relations.equal, found.active, strict=True)
+    texts = tuple(text for text, equal, active in held if equal or active)
+    if not texts:
+        return None
+    rise = 2.0 * max(found.cost - begin.cost, 0.0) / begin.scale**2
+    return ConstraintCost(texts, rise, np.inf if begin.scale_known else float(begin.dof))
 
 
 def _information(target: Target, found: _Found, dof: int) -> FloatArray:
     """Return the information of theta, constraints aside."""
     problem, loss = target.problem, loss_named(target.loss)
-    if found.information is not None:
-        _, J = problem.residuals_and_jacobian(found.theta, target.scale, tails=False)
-        of_priors = J[problem.n_residuals :]
-        return np.asarray(found.information + of_priors.T @ of_priors)
     if loss is None:
         return problem.information(found.theta, target.scale)
     return robust_information(problem, found.theta, target.scale, loss, dof)

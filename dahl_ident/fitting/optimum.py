@@ -10,6 +10,7 @@ from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import special
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.fitting.losses import Loss, loss_named
@@ -30,6 +31,33 @@ class Combination:
     expression: str
     value: float
     stderr: float
+
+
+@dataclass(frozen=True)
+class ConstraintCost:
+    """The rise of the sum of squares that constraints make.
+
+    Attributes
+    ----------
+    texts : tuple of str
+        The constraints that hold with equality.
+    rise : float
+        Of the sum of squares, over the variance of the noise.
+    dof : float
+        Degrees of freedom of that variance; infinite where it is known.
+    """
+
+    texts: tuple[str, ...]
+    rise: float
+    dof: float
+
+    @property
+    def p_value(self) -> float:
+        """Probability of such a rise where the constraints are right."""
+        count = len(self.texts)
+        if np.isinf(self.dof):
+            return float(special.chdtrc(count, self.rise))
+        return float(special.fdtrc(count, self.dof, self.rise / count))
 
 
 @dataclass(frozen=True)
@@ -69,6 +97,8 @@ class Optimum:
         "linear", or the robust loss.
     combinations : tuple of Combination
         What is determined where the optimum lies at infinity.
+    constraint_cost : ConstraintCost or None
+        What constraints cost; None where there are none, or the loss is robust.
     """
 
     problem: Problem
@@ -85,6 +115,7 @@ class Optimum:
     method: str
     loss: str = "linear"
     combinations: tuple[Combination, ...] = field(default=())
+    constraint_cost: ConstraintCost | None = None
 
     @property
     def success(self) -> bool:

@@ -327,9 +327,12 @@ def _descend(problem: RecordProblem, theta: FloatArray, steps: int) -> Minima:
     if bool(found.converged[0]):
         return found
     # where a motion comes to rest, errors of its integration hide the last small falls of the cost
-    end = problem.quadratic(found.theta[0])
     with np.errstate(all="ignore"):
+        end = problem.quadratic(found.theta[0])
+        if not np.isfinite(end.cost):
+            return found
         size = np.sqrt(end.hessian.diagonal())
+        size[size == 0.0] = 1.0  # what vanishes, such as a damper that these data do not need
         slope = end.gradient / size
         left = slope @ np.linalg.pinv(end.hessian / np.outer(size, size), hermitian=True) @ slope
     return replace(found, converged=np.array([bool(left < _SETTLED**2 * noise)]))

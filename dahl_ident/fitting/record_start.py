@@ -12,8 +12,6 @@ from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
-from scipy.signal import butter, detrend, sosfiltfilt
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element
@@ -247,12 +245,12 @@ def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
         if problem.output == "motion":
             x, v, a = in_band(problem, number)
             own[0], own[1] = x[0], v[0]
-            forces = [
-                e.force_history(element_values, x, v, 0.0, acceleration=a)
+            states = [
+                state
                 for e, element_values in problem.model.of(at)
-                if e.has_memory
+                for state in e.state_histories(element_values, x, v, a)
             ]
-            problem.set_guess(number, np.column_stack([x, v, *forces]))
+            problem.set_guess(number, np.column_stack([x, v, *states]))
         else:
             total = problem.predict(full, number, derivatives=False).output
             own[-2] = float(np.mean(measured - total))
@@ -303,6 +301,9 @@ def in_band(problem: RecordProblem, number: int) -> tuple[FloatArray, FloatArray
             wave = wave + (y[-1] - y[0]) / record.duration
         found.append(wave)
     if order:
+        from scipy.integrate import cumulative_trapezoid
+        from scipy.signal import butter, detrend, sosfiltfilt
+
         cut = min(max(lowest, 1.0 / n), 0.5)
         passed = butter(4, cut, "highpass", output="sos")
         for _ in range(order):

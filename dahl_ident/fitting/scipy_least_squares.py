@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import optimize
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.fitting.asymptotes import Chart
@@ -27,6 +26,8 @@ def minimise_by_scipy(
 
     The trust-region reflective algorithm. In a `chart`, from phi and without bounds.
     """
+    from scipy import optimize
+
     rows = _Rows(problem, scale, loss, chart)
     bounds = problem.bounds() if chart is None else (-np.inf, np.inf)
     converged, nfev, cost, at = False, 1, np.inf, start

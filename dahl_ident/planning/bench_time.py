@@ -32,6 +32,8 @@ class BenchTime:
         Share of the friction force.
     between_runs : float
         Seconds that a run takes in addition to its levels.
+    least_settling : int
+        Cycles before measuring, at least.
     """
 
     frequency_hz: FloatArray
@@ -40,33 +42,40 @@ class BenchTime:
     change_over: float
     settled: float
     between_runs: float = 0.0
+    least_settling: int = _LEAST_SETTLING
 
     def order(self, levels: Sequence[int] | NDArray[np.intp]) -> NDArray[np.intp]:
-        """Return the levels in order of rising friction force.
+        """Return the levels, (..., m), in order of rising friction force.
 
         In this order no transient starts larger than the friction force itself; the transient of a
         level that follows a larger one would.
         """
         chosen = np.asarray(levels, dtype=np.intp)
-        return chosen[np.lexsort((self.frequency_hz[chosen], self.force[chosen]))]
+        rising = np.lexsort((self.frequency_hz[chosen], self.force[chosen]), axis=-1)
+        return np.take_along_axis(chosen, rising, axis=-1)
 
     def settling_cycles(self, ordered: Sequence[int] | NDArray[np.intp]) -> FloatArray:
-        """Return the cycles before measuring at each of the levels, in this order; may be inf."""
+        """Return the cycles before measuring at each level, (..., m), in this order; may be inf."""
         chosen = np.asarray(ordered, dtype=np.intp)
         force, decay = self.force[chosen], self.decay[chosen]
-        before = np.concatenate([[0.0], force[:-1]])
+        before = np.concatenate([np.zeros_like(force[..., :1]), force[..., :-1]], axis=-1)
         with np.errstate(divide="ignore", invalid="ignore"):
             start = np.where(force > 0.0, np.abs(force - before) / force, 0.0)
             cycles = np.log(start / self.settled) / -np.log(decay)
         cycles = np.where(start <= self.settled, 0.0, np.where(decay > 0.0, cycles, 0.0))
-        return np.asarray(np.maximum(np.ceil(cycles - 1e-9), _LEAST_SETTLING))
+        return np.asarray(np.maximum(np.ceil(cycles - 1e-9), self.least_settling))
 
-    def fixed(self, levels: Sequence[int] | NDArray[np.intp]) -> float:
-        """Return the seconds of one run before anything is measured, in the best order."""
+    def fixed(self, levels: Sequence[int] | NDArray[np.intp]) -> FloatArray:
+        """Return the seconds of one run before anything is measured, in the best order.
+
+        Of each set of levels, (..., m).
+        """
         ordered = self.order(levels)
         settling = self.settling_cycles(ordered) / self.frequency_hz[ordered]
-        return self.between_runs + float(settling.sum()) + self.change_over * len(ordered)
+        whole = self.between_runs + settling.sum(axis=-1) + self.change_over * ordered.shape[-1]
+        return np.asarray(whole)
 
     def seconds(self, levels: Sequence[int] | NDArray[np.intp], cycles: FloatArray) -> float:
         """Return the seconds of one run."""
-        return self.fixed(levels) + float((cycles / self.frequency_hz[np.asarray(levels)]).sum())
+        measured = (cycles / self.frequency_hz[np.asarray(levels)]).sum()
+        return float(self.fixed(levels) + measured)

@@ -21,10 +21,11 @@ from dahl_ident.errors import ValidationError
 from dahl_ident.planning.bench_time import BenchTime
 from dahl_ident.planning.criteria import LevelInformation
 from dahl_ident.planning.knowledge import Knowledge, placeholder, to_values
+from dahl_ident.planning.trajectories import Motion
 from dahl_ident.problem import Problem
 
 CONTROLLED = ("displacement", "force")
-_LIMITS = ("displacement", "force", "speed", "frequency_hz", "time")
+_LIMITS = ("displacement", "force", "speed", "acceleration", "frequency_hz", "time")
 _CERTAIN = 0.95  # fraction of the draws that stay within a limit
 _FREQUENCIES = 12  # at most: six a decade of the default range
 _BELOW, _ABOVE = 0.03, 30.0  # range of amplitudes over the knee where no limit is given
@@ -39,7 +40,7 @@ class Limits:
 
     Attributes
     ----------
-    displacement, force, speed, frequency_hz : (float, float)
+    displacement, force, speed, acceleration, frequency_hz : (float, float)
         Zero-to-peak, SI.
     time : float
         Seconds for everything.
@@ -48,6 +49,7 @@ class Limits:
     displacement: tuple[float, float] = (0.0, np.inf)
     force: tuple[float, float] = (0.0, np.inf)
     speed: tuple[float, float] = (0.0, np.inf)
+    acceleration: tuple[float, float] = (0.0, np.inf)
     frequency_hz: tuple[float, float] = (0.0, np.inf)
     time: float = np.inf
 
@@ -58,7 +60,7 @@ class Limits:
         Raises
         ------
         ValidationError
-            If a name is unknown, no highest frequency is given, or a range does not rise.
+            If a name is unknown, or a range does not rise.
         """
         if not isinstance(given, Mapping):
             raise ValidationError(
@@ -83,11 +85,6 @@ class Limits:
                     "highest"
                 )
             found[name] = tuple(pair)
-        if "frequency_hz" not in found:
-            raise ValidationError(
-                "limits has no frequency_hz; give the highest frequency of the exciter, or lowest "
-                "and highest: a cycle's time follows from it"
-            )
         return cls(**found)
 
     def relaxed(self, name: str, factor: float) -> Limits:
@@ -142,6 +139,8 @@ class Candidates:
         phase.
     variance : ndarray, shape (S, K)
         Of ln gain and phase in one cycle.
+    motions : tuple of Motion
+        Motions in time whose periods the cycles are; empty for sines.
     """
 
     controlled: str
@@ -152,6 +151,7 @@ class Candidates:
     rows: FloatArray
     offsets: FloatArray
     variance: FloatArray
+    motions: tuple[Motion, ...] = ()
 
     @property
     def count(self) -> int:
@@ -165,6 +165,7 @@ class Candidates:
             self,
             level=self.level[chosen],
             frequency_hz=self.frequency_hz[chosen],
+            motions=tuple(self.motions[k] for k in chosen.tolist()) if self.motions else (),
             **{name: getattr(self, name)[:, chosen] for name in parts},
         )
 
@@ -182,13 +183,22 @@ def grid(
     knowledge: Knowledge, limits: Limits, controlled: str, count: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return levels and frequencies of about `count` candidates, before limits are applied."""
-    low, high = _level_range(knowledge, limits, controlled)
+    if not np.isfinite(limits.frequency_hz[1]):
+        raise ValidationError(
+            "limits has no frequency_hz; give the highest frequency of the exciter, or lowest "
+            "and highest: a cycle's time follows from it"
+        )
+    low, high = level_range(knowledge, limits, controlled)
     f_low, f_high = limits.frequency_hz
     free_of_rate = knowledge.model.rate_independent and controlled == "displacement"
     if free_of_rate or f_low == f_high:
         levels = np.geomspace(low, high, max(count, 2))
         with np.errstate(divide="ignore"):
             fastest = limits.speed[1] / (2.0 * np.pi * levels) if free_of_rate else np.inf
+            if free_of_rate:
+                fastest = np.minimum(
+                    fastest, np.sqrt(limits.acceleration[1] / levels) / (2.0 * np.pi)
+                )
         return levels, np.minimum(f_high, fastest) + 0.0 * levels
     f_low = f_low or f_high / 100.0
     n = min(_FREQUENCIES, max(count // 4, 1))
@@ -199,7 +209,8 @@ def grid(
     return np.tile(levels, n), np.repeat(frequencies, len(levels))
 
 
-def _level_range(knowledge: Knowledge, limits: Limits, controlled: str) -> tuple[float, float]:
+def level_range(knowledge: Knowledge, limits: Limits, controlled: str) -> tuple[float, float]:
+    """Return the lowest and the highest level: the limits, or what the knee suggests."""
     low, high = getattr(limits, controlled)
     if controlled == "force":
         if not np.isfinite(high):
@@ -209,7 +220,8 @@ def _level_range(knowledge: Knowledge, limits: Limits, controlled: str) -> tuple
     known = knees[np.isfinite(knees) & (knees > 0.0)]
     if known.size:
         low = low or _BELOW * float(np.quantile(known, 0.025))
-        high = min(high, max(_ABOVE * float(np.quantile(known, 0.975)), 2.0 * low))
+        if not np.isfinite(high):
+            high = max(_ABOVE * float(np.quantile(known, 0.975)), 2.0 * low)
     if not np.isfinite(high):
         raise ValidationError("limits has no displacement; give the largest amplitude, m")
     return low or 1e-3 * high, high
@@ -232,7 +244,7 @@ def evaluate(
     """
     data = placeholder(level, frequency_hz, controlled, knowledge.motion)
     problem = _problem(data, knowledge)
-    predicted = problem.predict(knowledge.theta)
+    predicted, changes = problem.prediction_and_jacobian(knowledge.theta)
     if controlled == "force":
         force = np.broadcast_to(level, predicted.shape)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -240,12 +252,20 @@ def evaluate(
     else:
         amplitude = np.broadcast_to(level, predicted.shape)
         force = amplitude * np.abs(predicted)
-    allowed = _allowed(limits, amplitude, force, frequency_hz)
+    omega = 2.0 * np.pi * frequency_hz
+    sizes = {
+        "displacement": amplitude,
+        "force": force,
+        "speed": omega * amplitude,
+        "acceleration": omega**2 * amplitude,
+        "frequency_hz": frequency_hz[None],
+    }
+    possible = allowed(limits, sizes, len(frequency_hz))
     if controlled == "force":
-        allowed &= _single_valued(knowledge, level, frequency_hz)
-    kept = np.flatnonzero(allowed)
-    changes = problem.prediction_jacobian(knowledge.theta)[:, kept]
-    relative = changes / predicted[:, kept, None]
+        possible &= np.isfinite(predicted).all(axis=0)
+        possible &= _single_valued(knowledge, level, frequency_hz)
+    kept = np.flatnonzero(possible)
+    relative = changes[:, kept] / predicted[:, kept, None]
     amplitude, force = amplitude[:, kept], force[:, kept]
     variance = noise.variance(force, amplitude)
     size = 1.0 / np.sqrt(variance)[..., None, None]
@@ -256,30 +276,28 @@ def evaluate(
     )  # fmt: skip
 
 
-def _allowed(
-    limits: Limits, amplitude: FloatArray, force: FloatArray, frequency_hz: FloatArray
-) -> NDArray[np.bool_]:
-    speed = 2.0 * np.pi * frequency_hz * amplitude
-    sizes = {
-        "displacement": amplitude,
-        "force": force,
-        "speed": speed,
-        "frequency_hz": frequency_hz[None],
-    }
-    allowed, refused = np.ones(len(frequency_hz), dtype=bool), {}
+def allowed(limits: Limits, sizes: Mapping[str, FloatArray], count: int) -> NDArray[np.bool_]:
+    """Return which of `count` candidates stay within every limit at nearly all draws.
+
+    Raises
+    ------
+    ValidationError
+        If none does; the message names the limit that excludes most.
+    """
+    possible, refused = np.ones(count, dtype=bool), {}
     for name, size in sizes.items():
         low, high = getattr(limits, name)
         inside = (size >= low * (1.0 - 1e-9)) & (size <= high * (1.0 + 1e-9))
         good = inside.mean(axis=0) >= _CERTAIN
         refused[name] = int((~good).sum())
-        allowed &= good
-    if not allowed.any():
+        possible &= good
+    if not possible.any():
         worst = max(refused, key=lambda name: refused[name])
         raise ValidationError(
             f"limits leave no level to measure: {worst} excludes {refused[worst]} of "
-            f"{len(frequency_hz)} candidates; widen limits[{worst!r}], or give narrower ranges"
+            f"{count} candidates; widen limits[{worst!r}], or give narrower ranges"
         )
-    return allowed
+    return possible
 
 
 def _single_valued(
@@ -315,6 +333,12 @@ def bench_time(
     between_runs: float,
 ) -> BenchTime:
     """Return the bench time of the candidates, so that the slowest tenth of the draws settles."""
+    if candidates.motions:  # records are fitted from their first sample
+        nothing = np.zeros(candidates.count)
+        size = np.median(candidates.force, axis=0)
+        return BenchTime(
+            candidates.frequency_hz, nothing, size, change_over, settled, between_runs, 0
+        )
     model, omega = knowledge.model, 2.0 * np.pi * candidates.frequency_hz
     values = knowledge.model_values()
     A = np.where(np.isfinite(candidates.amplitude), candidates.amplitude, 1.0)

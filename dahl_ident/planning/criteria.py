@@ -37,7 +37,7 @@ class LevelInformation:
 
     Attributes
     ----------
-    packed : ndarray, shape (K, S Q Q)
+    packed : ndarray, shape (..., K, S Q Q)
         Q = P, or P + 2 with the gain and the phase of the run behind the parameters.
     draws, parameters : int
         S and P.
@@ -137,9 +137,9 @@ class Term:
 
 @dataclass(frozen=True)
 class Point:
-    """A criterion's value at a design, and its sensitivity for each term's packed rows."""
+    """A criterion's value at each design, and its sensitivity for each term's packed rows."""
 
-    value: float
+    value: FloatArray
     sensitivities: tuple[FloatArray, ...]
 
 
@@ -164,15 +164,16 @@ class Objective:
         return len(self.terms[0].levels.packed)
 
     def only(self, candidates: Sequence[int] | NDArray[np.intp]) -> Objective:
-        """Return the objective of some candidates."""
+        """Return the objective of some candidates, or of each of several sets, (designs, m)."""
         chosen = np.asarray(candidates, dtype=np.intp)
         terms = tuple(replace(t, levels=t.levels.only(chosen)) for t in self.terms)
         return replace(self, terms=terms)
 
     def information(self, cycles: FloatArray) -> list[FloatArray]:
-        """Return the information of every term, shape (S, P, P) each."""
+        """Return the information of every term, shape (..., S, P, P) each."""
         return [
-            t.known + self.runs * t.levels.of_run(cycles @ t.levels.packed)[0] for t in self.terms
+            t.known + self.runs * t.levels.of_run(_sum(cycles, t.levels.packed))[0]
+            for t in self.terms
         ]
 
     def values(self, totals: Sequence[FloatArray]) -> FloatArray:
@@ -184,18 +185,26 @@ class Objective:
         return result
 
     def at(self, cycles: FloatArray) -> Point:
-        """Return value and sensitivities at the cycles of every candidate."""
-        value, found = 0.0, []
+        """Return values and sensitivities at the cycles of every candidate, (..., K)."""
+        value, found = np.zeros(cycles.shape[:-1]), []
         for term in self.terms:
-            S, back = term.levels.of_run(cycles @ term.levels.packed)
+            S, back = term.levels.of_run(_sum(cycles, term.levels.packed))
             own, slope = term.value_and_slope(term.known + self.runs * S)
-            value += term.weight * float(own)
+            value = value + term.weight * own
             factor = term.weight * self.runs / term.levels.draws
-            found.append(factor * (back.swapaxes(-1, -2) @ slope @ back).ravel())
+            by_total = factor * (back.swapaxes(-1, -2) @ slope @ back)
+            found.append(by_total.reshape(*value.shape, -1))
         return Point(value, tuple(found))
 
     def gradient(self, point: Point) -> FloatArray:
-        """Return the derivative by the cycles of each of this objective's candidates."""
+        """Return the derivative by the cycles of each of this objective's candidates, (..., K)."""
         return np.asarray(
-            sum(t.levels.packed @ s for t, s in zip(self.terms, point.sensitivities, strict=True))
+            sum(
+                (t.levels.packed @ s[..., None])[..., 0]
+                for t, s in zip(self.terms, point.sensitivities, strict=True)
+            )
         )
+
+
+def _sum(cycles: FloatArray, packed: FloatArray) -> FloatArray:
+    return np.asarray((cycles[..., None, :] @ packed)[..., 0, :])

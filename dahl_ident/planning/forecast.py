@@ -33,6 +33,7 @@ from dahl_ident.planning.quantities import (
 from dahl_ident.problem import Problem
 
 _NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
+_ROUNDING = 1e-14  # of a parameter's information: less is rounding, and could cancel to nothing
 _NONE = 1e12  # information on departures that are left out
 _SEARCHED = 24  # draws that the search for levels averages over
 _SEARCHED_WITH_DEPARTURES = 2  # the same of many parameters more, close to the fit's estimate
@@ -137,9 +138,9 @@ class Forecast:
     ) -> FloatArray:
         """Return the covariance of parameters and departures after a design, (S, Q, Q)."""
         if not len(levels):
-            return _inverse(self.before)
+            return covariance_of(self.before)
         one = self.candidates.only(levels).information(self.scatter if scatter is None else scatter)
-        return _inverse(self.before + runs * one.of_run(cycles @ one.packed)[0])
+        return covariance_of(self.before + runs * one.of_run(cycles @ one.packed)[0])
 
     def uncertainty(self, covariance: FloatArray) -> dict[str, FloatArray]:
         """Return the relative standard uncertainty of every quantity at every draw."""
@@ -172,7 +173,7 @@ class Forecast:
     def expected(self, levels: Any, cycles: FloatArray, runs: int) -> dict[str, Expected]:
         """Return the expected uncertainty of each quantity after a design."""
         after, shares = self.after(levels, cycles, runs)
-        before = self.uncertainty(_inverse(self.before))
+        before = self.uncertainty(covariance_of(self.before))
         values = dict(zip(self.knowledge.names, self.knowledge.values.T, strict=True))
         return {
             name: Expected(
@@ -247,9 +248,16 @@ def _response(candidates: Candidates) -> FloatArray:
     return np.asarray(np.linalg.qr(changes, mode="r")).swapaxes(-1, -2)
 
 
-def _inverse(M: FloatArray) -> FloatArray:
-    """Return the inverse of the information; unknown directions get a very large variance."""
-    return np.asarray(np.linalg.inv(M + _NOTHING * np.eye(M.shape[-1])))
+def covariance_of(M: FloatArray) -> FloatArray:
+    """Return the inverse of the information; unknown directions get a very large variance.
+
+    In units in which the diagonal is 1, so that much information on one parameter does not hide
+    that there is none on another.
+    """
+    size = np.sqrt(np.diagonal(M, axis1=-2, axis2=-1) + _NOTHING)
+    units = size[..., :, None] * size[..., None, :]
+    eye = np.eye(M.shape[-1])
+    return np.asarray(np.linalg.inv((M + _NOTHING * eye) / units + _ROUNDING * eye) / units)
 
 
 def typical(u: FloatArray) -> float:

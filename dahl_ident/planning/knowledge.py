@@ -20,9 +20,14 @@ from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError
 from dahl_ident.problem import Problem
+from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.sensors import Sensors
 from dahl_ident.units import Motion
 
+# Least relative standard deviation that the search takes from a range. The fit will not have the
+# range: levels chosen with it do not determine what the fit then has to.
+_LEANED_ON = 100.0
+_MANY = 2000  # draws of a posterior for its covariance: 3 % of each uncertainty (two sigma)
 _NORMAL_RANGE = 2.0 * 1.959964  # standard deviations in a 95 % range
 
 Ranges = Mapping[str, tuple[float, float]]
@@ -44,8 +49,8 @@ class Knowledge:
         Of the data measured before, at each draw, and of assumed values such as the exponent of
         ``Dahl()``, which are parameters here as they are in a fit's uncertainty.
     prior : ndarray, shape (P, P)
-        Information of the ranges, each taken as no narrower than a factor of e to either side: the
-        search uses it where nothing else is known, but a predicted uncertainty does not include it.
+        Information of the ranges, each taken as very wide: it keeps the search defined where a
+        parameter cannot be determined, and a predicted uncertainty does not include it.
     assumed : tuple of str
         Names of the assumed parameters.
     row_noise : float or None
@@ -58,6 +63,8 @@ class Knowledge:
         Standard deviation of ln gain and phase between runs in the earlier data.
     errors : ErrorModel or None
         Of an earlier fit.
+    sample_noise : float or None
+        Standard deviation of a sample of force in earlier records, N.
     """
 
     model: Model
@@ -73,6 +80,7 @@ class Knowledge:
     problem: Problem | None = None
     scatter: float = 0.0
     errors: ErrorModel | None = None
+    sample_noise: float | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -115,12 +123,11 @@ def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowled
         return _of_model(as_model(source), ranges or {}, draws, rng)
     if hasattr(source, "draws") and hasattr(source, "problem"):
         return _of_posterior(source, ranges or {}, draws, seed)
+    if hasattr(source, "draws") and hasattr(source, "fit"):
+        return _of_record_fit(source.fit, ranges or {}, draws, rng, source.draws(_MANY, seed))
     if hasattr(source, "optimum") and hasattr(source.optimum, "problem"):
-        if not isinstance(source.optimum.problem, Problem):
-            raise ValidationError(
-                "plan: the fit is one of a record; planning takes fits of frequency responses: "
-                "extract one from the record, or give the model with ranges="
-            )
+        if isinstance(source.optimum.problem, RecordProblem):
+            return _of_record_fit(source, ranges or {}, draws, rng)
         return _of_fit(source.optimum, ranges or {}, draws, rng)
     raise ValidationError(
         f"plan: got a {type(source).__name__}; expected a model such as Dahl(), a fit, or a "
@@ -180,6 +187,45 @@ def _of_fit(optimum: Any, ranges: Ranges, draws: int, rng: np.random.Generator) 
     drawn = rng.multivariate_normal(theta, covariance, draws, method="eigh")
     drawn = _within(drawn, problem.parameters)
     return _with_data(problem, np.vstack([drawn, theta]), scale, prior, at=draws)
+
+
+def _of_record_fit(
+    fit: Any, ranges: Ranges, draws: int, rng: np.random.Generator,
+    sampled: FloatArray | None = None,
+) -> Knowledge:  # fmt: skip
+    """Return the knowledge from a fit of records, whose force follows from the displacement.
+
+    With values sampled from their posterior, (N, P), the draws and the covariance are theirs.
+    """
+    if ranges:
+        raise ValidationError(
+            "plan: ranges are given with a fit of records, which determines its parameters; leave "
+            "them out, or give the model with ranges="
+        )
+    problem: RecordProblem = fit.optimum.problem
+    if problem.output != "force":
+        raise ValidationError(
+            "plan: the fit predicts the motion of a driven plant; planned are fits of frequency "
+            "responses, and of records whose force was predicted: give the model with ranges="
+        )
+    P, parameters = len(problem.free), tuple(problem.free)
+    positive = np.array([p.transform == "log" for p in parameters])
+    values = np.asarray(fit.optimum.values)[:P] if sampled is None else sampled[:, :P]
+    theta = np.where(positive, np.log(np.where(positive, values, 1.0)), values)
+    if sampled is None:
+        slope = np.where(positive, values, 1.0)
+        covariance = np.asarray(fit.covar)[:P, :P] / np.outer(slope, slope)
+        if not np.isfinite(covariance).all():
+            raise ValidationError("plan: the fit does not determine its parameters; give the model")
+        drawn = rng.multivariate_normal(theta, covariance, draws, method="eigh")
+    else:
+        covariance = np.atleast_2d(np.cov(theta, rowvar=False))
+        drawn = theta[rng.integers(len(theta), size=draws)]
+    return Knowledge(
+        problem.model, None, problem.records[0].motion, parameters, _within(drawn, parameters),
+        np.broadcast_to(np.linalg.inv(covariance), (draws, P, P)), np.zeros((P, P)),
+        sample_noise=float(np.std(np.concatenate(fit.residuals))),
+    )  # fmt: skip
 
 
 def _of_errors(
@@ -261,9 +307,10 @@ def _of_assumed(names: Sequence[str], assumed: Mapping[str, float]) -> FloatArra
 
 
 def _leaned_on(parameters: Sequence[Parameter], centre: FloatArray, std: FloatArray) -> FloatArray:
-    """Return the information of ranges, each at least as wide as a factor of e to either side."""
+    """Return the information of ranges, none taken as narrower than `_LEANED_ON`."""
     least = [
-        1.0 if p.transform == "log" else abs(c) for p, c in zip(parameters, centre, strict=True)
+        _LEANED_ON * (1.0 if p.transform == "log" else abs(c))
+        for p, c in zip(parameters, centre, strict=True)
     ]
     return np.asarray(1.0 / np.maximum(std, least) ** 2)
 

@@ -20,6 +20,7 @@ from dahl_ident.problem import Problem
 _POOL = 80  # candidates: the time of the search grows with their number
 _MOST_RUNS = 8  # against scatter between runs: a ninth would gain 6 %
 _WEIGHTS = (0.0, 0.1, 0.25, 0.5, 0.75)  # of the suspected parameters, the least that is enough
+LONGEST = 30.0 * 86400.0  # s, of a plan for which no time is given: a month
 _TIMES = 20  # corrections of the time that reaches a target
 _HELPS = 0.1  # of what the square root of the time would do, below which more time is useless
 _CLOSE = 0.985  # fraction of the target at which the search stops
@@ -118,7 +119,8 @@ class LevelSearch:
     def _fewest(self) -> int:
         """Levels needed for at least one degree of freedom, with two numbers per level."""
         known = self.question.knowledge
-        return 1 if known.problem is not None else len(known.names) // 2 + 1
+        earlier = known.problem is not None or known.sample_noise is not None
+        return 1 if earlier or self.forecast.candidates.motions else len(known.names) // 2 + 1
 
     def pool(self, time: float) -> Any:
         """Return promising candidates: those of the continuous design, and evenly spread ones."""
@@ -128,7 +130,7 @@ class LevelSearch:
                 self._pool = np.arange(K)
                 return self._pool
             f = self.forecast.candidates.frequency_hz
-            alone = np.array([self.bench.fixed([k]) for k in range(K)])
+            alone = self.bench.fixed(np.arange(K)[:, None])
             usual = 0.2 * time if np.isfinite(time) else 20.0 * float(np.median(alone))
             reachable = alone + LEAST_CYCLES / f <= time
             rate = f * usual / (usual + alone) * reachable + 1e-12
@@ -165,12 +167,15 @@ class LevelSearch:
         return max(typical(column) for column in h.T)
 
     def least_time(self) -> Solution | None:
-        """Return the shortest plan that reaches the targets, or the best in the time allowed."""
-        most = self.question.limits.time
+        """Return the shortest plan that reaches the targets, or the best in the time allowed.
+
+        Where no time is given, that is a month.
+        """
+        most = min(self.question.limits.time, LONGEST)
         some = range(
             0, self.forecast.candidates.count, max(1, self.forecast.candidates.count // 20)
         )
-        usual = float(np.median([self.bench.fixed([k]) for k in some]))
+        usual = float(np.median(self.bench.fixed(np.array(some)[:, None])))
         time = min(most, 30.0 * usual + 1.0)
         best: Solution | None = None
         found: Solution | None = None
@@ -201,7 +206,7 @@ class LevelSearch:
                 continue
             if short >= _CLOSE * best.seconds:
                 break
-            fixed = best.runs * self.bench.fixed(best.selection.levels)
+            fixed = best.runs * float(self.bench.fixed(best.selection.levels))
             time = fixed + (best.seconds - fixed) * (best.ratio / 0.995) ** 2
             narrow = np.log(best.seconds / max(short, 1e-3 * best.seconds))
             if not short < time < 0.99 * best.seconds or narrow > 0.6 * wide:
@@ -218,7 +223,8 @@ class LevelSearch:
         c = self.forecast.candidates
         frequencies = np.unique(c.frequency_hz)
         spread = self.question.knowledge.model.rate_independent
-        if not (spread and self.question.controlled == "displacement") and len(frequencies) > 2:
+        single = c.motions or (spread and self.question.controlled == "displacement")
+        if not single and len(frequencies) > 2:
             frequencies = frequencies[[0, len(frequencies) // 2, -1]]
             groups = [np.flatnonzero(c.frequency_hz == f) for f in frequencies]
         else:

@@ -13,6 +13,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray, positive_number
 from dahl_ident.data.storage import place_of, plain_data, write_whole
 from dahl_ident.errors import ValidationError
+from dahl_ident.planning import trajectories
 from dahl_ident.synthetic.waveform import Waveform, WaveformBuilder
 from dahl_ident.units import Motion, shown_unit
 
@@ -26,18 +27,20 @@ _CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the plan's time, in the picture
 
 @dataclass(frozen=True)
 class Step:
-    """One level of a run.
+    """One level of a run, or one motion in time.
 
     Attributes
     ----------
     level : float
         Amplitude of displacement (m) or drive (N), zero to peak.
     frequency_hz : float
-        Hz.
+        Hz; one over the period of a motion.
     settling_cycles, measured_cycles : int
-        Cycles before measuring, and measured.
+        Cycles before measuring, and measured: the repeats of a motion.
     seconds : float
         Change-over, settling and measuring.
+    motion : Motion or None
+        The motion in time that is repeated, None for a sine.
     """
 
     level: float
@@ -45,6 +48,7 @@ class Step:
     settling_cycles: int
     measured_cycles: int
     seconds: float
+    motion: trajectories.Motion | None = None
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,7 @@ class Expected:
 
 
 class _Planner(Protocol):
+    question: Any
     forecast: Any
     search: Any
 
@@ -129,10 +134,12 @@ class Plan:
     def to_frame(self) -> pd.DataFrame:
         """Return the table: level, frequency, settling and measured cycles, seconds.
 
+        Of motions in time: the motion, its parameters, period, repeats and seconds.
+
         Returns
         -------
         pandas.DataFrame
-            One row a level, in the order of the run.
+            One row a level or motion, in the order of the run.
         """
         import pandas as pd
 
@@ -166,7 +173,15 @@ class Plan:
         }
 
     def waveform(self) -> Waveform:
-        """Return one run as a smooth waveform with its measured windows."""
+        """Return one run of sines as a smooth waveform with its measured windows.
+
+        Raises
+        ------
+        ValidationError
+            If the plan is one of motions in time; `write_waveform` writes them.
+        """
+        if self.steps[0].motion is not None:
+            raise ValidationError("the plan holds motions in time; write_waveform() writes them")
         run = WaveformBuilder(self.steps[0].frequency_hz)
         for step in self.steps:
             run.go_to(step.level, step.frequency_hz, self.change_over)
@@ -184,7 +199,8 @@ class Plan:
         path : path
             Ending in ``.csv``.
         sample_rate : float
-            Samples a second; at least ten a cycle of the highest frequency.
+            Samples a second; at least ten a cycle of the highest frequency, or ten in the time
+            of a trapezoid from end to end.
         overwrite : bool, default False
             Replace a file that is there already.
 
@@ -197,33 +213,62 @@ class Plan:
         Raises
         ------
         ValidationError
-            If there are fewer than ten samples a cycle.
+            If there are fewer than ten samples a cycle, or the move to a motion's start takes more
+            speed or acceleration than the limits allow.
         """
         import pandas as pd
 
-        rate, wave = positive_number(sample_rate, "sample_rate"), self.waveform()
-        if rate < 10.0 * wave.highest_frequency_hz:
+        rate = positive_number(sample_rate, "sample_rate")
+        motions = [step.motion for step in self.steps if step.motion is not None]
+        fastest = max(
+            step.motion.fastest_hz if step.motion else step.frequency_hz for step in self.steps
+        )
+        if rate < trajectories.SAMPLES_PER_CYCLE * fastest:
             raise ValidationError(
                 f"sample_rate is {rate:g}; expected at least ten samples a cycle: "
-                f"{10.0 * wave.highest_frequency_hz:g}"
+                f"{trajectories.SAMPLES_PER_CYCLE * fastest:g}"
             )
-        time = np.arange(int(np.floor(wave.duration * rate)) + 1) / rate
-        measured, step = np.zeros(time.size, dtype=int), np.ones(time.size, dtype=int)
-        for i, window in enumerate(wave.windows, start=1):
-            measured[(time >= window.start) & (time < window.stop)] = 1
-            step[time >= window.stop] = min(i + 1, len(wave.windows))
+        if motions:
+            self._check_moves(motions)
+            time = np.arange(int(np.floor(self.seconds * rate + 1e-6)) + 1) / rate
+            repeats = [one.measured_cycles for one in self.steps]
+            value, step, measured = trajectories.course(motions, repeats, self.change_over, time)
+        else:
+            wave = self.waveform()
+            time = np.arange(int(np.floor(wave.duration * rate)) + 1) / rate
+            value = wave.value(time)
+            measured, step = np.zeros(time.size, dtype=bool), np.ones(time.size, dtype=np.int64)
+            for i, window in enumerate(wave.windows, start=1):
+                measured[(time >= window.start) & (time < window.stop)] = True
+                step[time >= window.stop] = min(i + 1, len(wave.windows))
         what = "drive" if self.controlled == "force" else "displacement"
         frame = pd.DataFrame(
             {
                 "time [s]": time,
-                f"{what} [{self._unit}]": wave.value(time),
+                f"{what} [{self._unit}]": value,
                 "step": step,
-                "measured": measured,
+                "measured": measured.astype(int),
             }
         )
         place = place_of(path, "a waveform", (".csv",))
         write_whole(place, frame.to_csv(index=False).encode(), overwrite=overwrite)
         return place
+
+    def _check_moves(self, motions: list[trajectories.Motion]) -> None:
+        """Check that the moves to the motions' starts are within the limits of the exciter."""
+        limits, place = self.planner.question.limits, 0.0
+        for i, motion in enumerate(motions, start=1):
+            start = float(motion.displacement(np.zeros(1))[0])
+            least = trajectories.seconds_of_move(
+                abs(start - place), limits.speed[1], limits.acceleration[1]
+            )
+            if self.change_over < least:
+                raise ValidationError(
+                    f"change_over is {self.change_over:g} s, and the move to the start of motion "
+                    f"{i} takes {least:.3g} s within the limits of speed and acceleration; plan "
+                    "with a longer change_over"
+                )
+            place = start
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the plan as JSON.
@@ -250,15 +295,19 @@ class Plan:
         """Return time, uncertainty by plans and by a logarithmic grid, for each quantity.
 
         The quantities are the targets, or all parameters where time was given. The grid has ten
-        levels with equal cycles; NaN where the time is too short.
+        levels with equal cycles; NaN where the time is too short. At the plan's own time, its
+        uncertainties are those of the plan.
         """
         names = list(self.target or self.expected)
         times = self.seconds * np.array(_CURVE)
         planned = {name: np.full(len(times), np.nan) for name in names}
         even = {name: np.full(len(times), np.nan) for name in names}
         for i, time in enumerate(times.tolist()):
-            found = self.planner.search.solve(time)
-            if found is not None:
+            found = self.planner.search.solve(time) if time != self.seconds else None
+            if time == self.seconds:
+                for name in names:
+                    planned[name][i] = self.expected[name].after
+            elif found is not None:
                 selection = found.selection
                 told = self.planner.forecast.expected(
                     selection.levels, selection.cycles, found.runs
@@ -294,14 +343,7 @@ class Plan:
 
     def __str__(self) -> str:
         """Return the plan as text."""
-        lines = [_headline(self), ""]
-        lines.append(f"{'':4}{'level [' + self._unit + ']':>13}{'[Hz]':>10}{'settling':>10}"
-                     f"{'measured':>10}{'time [s]':>10}")  # fmt: skip
-        for i, s in enumerate(self.steps, start=1):
-            lines.append(
-                f"{i:<4}{s.level:>13.4g}{s.frequency_hz:>10.4g}{s.settling_cycles:>10d}"
-                f"{s.measured_cycles:>10d}{s.seconds:>10.1f}"
-            )
+        lines = [_headline(self), "", *(self._motions() or self._levels())]
         lines += ["", f"{'':24}{'value':>11}{'before':>11}{'after':>11}{'wanted':>11}"]
         for name, e in self.expected.items():
             wanted = _percent(self.target[name]) if name in self.target else ""
@@ -316,14 +358,57 @@ class Plan:
         lines.append(f"Assumed: {'; '.join(self.assumptions)}.")
         return "\n".join(lines)
 
+    def _levels(self) -> list[str]:
+        heading = (
+            f"{'':4}{'level [' + self._unit + ']':>13}{'[Hz]':>10}{'settling':>10}"
+            f"{'measured':>10}{'time [s]':>10}"
+        )
+        return [heading] + [
+            f"{i:<4}{s.level:>13.4g}{s.frequency_hz:>10.4g}{s.settling_cycles:>10d}"
+            f"{s.measured_cycles:>10d}{s.seconds:>10.1f}"
+            for i, s in enumerate(self.steps, start=1)
+        ]
+
+    def _motions(self) -> list[str]:
+        """Return the table of motions in time; empty for sines."""
+        moving = [(s, s.motion) for s in self.steps if s.motion is not None]
+        if not moving:
+            return []
+        names = {
+            n: f"{n} [{shown_unit(trajectories.UNITS[n], self.motion)}]"
+            for _, motion in moving for n in motion.parameters
+        }  # fmt: skip
+        rows = [
+            (motion.kind,
+             *(f"{motion.parameters[n]:.4g}" if n in motion.parameters else "-" for n in names),
+             f"{1.0 / s.frequency_hz:.4g}", str(s.measured_cycles), f"{s.seconds:.1f}")
+            for s, motion in moving
+        ]  # fmt: skip
+        heading = ("motion", *names.values(), "one [s]", "repeats", "time [s]")
+        widths = [max(len(h), *(len(r[i]) for r in rows)) for i, h in enumerate(heading)]
+        return [
+            f"{number:<4}" + "  ".join(f"{c:>{w}}" for c, w in zip(row, widths, strict=True))
+            for number, row in zip(("", *range(1, len(rows) + 1)), (heading, *rows), strict=True)
+        ]
+
 
 def vars_of(one: Step | Expected) -> dict[str, Any]:
-    """Return the fields of a step or an expectation."""
-    return dict(vars(one))
+    """Return the fields of a step or an expectation; of a motion what describes it."""
+    found = dict(vars(one))
+    if not isinstance(one, Step):
+        return found
+    motion = found.pop("motion")
+    if motion is None:
+        return found
+    return {
+        "motion": motion.kind, **motion.parameters, "period": motion.period,
+        "repeats": one.measured_cycles, "seconds": one.seconds,
+    }  # fmt: skip
 
 
 def _headline(plan: Plan) -> str:
-    levels = f"{len(plan.steps)} level{'s' if len(plan.steps) != 1 else ''}"
+    what = "level" if plan.steps[0].motion is None else "motion"
+    levels = f"{len(plan.steps)} {what}{'s' if len(plan.steps) != 1 else ''}"
     runs = f"{plan.runs} runs of {levels}" if plan.runs > 1 else levels
     end = ""
     if plan.target:

@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
-from dahl_ident.planning.criteria import Objective
+from dahl_ident.planning.criteria import Objective, Point
 
 _IMPROVES = 1e-3  # least improvement of the logarithm by a change of the levels
 _ROUNDS = 12  # at most; a round without improvement is the last
 _TRIED = 3  # candidates whose times are optimised after a first look at all
+_NO_TIME = 1e-9  # s, shared where there is none, so that the sums stay defined
 _MOST_LEVELS = 24  # an optimum of six parameters takes at most 21 (Caratheodory)
 
 
@@ -80,34 +81,44 @@ def continuous_design(
         seconds[missing] = 1e-3 * time / max(int(missing.sum()), 1)
         seconds *= time / seconds.sum()
         active = np.flatnonzero(seconds)
-    return ContinuousDesign(seconds, point.value, excess)
+    return ContinuousDesign(seconds, float(point.value), excess)
 
 
 def _shared(
     objective: Objective,
     frequency_hz: FloatArray,
-    time: float,
+    time: FloatArray | float,
     start: FloatArray,
     iterations: int,
     tolerance: float,
     least: FloatArray | float = 0.0,
 ) -> FloatArray:
-    """Return seconds beyond `least` that share `time` best, by multiplication from `start`."""
-    seconds, power = start * (time / start.sum()), 1.0
+    """Return seconds beyond `least` that share `time` best, by multiplication from `start`.
+
+    Of each design, (..., m), with its own time, (..., 1).
+    """
+    seconds = start * (time / start.sum(axis=-1, keepdims=True))
+    power = np.ones((*seconds.shape[:-1], 1))
     point = objective.at((least + seconds) * frequency_hz)
+    rate = objective.gradient(point) * frequency_hz
     for _ in range(iterations):
-        rate = objective.gradient(point) * frequency_hz
-        mean = float(rate @ seconds) / time
-        if not mean > 0.0 or rate.max() < (1.0 + tolerance) * mean:
+        mean = (rate * seconds).sum(axis=-1, keepdims=True) / time
+        better = (mean > 0.0) & (rate.max(axis=-1, keepdims=True) >= (1.0 + tolerance) * mean)
+        if not better.any():
             break
-        while True:
+        with np.errstate(divide="ignore", invalid="ignore"):
             moved = seconds * (rate / mean) ** power
-            moved *= time / moved.sum()
-            new = objective.at((least + moved) * frequency_hz)
-            if new.value >= point.value or power < 0.1:
-                break
-            power *= 0.5  # only D-optimality rises with full steps
-        seconds, point = moved, new
+            moved *= time / moved.sum(axis=-1, keepdims=True)
+        moved = np.where(better, moved, seconds)
+        new = objective.at((least + moved) * frequency_hz)
+        # only D-optimality rises with full steps; a step that fell is tried again, half as long
+        fell = (new.value < point.value)[..., None] & (power >= 0.1)
+        power = np.where(fell, 0.5 * power, power)
+        if fell.all():
+            continue
+        new_rate = objective.gradient(new) * frequency_hz
+        seconds, rate = np.where(fell, seconds, moved), np.where(fell, rate, new_rate)
+        point = Point(np.where(fell[..., 0], point.value, new.value), new.sensitivities)
     return np.asarray(seconds)
 
 
@@ -136,7 +147,7 @@ class Exchange:
         """Return the best levels for one run of `time` s; None where nothing can be measured."""
         chosen, value = list(start), -np.inf
         if chosen:
-            value = self._value(chosen, time)
+            value = float(self._values([chosen], time)[0])
             if value == -np.inf:
                 chosen = []
         for _ in range(_ROUNDS):
@@ -174,40 +185,43 @@ class Exchange:
     def _better(
         self, trials: list[list[int]], value: float, time: float
     ) -> tuple[list[int], float] | None:
-        values = [self._value(trial, time) for trial in trials]
-        best = int(np.argmax(values)) if values else -1
+        values = self._values(trials, time)
+        best = int(np.argmax(values)) if trials else -1
         if best < 0 or not values[best] > value + (_IMPROVES if np.isfinite(value) else 0.0):
             return None
-        return trials[best], values[best]
+        return trials[best], float(values[best])
 
-    def _room(self, levels: Sequence[int], time: float) -> float:
-        """Return the seconds to share beyond the least cycles at every level."""
-        least = LEAST_CYCLES / self._bench.frequency_hz[list(levels)]
-        return time - self._bench.fixed(levels) - float(least.sum())
-
-    def _share(self, levels: Sequence[int], time: float, iterations: int) -> FloatArray | None:
-        room = self._room(levels, time)
-        if not room >= 0.0:
-            return None
-        f = self._bench.frequency_hz[list(levels)]
+    def _share(
+        self, levels: NDArray[np.intp], time: float, iterations: int
+    ) -> tuple[Objective, FloatArray]:
+        """Return the cycles at the levels of each design, (..., m); NaN without enough time."""
+        f = self._bench.frequency_hz[levels]
         least = LEAST_CYCLES / f
-        if room == 0.0:
-            return np.asarray(least * f)
+        room = (time - self._bench.fixed(levels) - least.sum(axis=-1))[..., None]
         sub = self._objective.only(levels)
-        start = np.full(len(f), 1.0)
-        seconds = _shared(sub, f, room, start, iterations, 0.003, least)
-        return np.asarray((least + seconds) * f)
+        some = np.maximum(room, _NO_TIME)
+        seconds = _shared(sub, f, some, np.ones(f.shape), iterations, 0.003, least)
+        return sub, np.where(room >= 0.0, (least + np.where(room > 0.0, seconds, 0.0)) * f, np.nan)
 
-    def _value(self, levels: Sequence[int], time: float) -> float:
-        cycles = self._share(levels, time, 15)
-        if cycles is None:
-            return -np.inf
-        return self._objective.only(levels).at(cycles).value
+    def _values(self, trials: list[list[int]], time: float) -> FloatArray:
+        """Return the criterion of each set of levels; -inf without enough time."""
+        result = np.full(len(trials), -np.inf)
+        sizes = np.array([len(trial) for trial in trials])
+        for size in np.unique(sizes[sizes > 0]).tolist():
+            same = np.flatnonzero(sizes == size)
+            levels = np.array([trials[i] for i in same], dtype=np.intp)
+            sub, cycles = self._share(levels, time, 15)
+            enough = np.asarray(np.isfinite(cycles).all(axis=-1))
+            value = sub.at(np.where(enough[:, None], cycles, 1.0)).value
+            result[same] = np.where(enough, value, -np.inf)
+        return result
 
     def _promising(self, chosen: list[int], time: float) -> list[int]:
         """Return the candidates that look best beside the chosen ones, at equal shares."""
         rest = np.setdiff1d(self._pool, chosen)
-        rooms = np.array([self._room([*chosen, k], time) for k in rest.tolist()])
+        beside = np.column_stack([np.tile(chosen, (rest.size, 1)), rest]).astype(np.intp)
+        least = (LEAST_CYCLES / self._bench.frequency_hz[beside]).sum(axis=-1)
+        rooms = time - self._bench.fixed(beside) - least
         possible = rest[rooms >= 0.0]
         if not possible.size:
             return []
@@ -229,10 +243,8 @@ class Exchange:
         """Return whole cycles at the levels; the remaining time goes where it helps most."""
         ordered = self._bench.order(levels)
         f = self._bench.frequency_hz[ordered]
-        shared = self._share(ordered.tolist(), time, 100)
-        assert shared is not None
+        sub, shared = self._share(ordered, time, 100)
         cycles = np.maximum(np.floor(shared + 1e-9), float(LEAST_CYCLES))
-        sub = self._objective.only(ordered)
         while True:
             left = time - self._bench.seconds(ordered, cycles)
             possible = 1.0 / f <= left + 1e-9
@@ -240,4 +252,4 @@ class Exchange:
                 break
             gain = np.where(possible, sub.gradient(sub.at(cycles)) * f, -np.inf)
             cycles[int(np.argmax(gain))] += 1.0
-        return Selection(ordered, cycles, sub.at(cycles).value)
+        return Selection(ordered, cycles, float(sub.at(cycles).value))

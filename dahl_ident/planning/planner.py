@@ -3,27 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray, non_negative_array, positive_number, whole_number
+from dahl_ident.arrays import non_negative_array, positive_number, whole_number
 from dahl_ident.data.fields import one_of
 from dahl_ident.elements import Element
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.bench_time import LEAST_CYCLES
-from dahl_ident.planning.candidates import CONTROLLED, Limits, bench_time, evaluate, grid
+from dahl_ident.planning.candidates import (
+    CONTROLLED,
+    Candidates,
+    CycleNoise,
+    Limits,
+    bench_time,
+    evaluate,
+    grid,
+    level_range,
+)
 from dahl_ident.planning.criteria import Objective, Term
 from dahl_ident.planning.forecast import Forecast
 from dahl_ident.planning.knowledge import Ranges, gather
-from dahl_ident.planning.level_search import LevelSearch, Solution
+from dahl_ident.planning.level_search import LONGEST, LevelSearch, Solution
 from dahl_ident.planning.measurement_plan import Expected, Plan, Step
+from dahl_ident.planning.motion_information import evaluate_motions, motions_of, root
 from dahl_ident.planning.optimal_design import continuous_design
-from dahl_ident.planning.quantities import is_expanded
-from dahl_ident.planning.question import Question, larger_model, noise_of, targets_of
+from dahl_ident.planning.quantities import RESPONSE, is_expanded, sizes
+from dahl_ident.planning.question import (
+    Question,
+    larger_model,
+    motions_asked,
+    noise_of,
+    recorded_force,
+    targets_of,
+)
+from dahl_ident.planning.trajectories import Motion
 
 _NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
+_FEW_LEVELS = 60  # candidates with which the effect of a wider limit is judged
+_MOTION_DRAWS = 24  # at which the records of motions are computed
+_CORRECTIONS = 6  # of the repeats of motions, each by the whole information
+_NEARLY = 0.99  # of the longest plan: whole cycles leave some of the time
+_AIMED = 0.999  # fraction of the target
 _RELAXED = 10.0  # times: a limit that prevents nothing then hardly helps
 
 
@@ -37,12 +61,13 @@ def plan(
     scatter: float | None = None,
     runs: int | None = None,
     controlled: str = "displacement",
-    candidates: int | Sequence[tuple[float, float]] = 240,
+    candidates: int | str | Sequence[tuple[float, float]] | Sequence[Motion] = 240,
     larger: Element | None = None,
     suspects: Mapping[str, float] | None = None,
     change_over: float = 1.0,
     settled: float = 0.01,
     between_runs: float = 0.0,
+    sample_rate: float | None = None,
     draws: int = 200,
     seed: int = 0,
 ) -> Plan:
@@ -50,12 +75,13 @@ def plan(
 
     Parameters
     ----------
-    source : Element, FitResult or posterior
+    source : Element, FitResult, RecordFit or posterior
         What is known: a model with `ranges` before any data, or the result of earlier ones,
         whose information is added.
     limits : mapping
-        ``frequency_hz`` (needed), ``displacement``, ``force`` and ``speed``: the highest value,
-        or lowest and highest, zero-to-peak, SI; ``time``: seconds for everything.
+        ``frequency_hz`` (needed for sines), ``displacement``, ``force``, ``speed`` and
+        ``acceleration``: the highest value, or lowest and highest, zero-to-peak, SI; ``time``:
+        seconds for everything.
     target : mapping, sequence of str, or str, optional
         Mapping from a parameter, or a product of powers such as ``"f_max/sigma"``, to its wanted
         relative standard uncertainty, or from ``"U(f_max)"`` to its relative expanded uncertainty
@@ -68,7 +94,8 @@ def plan(
     noise : float or mapping, optional
         Of one cycle: standard deviation of ln gain and phase, or a mapping with ``relative``,
         ``force`` and ``displacement`` (N and m, standard deviation of each part of the
-        fundamental). Left out, that of the earlier data.
+        fundamental). Left out, that of the earlier data. For motions in time ``{"force": s}``, the
+        standard deviation of a sample, N.
     scatter : float, optional
         Standard deviation of ln gain and phase between runs. Left out, that of the earlier data,
         else 0.
@@ -76,8 +103,10 @@ def plan(
         Left out, as many as are best: 1 without scatter, else up to 8.
     controlled : {"displacement", "force"}
         What the exciter holds. With "force", levels are drives of the whole plant.
-    candidates : int or sequence of (level, frequency_hz), default 240
-        How many to choose from, or which.
+    candidates : int, sequence of (level, frequency_hz), str, or sequence of motions, default 240
+        How many levels to choose from, or which. ``"trapezoid"`` and ``"multisine"`` stand for
+        motions in time within the limits, to be fitted as records; or give them as
+        :class:`dahl_ident.planning.Trapezoid` and :class:`dahl_ident.planning.Multisine`.
     larger : Element, optional
         Model in which `suspects` are parameters; left out, the model itself.
     suspects : mapping of str to float, optional
@@ -90,6 +119,8 @@ def plan(
         Share of the friction force below which a transient counts as settled.
     between_runs : float, default 0
         Seconds that each run takes in addition to its levels.
+    sample_rate : float, optional
+        Samples a second of the records of motions in time, which need it.
     draws : int, default 200
         Parameter vectors that the criterion is averaged over.
     seed : int, default 0
@@ -132,15 +163,6 @@ def plan(
     one_of(controlled, "controlled", CONTROLLED)
     bench = Limits.of(limits)
     knowledge = gather(source, ranges, draws, seed)
-    per_cycle = noise_of(noise, knowledge)
-    if isinstance(candidates, int):
-        whole_number(candidates, "candidates", 2)
-        level, frequency = grid(knowledge, bench, controlled, candidates)
-    else:
-        pairs = non_negative_array([list(pair) for pair in candidates], "candidates")
-        if pairs.ndim != 2 or pairs.shape[1] != 2:
-            raise ValidationError("candidates: expected pairs of level and frequency in Hz")
-        level, frequency = pairs.T
     wanted, numbers = targets_of(target)
     if not numbers and not np.isfinite(bench.time):
         raise ValidationError(
@@ -152,23 +174,96 @@ def plan(
         "settled": positive_number(settled, "settled"),
         "between_runs": float(non_negative_array(between_runs, "between_runs")),
     }
+    asked = motions_asked(candidates)
+    if asked:
+        _only_motions(wanted, scatter, suspects, controlled, runs, larger)
+        some = np.unique(np.linspace(0, draws - 1, min(draws, _MOTION_DRAWS)).astype(int))
+        known = replace(knowledge.only(some), errors=None, scatter=0.0)
+        question = Question(
+            known, bench, controlled, CycleNoise(0.0), wanted, numbers, 0.0, 1, costs, None, {},
+            recorded_force(noise, sample_rate, knowledge), asked,
+        )  # fmt: skip
+        return _of_motions(question, bench)
+    if sample_rate is not None:
+        raise ValidationError(
+            "plan: sample_rate is that of records of motions in time; leave it out for settled "
+            "sines, or give candidates='trapezoid'"
+        )
     question = Question(
-        knowledge, bench, controlled, per_cycle, wanted, numbers,
+        knowledge, bench, controlled, noise_of(noise, knowledge), wanted, numbers,
         knowledge.scatter if scatter is None else float(non_negative_array(scatter, "scatter")),
         None if runs is None else whole_number(runs, "runs", 1),
         costs, larger_model(knowledge, larger, suspects), dict(suspects or {}),
     )  # fmt: skip
-    return Planner(question, level, frequency).plan()
+    if isinstance(candidates, int):
+        whole_number(candidates, "candidates", 2)
+        return Planner(question, _options(question, bench, candidates)).plan()
+    pairs = non_negative_array(
+        [list(cast("tuple[float, float]", p)) for p in candidates], "candidates"
+    )
+    if pairs.ndim != 2 or pairs.shape[1] != 2:
+        raise ValidationError("candidates: expected pairs of level and frequency in Hz")
+    level, frequency = pairs.T
+    return Planner(
+        question, evaluate(knowledge, level, frequency, controlled, bench, question.noise)
+    ).plan()
+
+
+def _only_motions(
+    wanted: Any, scatter: Any, suspects: Any, controlled: str, runs: Any, larger: Any
+) -> None:
+    """Check that nothing is asked of motions in time that only settled sines have."""
+    given = {
+        "target 'response'": RESPONSE in wanted,
+        "scatter": bool(scatter),
+        "suspects": bool(suspects),
+        "larger": larger is not None,
+        "runs": runs not in (None, 1),
+        "controlled='force'": controlled == "force",
+    }
+    for name, there in given.items():
+        if there:
+            raise ValidationError(
+                f"plan: {name} is planned with settled sines only; leave it out for motions in "
+                "time, or leave candidates out"
+            )
+
+
+def _of_motions(question: Question, limits: Limits) -> Plan:
+    """Return the better of two plans of motions.
+
+    The first takes a repeat as worth the same share of a long record for every motion; the second
+    as worth what it is in a record as long as the first plan, so that a motion of which that time
+    holds few repeats, whose first is spent on the record's own unknowns, is not preferred.
+    """
+    first = Planner(question, _options(question, limits))
+    plan = first.plan()
+    second = Planner(question, _options(question, limits, lasting=plan.seconds))
+    other = second.plan()
+    return other if second.score(other) > first.score(plan) else plan
+
+
+def _options(
+    question: Question, limits: Limits, count: int = _FEW_LEVELS, lasting: float | None = None
+) -> Candidates:
+    """Return the candidates of a question within limits; motions repeated for `lasting` s."""
+    q = question
+    if q.recorded is None:
+        level, frequency = grid(q.knowledge, limits, q.controlled, count)
+        return evaluate(q.knowledge, level, frequency, q.controlled, limits, q.noise)
+    asked: Sequence[Motion] | str = q.motions
+    if isinstance(asked, str):
+        asked = motions_of(asked, limits, level_range(q.knowledge, limits, q.controlled))
+    return evaluate_motions(q.knowledge, asked, limits, q.recorded, lasting)
 
 
 class Planner:
     """One planning problem: its candidates, the search among them, and the plan in words."""
 
-    def __init__(self, question: Question, level: FloatArray, frequency_hz: FloatArray) -> None:
+    def __init__(self, question: Question, candidates: Candidates) -> None:
         self.question = q = question
-        candidates = evaluate(q.knowledge, level, frequency_hz, q.controlled, q.limits, q.noise)
         bench = bench_time(candidates, q.knowledge, **q.costs)
-        settles = np.isfinite([bench.fixed([k]) for k in range(candidates.count)])
+        settles = np.isfinite(bench.fixed(np.arange(candidates.count)[:, None]))
         if not settles.any():
             raise ValidationError(
                 "plan: no candidate ever settles; widen limits['displacement'] upwards"
@@ -178,35 +273,83 @@ class Planner:
             bench = bench_time(candidates, q.knowledge, **q.costs)
         self.forecast = Forecast.of(q.knowledge, candidates, q.wanted, q.scatter)
         self.search = LevelSearch(q, self.forecast, bench)
+        self.found: Solution | None = None
 
     def plan(self) -> Plan:
         """Return the plan."""
         q = self.question
         found = self.search.least_time() if q.numbers else self.search.solve(q.limits.time)
         if found is None:
-            least = min(
-                self.search.bench.fixed([k]) + LEAST_CYCLES / f
-                for k, f in enumerate(self.forecast.candidates.frequency_hz.tolist())
-            )
+            f = self.forecast.candidates.frequency_hz
+            alone = self.search.bench.fixed(np.arange(len(f))[:, None])
+            least = float((alone + LEAST_CYCLES / f).min())
             raise ValidationError(
-                f"limits['time'] is {q.limits.time:g} s, and the quickest level takes {least:.3g} "
+                f"limits['time'] is {q.limits.time:g} s, and the quickest "
+                f"{'level' if q.recorded is None else 'motion'} takes {least:.3g} "
                 "s to change over, settle and measure; give more time"
             )
-        return self._told(found)
+        self.found = found if q.recorded is None else self._exactly(found)
+        return self._told(self.found)
+
+    def score(self, plan: Plan) -> tuple[bool, float]:
+        """Return what is larger for the better of two plans of the same question."""
+        q = self.question
+        if q.numbers and plan.reached:
+            return True, -plan.seconds
+        if q.numbers:
+            return False, -max(plan.expected[name].after / u for name, u in q.wanted.items())
+        assert self.found is not None
+        chosen = self.found.selection
+        some = Objective((self.forecast.thinned().term(q.wanted),)).only(chosen.levels)
+        return True, float(some.at(chosen.cycles).value)
+
+    def _exactly(self, found: Solution) -> Solution:
+        """Return the repeats that reach the targets by the information of the whole records.
+
+        The search takes each repeat of a motion as worth the same; the first ones, which also have
+        to determine the state at the start, the offset and the drift, are worth less.
+        """
+        q, candidates = self.question, self.forecast.candidates
+        levels, cycles = found.selection.levels, found.selection.cycles
+        assert q.recorded is not None
+        risen = False
+        for attempt in range(_CORRECTIONS):
+            rows = candidates.rows.copy()
+            for k, n in zip(levels.tolist(), cycles.tolist(), strict=True):
+                one = q.recorded.information(q.knowledge, candidates.motions[k], int(n))
+                rows[:, k] = root(one / n) * sizes(q.knowledge.parameters, q.knowledge.theta)
+            exact = replace(self.forecast, candidates=replace(candidates, rows=rows))
+            self.search.forecast = exact
+            ratio = self.search.ratio(replace(found.selection, cycles=cycles), 1)
+            better = np.maximum(np.ceil(cycles * (ratio / _AIMED) ** 2), float(LEAST_CYCLES))
+            possible = self.search.bench.seconds(levels, better) <= min(q.limits.time, LONGEST)
+            done = (ratio <= 1.0 and risen) or bool((better == cycles).all())
+            if done or not (q.numbers and possible) or attempt == _CORRECTIONS - 1:
+                break
+            risen = risen or ratio > 1.0
+            cycles = better
+        self.forecast = exact
+        return Solution(
+            replace(found.selection, cycles=cycles), 1,
+            self.search.bench.seconds(levels, cycles), ratio,
+        )  # fmt: skip
 
     def _told(self, found: Solution) -> Plan:
         q, chosen = self.question, found.selection
         settling = self.search.bench.settling_cycles(chosen.levels)
+        options = self.forecast.candidates.only(chosen.levels)
         steps = tuple(
-            Step(level, f, int(wait), int(n), q.costs["change_over"] + (wait + n) / f)
-            for level, f, wait, n in zip(
-                self.forecast.candidates.level[chosen.levels].tolist(),
-                self.forecast.candidates.frequency_hz[chosen.levels].tolist(),
-                settling.tolist(), chosen.cycles.tolist(), strict=True,
+            Step(level, f, int(wait), int(n), q.costs["change_over"] + (wait + n) / f, motion)
+            for level, f, wait, n, motion in zip(
+                options.level.tolist(), options.frequency_hz.tolist(), settling.tolist(),
+                chosen.cycles.tolist(), options.motions or (None,) * len(settling), strict=True,
             )
         )  # fmt: skip
         expected = self.forecast.expected(chosen.levels, chosen.cycles, found.runs)
         reached = not q.numbers or found.ratio <= 1.0
+        assumptions = self._assumptions()
+        if found.seconds > _NEARLY * LONGEST and not np.isfinite(q.limits.time):
+            assumptions = (*assumptions, "no plan takes more than 30 days unless a time is given")
         return Plan(
             controlled=q.controlled,
             steps=steps,
@@ -216,7 +359,7 @@ class Planner:
             target=dict(q.wanted) if q.numbers else {},
             reached=reached and found.ratio <= 1.0,
             undetermined=self._undetermined(found, expected),
-            assumptions=self._assumptions(),
+            assumptions=assumptions,
             change_over=q.costs["change_over"],
             motion=q.knowledge.motion,
             planner=self,
@@ -269,8 +412,7 @@ class Planner:
     def _within_reach(self, name: str, limits: Limits) -> float:
         """Return the uncertainty of one quantity by the best continuous design."""
         q = self.question
-        level, f = grid(q.knowledge, limits, q.controlled, 60)
-        options = evaluate(q.knowledge, level, f, q.controlled, limits, q.noise)
+        options = _options(q, limits)
         some = Forecast.of(q.knowledge, options, q.wanted, q.scatter).thinned()
         known = some.before + _NOTHING * np.eye(some.before.shape[-1])
         levels = some.candidates.information(q.scatter)
@@ -281,6 +423,14 @@ class Planner:
 
     def _assumptions(self) -> tuple[str, ...]:
         q, found = self.question, []
+        if q.recorded is not None:
+            return (
+                f"white noise of {q.recorded.noise:.3g} N in each sample of force, "
+                f"{q.recorded.sample_rate:g} samples a second; a record of each motion is fitted "
+                "with its initial state, offset and drift",
+                *(f"{n} within the range that a fit assumes" for n in q.knowledge.assumed),
+                "the model is right", "calibrations are exact",
+            )  # fmt: skip
         found.append(
             f"noise of one cycle: {100.0 * q.noise.relative:.3g} % of the response"
             + (f", {q.noise.force:.3g} N" if q.noise.force else "")

@@ -14,11 +14,13 @@ from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.candidates import CycleNoise, Limits
 from dahl_ident.planning.knowledge import Knowledge
+from dahl_ident.planning.motion_information import RecordedForce
+from dahl_ident.planning.trajectories import KINDS, Motion
 
 
 @dataclass(frozen=True)
 class Question:
-    """The arguments of :func:`plan` in checked form."""
+    """The arguments of :func:`plan` in checked form; `recorded` only for motions in time."""
 
     knowledge: Knowledge
     limits: Limits
@@ -31,6 +33,8 @@ class Question:
     costs: dict[str, float]
     larger: Any
     suspects: dict[str, float]
+    recorded: RecordedForce | None = None
+    motions: str | tuple[Motion, ...] = ()
 
 
 def noise_of(given: float | Mapping[str, float] | None, knowledge: Knowledge) -> CycleNoise:
@@ -39,7 +43,7 @@ def noise_of(given: float | Mapping[str, float] | None, knowledge: Knowledge) ->
         if knowledge.row_noise is None:
             raise ValidationError(
                 "plan: the noise is unknown before any data; give noise=0.01 (of ln gain and phase "
-                "in one cycle), or noise={'relative': 0.01, 'force': 1e-3, 'displacement': 1e-7}"
+                "in one cycle), or its parts: relative, force in N, displacement in m"
             )
         return CycleNoise(knowledge.row_noise * float(np.sqrt(knowledge.row_cycles)))
     if not isinstance(given, Mapping):
@@ -55,6 +59,52 @@ def noise_of(given: float | Mapping[str, float] | None, knowledge: Knowledge) ->
     return CycleNoise(**{"relative": 0.0, **parts})
 
 
+def motions_asked(candidates: Any) -> str | tuple[Motion, ...]:
+    """Return the motions in time among the candidates' forms, empty for sines."""
+    if isinstance(candidates, str):
+        if candidates not in KINDS:
+            raise ValidationError(
+                f"candidates is {candidates!r}; expected a number, pairs of level and frequency, "
+                f"motions, or one of {', '.join(KINDS)}"
+            )
+        return candidates
+    if isinstance(candidates, int):
+        return ()
+    try:
+        listed = tuple(candidates)
+    except TypeError:
+        raise ValidationError(
+            f"candidates is {candidates!r}; expected a number, pairs of level and frequency, a "
+            f"list of motions, or one of {', '.join(KINDS)}"
+        ) from None
+    moving = [getattr(one, "kind", None) in KINDS for one in listed]
+    if any(moving) and not all(moving):
+        raise ValidationError("candidates holds motions and others; plan one or the other")
+    return listed if any(moving) else ()
+
+
+def recorded_force(
+    noise: float | Mapping[str, float] | None, sample_rate: float | None, knowledge: Knowledge
+) -> RecordedForce:
+    """Return the noise of a record's force, as given or from earlier records."""
+    if sample_rate is None:
+        raise ValidationError("plan: motions in time need sample_rate, the samples a second, Hz")
+    rate = positive_number(sample_rate, "sample_rate")
+    if noise is None:
+        if knowledge.sample_noise is None:
+            raise ValidationError(
+                "plan: the noise of the force is unknown; give the standard deviation of a force "
+                "sample, N, in noise"
+            )
+        return RecordedForce(knowledge.sample_noise, rate)
+    if not isinstance(noise, Mapping) or set(noise) != {"force"}:
+        raise ValidationError(
+            f"noise is {noise!r}; of motions in time give that of a force sample alone, its "
+            "standard deviation in N, such as {'force': 0.001}"
+        )
+    return RecordedForce(positive_number(noise["force"], "noise['force']"), rate)
+
+
 def targets_of(target: Any) -> tuple[dict[str, float], bool]:
     """Return quantities with the uncertainty wanted, and whether numbers were given."""
     if target is None:
@@ -63,6 +113,12 @@ def targets_of(target: Any) -> tuple[dict[str, float], bool]:
         return {target: 1.0}, False
     if isinstance(target, Mapping):
         found = {str(n): positive_number(u, f"target[{n!r}]") for n, u in target.items()}
+        for name, u in found.items():
+            if u >= 1.0:
+                raise ValidationError(
+                    f"target[{name!r}] is {u:g}; expected a relative uncertainty below 1: 0.02 is "
+                    "2 %"
+                )
         return found, bool(found)
     return {str(name): 1.0 for name in target}, False
 

@@ -45,15 +45,17 @@ def plot_bench_time(
         for i, (name, (time, planned, grid)) in enumerate(curves.items()):
             colour = style.SERIES[i % len(style.SERIES)]
             axis.plot(time, 100.0 * np.asarray(planned), "o-", color=colour, label=f"{name}, plan")
-            axis.plot(
-                time, 100.0 * np.asarray(grid), "s--", color=colour, mfc="white",
-                label=f"{name}, logarithmic grid",
-            )  # fmt: skip
+            if np.isfinite(grid).any():
+                axis.plot(
+                    time, 100.0 * np.asarray(grid), "s--", color=colour, mfc="white",
+                    label=f"{name}, logarithmic grid",
+                )  # fmt: skip
             if target and name in target:
                 axis.axhline(100.0 * target[name], color=colour, ls=":", lw=1.0)
         axis.set(
             xscale="log", yscale="log", xlabel="bench time [s]",
-            ylabel="standard uncertainty [%]",
+            ylabel="relative uncertainty [%]",
         )  # fmt: skip
+        style.readable_log_ticks(axis)
         axis.legend()
         return axis

@@ -119,8 +119,8 @@ class Predictor:
     ) -> Prediction:
         """Return the response and its derivatives at search coordinates, (P,) or (S, P).
 
-        `amplitude_error` is the error of ln A of explicit rows: A is the measured amplitude over
-        its exponential.
+        `amplitude_error` is the error of ln A, or of ln of the drive where that is controlled:
+        the true one is the measured one over its exponential.
         """
         columns = self._coordinates.to_values(theta)[..., None]
         values = [
@@ -173,11 +173,10 @@ class Predictor:
             if stretch is not None:
                 change = change - by_ln_amplitude * ((change / Z).real * stretch)
             changes.append(slope * change)
-        by_ln_amplitude = slope * by_ln_amplitude
+        by_level = slope * by_ln_amplitude * (1.0 if stretch is None else stretch)
         if not self._neutral:
-            direct = by_ln_amplitude if stretch is None else by_ln_amplitude * stretch
-            changes += self._sensor_changes(group, response, direct)
-        return Prediction(response, changes, by_ln_amplitude)
+            changes += self._sensor_changes(group, response, by_level)
+        return Prediction(response, changes, by_level)
 
     def _sensor_changes(
         self, group: _Group, response: ComplexArray, direct: ComplexArray
@@ -205,6 +204,8 @@ class Predictor:
             return amplitude if error is None else amplitude * np.exp(-error[..., group.rows]), None
         assert group.drive is not None
         drive = group.drive / sensed[0]
+        if error is not None:
+            drive = drive * np.exp(-error[..., group.rows])
         amplitude = steady_state.solve(self._model, own, group.omega, drive, amplitude)
         found = np.isfinite(amplitude)
         return (amplitude, None) if found.all() else (np.where(found, amplitude, 1.0), found)

@@ -265,9 +265,14 @@ class Problem:
 
     def prediction_jacobian(self, theta: ArrayLike) -> ComplexArray:
         """Return dR/dtheta, shape (n, P) or (S, n, P)."""
+        return self.prediction_and_jacobian(theta)[1]
+
+    def prediction_and_jacobian(self, theta: ArrayLike) -> tuple[ComplexArray, ComplexArray]:
+        """Return R, shape (n,) or (S, n), and dR/dtheta, (n, P) or (S, n, P)."""
         theta = self._coordinates.checked(theta)
-        changes = self._predictor(theta).changes
-        return np.stack([np.broadcast_to(d, self._shape(theta)) for d in changes], axis=-1)
+        found, shape = self._predictor(theta), self._shape(theta)
+        changes = [np.broadcast_to(d, shape) for d in found.changes]
+        return np.array(np.broadcast_to(found.value, shape)), np.stack(changes, axis=-1)
 
     @cached_property
     def stiffness_data(self) -> StiffnessData:

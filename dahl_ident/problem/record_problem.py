@@ -12,32 +12,31 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 from dahl_ident.elements import Element, Parameter
+from dahl_ident.elements.behaviour import Behaviour
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
 from dahl_ident.problem.displacement_noise import LEADS, noise_of, travelled
 from dahl_ident.problem.problem import Quadratic
-from dahl_ident.time_domain import (
-    Excitation,
-    ForcedMotion,
-    Plant,
-    band_limited,
-    differentiated,
-)
+
+if TYPE_CHECKING:
+    from dahl_ident.time_domain import Excitation, ForcedMotion, Plant
 
 Output = Literal["force", "motion"]
 _SHORTEST = 16  # samples from which noise can be estimated
 _PER_CYCLE = 100.0  # samples that a slow cycle keeps where a record is too long
 _SUBSTEP = 0.4  # rad of the fastest motion in a step of integration
+_LINEAR = 0.1  # of the largest motion: a larger change is not what the slopes tell
 _SMALL = 0.1  # of the motion's inverse size: rates below are searched as numbers
+_INSIDE = 1.0 - 1e-9  # of the way to a bound: on it, a search would see no slope and stay
+_VANISHED = 1e4  # times below what would change the residuals: held, or all steps shrink with it
 _POWER = 0.999  # share of the drive's power below its band's end
 
 
@@ -128,7 +127,11 @@ class RecordProblem:
             self._check(record, f"record {number}" if len(self.records) > 1 else "the record")
         self.parameters = (*self.free, *self._nuisance())
         self.names = [p.name for p in self.parameters]
-        self.logarithmic = np.array([p.transform == "log" for p in self.parameters])
+        low, high = (np.array([getattr(p, b) for p in self.parameters]) for b in ("lower", "upper"))
+        self._between = np.isfinite(low) & np.isfinite(high)
+        low, high = (np.where(self._between, b, side) for b, side in ((low, -1.0), (high, 1.0)))
+        self._middle, self._reach = 0.5 * (low + high), 0.5 * (high - low)
+        self.logarithmic = ~self._between & [p.transform == "log" for p in self.parameters]
         self._bend = self._bends()
         self.whitening = np.ones(1)
         """Filter of the residuals; see :func:`~.record_noise.prediction_error_filter`."""
@@ -136,6 +139,7 @@ class RecordProblem:
         """Standard deviation of the displacement, m, within which no movement counts."""
         self._paths: tuple[FloatArray, ...] | None = None
         self._guesses: list[FloatArray | None] = [None] * len(self.records)
+        self._slopes: list[tuple[FloatArray, FloatArray] | None] = [None] * len(self.records)
         self.watch: Watch | None = None
         """Called after each evaluation of the cost."""
 
@@ -169,9 +173,8 @@ class RecordProblem:
                 found.append(Parameter(f"initial_velocity{tail}", "m/s", "at the first sample"))
             for element in self.with_memory:
                 name = f"{element.name}_" if element.name else ""
-                found.append(
-                    Parameter(f"{name}initial_force{tail}", "N", "friction at the first sample")
-                )
+                start = element.start if self.output == "motion" else Behaviour.start
+                found.append(Parameter(f"{name}{start[0]}{tail}", *start[1:]))
             if self.output == "force":
                 found.append(Parameter(f"offset{tail}", "N", "constant in the measured force"))
                 found.append(Parameter(f"drift{tail}", "N/s", "slope of the measured force"))
@@ -262,6 +265,8 @@ class RecordProblem:
         """Return residuals or derivatives, (n, ...), filtered; the first `order` are left out."""
         if self.whitening.size == 1:
             return waves
+        from scipy.signal import lfilter
+
         return np.asarray(lfilter(self.whitening, [1.0], waves, axis=0)[self.whitening.size - 1 :])
 
     @property
@@ -291,6 +296,8 @@ class RecordProblem:
     ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], ...]:
         if all(e.rate_independent for e in self.model.elements):
             return tuple((x, np.zeros(0), np.zeros(0)) for x in displacements)
+        from dahl_ident.time_domain import differentiated
+
         return tuple(
             (x, *differentiated(x, 1.0 / record.sample_rate))
             for x, record in zip(displacements, self.records, strict=True)
@@ -301,9 +308,9 @@ class RecordProblem:
         """Standard deviation of the displacements' white noise, m; see `displacement_noise`."""
         return float(np.median([noise_of(x) for x, _, _ in self.motions]))
 
-    def with_more_noise(self, noise: float) -> RecordProblem:
+    def with_more_noise(self, noise: float, draw: int = 0) -> RecordProblem:
         """Return the same problem, white noise added to the displacements."""
-        rng = np.random.default_rng(0)
+        rng = np.random.default_rng(draw)
         other = copy(self)
         other.motions = self._motions_of(
             [x + noise * rng.standard_normal(x.size) for x, _, _ in self.motions]
@@ -312,11 +319,15 @@ class RecordProblem:
 
     @cached_property
     def _plant(self) -> Plant:
+        from dahl_ident.time_domain import Plant
+
         return Plant(self.model, self.excitation)
 
     @cached_property
     def forced(self) -> tuple[ForcedMotion, ...]:
         """The driven plant of each record, for the output "motion"."""
+        from dahl_ident.time_domain import ForcedMotion, band_limited
+
         found = []
         for record in self.records:
             rate, wave = record.sample_rate, record.force_samples
@@ -337,8 +348,12 @@ class RecordProblem:
         return int(np.clip(np.ceil(np.pi * highest / _SUBSTEP), 1, 8))
 
     def values(self, theta: FloatArray) -> FloatArray:
-        """Return the parameters' values from search coordinates."""
+        """Return the parameters' values from search coordinates.
+
+        A value between two bounds is a sine, so that no step leaves them.
+        """
         values = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, theta, 0.0)), theta)
+        values = np.where(self._between, self._middle + self._reach * np.sin(theta), values)
         bent = self._bend > 0.0
         return np.where(bent, self._bend * np.sinh(np.where(bent, theta, 0.0)), values)
 
@@ -347,7 +362,9 @@ class RecordProblem:
         safe = np.where(self.logarithmic, np.maximum(values, 1e-300), 1.0)
         bend = np.where(self._bend > 0.0, self._bend, 1.0)
         bent = np.where(self._bend > 0.0, np.arcsinh(values / bend), values)
-        return np.where(self.logarithmic, np.log(safe), bent)
+        part = np.where(self._between, (values - self._middle) / self._reach, 0.0)
+        angle = np.arcsin(np.clip(part, -_INSIDE, _INSIDE))
+        return np.where(self._between, angle, np.where(self.logarithmic, np.log(safe), bent))
 
     @property
     def relative(self) -> NDArray[np.bool_]:
@@ -357,7 +374,9 @@ class RecordProblem:
     def slopes(self, values: FloatArray) -> FloatArray:
         """Return the derivatives of the parameters' values by their search coordinates."""
         bent = np.where(self._bend > 0.0, np.hypot(values, self._bend), 1.0)
-        return np.where(self.logarithmic, values, bent)
+        part = np.where(self._between, (values - self._middle) / self._reach, 0.0)
+        sides = self._reach * np.sqrt(np.maximum(1.0 - part**2, 0.0))
+        return np.where(self._between, sides, np.where(self.logarithmic, values, bent))
 
     def full_values(self, values: FloatArray) -> list[float]:
         """Return the value of every parameter of the model, fixed ones included."""
@@ -407,16 +426,16 @@ class RecordProblem:
 
     def _motion(self, values: FloatArray, number: int, *, derivatives: bool) -> Prediction:
         forced, own = self.forced[number], self.own(values, number)
-        order, free = self._plant.order, values[: len(self.free)]
-        guess = self._guesses[number]
-        if guess is None:
-            guess = np.tile(own[:order], (len(self.records[number]), 1))
-        motion = forced.solve(free, own[:order], guess)
-        self._guesses[number] = motion
+        order, free, starts = self._plant.order, values[: len(self.free)], own.size - 1
+        first, first_by = self._plant.first(own[:starts], free)
+        motion = forced.solve(free, first, self._guessed(number, np.concatenate([free, first])))
+        self._guesses[number], self._slopes[number] = motion, None
         channel = ("displacement", "velocity", "acceleration").index(
             self.records[number].motion_channel
         )
         sensitivities = forced.sensitivities(free, motion) if derivatives else None
+        if sensitivities is not None:
+            self._slopes[number] = np.concatenate([free, first]), sensitivities
         if channel < 2:
             output = motion[:, channel]
             slopes = None if sensitivities is None else sensitivities[:, channel]
@@ -426,11 +445,25 @@ class RecordProblem:
             )
         by = np.zeros((output.size, len(self.parameters) if derivatives else 0))
         if slopes is not None:
-            first = len(self.free) + number * self.per_record
-            by[:, : len(self.free)] = slopes[:, order:]
-            by[:, first : first + order] = slopes[:, :order]
-            by[:, first + order] = 1.0
-        return Prediction(output + own[order], by)
+            column = len(self.free) + number * self.per_record
+            by_first = slopes[:, :order] @ first_by
+            by[:, : len(self.free)] = slopes[:, order:] + by_first[:, starts:]
+            by[:, column : column + starts] = by_first[:, :starts]
+            by[:, column + starts] = 1.0
+        return Prediction(output + own[starts], by)
+
+    def _guessed(self, number: int, at: FloatArray) -> FloatArray:
+        """Return a guess of the motion for free values and a first state."""
+        guess, known = self._guesses[number], self._slopes[number]
+        count = len(self.free)
+        if guess is None:
+            return np.tile(at[count:], (len(self.records[number]), 1))
+        if known is None:
+            return guess
+        change = at - known[0]
+        moved = known[1] @ np.concatenate([change[count:], change[:count]])
+        small = np.abs(moved).max(axis=0) < _LINEAR * np.abs(guess).max(axis=0)
+        return guess + moved if small.all() else guess
 
     @property
     def guesses(self) -> tuple[FloatArray | None, ...]:
@@ -439,7 +472,7 @@ class RecordProblem:
 
     def set_guess(self, number: int, motion: FloatArray | None) -> None:
         """Give a guess of the motion, (n, order), from which the next solution starts."""
-        self._guesses[number] = motion
+        self._guesses[number], self._slopes[number] = motion, None
 
     def split_residuals(self, values: FloatArray) -> list[FloatArray]:
         """Return measured minus predicted output of each record."""
@@ -473,6 +506,12 @@ class RecordProblem:
             cost += 0.5 * float(residual @ residual)
             gradient -= jacobian.T @ residual
             hessian += jacobian.T @ jacobian
+        if not (np.isfinite(cost) and np.isfinite(hessian).all()):  # a motion beyond all bounds
+            return Quadratic(np.asarray(np.inf), np.zeros(P), np.eye(P))
+        far = _VANISHED * hessian.diagonal()
+        gone = self.logarithmic & (gradient >= far) | self._between & (np.abs(gradient) >= far)
+        gradient[gone], hessian[gone], hessian[:, gone] = 0.0, 0.0, 0.0
+        hessian[gone, gone] = 1.0
         if self.watch is not None:
             self.watch(self, theta, cost)
         return Quadratic(np.asarray(cost), gradient, hessian)

@@ -110,9 +110,12 @@ def _fit(fit: FitResult) -> list[str]:
 def _sample(posterior: ChainPosterior) -> list[str]:
     priors = [f"{name}={prior_text(given)}" for name, given in posterior.given_priors.items()]
     return [
-        "sample", *_model(posterior.problem), "--noise", posterior.problem.noise,
+        "sample", *_model(posterior.asked), "--noise", posterior.problem.noise,
         "--seed", str(posterior.seed), "--steps", str(posterior.steps),
-        *_changed(likelihood=(posterior.likelihood, "gaussian")),
+        *_changed(
+            likelihood=(posterior.likelihood, "gaussian"),
+            uncertainty=(posterior.uncertainty, "combined"),
+        ),
         *(word for prior in priors for word in ("--prior", prior)),
     ]  # fmt: skip
 
@@ -135,7 +138,8 @@ def _parameter(parameter: Parameter, problem: Problem) -> Iterator[str]:
         value = prior_text(problem.priors[name])
     elif name not in problem.names:
         value = repr(parameter.value)
-        if parameter.value == _USUAL.get(name):
+        stated = parameter.prior is not None and not parameter.assumed
+        if parameter.value == _USUAL.get(name) and not stated:
             return
     elif name in _USUAL and _USUAL[name] is None:
         return

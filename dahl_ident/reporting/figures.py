@@ -17,6 +17,7 @@ from dahl_ident.elements import Friction, UniversalCurve
 from dahl_ident.plots.style import new_axes
 from dahl_ident.reporting.document import Picture, figure_of
 from dahl_ident.reporting.hysteresis_loops import loops
+from dahl_ident.results.fit_plots import standardized_residuals
 from dahl_ident.units import engineering, si_unit
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def budget_picture(found: Budget) -> Picture:
 def _response(fit: FitResult) -> Picture:
     data = fit.data.select(harmonic=1)
     gain, phase = data.gain, np.degrees(data.phase)
-    worst = float(np.abs(_whitened_pairs(fit)).max())
+    worst = float(np.nanmax(np.abs(standardized_residuals(fit))))
     alt = (
         f"Gain above phase, as points with fitted lines: gain from {gain.min():.3g} to "
         f"{gain.max():.3g} {data.unit}, phase from {phase.min():.1f} to {phase.max():.1f} degrees; "
@@ -127,10 +128,11 @@ def _ends(values: FloatArray) -> tuple[float, float]:
 
 
 def _residuals(fit: FitResult) -> Picture:
-    pairs = _whitened_pairs(fit)
-    beyond = int(np.sum(np.abs(pairs) > 3.0))
+    residuals = standardized_residuals(fit)
+    present = residuals[np.isfinite(residuals)]
+    beyond = int(np.sum(np.abs(present) > 3.0))
     alt = (
-        f"Residuals as points: {pairs.size} with a standard deviation of {pairs.std():.2f}; "
+        f"Residuals as points: {present.size} with a standard deviation of {present.std():.2f}; "
         f"{beyond} of them beyond three standard deviations. {fit.goodness.headline}"
     )
     caption = (
@@ -252,12 +254,6 @@ def _information(fit: FitResult) -> Picture:
             )
         ),
     )
-
-
-def _whitened_pairs(fit: FitResult) -> FloatArray:
-    """Return the residuals of each row in standard deviations, shape (n, 2)."""
-    scale = 1.0 if fit.scale_known or not fit.scale > 0.0 else fit.scale
-    return fit.residual[: fit.ndata].reshape(-1, 2) / scale
 
 
 def _is_friction_alone(fit: FitResult) -> bool:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from dahl_ident import plots
 from dahl_ident.diagnostics.formatting import rounded
@@ -142,7 +142,7 @@ def _changes(a: str, fit: FitResult, b: str, later: FitResult) -> list[dict[str,
         change = other.value - one.value
         u = math.hypot(one.stderr or 0.0, other.stderr or 0.0)
         usable = all(_is_usable(f, name) for f in (fit, later)) and math.isfinite(u) and u > 0.0
-        p = float(2.0 * stats.norm.sf(abs(change) / u)) if usable else math.nan
+        p = float(2.0 * special.ndtr(-abs(change) / u)) if usable else math.nan
         found.append(
             {
                 "parameter": name, "unit": one.unit, "from": a, "to": b, "change": change,
@@ -155,7 +155,8 @@ def _changes(a: str, fit: FitResult, b: str, later: FitResult) -> list[dict[str,
 
 def _is_usable(fit: FitResult, name: str) -> bool:
     """Return whether the uncertainty of a parameter is valid."""
-    identified = fit.identifiability.parameters[name].verdict is Verdict.IDENTIFIED
+    judged = fit.identifiability.parameters[name].verdict
+    identified = judged in (Verdict.IDENTIFIED, Verdict.BY_PRIOR)
     return identified and str(fit.status) != "not described"
 
 

@@ -232,8 +232,9 @@ def _details(
 
 
 def _parameters(fit: FitResult, drawn: Sequence[ChainPosterior]) -> Iterator[Block]:
-    for method in ("wald", "profile"):
-        fit.conf_interval(method)
+    fit.conf_interval("wald")
+    if not fit.first_order:
+        fit.conf_interval("profile")
     intervals = fit.intervals_run(CONFIDENCE)
     yield tables.parameters(fit, intervals, drawn)
     by_note: dict[str, list[str]] = {}

@@ -32,7 +32,7 @@ def answer(fit: FitResult, *, described: bool) -> Table:
     for name in fit.var_names:
         estimate, judged = fit.params[name], fit.identifiability.parameters[name]
         value, error = rounded(estimate.value, estimate.stderr)
-        lost = judged.verdict is not Verdict.IDENTIFIED
+        lost = judged.verdict in (Verdict.WEAK, Verdict.NOT_IDENTIFIED)
         struck = lost or not described
         found = limits[name]
         closed = lost and bool(np.isfinite([found.lower, found.upper]).all())  # a bound holds

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from typing import Literal, overload
+from typing import Literal, NamedTuple, overload
 
 import numpy as np
 
@@ -27,6 +27,8 @@ from dahl_ident.bayes.walker_start import (
     starting_points,
 )
 from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.diagnostics.error_model import EXPONENT, error_model, with_assumed
+from dahl_ident.diagnostics.shared_errors import row_errors
 from dahl_ident.elements import Element
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
 from dahl_ident.fitting import Optimum
@@ -44,6 +46,7 @@ from dahl_ident.sensors import Sensors
 _LEAST_STEPS = 20  # with fewer no autocorrelation can be estimated
 _MOST_AXES = 3  # the number of points is a power of the number of axes
 METHODS = ("mcmc", "grid")
+UNCERTAINTIES = ("combined", "noise")
 
 
 @overload
@@ -58,6 +61,7 @@ def posterior(
     noise: str | None = None,
     sensors: Sensors | None = None,
     likelihood: str = "gaussian",
+    uncertainty: str = "combined",
     seed: int | None = None,
     steps: int | None = None,
     max_steps: int = 20000,
@@ -101,6 +105,7 @@ def posterior(
     noise: str | None = None,
     sensors: Sensors | None = None,
     likelihood: str = "gaussian",
+    uncertainty: str = "combined",
     seed: int | None = None,
     progress: bool = False,
     tolerance: float = 1e-4,
@@ -118,6 +123,7 @@ def posterior(
     noise: str | None = None,
     sensors: Sensors | None = None,
     likelihood: str = "gaussian",
+    uncertainty: str = "combined",
     seed: int | None = None,
     steps: int | None = None,
     max_steps: int = 20000,
@@ -151,6 +157,12 @@ def posterior(
     likelihood : {"gaussian", "student_t", "none"}, default "gaussian"
         "student_t" makes outliers count less (4 degrees of freedom; on a grid it needs noise of
         known scale); "none" gives the prior.
+    uncertainty : {"combined", "noise"}, default "combined"
+        "combined" counts every source of the fit's uncertainty budget that was estimated from the
+        data, such as scatter between runs and model error, and samples exponents that were not
+        given, log-uniform over their range, which takes several times as long as a given one.
+        "noise" counts independent noise alone, as do likelihoods other than "gaussian". The
+        verdict says which.
     seed : int, optional
         The same seed gives the same chain. Left out, one is drawn, and reported. A grid needs
         none.
@@ -206,7 +218,7 @@ def posterior(
     >>> data = di.FrequencyResponse(np.ones(9), N * np.exp(noise[0] + 1j * noise[1]), A)
     >>> chain = di.posterior(data, di.Dahl(), seed=1)
     >>> chain.converged, chain.names
-    (True, ('f_max', 'sigma', 'noise_scale'))
+    (True, ('f_max', 'sigma', 'alpha', 'noise_scale'))
     >>> grid = di.posterior(data, di.Dahl(), method="grid")
     >>> grid.converged, round(float(grid.quantile("f_max", 0.5)), 2)
     (True, 0.1)
@@ -217,25 +229,26 @@ def posterior(
         refused = {
             "method": method != "mcmc", "noise": noise is not None, "sensors": sensors is not None,
             "likelihood": likelihood != "gaussian", "pool": pool is not None,
+            "uncertainty": uncertainty != "combined",
             "tolerance": tolerance != 1e-4,
         }  # fmt: skip
         given = [name for name, is_given in refused.items() if is_given]
         if given:
             raise ValidationError(f"{', '.join(given)} given; a posterior of records takes none")
-        fit = _record_fit(data, model, free, fixed)
+        recorded = _record_fit(data, model, free, fixed)
         record_density = RecordDensity(
-            fit.problem,
-            fit.optimum.values,
-            fit.covar[: len(fit.problem.free), : len(fit.problem.free)],
-            fit.errors.dof,
-            record_prior(fit.problem, priors, fit.optimum.values),
+            recorded.problem,
+            recorded.optimum.values,
+            recorded.covar[: len(recorded.problem.free), : len(recorded.problem.free)],
+            recorded.errors.dof,
+            record_prior(recorded.problem, priors, recorded.optimum.values),
         )
         settings = _settings(record_density, seed, steps, max_steps, ess, walkers, ensembles)
         start = partial(scattered, record_density, record_density.centre, record_density.root)
         chain, verdict, settings = _chain(
             record_density, start, settings, seed, resume, None, progress
         )
-        return refuse_unusable(RecordPosterior(fit, record_density, chain, verdict, settings))
+        return refuse_unusable(RecordPosterior(recorded, record_density, chain, verdict, settings))
     for_chain = {
         "steps": steps is not None, "max_steps": max_steps != 20000, "ess": ess != 2000.0,
         "walkers": walkers is not None, "ensembles": ensembles != 4, "resume": resume is not None,
@@ -244,14 +257,20 @@ def posterior(
     _refuse_other_methods(method, for_chain, {"tolerance": tolerance != 1e-4})
     if pool is not None and not callable(getattr(pool, "map", None)):
         raise ValidationError(f"pool is {pool!r}; expected an object with map, such as a Pool")
-    problem, optimum = _problem(data, model, noise, sensors, free, fixed)
+    if uncertainty not in UNCERTAINTIES:
+        raise ValidationError(
+            f"uncertainty is {uncertainty!r}; expected {' or '.join(UNCERTAINTIES)}"
+        )
+    problem, fit = _fit(data, model, noise, sensors, free, fixed)
+    case = _case(problem, fit, priors, likelihood, uncertainty)
     if method == "grid":
-        return _grid(problem, optimum, priors, likelihood, tolerance)
-    density = Density(problem, joint_prior(problem, priors, _estimate(optimum)), likelihood)
-    settings = _settings(density, seed, steps, max_steps, ess, walkers, ensembles)
-    start = partial(starting_points, density, optimum)
-    chain, verdict, settings = _chain(density, start, settings, seed, resume, pool, progress)
-    return refuse_unusable(ChainPosterior(density, chain, verdict, settings, optimum))
+        return _grid(case, tolerance)
+    settings = _settings(case.density, seed, steps, max_steps, ess, walkers, ensembles)
+    start = partial(starting_points, case.density, case.optimum)
+    chain, verdict, settings = _chain(case.density, start, settings, seed, resume, pool, progress)
+    return refuse_unusable(
+        ChainPosterior(case.density, chain, verdict, settings, case.fit, case.uncertainty)
+    )
 
 
 def _refuse_other_methods(
@@ -267,22 +286,61 @@ def _refuse_other_methods(
         )
 
 
-def _grid(
+class _Case(NamedTuple):
+    """A posterior density, where to start from, and the fit that its errors are those of."""
+
+    density: Density
+    optimum: Optimum | None
+    fit: FitResult | None
+    uncertainty: str = "noise"
+
+
+def _case(
     problem: Problem,
-    optimum: Optimum | None,
+    fit: FitResult | None,
     priors: Mapping[str, PriorLike] | None,
     likelihood: str,
-    tolerance: float,
-) -> GridPosterior:
+    uncertainty: str,
+) -> _Case:
+    """Return the density with every source of error, or noise alone."""
+    from scipy import stats
+
+    given, optimum = dict(priors or {}), None if fit is None else fit.optimum
+    if fit is None or optimum is None or uncertainty == "noise" or likelihood != "gaussian":
+        values = None if optimum is None else optimum.values
+        return _Case(
+            Density(problem, joint_prior(problem, given, values), likelihood), optimum, fit
+        )
+    wider, assumed = with_assumed(problem)
+    errors = fit.errors or error_model(optimum, of_combinations=True)
+    known = dict(zip(optimum.names, optimum.theta.tolist(), strict=True))
+    theta = np.array([known.get(p.name, np.log(p.value or 1.0)) for p in wider.parameters])
+    if errors is not None:
+        theta = errors.theta
+    ranges = {p.name: p.prior for p in wider.parameters if p.prior is not None}
+    own = {
+        name: ranges[name] if one.source == EXPONENT else stats.norm(1.0, one.std)
+        for name, one in assumed.items()
+    }
+    shared = None if errors is None else row_errors(errors)
+    prior = joint_prior(wider, given, wider.to_values(theta), own)
+    density = Density(wider, prior, likelihood, shared)
+    return _Case(density, replace(optimum, problem=wider, theta=theta), fit, "combined")
+
+
+def _grid(case: _Case, tolerance: float) -> GridPosterior:
     """Integrate the posterior of up to three parameters."""
-    if len(problem.names) > _MOST_AXES:
+    density, names = case.density, case.density.problem.names
+    if len(names) > _MOST_AXES:
+        own = names if case.fit is None else case.fit.problem.names
+        assumed = [name for name in names if name not in own]
+        instead = f"give {', '.join(assumed)} or " if assumed else ""
         raise SamplingError(
-            f"{len(problem.names)} parameters are free ({', '.join(problem.names)}); a grid takes "
-            f"up to {_MOST_AXES}: fix some, or use method='mcmc'"
+            f"{len(names)} parameters are free ({', '.join(names)}); a grid takes up to "
+            f"{_MOST_AXES}: {instead}fix some, or use method='mcmc'"
         )
     tolerance = positive_number(tolerance, "tolerance")
-    density = Density(problem, joint_prior(problem, priors, _estimate(optimum)), likelihood)
-    centre, covariance = centre_and_covariance(density, optimum, np.random.default_rng(0))
+    centre, covariance = centre_and_covariance(density, case.optimum, np.random.default_rng(0))
     slicers = [ConditionalModes(density, axis, centre) for axis in range(len(centre))]
     grid = integrate(
         density.marginal,
@@ -292,7 +350,7 @@ def _grid(
         np.sqrt(np.diagonal(covariance)),
         tolerance=tolerance,
     )
-    return GridPosterior(density, grid, tolerance, optimum)
+    return GridPosterior(density, grid, tolerance, case.fit, case.uncertainty)
 
 
 def _record_fit(
@@ -361,14 +419,15 @@ def _with_seed_of(
     return replace(settings, seed=stored.seed)
 
 
-def _problem(
+def _fit(
     data: FrequencyResponse | FitResult,
     model: Element | None,
     noise: str | None,
     sensors: Sensors | None,
     free: Iterable[str],
     fixed: Mapping[str, float] | None,
-) -> tuple[Problem, Optimum | None]:
+) -> tuple[Problem, FitResult | None]:
+    """Return the problem, and its least-squares fit; None where there are too few data for one."""
     if isinstance(data, FitResult):
         given = {"model": model, "noise": noise, "sensors": sensors, "fixed": fixed}
         extra = [name for name, value in given.items() if value is not None]
@@ -377,15 +436,16 @@ def _problem(
                 f"{', '.join([*extra, *(['free'] if tuple(free) else [])])} is given beside a "
                 "FitResult, which has its own; pass the data instead"
             )
-        return data.problem, data.optimum
+        if data.first_order:
+            raise ValidationError(
+                "the fit had constraints, which a posterior does not take; pass the data instead"
+            )
+        return data.problem, data
     if model is None:
         raise ModelError("there is no model; give one, such as Dahl(), or pass a FitResult")
     problem = Problem(data, model, noise=noise, sensors=sensors, free=free, fixed=fixed)
-    return problem, optimum_of(problem)
-
-
-def _estimate(optimum: Optimum | None) -> FloatArray | None:
-    return None if optimum is None else optimum.values
+    optimum = optimum_of(problem)
+    return problem, None if optimum is None else FitResult(optimum)
 
 
 def _settings(

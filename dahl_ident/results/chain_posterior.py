@@ -7,9 +7,9 @@ from typing import Any
 from dahl_ident.bayes.chain import Chain, Settings
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density
-from dahl_ident.fitting import Optimum
 from dahl_ident.results.arviz_export import to_arviz
 from dahl_ident.results.chain_draws import ChainDraws
+from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.response_posterior import ResponsePosterior
 
 
@@ -22,9 +22,9 @@ class ChainPosterior(ChainDraws, ResponsePosterior):
     Examples
     --------
     >>> import dahl_ident as di
-    >>> chain = di.posterior(di.load_dataset("noisy"), di.Dahl(), seed=1, steps=20)
+    >>> chain = di.posterior(di.load_dataset("noisy"), di.Dahl(), seed=1, steps=60)
     >>> chain.names, chain.steps, chain.converged
-    (('f_max', 'sigma'), 20, False)
+    (('f_max', 'sigma', 'alpha'), 60, False)
     """
 
     def __init__(
@@ -33,11 +33,13 @@ class ChainPosterior(ChainDraws, ResponsePosterior):
         chain: Chain,
         convergence: Convergence,
         settings: Settings,
-        optimum: Optimum | None = None,
+        fit: FitResult | None = None,
+        uncertainty: str = "noise",
     ) -> None:
         self._density, self._chain = density, chain
         self.convergence = convergence
-        self._settings, self._optimum = settings, optimum
+        self._settings, self._fit = settings, fit
+        self._uncertainty = uncertainty
 
     def to_arviz(self, seed: int = 0) -> Any:
         """Return the posterior for ArviZ: InferenceData below version 1.0, DataTree from there.

@@ -188,7 +188,7 @@ def fit(
         raise ValidationError(f"{' and '.join(beyond)} given; only method='ipopt' takes that")
     else:
         optimum = solve(problem, method=method, loss=loss, start=start)
-    result = FitResult(optimum, first_order=bool(beyond))
+    result = FitResult(optimum, first_order=constraints is not None)
     if throw and not result.success:
         cause = result.goodness.cause
         raise FitError(f"{cause} {result.message}" if cause else result.message, result)

@@ -22,7 +22,7 @@ from dahl_ident.units import Motion, shown_unit
 class FitNumbers(Result):
     """An optimum under lmfit's names; see :class:`dahl_ident.FitResult`."""
 
-    _first_order = False  # constraints, or noise in the drive: errors of first order alone
+    _first_order = False  # constraints: errors of first order alone
 
     def __init__(self, optimum: Optimum) -> None:
         self._optimum = optimum
@@ -51,6 +51,11 @@ class FitNumbers(Result):
     def noise(self) -> str:
         """The noise model."""
         return self.problem.noise
+
+    @property
+    def first_order(self) -> bool:
+        """Whether errors are of first order alone: with constraints."""
+        return self._first_order
 
     @property
     def success(self) -> bool:

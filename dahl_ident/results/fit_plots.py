@@ -31,6 +31,17 @@ def draw_fit(fit: JudgedFit, ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:
     )
 
 
+def standardized_residuals(fit: JudgedFit) -> FloatArray:
+    """Return both residuals of each row in standard deviations, (n, 2); NaN where there is none.
+
+    A mean force is real, so that its row has a first residual only.
+    """
+    scale = fit.scale if fit.scale > 0.0 else 1.0
+    residuals = fit.residual[: fit.problem.n_residuals].reshape(-1, 2) / scale
+    residuals[fit.data.harmonic == 0, 1] = np.nan
+    return residuals
+
+
 def draw_residuals(fit: JudgedFit, against: str | None, ax: Axes | None) -> Axes:
     """Draw both residuals of every row over a quantity, by default the one that suits the table."""
     data = fit.data
@@ -51,11 +62,11 @@ def draw_residuals(fit: JudgedFit, against: str | None, ax: Axes | None) -> Axes
         raise ValidationError(f"against is {against!r}; expected one of {', '.join(places)}")
     x, label = places[against]
     of_curve = np.stack([curves.curve_of_row(data), data.harmonic])
-    residuals = fit.residual[: fit.ndata] / (fit.scale if fit.scale > 0.0 else 1.0)
+    first, second = standardized_residuals(fit).T
     return plot_residuals(
         x,
-        residuals[0::2],
-        residuals[1::2],
+        first,
+        second,
         names=("ln gain", "phase") if fit.noise == "relative" else ("real part", "imaginary part"),
         x_label=label,
         group=np.unique(of_curve, axis=1, return_inverse=True)[1],

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.storage import digest, plain_data
 from dahl_ident.elements.description import describe_model, model_from_description
 from dahl_ident.errors import DataError
-from dahl_ident.fitting.optimum import Combination, Optimum
+from dahl_ident.fitting.optimum import Combination, ConstraintCost, Optimum
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem
 from dahl_ident.sensors import EXACT, Sensors
@@ -32,7 +33,11 @@ _SAME = 1e-6  # relative: what versions of numerical libraries never change
 
 _COLUMNS = (
     "frequency_hz", "amplitude", "drive", "covariance", "dof", "amplitude_std",
-    "amplitude_covariance", "level", "run", "controlled", "harmonic",
+    "amplitude_covariance", "drive_std", "drive_covariance", "level", "run",
+    "controlled", "harmonic",
+)  # fmt: skip
+_ERRORS = (
+    "covariance", "dof", "amplitude_std", "amplitude_covariance", "drive_std", "drive_covariance",
 )  # fmt: skip
 _SENSORS = ("force_gain", "displacement_gain", "delay")
 
@@ -66,6 +71,9 @@ def to_dict(optimum: Optimum, first_order: bool) -> dict[str, Any]:
                 {"expression": c.expression, "value": c.value, "stderr": c.stderr}
                 for c in optimum.combinations
             ],
+            "constraint_cost": None
+            if optimum.constraint_cost is None
+            else asdict(optimum.constraint_cost),
         },
     }
     return sealed(plain_data(facts, not_finite=str))
@@ -186,6 +194,7 @@ def _optimum(content: Mapping[str, Any]) -> Optimum:
         message=stored["message"],
         method=stored["method"],
         loss=stored["loss"],
+        constraint_cost=_constraint_cost(stored.get("constraint_cost")),
         combinations=tuple(
             Combination(c["expression"], float(c["value"]), float(c["stderr"]))
             for c in stored["combinations"]
@@ -209,9 +218,8 @@ def _describe_data(data: FrequencyResponse) -> dict[str, Any]:
 
 def _data(content: Mapping[str, Any]) -> FrequencyResponse:
     columns = {name: content[name] for name in _COLUMNS if name in content}
-    for name in ("covariance", "dof", "amplitude_std", "amplitude_covariance"):
-        if name in columns:
-            columns[name] = _floats(columns[name])
+    for name in columns.keys() & set(_ERRORS):
+        columns[name] = _floats(columns[name])
     return FrequencyResponse(
         columns.pop("frequency_hz"),
         _floats(content["real"]) + 1j * _floats(content["imag"]),
@@ -222,6 +230,12 @@ def _data(content: Mapping[str, Any]) -> FrequencyResponse:
         provenance=content["provenance"],
         **columns,
     )
+
+
+def _constraint_cost(stored: Mapping[str, Any] | None) -> ConstraintCost | None:
+    if stored is None:
+        return None
+    return ConstraintCost(tuple(stored["texts"]), float(stored["rise"]), float(stored["dof"]))
 
 
 def _describe_channel(given: Any) -> Any:

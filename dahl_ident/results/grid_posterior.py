@@ -13,7 +13,7 @@ from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.noise_scale import ScalePosterior, ln_scale_draws
 from dahl_ident.bayes.quadrature import Grid
 from dahl_ident.errors import ModelError
-from dahl_ident.fitting import Optimum
+from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_base import QUANTILES
 from dahl_ident.results.response_posterior import ResponsePosterior
 
@@ -32,7 +32,7 @@ class GridPosterior(ResponsePosterior):
     Examples
     --------
     >>> import dahl_ident as di
-    >>> grid = di.posterior(di.load_dataset("noisy"), di.Dahl(), method="grid")
+    >>> grid = di.posterior(di.load_dataset("noisy"), di.Dahl(alpha=1.0), method="grid")
     >>> print(grid.message)
     Converged: error 2e-05 of the probability, 3280 points.
     >>> low, high = grid.quantile("f_max", [0.025, 0.975])
@@ -41,10 +41,15 @@ class GridPosterior(ResponsePosterior):
     """
 
     def __init__(
-        self, density: Density, grid: Grid, tolerance: float, optimum: Optimum | None = None
+        self,
+        density: Density,
+        grid: Grid,
+        tolerance: float,
+        fit: FitResult | None = None,
+        uncertainty: str = "noise",
     ) -> None:
         self._density, self._grid, self._tolerance = density, grid, tolerance
-        self._optimum = optimum
+        self._fit, self._uncertainty = fit, uncertainty
 
     @property
     def log_evidence(self) -> float:
@@ -141,10 +146,10 @@ class GridPosterior(ResponsePosterior):
 
     @cached_property
     def _scale(self) -> ScalePosterior:
-        theta = self._grid.theta
         likely = self._grid.weights > 0.0
-        squares = self._density.squares(theta[likely]).sum(axis=-1)
-        return ScalePosterior(squares, self._grid.weights[likely], self.problem.n_residuals // 2)
+        sums = self._density.sums(self._grid.theta[likely])
+        weights = self._grid.weights[likely, None] * self._density.probabilities(sums)
+        return ScalePosterior(sums.ravel(), weights.ravel(), self.problem.n_residuals // 2)
 
     @property
     def points(self) -> tuple[FloatArray, FloatArray]:
@@ -181,7 +186,10 @@ class GridPosterior(ResponsePosterior):
         theta = random.choice(self._grid.theta, size=size, p=self._grid.weights)
         if not self._density.has_scale:
             return theta
-        squares = self._density.squares(theta).sum(axis=-1)
+        sums = self._density.sums(theta)
+        below = np.cumsum(self._density.probabilities(sums), axis=1)
+        chosen = (random.random((size, 1)) * below[:, -1:] > below).sum(axis=1, keepdims=True)
+        squares = np.take_along_axis(sums, chosen, axis=1)[:, 0]
         rows = self.problem.n_residuals // 2
         return np.column_stack([theta, ln_scale_draws(squares, rows, random)])
 

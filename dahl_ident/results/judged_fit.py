@@ -77,13 +77,13 @@ class JudgedFit(FitNumbers):
         ConfidenceIntervals
             A mapping from the parameter's name to its intervals; a side on which the data set no
             limit is open. Profiles never raise, however badly a parameter is determined. Where
-            the fit had constraints or noise in the drive, intervals are those of Wald.
+            the fit had constraints, "combined" gives Wald's, and says so.
 
         Raises
         ------
         ValidationError
             If `method` is unknown, a level is not between 0 and 1, or repetitions of a fit with
-            a robust loss are wanted.
+            a robust loss, or profiles or repetitions of one with constraints, are wanted.
         FitError
             If there is no optimum to repeat.
         """
@@ -104,7 +104,13 @@ class JudgedFit(FitNumbers):
         self, method: Method, levels: Sequence[float], replicates: int, seed: int
     ) -> ConfidenceIntervals:
         if self._first_order:
-            note = "first order: the fit had constraints or noise in the drive"
+            if method in ("profile", "bootstrap"):
+                raise ValidationError(
+                    f"method is {method!r}, but the fit had constraints, which profiles and "
+                    "repetitions do not keep; use method='wald', whose covariance is that on the "
+                    "constraints"
+                )
+            note = "first order, noise alone: the fit had constraints"
             return wald_intervals(self._optimum, levels).noted(note)
         if method == "combined":
             profile = self.conf_interval("profile", levels)
@@ -143,7 +149,8 @@ class JudgedFit(FitNumbers):
     @cached_property
     def identifiability(self) -> Identifiability:
         """Which parameters, or which combinations of them, the data determine."""
-        return judged(self._optimum, self.conf_interval("profile"), self.errors)
+        method: Method = "wald" if self._first_order else "profile"
+        return judged(self._optimum, self.conf_interval(method), self.errors)
 
     @cached_property
     def goodness(self) -> Goodness:

@@ -87,7 +87,7 @@ class Posterior(Result):
     def statements(self) -> tuple[str, ...]:
         """The verdict sentence by sentence: the first says whether to trust, the others why."""
         first, *others = self._objections or (self.message,)
-        said = doubted(*self._provenances)
+        said = (*self._notes, *doubted(*self._provenances))
         return (f"{self.status.capitalize()}. {first}", *others, *said)
 
     @property
@@ -97,21 +97,38 @@ class Posterior(Result):
 
     @property
     def status(self) -> VerdictStatus:
-        """Not determined where it has not converged; not described where data or prior object."""
-        if not self.converged:
-            return VerdictStatus.NOT_DETERMINED
-        return VerdictStatus.NOT_DESCRIBED if self._objections else VerdictStatus.TRUSTED
+        """Whether the numbers can be used.
+
+        Not determined where it has not converged, or a prior that nobody gave sets a parameter;
+        not described where data or prior object.
+        """
+        against = any(rule.contradicted for rule in self.prior_influences)
+        if self.converged and (against or self._misfits):
+            return VerdictStatus.NOT_DESCRIBED
+        return VerdictStatus.NOT_DETERMINED if self._objections else VerdictStatus.TRUSTED
 
     @property
     def _objections(self) -> tuple[str, ...]:
         unfinished = () if self.converged else (self.message,)
         against = (str(rule) for rule in self.prior_influences if rule.contradicted)
-        return (*unfinished, *against, *self._misfits)
+        return (*unfinished, *against, *self._misfits, *map(str, self._left_open))
+
+    @property
+    def _left_open(self) -> tuple[PriorInfluence, ...]:
+        """Parameters that are set by a default prior, which is knowledge of nobody."""
+        default = {p.parameter.name for p in self._density.prior.priors if p.source == "default"}
+        rules = self.prior_influences
+        return tuple(r for r in rules if r.name in default and not r.contradicted)
+
+    @property
+    def _notes(self) -> tuple[str, ...]:
+        """What the numbers count and assume, sentence by sentence."""
+        return ()
 
     @property
     def findings(self) -> tuple[str, ...]:
         """What the prior determines, and what does not fit."""
-        return (*map(str, self.prior_influences), *self._misfits)
+        return (*map(str, self.prior_influences), *self._misfits, *self._notes)
 
     @property
     @abstractmethod

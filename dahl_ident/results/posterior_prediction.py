@@ -30,7 +30,7 @@ class PredictiveBand:
     Examples
     --------
     >>> import dahl_ident as di
-    >>> grid = di.posterior(di.load_dataset("noisy"), di.Dahl(), method="grid")
+    >>> grid = di.posterior(di.load_dataset("noisy"), di.Dahl(alpha=1.0), method="grid")
     >>> band = grid.predict([1.0, 1.0], amplitude=[0.002, 0.004])
     >>> low, high = band.gain()
     >>> print(abs(band.response).round(1), (high - low).round(1))

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from scipy.stats import t as student_t
+from scipy import special
 
 from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.data import Record
@@ -301,7 +301,7 @@ class RecordFit(Result):
     @cached_property
     def coverage_factor(self) -> float:
         """Half-width of a 95 % interval in standard errors: Student's t, effective samples."""
-        return float(student_t.ppf(0.975, self.errors.dof))
+        return float(special.stdtrit(self.errors.dof, 0.975))
 
     def conf_interval(self) -> Mapping[str, tuple[float, float]]:
         """Return the 95 % interval of every free parameter."""

@@ -16,6 +16,7 @@ from dahl_ident.bayes.record_density import RecordDensity
 from dahl_ident.data import Record
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget
+from dahl_ident.diagnostics.formatting import listed
 from dahl_ident.diagnostics.record_errors import record_derived
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.results.chain_draws import ChainDraws
@@ -87,6 +88,13 @@ class RecordPosterior(ChainDraws):
         if self.fit.status in (VerdictStatus.TRUSTED, VerdictStatus.NOT_DETERMINED):
             return ()
         return self.fit.statements[:2]
+
+    @property
+    def _notes(self) -> tuple[str, ...]:
+        errors = self.fit.errors
+        counted = [name for name, part in errors.contributions.items() if part.any()]
+        assumed = (f"Assumed: {listed(errors.exact)} exact.",) if errors.exact else ()
+        return (f"Counted: {'; '.join(counted)}.", *assumed)
 
     def budget(self) -> Budget:
         """Return the uncertainty budget of the least-squares fit."""

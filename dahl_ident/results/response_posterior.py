@@ -14,11 +14,15 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.density import Density
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.bands import DerivedQuantity, problem_at
-from dahl_ident.diagnostics.budget import Budget, budget
+from dahl_ident.diagnostics.budget import Budget
+from dahl_ident.diagnostics.formatting import listed
+from dahl_ident.diagnostics.statements import assumptions
+from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
 from dahl_ident.results.fit_numbers import estimates
+from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_base import RULE_DRAWS, Posterior
 from dahl_ident.results.posterior_prediction import PredictiveBand, derived_at_draws
 from dahl_ident.results.predictive_checks import PredictiveCheck, predictive_checks
@@ -32,12 +36,18 @@ class ResponsePosterior(Posterior):
     """The posterior of a frequency response."""
 
     _density: Density
-    _optimum: Optimum | None
+    _fit: FitResult | None
+    _uncertainty: str
 
     @property
     def problem(self) -> Problem:
         """Data, model, noise and sensors."""
         return self._density.problem
+
+    @property
+    def asked(self) -> Problem:
+        """The problem as it was given, before exponents that were not given became parameters."""
+        return self.problem if self._fit is None else self._fit.problem
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -47,8 +57,11 @@ class ResponsePosterior(Posterior):
 
     @cached_property
     def checks(self) -> tuple[PredictiveCheck, ...]:
-        """Posterior predictive checks of the residuals; none where the prior was sampled."""
-        if self.likelihood == "none":
+        """Posterior predictive checks of the residuals, with noise alone.
+
+        None where the prior was sampled, or where rows share errors; the fit's tests count there.
+        """
+        if self.likelihood == "none" or self._combined is not None:
             return ()
         draws = self._draws(_CHECK_DRAWS, 0)
         return predictive_checks(self._density, draws, np.random.default_rng(0))
@@ -59,7 +72,57 @@ class ResponsePosterior(Posterior):
 
     @property
     def _misfits(self) -> tuple[str, ...]:
-        return tuple(str(check) for check in self.checks if not check.passed)
+        fit = self._combined
+        if fit is None:
+            return tuple(str(check) for check in self.checks if not check.passed)
+        if fit.status is VerdictStatus.NOT_DESCRIBED:
+            first, *others = fit.statements
+            return (first.removeprefix(f"{fit.status.capitalize()}. "), *others)
+        undetermined = fit.status is VerdictStatus.NOT_DETERMINED
+        return fit.goodness.statements if undetermined and fit.goodness.objections else ()
+
+    @property
+    def uncertainty(self) -> str:
+        """What is counted: every source of the fit's budget, "combined", or "noise" alone."""
+        return self._uncertainty
+
+    @property
+    def _combined(self) -> FitResult | None:
+        """The fit whose sources of error are counted; None where noise alone is."""
+        return self._fit if self._uncertainty == "combined" else None
+
+    @property
+    def status(self) -> VerdictStatus:
+        """Whether the numbers can be used; approximate where the fit's are."""
+        own, fit = super().status, self._combined
+        if own is VerdictStatus.TRUSTED and fit is not None:
+            return fit.status if fit.status is VerdictStatus.APPROXIMATE else own
+        return own
+
+    @property
+    def _notes(self) -> tuple[str, ...]:
+        fit = self._fit
+        if fit is None or self.likelihood == "none":
+            return ()
+        if self._combined is not None:
+            shared = self._density.errors
+            names = ["noise"] if shared is None else list(shared.counted)
+            free = [n for n in self.problem.names if n not in fit.problem.names]
+            ranges = (f"{name} as a parameter, which was not given" for name in free)
+            counted = f"Counted: {'; '.join([*names, *ranges])}."
+            approximate = fit.statements[:1] if self.status is VerdictStatus.APPROXIMATE else ()
+            return (*approximate, counted, *assumptions(fit.optimum, fit.errors))
+        return (*self._beside, *assumptions(fit.optimum, None))
+
+    @property
+    def _beside(self) -> tuple[str, ...]:
+        """What every source together would make of the uncertainties, where noise alone counts."""
+        fit = self._fit
+        if fit is None or fit.errors is None:
+            return ()
+        own = dict(zip(self.names, self.std().tolist(), strict=True))
+        u = [f"{fit.params[n].stderr:.2g} instead of {own[n]:.2g} for {n}" for n in fit.var_names]
+        return (f"Noise alone is counted; with every source of the budget, u is {listed(u)}.",)
 
     @cached_property
     def params(self) -> Mapping[str, Estimate]:
@@ -79,7 +142,7 @@ class ResponsePosterior(Posterior):
     @property
     def optimum(self) -> Optimum | None:
         """The least-squares optimum from which the search started; None with too few data."""
-        return self._optimum
+        return None if self._fit is None else self._fit.optimum
 
     def budget(self) -> Budget:
         """Return the uncertainty budget of the least-squares fit to the same data and model.
@@ -89,9 +152,9 @@ class ResponsePosterior(Posterior):
         FitError
             If there are too few data for one.
         """
-        if self._optimum is None:
+        if self._fit is None:
             raise FitError("there are too few data for a least-squares fit, so there is no budget")
-        return budget(self._optimum)
+        return self._fit.budget()
 
     def predict(
         self,

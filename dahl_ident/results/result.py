@@ -76,7 +76,7 @@ class Result(ABC):
     >>> for result in (di.fit(data, di.Dahl()), di.posterior(data, di.Dahl(), method="grid")):
     ...     print(result.status, result.params["f_max"])
     trusted f_max = 0.10002 +- 0.00039 N
-    trusted f_max = 0.09982 +- 0.00028 N
+    trusted f_max = 0.10002 +- 0.00039 N
     """
 
     _called: ClassVar[str] = "a result"

@@ -22,6 +22,7 @@ EPS = float(np.finfo(np.float64).eps)  # distance from 1 to the next number
 _ROUNDING = 8.0 * EPS  # of k - m omega^2 and its like, relative to the terms' sizes
 _LARGEST = 1e300  # represents an unbounded amplitude
 _REACH = 40  # decades of amplitude, m, to both sides, that are searched where N has no bounds
+_TOGETHER = 64  # points, 20,000 numbers: their arrays stay in the processor's cache
 _AT_REST = np.zeros(())
 
 
@@ -52,6 +53,14 @@ class Nonlinear:
             force += element.stiffness(_rows(values, vector), amplitude, omega)
         force *= amplitude
         return force
+
+    def forces(self, grid: FloatArray, vector: IntArray) -> ComplexArray:
+        """Return A N of several parameter vectors over one grid of amplitudes, (vectors, n)."""
+        if self.shared:
+            return self.force(grid, np.zeros(grid.shape, dtype=np.intp))[None]
+        one, which = np.unique(vector, return_inverse=True)
+        force = self.force(np.tile(grid, one.size), np.repeat(one, grid.size))
+        return force.reshape(one.size, -1)[which]
 
     def force_and_slope(
         self, amplitude: FloatArray, vector: IntArray
@@ -136,14 +145,17 @@ class Plant:
         """Return amplitudes beyond which A |Z| is far from the drive, where N has no bounds."""
         grid = 10.0 ** np.arange(-_REACH, _REACH, 0.25)
         least, most = np.empty(self.drive.shape), np.empty(self.drive.shape)
-        for point in range(self.drive.size):
-            one = self.at(np.full(grid.size, point))
+        for start in range(0, least.size, _TOGETHER):
+            points = np.arange(start, min(start + _TOGETHER, least.size))
+            part = self.at(points)
             with np.errstate(all="ignore"):
-                ratio = np.abs(one.force(grid)) / one.drive
+                total = part.linear[:, None] * grid + part.friction.forces(grid, part.vector)
+                ratio = np.abs(total) / part.drive[:, None]
             reached = ~(ratio < 0.1)  # true as well where A |Z| overflows
-            least[point] = grid[max(int(reached.argmax()) - 1, 0)] if reached.any() else grid[-1]
-            last = grid.size - 1 - int((ratio < 10.0)[::-1].argmax())
-            most[point] = grid[min(last + 1, grid.size - 1)]
+            first = np.where(reached.any(axis=1), reached.argmax(axis=1) - 1, grid.size - 1)
+            last = grid.size - 1 - (ratio < 10.0)[:, ::-1].argmax(axis=1)
+            least[points] = grid[np.maximum(first, 0)]
+            most[points] = grid[np.minimum(last + 1, grid.size - 1)]
         return least, most
 
     def misfit(
@@ -177,10 +189,16 @@ def flatten(
             elements.append(element)
             friction.append(own)
     rates = [] if all(e.rate_independent for e in elements) else [np.asarray(omega)]
+    which: IntArray | None = None
+    if rates and rates[0].ndim == 1 and all(np.shape(v)[-1:] in ((), (1,)) for v in values):
+        one, which = np.unique(rates[0], return_inverse=True)  # rows of one frequency are alike
+        rates = [one]
     linear, friction = _without_overflow(linear, friction)
     force, stiffness, friction = _units(elements, friction)
     batch = np.broadcast_shapes(*(np.shape(v) for own in (*friction, rates) for v in own))
     vectors = np.arange(np.prod(batch, dtype=np.intp)).reshape(batch)
+    if which is not None:
+        vectors = vectors[..., which]
     plant = Plant(
         _flat(linear / stiffness, shape),
         _flat(_ROUNDING * size / stiffness, shape),

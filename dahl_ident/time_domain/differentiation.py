@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from dahl_ident.arrays import FloatArray
 
@@ -39,6 +38,8 @@ def differentiated(samples: FloatArray, interval: float) -> tuple[FloatArray, Fl
     >>> bool(abs(a[200] + (2.0 * np.pi) ** 2 * np.sin(2.0 * np.pi * t[200])) < 0.05)
     True
     """
+    from scipy.signal import savgol_filter  # loads for long, and few need it
+
     window = min(filter_window(samples), samples.size - 1 + samples.size % 2)
     degree = min(_DEGREE, window - 1)
     first, second = (

@@ -4,12 +4,13 @@ Every interval between two samples is integrated from a guess of its first state
 side by side on arrays; Newton's method then makes the ends fit the beginnings, which is a linear
 recursion. The motion found is that of one integration after the other, but costs a few passes
 over arrays instead of a loop. Where the guess is poor, the recursion is first cut into short
-segments that double from pass to pass, so that errors cannot grow along the record.
+segments that double from pass to pass, so that errors cannot grow along the record; where that
+fails, the motion is found stretch by stretch.
 
 Within an interval the method is of order 6, and the drive band-limited. Where the velocity or a
-friction force passes through zero the laws have kinks: those places are located and the step is
-divided there, so that each part is smooth. The rates are continuous there, so the sensitivities
-pass through unchanged.
+friction force passes through zero, or a Jenkins element begins to slip, the laws have kinks: those
+places are located and the step is divided there, so that each part is smooth. Where the rates jump,
+so do the sensitivities.
 """
 
 from __future__ import annotations
@@ -30,9 +31,11 @@ _PLACES = np.array(PLACES[:6])  # of the drive: the seventh stage is at the seco
 _PIECES = 6  # parts that a step is divided into at most
 _LOCATING = 8  # Newton steps for a passage through zero, at most
 _LOCATED = 1e-9  # of a step: the error of the next Newton step is below rounding
+_SMALL = 1e-6  # of a switching function's largest value: more is not near to its passage
 _PASSES = 50  # at most; corrections shrink or the search ends
 _GROWTHS = 3  # passes in which the correction may grow
 _SEGMENT = 32  # samples, within which motions stay near a wrong start
+_SHORTER = 4  # where a stretch was too long; each success doubles it
 _TOLERANCE = 1e-11  # of the largest motion: the next pass changes rounding alone
 _POWERS = np.arange(8)  # of time, in the drive's polynomial over a step
 
@@ -100,16 +103,30 @@ class ForcedMotion:
         motion = guess.copy()
         motion[0] = first
         found = self._newton(values, motion, self._n)
-        for segment in (_SEGMENT, 1):
-            if found is None:
-                motion[1:] = first
-                found = self._newton(values, motion, segment)
         if found is None:
-            raise FitError(
-                "the motion grows beyond all bounds at the parameters "
-                f"{dict(zip(self.plant.free, values.tolist(), strict=True))}"
-            )
-        return found
+            motion[1:] = first
+            found = self._newton(values, motion, _SEGMENT)
+        return self._marched(values, motion) if found is None else found
+
+    def _marched(self, values: FloatArray, motion: FloatArray) -> FloatArray:
+        """Return the motion stretch by stretch, each guessed to stay where it begins."""
+        start, width = 0, _SEGMENT
+        while start < self._n:
+            stop = min(start + width, self._n)
+            motion[start + 1 : stop + 1] = motion[start]
+            size = np.abs(motion[: start + 1]).max(axis=0)
+            found = self._newton(values, motion[start : stop + 1], self._n, start, size)
+            if found is not None:
+                motion[start : stop + 1] = found
+                start, width = stop, 2 * width
+            elif width > 1:
+                width = max(1, width // _SHORTER)
+            else:
+                raise FitError(
+                    "the motion grows beyond all bounds at the parameters "
+                    f"{dict(zip(self.plant.free, values.tolist(), strict=True))}"
+                )
+        return motion
 
     def sensitivities(self, values: FloatArray, motion: FloatArray) -> FloatArray:
         """Return the states' derivatives by the first state and the free parameters.
@@ -164,29 +181,39 @@ class ForcedMotion:
         slopes[:, order:] += np.array(by[order:]).T.reshape(n, -1)
         return np.array(acceleration), slopes
 
-    def _newton(self, values: FloatArray, motion: FloatArray, segment: int) -> FloatArray | None:
+    def _newton(
+        self,
+        values: FloatArray,
+        motion: FloatArray,
+        segment: int,
+        start: int = 0,
+        earlier: FloatArray | float = 0.0,
+    ) -> FloatArray | None:
         """Return the motion from a guess, or None where Newton's method does not find it.
 
         In the first pass corrections run through `segment` samples, then through twice as many.
+        From sample `start` on, before which states have at most the size `earlier`.
         """
         order = self.plant.order
         last, growths = np.inf, 0
         for _ in range(_PASSES):
             with np.errstate(all="ignore"):
-                flow = self.flow(values, motion[:-1], derivatives=1)
+                flow = self.flow(values, motion[:-1], start, derivatives=1)
                 gaps = flow.end - motion[1:]
                 keep = flow.by_state
-                if segment < self._n:
+                if segment < len(gaps):
                     keep = keep.copy()
                     keep[segment - 1 :: segment] = 0.0
                 change = _recursion(keep, gaps[:, :, None], np.zeros((order, 1)))[..., 0]
                 motion = motion + change
-                size = np.abs(motion).max(axis=0) + 1e-300
+                size = np.maximum(np.abs(motion).max(axis=0), earlier) + 1e-300
                 largest = float(np.max(np.abs(change).max(axis=0) / size))
             if not largest < np.inf:
                 return None
-            if segment >= self._n:
-                if largest < _TOLERANCE:
+            if segment >= len(gaps):
+                # the next change is smaller by the same ratio at least
+                ratio = min(1.0, largest / last) if last < np.inf else 1.0
+                if largest * ratio < _TOLERANCE:
                     return motion
                 growths += largest > last
                 if growths > _GROWTHS:
@@ -195,15 +222,18 @@ class ForcedMotion:
             segment = min(2 * segment, self._n)
         return None
 
-    def flow(self, values: FloatArray, states: FloatArray, *, derivatives: int) -> Flow:
-        """Return where the intervals that begin at `states`, (n - 1, order), end.
+    def flow(
+        self, values: FloatArray, states: FloatArray, start: int = 0, *, derivatives: int
+    ) -> Flow:
+        """Return where the intervals that begin at `states`, (m, order), end.
 
-        `derivatives`: 0 none, 1 by the state, 2 by the free parameters as well.
+        The first one begins at sample `start`. `derivatives`: 0 none, 1 by the state, 2 by the
+        free parameters as well.
         """
         order = self.plant.order
         y, total = states.T, None
         for r in range(self._substeps):
-            y, by = self._step(values, y, r, derivatives)
+            y, by = self._step(values, y, start, r, derivatives)
             if by is not None:
                 total = by if total is None else _chained(by, total, order)
         if total is None:
@@ -212,19 +242,20 @@ class ForcedMotion:
         return Flow(y.T, by_all[:, :, :order], by_all[:, :, order:])
 
     def _step(
-        self, values: FloatArray, y: FloatArray, r: int, derivatives: int
+        self, values: FloatArray, y: FloatArray, start: int, r: int, derivatives: int
     ) -> tuple[FloatArray, FloatArray | None]:
         """Return the states after one fine step, and their derivatives (order, order + P, n)."""
-        stages = self._stages[r]
+        stages = self._stages[r][:, start : start + y.shape[1]]
         direction, sides = self._branch(values, y, stages[0])
         after, by = self._advance(values, y, stages, self._length, direction, sides, derivatives)
         crosses = after[1] * direction < 0.0
         if len(sides):
-            now = self._switches(values, after, stages[1], direction, sides)[1 : 1 + len(sides)]
-            crosses |= (now * sides < 0.0).any(axis=0)
+            both = self._switches(values, after, stages[1], direction, sides)
+            now, soon = both[1 : 1 + len(sides)], both[2 + len(sides) :]
+            crosses |= ((now * sides < 0.0) & (soon != 0.0)).any(axis=0)
         places = np.flatnonzero(crosses)
         if places.size:
-            coefficients = self._drive[:, places, r]
+            coefficients = self._drive[:, start + places, r]
             end, d = self._divided(
                 values, y[:, places], coefficients, direction[places], sides[:, places], derivatives
             )
@@ -238,7 +269,8 @@ class ForcedMotion:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the direction of motion, and the side of every switch, at the states `y`.
 
-        Where the velocity or a switching function is zero, what it is about to become.
+        Where the velocity is zero, or a switching function as near to zero as its passage is
+        located, what it is about to become.
         """
         n, count = y.shape[1], self.plant.n_switches
         direction = np.where(y[1] < 0.0, -1.0, 1.0)
@@ -248,9 +280,16 @@ class ForcedMotion:
             (push,) = self.plant.push(*y[:, still], drive[still], 1.0, *sides[:, still], *values)
             direction[still] = np.where(np.broadcast_to(push, still.shape) < 0.0, -1.0, 1.0)
         if count:
-            both = self._switches(values, y, drive, direction, sides)
-            now, soon = both[1 : 1 + count], both[2 + count :]
-            sides = np.where((now < 0.0) | ((now == 0.0) & (soon < 0.0)), -1.0, 1.0)
+            now = self._switches(values, y, drive, direction, sides)[1 : 1 + count]
+            sides = np.where(now < 0.0, -1.0, 1.0)
+            small = np.abs(now) <= _SMALL * np.abs(now).max(axis=1, keepdims=True)
+            places = np.flatnonzero(small.any(axis=0))
+            if places.size:
+                own = sides[:, places]
+                both = self._switches(values, y[:, places], drive[places], direction[places], own)
+                soon = both[2 + count :]
+                passes = np.abs(now[:, places]) <= _LOCATED * self._length * np.abs(soon)
+                sides[:, places] = np.where(passes & (own * soon < 0.0), -own, own)
         return direction, sides
 
     def _switches(
@@ -318,28 +357,18 @@ class ForcedMotion:
             share = 1.0 - done[active]
             after, by = self._part(values, part, share, derivatives)
             first, which = share.copy(), np.full(active.size, -1)
-            if piece < _PIECES - 1:
-                drive = part.drive(done[active] + share)
-                signs = np.vstack([direction[active], sides[:, active]])
-                ends = self._switches(values, after, drive, direction[active], sides[:, active])[
-                    : len(signs)
-                ]
-                for i in range(len(signs)):
-                    places = np.flatnonzero(ends[i] * signs[i] < 0.0)
-                    if not places.size:
-                        continue
-                    where = self._passage(
-                        values, part.take(places), share[places], ends[i, places], i
-                    )
-                    earlier = where < first[places]
-                    first[places[earlier]] = where[earlier]
-                    which[places[earlier]] = i
+            divided = which[:0]
+            # a switch may pass through zero before the motion turns, and back until the step's end
+            for _ in range(1 + min(1, self.plant.n_switches)):
+                if piece == _PIECES - 1:
+                    break
+                changed = self._earliest(values, part, after, first, which)
+                if changed.size:
+                    again, d = self._part(values, part.take(changed), first[changed], derivatives)
+                    after[:, changed] = again
+                    if by is not None and d is not None:
+                        by[:, :, changed] = d
             divided = np.flatnonzero(which >= 0)
-            if divided.size:
-                again, d = self._part(values, part.take(divided), first[divided], derivatives)
-                after[:, divided] = again
-                if by is not None and d is not None:
-                    by[:, :, divided] = d
             y[:, active] = after
             if total is not None and by is not None:
                 total[:, :, active] = _chained(by, total[:, :, active], order)
@@ -359,9 +388,65 @@ class ForcedMotion:
                     now = both[1 : 1 + len(sides)]
                     sides[:, turned] = np.where(now < 0.0, -1.0, 1.0)
             for i in range(len(sides)):
-                sides[i, hit[cause == i + 1]] *= -1.0
+                switched = hit[cause == i + 1]
+                if switched.size:
+                    drive = _polynomial(coefficients[:, switched], done[switched])
+                    change, passed = self._passed(
+                        values, y[:, switched], drive, direction[switched], sides[:, switched], i
+                    )
+                    y[:, switched] += change
+                    if total is not None:
+                        width = total.shape[1]
+                        total[:, :, switched] = _chained(
+                            passed[:, :width], total[:, :, switched], order
+                        )
+                    sides[i, switched] *= -1.0
             active = hit
         return y, total
+
+    def _earliest(
+        self,
+        values: FloatArray,
+        part: _Part,
+        after: FloatArray,
+        first: FloatArray,
+        which: NDArray[np.intp],
+    ) -> NDArray[np.intp]:
+        """Shorten parts, in place, to where the first switching function passes through zero.
+
+        `after` is the state at the share `first` of the step, where `which` passes already;
+        return the parts that are shorter now.
+        """
+        signs = np.vstack([part.direction, part.sides])
+        drive, count = part.drive(part.done + first), len(signs)
+        both = self._switches(values, after, drive, part.direction, part.sides)
+        ends, soon = both[:count], both[count:]
+        before, share = which.copy(), first.copy()
+        for i in range(count):
+            beyond = (ends[i] * signs[i] < 0.0) & (before != i)
+            places = np.flatnonzero(beyond & (soon[i] != 0.0) if i else beyond)
+            if not places.size:
+                continue
+            where = self._passage(values, part.take(places), share[places], ends[i, places], i)
+            earlier = where < first[places]
+            first[places[earlier]] = where[earlier]
+            which[places[earlier]] = i
+        return np.flatnonzero(which != before)
+
+    def _passed(
+        self,
+        values: FloatArray,
+        y: FloatArray,
+        drive: FloatArray,
+        direction: FloatArray,
+        sides: FloatArray,
+        i: int,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return what switch `i` changes where it passes through zero; see `Plant.passages`."""
+        order, n = y.shape
+        found = self.plant.passages[i](*y, drive, direction, *sides, *values)
+        entries = np.array([np.broadcast_to(entry, (n,)) for entry in found])
+        return entries[:order], entries[order:].reshape(-1, order, n).transpose(1, 0, 2)
 
     def _part(
         self, values: FloatArray, part: _Part, share: FloatArray, derivatives: int
@@ -389,7 +474,8 @@ class ForcedMotion:
             now, slope = both[i], both[count + i] * self._length
             beyond = now * sign > 0.0
             high, low = np.where(beyond, where, high), np.where(beyond, low, where)
-            trial = where - now / slope
+            with np.errstate(divide="ignore", invalid="ignore"):
+                trial = where - now / slope
             inside = (trial >= low) & (trial <= high)
             new = np.where(inside, trial, 0.5 * (low + high))
             moved, where = np.abs(new - where).max(), new

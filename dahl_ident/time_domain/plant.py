@@ -4,18 +4,21 @@
     dF_i/dt = slope_i(F_i, sgn v, v) v    for every element with memory
 
 Base motion: x is the displacement relative to the base, and the drive is -m times the base's
-acceleration. The state is x, v and one force for each element with memory.
+acceleration. The state is x, v and the elements' own: one force for most that have memory.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Literal
 
 import casadi as ca
+import numpy as np
 
+from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Model
 from dahl_ident.errors import ModelError
 from dahl_ident.time_domain.runge_kutta import step
@@ -23,6 +26,14 @@ from dahl_ident.time_domain.switches import on_one_branch
 from dahl_ident.time_domain.vectorised import Evaluator, vectorised
 
 Excitation = Literal["force", "base"]
+
+
+@contextmanager
+def _numpy_names() -> Iterator[None]:
+    """Allow numpy's names, which laws in plain arithmetic may use; casadi answers, and warns."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        yield
 
 
 class Plant:
@@ -50,8 +61,7 @@ class Plant:
     def __init__(self, model: Model, excitation: Excitation) -> None:
         self.model = model
         self.excitation = excitation
-        self.with_memory = tuple(e for e in model.elements if e.has_memory)
-        self.order = 2 + len(self.with_memory)
+        self.order = 2 + sum(e.n_states for e in model.elements)
         self._state = [ca.SX.sym(f"y{i}") for i in range(self.order)]
         # fixed values as numbers, so that what follows from them is worked out once
         self._values = [
@@ -61,26 +71,23 @@ class Plant:
         self._free = [v for v, p in zip(self._values, model.parameters, strict=True) if p.free]
         self._drive, self._direction = ca.SX.sym("u"), ca.SX.sym("s")
         inputs = [*self._state, self._drive, self._direction, *self._free]
-        with warnings.catch_warnings():
-            # laws in plain arithmetic may use numpy's names; casadi answers to them, and says so
-            warnings.simplefilter("ignore", FutureWarning)
+        with _numpy_names():
             rates = self._rates()
         self._held, self._switches, self._sides = on_one_branch(inputs, rates)
         self.n_switches = len(self._switches)
         """How many switching functions the laws have; see :mod:`~.switches`."""
 
     def _rates(self) -> ca.SX:
-        x, v, *forces = self._state
-        inertia, total, slopes = ca.SX(0.0), ca.SX(0.0), []
-        waiting = iter(forces)
+        x, v, *states = self._state
+        inertia, total = ca.SX(0.0), ca.SX(0.0)
+        slopes: list[ca.SX] = []
         has_inertia = False
         for element, values in self.model.of(self._values):
-            own = next(waiting) if element.has_memory else None
+            own, states = states[: element.n_states], states[element.n_states :]
             part = element.mechanics(values, x, v, self._direction, own)
             has_inertia = has_inertia or isinstance(part.inertia, ca.SX)
             inertia, total = inertia + part.inertia, total + part.force
-            if own is not None:
-                slopes.append(part.rate)
+            slopes += part.rates
         if not has_inertia:
             raise ModelError(
                 f"{self.model!r} has no mass, so a force does not determine its motion; add "
@@ -117,6 +124,38 @@ class Plant:
         return self._function(lambda after: ca.vertcat(after, ca.vec(ca.jacobian(after, at))))
 
     @cached_property
+    def _first(self) -> Evaluator:
+        starts = [ca.SX.sym(f"f{i}") for i, e in enumerate(self.model.elements) if e.has_memory]
+        states = list(self._state[:2])
+        waiting = iter(starts)
+        with _numpy_names():
+            for element, values in self.model.of(self._values):
+                start = next(waiting) if element.has_memory else ca.SX(0.0)
+                states += element.initial_states(values, start)
+        inputs = [*self._state[:2], *starts, *self._free]
+        first = ca.vertcat(*states)
+        by = ca.jacobian(first, ca.vertcat(*inputs))
+        return vectorised(inputs, ca.vertcat(first, ca.vec(by)))
+
+    def first(self, own: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the state at the first sample, and its derivatives.
+
+        Parameters
+        ----------
+        own : ndarray, shape (m,)
+            Displacement, velocity and the start of each element with memory.
+        values : ndarray, shape (P,)
+            Free parameters.
+
+        Returns
+        -------
+        state : ndarray, shape (order,)
+        by : ndarray, shape (order, m + P)
+        """
+        found = np.array(self._first(*own.tolist(), *values.tolist()), dtype=np.float64)
+        return found[: self.order], found[self.order :].reshape(-1, self.order).T
+
+    @cached_property
     def push(self) -> Evaluator:
         """The acceleration, of state, drive, direction, sides and free values."""
         return self._at_a_moment([self._held[1]])
@@ -130,6 +169,24 @@ class Plant:
         functions = ca.vertcat(self._state[1], *self._switches)
         rates = ca.jacobian(functions, ca.vertcat(*self._state)) @ self._held
         return self._at_a_moment([functions, rates])
+
+    @cached_property
+    def passages(self) -> tuple[Evaluator, ...]:
+        """What each switching function does to the state where it passes through zero.
+
+        Of state, drive, direction, sides before the passage and free values. The state's change,
+        which puts right what the place is off; then the derivatives by state and free parameters
+        of the state after it: the rates may jump, and other values pass at another time.
+        """
+        at = ca.vertcat(*self._state, *self._free)
+        found = []
+        for function, side in zip(self._switches, self._sides, strict=True):
+            jump = ca.substitute(self._held, side, -side) - self._held
+            speed = ca.jacobian(function, ca.vertcat(*self._state)) @ self._held
+            late = ca.if_else(speed == 0.0, 0.0 * jump, jump / speed)
+            by = ca.jacobian(ca.vertcat(*self._state), at) + late @ ca.jacobian(function, at)
+            found.append(self._at_a_moment([late * function, ca.vec(by)]))
+        return tuple(found)
 
     @cached_property
     def acceleration(self) -> Evaluator:

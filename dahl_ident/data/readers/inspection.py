@@ -181,7 +181,19 @@ def _proposal(source: Source) -> str:
     unused = [path for path in others if path not in found]
     for what, paths in (("read by their names", found), ("not used", unused)):
         lines += [f"# {what}: {listed(paths, 20)}"] if paths else []
-    return "\n".join(lines)
+    return "\n".join([*lines, *_to_fill_in(roles.keys(), response)])
+
+
+def _to_fill_in(found: Collection[str], response: bool) -> Iterator[str]:
+    """Yield comments that become the entries of required roles once they are filled in."""
+    required = [("frequency",)] if response else [("time",), MOTION_KINDS, ("force", "drive")]
+    missing = [roles[0] for roles in required if not set(roles) & set(found)]
+    if missing:
+        yield f"# not found: {', '.join(missing)}. Fill in, and remove the comment signs:"
+    for role in missing:
+        yield f'# {role} = {{column = "", unit = ""}}'
+    if "time" in missing:
+        yield "# sample_rate = 1000.0  # Hz, in place of the time; above all lines in brackets"
 
 
 def _has_name(channel: Channel, roles: Iterable[str], names: Mapping[str, tuple[str, ...]]) -> bool:

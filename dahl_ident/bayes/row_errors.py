@@ -1,0 +1,151 @@
+r"""What the rows of a table share beside independent noise, in a likelihood.
+
+Residuals y have the covariance s^2 (V_n + lambda V_c): noise V_n and what rows have in common V_c
+(scatter between runs and levels, a smooth model error), both relative to the noise's scale s. In
+coordinates W y in which V_n is the unit matrix and V_c is diagonal, mu,
+
+    -2 ln L = sum of (W y)^2/(1 + lambda mu)/s^2 + constants.
+
+The size of V_c was estimated, so lambda is unknown. It takes M equally probable values, such that
+the parameter which V_c affects most follows Student's t with the nu effective degrees of freedom of
+its budget: with p the share of V_c in its squared uncertainty, p lambda + 1 - p follows
+nu/chi^2_nu. The likelihood is the mean of the likelihoods with each lambda, each divided by its
+integral over the parameters (Laplace's).
+
+Where a parameter differs from run to run, V_c holds what that does to the residuals to first order,
+so the residuals are linear in that parameter: it is the mean over runs, and no run is there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import chdtri
+
+from dahl_ident.arrays import FloatArray
+
+_SIZES = 32  # values of lambda: quantiles of Student's t with 2 dof then err by 2 % at 95 %
+_MANY = 200.0  # degrees of freedom with which Student's t is normal to 1 % at 95 %
+
+
+@dataclass(frozen=True)
+class RowErrors:
+    """Covariance of a table's residuals, and the sources that it counts.
+
+    Attributes
+    ----------
+    counted : tuple of str
+        Names of the sources.
+    turn : ndarray, shape (k, m)
+        W: takes m residuals to coordinates in which they are independent.
+    shared : ndarray, shape (k,)
+        mu: variance of what rows share there; that of noise is 1.
+    log_volume : float
+        ln of the determinant of W.
+    offset, weight : ndarray, shape (m,)
+        Residuals are taken as ``weight * y + offset``.
+    dof, share : float
+        nu and p.
+    jacobian : ndarray, shape (m, P)
+        Derivatives by what the data determine, weights included, near the estimate.
+    residuals : ndarray, shape (m,)
+        There, weights and offset included.
+    scale_known : bool
+        Whether s is 1.
+    centre : ndarray, shape (P,)
+        Estimates of parameters that differ from run to run, search coordinates; NaN for others.
+    slopes : ndarray, shape (m, P)
+        Derivatives of the residuals by them, 0 for others.
+    inside : ndarray, shape (m, k), or None
+        Orthonormal directions of residuals beyond which rows share nothing, where rows are many.
+    outside : float
+        Variance of the residuals there.
+    """
+
+    counted: tuple[str, ...]
+    turn: FloatArray
+    shared: FloatArray
+    log_volume: float
+    offset: FloatArray
+    weight: FloatArray
+    dof: float
+    share: float
+    jacobian: FloatArray
+    residuals: FloatArray
+    scale_known: bool
+    centre: FloatArray
+    slopes: FloatArray
+    inside: FloatArray | None = None
+    outside: float = 1.0
+
+    @cached_property
+    def sizes(self) -> FloatArray:
+        """Values of lambda, (M,), equally probable."""
+        if self.dof > _MANY or not self.share > 0.0:
+            return np.ones(1)
+        whole = self.dof / chdtri(self.dof, (np.arange(_SIZES) + 0.5) / _SIZES)
+        return np.asarray(np.maximum(1.0 + (whole - 1.0) / self.share, 0.0))
+
+    @cached_property
+    def _variances(self) -> FloatArray:
+        """Of each coordinate, shape (k, M)."""
+        return 1.0 + self.shared[:, None] * self.sizes
+
+    @cached_property
+    def log_weights(self) -> FloatArray:
+        """Ln of what each likelihood counts, (M,); all integrals are that of lambda = 1."""
+        every = np.column_stack([1.0 + self.shared, self._variances])
+        at_one, *each = [self._log_integral(variances) for variances in every.T]
+        volume = self.log_volume - 0.5 * float(np.log1p(self.shared).sum())
+        return np.asarray(volume + at_one - np.array(each) - np.log(len(self.sizes)))
+
+    def _log_integral(self, variances: FloatArray) -> float:
+        """Return ln of the likelihood's integral over parameters and scale, less constants."""
+        root = np.sqrt(variances)
+        Q, R = np.linalg.qr(self.turn @ self.jacobian / root[:, None])
+        z = self.turn @ self.residuals / root
+        left = float(z @ z - np.sum((Q.T @ z) ** 2)) + float(self._beyond(self.residuals))
+        size = -float(np.log(np.abs(np.diagonal(R))).sum())
+        if self.scale_known:
+            return size - 0.5 * left
+        return size - 0.5 * (len(self.offset) - len(R)) * float(np.log(left))
+
+    def held(self, theta: FloatArray) -> FloatArray:
+        """Return theta, (S, P), with parameters that differ from run to run at their centre."""
+        return np.where(np.isnan(self.centre), theta, self.centre)
+
+    def moved(self, theta: FloatArray) -> FloatArray:
+        """Return what those parameters add to the residuals, (S, m)."""
+        return np.asarray((theta - self.held(theta)) @ self.slopes.T)
+
+    def squares(self, y: FloatArray) -> FloatArray:
+        """Return the sum of squares of residuals, (S, m) -> (S, M)."""
+        y = y * self.weight + self.offset
+        turned = y @ self.turn.T
+        return np.asarray(turned**2 @ (1.0 / self._variances) + self._beyond(y)[..., None])
+
+    def _beyond(self, y: FloatArray) -> FloatArray:
+        """Return the sum of squares of residuals (..., m) where rows share nothing."""
+        if self.inside is None:
+            return np.zeros(y.shape[:-1])
+        rest = np.sum(y**2, axis=-1) - np.sum((y @ self.inside) ** 2, axis=-1)
+        return np.asarray(np.maximum(rest, 0.0) / self.outside)
+
+    def independent(self, y: FloatArray, by: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return independent residuals, (S, k), and derivatives, (S, k, P), of (S, m[, P]).
+
+        Their sum of squares is that of lambda = 1.
+        """
+        y, by = y * self.weight + self.offset, by * self.weight[:, None]
+        turn = self.turn / np.sqrt(1.0 + self.shared)[:, None]
+        found = y @ turn.T, turn @ by
+        if self.inside is None:
+            return found
+        size = self.outside**0.5
+        rest = y - (y @ self.inside) @ self.inside.T, by - self.inside @ (self.inside.T @ by)
+        return (
+            np.concatenate([found[0], rest[0] / size], axis=-1),
+            np.concatenate([found[1], rest[1] / size], axis=-2),
+        )

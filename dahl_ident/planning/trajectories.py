@@ -1,0 +1,250 @@
+"""Motions in time that a plan can choose from: trapezoidal trajectories and multisines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray, non_negative_array, positive_number
+from dahl_ident.errors import ValidationError
+
+KINDS = ("trapezoid", "multisine")
+SAMPLES_PER_CYCLE = 10  # at least, of the fastest part of a waveform
+UNITS = {
+    "stroke": "m", "speed": "m/s", "acceleration": "m/s^2", "dwell": "s", "lowest_hz": "Hz",
+    "highest_hz": "Hz", "peak": "m", "rms": "m",
+}  # fmt: skip
+_FINE = 64  # places a line at which a multisine's peaks are looked for: within 0.1 %
+
+
+class Motion(Protocol):
+    """One period of a motion, which begins and ends at rest at the same place."""
+
+    @property
+    def kind(self) -> str:
+        """One of `KINDS`."""
+
+    @property
+    def period(self) -> float:
+        """Seconds."""
+
+    @property
+    def fastest_hz(self) -> float:
+        """Frequency that the sample rate of a waveform has to resolve, Hz."""
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """What describes it, SI."""
+
+    def displacement(self, time: FloatArray) -> FloatArray:
+        """Return the displacement at any times from the start of a period, m."""
+
+    @property
+    def peaks(self) -> tuple[float, float, float]:
+        """Largest displacement, speed and acceleration, SI."""
+
+
+@dataclass(frozen=True)
+class Trapezoid:
+    """There and back about zero with trapezoidal velocity, and a dwell at both ends.
+
+    Attributes
+    ----------
+    stroke : float
+        From end to end, m.
+    speed, acceleration : float
+        Highest, m/s and m/s^2.
+    dwell : float, default 0
+        Seconds at each end.
+
+    Examples
+    --------
+    >>> motion = Trapezoid(stroke=0.01, speed=0.02, acceleration=0.1)
+    >>> round(motion.period, 9), motion.displacement(np.array([0.0, 0.7])).round(6).tolist()
+    (1.4, [-0.005, 0.005])
+    """
+
+    stroke: float
+    speed: float
+    acceleration: float
+    dwell: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name in ("stroke", "speed", "acceleration"):
+            positive_number(getattr(self, name), f"{name} of a trapezoid")
+        non_negative_array(self.dwell, "dwell of a trapezoid")
+
+    @property
+    def kind(self) -> str:
+        """``"trapezoid"``."""
+        return "trapezoid"
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """Stroke, speed, acceleration and dwell."""
+        return dict(vars(self))
+
+    @property
+    def _reached(self) -> float:
+        return min(self.speed, float(np.sqrt(self.acceleration * self.stroke)))
+
+    @property
+    def _way(self) -> float:
+        """Seconds from end to end."""
+        return self.stroke / self._reached + self._reached / self.acceleration
+
+    @property
+    def period(self) -> float:
+        """Seconds."""
+        return 2.0 * (self._way + self.dwell)
+
+    @property
+    def fastest_hz(self) -> float:
+        """One over the time from end to end."""
+        return 1.0 / self._way
+
+    @property
+    def peaks(self) -> tuple[float, float, float]:
+        """Largest displacement, speed and acceleration."""
+        return 0.5 * self.stroke, self._reached, self.acceleration
+
+    def displacement(self, time: FloatArray) -> FloatArray:
+        """Return the displacement, m; it begins at the negative end."""
+        t = np.mod(time, self.period)
+        back = t >= 0.5 * self.period
+        s = np.clip(np.where(back, t - 0.5 * self.period, t), 0.0, self._way)
+        v, a = self._reached, self.acceleration
+        rise, left = np.minimum(s, v / a), np.minimum(self._way - s, v / a)
+        way = 0.5 * a * rise**2 + v * np.clip(s - v / a, 0.0, self._way - 2.0 * v / a)
+        way = way + 0.5 * a * ((v / a) ** 2 - left**2)
+        return np.asarray((way - 0.5 * self.stroke) * np.where(back, -1.0, 1.0))
+
+
+@dataclass(frozen=True)
+class Multisine:
+    """Equal sines at all multiples of the lowest frequency up to the highest, Schroeder's phases.
+
+    It starts at its largest displacement, at rest. Source of the phases: Schroeder, *IEEE Trans.
+    Inf. Theory* 16, 85 (1970).
+
+    Attributes
+    ----------
+    lowest_hz, highest_hz : float
+        Band; the lowest is one over the period.
+    peak : float
+        Largest displacement, m.
+
+    Examples
+    --------
+    >>> motion = Multisine(lowest_hz=0.5, highest_hz=5.0, peak=1e-3)
+    >>> motion.period, motion.displacement(np.array([0.0, 2.0])).round(9).tolist()
+    (2.0, [0.001, 0.001])
+    """
+
+    lowest_hz: float
+    highest_hz: float
+    peak: float
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name in ("lowest_hz", "highest_hz", "peak"):
+            positive_number(getattr(self, name), f"{name} of a multisine")
+        if self.highest_hz < self.lowest_hz:
+            raise ValidationError(
+                f"a multisine's band is {self.lowest_hz:g} to {self.highest_hz:g} Hz; expected "
+                "rising frequencies"
+            )
+
+    @property
+    def kind(self) -> str:
+        """``"multisine"``."""
+        return "multisine"
+
+    @property
+    def period(self) -> float:
+        """Seconds."""
+        return 1.0 / self.lowest_hz
+
+    @property
+    def fastest_hz(self) -> float:
+        """The highest frequency."""
+        return self.highest_hz
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """Band, peak and rms."""
+        _, _, _, gain = self._shape()
+        lines = self._lines.size
+        return {**vars(self), "rms": abs(gain) * float(np.sqrt(0.5 * lines))}
+
+    @property
+    def _lines(self) -> FloatArray:
+        return np.arange(1.0, np.floor(self.highest_hz / self.lowest_hz + 1e-9) + 1.0)
+
+    def _shape(self) -> tuple[FloatArray, FloatArray, float, float]:
+        """Return angular frequencies and phases, where the period starts, and the amplitude."""
+        k = self._lines
+        phase = -np.pi * k * (k - 1) / k.size
+        w = 2.0 * np.pi * self.lowest_hz * k
+        fine = np.arange(_FINE * k.size) * self.period / (_FINE * k.size)
+        start = float(fine[np.argmax(np.abs(np.cos(np.outer(fine, w) + phase).sum(axis=-1)))])
+        for _ in range(8):  # to where the velocity vanishes
+            angle = w * start + phase
+            start -= float((w * np.sin(angle)).sum() / (w**2 * np.cos(angle)).sum())
+        top = float(np.cos(w * start + phase).sum())
+        return w, phase, start, self.peak / top
+
+    def displacement(self, time: FloatArray) -> FloatArray:
+        """Return the displacement, m; it begins at the peak."""
+        w, phase, start, gain = self._shape()
+        return np.asarray(gain * np.cos(np.multiply.outer(time + start, w) + phase).sum(axis=-1))
+
+    @property
+    def peaks(self) -> tuple[float, float, float]:
+        """Largest displacement, speed and acceleration."""
+        w, phase, _, gain = self._shape()
+        time = np.arange(_FINE * w.size) * self.period / (_FINE * w.size)
+        angle = np.multiply.outer(time, w) + phase
+        speed = abs(gain) * float(np.abs((w * np.sin(angle)).sum(axis=-1)).max())
+        pull = abs(gain) * float(np.abs((w**2 * np.cos(angle)).sum(axis=-1)).max())
+        return self.peak, speed, pull
+
+
+def seconds_of_move(distance: float, speed: float, acceleration: float) -> float:
+    """Return the least time of a quintic from rest to rest within a speed and an acceleration."""
+    by_speed, by_acceleration = 15.0 / 8.0, 10.0 / np.sqrt(3.0)  # its peaks for one m in one s
+    return max(
+        by_speed * distance / speed, float(np.sqrt(by_acceleration * distance / acceleration))
+    )
+
+
+def course(
+    motions: Sequence[Motion], repeats: Sequence[int], change_over: float, time: FloatArray
+) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
+    """Return displacement, number of the motion, and whether it is measured, at any times.
+
+    The exciter begins at zero and moves from motion to motion along a quintic, at rest at both
+    ends, in `change_over` seconds.
+    """
+    value, measured = np.zeros(time.size), np.zeros(time.size, dtype=np.bool_)
+    number = np.full(time.size, len(motions), dtype=np.int64)
+    start = place = 0.0
+    for i, (motion, count) in enumerate(zip(motions, repeats, strict=True)):
+        first = float(motion.displacement(np.zeros(1))[0])
+        begin = start + change_over
+        stop = begin + count * motion.period
+        there = (time >= start) & (time < begin)
+        tau = (time[there] - start) / change_over if change_over > 0.0 else time[there]
+        value[there] = place + (first - place) * tau**3 * (10.0 - tau * (15.0 - 6.0 * tau))
+        inside = (time >= begin - 1e-9) & (time < stop - 1e-9)
+        value[inside] = motion.displacement(time[inside] - begin)
+        number[(time >= start) & (time < stop)] = i + 1
+        measured |= inside
+        start, place = stop, first
+    value[time >= start - 1e-9] = place
+    return value, number, measured

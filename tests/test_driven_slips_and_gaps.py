@@ -1,0 +1,205 @@
+"""Maxwell slip and backlash driven by a force: scipy with located events, slopes, recovery."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dahl_ident as di
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements import Element, Model
+from dahl_ident.time_domain import ForcedMotion, Plant, band_limited
+from tests.test_forced_motion import RATE, multisine
+from tests.test_record_laws import assert_recovered
+
+SAMPLES = 64
+LINEAR = di.Mass(2.0) + di.Damper(10.0) + di.Spring(3e4)
+STIFFNESSES, SLIPS = [2e4, 1e4], [2e-4, 5e-4]
+F_MAX, SIGMA, GAP = 20.0, 4e4, 4e-4
+PLACE = 1e-4  # at the first sample
+
+Event = Callable[[float, FloatArray], float]
+
+
+def by_events(
+    start: Sequence[float],
+    rates: Callable[[FloatArray, float, list[bool]], list[float]],
+    guards: Callable[[FloatArray, float, list[bool]], list[float]],
+    passed: Callable[[FloatArray, float, list[bool], int], None],
+    flags: list[bool],
+) -> FloatArray:
+    """Return displacement and velocity by DOP853, stopped where it turns or a guard rises to 0.
+
+    `passed` puts the state and the flags right after guard i; -1 is a turn.
+    """
+    _, drive = multisine(SAMPLES)
+    times = np.arange(SAMPLES) / RATE
+    out, place, now, y = np.empty((SAMPLES, 2)), 0, 0.0, np.array([PLACE, 0.0, *start])
+    s = 1.0 if drive(0.0) - 3e4 * PLACE > 0.0 else -1.0
+    while place < SAMPLES:
+
+        def motion(t: float, y: FloatArray, s: float = s) -> list[float]:
+            push = drive(t) - 10.0 * y[1] - 3e4 * y[0]
+            force, *own = rates(y, s, flags)
+            return [y[1], (push - force) / 2.0, *own]
+
+        def turn(_: float, y: FloatArray) -> float:
+            return float(y[1])
+
+        turn.terminal, turn.direction = True, -s  # type: ignore[attr-defined]
+        events: list[Event] = [turn]
+        for i in range(len(guards(y, s, flags))):
+
+            def guard(_: float, y: FloatArray, i: int = i, s: float = s) -> float:
+                return guards(y, s, flags)[i]
+
+            guard.terminal, guard.direction = True, 1.0  # type: ignore[attr-defined]
+            events.append(guard)
+        found = solve_ivp(
+            motion, (now, times[-1] + 1e-9), y, method="DOP853", rtol=1e-11, atol=1e-13,
+            max_step=0.3 / RATE, events=events, dense_output=True,
+        )  # fmt: skip
+        now, y = float(found.t[-1]), found.y[:, -1].copy()
+        here = times[place:][times[place:] <= now]
+        if here.size and found.sol is not None:
+            out[place : place + here.size] = found.sol(here)[:2].T
+            place += here.size
+        for i, hits in enumerate(found.t_events or ()):
+            if hits.size and i == 0:
+                y[1] = 0.0
+                passed(y, s, flags, -1)
+                s = -s
+            elif hits.size:
+                passed(y, s, flags, i - 1)
+    return out
+
+
+def slipping() -> FloatArray:
+    """Return the motion beside two Jenkins elements; a flag where one slips."""
+
+    def rates(y: FloatArray, _: float, slips: list[bool]) -> list[float]:
+        own = [0.0 if gone else k * y[1] for k, gone in zip(STIFFNESSES, slips, strict=True)]
+        return [y[2] + y[3], *own]
+
+    def guards(y: FloatArray, s: float, slips: list[bool]) -> list[float]:
+        return [
+            -1.0 if slips[i] else s * y[2 + i] - STIFFNESSES[i] * SLIPS[i]
+            for i in range(len(slips))
+        ]
+
+    def passed(y: FloatArray, s: float, slips: list[bool], i: int) -> None:
+        if i < 0:
+            slips[:] = [False] * len(slips)
+        else:
+            slips[i], y[2 + i] = True, s * STIFFNESSES[i] * SLIPS[i]
+
+    return by_events([0.0, 0.0], rates, guards, passed, [False, False])
+
+
+def crossing() -> FloatArray:
+    """Return the motion beside Dahl friction behind a gap; flags: in the gap, loading."""
+
+    def rates(y: FloatArray, s: float, flags: list[bool]) -> list[float]:
+        if flags[0]:
+            return [y[2], 0.0, y[1]]
+        return [y[2], SIGMA * (1.0 - s * y[2] / F_MAX) * y[1], 0.0]
+
+    def guards(y: FloatArray, s: float, flags: list[bool]) -> list[float]:
+        if flags[0]:
+            return [s * y[3] - 0.5 * GAP]
+        return [-1.0 if flags[1] else s * y[2]]
+
+    def passed(y: FloatArray, s: float, flags: list[bool], i: int) -> None:
+        if i < 0:
+            flags[1] = not flags[1]
+        elif flags[0]:
+            flags[:], y[3] = [False, True], s * 0.5 * GAP
+        else:
+            flags[:], y[2] = [True, True], 0.0
+
+    return by_events([0.0, 0.0], rates, guards, passed, [True, True])
+
+
+LAWS: list[tuple[Element, list[float], Callable[[], FloatArray]]] = [
+    (di.MaxwellSlip(2) + LINEAR, [*STIFFNESSES, *SLIPS], slipping),
+    (di.Backlash(di.Dahl()) + LINEAR, [F_MAX, SIGMA, GAP], crossing),
+]
+
+
+def plant(model: Element) -> tuple[Plant, ForcedMotion]:
+    """Return the equation of motion and the driven plant."""
+    wave, _ = multisine(SAMPLES)
+    found = Plant(Model(model), "force")
+    return found, ForcedMotion(found, band_limited(wave, 1.0 / RATE, 8), 1.0 / RATE)
+
+
+def solved(own: Plant, forced: ForcedMotion, point: FloatArray, guess: FloatArray) -> FloatArray:
+    """Return the states from displacement, velocity, the law's start and all values."""
+    first, _ = own.first(point[:3], point[3:])
+    return forced.solve(point[3:], first, guess)
+
+
+@pytest.mark.parametrize(("law", "values", "expected"), LAWS)
+def test_motion_against_scipy(
+    law: Element, values: list[float], expected: Callable[[], FloatArray]
+) -> None:
+    own, forced = plant(law)
+    point = np.array([PLACE, 0.0, 0.0, *values])
+    found = solved(own, forced, point, np.zeros((SAMPLES, own.order)))
+    reference = expected()
+    error = np.abs(found[:, :2] - reference).max(axis=0) / np.abs(reference).max(axis=0)
+    assert error.max() < 1e-8
+
+
+@pytest.mark.parametrize(("law", "values", "start"), [(*LAWS[0][:2], 3.0), (*LAWS[1][:2], 2.5e-4)])
+def test_slopes_are_derivatives(law: Element, values: list[float], start: float) -> None:
+    point = np.array([PLACE, 0.01, start, *values])
+    own, forced = plant(law)
+    states = solved(own, forced, point, np.zeros((SAMPLES, own.order)))
+    _, by = own.first(point[:3], point[3:])
+    slopes = forced.sensitivities(point[3:], states)
+    total = slopes[:, :, : own.order] @ by
+    total[:, :, 3:] += slopes[:, :, own.order :]
+    for i in range(point.size):
+        h = np.zeros(point.size)
+        h[i] = 1e-6 * point[i]
+        up, down = (solved(own, forced, point + d, states) for d in (h, -h))
+        expected = (up - down)[:, :2] / (2.0 * h[i])
+        error = np.abs(total[:, :2, i] - expected).max(axis=0) / np.abs(expected).max(axis=0)
+        assert error.max() < 2e-6, i
+
+
+def test_springs_start_where_the_backbone_has_the_force() -> None:
+    law = di.MaxwellSlip(SLIPS, STIFFNESSES)
+    values = [*STIFFNESSES, *SLIPS]
+    for x in (-3e-4, 1e-4, 4e-4, 9e-4):
+        force = float(
+            np.sign(x) * law.backbone([np.asarray(v) for v in values], np.asarray(abs(x)))
+        )
+        expected = [k * np.clip(x, -d, d) for k, d in zip(STIFFNESSES, SLIPS, strict=True)]
+        assert law.initial_states(values, force) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("law", "model"),
+    [
+        (di.MaxwellSlip(SLIPS, STIFFNESSES), di.MaxwellSlip(SLIPS)),
+        (di.Backlash(di.Dahl(F_MAX, SIGMA), gap=GAP), di.Backlash(di.Dahl())),
+    ],
+)
+def test_recovered(law: Element, model: Element) -> None:
+    wave, _ = multisine(SAMPLES)
+    wave = np.tile(wave, 3)
+    whole = Model(law + LINEAR)
+    forced = ForcedMotion(Plant(whole, "force"), band_limited(wave, 1.0 / RATE, 4), 1.0 / RATE)
+    rest = np.zeros((wave.size, forced.plant.order))
+    x = forced.solve(np.zeros(0), rest[0], rest)[:, 0]
+    x = x + 1e-3 * x.std() * np.random.default_rng(0).standard_normal(x.size)
+    record = di.Record(np.arange(x.size) / RATE, displacement=x, force=wave)
+    free = Model(model + di.Mass() + di.Damper() + di.Spring())
+    names = [p.name for p in free.parameters if p.free]
+    start = {p.name: 1.05 * float(p.value or 0.0) for p in whole.parameters if p.name in names}
+    assert_recovered(di.fit(record, free, start=start), whole)

@@ -1,0 +1,152 @@
+"""Posteriors that count every source of error: against matrices, Student's t, and the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+import dahl_ident as di
+from benchmarks.uncertainty import three_days
+from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.priors import joint_prior
+from dahl_ident.diagnostics.error_sources import NOISE
+from dahl_ident.diagnostics.shared_errors import row_errors
+from dahl_ident.errors import SamplingError, ValidationError
+from tests.bayes_cases import friction_table
+
+LINEAR = di.Dahl(alpha=1.0)
+Q = (0.02275, 0.97725)
+
+
+def days(seed: int, rows: int = 1) -> di.FrequencyResponse:
+    data, _ = three_days("f_max", 0.02)(np.random.default_rng(seed))
+    return di.FrequencyResponse.concatenate([data] * rows) if rows > 1 else data
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_the_likelihood_is_that_of_the_covariance_by_source(rows: int) -> None:
+    """Of 36 rows, and of 108, which are compressed to what their errors share."""
+    fit = di.fit(days(3, rows), LINEAR)
+    errors = fit.errors
+    assert errors is not None
+    found = row_errors(errors)
+    assert found is not None
+    density = Density(fit.problem, joint_prior(fit.problem), errors=found)
+    theta = errors.theta + np.array([[0.0, 0.0], [0.01, -0.002], [-0.03, 0.001]])
+    m = fit.problem.n_residuals
+    noise, shared = np.zeros((2, m, m))
+    for source, variance in zip(errors.sources, errors.variances.tolist(), strict=True):
+        columns = source.columns
+        if columns.ndim == 3:
+            wide = np.zeros((m, m // 2))
+            for i, block in enumerate(columns):
+                wide[2 * i : 2 * i + 2, i] = block[:, 0]
+            columns = wide
+        own = np.diag(columns**2) if columns.ndim == 1 else columns @ columns.T
+        (noise if source.name == NOISE else shared)[:] += variance * own
+    sums, log_weights = density.sums(theta), found.log_weights
+    # f_max differs from day to day: residuals are linear in it
+    move = theta - errors.theta
+    other = fit.problem.residuals(errors.theta + move * [0.0, 1.0])
+    y = errors.near.y + move[:, :1] * errors.near.J[:, 0]
+    y = y + other - fit.problem.residuals(errors.theta)
+    ratios = []
+    for k in (0, len(found.sizes) // 2, len(found.sizes) - 1):
+        V = noise + found.sizes[k] * shared
+        expected = np.einsum("si,ij,sj->s", y, np.linalg.inv(V), y)
+        ratios.append(sums[:, k] / expected)
+    assert np.array(ratios) == pytest.approx(np.full((3, 3), ratios[0][0]), rel=1e-6)
+    n = m / 2
+    whole = density.marginal(theta) - density.log_prior(theta)
+    expected = logsumexp(log_weights - n * np.log(sums), axis=1)
+    assert whole - whole[0] == pytest.approx(expected - expected[0], rel=1e-9)
+    # an integral over the scale
+    ln_s = np.linspace(-10.0, 4.0, 1001)
+    terms = density.log_likelihood(np.repeat(theta[:1], 1001, axis=0), np.exp(ln_s))
+    assert logsumexp(terms) + np.log(ln_s[1] - ln_s[0]) == pytest.approx(whole[0], abs=1e-6)
+
+
+def test_intervals_are_those_of_the_budget_where_all_is_linear() -> None:
+    fit = di.fit(days(3), LINEAR)
+    budget = fit.budget()["f_max"]
+    assert budget.dof < 4.0
+    grid = di.posterior(fit, method="grid", tolerance=1e-3)
+    low, high = grid.quantile("f_max", Q)
+    assert high - low == pytest.approx(2.0 * budget.U, rel=0.02)
+    assert np.sqrt(low * high) == pytest.approx(budget.value, abs=0.1 * budget.u)
+    chain = di.posterior(fit, seed=1, ess=1000.0)
+    assert chain.names == grid.names
+    share = np.mean((chain.values[:, 0] > low) & (chain.values[:, 0] < high))
+    assert share == pytest.approx(0.9545, abs=0.03)
+
+
+def test_coverage_with_scatter_between_days() -> None:
+    inside = {"noise": 0, "combined": 0}
+    for seed in range(8):
+        fit = di.fit(days(100 + seed), LINEAR)
+        for uncertainty in inside:
+            grid = di.posterior(fit, method="grid", uncertainty=uncertainty, tolerance=1e-2)
+            low, high = grid.quantile("f_max", Q)
+            inside[uncertainty] += bool(low <= 0.1 <= high)
+    assert inside["combined"] >= 7
+    assert inside["noise"] <= 5
+
+
+def test_an_exponent_that_was_not_given_is_sampled_over_its_range() -> None:
+    microslip = friction_table(10, 0.003, 0.03, 0.02)
+    grid = di.posterior(microslip, di.Dahl(sigma=30.0), method="grid", tolerance=1e-3)
+    assert grid.names == ("f_max", "alpha", "noise_scale")
+    assert "alpha: log-uniform from 0.5 to 2 (its range)" in str(grid)
+    given = di.posterior(microslip, di.Dahl(sigma=30.0, alpha=1.0), method="grid")
+    assert "alpha" not in given.names
+    assert "alpha = 1 exactly" in given.verdict
+    four = di.Dahl() + di.Spring()
+    with pytest.raises(SamplingError, match="give alpha or fix some, or use method='mcmc'"):
+        di.posterior(friction_table(), four, method="grid")
+
+
+def test_the_verdict_says_what_is_counted() -> None:
+    fit = di.fit(days(3), LINEAR)
+    combined = di.posterior(fit, method="grid", tolerance=1e-2)
+    assert "Counted: noise; scatter between runs" in combined.verdict
+    assert "no error but noise" not in combined.verdict
+    assert combined.status is fit.status
+    alone = di.posterior(fit, method="grid", uncertainty="noise")
+    assert "Noise alone is counted; with every source of the budget, u is 0.0" in alone.verdict
+    assert "no error but noise" in alone.verdict
+    assert alone.uncertainty == "noise"
+
+
+def test_a_parameter_that_a_default_prior_sets_is_not_determined() -> None:
+    microslip = friction_table(10, 0.0003, 0.003, 0.05)
+    for uncertainty in ("noise", "combined"):
+        open_ = di.posterior(microslip, LINEAR, method="grid", uncertainty=uncertainty)
+        assert str(open_.status) == "not determined"
+        assert "f_max is set by its prior" in open_.verdict
+    known = di.posterior(microslip, LINEAR, method="grid", priors={"f_max": (0.5, 2.0)})
+    assert known.status.usable
+
+
+def test_refusals() -> None:
+    with pytest.raises(ValidationError, match="uncertainty is 'all'; expected combined or noise"):
+        di.posterior(friction_table(), LINEAR, method="grid", uncertainty="all")
+    tied = di.fit(
+        friction_table(),
+        LINEAR,
+        method="ipopt",
+        constraints=lambda p: [p["sigma"] == 300 * p["f_max"]],
+    )
+    with pytest.raises(ValidationError, match="had constraints, which a posterior"):
+        di.posterior(tied, method="grid")
+
+
+def test_what_rows_share_may_be_all_there_is() -> None:
+    """Residuals along one smooth curve leave no noise of their own."""
+    A = np.geomspace(0.1, 10.0, 12) * 0.1 / 30.0
+    plant = di.Dahl(0.1, 30.0) + di.Spring(0.3)
+    data = di.FrequencyResponse(np.ones(12), plant.dynamic_stiffness(A, 2.0 * np.pi), A)
+    fit = di.fit(data, LINEAR)
+    grid = di.posterior(fit, method="grid", tolerance=1e-2)
+    assert np.isfinite(grid.std()[:2]).all()
+    assert grid.std()[1] > 0.1 * fit.budget()["sigma"].u
