@@ -90,3 +90,19 @@ def test_a_missing_amplitude_has_no_prediction() -> None:
     theta = problem.to_search([1.0, 10.0])
     assert np.isnan(problem.predict(theta)).tolist() == [True, False]
     assert np.isnan(problem.prediction_jacobian(theta)[:, 0]).tolist() == [True, False]
+
+
+def test_by_level() -> None:
+    """Of drives and amplitudes, against responses at levels a little higher and lower."""
+    A = np.geomspace(1e-3, 0.1, 6)
+    controlled = ["force", "displacement"] * 3
+
+    def at(factor: float) -> Problem:
+        data = FrequencyResponse(
+            np.full(6, 0.3), np.ones(6), factor * A, drive=factor * A, controlled=controlled
+        )
+        return Problem(data, Dahl() + Mass() + Damper(), noise="absolute")
+
+    theta = at(1.0).to_search([0.1, 30.0, 0.3, 0.24])
+    change = at(np.exp(1e-5)).predict(theta) - at(np.exp(-1e-5)).predict(theta)
+    np.testing.assert_allclose(at(1.0).level_slope(theta), change / 2e-5, rtol=1e-6)

@@ -365,8 +365,7 @@ def _estimated(
 ) -> ErrorModel:
     rows = _Rows(optimum, problem, assumed)
     theta, m = rows.start, rows.m
-    near = linearization(problem, theta)
-    basis = None if determined else _basis(rows.at(theta, near)[1])
+    basis = None if determined else _basis(rows.at(theta, linearization(problem, theta))[1])
     noise: tuple[Source, ...] | None = None
     dof = problem.n_numbers - len(problem.names)
     shared = StructuredSources(problem, theta) if _tells(problem, assumed) else None

@@ -14,7 +14,7 @@ or spring missing from the model; the part that the model's linear elements can 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,6 @@ _EQUAL = 1e-9  # of the same: one number, stored twice
 _BY_CHANCE = 0.01  # tables without repeats in which some seem to be
 _MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it leaves
 _LEAST_RATE_RANGE = np.log(2.0)  # of frequency, that tells speed from amplitude
-_STEP = 1e-5  # of ln A, for a slope
 _MOST_LEVEL_NOISE = 0.05  # of ln A: sensors scatter less; more of it would hide a wrong model
 _FEWEST = 2  # runs, or repeated levels, that show a scatter
 
@@ -214,7 +213,7 @@ class StructuredSources:
         self._changes = [shape.changes(self._places, stiffness) for shape in self._shapes]
         self._speed = self._places.sum(axis=1)
         self._rates = bool(np.ptp(self._places[:, 1]) > _LEAST_RATE_RANGE)
-        self._moved = _moved(problem)
+        self._levels = _scattering_levels(problem)
 
     def at(self, theta: FloatArray, near: Linearization) -> tuple[Source, ...]:
         """Return the sources at theta, their columns linearised where `near` is."""
@@ -260,14 +259,14 @@ class StructuredSources:
                 Source(RUNS, each * J[:, i : i + 1], 0.0, own=problem.names[i])
                 for i in _scattering_parameters(problem)
             ]
-        if self._moved is not None:
-            found += self._noise_of_levels(theta, self._moved)
+        if self._levels:
+            found += self._noise_of_levels(theta)
         if len(self._repeats) >= _FEWEST:
             shared = np.concatenate([self._repeats, 1j * self._repeats])
             found.append(Source(LEVELS, columns(shared), 1.0, own="both"))
         return tuple(found)
 
-    def _noise_of_levels(self, theta: FloatArray, moved: Problem) -> Iterator[Source]:
+    def _noise_of_levels(self, theta: FloatArray) -> Iterator[Source]:
         """Yield noise of the amplitudes, or drives, at which responses were measured.
 
         The first counts in slip, where the response changes with amplitude, and not in microslip.
@@ -275,7 +274,7 @@ class StructuredSources:
         amplitude, a stiffness is off by as much in microslip, and right in slip.
         """
         predicted = self._problem.predict(theta)
-        by_level = (moved.predict(theta) - predicted) / _STEP
+        by_level = self._problem.level_slope(theta)
         data = self._problem.data
         divided = (data.controlled == "force") == (data.quantity in COMPLIANCES)
         by_both = by_level + np.where(divided, predicted, -predicted)
@@ -302,22 +301,11 @@ def run_deviations(
     return found
 
 
-def _moved(problem: Problem) -> Problem | None:
-    """Return the problem at levels a little higher; None where noise is known or rows are many."""
+def _scattering_levels(problem: Problem) -> bool:
+    """Return whether levels may be noisy; not where noise is known or rows are many."""
     data = problem.data
-    if data.n > _MOST_PLACES:
-        return None
-    driven = data.controlled == "force"
     stated = problem.scale_known or problem.noise != "relative"
-    if stated and not driven.any():
-        return None
-    step = np.exp(_STEP)
-    moved = replace(
-        data,
-        amplitude=None if data.amplitude is None else data.amplitude * np.where(driven, 1.0, step),
-        drive=None if data.drive is None else data.drive * np.where(driven, step, 1.0),
-    )
-    return Problem(moved, problem.model, noise=problem.noise, sensors=problem.sensors)
+    return data.n <= _MOST_PLACES and not (stated and (data.controlled != "force").all())
 
 
 def _sizes(problem: Problem, predicted: ComplexArray) -> ComplexArray:

@@ -27,6 +27,7 @@ from dahl_ident.arrays import FloatArray
 
 _STEPS = 40  # at most; the likelihood rises in each, so the last is the best
 _FEW = 3  # residuals over columns of sources beyond which columns are quicker
+_DENSE = 60  # residuals up to which dense matrices are quicker in any case
 _LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.02)  # of a scoring step, until the likelihood rises
 CLOSE = 1e-3  # rise of the log-likelihood that no longer matters
 _ALIKE = 1e-10  # added to correlations of one: sources that do the same share a variance
@@ -184,6 +185,8 @@ class Likelihood(Protocol):
 
 def likelihood(model: LinearModel) -> Likelihood:
     """Return what computes a model's likelihood: in few columns, where most sources have few."""
+    if len(model.y) <= _DENSE:
+        return Contrasts(model)
     columns = model.J.shape[1] + sum(z.shape[1] for z in model.Z if not _within_pairs(z))
     return Columns(model) if _FEW * columns < len(model.y) else Contrasts(model)
 

@@ -22,7 +22,7 @@ from dahl_ident.problem.coordinates import (
     Interchangeable,
     with_changes,
 )
-from dahl_ident.problem.prediction import Predictor
+from dahl_ident.problem.prediction import Prediction, Predictor
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import EXACT, Prior, Sensors
 from dahl_ident.units import Motion, shown_unit
@@ -139,7 +139,7 @@ class Problem:
     def _set_rows(self, rows: Rows, noise: str | None) -> None:
         self._rows = rows
         self._predictor = Predictor(self.model, self.sensors, self._coordinates, rows)
-        self._predicted: tuple[object, ComplexArray] = (None, rows.response)
+        self._predicted: tuple[bytes, Prediction | None] = (b"", None)
         self._noise = noise_for(rows, noise)
         self.noise = self._noise.name
         self.scale_known = self._noise.scale_known
@@ -257,11 +257,23 @@ class Problem:
             Sensors included; NaN where a driven plant has no steady amplitude.
         """
         theta = self._coordinates.checked(theta)
-        key = (theta.shape, theta.tobytes())
-        if self._predicted[0] != key:  # judging asks for the estimate's many times
-            value = self._predictor(theta, derivatives=False).value
-            self._predicted = (key, np.broadcast_to(value, self._shape(theta)))
-        return self._predicted[1].copy()
+        found = self._prediction(theta, derivatives=False)
+        return np.array(np.broadcast_to(found.value, self._shape(theta)))
+
+    def level_slope(self, theta: FloatArray) -> ComplexArray:
+        """Return dR by ln of the amplitude, or of the drive where that is controlled, (n,)."""
+        slope = self._prediction(theta, derivatives=True).by_ln_amplitude
+        return np.array(np.broadcast_to(slope, self._shape(theta)))
+
+    def _prediction(self, theta: FloatArray, *, derivatives: bool) -> Prediction:
+        """Return the prediction; judging asks for that at one theta many times."""
+        if theta.ndim > 1:
+            return self._predictor(theta, derivatives=derivatives)
+        key, (last, found) = theta.tobytes(), self._predicted
+        if found is None or last != key or (derivatives and not found.changes):
+            found = self._predictor(theta, derivatives=derivatives)
+            self._predicted = (key, found)
+        return found
 
     def prediction_jacobian(self, theta: ArrayLike) -> ComplexArray:
         """Return dR/dtheta, shape (n, P) or (S, n, P)."""
@@ -375,14 +387,14 @@ class Problem:
             if isinstance(noise, Measured):
                 y, changes = self._whitened_by_covariance(noise, theta, derivatives)
                 return bend(y, changes, self._tail) if tails and self._tail else (y, changes)
-            predicted, by, _ = self._predictor(theta, derivatives=derivatives)
+            predicted, by, _ = self._prediction(theta, derivatives=derivatives)
             return noise.residual(predicted), [noise.change(predicted, d) for d in by]
 
     def _whitened_by_covariance(
         self, noise: Measured, theta: FloatArray, derivatives: bool
     ) -> tuple[ComplexArray, list[ComplexArray]]:
         if noise.amplitude is None:
-            predicted, by, _ = self._predictor(theta, derivatives=derivatives)
+            predicted, by, _ = self._prediction(theta, derivatives=derivatives)
             return noise.residual(predicted), [noise.change(predicted, d) for d in by]
 
         def value_and_slope(error: FloatArray) -> tuple[ComplexArray, ComplexArray]:
@@ -411,7 +423,7 @@ class Problem:
         noise = self._noise
         with np.errstate(divide="ignore", invalid="ignore"):
             if isinstance(noise, Measured) and noise.amplitude is not None:
-                slope = self._predictor(theta).by_ln_amplitude
+                slope = self._prediction(theta, derivatives=True).by_ln_amplitude
                 by = -noise.amplitude.whitening(noise.covariance, slope)(change)
             else:
                 by = noise.change(self.predict(theta), change)
