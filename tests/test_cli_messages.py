@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from dahl_ident.cli import console
 from dahl_ident.cli.console import in_options
 
 
@@ -30,3 +31,11 @@ from dahl_ident.cli.console import in_options
 )
 def test_arguments_become_options(message: str, shown: str) -> None:
     assert in_options(message) == shown
+
+
+def test_extract_names_its_own_options(monkeypatch: pytest.MonkeyPatch) -> None:
+    message = "Name it with columns={'force': ...}, or columns={'force': 'friction force'}"
+    monkeypatch.setattr(console._session, "typed", ["extract", "run.csv"])
+    assert in_options(message) == "Name it with --force ..., or --force 'friction force'"
+    monkeypatch.setattr(console._session, "typed", ["fit", "run.csv"])
+    assert "--columns map.toml" in in_options(message)

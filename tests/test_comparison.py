@@ -13,6 +13,7 @@ from dahl_ident import (
     Element,
     FrequencyResponse,
     LuGre,
+    Mass,
     Spring,
     compare_models,
     fit,
@@ -125,3 +126,12 @@ def test_lugre_says_where_sines_cannot_distinguish_it_from_dahl() -> None:
     (text,) = sentences(100.0)
     assert text.startswith("LuGre: at these levels it differs from linear Dahl with a damper by")
     assert not sentences(0.2)
+
+
+def test_what_is_stated_stands_beside_what_noise_alone_gives() -> None:
+    result = fit(table(noise=1e-3), Dahl() + Mass(0.01))
+    found = compare_models(result, {"spring": Dahl() + Spring()})
+    assert found.stated is not None
+    assert found.stated["force limit"] == pytest.approx(result.params["f_max"].value)
+    assert found.columns_of_meanings == ["every source", "as fitted", "spring"]
+    assert all(len(row) == 4 for row in found.meanings)

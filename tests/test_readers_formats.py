@@ -870,3 +870,10 @@ def test_doubts_name_indices(tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", {"f": FREQUENCY, "u": np.ones(3), "H": RECEPTANCE * [1, 1, -1j]})
     with pytest.warns(DataWarning, match="creates energy: index 2"):
         read_frequency_response(tmp_path / "a.mat", columns=columns)
+
+
+@pytest.mark.parametrize(("name", "value"), [("Ts", 0.01), ("fs", 100.0)])
+def test_a_sample_rate_in_the_file_is_proposed(tmp_path: Path, name: str, value: float) -> None:
+    path = tmp_path / "run.mat"
+    savemat(path, {name: value, "x": np.sin(np.arange(50.0)), "F": np.arange(50.0)})
+    assert "# sample_rate = 100  # Hz, " in inspect(path).column_map

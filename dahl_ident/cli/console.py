@@ -72,11 +72,17 @@ def in_options(message: str) -> str:
 
 
 def _column_map(found: re.Match[str]) -> str:
-    """Return the option and the line of its file that correspond to a map in Python."""
+    """Return the options, or the line of the file, that correspond to a map in Python.
+
+    ``extract`` has an option for the column of each role.
+    """
     try:
         entries = ast.literal_eval(found[1])
     except (SyntaxError, ValueError):
         return found[0]
+    if _session.typed[:1] == ["extract"] and not any(isinstance(e, dict) for e in entries.values()):
+        named = (f"--{role} {'...' if e is ... else shlex.quote(e)}" for role, e in entries.items())
+        return " ".join(named)
     lines = []
     for role, entry in entries.items():
         if isinstance(entry, dict):

@@ -16,13 +16,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.polynomial import legendre
 from scipy import special
 
-from dahl_ident.diagnostics.formatting import listed, table, with_unit
+from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.formatting import listed, percent, table, with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.physics import is_spring, negative_parameters
 from dahl_ident.diagnostics.predictive_density import PredictiveDensity, predictive_density
@@ -39,6 +40,7 @@ _RATES = 1.05  # highest over lowest frequency that can show a dependence on the
 _SMOOTH = 8  # degree over ln A of what the gain may be whatever the frequency
 _FALSE_ALARM = 1e-4  # of a force that falls with the frequency: one more candidate, to no harm
 _SEEN = 3.0  # rms differences over noise that has been averaged over all rows
+_STATED = "every source"  # of error is counted in what the fit states
 _LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
 
 
@@ -90,27 +92,7 @@ class ComparedModel:
         Of all elements with memory together: N, N/m, and joules lost in a cycle at the smallest,
         the middle and the largest amplitude. Infinite where a law never slips.
         """
-        problem = self.optimum.problem
-        values, A = parameter_values(self.optimum), problem.stiffness_data.amplitude
-        sizes = np.geomspace(A.min(), A.max(), _LEVELS)
-        omega = np.asarray(np.exp(np.mean(np.log(problem.stiffness_data.omega))))
-        limit, stiffness, energy = 0.0, 0.0, np.zeros(_LEVELS)
-        for element in problem.model.elements:
-            if not isinstance(element, Friction):
-                continue
-            own = [np.asarray(values[p.name]) for p in element.parameters]
-            with np.errstate(all="ignore"):
-                limit += float(np.mean(element.force_limits(own)))
-                contact = float(element.rest_stiffness(own))
-                if not contact:  # behind a gap
-                    contact = float(element.quasi_static_slope(np.zeros(()), 1.0, own))
-                stiffness += contact
-                energy += np.pi * sizes**2 * np.imag(element.stiffness(own, sizes, omega))
-        found = {"force limit": limit, "stiffness at zero force": stiffness}
-        return found | {
-            f"energy a cycle at {size:.2g} m": float(e)
-            for size, e in zip(sizes, energy, strict=True)
-        }
+        return _meaning(self.optimum.problem, parameter_values(self.optimum))
 
     @property
     def resemblances(self) -> list[str]:
@@ -124,7 +106,7 @@ class ComparedModel:
             if known is not None and known[1] < _SEEN * noise:
                 found.append(
                     f"{self.name}: at these levels it differs from {known[0]} by "
-                    f"{_percent(known[1])} rms, too little for these data to distinguish the two."
+                    f"{percent(known[1])} rms, too little for these data to distinguish the two."
                 )
         return found
 
@@ -139,6 +121,9 @@ class ModelComparison:
         Those that could be fitted.
     failed : mapping of str to str
         Why the others could not.
+    stated : mapping of str to float or None
+        What all laws have in common, at the estimate of the first that counts every source of
+        error; None where there is none. The models compared weigh rows by their noise alone.
 
     Examples
     --------
@@ -150,6 +135,7 @@ class ModelComparison:
 
     models: tuple[ComparedModel, ...]
     failed: Mapping[str, str]
+    stated: Mapping[str, float] | None = None
 
     @cached_property
     def best(self) -> ComparedModel:
@@ -178,7 +164,9 @@ class ModelComparison:
 
     def __str__(self) -> str:
         lines = [self.headline, table([self.columns, *self.rows], left=(0, 1))]
-        lines.append(table([["", *(m.name for m in self.models)], *self.meanings]))
+        lines.append(table([["", *self.columns_of_meanings], *self.meanings]))
+        if self.stated is not None:
+            lines.append(f"{_STATED}: the parameters as stated; the others weigh noise alone.")
         lines += [text for m in self.models for text in m.resemblances]
         lines += [f"{name} could not be fitted: {why}" for name, why in self.failed.items()]
         return "\n".join(lines)
@@ -199,18 +187,23 @@ class ModelComparison:
             ]
             mark = " (best)" if m is self.best else ""
             found.append([
-                m.name, m.reason, _percent(m.density.misfit), _percent(m.density.harmonic_misfit),
+                m.name, m.reason, percent(m.density.misfit), percent(m.density.harmonic_misfit),
                 str(m.optimum.dof), *changes,
                 ("0" if m is first else f"{gain:+.1f} +- {error:.1f}") + mark,
             ])  # fmt: skip
         return found
 
     @property
+    def columns_of_meanings(self) -> list[str]:
+        """Of :attr:`meanings`, after the first."""
+        return [*([_STATED] if self.stated is not None else []), *(m.name for m in self.models)]
+
+    @property
     def meanings(self) -> list[list[str]]:
         """Quantities common to all laws, one row a quantity, one column a model."""
-        return [
-            [key, *(f"{m.meaning[key]:.3g}" for m in self.models)] for key in self.models[0].meaning
-        ]
+        stated = [] if self.stated is None else [self.stated]
+        columns = [*stated, *(m.meaning for m in self.models)]
+        return [[key, *(f"{c[key]:.3g}" for c in columns)] for key in columns[0]]
 
     def to_frame(self) -> Any:
         """Return a pandas table: one row a model."""
@@ -235,17 +228,44 @@ class ModelComparison:
         )
 
 
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.2g} %" if np.isfinite(share) else "-"
+def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
+    """Return what all laws have in common at the values of the parameters, see `ComparedModel`."""
+    A = problem.stiffness_data.amplitude
+    sizes = np.geomspace(A.min(), A.max(), _LEVELS)
+    omega = np.asarray(np.exp(np.mean(np.log(problem.stiffness_data.omega))))
+    limit, stiffness, energy = 0.0, 0.0, np.zeros(_LEVELS)
+    for element in problem.model.elements:
+        if not isinstance(element, Friction):
+            continue
+        own = [np.asarray(values[p.name]) for p in element.parameters]
+        with np.errstate(all="ignore"):
+            limit += float(np.mean(element.force_limits(own)))
+            contact = float(element.rest_stiffness(own))
+            if not contact:  # behind a gap
+                contact = float(element.quasi_static_slope(np.zeros(()), 1.0, own))
+            stiffness += contact
+            energy += np.pi * sizes**2 * np.imag(element.stiffness(own, sizes, omega))
+    found = {"force limit": limit, "stiffness at zero force": stiffness}
+    return found | {
+        f"energy a cycle at {size:.2g} m": float(e) for size, e in zip(sizes, energy, strict=True)
+    }
 
 
 def _change(value: float, before: float) -> str:
     with np.errstate(all="ignore"):
-        ratio = np.float64(value) / before - 1.0
-    return f"{100.0 * ratio:+.2g} %" if np.isfinite(ratio) else "-"
+        ratio = float(np.float64(value) / before - 1.0)
+    return percent(ratio) if ratio < 0.0 or not np.isfinite(ratio) else f"+{percent(ratio)}"
 
 
-def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> ModelComparison:
+class Compared(Fit, Protocol):
+    """A fit that counts its sources of error."""
+
+    @property
+    def errors(self) -> ErrorModel | None:
+        """The sources of error."""
+
+
+def compare_models(fit: Compared, models: Mapping[str, Element] | None = None) -> ModelComparison:
     """Fit other models to the same data and compare how they predict tests left out.
 
     Parameters
@@ -294,7 +314,11 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
             fitted.append(ComparedModel(name, other, predictive_density(other), reason))
         except DahlIdentError as exc:
             failed[name] = str(exc)
-    return ModelComparison(tuple(fitted), failed)
+    stated = None
+    if fit.errors is not None:
+        values = parameter_values(optimum) | dict(fit.errors.values)
+        stated = _meaning(optimum.problem, values)
+    return ModelComparison(tuple(fitted), failed, stated)
 
 
 def _solved(optimum: Optimum, model: Element, *, own: bool) -> Optimum:
@@ -311,9 +335,9 @@ def _candidates(
     problem = optimum.problem
     model, data = problem.model, problem.data
     values = parameter_values(optimum)
-    misfit = f"{_percent(left.misfit)} of the fundamental left"
+    misfit = f"{percent(left.misfit)} of the fundamental left"
     if np.isfinite(left.harmonic_misfit):
-        misfit += f", {_percent(left.harmonic_misfit)} in harmonics"
+        misfit += f", {percent(left.harmonic_misfit)} in harmonics"
     smallest = float(problem.stiffness_data.amplitude.min())
     offers: list[tuple[Element, dict[str, Alternative]]] = []
     for e in model.elements:
@@ -377,7 +401,7 @@ def _even(optimum: Optimum) -> str:
     ):
         if rows.any():
             share = float(np.sqrt(np.mean(np.abs(data.response[rows]) ** 2)) / size)
-            return f"{name} {_percent(share)} of the fundamental"
+            return f"{name} {percent(share)} of the fundamental"
     return ""
 
 
@@ -412,7 +436,7 @@ def _falling_force(optimum: Optimum) -> str:
     if not (by_chance < _FALSE_ALARM and fall > 0.0):
         return ""
     f = view.omega[rows] / (2.0 * np.pi)
-    return f"force falls by {_percent(fall)} from {f.min():.3g} to {f.max():.3g} Hz"
+    return f"force falls by {percent(fall)} from {f.min():.3g} to {f.max():.3g} Hz"
 
 
 def _jenkins(optimum: Optimum, left: PredictiveDensity) -> str:
@@ -423,7 +447,7 @@ def _jenkins(optimum: Optimum, left: PredictiveDensity) -> str:
         return ""
     if not least < FAR_LESS * left.misfit:
         return ""
-    return f"parallel Jenkins elements would leave {_percent(least)} of the fundamental"
+    return f"parallel Jenkins elements would leave {percent(least)} of the fundamental"
 
 
 def _force(optimum: Optimum) -> float:

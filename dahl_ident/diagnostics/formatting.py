@@ -87,6 +87,17 @@ def with_unit(value: float, uncertainty: float | None, unit: str) -> str:
     return f"{number} +- {error} {unit}".rstrip()
 
 
+def percent(share: float) -> str:
+    """Return a share with two significant digits, such as ``"9.2 %"``.
+
+    Examples
+    --------
+    >>> percent(0.0917), percent(1.04), percent(float("nan"))
+    ('9.2 %', '100 %', '-')
+    """
+    return f"{float(f'{100.0 * share:.2g}'):g} %" if math.isfinite(share) else "-"
+
+
 def p_text(p: float) -> str:
     """Return ``"p = 0.012"``, or a bound where noise alone cannot be the reason.
 
@@ -130,6 +141,8 @@ def interval(lower: float, upper: float, unit: str) -> str:
     '0.0981 to 0.1019 N'
     >>> interval(0.31, math.inf, "N")
     'at least 0.31 N'
+    >>> interval(3.9e5, 1.52e7, "N/m")
+    '3.9e+05 to 1.5e+07 N/m'
     >>> interval(0.1, 0.1 + 1e-15, "N")
     '0.1 N'
     """
@@ -142,6 +155,8 @@ def interval(lower: float, upper: float, unit: str) -> str:
         return f"at most {upper:.3g} {unit}".rstrip()
     if upper - lower <= 10.0**-_DIGITS * max(abs(lower), abs(upper)):
         return f"{lower:.{_DIGITS}g} {unit}".rstrip()
+    if 0.0 < lower < 0.1 * upper:  # its digits would be rounded away
+        return f"{lower:.2g} to {upper:.2g} {unit}".rstrip()
     low, high = _alike((lower, upper), math.floor(math.log10(upper - lower)) - 1)
     return f"{low} to {high} {unit}".rstrip()
 

@@ -25,12 +25,11 @@ from scipy import special
 from dahl_ident.arrays import ComplexArray
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.error_sources import RUNS
-from dahl_ident.diagnostics.formatting import p_text, with_unit
+from dahl_ident.diagnostics.formatting import p_text, percent, with_unit
 from dahl_ident.diagnostics.misfit_explanations import (
     EXPLAINS,
     at_an_end,
     neighbourhood,
-    percent,
     rms_misfit,
     set_aside,
     sign_convention,
@@ -248,7 +247,7 @@ class Goodness:
         rate = [trend for trend in found if trend.covariate == "frequency"]
         if self.noise_share is not None and self.noise_share > _NO_SENSOR:
             yield (
-                f"the scatter is {100.0 * self.noise_share:.2g} % of the response, "
+                f"the scatter is {percent(self.noise_share)} of the response, "
                 "more than any sensor's noise"
             )
         yield from (f"{trend}, which no rate-independent model can describe" for trend in rate)
@@ -296,7 +295,7 @@ class Goodness:
     @property
     def described(self) -> str:
         """Whether the model describes the data."""
-        misfit = f"{100.0 * self.rms_misfit:.2g} % rms misfit"
+        misfit = f"{percent(self.rms_misfit)} rms misfit"
         if self.objections:
             return f"The model does not describe these data ({misfit}): {self.departures}."
         if not self._enough_points:
@@ -456,7 +455,7 @@ def _tested(optimum: Optimum, space: ResidualSpace | None = None) -> Goodness:
 
 
 def _relative(name: str, size: float) -> str:
-    return f"{np.degrees(size):.2g} deg" if name == "phase" else f"{100.0 * size:.2g} %"
+    return f"{np.degrees(size):.2g} deg" if name == "phase" else percent(size)
 
 
 def _untested(optimum: Optimum) -> bool:

@@ -14,6 +14,7 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.formatting import percent
 from dahl_ident.diagnostics.trends import covariates
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.fitting import Optimum, Status, solve
@@ -136,11 +137,6 @@ def at_an_end(optimum: Optimum, rows: Sequence[int]) -> bool:
         return False
     ranges = (values for _, values, _ in covariates(optimum) if np.unique(values).size >= _RANGE)
     return any(values[rows[0]] in (values.min(), values.max()) for values in ranges)
-
-
-def percent(share: float) -> str:
-    """Return a share to two digits, such as "98 %"."""
-    return f"{float(f'{100.0 * share:.2g}'):g} %"
 
 
 def _misfit(problem: Problem, fitted: ComplexArray) -> FloatArray:

@@ -9,7 +9,7 @@ from scipy import special
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.row_names import row_names
-from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.diagnostics.formatting import percent, with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.plausible_units import implausible_units
 from dahl_ident.diagnostics.third_harmonic import third_harmonic_share
@@ -42,7 +42,7 @@ def _not_a_sine(optimum: Optimum) -> Iterator[str]:
         data = optimum.problem.data
         (name,) = row_names(data, [int(np.flatnonzero(data.controlled == "force")[share.argmax()])])
         yield (
-            f"the displacement's third harmonic is predicted to be {100.0 * share.max():.2g} % of "
+            f"the displacement's third harmonic is predicted to be {percent(share.max())} of "
             f"its fundamental at {name}: a describing function, which assumes a sine, is "
             "inaccurate there; control the displacement, or leave such points out"
         )

@@ -19,6 +19,7 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.formatting import percent
 from dahl_ident.elements import Element, MaxwellSlip, Model
 from dahl_ident.elements.element import as_model
 from dahl_ident.elements.masing import jenkins
@@ -156,7 +157,7 @@ def least_misfit(data: FrequencyResponse, model: Element) -> float:
 
 def bound_statement(least: float, misfit: float) -> str:
     """Return the least misfit of parallel Jenkins elements in words, beside a model's misfit."""
-    share = f"{100.0 * least:.2g} % (rms of the fundamental)"
+    share = f"{percent(least)} (rms of the fundamental)"
     if least < FAR_LESS * misfit:
         return (
             "The best symmetric rate-independent law of parallel Jenkins elements (MaxwellSlip, "

@@ -15,11 +15,13 @@ from dahl_ident.data.tabular import doubts
 from dahl_ident.diagnostics.budget import taken_as_exact
 from dahl_ident.diagnostics.cross_validation import CrossValidation
 from dahl_ident.diagnostics.error_model import ErrorModel
-from dahl_ident.diagnostics.formatting import listed, p_text, with_unit
+from dahl_ident.diagnostics.formatting import listed, p_text, percent, with_unit
 from dahl_ident.diagnostics.goodness import Goodness
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
+from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Identifiability
+from dahl_ident.elements import Model
 from dahl_ident.fitting import Optimum, solve
 from dahl_ident.problem import Problem
 
@@ -84,7 +86,7 @@ def statements(fit: Judged) -> tuple[str, ...]:
         found = list(goodness.statements)
         if goodness.described in found and goodness.objections:
             found.remove(goodness.described)
-            misfit = f"misfit of {100.0 * goodness.rms_misfit:.2g} % rms"
+            misfit = f"misfit of {percent(goodness.rms_misfit)} rms"
             found.insert(0, f"The stated uncertainties include a {misfit}: {goodness.departures}.")
         first, *others = (*found, *_reservations(fit), known.headline)
         said = (*others, *_checked(fit), *doubted(data.provenance))
@@ -134,8 +136,8 @@ def _too_narrow(fit: Judged) -> str:
     if check.width >= _NARROWEST * misfit:
         return ""
     return (
-        f"The 95 % bands (half width {100.0 * check.width:.2g} %) do not cover the misfit "
-        f"({100.0 * misfit:.2g} % rms): no uncertainty can be stated."
+        f"The 95 % bands (half width {percent(check.width)}) do not cover the misfit "
+        f"({percent(misfit)} rms): no uncertainty can be stated."
     )
 
 
@@ -186,11 +188,15 @@ def _moved_by_outliers(fit: Judged) -> Iterator[str]:
     if optimum.loss != "linear" or errors is None:
         return
     problem = optimum.problem
+    values = parameter_values(optimum) | dict(errors.values)
+    here = [e.started([values[p.name] for p in e.parameters]) for e in problem.model.elements]
     fixed = {name: errors.values[name] for name in errors.assumed}
     same = Problem(
-        problem.data, problem.model, noise=problem.noise, sensors=problem.sensors, fixed=fixed
+        problem.data, Model(*here), noise=problem.noise, sensors=problem.sensors, fixed=fixed
     )
-    robust = solve(same, loss="huber")
+    robust = solve(same, loss="huber", limits=False)
+    if not robust.success:  # the estimate is no start for it
+        robust = solve(same, loss="huber")
     if not robust.success:
         return
     moved = [

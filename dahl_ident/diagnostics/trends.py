@@ -20,7 +20,7 @@ from scipy import special
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.quantities import COMPLIANCES
-from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.diagnostics.formatting import percent, with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.physics import is_spring
 from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, ResidualSpace
@@ -70,7 +70,7 @@ class Trend:
         ends = f"from {self.low:.3g} to {self.high:.3g} {self.unit}".rstrip()
         size = "more than tenfold"
         if self.largest < _FARTHEST:
-            size = f"by up to {100.0 * self.largest:.2g} %"
+            size = f"by up to {percent(self.largest)}"
         text = f"over {self.covariate}, {ends}, the data depart from the model {size}"
         parts = [
             f"friction's {name} {_change(part)}"

@@ -179,9 +179,9 @@ def comparison(compared: ModelComparison) -> Table:
 
 def meanings(compared: ModelComparison) -> Table:
     """Return what means the same in every law."""
-    names = tuple(model.name for model in compared.models)
     rows = tuple(tuple(map(Cell, row)) for row in compared.meanings)
-    return Table("Quantities common to all laws", ("quantity", *names), rows)
+    columns = ("quantity", *compared.columns_of_meanings)
+    return Table("Quantities common to all laws", columns, rows)
 
 
 def measured(data: FrequencyResponse) -> Table:

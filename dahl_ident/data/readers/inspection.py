@@ -37,6 +37,8 @@ _RESPONSE_UNITS: dict[str, tuple[str, ...]] = {
     "phase": ("angle",),
     "level": (),
 }
+_INTERVALS = ("ts", "dt", "sampling_interval", "sample_interval")  # s, of single numbers
+_RATES = ("fs", "sample_rate", "sampling_rate", "sampling_frequency")  # Hz
 _FEW_GAPS = 5  # that are listed; of more, number, longest and first say more
 _NO_UNIT = ("level",)
 _PROPOSED_NAMES = RESPONSE_NAMES | {"frequency": (*RESPONSE_NAMES["frequency"], "f")}
@@ -181,10 +183,23 @@ def _proposal(source: Source) -> str:
     unused = [path for path in others if path not in found]
     for what, paths in (("read by their names", found), ("not used", unused)):
         lines += [f"# {what}: {listed(paths, 20)}"] if paths else []
-    return "\n".join([*lines, *_to_fill_in(roles.keys(), response)])
+    return "\n".join([*lines, *_to_fill_in(roles.keys(), response, _stated_rate(source))])
 
 
-def _to_fill_in(found: Collection[str], response: bool) -> Iterator[str]:
+def _stated_rate(source: Source) -> str:
+    """Return a line with the sample rate that single numbers of the file state, if any do."""
+    for channel in source.channels:
+        if channel.size != 1 or channel.kind not in "fiu":
+            continue
+        name, value = channel.short or channel.name, float(channel.values.flat[0])
+        interval = plain(name) in _INTERVALS
+        if value > 0.0 and (interval or plain(name) in _RATES):
+            rate, source_of = (1.0 / value, f"1/{name}") if interval else (value, name)
+            return f"# sample_rate = {rate:.10g}  # Hz, {source_of}"
+    return "# sample_rate = 1000.0  # Hz"
+
+
+def _to_fill_in(found: Collection[str], response: bool, rate: str) -> Iterator[str]:
     """Yield comments that become the entries of required roles once they are filled in."""
     required = [("frequency",)] if response else [("time",), MOTION_KINDS, ("force", "drive")]
     missing = [roles[0] for roles in required if not set(roles) & set(found)]
@@ -193,7 +208,7 @@ def _to_fill_in(found: Collection[str], response: bool) -> Iterator[str]:
     for role in missing:
         yield f'# {role} = {{column = "", unit = ""}}'
     if "time" in missing:
-        yield "# sample_rate = 1000.0  # Hz, in place of the time; above all lines in brackets"
+        yield f"{rate}, in place of the time; above all lines in brackets"
 
 
 def _has_name(channel: Channel, roles: Iterable[str], names: Mapping[str, tuple[str, ...]]) -> bool:
