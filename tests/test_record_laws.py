@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import control
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -130,18 +129,10 @@ def test_trapezoids_that_are_hard_to_search(truth: Element, model: Element, nois
             assert error < 4.5 * float(found.stderr or 0.0), found
 
 
-@pytest.mark.parametrize(
-    ("law", "reason"),
-    [
-        (di.Iwan(), "more than its present force"),
-        (di.LinearSystem(control.tf([1.0], [1.0, 2.0]), quantity="receptance"), "frequency domain"),
-    ],
-)
-def test_laws_without_an_equation_of_motion_say_why(law: Element, reason: str) -> None:
+def test_laws_without_an_equation_of_motion_say_why() -> None:
     record = driven("multisine", Model(_DAHL[0] + di.Mass(0.3) + di.Spring(50.0)), 64, 1e-3)
-    with pytest.raises(ModelError, match=reason) as refusal:
-        di.fit(record, law + di.Mass())
-    assert type(law).__name__ in str(refusal.value)
+    with pytest.raises(ModelError, match=r"Iwan.* more than its present force"):
+        di.fit(record, di.Iwan() + di.Mass())
 
 
 @pytest.mark.parametrize(("exponent", "accuracy"), [(1.5, 1e-8), (0.5, 1e-5)])

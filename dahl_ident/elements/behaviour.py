@@ -9,7 +9,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -302,8 +302,29 @@ class Behaviour(ABC):
         """States in an equation of motion."""
         return int(self.has_memory)
 
+    @property
+    def has_inertia(self) -> bool:
+        """Whether a force determines the motion of the element."""
+        return any(p.is_mass for p in self.parameters)
+
+    @property
+    def fastest_rate(self) -> float:
+        """Largest modulus of the poles of a linear element's states, rad/s."""
+        return 0.0
+
+    def sampled(self, interval: float) -> Self:
+        """Return this element for histories of one sampling interval, s."""
+        return self
+
+    def free_responses(self, samples: int) -> FloatArray:
+        """Return the force from each state of a linear element at the first sample, (n, states)."""
+        return np.zeros((samples, 0))
+
     def initial_states(self, values: Sequence[Any], start: Any) -> Sequence[Any]:
-        """Return the states at the first sample, in plain arithmetic, from :attr:`start` there."""
+        """Return the states at the first sample, in plain arithmetic, from :attr:`start` there.
+
+        The states of an element without memory are unknowns themselves.
+        """
         return (start,) * self.n_states
 
     def state_histories(

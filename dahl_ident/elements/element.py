@@ -20,6 +20,7 @@ from dahl_ident.arrays import (
     real_array,
     whole_number,
 )
+from dahl_ident.data.record import is_even
 from dahl_ident.elements.behaviour import Behaviour, StiffnessGradient
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError, ValidationError
@@ -260,7 +261,10 @@ class Element(Behaviour):
                 raise ValidationError("time does not rise from sample to sample")
             v = np.gradient(x, t) if v is None else v
             a = np.gradient(v, t) if a is None else a
-        force = self.force_history(values, np.atleast_1d(x), v, start, acceleration=a)
+        own = self
+        if time is not None and x.size > 1 and is_even(t):
+            own = self.sampled(float(t[-1] - t[0]) / (x.size - 1))
+        force = own.force_history(values, np.atleast_1d(x), v, start, acceleration=a)
         return force if x.ndim else force[0]
 
     def _check_start(self, values: Sequence[float], initial_force: float) -> None:
@@ -393,6 +397,15 @@ class Model(Element):
         for one, other in pairs[1:]:
             value, slope = value + one, slope + other
         return value, slope
+
+    @property
+    def has_inertia(self) -> bool:
+        """Whether a force determines the motion."""
+        return any(element.has_inertia for element in self._elements)
+
+    def sampled(self, interval: float) -> Model:
+        """Return the model for histories of one sampling interval, s."""
+        return Model(*(element.sampled(interval) for element in self._elements))
 
     def force_history(
         self,

@@ -11,19 +11,29 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.fields import one_of
 from dahl_ident.data.quantities import DEFINITIONS, converted
-from dahl_ident.elements.behaviour import STENCIL, STEP, Mechanics, StiffnessGradient
-from dahl_ident.elements.element import Element, prefixed
+from dahl_ident.elements.behaviour import (
+    STENCIL,
+    STEP,
+    HistoryGradient,
+    Mechanics,
+    StiffnessGradient,
+)
+from dahl_ident.elements.element import Element, motion, prefixed
 from dahl_ident.elements.parameter import Parameter
+from dahl_ident.elements.rational import Rational, StateSpace, typical_rate
+from dahl_ident.elements.recursion import matrix_recursion
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.units import QUANTITIES, Quantity
 
+_VANISHES = 1e-12  # of its terms: a sum that is 0 but for rounding
+_UNSTABLE = 1e-9  # of the fastest pole: a real part above grows
 _FORCE_OVER_MOTION = ("dynamic_stiffness", "mechanical_impedance", "apparent_mass")
 
 
@@ -53,6 +63,10 @@ class LinearSystem(Element):
 
     Notes
     -----
+    In records, a fixed continuous system has a force over time: its Z(s) is a stiffness, a damper,
+    a mass, and poles whose states at the first sample are unknowns of the fit. So a receptance with
+    inertia is driven by a measured force without `Mass`; an absorber needs one beside it.
+
     Evaluating outside the frequencies of an FRD, above half a sampling rate, or where the
     response determines no stiffness, raises ValidationError. Derivatives by the arguments
     of a callable are central differences of fourth order with steps of 1e-3 of the argument,
@@ -75,6 +89,7 @@ class LinearSystem(Element):
     equation = "F = Z(j omega) X"
     is_linear = True
     rate_independent = False
+    _interval: float | None = None  # between the samples of a history, s
 
     def __init__(
         self,
@@ -98,6 +113,9 @@ class LinearSystem(Element):
         self._labels = tuple(given)
         self.parameters = tuple(_parameter(prefixed(name, k), v) for k, v in given.items())
         self._last: tuple[FloatArray, ComplexArray] | None = None
+        self._parts: (
+            tuple[tuple[float, ...], tuple[tuple[float, float, float], StateSpace]] | None
+        ) = None
         if not is_function:
             check_system(system, "system")
 
@@ -135,17 +153,49 @@ class LinearSystem(Element):
         Z, *slopes = (row + 0.0 * amplitude for row in table)
         return StiffnessGradient(Z, np.zeros_like(Z), tuple(slopes))
 
-    def force_history(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-    ) -> FloatArray:
-        """Raise ModelError: a frequency response gives no force for a displacement history."""
-        raise self._no_time()
+    @property
+    def _over_time(self) -> tuple[tuple[float, float, float], StateSpace]:
+        """Return stiffness, damping and mass, and the strictly proper rest of Z(s)."""
+        free = [p.name for p in self.parameters if p.free]
+        if free:
+            raise ModelError(
+                f"{self!r} leaves {', '.join(free)} free, and only a fixed system has an equation "
+                "of motion; fix it, or build what is unknown from Mass, Damper and Spring"
+            )
+        at = tuple(float(v) for v in self.known_values())
+        if self._parts is None or self._parts[0] != at:
+            self._parts = at, self._split()
+        return self._parts[1]
+
+    def _split(self) -> tuple[tuple[float, float, float], StateSpace]:
+        control = importlib.import_module("control")
+        Z = Rational(*self.rational_stiffness()).without_common_zeros_at_0().trimmed()
+        lean = control.tf(Z.numerator, Z.denominator).minreal()
+        if lean.den[0][0].size < Z.denominator.size:
+            Z = Rational(lean.num[0][0], lean.den[0][0])
+        polynomial, rest = Z.split()
+        if polynomial.size > 3:
+            raise ModelError(
+                f"the dynamic stiffness of {self!r} grows as s^{polynomial.size - 1}; an equation "
+                "of motion allows s^2, a mass: give the system at its point of drive"
+            )
+        k, c, m = [*polynomial[::-1].tolist(), 0.0, 0.0][:3]
+        return (k, c, m), rest.state_space()
+
+    @property
+    def n_states(self) -> int:
+        """Poles of the dynamic stiffness."""
+        return self._over_time[1].order
+
+    @property
+    def has_inertia(self) -> bool:
+        """Whether Z(s) grows as s^2."""
+        return self._over_time[0][2] != 0.0
+
+    @property
+    def fastest_rate(self) -> float:
+        """Largest modulus of the poles of Z(s), rad/s."""
+        return float(np.max(np.abs(np.linalg.eigvals(self._over_time[1].A)), initial=0.0))
 
     def mechanics(
         self,
@@ -155,14 +205,125 @@ class LinearSystem(Element):
         direction: Any,
         states: Sequence[Any],
     ) -> Mechanics:
-        """Raise ModelError, as :meth:`force_history`."""
-        raise self._no_time()
+        """Return mass, the rest of the force, and the changes of the states, in metres."""
+        (k, c, m), rest = self._over_time
+        rates = [
+            b * displacement + sum(a * z for a, z in zip(row, states, strict=True) if a)
+            for row, b in zip(rest.A.tolist(), rest.B.tolist(), strict=True)
+        ]
+        force = sum(a * z for a, z in zip(rest.C.tolist(), states, strict=True))
+        return Mechanics(m, k * displacement + c * velocity + force, rates)
 
-    def _no_time(self) -> ModelError:
-        return ModelError(
-            f"{self!r} is defined only in the frequency domain and has no force over time; build "
-            "the model from Mass, Damper and Spring to simulate records"
+    def sampled(self, interval: float) -> Self:
+        """Return this element for histories of one sampling interval, s."""
+        copy = self.with_bound(self.parameters)
+        copy._interval = interval
+        return copy
+
+    def free_responses(self, samples: int) -> FloatArray:
+        """Return the force from each state at the first sample, (n, states)."""
+        rest = self._over_time[1]
+        return np.asarray(
+            self._histories(rest, np.zeros((samples - 1, 6)), np.eye(rest.order)) @ rest.C
         )
+
+    def state_histories(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray,
+        acceleration: FloatArray,
+    ) -> Sequence[FloatArray]:
+        """Return the states along a displacement, from rest; zero where they would grow."""
+        rest = self._over_time[1]
+        if self._grows(rest):
+            return [np.zeros(displacement.shape)] * rest.order
+        paths = self._paths(displacement, velocity, acceleration)
+        return list(self._histories(rest, paths, np.zeros((rest.order, 1)))[:, 0].T)
+
+    def force_history(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
+        *,
+        acceleration: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return the force, from rest; between samples the motion is a polynomial of degree 5."""
+        (k, c, m), rest = self._over_time
+        v, a = np.zeros((2, *displacement.shape))
+        if c or m or rest.order:
+            v = motion(velocity, "velocity", displacement, self)
+        if m or rest.order:
+            a = motion(acceleration, "acceleration", displacement, self)
+        force = k * displacement + c * v + m * a
+        if not rest.order:
+            return np.asarray(force)
+        if self._grows(rest):
+            raise ModelError(
+                f"under a prescribed displacement the force of {self!r} grows beyond all bounds; "
+                "give records in which a force drives a mass"
+            )
+        states = self._histories(rest, self._paths(displacement, v, a), np.zeros((rest.order, 1)))
+        return np.asarray(force + states[:, 0] @ rest.C)
+
+    def force_history_gradient(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
+        *,
+        acceleration: FloatArray | None = None,
+    ) -> HistoryGradient:
+        """Return the force, which fixed parameters do not change."""
+        force = self.force_history(values, displacement, velocity, acceleration=acceleration)
+        zero = np.zeros(force.shape)
+        return HistoryGradient(force, zero, (zero,) * len(self.parameters))
+
+    @staticmethod
+    def _grows(rest: StateSpace) -> bool:
+        poles = np.linalg.eigvals(rest.A)
+        return bool(np.any(poles.real > _UNSTABLE * np.abs(poles).max(initial=0.0)))
+
+    def _paths(self, x: FloatArray, v: FloatArray, a: FloatArray) -> FloatArray:
+        """Return the coefficients of x in the share of each interval, (n - 1, 6)."""
+        h = self._step
+        one, two = h * v, 0.5 * h**2 * a
+        place = np.diff(x) - one[:-1] - two[:-1]
+        speed = np.diff(one) - 2.0 * two[:-1]
+        bend = np.diff(two)
+        return np.column_stack(
+            [
+                x[:-1], one[:-1], two[:-1],
+                10.0 * place - 4.0 * speed + bend,
+                -15.0 * place + 7.0 * speed - 2.0 * bend,
+                6.0 * place - 3.0 * speed + bend,
+            ]
+        )  # fmt: skip
+
+    def _histories(self, rest: StateSpace, paths: FloatArray, first: FloatArray) -> FloatArray:
+        """Return the states, (n, c, order), driven by polynomials from `first`, (order, c)."""
+        from scipy.linalg import expm
+
+        order, h = rest.order, self._step
+        chain = np.zeros((order + 6, order + 6))
+        chain[:order, :order], chain[:order, order] = h * rest.A, h * rest.B
+        chain[np.arange(order, order + 5), np.arange(order + 1, order + 6)] = 1.0
+        whole = expm(chain)[:order]
+        moved = paths @ (whole[:, order:] * [1.0, 1.0, 2.0, 6.0, 24.0, 120.0]).T
+        term = np.broadcast_to(moved[:, :, None], (len(paths), *first.shape))
+        keep = np.broadcast_to(whole[:, :order], (len(paths), order, order))
+        return matrix_recursion(keep, term, first).transpose(0, 2, 1)
+
+    @property
+    def _step(self) -> float:
+        if self._interval is None:
+            raise ValidationError(
+                f"{self!r} needs evenly spaced times to give its force; pass time="
+            )
+        return self._interval
 
     def describe(self) -> dict[str, Any]:
         """Return quantity and system as plain data; a function cannot be written to a file."""
@@ -255,8 +416,15 @@ class LinearSystem(Element):
                 "continuous time; give a continuous TransferFunction or StateSpace"
             )
         transfer = control.tf(system)
-        numerator, denominator = transfer.num[0][0], transfer.den[0][0]
-        return np.asarray(numerator, np.float64), np.asarray(denominator, np.float64)
+        numerator, denominator = (
+            np.asarray(p[0][0], np.float64) for p in (transfer.num, transfer.den)
+        )
+        if isinstance(system, control.StateSpace):
+            # its conversion leaves rounding errors where there is no coefficient
+            numerator = numerator[max(0, numerator.size - _degree(system) - 1) :]
+            sizes = np.abs(numerator) * typical_rate(denominator) ** np.arange(numerator.size)[::-1]
+            numerator = np.where(sizes > _VANISHES * sizes.max(), numerator, 0.0)
+        return numerator, denominator
 
     def rational_stiffness(self) -> tuple[FloatArray, FloatArray]:
         """Return numerator and denominator of Z(s), from the highest power of s down."""
@@ -347,6 +515,23 @@ def _to_stiffness(R: ComplexArray, quantity: Quantity, omega: FloatArray) -> Com
         )
     Z, _ = converted(np.where(pole, 1.0, R), omega, quantity, "dynamic_stiffness")
     return np.where(pole, 0.0, Z)
+
+
+def _degree(system: Any) -> int:
+    """Return the degree in s of the numerator of a state-space system's response.
+
+    It follows from the response to an impulse, D, C B, C A B, ..., the first of which may vanish.
+    """
+    A, B, row, D = (np.asarray(getattr(system, key), np.float64) for key in "ABCD")
+    size, degree = np.abs(row), len(A)
+    if D[0, 0]:
+        return degree
+    while degree > 0:
+        degree -= 1
+        if abs((row @ B)[0, 0]) > _VANISHES * (size @ np.abs(B))[0, 0]:
+            break
+        row, size = row @ A, size @ np.abs(A)
+    return degree
 
 
 def check_system(system: Any, name: str) -> None:

@@ -103,3 +103,33 @@ def linear_recursion(keep: FloatArray, term: FloatArray, first: FloatArray) -> F
     right[0], right[1:] = first, term
     solution, _ = dtbtrs(band, right, uplo="L", diag="U", overwrite_b=1)
     return np.asarray(solution)
+
+
+def matrix_recursion(keep: FloatArray, term: FloatArray, first: FloatArray) -> FloatArray:
+    """Return y with y[0] = first and y[i + 1] = keep[i] y[i] + term[i].
+
+    Parameters
+    ----------
+    keep : ndarray, shape (n, order, order)
+    term : ndarray, shape (n, order, c)
+    first : ndarray, shape (order, c)
+
+    Returns
+    -------
+    ndarray, shape (n + 1, order, c)
+
+    Examples
+    --------
+    >>> matrix_recursion(np.full((2, 1, 1), 0.5), np.ones((2, 1, 1)), np.zeros((1, 1))).ravel()
+    array([0. , 1. , 1.5])
+    """
+    n, order, _ = keep.shape
+    band = np.zeros((2 * order, (n + 1) * order), order="F")
+    band[0] = 1.0
+    columns = band.reshape(2 * order, n + 1, order)
+    for i in range(order):  # row of the later state
+        for j in range(order):  # column of the earlier one
+            columns[order + i - j, :-1, j] = -keep[:, i, j]
+    right = np.concatenate([first[None], term]).reshape((n + 1) * order, -1)
+    solution, _ = dtbtrs(band, np.asfortranarray(right), uplo="L", diag="U", overwrite_b=1)
+    return np.asarray(solution).reshape(n + 1, order, -1)

@@ -147,8 +147,10 @@ class _Scan:
 
     def _columns(self, element: Element, values: tuple[float, ...]) -> list[FloatArray]:
         return [
-            element.force_history(values, x, v, 0.0, acceleration=a)
-            for x, v, a, _ in self.histories
+            element.sampled(1.0 / record.sample_rate).force_history(
+                values, x, v, 0.0, acceleration=a
+            )
+            for record, (x, v, a, _) in zip(self.problem.records, self.histories, strict=True)
         ]
 
     def _solve(
@@ -245,9 +247,10 @@ def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
         if problem.output == "motion":
             x, v, a = in_band(problem, number)
             own[0], own[1] = x[0], v[0]
+            model = problem.model.sampled(1.0 / problem.records[number].sample_rate)
             states = [
                 state
-                for e, element_values in problem.model.of(at)
+                for e, element_values in model.of(at)
                 for state in e.state_histories(element_values, x, v, a)
             ]
             problem.set_guess(number, np.column_stack([x, v, *states]))

@@ -33,6 +33,8 @@ Output = Literal["force", "motion"]
 _SHORTEST = 16  # samples from which noise can be estimated
 _PER_CYCLE = 100.0  # samples that a slow cycle keeps where a record is too long
 _SUBSTEP = 0.4  # rad of the fastest motion in a step of integration
+_STABLE = 2.0  # of the fastest pole's time in a step: from about 3 the integration is unstable
+_MOST_STEPS = 32  # in a sampling interval
 _LINEAR = 0.1  # of the largest motion: a larger change is not what the slopes tell
 _SMALL = 0.1  # of the motion's inverse size: rates below are searched as numbers
 _INSIDE = 1.0 - 1e-9  # of the way to a bound: on it, a search would see no slope and stay
@@ -115,8 +117,7 @@ class RecordProblem:
         self.model = as_model(model)
         self.excitation = excitation
         self.substeps = substeps
-        inertial = any(p.is_mass for p in self.model.parameters)
-        self.output: Output = output or ("motion" if inertial else "force")
+        self.output: Output = output or ("motion" if self.model.has_inertia else "force")
         if self.output not in ("force", "motion"):
             raise ValidationError(f"output is {output!r}; expected force or motion")
         self.free = [p for p in self.model.parameters if p.free]
@@ -171,10 +172,16 @@ class RecordProblem:
             if self.output == "motion":
                 found.append(Parameter(f"initial_displacement{tail}", "m", "at the first sample"))
                 found.append(Parameter(f"initial_velocity{tail}", "m/s", "at the first sample"))
-            for element in self.with_memory:
+            for element in self.model.elements:
                 name = f"{element.name}_" if element.name else ""
-                start = element.start if self.output == "motion" else Behaviour.start
-                found.append(Parameter(f"{name}{start[0]}{tail}", *start[1:]))
+                if element.has_memory:
+                    start = element.start if self.output == "motion" else Behaviour.start
+                    found.append(Parameter(f"{name}{start[0]}{tail}", *start[1:]))
+                else:
+                    found += [
+                        Parameter(f"{name}state_{i + 1}{tail}", "m", "at the first sample")
+                        for i in range(element.n_states)
+                    ]
             if self.output == "force":
                 found.append(Parameter(f"offset{tail}", "N", "constant in the measured force"))
                 found.append(Parameter(f"drift{tail}", "N/s", "slope of the measured force"))
@@ -331,10 +338,24 @@ class RecordProblem:
         found = []
         for record in self.records:
             rate, wave = record.sample_rate, record.force_samples
-            substeps = self.substeps or self.substeps_for(record)
+            substeps = self.substeps or max(self.substeps_for(record), self._pole_steps(rate))
             drive = band_limited(wave, 1.0 / rate, substeps)
             found.append(ForcedMotion(self._plant, drive, 1.0 / rate))
         return tuple(found)
+
+    def _pole_steps(self, rate: float) -> int:
+        """Return the steps of integration that the poles of linear systems ask for."""
+        found = 1
+        for element in self.model.elements:
+            steps = int(np.ceil(element.fastest_rate / (rate * _STABLE)))
+            if steps > _MOST_STEPS:
+                raise ModelError(
+                    f"{element!r} has a pole at {element.fastest_rate:.3g} rad/s, "
+                    f"{element.fastest_rate / rate:.0f} times the sampling rate; leave out what is "
+                    "so fast, or sample faster"
+                )
+            found = max(found, steps)
+        return found
 
     @staticmethod
     def substeps_for(record: Record) -> int:
@@ -403,10 +424,11 @@ class RecordProblem:
         *states, offset, drift = own.tolist()
         total = offset + drift * time
         by = np.zeros((x.size, len(self.parameters) if derivatives else 0))
-        memory, column = 0, 0
+        start, column = 0, 0
         first = len(self.free) + number * self.per_record
-        for element, at in self.model.of(self.full_values(values)):
-            state, moved = (states[memory], path) if element.has_memory else (0.0, x)
+        model = self.model.sampled(1.0 / record.sample_rate)
+        for element, at in model.of(self.full_values(values)):
+            state, moved = (states[start], path) if element.has_memory else (0.0, x)
             if derivatives:
                 found = element.force_history_gradient(at, moved, v, state, acceleration=a)
                 total = total + found.value
@@ -415,13 +437,21 @@ class RecordProblem:
                         by[:, column] = slope
                         column += 1
                 if element.has_memory:
-                    by[:, first + memory] = found.by_state
+                    by[:, first + start] = found.by_state
             else:
                 total = total + element.force_history(at, moved, v, state, acceleration=a)
-            memory += element.has_memory
+            if element.has_memory:
+                start += 1
+            elif element.n_states:
+                stop = start + element.n_states
+                free = element.free_responses(x.size)
+                total = total + free @ states[start:stop]
+                if derivatives:
+                    by[:, first + start : first + stop] = free
+                start = stop
         if derivatives:
-            by[:, first + memory] = 1.0
-            by[:, first + memory + 1] = time
+            by[:, first + start] = 1.0
+            by[:, first + start + 1] = time
         return Prediction(total, by)
 
     def _motion(self, values: FloatArray, number: int, *, derivatives: bool) -> Prediction:

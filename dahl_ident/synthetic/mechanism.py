@@ -12,9 +12,9 @@ from scipy.interpolate import CubicHermiteSpline
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, Model
 from dahl_ident.elements.element import as_model
+from dahl_ident.elements.rational import Rational
 from dahl_ident.errors import FitError, ModelError
 from dahl_ident.synthetic.plant_motion import Progress, simulate_plant
-from dahl_ident.synthetic.state_space import Rational
 from dahl_ident.synthetic.waveform import Waveform
 from dahl_ident.time_domain.forced_motion import ForcedMotion
 from dahl_ident.time_domain.plant import Plant as TimeDomainPlant

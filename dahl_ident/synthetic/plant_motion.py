@@ -23,8 +23,8 @@ from scipy.optimize import brentq
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element
+from dahl_ident.elements.rational import StateSpace
 from dahl_ident.errors import ModelError
-from dahl_ident.synthetic.state_space import StateSpace
 from dahl_ident.synthetic.trajectory import (
     DERIVATIVE,
     FINE,

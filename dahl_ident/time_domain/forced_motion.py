@@ -19,9 +19,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dtbtrs
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.elements.recursion import matrix_recursion
 from dahl_ident.errors import FitError
 from dahl_ident.time_domain.plant import Plant
 from dahl_ident.time_domain.runge_kutta import PLACES
@@ -147,7 +147,7 @@ class ForcedMotion:
         terms[:, :, order:] = flow.by_value
         first = np.zeros((order, order + count))
         first[:, :order] = np.eye(order)
-        return _recursion(flow.by_state, terms, first)
+        return matrix_recursion(flow.by_state, terms, first)
 
     def accelerations(
         self,
@@ -204,7 +204,7 @@ class ForcedMotion:
                 if segment < len(gaps):
                     keep = keep.copy()
                     keep[segment - 1 :: segment] = 0.0
-                change = _recursion(keep, gaps[:, :, None], np.zeros((order, 1)))[..., 0]
+                change = matrix_recursion(keep, gaps[:, :, None], np.zeros((order, 1)))[..., 0]
                 motion = motion + change
                 size = np.maximum(np.abs(motion).max(axis=0), earlier) + 1e-300
                 largest = float(np.max(np.abs(change).max(axis=0) / size))
@@ -521,17 +521,3 @@ def _chained(later: FloatArray, earlier: FloatArray, order: int) -> FloatArray:
         row[order:] += later[i, order:]
         total[i] = row
     return total
-
-
-def _recursion(keep: FloatArray, term: FloatArray, first: FloatArray) -> FloatArray:
-    """Return y, (n + 1, order, c), with y[k + 1] = keep[k] y[k] + term[k] and y[0] = first."""
-    n, order, _ = keep.shape
-    band = np.zeros((2 * order, (n + 1) * order), order="F")
-    band[0] = 1.0
-    columns = band.reshape(2 * order, n + 1, order)
-    for i in range(order):  # row of the later state
-        for j in range(order):  # column of the earlier one
-            columns[order + i - j, :-1, j] = -keep[:, i, j]
-    right = np.concatenate([first[None], term]).reshape((n + 1) * order, -1)
-    solution, _ = dtbtrs(band, np.asfortranarray(right), uplo="L", diag="U", overwrite_b=1)
-    return np.asarray(solution).reshape(n + 1, order, -1)

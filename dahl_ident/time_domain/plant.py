@@ -85,7 +85,12 @@ class Plant:
         for element, values in self.model.of(self._values):
             own, states = states[: element.n_states], states[element.n_states :]
             part = element.mechanics(values, x, v, self._direction, own)
-            has_inertia = has_inertia or isinstance(part.inertia, ca.SX)
+            has_inertia = has_inertia or element.has_inertia
+            if self.excitation == "base" and element.is_linear and element.n_states:
+                raise ModelError(
+                    f"{element!r} has inertia inside, and how the base moves it is not known; "
+                    "build it from Mass, Damper and Spring, or drive the plant by a force"
+                )
             inertia, total = inertia + part.inertia, total + part.force
             slopes += part.rates
         if not has_inertia:
@@ -125,13 +130,14 @@ class Plant:
 
     @cached_property
     def _first(self) -> Evaluator:
-        starts = [ca.SX.sym(f"f{i}") for i, e in enumerate(self.model.elements) if e.has_memory]
+        starts: list[ca.SX] = []
         states = list(self._state[:2])
-        waiting = iter(starts)
         with _numpy_names():
             for element, values in self.model.of(self._values):
-                start = next(waiting) if element.has_memory else ca.SX(0.0)
-                states += element.initial_states(values, start)
+                count = 1 if element.has_memory else element.n_states
+                own = [ca.SX.sym(f"f{len(starts) + i}") for i in range(count)]
+                states += element.initial_states(values, own[0]) if element.has_memory else own
+                starts += own
         inputs = [*self._state[:2], *starts, *self._free]
         first = ca.vertcat(*states)
         by = ca.jacobian(first, ca.vertcat(*inputs))
@@ -143,7 +149,8 @@ class Plant:
         Parameters
         ----------
         own : ndarray, shape (m,)
-            Displacement, velocity and the start of each element with memory.
+            Displacement, velocity, the start of each element with memory and the states of those
+            without.
         values : ndarray, shape (P,)
             Free parameters.
 

@@ -1,4 +1,4 @@
-"""A linear part as polynomials in s, and as a state-space system for the time domain.
+"""A linear stiffness as polynomials in s, and as a state-space system for the time domain.
 
 Masses, dampers, springs and linear systems in parallel have one dynamic stiffness
 Z(s) = n(s)/d(s). Driven by force, the displacement obeys H(s) = d(s)/n(s); under a prescribed
@@ -42,7 +42,7 @@ class Rational:
         crossed = np.polymul(self.numerator, other.denominator)
         crossed = np.polyadd(crossed, np.polymul(other.numerator, self.denominator))
         below = np.polymul(self.denominator, other.denominator).astype(np.float64)
-        return Rational(crossed.astype(np.float64), below)._without_common_zeros_at_0()
+        return Rational(crossed.astype(np.float64), below).without_common_zeros_at_0()
 
     def inverse(self) -> Rational:
         """Return d(s)/n(s)."""
@@ -50,7 +50,7 @@ class Rational:
 
     def trimmed(self) -> Rational:
         """Return the function without leading coefficients that are rounding errors."""
-        rate = _typical_rate(np.trim_zeros(self.denominator, "f"))
+        rate = typical_rate(np.trim_zeros(self.denominator, "f"))
         return Rational(_leading(self.numerator, rate), _leading(self.denominator, rate))
 
     def split(self) -> tuple[FloatArray, Rational]:
@@ -76,7 +76,7 @@ class Rational:
         if n.size == 0 or order == 0:
             D = float(n[0] / d[0]) if n.size else 0.0
             return StateSpace(np.zeros((0, 0)), np.zeros(0), np.zeros(0), D)
-        rate = _typical_rate(d)
+        rate = typical_rate(d)
         powers = rate ** np.arange(order, -1, -1)
         a = d * powers
         b = np.concatenate([np.zeros(d.size - n.size), n]) * powers
@@ -87,7 +87,8 @@ class Rational:
         B[0] = 1.0
         return StateSpace(rate * A, rate * B, b[1:] - b[0] * a[1:], float(b[0]))
 
-    def _without_common_zeros_at_0(self) -> Rational:
+    def without_common_zeros_at_0(self) -> Rational:
+        """Return the same function with powers of s that cancel left out."""
         n, d = self.numerator, self.denominator
         while n.size > 1 and d.size > 1 and n[-1] == 0.0 and d[-1] == 0.0:
             n, d = n[:-1], d[:-1]
@@ -100,7 +101,7 @@ def _leading(polynomial: FloatArray, rate: float) -> FloatArray:
     return polynomial[int(np.argmax(sizes > 1e-12 * np.max(sizes))) :]
 
 
-def _typical_rate(polynomial: FloatArray) -> float:
+def typical_rate(polynomial: FloatArray) -> float:
     """Return the geometric mean of the moduli of the roots that are not 0, rad/s."""
     nonzero = np.trim_zeros(polynomial, "b")
     if nonzero.size < 2:
