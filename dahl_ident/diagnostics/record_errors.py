@@ -7,13 +7,21 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import special
 
 from dahl_ident.arrays import FloatArray, positive_array
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget, BudgetRow, ParameterBudget, coverage_factor
 from dahl_ident.diagnostics.correlated_residuals import sandwich
+from dahl_ident.diagnostics.error_model import EXPONENT
+from dahl_ident.diagnostics.error_sources import RUNS
+from dahl_ident.diagnostics.formatting import listed
+from dahl_ident.diagnostics.record_sources import (
+    BLOCKS,
+    AssumedExponent,
+    assumed_exponents,
+    between_blocks,
+    between_records,
+)
 from dahl_ident.problem.displacement_noise import LEADS
 from dahl_ident.problem.record_noise import drive_noise
 from dahl_ident.problem.record_problem import RecordProblem
@@ -22,8 +30,6 @@ _SLIGHT = 1e-6  # relative: noise of the drive below does not count
 _MATTERS = 0.2  # standard errors that noise in the displacement may shift without being counted
 _DRAWS = 8  # of noise: the mean square of what they change is known to a half
 _STEP = 1e-5  # relative, of parameters, for slopes of derived quantities
-_BLOCKS = 20  # of all records together, from which the model error is estimated
-_LEVEL = 0.9995  # of chance, at which scatter between blocks is no noise
 NOISE, DRIVE, FORCE = "noise", "noise in the drive", "force calibration"
 MODEL, DISPLACEMENT = "model error", "noise in the displacement"
 
@@ -40,11 +46,17 @@ class RecordErrors:
         Samples of white noise that would tell as much as the residuals.
     exact : tuple of str
         Inputs without a stated uncertainty.
+    runs : int
+        Records that were fitted together.
+    exponents : tuple of AssumedExponent
+        What the records say of exponents that nobody gave.
     """
 
     contributions: Mapping[str, FloatArray]
     effective: float
     exact: tuple[str, ...]
+    runs: int
+    exponents: tuple[AssumedExponent, ...]
 
     @property
     def covariance(self) -> FloatArray:
@@ -53,14 +65,20 @@ class RecordErrors:
 
     @property
     def dof(self) -> float:
-        """Degrees of freedom: of the noise, or of the blocks that show a model error."""
-        return _BLOCKS - 1.0 if MODEL in self.contributions else self.dof_of(NOISE)
+        """Degrees of freedom of the whole: of the source that was estimated from the fewest."""
+        return min(self.dof_of(source) for source in self.contributions)
 
     def dof_of(self, source: str) -> float:
         """Degrees of freedom of one source."""
         if source == NOISE:
             return max(self.effective - len(self.covariance), 1.0)
-        return _BLOCKS - 1.0 if source == MODEL else np.inf
+        return {MODEL: BLOCKS - 1.0, RUNS: self.runs - 1.0}.get(source, np.inf)
+
+    def dof_for(self, place: int) -> float:
+        """Degrees of freedom of one value, by Welch and Satterthwaite."""
+        own = {name: float(C[place, place]) for name, C in self.contributions.items()}
+        loss = sum(u2**2 / self.dof_of(name) for name, u2 in own.items())
+        return sum(own.values()) ** 2 / loss if loss > 0.0 else np.inf
 
 
 def record_errors(
@@ -73,7 +91,10 @@ def record_errors(
 
     A model that misses more than noise does so differently from place to place: where the blocks
     of a record ask for parameters that scatter more than noise explains, the excess is the model
-    error. What the model misses everywhere alike does not show. Noise in a measured drive makes
+    error. What the model misses everywhere alike does not show. Where several records ask for
+    parameters that scatter more than that explains, the excess is the scatter between runs. What
+    an assumed exponent changes counts with its range and with what the records say of it. Noise in
+    a measured drive makes
     the response look smaller than it is, by the noise's share of the drive's power within its
     band; a calibration error of the force scales every force. Noise in a
     measured displacement counts as far as it shifts the estimate.
@@ -91,13 +112,18 @@ def record_errors(
     RecordErrors
     """
     white = [problem.filtered(J) for J in jacobians]
-    covariance, effective = sandwich(white, [problem.filtered(e) for e in residuals])
+    left = [problem.filtered(e) for e in residuals]
+    covariance, effective = sandwich(white, left)
     found = {NOISE: covariance}
-    beyond = _model_error(
-        white, [problem.filtered(e) for e in residuals], covariance, len(problem.free)
-    )
+    beyond = between_blocks(white, left, covariance, len(problem.free))
     if beyond is not None:
         found[MODEL] = beyond
+    scatter = between_records(white, left, np.asarray(sum(found.values())), len(problem.free))
+    if scatter is not None:
+        found[RUNS] = scatter
+    exponents = assumed_exponents(problem, values, white, left)
+    if exponents:
+        found[EXPONENT] = np.asarray(sum(one.contribution for one in exponents))
     if problem.output == "force":
         moved = _by_displacement(problem, values, jacobians)
         matters = moved.diagonal() > _MATTERS**2 * covariance.diagonal()
@@ -120,7 +146,7 @@ def record_errors(
         found[FORCE] = factor**2 * np.outer(scale, scale)
     else:
         exact.insert(0, FORCE)
-    return RecordErrors(found, effective, tuple(exact))
+    return RecordErrors(found, effective, tuple(exact), len(problem.records), exponents)
 
 
 def _by_displacement(
@@ -171,53 +197,6 @@ def _moved(
     return change / size, square - float(change @ right)
 
 
-def _model_error(
-    jacobians: Sequence[FloatArray],
-    residuals: Sequence[FloatArray],
-    noise: FloatArray,
-    count: int,
-) -> FloatArray | None:
-    """Return the covariance between blocks beyond that of noise, or None where it shows none.
-
-    The covariance between blocks is that of Liang and Zeger, Biometrika 73 (1986) 13-22; whether
-    it exceeds noise is judged for each of the first `count` parameters.
-    """
-    samples = sum(e.size for e in residuals)
-    seen = np.flatnonzero(np.isfinite(noise.diagonal()))
-    if samples < _BLOCKS * _BLOCKS or not noise[np.ix_(seen, seen)].any():
-        return None
-    if seen.size < len(noise):
-        own, inside = [J[:, seen] for J in jacobians], noise[np.ix_(seen, seen)]
-        found = _model_error(own, residuals, inside, int((seen < count).sum()))
-        return None if found is None else _embedded(found, seen, len(noise))
-    size = np.sqrt(noise.diagonal())
-    scores, parts = [], []
-    for J, e in zip(jacobians, residuals, strict=True):
-        scaled = J * size
-        for rows in np.array_split(np.arange(e.size), max(1, round(_BLOCKS * e.size / samples))):
-            scores.append(scaled[rows].T @ e[rows])
-            parts.append(scaled[rows].T @ scaled[rows])
-    inverse = np.linalg.inv(sum(parts))
-    steps = np.array(scores) @ inverse
-    blocks = len(steps)
-    between = blocks / (blocks - 1.0) * steps.T @ steps
-    correlation = noise / np.outer(size, size)
-    weights = np.array([(inverse @ part @ inverse).diagonal() for part in parts])
-    dof = np.maximum(weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0) - 1.0, 1.0)
-    ratio = between.diagonal() / correlation.diagonal()
-    if not (ratio > special.chdtri(dof, 1.0 - _LEVEL) / dof)[:count].any():
-        return None
-    values, vectors = np.linalg.eigh(between - correlation)
-    beyond = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return np.asarray(beyond * np.outer(size, size))
-
-
-def _embedded(part: FloatArray, places: NDArray[np.intp], size: int) -> FloatArray:
-    whole = np.zeros((size, size))
-    whole[np.ix_(places, places)] = part
-    return whole
-
-
 def record_budget(problem: RecordProblem, values: FloatArray, errors: RecordErrors) -> Budget:
     """Return the uncertainty budget of the model's free parameters."""
     count = len(problem.free)
@@ -227,12 +206,11 @@ def record_budget(problem: RecordProblem, values: FloatArray, errors: RecordErro
         u2 = float(total[i, i])
         rows = []
         for source, covariance in errors.contributions.items():
-            kind: Literal["A", "B"] = "A" if source in (NOISE, MODEL) else "B"
+            kind: Literal["A", "B"] = "A" if source in (NOISE, MODEL, RUNS) else "B"
             own = float(covariance[i, i])
             dof = errors.dof_of(source)
             rows.append(BudgetRow(source, kind, own**0.5, dof, own / u2 if u2 > 0.0 else 0.0))
-        loss = sum(row.u**4 / row.dof for row in rows)  # Welch and Satterthwaite
-        dof = u2**2 / loss if loss > 0.0 else np.inf
+        dof = errors.dof_for(i)
         rows.sort(key=lambda row: -row.u)
         parameters.append(
             ParameterBudget(
@@ -241,6 +219,22 @@ def record_budget(problem: RecordProblem, values: FloatArray, errors: RecordErro
             )
         )  # fmt: skip
     return Budget(tuple(parameters), total[:count, :count], errors.exact)
+
+
+def record_assumptions(problem: RecordProblem, errors: RecordErrors) -> str:
+    """Return one sentence with what the estimate rests on and the records cannot test."""
+    parts = [str(one) for one in errors.exponents]
+    known = {one.name for one in errors.exponents}
+    parts += [
+        f"{p.name} = {p.value:g} exactly"
+        for p in problem.model.parameters
+        if p.prior is not None and not p.free and p.name not in known
+    ]
+    if errors.exact:
+        parts.append(f"{listed(errors.exact)} exact")
+    if errors.runs < 2:
+        parts.append("a single run")
+    return f"Assumed: {'; '.join(parts)}."
 
 
 def record_derived(

@@ -22,6 +22,7 @@ def undetermined(
     stderr: Mapping[str, float],
     covariance: FloatArray,
     names: Sequence[str],
+    by_exponents: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """Return one sentence for each parameter that the records do not determine.
 
@@ -36,6 +37,8 @@ def undetermined(
     covariance : ndarray, shape (P, P)
         Of the parameters `names`.
     names : sequence of str
+    by_exponents : sequence of str
+        Those whose uncertainty is mostly that of an exponent that nobody gave.
 
     Returns
     -------
@@ -68,6 +71,11 @@ def undetermined(
                 found.append(
                     f"{start}: the motion never stays below x_c = {low:.2g} m long enough; add "
                     "reversals and small motions of that size, sampled closely."
+                )
+            elif parameter.name in by_exponents:
+                found.append(
+                    f"{start} because of the exponent, which was not given: give it if it is "
+                    "known, or estimate it too."
                 )
             else:
                 found.append(f"{start}{_alike(parameter.name, covariance, names)}.")

@@ -8,7 +8,7 @@ sample, an offset and, for forces, a drift.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -246,6 +246,15 @@ class RecordProblem:
         """Return the same problem with filtered residuals."""
         other = copy(self)
         other.whitening = whitening
+        return other
+
+    def with_fixed(self, values: Mapping[str, float]) -> RecordProblem:
+        """Return the same problem with other values of parameters that are fixed."""
+        other = copy(self)
+        other.model = self.model.with_fixed(values)
+        other._guesses, other._slopes = list(self._guesses), [None] * len(self.records)
+        for name in ("_plant", "forced"):
+            other.__dict__.pop(name, None)
         return other
 
     def without_noise(self, noise: float, lead: float = LEADS[1]) -> RecordProblem:

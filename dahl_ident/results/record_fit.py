@@ -19,11 +19,14 @@ from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.data import Record
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget
-from dahl_ident.diagnostics.formatting import listed, rounded, table
+from dahl_ident.diagnostics.doubtful_elements import below_zero, is_single, slight
+from dahl_ident.diagnostics.error_model import EXPONENT
+from dahl_ident.diagnostics.formatting import rounded, table
 from dahl_ident.diagnostics.record_errors import (
     MODEL,
     NOISE,
     RecordErrors,
+    record_assumptions,
     record_budget,
     record_derived,
     record_errors,
@@ -234,7 +237,68 @@ class RecordFit(Result):
     def findings(self) -> tuple[str, ...]:
         """The undetermined parameters with the reasons, in words; empty if there are none."""
         stderr = {p.name: self.params[p.name].stderr or 0.0 for p in self.problem.free}
-        return undetermined(self.model, self.records, stderr, self.covar, self.var_names)
+        by_exponents = [
+            p.name
+            for i, p in enumerate(self.problem.free)
+            if EXPONENT in self.errors.contributions
+            and self.errors.contributions[EXPONENT][i, i] > 0.5 * self.covar[i, i]
+        ]
+        return undetermined(
+            self.model, self.records, stderr, self.covar, self.var_names, by_exponents
+        )
+
+    @cached_property
+    def _doubts(self) -> tuple[str, ...]:
+        """What speaks against the estimates physically, a sentence each with what to do."""
+        values = dict(zip(self.var_names, self._optimum.values.tolist(), strict=True))
+        stderr = {p.name: self.params[p.name].stderr or 0.0 for p in self.problem.free}
+        single = [e for e in self.problem.model.elements if is_single(e) and e.parameters[0].free]
+        found = list(below_zero([e.parameters[0] for e in single], values, stderr))
+        found += [
+            f"Physically doubtful: {objection}."
+            for element in self.model.elements
+            if not is_single(element)
+            for objection in element.physics([p.value or 0.0 for p in element.parameters])
+        ]
+        for one in self.errors.exponents:
+            if one.contradicted:
+                found.append(
+                    f"The records ask for {one.name} = {one.found} instead of the assumed "
+                    f"{one.parameter.value:g}: estimate it ({one.name}=None; "
+                    f"{one.name}=free on the command line)."
+                )
+        return tuple(found)
+
+    @cached_property
+    def _slight(self) -> tuple[str, ...]:
+        """What may stand for a part of the misfit, because it carries less force than that."""
+        if self.problem.output == "motion" or not self.misses:
+            return ()
+        size = np.concatenate([y - y.mean() for y in self.problem.measured]).std()
+        found: list[str] = []
+        for element in self.model.elements:
+            (parameter, *_), values = (
+                element.parameters,
+                [p.value or 0.0 for p in element.parameters],
+            )
+            if parameter.name in self.var_names and is_single(element):
+                force = [
+                    element.force_history(values, x, v, 0.0, acceleration=a)
+                    for x, v, a in self.problem.motions
+                ]
+                share = float(np.concatenate([f - f.mean() for f in force]).std() / size)
+                p = self.params[parameter.name]
+                found += slight(
+                    self.problem.free[self.var_names.index(p.name)], p.value, p.stderr or 0.0,
+                    share, float(np.sqrt(self._share_left)),
+                )  # fmt: skip
+        return tuple(found)
+
+    @property
+    def misses(self) -> bool:
+        """Whether the model misses more than noise."""
+        structured = self.goodness.correlation > _STRUCTURED and self._share_left > _WELL
+        return structured or MODEL in self.errors.contributions
 
     @property
     def status(self) -> VerdictStatus:
@@ -243,10 +307,8 @@ class RecordFit(Result):
             return VerdictStatus.NOT_DESCRIBED
         if self.findings:
             return VerdictStatus.NOT_DETERMINED
-        structured = self.goodness.correlation > _STRUCTURED and self._share_left > _WELL
-        if structured or MODEL in self.errors.contributions:
-            return VerdictStatus.APPROXIMATE
-        return VerdictStatus.TRUSTED
+        approximate = self.misses or self._doubts
+        return VerdictStatus.APPROXIMATE if approximate else VerdictStatus.TRUSTED
 
     @cached_property
     def statements(self) -> tuple[str, ...]:
@@ -256,18 +318,20 @@ class RecordFit(Result):
         )
         first = {
             VerdictStatus.TRUSTED: "Trusted.",
-            VerdictStatus.APPROXIMATE: "Approximate. The misfit exceeds the noise.",
+            VerdictStatus.APPROXIMATE: "Approximate. The misfit exceeds the noise."
+            if self.misses
+            else "Approximate. The estimates are those of no device, or of a wrong assumption.",
             VerdictStatus.NOT_DETERMINED: "Not determined. Not every parameter is determined.",
             VerdictStatus.NOT_DESCRIBED: "Not described. The model does not describe the records.",
         }[self.status]
         described = f"The residuals are {left:.2g} % rms of the measured {self.problem.output}"
-        objections = [o for e, v in self.model.of([p.value or 0.0 for p in self.model.parameters])
-                      for o in e.physics(v)]  # fmt: skip
         return (
             first,
             *(() if self.success else (self.message,)),
+            *self._doubts,
             *self.findings,
             f"{described}; {self.goodness.worst_text}.",
+            *self._slight,
             *(
                 (
                     f"Most of this varies slowly, as noise in the drive causes it: {within:.2g} % "
@@ -278,11 +342,10 @@ class RecordFit(Result):
                 else ()
             ),
             *self._not_counted,
-            *(f"Physically doubtful: {o}." for o in objections),
             *doubted(*(record.provenance for record in self.records)),
             f"Error bars take the residuals' correlation into account: {self.effective_samples:.0f}"
             f" effective of {self.problem.n_residuals} samples.",
-            f"Assumed: {listed(self.errors.exact)} exact.",
+            record_assumptions(self.problem, self.errors),
         )
 
     @property
@@ -304,11 +367,11 @@ class RecordFit(Result):
         return float(special.stdtrit(self.errors.dof, 0.975))
 
     def conf_interval(self) -> Mapping[str, tuple[float, float]]:
-        """Return the 95 % interval of every free parameter."""
+        """Return the 95 % interval of every free parameter, by Student's t."""
         found = {}
-        for name in self.var_names:
+        for place, name in enumerate(self.var_names):
             p = self.params[name]
-            half = self.coverage_factor * (p.stderr or 0.0)
+            half = float(special.stdtrit(self.errors.dof_for(place), 0.975)) * (p.stderr or 0.0)
             found[name] = (p.value - half, p.value + half)
         return MappingProxyType(found)
 

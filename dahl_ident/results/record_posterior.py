@@ -16,8 +16,7 @@ from dahl_ident.bayes.record_density import RecordDensity
 from dahl_ident.data import Record
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget
-from dahl_ident.diagnostics.formatting import listed
-from dahl_ident.diagnostics.record_errors import record_derived
+from dahl_ident.diagnostics.record_errors import record_assumptions, record_derived
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.results.chain_draws import ChainDraws
 from dahl_ident.results.record_fit import RecordBand, RecordFit
@@ -85,16 +84,25 @@ class RecordPosterior(ChainDraws):
 
     @property
     def _misfits(self) -> tuple[str, ...]:
-        if self.fit.status in (VerdictStatus.TRUSTED, VerdictStatus.NOT_DETERMINED):
+        if self.fit.status is not VerdictStatus.NOT_DESCRIBED:
             return ()
-        return self.fit.statements[:2]
+        first, *others = self.fit.statements[:2]
+        return (first.removeprefix(f"{self.fit.status.capitalize()}. "), *others)
+
+    @property
+    def status(self) -> VerdictStatus:
+        """Whether the numbers can be used; approximate where the fit's are."""
+        own = super().status
+        approximate = self.fit.status is VerdictStatus.APPROXIMATE
+        return self.fit.status if own is VerdictStatus.TRUSTED and approximate else own
 
     @property
     def _notes(self) -> tuple[str, ...]:
         errors = self.fit.errors
         counted = [name for name, part in errors.contributions.items() if part.any()]
-        assumed = (f"Assumed: {listed(errors.exact)} exact.",) if errors.exact else ()
-        return (f"Counted: {'; '.join(counted)}.", *assumed)
+        missed = ("The misfit exceeds the noise.",) if self.fit.misses and not self._misfits else ()
+        said = (f"Counted: {'; '.join(counted)}.", record_assumptions(self.fit.problem, errors))
+        return (*missed, *said)
 
     def budget(self) -> Budget:
         """Return the uncertainty budget of the least-squares fit."""

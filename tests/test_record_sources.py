@@ -1,0 +1,116 @@
+"""What the uncertainty of a fit to records counts, and what its verdict says of doubtful values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import dahl_ident as di
+from dahl_ident.arrays import FloatArray
+from tests.test_record_fit import DAHL, RATE, driven, recorded, trajectory
+
+
+def sources(fit: di.RecordFit, name: str) -> dict[str, float]:
+    return {row.source: row.u for row in fit.budget()[name].rows}
+
+
+def test_an_assumed_exponent_counts_as_if_it_were_estimated() -> None:
+    record = recorded(DAHL, "random", 1500, 1e-3)
+    assumed, free = di.fit(record, di.Dahl()), di.fit(record, di.Dahl(alpha=None))
+    assert assumed.trusted
+    assert "Assumed: alpha between 0.5 and 2 (here " in assumed.verdict
+    for name in ("f_max", "sigma"):
+        own, wider = assumed.params[name].stderr, free.params[name].stderr
+        assert own == pytest.approx(wider, rel=0.1)
+    given = di.fit(record, di.Dahl(alpha=1.0))
+    assert "exponent" not in sources(given, "f_max")
+    assert "Assumed: alpha = 1 exactly" in given.verdict
+    assert given.params["f_max"].value == assumed.params["f_max"].value
+
+
+@pytest.mark.parametrize("alpha", [0.5, 0.8, 1.3, 2.0])
+def test_a_wrong_exponent_is_named_and_in_the_budget(alpha: float) -> None:
+    record = recorded(di.Dahl(0.1, 30.0, alpha=alpha), "random", 1500, 1e-3)
+    fit, free = di.fit(record, di.Dahl(), throw=False), di.fit(record, di.Dahl(alpha=None))
+    assert not fit.trusted
+    assert "The records ask for alpha = " in fit.verdict
+    (found,) = fit.errors.exponents
+    assert np.exp(found.mean) == pytest.approx(free.params["alpha"].value, rel=0.03)
+    moved = abs(fit.params["f_max"].value - free.params["f_max"].value)
+    assert sources(fit, "f_max")["exponent"] == pytest.approx(moved, rel=0.05)
+    low, high = fit.conf_interval()["f_max"]
+    assert low <= 0.1 <= high
+
+
+def test_an_assumed_exponent_of_a_driven_motion() -> None:
+    plant = di.Mass(0.3) + di.Damper(0.5) + di.Spring(50.0)
+    start = {"f_max": 0.1, "sigma": 300.0}
+    record = driven(2, 0.01, 1024)
+    fit = di.fit(record, di.Dahl() + plant, start=start)
+    free = di.fit(record, di.Dahl(alpha=None) + plant, start={**start, "alpha": 1.0})
+    for name in start:
+        assert fit.params[name].stderr == pytest.approx(free.params[name].stderr, rel=0.1)
+    (found,) = fit.errors.exponents
+    assert np.exp(found.mean) == pytest.approx(free.params["alpha"].value, abs=1e-4)
+    assert found.std == pytest.approx(free.params["alpha"].stderr, rel=0.1)
+
+
+def test_scatter_between_runs_is_in_the_budget() -> None:
+    count = 6
+    levels = np.random.default_rng(3).standard_normal(count)
+    levels = 1.0 + 0.1 * (levels - levels.mean()) / levels.std(ddof=1)
+    runs = []
+    for seed, level in enumerate(levels.tolist()):
+        clean = recorded(DAHL, "random", 600, 0.0, seed)
+        noise = 1e-3 * np.random.default_rng(seed).standard_normal(600)
+        force = level * clean.force_samples + noise
+        runs.append(di.Record(clean.time, displacement=clean.displacement, force=force))
+    fit = di.fit(runs, di.Dahl(alpha=1.0))
+    found = sources(fit, "f_max")
+    between = np.hypot(found["scatter between runs"], found.get("model error", 0.0))
+    assert between == pytest.approx(0.01 / count**0.5, rel=0.3)
+    assert fit.errors.dof_of("scatter between runs") == count - 1
+    low, high = fit.conf_interval()["f_max"]
+    assert low <= 0.1 <= high
+    assert "a single run" not in fit.verdict
+    alike = di.fit([recorded(DAHL, "random", 600, 1e-3, s) for s in range(count)], di.Dahl())
+    found = sources(alike, "f_max")
+    assert found.get("scatter between runs", 0.0) < 2.0 * found["noise"]
+    assert "a single run" in di.fit(runs[0], di.Dahl()).verdict
+
+
+def test_a_negative_damper_is_said_in_the_verdict_with_what_to_do() -> None:
+    record = recorded(DAHL + di.Damper(-0.3), "multisine", 1500, 1e-3)
+    fit = di.fit(record, di.Dahl() + di.Damper())
+    assert fit.status.value == "approximate"
+    assert "damping is negative (-0.3" in fit.verdict
+    assert "leave the damper out" in fit.verdict
+    given = di.fit(record, di.Dahl() + di.Damper(-0.3))
+    assert "negative" not in given.verdict
+
+
+def test_a_mass_that_rests_on_less_than_the_misfit_is_doubted() -> None:
+    x: FloatArray = trajectory("multisine", 3000)
+    law = di.MaxwellSlip(slips=[5e-4, 2e-3, 4e-3], stiffnesses=[20.0, 10.0, 5.0])
+    noise = 1e-3 * np.random.default_rng(1).standard_normal(x.size)
+    force = law.force(x) + noise
+    record = di.Record(np.arange(x.size) / RATE, displacement=x, force=force)
+    fit = di.fit(record, di.Dahl() + di.Mass(), output="force", throw=False)
+    assert "mass = " in fit.verdict
+    assert "less than the model misses" in fit.verdict
+    right = di.fit(record, di.MaxwellSlip(3) + di.Mass(), output="force", throw=False)
+    assert "less than the model misses" not in right.verdict
+
+
+def test_the_posterior_of_an_approximate_fit_is_approximate() -> None:
+    clean = recorded(DAHL, "random", 1000, 0.0)
+    level = np.repeat(1.0 + 0.05 * np.random.default_rng(3).standard_normal(20), 50)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(1000)
+    force = level * clean.force_samples + noise
+    fit = di.fit(di.Record(clean.time, displacement=clean.displacement, force=force), di.Dahl())
+    assert fit.status.value == "approximate"
+    found = di.posterior(fit, seed=1, steps=400, walkers=64)
+    assert found.converged
+    assert found.status.value == "approximate"
+    assert "The misfit exceeds the noise." in found.verdict
+    assert "alpha between 0.5 and 2" in found.verdict
