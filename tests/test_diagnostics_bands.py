@@ -171,6 +171,29 @@ class TestHarmonics:
             assert error is not None
             assert error < 0.02 * truth
 
+    def test_a_gross_error_of_one_leaves_the_bands_of_the_fundamental_alone(self) -> None:
+        rng = np.random.default_rng(3)
+        A = np.geomspace(3e-4, 3e-2, 12)
+        own = [np.asarray(v) for v in (0.1, 30.0, 1.0)]
+        rows = [
+            Dahl().stiffness(own, A, np.zeros(()), k)
+            * (1.0 + 0.01 * rng.standard_normal((12, 2)) @ [1.0, 1.0j])
+            for k in (1, 3)
+        ]
+        size = np.abs(np.concatenate(rows))
+        stds = []
+        for factor in (1.0, 3.0):
+            rows[1][5] *= factor
+            data = FrequencyResponse(
+                np.ones(24), np.concatenate(rows), np.tile(A, 2), harmonic=np.repeat([1, 3], 12),
+                covariance=1e-4 * size[:, None, None] ** 2 * np.eye(2),
+            )  # fmt: skip
+            found = fit(data, Dahl(), throw=False)
+            stds.append(found.predict(1.0, amplitude=A).log_gain_std)
+        assert found.errors is not None
+        assert "suspicious points" in found.errors.contributions
+        np.testing.assert_allclose(stds[1], stds[0], rtol=0.05)
+
 
 class TestDerived:
     def test_x_c_by_its_formula(self, result: FitResult) -> None:

@@ -144,7 +144,7 @@ def test_the_order_is_answer_assumed_pictures_details(fit: di.FitResult, tmp_pat
         "Result", "Uncertainty budget", "What was assumed", "Pictures", "Signature", "Parameters"
     ]  # fmt: skip
     assumed = text.split("## What was assumed")[1].split("## ")[0]
-    assert "Held fixed: alpha = 1." in assumed
+    assert "Not given, so that the uncertainty counts it: alpha, here 0.996 +- 0.014." in assumed
     assert f"Taken as exact: {listed(fit.budget().exact)}." in assumed
     budget = text.split("## Uncertainty budget")[1].split("## ")[0]
     for row in fit.budget()["f_max"].rows:

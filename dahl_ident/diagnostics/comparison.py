@@ -41,6 +41,7 @@ _SMOOTH = 8  # degree over ln A of what the gain may be whatever the frequency
 _FALSE_ALARM = 1e-4  # of a force that falls with the frequency: one more candidate, to no harm
 _SEEN = 3.0  # rms differences over noise that has been averaged over all rows
 _STATED = "every source"  # of error is counted in what the fit states
+_PLACES = 6  # of a change: less is rounding
 _LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
 
 
@@ -164,7 +165,7 @@ class ModelComparison:
 
     def __str__(self) -> str:
         lines = [self.headline, table([self.columns, *self.rows], left=(0, 1))]
-        lines.append(table([["", *self.columns_of_meanings], *self.meanings]))
+        lines.append(table([["", *self.common], *self.meanings]))
         if self.stated is not None:
             lines.append(f"{_STATED}: the parameters as stated; the others weigh noise alone.")
         lines += [text for m in self.models for text in m.resemblances]
@@ -194,16 +195,16 @@ class ModelComparison:
         return found
 
     @property
-    def columns_of_meanings(self) -> list[str]:
-        """Of :attr:`meanings`, after the first."""
-        return [*([_STATED] if self.stated is not None else []), *(m.name for m in self.models)]
+    def common(self) -> list[str]:
+        """What means the same in all laws: columns of :attr:`meanings`, after the model."""
+        return list(self.models[0].meaning)
 
     @property
     def meanings(self) -> list[list[str]]:
-        """Quantities common to all laws, one row a quantity, one column a model."""
-        stated = [] if self.stated is None else [self.stated]
-        columns = [*stated, *(m.meaning for m in self.models)]
-        return [[key, *(f"{c[key]:.3g}" for c in columns)] for key in columns[0]]
+        """Quantities common to all laws, one row a model, the stated estimate first."""
+        found = [] if self.stated is None else [(_STATED, self.stated)]
+        found += [(m.name, m.meaning) for m in self.models]
+        return [[name, *(f"{meaning[key]:.3g}" for key in self.common)] for name, meaning in found]
 
     def to_frame(self) -> Any:
         """Return a pandas table: one row a model."""
@@ -253,7 +254,7 @@ def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
 
 def _change(value: float, before: float) -> str:
     with np.errstate(all="ignore"):
-        ratio = float(np.float64(value) / before - 1.0)
+        ratio = round(float(np.float64(value) / before - 1.0), _PLACES)
     return percent(ratio) if ratio < 0.0 or not np.isfinite(ratio) else f"+{percent(ratio)}"
 
 

@@ -93,11 +93,12 @@ def prediction_error(
     total = np.trace(covariance, axis1=1, axis2=2)
     if of_a_test:
         near = _nearest(errors.problem, amplitude, omega)
+        first = errors.problem.data.harmonic == 1
         for k, source in enumerate(errors.sources):
             if source.name in (NOISE, APART):
                 own = _noise(errors, source)
-                # a gross error may befall any test, once in as many as there are rows
-                own = own[near] if source.name == NOISE else own.mean(axis=0)[None]
+                # a gross error may befall any test, once in as many as there are fundamentals
+                own = own[near] if source.name == NOISE else own[first].mean(axis=0)[None]
                 squares[k] += np.trace(own, axis1=1, axis2=2)
                 covariance += errors.variances[k] * own
         if errors.problem.scale_known:

@@ -10,7 +10,7 @@ from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.diagnostics.budget import taken_as_exact
 from dahl_ident.diagnostics.comparison import compare_models
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
-from dahl_ident.diagnostics.formatting import listed
+from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.reporting import posterior_sections, provenance, tables
 from dahl_ident.reporting.document import (
@@ -197,9 +197,18 @@ def _budget(fit: FitResult) -> Iterator[Block]:
 
 def _assumed(fit: FitResult) -> Iterator[Block]:
     """Yield the assumptions of the result that these data do not test."""
-    fixed = [_value(p.name, p.value, p.unit) for p in fit.params.values() if not p.vary]
+    errors = fit.errors
+    counted = () if errors is None else errors.assumed
+    held = [p for p in fit.params.values() if not p.vary and p.name not in counted]
+    fixed = [_value(p.name, p.value, p.unit) for p in held]
     exact = taken_as_exact(fit.optimum)
     lines = [f"Held fixed: {listed(fixed)}."] if fixed else []
+    if errors is not None:
+        lines += [
+            f"Not given, so that the uncertainty counts it: {name}, here "
+            f"{with_unit(errors.values[name], errors.stderr[name], fit.params[name].unit)}."
+            for name in counted
+        ]
     if exact:
         lines.append(f"Taken as exact: {listed(exact)}.")
     lines += [f"Prior of {name}: {given}." for name, given in tables.priors(fit).items()]

@@ -180,7 +180,7 @@ def comparison(compared: ModelComparison) -> Table:
 def meanings(compared: ModelComparison) -> Table:
     """Return what means the same in every law."""
     rows = tuple(tuple(map(Cell, row)) for row in compared.meanings)
-    columns = ("quantity", *compared.columns_of_meanings)
+    columns = ("model", *compared.common)
     return Table("Quantities common to all laws", columns, rows)
 
 
