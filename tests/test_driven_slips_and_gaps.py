@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from tests.test_record_laws import assert_recovered
 SAMPLES = 64
 LINEAR = di.Mass(2.0) + di.Damper(10.0) + di.Spring(3e4)
 STIFFNESSES, SLIPS = [2e4, 1e4], [2e-4, 5e-4]
+MANY = [1e4, 8e3, 6e3, 4e3, 3e3, 2e3], [3e-5, 8e-5, 2e-4, 4e-4, 6e-4, 1e-3]
 F_MAX, SIGMA, GAP = 20.0, 4e4, 4e-4
 PLACE = 1e-4  # at the first sample
 
@@ -77,26 +79,24 @@ def by_events(
     return out
 
 
-def slipping() -> FloatArray:
-    """Return the motion beside two Jenkins elements; a flag where one slips."""
+def slipping(stiffnesses: list[float], places: list[float]) -> FloatArray:
+    """Return the motion beside Jenkins elements; a flag where one slips."""
+    n = len(places)
 
     def rates(y: FloatArray, _: float, slips: list[bool]) -> list[float]:
-        own = [0.0 if gone else k * y[1] for k, gone in zip(STIFFNESSES, slips, strict=True)]
-        return [y[2] + y[3], *own]
+        own = [0.0 if gone else k * y[1] for k, gone in zip(stiffnesses, slips, strict=True)]
+        return [float(np.sum(y[2:])), *own]
 
     def guards(y: FloatArray, s: float, slips: list[bool]) -> list[float]:
-        return [
-            -1.0 if slips[i] else s * y[2 + i] - STIFFNESSES[i] * SLIPS[i]
-            for i in range(len(slips))
-        ]
+        return [-1.0 if slips[i] else s * y[2 + i] - stiffnesses[i] * places[i] for i in range(n)]
 
     def passed(y: FloatArray, s: float, slips: list[bool], i: int) -> None:
         if i < 0:
             slips[:] = [False] * len(slips)
         else:
-            slips[i], y[2 + i] = True, s * STIFFNESSES[i] * SLIPS[i]
+            slips[i], y[2 + i] = True, s * stiffnesses[i] * places[i]
 
-    return by_events([0.0, 0.0], rates, guards, passed, [False, False])
+    return by_events([0.0] * n, rates, guards, passed, [False] * n)
 
 
 def crossing() -> FloatArray:
@@ -124,8 +124,9 @@ def crossing() -> FloatArray:
 
 
 LAWS: list[tuple[Element, list[float], Callable[[], FloatArray]]] = [
-    (di.MaxwellSlip(2) + LINEAR, [*STIFFNESSES, *SLIPS], slipping),
+    (di.MaxwellSlip(2) + LINEAR, [*STIFFNESSES, *SLIPS], partial(slipping, STIFFNESSES, SLIPS)),
     (di.Backlash(di.Dahl()) + LINEAR, [F_MAX, SIGMA, GAP], crossing),
+    (di.MaxwellSlip(6) + LINEAR, [*MANY[0], *MANY[1]], partial(slipping, *MANY)),
 ]
 
 
@@ -154,7 +155,10 @@ def test_motion_against_scipy(
     assert error.max() < 1e-8
 
 
-@pytest.mark.parametrize(("law", "values", "start"), [(*LAWS[0][:2], 3.0), (*LAWS[1][:2], 2.5e-4)])
+@pytest.mark.parametrize(
+    ("law", "values", "start"),
+    [(*LAWS[0][:2], 3.0), (*LAWS[1][:2], 2.5e-4), (*LAWS[2][:2], 3.0)],
+)
 def test_slopes_are_derivatives(law: Element, values: list[float], start: float) -> None:
     point = np.array([PLACE, 0.01, start, *values])
     own, forced = plant(law)

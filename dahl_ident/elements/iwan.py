@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.special import beta, betainc
@@ -32,6 +33,7 @@ from dahl_ident.elements.behaviour import SOFTENED, StiffnessGradient
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 
+_SLIDERS = 30  # Jenkins elements in the place of the law where a force drives it
 _REST = 1e-100  # m, below every amplitude allowed: d_m/A does not overflow
 _NARROWEST = 1e-6  # of the onset: near chi = -1 the stiffness is never all there
 _DEEP = 1e-8  # d_m/A below which the incomplete beta function is its series
@@ -66,6 +68,7 @@ class Iwan(Masing):
     D. J. Segalman, A four-parameter Iwan model for lap-type joints, J. Appl. Mech. 72 (2005)
     752-760. Amplitudes of microslip alone determine sigma (beside a spring: its sum with the
     spring's), chi and one coefficient of the power law; f_max and ratio then are not determined.
+    Where a force drives it over time, 30 Jenkins elements take its place.
 
     Examples
     --------
@@ -95,6 +98,30 @@ class Iwan(Masing):
             transform="log", scan=(0.1, 1.0, 10.0), prior=(0.02, 50.0),
         ),
     )  # fmt: skip
+
+    @property
+    def n_states(self) -> int:
+        """The forces of the Jenkins elements in the law's place."""
+        return _SLIDERS
+
+    def sliders(self, values: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
+        """Return stiffnesses and slip displacements whose backbone curve is a polygon in this one.
+
+        The slip displacements are d_m (i/n)^2, and the forces there those of this curve.
+        """
+        _, sigma, chi, ratio = values
+        d = _onset_of(values)
+        places: list[Any] = [0.0]
+        forces: list[Any] = [0.0]
+        for share in (np.arange(1, _SLIDERS + 1) / _SLIDERS).tolist():
+            lost = share ** (2.0 * chi + 2.0) / ((1.0 + ratio) * (chi + 2.0))
+            places.append(d * share**2)
+            forces.append(sigma * places[-1] * (1.0 - lost))
+        slopes = [
+            (forces[i + 1] - forces[i]) / (places[i + 1] - places[i]) for i in range(_SLIDERS)
+        ]
+        stiffnesses = [a - b for a, b in zip(slopes, [*slopes[1:], 0.0], strict=True)]
+        return stiffnesses, places[1:]
 
     @property
     def onset(self) -> float:
@@ -185,8 +212,12 @@ class Iwan(Masing):
 
 def _onset(values: Sequence[FloatArray]) -> FloatArray:
     """Return d_m."""
+    return np.asarray(_onset_of(values))
+
+
+def _onset_of(values: Sequence[Any]) -> Any:
     f_max, sigma, chi, ratio = values
-    return np.asarray(f_max / sigma / (1.0 - 1.0 / ((1.0 + ratio) * (chi + 2.0))))
+    return f_max / sigma / (1.0 - 1.0 / ((1.0 + ratio) * (chi + 2.0)))
 
 
 def _lost_fundamental(m: FloatArray, g: FloatArray) -> ComplexArray:

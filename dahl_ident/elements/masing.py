@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.behaviour import Mechanics
+from dahl_ident.elements.behaviour import Mechanics, clipped
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.recursion import stretches
 from dahl_ident.errors import ModelError
@@ -51,6 +51,17 @@ class Masing(Friction):
             "a law with one state, such as Dahl or BoucWen"
         )
 
+    def sliders(self, values: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
+        """Return stiffnesses and rising slip displacements of the Jenkins elements.
+
+        In plain arithmetic; as many as :attr:`n_states`.
+        """
+        raise ModelError(
+            f"{self!r} says of no Jenkins elements what it consists of, so it cannot be driven by "
+            "a force over time; add sliders() and n_states to it, or give records with measured "
+            "displacement and force"
+        )
+
     def mechanics(
         self,
         values: Sequence[Any],
@@ -59,12 +70,36 @@ class Masing(Friction):
         direction: Any,
         states: Sequence[Any],
     ) -> Mechanics:
-        """Raise ModelError: every Jenkins element would be a state."""
-        raise ModelError(
-            f"{self!r} remembers more than its present force, so it cannot be driven by a force "
-            "over time; use MaxwellSlip with a few slip displacements, or give records with "
-            "measured displacement and force"
-        )
+        """Return the springs' forces, and their changes: none for a spring that slips."""
+        rates = [
+            k * velocity * (k * d - direction * force > 0.0)
+            for k, d, force in zip(*self.sliders(values), states, strict=True)
+        ]
+        return Mechanics(0.0, sum(states), rates)
+
+    def initial_states(self, values: Sequence[Any], start: Any) -> Sequence[Any]:
+        """Return the springs' forces where the backbone curve, loaded from rest, has a force."""
+        stiffnesses, slips = self.sliders(values)
+        place: Any = 0.0
+        reached, sticking, rest = place, sum(stiffnesses), start
+        for k, d in zip(stiffnesses, slips, strict=True):
+            taken = clipped(rest, sticking * (d - reached))
+            place, rest = place + taken / sticking, rest - taken
+            reached, sticking = d, sticking - k
+        return [k * clipped(place, d) for k, d in zip(stiffnesses, slips, strict=True)]
+
+    def state_histories(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray,
+        acceleration: FloatArray,
+    ) -> Sequence[FloatArray]:
+        """Return the springs' forces along a displacement, unchecked, loaded from rest."""
+        return [
+            jenkins_history(float(k), float(d), displacement)
+            for k, d in zip(*self.sliders(values), strict=True)
+        ]
 
     def force_history(
         self,
@@ -217,6 +252,21 @@ class _Paths:
         return np.asarray(
             np.asarray(forces)[path_of] + beyond(np.concatenate(self._places), path_of)
         )
+
+
+def jenkins_history(stiffness: float, slip: float, displacement: FloatArray) -> FloatArray:
+    """Return the force of one Jenkins element along a displacement, from zero.
+
+    Examples
+    --------
+    >>> jenkins_history(2.0, 1.0, np.array([0.0, 1.5, 1.0, -2.0])).tolist()
+    [0.0, 2.0, 1.0, -2.0]
+    """
+    limit, force, forces = stiffness * slip, 0.0, [0.0]
+    for step in (stiffness * np.diff(displacement)).tolist():
+        force = min(max(force + step, -limit), limit)
+        forces.append(force)
+    return np.array(forces)
 
 
 def jenkins(ratio: FloatArray, harmonic: int) -> tuple[ComplexArray, ComplexArray]:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray, positive_array, whole_number
-from dahl_ident.elements.behaviour import Mechanics, StiffnessGradient, clipped
-from dahl_ident.elements.element import Element, Value, prefixed
+from dahl_ident.elements.behaviour import StiffnessGradient
+from dahl_ident.elements.element import Element, prefixed
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ValidationError
@@ -100,53 +100,9 @@ class MaxwellSlip(Masing):
 
     def backbone(self, values: Sequence[FloatArray], displacement: FloatArray) -> FloatArray:
         """Return the sum of k_i min(x, d_i)."""
-        stiffnesses, slips = self._split(values)
+        stiffnesses, slips = self.sliders(values)
         forces = [k * np.minimum(displacement, d) for k, d in zip(stiffnesses, slips, strict=True)]
         return np.asarray(sum(forces))
-
-    @property
-    def n_states(self) -> int:
-        """The force of every spring is a state."""
-        return len(self.parameters) // 2
-
-    def mechanics(
-        self,
-        values: Sequence[Any],
-        displacement: Any,
-        velocity: Any,
-        direction: Any,
-        states: Sequence[Any],
-    ) -> Mechanics:
-        """Return the springs' forces, and their changes: none for a spring that slips."""
-        rates = [
-            k * velocity * (k * d - direction * force > 0.0)
-            for k, d, force in zip(*self._split(values), states, strict=True)
-        ]
-        return Mechanics(0.0, sum(states), rates)
-
-    def initial_states(self, values: Sequence[Any], start: Any) -> Sequence[Any]:
-        """Return the springs' forces where the backbone curve, loaded from rest, has a force."""
-        stiffnesses, slips = self._split(values)
-        place: Any = 0.0
-        reached, sticking, rest = place, sum(stiffnesses), start
-        for k, d in zip(stiffnesses, slips, strict=True):
-            taken = clipped(rest, sticking * (d - reached))
-            place, rest = place + taken / sticking, rest - taken
-            reached, sticking = d, sticking - k
-        return [k * clipped(place, d) for k, d in zip(stiffnesses, slips, strict=True)]
-
-    def state_histories(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray,
-        acceleration: FloatArray,
-    ) -> Sequence[FloatArray]:
-        """Return the springs' forces along a displacement, unchecked, loaded from rest."""
-        return [
-            MaxwellSlip([1.0]).force_history(pair, displacement)
-            for pair in zip(*self._split(values), strict=True)
-        ]
 
     def stiffness(
         self,
@@ -170,7 +126,7 @@ class MaxwellSlip(Masing):
         A = np.asarray(amplitude, dtype=np.float64)
         N = np.zeros(shape, dtype=np.complex128)
         by_A, by_k, by_d = np.zeros_like(N), [], []
-        for k, d in zip(*self._split(values), strict=True):
+        for k, d in zip(*self.sliders(values), strict=True):
             with np.errstate(divide="ignore", over="ignore"):
                 unit, by_ratio = jenkins(np.asarray(d) / A, harmonic)
             safe = np.where(A > 0.0, A, 1.0)
@@ -190,15 +146,20 @@ class MaxwellSlip(Masing):
 
     def rest_stiffness(self, values: Sequence[FloatArray]) -> FloatArray:
         """Return the sum of all stiffnesses."""
-        return np.asarray(sum(np.asarray(k) for k in self._split(values)[0]))
+        return np.asarray(sum(np.asarray(k) for k in self.sliders(values)[0]))
 
     def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Return the smallest and the largest slip displacement."""
-        slips = np.array(np.broadcast_arrays(*self._split(values)[1]))
+        slips = np.array(np.broadcast_arrays(*self.sliders(values)[1]))
         return slips.min(axis=0), slips.max(axis=0)
 
-    @staticmethod
-    def _split(values: Sequence[Value]) -> tuple[Sequence[Value], Sequence[Value]]:
+    @property
+    def n_states(self) -> int:
+        """The force of every spring is a state."""
+        return len(self.parameters) // 2
+
+    def sliders(self, values: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
+        """Return stiffnesses and slip displacements."""
         n = len(values) // 2
         return values[:n], values[n:]
 

@@ -23,12 +23,14 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.recursion import matrix_recursion
 from dahl_ident.errors import FitError
+from dahl_ident.time_domain.marching import March
 from dahl_ident.time_domain.plant import Plant
 from dahl_ident.time_domain.runge_kutta import PLACES
 from dahl_ident.time_domain.vectorised import BLOCK
 
 _PLACES = np.array(PLACES[:6])  # of the drive: the seventh stage is at the second's
-_PIECES = 6  # parts that a step is divided into at most
+_PIECES = 6  # parts that a step is divided into at most, and one more for every switch
+_KINKS = 4  # switching functions beyond which the motion is found step by step
 _LOCATING = 8  # Newton steps for a passage through zero, at most
 _LOCATED = 1e-9  # of a step: the error of the next Newton step is below rounding
 _SMALL = 1e-6  # of a switching function's largest value: more is not near to its passage
@@ -100,6 +102,8 @@ class ForcedMotion:
         FitError
             If the motion grows beyond all bounds.
         """
+        if self.plant.n_switches > _KINKS:
+            return self._march(values, first, derivatives=False)[0]
         motion = guess.copy()
         motion[0] = first
         found = self._newton(values, motion, self._n)
@@ -107,6 +111,22 @@ class ForcedMotion:
             motion[1:] = first
             found = self._newton(values, motion, _SEGMENT)
         return self._marched(values, motion) if found is None else found
+
+    def _march(
+        self, values: FloatArray, first: FloatArray, *, derivatives: bool
+    ) -> tuple[FloatArray, FloatArray]:
+        march = March(self.plant, values, self._length, derivatives=derivatives)
+        with np.errstate(all="ignore"):
+            found = march.run(first, self._drive)
+        if found is None:
+            raise self._beyond_bounds(values)
+        return found
+
+    def _beyond_bounds(self, values: FloatArray) -> FitError:
+        return FitError(
+            "the motion grows beyond all bounds at the parameters "
+            f"{dict(zip(self.plant.free, values.tolist(), strict=True))}"
+        )
 
     def _marched(self, values: FloatArray, motion: FloatArray) -> FloatArray:
         """Return the motion stretch by stretch, each guessed to stay where it begins."""
@@ -122,10 +142,7 @@ class ForcedMotion:
             elif width > 1:
                 width = max(1, width // _SHORTER)
             else:
-                raise FitError(
-                    "the motion grows beyond all bounds at the parameters "
-                    f"{dict(zip(self.plant.free, values.tolist(), strict=True))}"
-                )
+                raise self._beyond_bounds(values)
         return motion
 
     def sensitivities(self, values: FloatArray, motion: FloatArray) -> FloatArray:
@@ -141,6 +158,8 @@ class ForcedMotion:
         -------
         ndarray, shape (n, order, order + P)
         """
+        if self.plant.n_switches > _KINKS:
+            return self._march(values, motion[0], derivatives=True)[1]
         flow = self.flow(values, motion[:-1], derivatives=2)
         order, count = self.plant.order, flow.by_value.shape[2]
         terms = np.zeros((self._n, order, order + count))
@@ -349,7 +368,8 @@ class ForcedMotion:
             total = np.zeros((order, order + count, n))
             total[np.arange(order), np.arange(order)] = 1.0
         active: NDArray[np.intp] = np.arange(n)
-        for piece in range(_PIECES):
+        pieces = _PIECES + len(sides)
+        for piece in range(pieces):
             part = _Part(
                 y[:, active], coefficients[:, active], done[active], direction[active],
                 sides[:, active],
@@ -360,7 +380,7 @@ class ForcedMotion:
             divided = which[:0]
             # a switch may pass through zero before the motion turns, and back until the step's end
             for _ in range(1 + min(1, self.plant.n_switches)):
-                if piece == _PIECES - 1:
+                if piece == pieces - 1:
                     break
                 changed = self._earliest(values, part, after, first, which)
                 if changed.size:

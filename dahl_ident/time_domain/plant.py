@@ -21,6 +21,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Model
 from dahl_ident.errors import ModelError
+from dahl_ident.time_domain.one_state import Inputs, OneState, one_state
 from dahl_ident.time_domain.runge_kutta import step
 from dahl_ident.time_domain.switches import on_one_branch
 from dahl_ident.time_domain.vectorised import Evaluator, vectorised
@@ -101,32 +102,48 @@ class Plant:
         push = self._drive if self.excitation == "force" else -inertia * self._drive
         return ca.vertcat(v, (push - total) / inertia, *slopes)
 
-    def _function(self, output: Callable[[ca.SX], ca.SX]) -> Evaluator:
-        """Return an array function of state, drives, length, direction, sides, free values."""
+    def _stepped(self, output: Callable[[ca.SX], ca.SX]) -> tuple[Inputs, ca.SX]:
+        """Return an output of state, drives with length, direction with sides, free values."""
         drives = [ca.SX.sym(f"u{i}") for i in range(6)]
         length = ca.SX.sym("h")
         state = ca.vertcat(*self._state)
         constant = [self._direction, *self._sides, *self._free]
         rates = ca.Function("rates", [state, self._drive, *constant], [self._held])
         after = step(lambda at, drive: rates(at, drive, *constant), state, drives, length)
-        return vectorised([*self._state, *drives, length, *constant], output(after))
+        signs = [self._direction, *self._sides]
+        return (self._state, [*drives, length], signs, self._free), output(after)
+
+    def _at_all(self, after: ca.SX) -> ca.SX:
+        at = ca.vertcat(*self._state, *self._free)
+        return ca.vertcat(after, ca.vec(ca.jacobian(after, at)))
 
     @cached_property
     def advance(self) -> Evaluator:
         """The state after a step."""
-        return self._function(lambda after: after)
+        return _arrays(*self._stepped(lambda after: after))
 
     @cached_property
     def advance_by_state(self) -> Evaluator:
         """The state after a step, then its derivatives by the state, column by column."""
         state = ca.vertcat(*self._state)
-        return self._function(lambda after: ca.vertcat(after, ca.vec(ca.jacobian(after, state))))
+        return _arrays(
+            *self._stepped(lambda after: ca.vertcat(after, ca.vec(ca.jacobian(after, state))))
+        )
 
     @cached_property
     def advance_by_all(self) -> Evaluator:
         """As :attr:`advance_by_state`, then the derivatives by the parameters."""
-        at = ca.vertcat(*self._state, *self._free)
-        return self._function(lambda after: ca.vertcat(after, ca.vec(ca.jacobian(after, at))))
+        return _arrays(*self._stepped(self._at_all))
+
+    @cached_property
+    def one_advance(self) -> OneState:
+        """As :attr:`advance`, for one state."""
+        return one_state(*self._stepped(lambda after: after))
+
+    @cached_property
+    def one_advance_by_all(self) -> OneState:
+        """As :attr:`advance_by_all`, for one state."""
+        return one_state(*self._stepped(self._at_all))
 
     @cached_property
     def _first(self) -> Evaluator:
@@ -165,7 +182,12 @@ class Plant:
     @cached_property
     def push(self) -> Evaluator:
         """The acceleration, of state, drive, direction, sides and free values."""
-        return self._at_a_moment([self._held[1]])
+        return _arrays(*self._at_a_moment([self._held[1]]))
+
+    @cached_property
+    def one_push(self) -> OneState:
+        """As :attr:`push`, for one state."""
+        return one_state(*self._at_a_moment([self._held[1]]))
 
     @cached_property
     def switches(self) -> Evaluator:
@@ -173,9 +195,16 @@ class Plant:
 
         Of state, drive, direction, sides and free values.
         """
+        return _arrays(*self._at_a_moment(self._switching()))
+
+    @cached_property
+    def one_switches(self) -> OneState:
+        """As :attr:`switches`, for one state."""
+        return one_state(*self._at_a_moment(self._switching()))
+
+    def _switching(self) -> list[ca.SX]:
         functions = ca.vertcat(self._state[1], *self._switches)
-        rates = ca.jacobian(functions, ca.vertcat(*self._state)) @ self._held
-        return self._at_a_moment([functions, rates])
+        return [functions, ca.jacobian(functions, ca.vertcat(*self._state)) @ self._held]
 
     @cached_property
     def passages(self) -> tuple[Evaluator, ...]:
@@ -185,15 +214,21 @@ class Plant:
         which puts right what the place is off; then the derivatives by state and free parameters
         of the state after it: the rates may jump, and other values pass at another time.
         """
+        return tuple(_arrays(*self._at_a_moment(found)) for found in self._passing())
+
+    @cached_property
+    def one_passages(self) -> tuple[OneState, ...]:
+        """As :attr:`passages`, for one state."""
+        return tuple(one_state(*self._at_a_moment(found)) for found in self._passing())
+
+    def _passing(self) -> Iterator[list[ca.SX]]:
         at = ca.vertcat(*self._state, *self._free)
-        found = []
         for function, side in zip(self._switches, self._sides, strict=True):
             jump = ca.substitute(self._held, side, -side) - self._held
             speed = ca.jacobian(function, ca.vertcat(*self._state)) @ self._held
             late = ca.if_else(speed == 0.0, 0.0 * jump, jump / speed)
             by = ca.jacobian(ca.vertcat(*self._state), at) + late @ ca.jacobian(function, at)
-            found.append(self._at_a_moment([late * function, ca.vec(by)]))
-        return tuple(found)
+            yield [late * function, ca.vec(by)]
 
     @cached_property
     def acceleration(self) -> Evaluator:
@@ -202,8 +237,13 @@ class Plant:
         Of state, drive, direction, sides and free values.
         """
         at = ca.vertcat(*self._state, *self._free)
-        return self._at_a_moment([self._held[1], ca.vec(ca.jacobian(self._held[1], at))])
+        found = [self._held[1], ca.vec(ca.jacobian(self._held[1], at))]
+        return _arrays(*self._at_a_moment(found))
 
-    def _at_a_moment(self, outputs: list[ca.SX]) -> Evaluator:
-        inputs = [*self._state, self._drive, self._direction, *self._sides, *self._free]
-        return vectorised(inputs, ca.vertcat(*outputs))
+    def _at_a_moment(self, outputs: list[ca.SX]) -> tuple[Inputs, ca.SX]:
+        signs = [self._direction, *self._sides]
+        return (self._state, [self._drive], signs, self._free), ca.vertcat(*outputs)
+
+
+def _arrays(inputs: Inputs, outputs: ca.SX) -> Evaluator:
+    return vectorised([symbol for group in inputs for symbol in group], outputs)

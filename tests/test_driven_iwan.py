@@ -1,0 +1,158 @@
+"""Iwan's law driven by a force, against an integration with its exact memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dahl_ident as di
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements import Model, iwan
+from dahl_ident.time_domain import ForcedMotion, Plant, band_limited
+from tests.test_forced_motion import RATE, multisine
+from tests.test_record_laws import assert_recovered
+
+M, C, K = 2.0, 10.0, 3e4
+LINEAR = di.Mass(M) + di.Damper(C) + di.Spring(K)
+VALUES = [20.0, 4e4, -0.5, 1.0]
+LAW = di.Iwan(*VALUES)
+
+
+class Memory:
+    """The turning points that the law remembers, and the force on from the last one."""
+
+    def __init__(self) -> None:
+        self.turns: list[tuple[float, float]] = []
+
+    def force(self, x: float) -> float:
+        at = [np.asarray(v) for v in VALUES]
+        if not self.turns:
+            return float(np.sign(x) * LAW.backbone(at, np.asarray(abs(x))))
+        place, force = self.turns[-1]
+        path = abs(x - place)
+        return float(force + np.sign(x - place) * 2.0 * LAW.backbone(at, np.asarray(0.5 * path)))
+
+    def limit(self) -> float:
+        """Return the displacement at which the present path ends."""
+        if not self.turns:
+            return np.inf
+        return self.turns[-2][0] if len(self.turns) > 1 else -self.turns[0][0]
+
+
+def exact(samples: int, drive: Callable[[float], float]) -> FloatArray:
+    """Return displacements by DOP853, stopped at every turn and where a loop closes."""
+    times, memory = np.arange(samples) / RATE, Memory()
+    out, filled, now, y = np.empty(samples), 0, 0.0, np.zeros(2)
+    s = 1.0 if drive(0.0) > 0.0 else -1.0
+    while filled < samples:
+
+        def rates(t: float, y: FloatArray) -> list[float]:
+            return [y[1], (drive(t) - C * y[1] - K * y[0] - memory.force(float(y[0]))) / M]
+
+        def turn(_: float, y: FloatArray) -> float:
+            return float(y[1])
+
+        def close(_: float, y: FloatArray, s: float = s) -> float:
+            return float(s * (y[0] - memory.limit())) if memory.turns else -1.0
+
+        for event, way in ((turn, -s), (close, 1.0)):
+            event.terminal, event.direction = True, way  # type: ignore[attr-defined]
+        found = solve_ivp(
+            rates, (now, times[-1] + 1e-9), y, method="DOP853", rtol=1e-10, atol=1e-13,
+            max_step=0.3 / RATE, events=[turn, close], dense_output=True,
+        )  # fmt: skip
+        now, y = float(found.t[-1]), found.y[:, -1].copy()
+        here = times[filled:][times[filled:] <= now]
+        if here.size and found.sol is not None:
+            out[filled : filled + here.size] = found.sol(here)[0]
+            filled += here.size
+        turned, closed = found.t_events or ((), ())
+        if len(turned):
+            memory.turns.append((float(y[0]), memory.force(float(y[0]))))
+            y[1], s = 0.0, -s
+        elif len(closed):
+            del memory.turns[-2:]
+    return out
+
+
+def driven(model: Model, wave: FloatArray, substeps: int = 8) -> ForcedMotion:
+    return ForcedMotion(Plant(model, "force"), band_limited(wave, 1 / RATE, substeps), 1 / RATE)
+
+
+def motion(wave: FloatArray) -> FloatArray:
+    forced = driven(Model(LAW + LINEAR), wave)
+    rest = np.zeros((wave.size, forced.plant.order))
+    return forced.solve(np.zeros(0), rest[0], rest)[:, 0]
+
+
+@pytest.mark.parametrize("values", [[2.0, 5.0, -0.9, 0.1], VALUES, [1.0, 1.0, 1.5, 0.3]])
+def test_elements_are_a_polygon_in_the_backbone_curve(values: list[float]) -> None:
+    law = di.Iwan(*values)
+    stiffnesses, places = law.sliders(values)
+    slips = di.MaxwellSlip(places, stiffnesses)
+    assert places[-1] == pytest.approx(law.onset)
+    np.testing.assert_allclose(
+        slips.force([0.0, *places]), law.force([0.0, *places]), rtol=1e-12, atol=1e-14
+    )
+    x = law.onset * np.linspace(0.0, 1.2, 3001)
+    g, ratio = values[2] + 1.0, values[3]
+    most = values[0] * g * (g + 1.0) / (2.0 * 30**2 * (ratio * (g + 1.0) + g))
+    error = law.force(x) - slips.force(x)
+    assert error.min() > -1e-12 * values[0]
+    assert 0.9 * most < error.max() < 1.1 * most
+
+
+def test_harmonics_have_the_error_that_is_stated() -> None:
+    for chi in (-0.9, -0.5, 0.0):
+        for ratio in (0.1, 1.0):
+            law = di.Iwan(1.0, 1.0, chi, ratio)
+            slips = di.MaxwellSlip(*law.sliders([1.0, 1.0, chi, ratio])[::-1])
+            A = law.onset * np.geomspace(0.1, 10.0, 60)
+            exact_one, other = (e.dynamic_stiffness(A) for e in (law, slips))
+            assert np.abs(other / exact_one - 1.0).max() < 2e-3
+            assert np.abs(other.imag / exact_one.imag - 1.0).max() < 0.02
+
+
+def test_motion_converges_to_that_of_the_exact_law(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = 128
+    wave, drive = multisine(samples)
+    truth = exact(samples, drive)
+    assert np.abs(truth).max() > 5.0 * LAW.onset
+    errors = []
+    for n in (30, 240):
+        monkeypatch.setattr(iwan, "_SLIDERS", n)
+        errors.append(float(np.abs(motion(wave) - truth).max() / np.abs(truth).max()))
+    assert errors[0] < 1e-4
+    assert errors[1] < errors[0] / 50.0
+
+
+def test_slopes_are_derivatives() -> None:
+    wave, _ = multisine(64)
+    forced = driven(Model(di.Iwan() + di.Mass() + di.Damper() + di.Spring()), wave)
+    plant, point = forced.plant, np.array([1e-4, 0.01, 3.0, *VALUES, M, C, K])
+
+    def solved(at: FloatArray) -> FloatArray:
+        return forced.solve(at[3:], plant.first(at[:3], at[3:])[0], np.zeros((64, plant.order)))
+
+    states = solved(point)
+    slopes = forced.sensitivities(point[3:], states)
+    total = slopes[:, :, : plant.order] @ plant.first(point[:3], point[3:])[1]
+    total[:, :, 3:] += slopes[:, :, plant.order :]
+    for i in range(point.size):
+        h = np.zeros(point.size)
+        h[i] = 1e-6 * abs(point[i])
+        expected = (solved(point + h) - solved(point - h))[:, :2] / (2.0 * h[i])
+        error = np.abs(total[:, :2, i] - expected).max(axis=0) / np.abs(expected).max(axis=0)
+        assert error.max() < 2e-6, i
+
+
+def test_recovered_from_a_motion_of_the_exact_law() -> None:
+    wave, drive = multisine(384)
+    x = exact(384, drive)
+    x = x + 1e-3 * x.std() * np.random.default_rng(0).standard_normal(x.size)
+    record = di.Record(np.arange(x.size) / RATE, displacement=x, force=wave)
+    fit = di.fit(record, di.Iwan() + di.Mass() + di.Damper() + di.Spring())
+    assert_recovered(fit, Model(LAW + LINEAR))
