@@ -113,6 +113,8 @@ class Sensors:
         return self._with(values)
 
     def _with(self, changes: Mapping[str, float | Prior | None]) -> Sensors:
+        if not changes:
+            return self
         current = {p.name: getattr(self, p.name) for p in self.parameters}
         return Sensors(**{**current, **changes})
 

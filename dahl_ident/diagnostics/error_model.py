@@ -369,7 +369,7 @@ def _estimated(
     noise: tuple[Source, ...] | None = None
     dof = problem.n_numbers - len(problem.names)
     shared = StructuredSources(problem, theta) if _tells(problem, assumed) else None
-    last: FloatArray | None = None
+    starts: dict[tuple[int, ...] | None, FloatArray] = {}
     runs: RunDeviations | None = None
     for step in range(_STEPS):
         near = linearization(problem, theta, runs)
@@ -385,11 +385,9 @@ def _estimated(
             if rest and m <= 2 * _FEW_ROWS
             else of_one_scale(problem)
         )
-        (sources, linear, found), last = _supported(
-            problem, y, J, noise or plain, rest, level, last
-        )
+        sources, linear, found = _supported(problem, y, J, noise or plain, rest, level, starts)
         if noise is None and step == 1:
-            noise, last = plain, None
+            noise = plain
             if rest and m <= 2 * _FEW_ROWS:
                 kinds = (
                     () if problem.scale_known else gain_and_phase(problem),
@@ -399,11 +397,14 @@ def _estimated(
                 noise, sources, linear, found = _kind_of_noise(
                     problem, y, J, (sources, linear, found), level, (plain, *kinds)
                 )
+            # far from the optimum all sources may have been led to a lower maximum
+            starts = {k: s for k, s in starts.items() if k is not None and noise is plain}
         projection = Projection(linear, found.variances)
         G = projection.generalised_inverse()
-        G = G if basis is None else basis.matrix @ G
+        covariance = projection.covariance()
+        if basis is not None:
+            G, covariance = basis.matrix @ G, basis.matrix @ covariance @ basis.matrix.T
         move = -G @ linear.y
-        covariance = G @ linear.covariance(found.variances) @ G.T
         std = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))  # below zero by rounding
         before, runs = runs, run_deviations(problem, sources, projection.effects())
         settled = step > 1 and bool(np.all(np.abs(move) < _SETTLED * std))
@@ -464,18 +465,20 @@ def _supported(
     noise: tuple[Source, ...],
     rest: tuple[Source, ...],
     level: float,
-    start: FloatArray | None,
-) -> tuple[_Found, FloatArray]:
+    starts: dict[tuple[int, ...] | None, FloatArray],
+) -> _Found:
     """Return the sources; model errors and noise of the amplitudes where the data ask for them.
 
-    Also the variances with all sources, to start from at the next estimate.
+    `starts` has the variances with all sources (None) and with those of each subset that were
+    estimated last; these ones take their place.
     """
     every = (*noise, *rest)
     linear, contrasts = linear_model(problem, y, J, every)
     upper = np.array([s.largest for s in every])
     scales = np.array([s.columns.ndim == 1 and not problem.scale_known for s in every])
     floor = np.where(scales, level, 0.0)
-    whole = variance_components(contrasts, floor if start is None else start, upper)
+    whole = variance_components(contrasts, np.minimum(starts.get(None, floor), upper), upper)
+    starts[None] = whole.variances
     optional = np.array([i >= len(noise) and s.name in _ASKED_FOR for i, s in enumerate(every)])
     # what has no variance beside all others has none beside fewer that explain as much
     asked = np.flatnonzero(optional & (whole.variances > 0.0)).tolist()
@@ -489,8 +492,10 @@ def _supported(
             kept = ~optional
             kept[list(subset)] = True
             most = np.where(kept, upper, 0.0)
-            begin = np.minimum(np.where(whole.variances > 0.0, whole.variances, floor), most)
+            begin = np.where(whole.variances > 0.0, whole.variances, floor)
+            begin = np.minimum(starts.get(subset, begin), most)
             trial = variance_components(contrasts, begin, most)
+            starts[subset] = trial.variances
             value = trial.log_likelihood - price
             if value > best_value:
                 best, best_value = trial, value
@@ -502,7 +507,7 @@ def _supported(
         replace(
             best, variances=best.variances[kept], information=best.information[np.ix_(kept, kept)]
         ),
-    ), whole.variances
+    )
 
 
 def _asked_for(source: Source) -> float:

@@ -23,13 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import TINY, FloatArray
 
 _STEPS = 40  # at most; the likelihood rises in each, so the last is the best
 _FEW = 3  # residuals over columns of sources beyond which columns are quicker
 _DENSE = 60  # residuals up to which dense matrices are quicker in any case
 _LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.02)  # of a scoring step, until the likelihood rises
 CLOSE = 1e-3  # rise of the log-likelihood that no longer matters
+_SETTLED = 1e-5  # twice the rise that a step promises, below which it is not made
 _ALIKE = 1e-10  # added to correlations of one: sources that do the same share a variance
 _LEAST = 1e-10  # variance over the largest, below which it is none
 
@@ -137,7 +138,10 @@ class Projection:
         self._model, self._variances = model, variances
         L = np.linalg.cholesky(model.covariance(variances))
         inverse_factor = linalg.lapack.dtrtri(L, lower=1)[0]
-        Q, self._R = np.linalg.qr(inverse_factor @ model.J)
+        Q, R = np.linalg.qr(inverse_factor @ model.J)
+        self._root, singular = linalg.lapack.dtrtri(R)
+        if singular:
+            raise np.linalg.LinAlgError("a parameter has no effect on the residuals")
         self._explained = Q.T @ inverse_factor
         self.P = inverse_factor.T @ inverse_factor - self._explained.T @ self._explained
 
@@ -151,7 +155,11 @@ class Projection:
 
     def generalised_inverse(self) -> FloatArray:
         """Return G = (J' V^-1 J)^-1 J' V^-1, shape (P, m)."""
-        return np.asarray(linalg.solve_triangular(self._R, self._explained))
+        return np.asarray(self._root @ self._explained)
+
+    def covariance(self) -> FloatArray:
+        """Return (J' V^-1 J)^-1 = G V G', shape (P, P)."""
+        return np.asarray(self._root @ self._root.T)
 
 
 def block_diagonal(blocks: FloatArray) -> FloatArray:
@@ -381,6 +389,8 @@ def variance_components(
     state = contrasts.at(s)
     for _ in range(_STEPS):
         step = _projected(s, state.gradient, state.information, s >= upper)
+        if state.gradient @ step < _SETTLED:
+            break
         found = _along(contrasts, state, s, step, upper)
         if found is None:
             break
@@ -395,14 +405,16 @@ def _projected(
     s: FloatArray, gradient: FloatArray, information: FloatArray, largest: NDArray[np.bool_]
 ) -> FloatArray:
     """Return the scoring step of the variances that are not held at zero or at their largest."""
-    active = ((s > 0.0) | (gradient > 0.0)) & ~(largest & (gradient > 0.0))
+    rising = gradient > 0.0
+    active = ((s > 0.0) | rising) & ~(largest & rising)
     step = np.zeros(len(s))
     scaled, size = _scaled(information)
-    scaled[np.diag_indices(len(s))] += _ALIKE
+    scaled.flat[:: len(s) + 1] += _ALIKE
+    rise = size * gradient
     while active.any():
+        part = np.flatnonzero(active)
         step[:] = 0.0
-        step[active] = np.linalg.solve(scaled[active][:, active], (size * gradient)[active])
-        step *= size
+        step[part] = size[part] * linalg.lapack.dgesv(scaled[np.ix_(part, part)], rise[part])[2]
         leaving = active & (((s == 0.0) & (step <= 0.0)) | (largest & (step > 0.0)))
         if not leaving.any():
             break
@@ -416,8 +428,8 @@ def _scaled(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     Variances of runs and of noise may lie many decades apart. Where rounding leaves no information
     on one, its unit is 0.
     """
-    own = np.diagonal(information)
-    known = own > np.finfo(float).tiny
+    own = information.diagonal()
+    known = own > TINY
     size = known / np.sqrt(np.where(known, own, 1.0))
     scaled = information * size * size[:, None]
     return np.minimum(np.maximum(scaled, -1.0), 1.0), size
