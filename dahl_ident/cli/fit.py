@@ -16,7 +16,7 @@ from dahl_ident.cli.files import written
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import STANDARD, Files, General, Reading, Writing, one_of
-from dahl_ident.errors import FitInterrupted
+from dahl_ident.errors import DataError, FitInterrupted, ValidationError
 
 if TYPE_CHECKING:
     from dahl_ident.data import Record
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _ESTIMATING = "Estimating"
 TAKEN = ("model", "free", "fixed", "start")  # by a fit of records
+_OF_RECORDS = ("columns", "drive_factor", "drive_factor_uncertainty", "sheet")
 ReportPlace = Annotated[
     str | None,
     typer.Option(help="Report to write: .html, .pdf, .md or .json; - is HTML on standard output."),
@@ -32,6 +33,14 @@ ReportPlace = Annotated[
 
 AsRecords = Annotated[
     bool, typer.Option("--record", help="The files are records of any motion; each is a run.")
+]
+Predicted = Annotated[
+    str | None,
+    typer.Option(
+        help="With --record: force or motion is predicted from the other; by default motion where "
+        "the model has a mass.",
+        callback=one_of("force", "motion"),
+    ),
 ]
 
 
@@ -94,6 +103,7 @@ def fit(
         bool, typer.Option("--compare", help="Compare with other models of the friction.")
     ] = False,
     record: AsRecords = False,
+    predicted: Predicted = None,
 ) -> None:
     """Estimate a model's parameters, and state whether the data determine them.
 
@@ -108,8 +118,16 @@ def fit(
     if save is not None:
         place_of(save, "a fit", FORMATS)
     if record:
-        _fit_records(files, general, model, estimating, writing, report, save)
+        if compare:
+            raise ValidationError("--compare is given together with --record; it takes tables")
+        how = refuse_for_tables(
+            "fit", {**model.keywords(), **estimating.keywords()}, Estimating().keywords()
+        )
+        result = _fit_records(read_records(files, reading), {**how, "output": predicted})
+        _tell_records(result, general, writing, report, save, verbose=verbose)
         return
+    if predicted is not None:
+        raise ValidationError("--predicted is given without --record; leave it out")
     result = fitted(files, reading, model, estimating)
     if save is not None:
         result.save(save, overwrite=writing.overwrite)
@@ -126,31 +144,75 @@ def fit(
     finish(result)
 
 
-def read_records(files: list[str]) -> list[Record]:
-    """Return the records of the files, each a run."""
+def read_records(files: list[str], reading: Reading) -> list[Record]:
+    """Return the records of the files, each a run; options of tables alone are refused."""
     from dahl_ident.data import read_record
 
-    return [read_record(name) for name in files]
+    given, usual = vars(reading), vars(Reading())
+    idle = [name for name in given if given[name] != usual[name] and name not in _OF_RECORDS]
+    if idle:
+        raise ValidationError(
+            f"{', '.join(option(name) for name in idle)} is given together with --record; of the "
+            "options of reading, records take --columns (a column map names each channel, "
+            "displacement and force; dahl-ident inspect proposes one), --drive-factor, "
+            "--drive-factor-uncertainty and --sheet"
+        )
+    how = {name: given[name] for name in _OF_RECORDS}
+    try:
+        return [read_record(name, **how) for name in files]
+    except DataError as exc:
+        if "Name it, such as displacement=" not in str(exc):
+            raise
+        text = str(exc).replace(
+            "Name it, such as displacement='x'",
+            "Name it in a column map (--columns map.toml; dahl-ident inspect proposes one)",
+        )
+        raise DataError(text) from exc
 
 
-def _fit_records(
-    files: list[str],
-    general: General,
-    model: ModelOptions,
-    estimating: Estimating,
-    writing: Writing,
-    report: str | None,
-    save: Path | None,
-) -> None:
+def refuse_for_tables(
+    what: str, given: dict[str, Any], usual: dict[str, Any], taken: tuple[str, ...] = TAKEN
+) -> dict[str, Any]:
+    """Return the options that an estimation from records takes; others given are refused."""
+    refused = [
+        option(name)
+        for name, value in given.items()
+        if name in usual and name not in taken and value != usual[name]
+    ]
+    if refused:
+        raise ValidationError(
+            f"{', '.join(refused)} is given together with --record; a {what} of records takes "
+            "none of them"
+        )
+    return {name: value for name, value in given.items() if name in taken}
+
+
+def option(name: str) -> str:
+    """Return how an argument is written on the command line."""
+    return f"--{name.replace('_', '-')}"
+
+
+def _fit_records(records: list[Record], how: dict[str, Any]) -> RecordFit:
     """Fit records of any motion sample by sample."""
     from dahl_ident.results import fit as fit_data
 
-    how = {k: v for k, v in {**model.keywords(), **estimating.keywords()}.items() if k in TAKEN}
     try:
-        result = fit_data(read_records(files), throw=False, progress=sys.stderr.isatty(), **how)
+        return fit_data(records, throw=False, progress=sys.stderr.isatty(), **how)
     except FitInterrupted as stop:
         console.write(stop.result.fit_report())
         raise
+
+
+def _tell_records(
+    result: RecordFit,
+    general: General,
+    writing: Writing,
+    report: str | None,
+    save: Path | None,
+    *,
+    verbose: bool,
+) -> None:
+    """Print, store and judge a fit of records."""
     if save is not None:
         result.save(save, overwrite=writing.overwrite)
     if general.json:
@@ -162,10 +224,12 @@ def _fit_records(
             }
         )
     elif report != STANDARD:
-        console.write(result.fit_report())
+        console.write_wrapped(result.fit_report(details=verbose))
+        if not verbose:
+            console.write("-v prints the budget, the records' own values and the residuals")
     if report is not None:
         write_report_beside([result], report, writing)
-    console.finish(result.status.usable, result.statements[0].partition(". ")[2])
+    finish(result)
 
 
 def fitted(

@@ -18,6 +18,7 @@ from dahl_ident.cli.fit import (
     check_reports,
     finish,
     read_records,
+    refuse_for_tables,
     write_report_beside,
 )
 from dahl_ident.cli.model import ModelOptions
@@ -143,7 +144,7 @@ def sample(
     check_reports(report)
     sampling.check(report)
     plant, how = model.keywords(), sampling.keywords()
-    data = read_records(files) if record else reading.read(files)
+    data = read_records(files, reading) if record else reading.read(files)
     if record:
         plant, how = _for_records(plant, how)
     try:
@@ -164,19 +165,9 @@ def _for_records(
     plant: dict[str, Any], how: dict[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the options that a posterior of records takes; others that were given are refused."""
-    own, usual = {**plant, **how}, Sampling()
-    refused = [
-        f"--{name}"
-        for name in ("method", "noise", "likelihood", "uncertainty")
-        if own[name] != getattr(usual, name)
-    ]
-    if refused:
-        raise ValidationError(
-            f"{', '.join(refused)} is given together with --record; a posterior of records takes "
-            "none of them"
-        )
+    own = refuse_for_tables("posterior", {**plant, **how}, vars(Sampling()), (*TAKEN, *_CHAIN))
     chain = [n for n in ("priors", *_CHAIN, "progress") if n in how]
-    return {n: plant[n] for n in TAKEN if n in plant}, {n: how[n] for n in chain}
+    return {n: own[n] for n in TAKEN if n in own}, {n: how[n] for n in chain}
 
 
 def _kept(chain: Path | None) -> str:

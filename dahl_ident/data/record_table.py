@@ -83,6 +83,9 @@ def record_from(
         raise DataError(f"{source.name}: {exc}") from exc
 
 
+_PLANNED = {"step", "measured"}  # columns of a waveform that a plan wrote
+
+
 def record_size(source: Source, columns: ColumnMap) -> int:
     """Return how many samples the record of a source has; nothing is read."""
     return next(iter(_channels(Binding(source, columns, RECORD_NAMES)).values())).size
@@ -107,6 +110,11 @@ def _channels(bound: Binding) -> dict[str, Channel]:
         if channel is not None:
             found[role] = channel
     if not {"force", "drive"} & found.keys():
+        if {c.name for c in bound.source.channels} >= _PLANNED:
+            raise DataError(
+                f"{bound.source.name}: a waveform for the exciter, as a plan writes it, holds no "
+                "measured force. Play it, record displacement and force, and read that record"
+            )
         bound.required("force")
     return found
 

@@ -16,8 +16,10 @@ from dahl_ident.problem.record_noise import prediction_error_filter, share_in_ba
 from dahl_ident.problem.record_problem import RecordProblem
 
 _STEPS = 60  # at most; a search without convergence is no estimate
-_SHORT = 8192  # samples with which a long record is begun
+_SHORT = {"force": 8192, "motion": 4096}  # samples with which a long record is begun
+_COMPARED = 8  # steps after which starts of a driven motion are compared
 _ROUGH = 15  # steps after which the noise is known well enough to say what a step is worth
+_STAGNANT = 0.01  # relative fall of the cost in as many steps, below which more lead nowhere
 _WORTHLESS = 1e-5  # fall of the cost, in units of the noise's variance
 _GOOD = 0.01  # share of variance left at which no further start is tried
 _SLOW = 0.5  # correlation of neighbouring residuals that are weighted by their spectrum
@@ -137,19 +139,22 @@ def solve_records(
 
 
 def _solved(problem: RecordProblem, start: Mapping[str, float] | None) -> RecordOptimum:
-    evaluations = 0
+    evaluations, steps = 0, _STEPS
     if start is not None and all(p.name in start for p in problem.free):
         begin = [start[p.name] for p in problem.free]
-    elif problem.n_residuals > 2 * _SHORT:
-        part = problem.shortened(_SHORT)
+    elif problem.n_residuals > 2 * _SHORT[problem.output]:
+        part = problem.shortened(_SHORT[problem.output])
         first, evaluations = _searched(part, start)
+        hopeless = problem.output == "motion" and not first.converged[0]
+        steps = _ROUGH if hopeless else _STEPS
         begin = part.values(first.theta[0])[: len(problem.free)].tolist()
     else:
         begin = None
     if begin is None:
         best, more = _searched(problem, start)
     else:
-        best, more = _best(problem, _changed(started_at(problem, begin)[None], problem, start))
+        starts = _changed(started_at(problem, begin)[None], problem, start)
+        best, more = _best(problem, starts, steps)
     found = RecordOptimum(
         problem,
         problem.values(best.theta[0]),
@@ -300,32 +305,52 @@ def _searched(problem: RecordProblem, start: Mapping[str, float] | None) -> tupl
         return _best(problem, _changed(more, problem, start))
 
 
-def _best(problem: RecordProblem, starts: FloatArray) -> tuple[Minima, int]:
-    """Return the best end of searches from the starts, in their order; few where one is good."""
-    evaluations, best = 0, None
+def _best(problem: RecordProblem, starts: FloatArray, steps: int = _STEPS) -> tuple[Minima, int]:
+    """Return the best end of searches from the starts, in their order; few where one is good.
+
+    A driven motion is expensive where nothing fits: its starts are compared after a few steps, and
+    the best one alone is followed to its end.
+    """
+    evaluations, finite, best = 0, 0, None
+    driven = problem.output == "motion" and len(starts) > 1
     for one in starts:
-        found = _descend(problem, problem.theta(one), _STEPS)
+        theta = problem.theta(one)
+        found = _minimise(problem, theta[None], 0.0, _COMPARED) if driven else None
+        if found is None or 2.0 * found.cost[0] < _GOOD * problem.n_residuals:
+            found = _descend(problem, theta if found is None else found.theta[0], steps)
         evaluations += int(found.evaluations[0])
+        finite += bool(np.isfinite(found.cost[0]))
         if np.isfinite(found.cost[0]) and (best is None or found.cost[0] < best.cost[0]):
             best = found
-        if best is not None and 2.0 * best.cost[0] < _GOOD * problem.n_residuals:
+        good = best is not None and 2.0 * best.cost[0] < _GOOD * problem.n_residuals
+        if good or (driven and finite == STARTS):
             break
     if best is None:
+        imposed = ", or, if the exciter imposes the motion, fit the force: output='force'"
         raise FitError(
             "from no start does the model give a finite motion; give start=, or check the units"
+            + (imposed if problem.output == "motion" else "")
         )
+    if driven and not best.converged[0]:
+        found = _descend(problem, best.theta[0], _STEPS)
+        evaluations += int(found.evaluations[0])
+        best = found if found.cost[0] <= best.cost[0] else best
     return best, evaluations
 
 
 def _descend(problem: RecordProblem, theta: FloatArray, steps: int) -> Minima:
     """Return the minimum near a start; first roughly, then to a small part of the noise."""
     found = _minimise(problem, theta[None], 0.0, _ROUGH)
-    if bool(found.converged[0]) or not np.isfinite(found.cost[0]):
+    if bool(found.converged[0]) or not np.isfinite(found.cost[0]) or steps == _ROUGH:
         return found
     noise = 2.0 * float(found.cost[0]) / problem.n_residuals
-    found = _minimise(problem, found.theta, _WORTHLESS * noise, steps)
-    if bool(found.converged[0]):
-        return found
+    for _ in range(0, steps, _ROUGH):
+        before = float(found.cost[0])
+        found = _minimise(problem, found.theta, _WORTHLESS * noise, _ROUGH)
+        if bool(found.converged[0]):
+            return found
+        if problem.output == "motion" and found.cost[0] > (1.0 - _STAGNANT) * before:
+            break
     # where a motion comes to rest, errors of its integration hide the last small falls of the cost
     with np.errstate(all="ignore"):
         end = problem.quadratic(found.theta[0])

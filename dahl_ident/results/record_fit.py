@@ -328,6 +328,7 @@ class RecordFit(Result):
         return (
             first,
             *(() if self.success else (self.message,)),
+            *self._imposed,
             *self._doubts,
             *self.findings,
             f"{described}; {self.goodness.worst_text}.",
@@ -346,6 +347,18 @@ class RecordFit(Result):
             f"Error bars take the residuals' correlation into account: {self.effective_samples:.0f}"
             f" effective of {self.problem.n_residuals} samples.",
             record_assumptions(self.problem, self.errors),
+        )
+
+    @property
+    def _imposed(self) -> tuple[str, ...]:
+        """What to do where a motion is not described that the exciter may have imposed."""
+        if self.problem.output != "motion" or self.status is not VerdictStatus.NOT_DESCRIBED:
+            return ()
+        if any(record.displacement is None for record in self.records):
+            return ()
+        return (
+            "If the exciter imposed the motion, fit the force instead (output='force'): what it "
+            "moves hardly depends on the force, and the model cannot follow it.",
         )
 
     @property
@@ -391,15 +404,28 @@ class RecordFit(Result):
             )  # fmt: skip
         return pd.DataFrame(rows).set_index("name")
 
-    def fit_report(self) -> str:
-        """Return the whole report as text, the verdict first."""
+    def fit_report(self, *, details: bool = True) -> str:
+        """Return the report as text, the verdict first.
+
+        Parameters
+        ----------
+        details : bool, default True
+            False: verdict and the model's parameters alone.
+
+        Returns
+        -------
+        str
+        """
+        own = {p.name for p in self.problem.model.parameters}
         rows = [["", "value", "stderr", "unit"]]
         for name, p in self.params.items():
-            value, error = (f"{p.value:g}", "fixed") if not p.vary else rounded(p.value, p.stderr)
-            rows.append([name, value, error, p.unit])
+            if details or name in own:
+                shown = (f"{p.value:g}", "fixed") if not p.vary else rounded(p.value, p.stderr)
+                rows.append([name, *shown, p.unit])
         parts = [("Verdict", self.statements), ("Parameters", table(rows, (0, 3)).splitlines())]
-        parts.append(("Uncertainty budget", str(self.budget()).splitlines()))
-        parts.append(("Goodness of fit", self.goodness.lines))
+        if details:
+            parts.append(("Uncertainty budget", str(self.budget()).splitlines()))
+            parts.append(("Goodness of fit", self.goodness.lines))
         return "\n".join(
             f"{title}\n" + "\n".join(f"    {line}" for line in lines) for title, lines in parts
         )

@@ -37,6 +37,7 @@ _SMALL = 1e-6  # of a switching function's largest value: more is not near to it
 _PASSES = 50  # at most; corrections shrink or the search ends
 _GROWTHS = 3  # passes in which the correction may grow
 _SEGMENT = 32  # samples, within which motions stay near a wrong start
+_STRETCHES = 100  # at most; a motion that asks for more is too unstable to be fitted
 _SHORTER = 4  # where a stretch was too long; each success doubles it
 _TOLERANCE = 1e-11  # of the largest motion: the next pass changes rounding alone
 _POWERS = np.arange(8)  # of time, in the drive's polynomial over a step
@@ -130,8 +131,9 @@ class ForcedMotion:
 
     def _marched(self, values: FloatArray, motion: FloatArray) -> FloatArray:
         """Return the motion stretch by stretch, each guessed to stay where it begins."""
-        start, width = 0, _SEGMENT
+        start, width, stretches = 0, _SEGMENT, 0
         while start < self._n:
+            stretches += 1
             stop = min(start + width, self._n)
             motion[start + 1 : stop + 1] = motion[start]
             size = np.abs(motion[: start + 1]).max(axis=0)
@@ -139,7 +141,7 @@ class ForcedMotion:
             if found is not None:
                 motion[start : stop + 1] = found
                 start, width = stop, 2 * width
-            elif width > 1:
+            elif width > 1 and stretches < _STRETCHES:
                 width = max(1, width // _SHORTER)
             else:
                 raise self._beyond_bounds(values)

@@ -1,0 +1,107 @@
+"""Records of any motion on the command line: what is read, refused and printed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dahl_ident as di
+from dahl_ident.cli.app import main
+from dahl_ident.errors import DataError
+from tests.test_record_fit import DAHL, recorded
+
+MAP = """
+[time]
+column = "t"
+unit = "s"
+[displacement]
+column = "x"
+unit = "mm"
+[force]
+column = "load"
+unit = "kN"
+"""
+
+
+@pytest.fixture
+def odd_columns(tmp_path: Path) -> Path:
+    """Return a file that only a column map explains: two motions, units of its own."""
+    record = recorded(DAHL, "random", 600, 1e-3)
+    x, force = np.asarray(record.displacement), record.force_samples
+    rows = np.column_stack([record.time, 1e3 * x, 1e-3 * force, np.gradient(x, record.time)])
+    place = tmp_path / "run.csv"
+    np.savetxt(place, rows, delimiter=",", header="t,x,load,velocity [m/s]", comments="")
+    (tmp_path / "map.toml").write_text(MAP)
+    return place
+
+
+def told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: object
+) -> tuple[int, str, str]:
+    monkeypatch.setattr("sys.argv", ["dahl-ident", *map(str, words)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    return int(end.value.code or 0), *capsys.readouterr()
+
+
+def test_a_column_map_is_used(
+    odd_columns: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("fit", odd_columns, "--record")
+    code, _, why = told(monkeypatch, capsys, *words)
+    assert code == 1
+    assert "--columns" in why
+    words = (*words, "--columns", odd_columns.with_name("map.toml"))
+    code, out, _ = told(monkeypatch, capsys, *words)
+    assert code == 0
+    assert "f_max" in out
+    (line,) = (line for line in out.splitlines() if line.split()[:1] == ["sigma"])
+    assert float(line.split()[1]) == pytest.approx(30.0, rel=0.01)
+    assert "Uncertainty budget" not in out
+    code, out, _ = told(monkeypatch, capsys, *words, "-v")
+    assert "Uncertainty budget" in out
+    assert "offset" in out
+
+
+@pytest.mark.parametrize("command", ["fit", "sample"])
+@pytest.mark.parametrize("words", [("--level", "1"), ("--noise", "relative")])
+def test_options_of_tables_are_refused(
+    command: str,
+    words: tuple[str, str],
+    odd_columns: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    place = odd_columns.with_name("map.toml")
+    code, _, why = told(
+        monkeypatch, capsys, command, odd_columns, "--record", "--columns", place, *words
+    )
+    assert code == 1
+    assert f"{words[0]} is given together with --record" in why
+
+
+def test_the_force_is_predicted_although_the_model_has_a_mass(
+    odd_columns: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = odd_columns.with_name("map.toml")
+    words = ("fit", odd_columns, "--record", "--columns", place, "--mass", "free")
+    _, out, _ = told(monkeypatch, capsys, *words, "--predicted", "force")
+    assert "of the measured force" in out
+    code, _, why = told(monkeypatch, capsys, "fit", odd_columns, "--predicted", "force")
+    assert code == 1
+    assert "--record" in why
+
+
+def test_a_waveform_of_a_plan_is_no_record(tmp_path: Path) -> None:
+    limits = {"displacement": (1e-4, 3e-2), "frequency_hz": 5.0, "time": 60.0}
+    plan = di.plan(
+        di.Dahl(alpha=1.0),
+        ranges={"f_max": (0.05, 0.2), "sigma": (15.0, 60.0)},
+        limits=limits,
+        noise=0.02,
+    )
+    place = plan.write_waveform(tmp_path / "wave.csv", 1000.0)
+    with pytest.raises(DataError, match="holds no measured force"):
+        di.read_record(place)
