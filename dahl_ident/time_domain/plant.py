@@ -103,15 +103,47 @@ class Plant:
         return ca.vertcat(v, (push - total) / inertia, *slopes)
 
     def _stepped(self, output: Callable[[ca.SX], ca.SX]) -> tuple[Inputs, ca.SX]:
-        """Return an output of state, drives with length, direction with sides, free values."""
+        """Return an output of state, drives with length, direction with sides, free values.
+
+        States that follow the displacement are not integrated, but the others with their sums.
+        """
         drives = [ca.SX.sym(f"u{i}") for i in range(6)]
         length = ca.SX.sym("h")
         state = ca.vertcat(*self._state)
         constant = [self._direction, *self._sides, *self._free]
         rates = ca.Function("rates", [state, self._drive, *constant], [self._held])
-        after = step(lambda at, drive: rates(at, drive, *constant), state, drives, length)
+        bound = self._bound
+        rest = [i for i in range(self.order) if i not in bound]
+        by_place = ca.jacobian(self._held[bound], self._state[1])
+        by_bound = ca.jacobian(self._held[rest], state[bound])
+        push, stiffness = by_bound @ state[bound], by_bound @ by_place
+
+        def own_rates(at: ca.SX, drive: ca.SX) -> ca.SX:
+            whole = ca.SX.zeros(self.order)
+            whole[rest] = at
+            found = rates(whole, drive, *constant)[rest]
+            return found + push + stiffness * (at[0] - state[0])
+
+        after = ca.SX.zeros(self.order)
+        after[rest] = step(own_rates, state[rest], drives, length)
+        after[bound] = state[bound] + by_place * (after[0] - state[0])
         signs = [self._direction, *self._sides]
         return (self._state, [*drives, length], signs, self._free), output(after)
+
+    @cached_property
+    def _bound(self) -> list[int]:
+        """States that follow the displacement on a branch, and act in proportion to themselves.
+
+        Such as the forces of Jenkins elements, of which a plant may have many.
+        """
+        moving = ca.vertcat(*self._state, self._drive)
+        by = ca.jacobian(self._held, moving)
+        found = []
+        for i in range(2, self.order):
+            at_rest = ca.substitute(self._held[i], self._state[1], ca.SX(0.0))
+            if not ca.depends_on(ca.vertcat(at_rest, by[i, 1], by[:, i]), moving):
+                found.append(i)
+        return found
 
     def _at_all(self, after: ca.SX) -> ca.SX:
         at = ca.vertcat(*self._state, *self._free)
