@@ -57,7 +57,7 @@ class TestBands:
         np.testing.assert_allclose(band.phase_std, np.angle(N).std(axis=0), rtol=0.05)
 
     def test_limits_take_the_threshold_of_t(self, result: FitResult) -> None:
-        band = result.predict(1.0, amplitude=GRID)
+        band = result.predict(1.0, amplitude=GRID, noise=False)
         t = special.stdtrit(result.nfree, 0.975)
         low, high = band.real(0.95)
         np.testing.assert_allclose(high - low, 2.0 * t * band.real_std)

@@ -10,18 +10,18 @@ takes them into account (:mod:`dahl_ident.diagnostics.prediction_error`); else n
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
 from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, positive_array
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.confidence_levels import checked_levels
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.diagnostics.held_out import band_factor, held_out
 from dahl_ident.diagnostics.information import Information
 from dahl_ident.diagnostics.parameters import values_at
 from dahl_ident.diagnostics.prediction_error import noise_near, prediction_error
@@ -54,6 +54,10 @@ class ResponseBand:
         Standard deviations of ln gain and of the phase, rad.
     dof : ndarray, shape (n,)
         Degrees of freedom of the standard deviations, for the factor of Student's t.
+    scores : ndarray, shape (k,)
+        Deviations of measured tests from their predictions without them, over their standard
+        deviations; where more of them are large than Student's t makes, bands of one more test
+        are wider.
     """
 
     response: ComplexArray
@@ -63,6 +67,7 @@ class ResponseBand:
     log_gain_std: FloatArray
     phase_std: FloatArray
     dof: FloatArray
+    scores: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def gain(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the gain at each point."""
@@ -87,10 +92,7 @@ class ResponseBand:
         return self.centre.imag - width, self.centre.imag + width
 
     def _threshold(self, level: float) -> FloatArray:
-        upper = 0.5 * (1.0 + float(checked_levels([level])[0]))
-        with np.errstate(invalid="ignore"):
-            t = special.stdtrit(np.minimum(self.dof, 1e12), upper)
-        return np.where(np.isinf(self.dof), special.ndtri(upper), t)
+        return band_factor(self.scores, self.dof, float(checked_levels([level])[0]))
 
 
 @dataclass(frozen=True)
@@ -226,7 +228,8 @@ def describing_function_band(
         return _noise_band(optimum, N, by)
     shape = A.shape
     band = _combined_band(errors, *_flat(N, by), np.isfinite(N.ravel()), A.ravel(), _omega(errors))
-    return ResponseBand(*(np.reshape(getattr(band, f.name), shape) for f in fields(band)))
+    parts = {k: np.reshape(v, shape) for k, v in vars(band).items() if k != "scores"}
+    return ResponseBand(**parts)
 
 
 def _flat(N: ComplexArray, by: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
@@ -376,4 +379,7 @@ def _combined_band(
     parts[4, known] = made.dof
     centre = R.copy()
     centre[known] *= np.exp(made.departure @ np.array([1.0, 1.0j]))
-    return ResponseBand(R, centre, *parts)
+    left_out = held_out(errors) if of_a_test else None
+    scores = np.empty(0) if left_out is None else left_out.scores
+    real, imag, gain, phase, dof = parts
+    return ResponseBand(R, centre, real, imag, gain, phase, dof, scores)

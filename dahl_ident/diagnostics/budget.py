@@ -19,11 +19,11 @@ from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.error_sources import APART, LEVELS, MODEL_ERROR, NOISE, RUNS
 from dahl_ident.diagnostics.formatting import listed, rounded, table
+from dahl_ident.diagnostics.information import Information
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 
-_DETERMINED = 0.25  # u of a logarithm
-_OUTSIDE = 1e-3  # share of a direction that the data may leave open, from rounding
+_DETERMINED, _HARDLY = 0.25, 1.0  # u of a logarithm
 # What rounding leaves where a source has no part: variances relative to the combined one.
 _ROUNDING = 1e-18
 # Student's t with more degrees of freedom is normal to all digits that a budget shows.
@@ -293,21 +293,31 @@ def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
             lost |= {name}
     # an exponent that was assumed is a member as any other
     freed = replace(optimum, problem=problem, theta=errors.theta)
+    own = [names.index(name) for name in optimum.names]
+    kept = {c.expression for c in optimum.combinations}
+    left = {tuple(c.direction): c.expression for c in candidates(optimum) if c.expression in kept}
+    information = Information(optimum)
+    by_noise = information.std(np.eye(len(own)))
+    vague = {n for n, std in zip(optimum.names, by_noise, strict=True) if std > _DETERMINED}
     for candidate in candidates(freed):
-        direction = candidate.direction
-        u = float(direction @ errors.covariance @ direction) ** 0.5
-        if candidate.members & lost and u < _DETERMINED and _noticed(errors, direction):
-            value = candidate.value
-            yield candidate.expression, candidate.unit, value, direction * abs(value)
+        direction, value = candidate.direction, candidate.value
+        if not (candidate.members & lost and _noticed(errors, direction)):
+            continue
+        # what a limit depends on has the name that the fit gives it
+        name = left.get(tuple(direction[own]), candidate.expression)
+        u = max(float(direction @ errors.covariance @ direction), 0.0) ** 0.5
+        # what noise alone leaves of parameters that it leaves open is what the verdict names
+        open_ = candidate.members & vague and not candidate.is_sum
+        named = (name in kept and u < _HARDLY) or (
+            open_ and information.std(direction[own]) < _DETERMINED
+        )
+        if u < _DETERMINED or named:
+            yield name, candidate.unit, float(value), direction * abs(value)
 
 
 def _noticed(errors: ErrorModel, direction: FloatArray) -> bool:
     """Return whether the data determine a direction at all."""
-    if errors.basis is None:
-        return True
-    scaled, own = direction * errors.basis.size, errors.basis.directions
-    left = scaled - own @ (own.T @ scaled)
-    return bool(np.linalg.norm(left) < _OUTSIDE * np.linalg.norm(scaled))
+    return errors.basis is None or bool(errors.basis.holds(direction))
 
 
 def coverage_factor(dof: float, confidence: float = CONFIDENCE) -> float:
@@ -334,7 +344,7 @@ def taken_as_exact(optimum: Optimum) -> tuple[str, ...]:
 def _parameter(
     errors: ErrorModel, name: str, unit: str, value: float, direction: FloatArray
 ) -> ParameterBudget:
-    total = float(direction @ errors.covariance @ direction)
+    total = max(float(direction @ errors.covariance @ direction), 0.0)
     rows = []
     for source, covariance in errors.contributions.items():
         own = float(direction @ covariance @ direction)

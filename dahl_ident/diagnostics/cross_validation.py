@@ -1,12 +1,7 @@
-r"""Cross-validation of the bands: each test is predicted from the others.
+"""Cross-validation of the bands: each test is predicted from the others.
 
-For the linear mixed model of :mod:`dahl_ident.diagnostics.error_model` the prediction of rows b
-from all others, parameters estimated without them, misses by
-
-    e_b = (P_bb)^-1 (P y)_b,    with the covariance (P_bb)^-1,
-
-P as in :mod:`dahl_ident.diagnostics.variance_components`; nothing is fitted again. Source:
-Dubrule, *Cross validation of kriging in a unique neighborhood*, Mathematical Geology 15 (1983) 687.
+The width of each band follows from the other tests alone; the variances are those of all, and
+nothing is fitted again (:mod:`dahl_ident.diagnostics.held_out`).
 """
 
 from __future__ import annotations
@@ -14,15 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.data import FrequencyResponse
-from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.error_model import ErrorModel
-from dahl_ident.diagnostics.error_sources import repeated_levels
+from dahl_ident.diagnostics.held_out import band_factor, held_out
 
-_FEWEST_TESTS = 3  # two leave one from which to predict, which shows no scatter
-_MOST_TESTS = 500  # left out one at a time: the share inside is then known to 1 %
 _CONFIDENCE = 0.95  # of the bands: one value in twenty is outside by chance
 
 
@@ -72,64 +62,24 @@ def cross_validation(errors: ErrorModel) -> CrossValidation | None:
     >>> found.inside > 0.8 * found.count
     True
     """
-    problem = errors.problem
-    tests = tests_of(problem.data)
-    if len(tests) < _FEWEST_TESTS:
+    found = held_out(errors)
+    if found is None:
         return None
-    chosen = np.linspace(0, len(tests) - 1, min(len(tests), _MOST_TESTS)).round().astype(int)
-    block_of, Py = errors.projected()
-    k = _factor(errors)
-    deviations, widths, orders = [], [], []
-    turn = errors.relative_units()
-    for rows in (tests[i] for i in chosen):
-        index = (2 * rows[:, None] + np.arange(2)).ravel()
-        try:
-            covariance = np.linalg.inv(block_of(index))
-        except np.linalg.LinAlgError:
-            continue
-        missed = (covariance @ Py[index]).reshape(-1, 2)
-        for place, row in enumerate(rows):
-            part = covariance[2 * place : 2 * place + 2, 2 * place : 2 * place + 2]
-            to_relative = turn[row]
-            own = to_relative @ part @ to_relative.T
-            deviations.append(to_relative @ missed[place])
-            orders.append(problem.data.harmonic[row])
-            widths.append(k * np.sqrt(np.maximum(np.diagonal(own), 0.0)))
-    found, width = np.array(deviations), np.array(widths)
-    known = np.isfinite(width) & (width < 1e6) & (width > 0.0)
+    width = np.empty(found.std.shape)
+    for test in np.unique(found.test).tolist():
+        rows = found.test == test
+        k = band_factor(found.without(test), found.dof[rows], _CONFIDENCE)
+        width[rows] = k * found.std[rows]
+    known = np.isfinite(width)
     if not known.any():
         return None
-    first = known & (np.array(orders) == 1)[:, None]
+    first = known & (errors.problem.data.harmonic[found.rows] == 1)[:, None]
     sized = first if first.any() else known
     return CrossValidation(
-        len(chosen),
-        int((np.abs(found) <= width)[known].sum()),
+        len(np.unique(found.test)),
+        int((np.abs(found.deviation) <= width)[known].sum()),
         int(known.sum()),
         float(np.sqrt(np.mean(width[sized] ** 2))),
-        float(np.sqrt(np.mean(found[sized] ** 2))),
-        len(tests),
+        float(np.sqrt(np.mean(found.deviation[sized] ** 2))),
+        found.available,
     )
-
-
-def tests_of(data: FrequencyResponse) -> list[NDArray[np.intp]]:
-    """Return the rows of each test: runs, else labelled levels, else repeats of one level."""
-    for labels in (data.run, data.level):
-        if labels is not None:
-            names, which = np.unique(labels, return_inverse=True)
-            if _FEWEST_TESTS <= len(names) < data.n:
-                return _rows_of(which)
-    return _rows_of(repeated_levels(data))
-
-
-def _rows_of(which: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    return np.split(np.argsort(which, kind="stable"), np.cumsum(np.bincount(which))[:-1])
-
-
-def _factor(errors: ErrorModel) -> float:
-    """Return the factor of a prediction's band, by the degrees of freedom of the variances."""
-    total = float(errors.variances.sum())
-    C = errors.components.covariance
-    spread = float(C.sum())
-    if not spread > 0.0 or errors.problem.scale_known:
-        return coverage_factor(np.inf, _CONFIDENCE)
-    return coverage_factor(max(2.0, 2.0 * total**2 / spread), _CONFIDENCE)

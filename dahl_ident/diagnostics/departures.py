@@ -10,7 +10,6 @@ Source: Searle, Casella and McCulloch, *Variance Components*, 1992, section 7.6.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -86,10 +85,11 @@ def departures(
         found = {_SMOOTH: noise_of_rows(errors) ** 2}
     if not any(found.values()):
         return None
-    where, near = places(amplitude, omega), replace(errors.near, J=errors.jacobian[:m])
+    where, apart = places(amplitude, omega), any(source.part for source in errors.sources)
+    every_source = StructuredSources(problem, errors.theta, where)
     sources = [
         source
-        for source in StructuredSources(problem, errors.theta, where).at(errors.theta, near)
+        for source in every_source.at(errors.theta, errors.near, apart=apart)
         if source.name == MODEL_ERROR and found.get(_kind(source))
     ]
     size = [np.sqrt(found[_kind(source)]) for source in sources]
@@ -107,12 +107,12 @@ def departures(
     return Departures(there @ turned, _information(errors, missed @ turned), assumed)
 
 
-_SMOOTH = (False, "")
+_SMOOTH = (False, "", "")
 
 
-def _kind(source: Source) -> tuple[bool, str]:
+def _kind(source: Source) -> tuple[bool, str, str]:
     parallel = source.shapes is not None and source.shapes.parallel
-    return parallel, "" if source.rate_of is None else source.rate_of[0]
+    return parallel, "" if source.rate_of is None else source.rate_of[0], source.part
 
 
 def _information(errors: ErrorModel, columns: FloatArray) -> FloatArray:

@@ -29,16 +29,16 @@ and Roger, Biometrics 53 (1997) 983; Rasmussen and Williams, *Gaussian Processes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.diagnostics.determined_directions import Basis, chart_of_limit
 from dahl_ident.diagnostics.error_sources import (
     MODEL_ERROR,
     NOISE,
@@ -65,6 +65,7 @@ from dahl_ident.diagnostics.variance_components import (
     Likelihood,
     LinearModel,
     Projection,
+    RowProjection,
     VarianceComponents,
     block_diagonal,
     likelihood,
@@ -81,7 +82,6 @@ _LONGEST_STEP = 0.7  # of a logarithm, in one iteration: the model is linearised
 _ASKED_FOR = {MODEL_ERROR: 0.3, NOISE: 0.5}  # rise of the log-likelihood that a source takes
 _RATE = 0.1  # the same for a force limit that changes with speed
 _SUPPORTED = 4.0  # the same for another kind of noise: 0.5 % of the tables, by chance
-_NOTICED = 1e-5  # change of residuals over the largest, below which a direction is undetermined
 _LEAST_DOF = 4  # residuals beyond the parameters, below which there is noise alone
 _FEW_ROWS = 100  # with more, rows are compressed to directions that the sources affect
 _CALIBRATIONS = {
@@ -96,18 +96,6 @@ class Assumption(NamedTuple):
 
     source: str
     std: float
-
-
-class Basis(NamedTuple):
-    """Orthonormal directions, (Q, r), of theta over the size of what residuals notice, (Q,)."""
-
-    size: FloatArray
-    directions: FloatArray
-
-    @property
-    def matrix(self) -> FloatArray:
-        """Changes of theta, shape (Q, r)."""
-        return np.asarray(self.size[:, None] * self.directions)
 
 
 @dataclass(frozen=True)
@@ -223,23 +211,25 @@ class ErrorModel:
         moved = self.optimum.theta - self.theta[columns]
         return None if self.runs is None else self.runs.about(moved, columns)
 
-    def projected(self) -> tuple[Callable[[NDArray[np.intp]], FloatArray], FloatArray]:
-        """Return what gives the block of P of some residuals, and P y of the data's; (m,)."""
-        m, residuals = self.problem.n_residuals, self.near.y
-        P, rotation = self.projection.P, self.linear.rotation
-        if rotation is None:
-            return lambda rows: P[np.ix_(rows, rows)], P[:m, :m] @ residuals
-        r = rotation.shape[1]
-        outside = 0.0
-        if self.linear.outside[1]:
-            outside = 1.0 / self.linear.outside_variance(self.variances)
-        inner = P[:r, :r] - outside * np.eye(r)
+    @cached_property
+    def beside_the_law(self) -> ComplexArray:
+        """Responses (n,) by generalised least squares, with forces beside the model and rates.
 
-        def block(rows: NDArray[np.intp]) -> FloatArray:
-            own = rotation[rows]
-            return np.asarray(outside * np.eye(len(rows)) + own @ inner @ own.T)
+        Without the smooth departure from the law itself, which its parameters do not describe.
+        """
+        moved = self.near.J @ (self.inverse @ self.linear.y)
+        for source, effect in zip(self.sources, self.projection.effects(), strict=True):
+            beside = source.shapes is None or source.shapes.parallel
+            if source.name == MODEL_ERROR and beside:
+                moved += source.columns @ effect
+        relative = np.einsum("nij,nj->ni", self.relative_units(), moved.reshape(-1, 2))
+        return np.asarray(self.near.fitted * np.exp(relative @ np.array([1.0, 1.0j])))
 
-        return block, outside * residuals + rotation @ (inner @ (rotation.T @ residuals))
+    @cached_property
+    def rows(self) -> RowProjection:
+        """P and what the variances do to it, for the residuals of the data."""
+        y = self.near.y * row_weights(self.problem)
+        return RowProjection(self.linear, self.projection, self.variances, y)
 
     def relative_units(self) -> FloatArray:
         """Return what takes each row's residuals to ln gain and phase, shape (n, 2, 2)."""
@@ -354,19 +344,17 @@ def row_weights(problem: Problem) -> FloatArray:
     return weight
 
 
-def _basis(J: FloatArray) -> Basis:
-    size = 1.0 / np.maximum(np.linalg.norm(J, axis=0), np.finfo(float).tiny)
-    _, singular, directions = np.linalg.svd(J * size, full_matrices=False)
-    return Basis(size, directions[singular > _NOTICED * singular[0]].T)
-
-
 def _estimated(
     optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumption], determined: bool
 ) -> ErrorModel:
     rows = _Rows(optimum, problem, assumed)
     theta, m = rows.start, rows.m
-    basis = None if determined else _basis(rows.at(theta, linearization(problem, theta))[1])
+    basis = None
+    if not determined:
+        chart = chart_of_limit(optimum, problem)
+        basis = Basis.of(rows.at(theta, linearization(problem, theta))[1], theta, chart)
     noise: tuple[Source, ...] | None = None
+    apart = False  # whether gain and phase have errors of their own size
     dof = problem.n_numbers - len(problem.names)
     shared = StructuredSources(problem, theta) if _tells(problem, assumed) else None
     starts: dict[tuple[int, ...] | None, FloatArray] = {}
@@ -377,30 +365,33 @@ def _estimated(
         if not np.isfinite(y).all():
             raise np.linalg.LinAlgError("a drive beyond the force limit has no steady response")
         level = float(y[:m] @ y[:m]) / max(dof, 1)
-        rest = () if shared is None else shared.at(theta, replace(near, J=J[:m]))
+        rest = () if shared is None else shared.at(theta, near, apart=apart)
         whole = J
-        J = J if basis is None else J @ basis.matrix
-        plain = (
-            (*of_one_scale(problem), *relative_scatter(problem, theta))
-            if rest and m <= 2 * _FEW_ROWS
-            else of_one_scale(problem)
-        )
+        if basis is not None:
+            basis = basis.at(theta)
+            J = J @ basis.matrix
+        scatter = relative_scatter(problem, theta) if rest and m <= 2 * _FEW_ROWS else ()
+        plain = (*of_one_scale(problem, beside=bool(scatter)), *scatter)
         sources, linear, found = _supported(problem, y, J, noise or plain, rest, level, starts)
         if noise is None and step == 1:
             noise = plain
             if rest and m <= 2 * _FEW_ROWS:
+                scales = of_one_scale(problem, beside=True)
                 kinds = (
-                    () if problem.scale_known else gain_and_phase(problem),
+                    (*scales, *relative_scatter(problem, theta, apart=True))
+                    if problem.scale_known
+                    else gain_and_phase(problem),
                     () if problem.scale_known else additive(problem),
                     _noise_and_own_errors(optimum, plain),
                 )
                 noise, sources, linear, found = _kind_of_noise(
                     problem, y, J, (sources, linear, found), level, (plain, *kinds)
                 )
+                apart = noise is kinds[0]
             # far from the optimum all sources may have been led to a lower maximum
             starts = {k: s for k, s in starts.items() if k is not None and noise is plain}
         projection = Projection(linear, found.variances)
-        G = projection.generalised_inverse()
+        G = inverse = projection.generalised_inverse()
         covariance = projection.covariance()
         if basis is not None:
             G, covariance = basis.matrix @ G, basis.matrix @ covariance @ basis.matrix.T
@@ -411,8 +402,11 @@ def _estimated(
         if step == _STEPS - 1 or (settled and alike(before, runs)):
             break
         rows.widen(covariance)
-        move *= min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
-        theta = np.clip(theta + move, *problem.bounds())
+        if basis is None:
+            theta = theta + move * _shortened(move)
+        else:
+            theta = basis.moved(theta, -inverse @ linear.y, _shortened)
+        theta = np.clip(theta, *problem.bounds())
     parts = [
         _by_source(problem, assumed, sources, linear, found, lever)
         for lever in (G[None], _by_variances(linear, found, projection, G))
@@ -422,6 +416,11 @@ def _estimated(
         optimum, problem, theta, sources, found, contributions, parts[1], tuple(assumed), linear,
         projection, whole, near, runs, basis,
     )  # fmt: skip
+
+
+def _shortened(move: FloatArray) -> float:
+    """Return the part of a move that an iteration makes."""
+    return min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
 
 
 def _noise_and_own_errors(optimum: Optimum, noise: tuple[Source, ...]) -> tuple[Source, ...]:
@@ -451,7 +450,10 @@ def linear_model(
     """
     m, extra = problem.n_residuals, len(y) - problem.n_residuals
     known = np.concatenate([np.full(m, float(problem.scale_known)), np.ones(extra)])
+    weight = row_weights(problem)
     Z = [s.columns if s.columns.ndim < 3 else block_diagonal(s.columns) for s in sources]
+    # an error of the response is one of its weighted residual; noise of one scale is that of these
+    Z = [z if z.ndim == 1 else weight[:, None] * z for z in Z]
     Z = [np.concatenate([z, np.zeros((extra, *z.shape[1:]))]) for z in Z]
     linear = LinearModel(y, J, known, Z)
     fewer = linear.compressed(m) if m > 2 * _FEW_ROWS else linear
@@ -505,7 +507,10 @@ def _supported(
         tuple(every[i] for i in kept.tolist()),
         replace(linear, Z=[linear.Z[i] for i in kept.tolist()]),
         replace(
-            best, variances=best.variances[kept], information=best.information[np.ix_(kept, kept)]
+            best,
+            variances=best.variances[kept],
+            largest=best.largest[kept],
+            information=best.information[np.ix_(kept, kept)],
         ),
     )
 

@@ -14,7 +14,7 @@ or spring missing from the model; the part that the model's linear elements can 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,7 @@ _BY_CHANCE = 0.01  # tables without repeats in which some seem to be
 _MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it leaves
 _LEAST_RATE_RANGE = np.log(2.0)  # of frequency, that tells speed from amplitude
 _MOST_LEVEL_NOISE = 0.05  # of ln A: sensors scatter less; more of it would hide a wrong model
+_MOST_UNDERSTATED = 3.0  # true standard deviation over the stated one
 _FEWEST = 2  # runs, or repeated levels, that show a scatter
 
 
@@ -70,6 +71,8 @@ class Source:
     rate_of : (str, float) or None
         Parameter that changes as a power of the peak speed, and ln of the speed where it is its
         estimate.
+    part : str
+        "gain" or "phase" of a smooth departure, where these have a variance each; else empty.
     """
 
     name: str
@@ -80,6 +83,7 @@ class Source:
     largest: float = np.inf
     absorbed: FloatArray | None = None
     rate_of: tuple[str, float] | None = None
+    part: str = ""
 
 
 @dataclass(frozen=True)
@@ -132,9 +136,14 @@ def places(amplitude: FloatArray, omega: FloatArray) -> FloatArray:
     return np.asarray(np.log(np.column_stack(np.broadcast_arrays(amplitude, omega))))
 
 
-def of_one_scale(problem: Problem) -> tuple[Source, ...]:
-    """Return noise of one scale: unknown, or beyond that of the data's covariance."""
-    return (Source(NOISE, np.ones(problem.n_residuals), unit_noise(problem)),)
+def of_one_scale(problem: Problem, *, beside: bool = False) -> tuple[Source, ...]:
+    """Return noise of one scale: unknown, or beyond that of the data's covariance.
+
+    `beside` a scatter of all rows alike, a stated covariance may be too small by a moderate factor
+    only. Far more than was stated is another error, and no larger where a covariance is.
+    """
+    most = _MOST_UNDERSTATED**2 - 1.0 if beside else np.inf
+    return (Source(NOISE, np.ones(problem.n_residuals), unit_noise(problem), largest=most),)
 
 
 def gain_and_phase(problem: Problem) -> tuple[Source, ...]:
@@ -154,24 +163,29 @@ def additive(problem: Problem) -> tuple[Source, ...]:
     return (*of_one_scale(problem), floor)
 
 
-def relative_scatter(problem: Problem, theta: FloatArray) -> tuple[Source, ...]:
+def relative_scatter(
+    problem: Problem, theta: FloatArray, *, apart: bool = False
+) -> tuple[Source, ...]:
     """Return scatter of ln gain and phase alike, beside a stated covariance.
 
     Harmonics have a scatter of their own: what a model misses of them is no error of the
-    fundamental.
+    fundamental. With `apart` gain and phase of the fundamentals have one each.
     """
     if not problem.scale_known:
         return ()
     n, predicted = problem.n_residuals // 2, problem.predict(theta)
     parts = [-problem.residual_change(theta, f * predicted).reshape(n, 2) for f in (1.0, 1j)]
     first = problem.data.harmonic == 1
+    both = np.stack(parts, axis=-1)
+    groups = [(first, both[..., :1]), (first, both[..., 1:])] if apart else [(first, both)]
     found = []
-    for own in (first, ~first):
+    for own, changes in (*groups, (~first, both)):
         if own.any():
-            blocks = np.zeros((n, 2, n, 2))
-            blocks[np.arange(n), :, np.arange(n), :] = np.stack(parts, axis=-1)
+            blocks = np.zeros((n, 2, n, changes.shape[-1]))
+            blocks[np.arange(n), :, np.arange(n), :] = changes
             columns = blocks[:, :, own].reshape(2 * n, -1)
-            found.append(Source(NOISE, columns, float(own.mean())))
+            square = 0.5 * changes.shape[-1] * float(own.mean())
+            found.append(Source(NOISE, columns, square))
     return tuple(found)
 
 
@@ -215,8 +229,13 @@ class StructuredSources:
         self._rates = bool(np.ptp(self._places[:, 1]) > _LEAST_RATE_RANGE)
         self._levels = _scattering_levels(problem)
 
-    def at(self, theta: FloatArray, near: Linearization) -> tuple[Source, ...]:
-        """Return the sources at theta, their columns linearised where `near` is."""
+    def at(
+        self, theta: FloatArray, near: Linearization, *, apart: bool = False
+    ) -> tuple[Source, ...]:
+        """Return the sources at theta, their columns linearised where `near` is.
+
+        With `apart`, a smooth departure has one variance in gain, and another in phase.
+        """
         problem, predicted, J = self._problem, near.predicted, near.J
         size = _sizes(problem, predicted)
 
@@ -225,18 +244,33 @@ class StructuredSources:
             return near.change(changes * size).T
 
         own = self._fundamental & (size != 0.0)  # a gap that is not crossed has no response
-        missed = np.abs(problem.data.response[own] / size[own] - 1.0)
-        most = _MOST_DEPARTURE**2 * 0.5 * float(np.mean(missed**2)) if own.any() else 0.0
+        missed = problem.data.response[own] / size[own] - 1.0
+        gain, phase = (
+            _MOST_DEPARTURE**2 * float(np.mean(part**2)) if own.any() else 0.0
+            for part in (missed.real, missed.imag)
+        )
         found = []
         for shape, changes in zip(self._shapes, self._changes, strict=True):
             square, made, absorbed = _mean_square(changes), columns(changes), None
             if shape.parallel:
                 absorbed = _absorbed(problem, J, made)
                 made = made + J @ absorbed
-            largest = most / square
-            found.append(
-                Source(MODEL_ERROR, made, square, shape, largest=largest, absorbed=absorbed)
-            )
+            whole = Source(
+                MODEL_ERROR, made, square, shape,
+                largest=0.5 * (gain + phase) / square, absorbed=absorbed,
+            )  # fmt: skip
+            if shape.parallel or not apart:
+                found.append(whole)
+                continue
+            for part, most, half in zip(
+                ("gain", "phase"), (gain, phase), np.split(made, 2, axis=1), strict=True
+            ):
+                found.append(
+                    replace(
+                        whole, columns=half, mean_square=0.5 * square,
+                        largest=most / square, part=part,
+                    )
+                )  # fmt: skip
         centre = float(self._speed[self._fundamental].mean()) if self._fundamental.any() else 0.0
         change = np.repeat(self._speed - centre, 2)[:, None]
         found += [

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.diagnostics.error_model import ErrorModel, relative_units
+from dahl_ident.diagnostics.error_model import ErrorModel, relative_units, row_weights
 from dahl_ident.diagnostics.error_sources import APART, NOISE, Source, places
 from dahl_ident.problem import Problem
 
@@ -107,6 +107,8 @@ def prediction_error(
     spread = np.einsum("kn,kl,ln->n", squares, errors.components.covariance, squares)
     with np.errstate(divide="ignore", invalid="ignore"):
         dof = np.where(spread > 0.0, 2.0 * total**2 / spread, np.inf)
+    if errors.basis is not None:
+        covariance[~errors.basis.holds(_parts(slopes)).all(axis=1)] = np.inf
     return PredictionError(lever @ errors.linear.y, covariance, np.maximum(dof, _LEAST_DOF))
 
 
@@ -127,6 +129,9 @@ def changes_there(
         return None
     ratio = np.ones(n, dtype=np.complex128) if stiffness is None else stiffness
     changes = _parts(shapes.changes(where, ratio).T)
+    if source.part:
+        gain, phase = np.split(changes, 2, axis=-1)
+        return gain if source.part == "gain" else phase
     return changes if source.absorbed is None else changes - _parts(slopes) @ source.absorbed
 
 
@@ -147,7 +152,8 @@ def _noise(errors: ErrorModel, source: Source) -> FloatArray:
     """Return the covariance of ln gain and phase of each row by a noise of unit variance."""
     n, units = errors.problem.n_residuals // 2, errors.relative_units()
     if source.columns.ndim == 1:
-        units = units * source.columns.reshape(n, 1, 2)
+        columns = source.columns / row_weights(errors.problem)  # of weighted residuals
+        units = units * columns.reshape(n, 1, 2)
     else:
         units = units @ source.columns.reshape(n, 2, -1)
     return np.asarray(units @ units.swapaxes(1, 2))
@@ -160,7 +166,8 @@ def noise_near(
 
     That of the row which was measured nearest to each point.
     """
-    units = relative_units(problem, theta)[_nearest(problem, amplitude, omega)]
+    units = relative_units(problem, theta) / row_weights(problem)[::2, None, None]
+    units = units[_nearest(problem, amplitude, omega)]
     return np.asarray(units @ units.swapaxes(1, 2))
 
 

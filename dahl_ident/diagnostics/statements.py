@@ -128,11 +128,14 @@ def _too_narrow(fit: Judged) -> str:
     """Return what is wrong with bands that leave out most of the misfit; empty where they hold.
 
     The misfit is that within runs: a row that was held out has others of its run beside it.
+    Nor do a force beside the model and a change with speed count, on which the bands are centred.
+    A smooth departure from the law does: parameters of another law have no uncertainty.
     """
     check, errors = fit.cross_validation, fit.errors
     if check is None or errors is None:
         return ""
-    misfit = rms_misfit_of(errors.problem, errors.near.fitted)
+    fitted = (errors.near.fitted, errors.beside_the_law)
+    misfit = min(rms_misfit_of(errors.problem, each) for each in fitted)
     if check.width >= _NARROWEST * misfit:
         return ""
     return (

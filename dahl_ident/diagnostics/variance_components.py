@@ -115,20 +115,29 @@ class VarianceComponents:
         Expected information on the variances.
     log_likelihood : float
         Restricted, up to a constant.
+    largest : ndarray, shape (K,)
+        Bounds of the variances.
     """
 
     variances: FloatArray
     information: FloatArray
     log_likelihood: float
+    largest: FloatArray
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Covariance of the variances, shape (K, K); zero for those at 0."""
+        """Covariance of the variances, shape (K, K); zero for those at 0.
+
+        No number between 0 and its bound has a standard deviation above half the bound (Popoviciu).
+        """
         found = np.zeros_like(self.information)
         part = np.ix_(*[np.flatnonzero(self.variances > 0.0)] * 2)
         scaled, size = _scaled(self.information[part])
         found[part] = np.linalg.pinv(scaled) * np.outer(size, size)
-        return found
+        std = np.sqrt(np.diagonal(found))
+        known = np.divide(0.5 * self.largest, std, out=np.ones(len(std)), where=std > 0.0)
+        known = np.minimum(known, 1.0)
+        return np.asarray(found * np.outer(known, known))
 
 
 class Projection:
@@ -160,6 +169,52 @@ class Projection:
     def covariance(self) -> FloatArray:
         """Return (J' V^-1 J)^-1 = G V G', shape (P, P)."""
         return np.asarray(self._root @ self._root.T)
+
+
+class RowProjection:
+    """P of a linear model between some residuals of the data, all of them if compressed."""
+
+    def __init__(
+        self, model: LinearModel, projection: Projection, variances: FloatArray, y: FloatArray
+    ) -> None:
+        P, self._rotation = projection.P, model.rotation
+        m = len(y)
+        self._outside, self._size = 0.0, 0.0
+        if self._rotation is not None:
+            m = self._rotation.shape[1]
+            if model.outside[1]:
+                self._outside = 1.0 / model.outside_variance(variances)
+                self._size = float(model.Z[0][0])
+        self._P = P[:m, :m]
+        self._sources = [P[:m] * z if z.ndim == 1 else P[:m] @ z for z in model.Z]
+        weighted = P[:m] @ model.y
+        if self._rotation is not None:
+            beside = y - self._rotation @ model.y[:m]
+            weighted = self._outside * beside + self._rotation @ weighted
+        self.weighted = weighted
+        """P y, (m,)."""
+
+    def block(self, rows: NDArray[np.intp]) -> FloatArray:
+        """Return P of some residuals, (r, r)."""
+        if self._rotation is None:
+            return np.asarray(self._P[np.ix_(rows, rows)])
+        own = self._rotation[rows]
+        return np.asarray(self._outside * self._beside(own) + own @ self._P @ own.T)
+
+    def falls(self, rows: NDArray[np.intp]) -> FloatArray:
+        """Return by how much that block falls with each variance, P V_k P, (K, r, r)."""
+        own = None if self._rotation is None else self._rotation[rows]
+        found = []
+        for part in self._sources:
+            turned = part[rows] if own is None else own @ part
+            found.append(turned @ turned.T)
+        if own is not None:
+            found[0] = found[0] + (self._outside * self._size) ** 2 * self._beside(own)
+        return np.array(found)
+
+    @staticmethod
+    def _beside(own: FloatArray) -> FloatArray:
+        return np.asarray(np.eye(len(own)) - own @ own.T)
 
 
 def block_diagonal(blocks: FloatArray) -> FloatArray:
@@ -398,7 +453,8 @@ def variance_components(
         s, state = found
         if rise < CLOSE:
             break
-    return VarianceComponents(s, state.information, state.log_likelihood)
+    bounds = np.broadcast_to(np.asarray(upper, dtype=np.float64), s.shape)
+    return VarianceComponents(s, state.information, state.log_likelihood, bounds)
 
 
 def _projected(

@@ -78,6 +78,13 @@ class FitNumbers(Result):
         return None if self._first_order else error_model(self._optimum)
 
     @cached_property
+    def errors_of_combinations(self) -> ErrorModel | None:
+        """The same; also where only combinations of parameters are determined, for these alone."""
+        if self._first_order:
+            return None
+        return self.errors or error_model(self._optimum, of_combinations=True)
+
+    @cached_property
     def params(self) -> Mapping[str, Estimate]:
         """Every parameter of model and sensors, by name, with combined uncertainties."""
         values = dict(zip(self.var_names, self._optimum.values.tolist(), strict=True))

@@ -160,7 +160,8 @@ class JudgedFit(FitNumbers):
     @cached_property
     def cross_validation(self) -> CrossValidation | None:
         """Held-out tests against their bands; None without tests to hold out."""
-        return None if self.errors is None else cross_validation(self.errors)
+        errors = self.errors_of_combinations
+        return None if errors is None else cross_validation(errors)
 
     @cached_property
     def status(self) -> VerdictStatus:
@@ -169,7 +170,7 @@ class JudgedFit(FitNumbers):
 
     @cached_property
     def _budget(self) -> Budget:
-        return budget(self._optimum, self.errors)
+        return budget(self._optimum, self.errors_of_combinations)
 
     def budget(self) -> Budget:
         """Return the uncertainty budget: each parameter's sources, combined and expanded.
@@ -240,8 +241,9 @@ class JudgedFit(FitNumbers):
             If both or neither of amplitude and drive are given, a value is not above zero, or
             the shapes do not go together.
         """
+        errors = self.errors_of_combinations
         return response_band(
-            self._optimum, frequency_hz, amplitude, drive, quantity, self.errors, of_a_test=noise
+            self._optimum, frequency_hz, amplitude, drive, quantity, errors, of_a_test=noise
         )
 
     def backbone(self, amplitude: ArrayLike) -> FrequencyResponse:

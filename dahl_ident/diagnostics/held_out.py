@@ -1,0 +1,162 @@
+r"""Tests that are left out one at a time, and predicted from all others.
+
+For the linear mixed model of :mod:`dahl_ident.diagnostics.error_model` the prediction of rows b
+from all others, parameters estimated without them, misses by
+
+    e_b = (P_bb)^-1 (P y)_b,    with the covariance (P_bb)^-1,
+
+P as in :mod:`dahl_ident.diagnostics.variance_components`; nothing is fitted again. The variances
+s_k are estimates, and with D = (P_bb)^-1 the covariance moves by dD/ds_k = D (P V_k P)_bb D, which
+gives its degrees of freedom. Source: Dubrule, *Cross validation of kriging in a unique
+neighborhood*, Mathematical Geology 15 (1983) 687.
+
+How far tests lay from their predictions also says how far the next one may lie, whatever the
+distribution of their errors is. With Student's t as the prior, worth a few values, the distribution
+of the next score is that of a Dirichlet process,
+
+    P(score > z) = (c P(|t| > z) + number of scores > z)/(c + their number),
+
+t where scores are few and what was observed where they are many. Source: Ferguson, *A Bayesian
+analysis of some nonparametric problems*, Annals of Statistics 1 (1973) 209.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.error_model import ErrorModel, row_weights
+from dahl_ident.diagnostics.error_sources import repeated_levels
+
+FEWEST_TESTS = 3  # two leave one from which to predict, which shows no scatter
+_MOST_TESTS = 500  # left out one at a time: the share inside is then known to 1 %
+_PRIOR_SCORES = 10.0  # values that Student's t counts for: a table's own 5 % are known from more
+_NORMAL = 1e12  # degrees of freedom beyond which Student's t is the normal distribution
+_WIDEST = 1e6  # standard deviation of ln gain or phase, beyond which nothing is predicted
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Rows of tests that were left out, predicted from the others; ln gain and phase, (r, 2).
+
+    Attributes
+    ----------
+    rows, test : ndarray of int, shape (r,)
+        Of the data, and the number of each one's test.
+    deviation, std, dof : ndarray, shape (r, 2)
+        How far a value is from its prediction, the standard deviation of that, and the degrees of
+        freedom of the latter; NaN where nothing is predicted.
+    available : int
+        Tests there are; of very many, some were left out, chosen evenly.
+    """
+
+    rows: NDArray[np.intp]
+    test: NDArray[np.intp]
+    deviation: FloatArray
+    std: FloatArray
+    dof: FloatArray
+    available: int
+
+    @property
+    def scores(self) -> FloatArray:
+        """Deviations over their standard deviations, shape (r, 2)."""
+        return np.asarray(np.abs(self.deviation) / self.std)
+
+    def without(self, test: int) -> FloatArray:
+        """Return the scores of all other tests."""
+        return np.asarray(self.scores[self.test != test].ravel())
+
+
+def band_factor(scores: FloatArray, dof: FloatArray, level: float) -> FloatArray:
+    """Return the half width of a band over the standard deviation of a test's deviation.
+
+    That of Student's t, or more where tests that were left out lie farther away than it says.
+
+    Parameters
+    ----------
+    scores : ndarray, shape (k,)
+        Deviations of tests that were left out, over their standard deviations.
+    dof : ndarray
+        Degrees of freedom of the standard deviation.
+    level : float
+        Probability of the band.
+
+    Examples
+    --------
+    >>> of_two = np.array([4.0, 5.0, *np.linspace(0.1, 1.9, 16)])
+    >>> band_factor(of_two[2:], np.array([30.0]), 0.95).round(2).tolist()
+    [2.04]
+    >>> band_factor(of_two, np.array([30.0]), 0.95).round(2).tolist()
+    [4.0]
+    """
+    upper, nu = 0.5 * (1.0 + level), np.minimum(dof, _NORMAL)
+    least = special.stdtrit(nu, upper)
+    falling = np.sort(scores[np.isfinite(scores)])[::-1]
+    outside = (1.0 - level) * (_PRIOR_SCORES + falling.size)
+    best = np.full(np.shape(nu), np.inf)
+    for j in range(min(int(outside), falling.size) + 1):
+        by_prior = min((outside - j) / _PRIOR_SCORES, 1.0)
+        if by_prior > 0.0:
+            t = special.stdtrit(nu, 1.0 - 0.5 * by_prior)
+            best = np.minimum(best, np.maximum(t, falling[j] if j < falling.size else 0.0))
+    return np.asarray(np.maximum(least, best))
+
+
+def held_out(errors: ErrorModel) -> HeldOut | None:
+    """Return the tests left out in turn; None with fewer than three."""
+    data = errors.problem.data
+    tests = rows_of_tests(data)
+    if len(tests) < FEWEST_TESTS:
+        return None
+    chosen = np.linspace(0, len(tests) - 1, min(len(tests), _MOST_TESTS)).round().astype(int)
+    units = errors.relative_units() / row_weights(errors.problem)[::2, None, None]
+    W = errors.components.covariance
+    parts, owner = [], []
+    for number, rows in enumerate(tests[i] for i in chosen):
+        index = (2 * rows[:, None] + np.arange(2)).ravel()
+        try:
+            D = np.asarray(np.linalg.inv(errors.rows.block(index)), dtype=np.float64)
+        except np.linalg.LinAlgError:
+            continue
+        turn = units[rows]
+
+        def own(matrix: FloatArray, turn: FloatArray = turn) -> FloatArray:
+            """Return the variances of ln gain and phase, (r, 2)."""
+            r = len(turn)
+            blocks = matrix.reshape(r, 2, r, 2)[np.arange(r), :, np.arange(r)]
+            return np.asarray(np.einsum("rai,rij,raj->ra", turn, blocks, turn))
+
+        missed = (D @ errors.rows.weighted[index]).reshape(-1, 2, 1)
+        variance = np.maximum(own(D), 0.0)
+        moves = np.array([own(np.asarray(D @ part @ D)) for part in errors.rows.falls(index)])
+        spread = np.einsum("kra,kl,lra->ra", moves, W, moves)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            dof = np.where(spread > 0.0, np.maximum(2.0 * variance**2 / spread, 1.0), np.inf)
+        std = np.sqrt(variance)
+        std = np.where((std > 0.0) & (std < _WIDEST), std, np.nan)
+        parts.append((rows, (turn @ missed)[..., 0], std, dof))
+        owner.append(np.full(len(rows), number))
+    if not parts:
+        return None
+    found = (np.concatenate(column) for column in zip(*parts, strict=True))
+    rows, deviation, std, dof = found
+    return HeldOut(rows, np.concatenate(owner), deviation, std, dof, len(tests))
+
+
+def rows_of_tests(data: FrequencyResponse) -> list[NDArray[np.intp]]:
+    """Return the rows of each test: runs, else labelled levels, else repeats of one level."""
+    for labels in (data.run, data.level):
+        if labels is not None:
+            names, which = np.unique(labels, return_inverse=True)
+            if FEWEST_TESTS <= len(names) < data.n:
+                return _rows_of(which)
+    return _rows_of(repeated_levels(data))
+
+
+def _rows_of(which: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    return np.split(np.argsort(which, kind="stable"), np.cumsum(np.bincount(which))[:-1])
