@@ -53,14 +53,14 @@ def test_a_column_map_is_used(
     code, _, why = told(monkeypatch, capsys, *words)
     assert code == 1
     assert "--columns" in why
-    words = (*words, "--columns", odd_columns.with_name("map.toml"))
-    code, out, _ = told(monkeypatch, capsys, *words)
+    mapped = (*words, "--columns", odd_columns.with_name("map.toml"))
+    code, out, _ = told(monkeypatch, capsys, *mapped)
     assert code == 0
     assert "f_max" in out
     (line,) = (line for line in out.splitlines() if line.split()[:1] == ["sigma"])
     assert float(line.split()[1]) == pytest.approx(30.0, rel=0.01)
     assert "Uncertainty budget" not in out
-    code, out, _ = told(monkeypatch, capsys, *words, "-v")
+    code, out, _ = told(monkeypatch, capsys, *mapped, "-v")
     assert "Uncertainty budget" in out
     assert "offset" in out
 

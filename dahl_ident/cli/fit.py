@@ -123,8 +123,8 @@ def fit(
         how = refuse_for_tables(
             "fit", {**model.keywords(), **estimating.keywords()}, Estimating().keywords()
         )
-        result = _fit_records(read_records(files, reading), {**how, "output": predicted})
-        _tell_records(result, general, writing, report, save, verbose=verbose)
+        of_records = _fit_records(read_records(files, reading), {**how, "output": predicted})
+        _tell_records(of_records, general, writing, report, save, verbose=verbose)
         return
     if predicted is not None:
         raise ValidationError("--predicted is given without --record; leave it out")

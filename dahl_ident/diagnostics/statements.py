@@ -14,6 +14,7 @@ import numpy as np
 from dahl_ident.data.tabular import doubts
 from dahl_ident.diagnostics.budget import taken_as_exact
 from dahl_ident.diagnostics.cross_validation import CrossValidation
+from dahl_ident.diagnostics.doubtful_elements import below_zero, is_single, slight
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.formatting import listed, p_text, percent, with_unit
 from dahl_ident.diagnostics.goodness import Goodness
@@ -89,7 +90,7 @@ def statements(fit: Judged) -> tuple[str, ...]:
             misfit = f"misfit of {percent(goodness.rms_misfit)} rms"
             found.insert(0, f"The stated uncertainties include a {misfit}: {goodness.departures}.")
         first, *others = (*found, *_reservations(fit), known.headline)
-        said = (*others, *_checked(fit), *doubted(data.provenance))
+        said = (*others, *_slight(fit), *_checked(fit), *doubted(data.provenance))
         return (f"Approximate. {first}", *said, *assumptions(fit.optimum, fit.errors))
     first, *others = _objections(fit)
     return (f"{status.capitalize()}. {first}", *others, *doubted(data.provenance))
@@ -153,8 +154,45 @@ def _checked(fit: Judged) -> Iterator[str]:
 
 def _reservations(fit: Judged) -> Iterator[str]:
     """Yield what keeps a fit from being trusted although its residuals may look like noise."""
+    yield from _below_zero(fit)
     yield from _contradicted_priors(fit)
     yield from _moved_by_outliers(fit)
+
+
+def _estimates(fit: Judged) -> tuple[dict[str, float], Mapping[str, float]]:
+    """Return the values of all parameters, and standard uncertainties of those estimated."""
+    optimum, errors = fit.optimum, fit.errors
+    values = parameter_values(optimum)
+    values |= dict(zip(optimum.names, optimum.values.tolist(), strict=True))
+    return (values, optimum.stderr) if errors is None else (values | errors.values, errors.stderr)
+
+
+def _below_zero(fit: Judged) -> Iterator[str]:
+    """Yield a statement for every mass, damping or stiffness clearly below zero."""
+    values, stderr = _estimates(fit)
+    problem = fit.optimum.problem
+    single = [e.parameters[0] for e in problem.model.elements if is_single(e)]
+    yield from below_zero(single, values, stderr, problem.data.motion)
+
+
+def _slight(fit: Judged) -> Iterator[str]:
+    """Yield a statement for every mass, damper or spring of less force than the model misses."""
+    if not fit.goodness.objections:
+        return
+    values, stderr = _estimates(fit)
+    misfit, errors = fit.goodness.rms_misfit, fit.errors
+    if errors is not None:  # what an exponent explains is not missed
+        misfit = rms_misfit_of(errors.problem, errors.near.fitted)
+    view = fit.optimum.problem.stiffness_data
+    rows = view.harmonic == 1
+    for element in fit.optimum.problem.model.elements:
+        if is_single(element) and rows.any():
+            (parameter,) = element.parameters
+            value = values[parameter.name]
+            part = view.of(element, [np.asarray(value)])[rows] / view.stiffness[rows]
+            share = float(np.sqrt(np.mean(np.abs(part) ** 2)))
+            error = float(stderr.get(parameter.name, 0.0))
+            yield from slight(parameter, value, error, share, misfit)
 
 
 def _contradicted_constraints(fit: Judged) -> str:

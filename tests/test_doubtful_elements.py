@@ -1,0 +1,41 @@
+"""Masses and dampers that fits of tables find and no device has: said in the verdict."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import dahl_ident as di
+from dahl_ident.elements import Element
+
+
+def table(device: Element, seed: int = 0, noise: float = 0.005) -> di.FrequencyResponse:
+    """Return the response of a device at twelve amplitudes and three frequencies, with noise."""
+    rng = np.random.default_rng(seed)
+    A, f = (v.ravel() for v in np.meshgrid(np.geomspace(1e-3, 2e-2, 12), [0.5, 1.0, 2.0]))
+    Z = sum(
+        e.stiffness([np.asarray(v) for v in e.known_values()], A, 2.0 * np.pi * f)
+        for e in di.elements.Model(device).elements
+    )
+    scatter = 1.0 + noise * rng.standard_normal((A.size, 2)) @ [1.0, 1.0j]
+    return di.FrequencyResponse(f, Z * scatter, A)
+
+
+def test_a_negative_damper_is_said_with_what_to_do() -> None:
+    device = di.Dahl(0.1, 30.0) + di.Damper(-0.1)
+    fit = di.fit(table(device), di.Dahl() + di.Damper(), throw=False)
+    assert not fit.trusted
+    assert "damping is negative (-0.1" in fit.verdict
+    assert "leave the damper out" in fit.verdict
+    sound = di.fit(table(di.Dahl(0.1, 30.0) + di.Damper(0.1), 1), di.Dahl() + di.Damper())
+    assert sound.trusted
+    assert "negative" not in sound.verdict
+
+
+def test_a_mass_that_rests_on_less_than_the_misfit_is_doubted() -> None:
+    law = di.Dahl(0.05, 20.0, name="a") + di.Dahl(0.05, 6.0, name="b") + di.Mass(3e-3)
+    fit = di.fit(table(law, noise=0.02), di.Dahl() + di.Mass(), throw=False)
+    assert fit.status.value == "approximate"
+    assert "mass = " in fit.verdict
+    assert "less than the model misses" in fit.verdict
+    heavy = di.fit(table(law + di.Mass(3.0, name="b"), noise=0.02), di.Dahl() + di.Mass())
+    assert "less than the model misses" not in heavy.verdict
