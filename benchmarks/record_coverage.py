@@ -80,14 +80,14 @@ def scenarios() -> list[Scenario]:
         noise = f"correlation {pole}" if pole else "white noise"
         found.append(
             Scenario(
-                f"force from displacement, {noise}", di.Dahl() + di.Spring(), spring,
+                f"force from displacement, {noise}", di.Dahl(alpha=1.0) + di.Spring(), spring,
                 partial(force_record, pole=pole), False,
             )
         )  # fmt: skip
         found.append(
             Scenario(
                 f"motion from force, {noise}",
-                di.Dahl() + di.Mass() + di.Damper() + di.Spring(), plant,
+                di.Dahl(alpha=1.0) + di.Mass() + di.Damper() + di.Spring(), plant,
                 partial(motion_record, pole=pole), True,
             )
         )  # fmt: skip
@@ -97,7 +97,7 @@ def scenarios() -> list[Scenario]:
             Scenario(
                 f"force from displacement, white noise; noise in the displacement {travel:g} m, "
                 f"{kind}",
-                di.Dahl() + di.Spring(), spring,
+                di.Dahl(alpha=1.0) + di.Spring(), spring,
                 partial(force_record, pole=0.0, travel_noise=travel, travel_pole=pole), False,
             )
         )  # fmt: skip
@@ -128,8 +128,8 @@ def main() -> None:
         "The displacement moves 10 mm to either side, and the force's noise is 1e-3 N; beside a",
         "contact stiffness of 30 N/m, noise in the displacement of 3e-5 m is as large. If it is",
         "correlated, as the error of an encoder between its lines, fourth differences show little",
-        "of it. It enters the residuals through the local stiffness, which is largest after",
-        "reversals, where the parameters show most; the mean spectrum of the residuals hides this.",
+        "of it. Friction goes on from where the motion turned, so errors there last for some x_c",
+        "of path, where the parameters show most; the residuals after reversals show their size.",
         "",
         "| scenario | records | coverage |",
         "|---|---|---|",

@@ -264,6 +264,25 @@ def test_noise_in_the_displacement_counts_by_its_mean_square() -> None:
     assert max(found) / min(found) < 3.0
 
 
+def turning_row(step: float, seed: int) -> float:
+    """Return the uncertainty of sigma by turning points, the displacement wrong by one pole."""
+    t = np.arange(2400) / RATE
+    x = 3e-3 * (np.sin(9.0 * t) + np.sin(23.3 * t))
+    rng = np.random.default_rng(seed)
+    force = DAHL.force(x) + 5.0 * x + 5e-4 * rng.standard_normal(x.size)
+    wrong = lfilter([(1.0 - 0.9**2) ** 0.5], [1.0, -0.9], rng.standard_normal(x.size + 200))[200:]
+    record = di.Record(t, displacement=x + step * wrong, force=force)
+    start = {"f_max": 0.1, "sigma": 30.0, "stiffness": 5.0}
+    fit = di.fit(record, di.Dahl(alpha=1.0) + di.Spring(), start=start)
+    rows = {row.source: row.u for row in fit.budget()["sigma"].rows}
+    return rows.get("displacement at turning points", 0.0) / rows["noise"]
+
+
+def test_correlated_errors_of_the_displacement_show_at_turning_points() -> None:
+    assert max(turning_row(0.0, seed) for seed in range(4)) == 0.0
+    assert min(turning_row(1e-5, seed) for seed in range(4)) > 0.25
+
+
 def test_autoregression_finds_a_known_one() -> None:
     e = lfilter([1.0], [1.0, -1.2, 0.5], np.random.default_rng(1).standard_normal(40_000))
     a, variance = autoregression(np.asarray(e))

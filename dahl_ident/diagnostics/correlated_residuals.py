@@ -143,7 +143,7 @@ def _taken_by_a_fit(basis: FloatArray, model: tuple[FloatArray, float], highest:
     n = basis.shape[0]
     m = fft.next_fast_len(2 * n, real=True)
     waves = fft.rfft(basis, m, axis=0)
-    filtered = fft.irfft(waves * _spectrum(model, m)[:, None], m, axis=0)[:n]
+    filtered = fft.irfft(waves * spectrum_of(model, m)[:, None], m, axis=0)[:n]
     inner = basis.T @ filtered
     taken = np.empty(highest + 1)
     for k in range(highest + 1):
@@ -154,7 +154,8 @@ def _taken_by_a_fit(basis: FloatArray, model: tuple[FloatArray, float], highest:
     return taken
 
 
-def _spectrum(model: tuple[FloatArray, float], m: int) -> FloatArray:
+def spectrum_of(model: tuple[FloatArray, float], m: int) -> FloatArray:
+    """Return the spectrum of an autoregressive model at the frequencies of m samples."""
     a, variance = model
     return np.asarray(variance / np.abs(fft.rfft(np.concatenate([[1.0], -a]), m)) ** 2)
 
@@ -163,7 +164,7 @@ def _correlated(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
     """Return J'R J, R the residuals' covariance matrix from their spectrum."""
     n = residual.size
     m = fft.next_fast_len(2 * n, real=True)
-    spectrum = _spectrum(autoregression(residual, jacobian), m)
+    spectrum = spectrum_of(autoregression(residual, jacobian), m)
     waves = fft.rfft(jacobian, m, axis=0)
     weights = np.full(spectrum.size, 2.0)
     weights[0] = 1.0

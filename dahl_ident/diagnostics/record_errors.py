@@ -22,6 +22,7 @@ from dahl_ident.diagnostics.record_sources import (
     between_blocks,
     between_records,
 )
+from dahl_ident.diagnostics.turning_noise import noise_at_turns
 from dahl_ident.problem.displacement_noise import LEADS
 from dahl_ident.problem.record_noise import drive_noise
 from dahl_ident.problem.record_problem import RecordProblem
@@ -32,6 +33,7 @@ _DRAWS = 8  # of noise: the mean square of what they change is known to a half
 _STEP = 1e-5  # relative, of parameters, for slopes of derived quantities
 NOISE, DRIVE, FORCE = "noise", "noise in the drive", "force calibration"
 MODEL, DISPLACEMENT = "model error", "noise in the displacement"
+TURNS = "displacement at turning points"
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,8 @@ def record_errors(
     a measured drive makes
     the response look smaller than it is, by the noise's share of the drive's power within its
     band; a calibration error of the force scales every force. Noise in a
-    measured displacement counts as far as it shifts the estimate.
+    measured displacement counts as far as it shifts the estimate; where the residuals show larger
+    errors of the displacement at turning points, what these shift beyond that.
 
     Parameters
     ----------
@@ -129,6 +132,12 @@ def record_errors(
         matters = moved.diagonal() > _MATTERS**2 * covariance.diagonal()
         if matters[: len(problem.free)].any():
             found[DISPLACEMENT] = moved
+        if problem.with_memory and not problem.displacement_noise:
+            more = noise_at_turns(problem, values, jacobians, residuals)
+            more = _beyond(more, found.get(DISPLACEMENT, 0.0 * moved), covariance)
+            matters = more.diagonal() > _MATTERS**2 * covariance.diagonal()
+            if matters[: len(problem.free)].any():
+                found[TURNS] = more
     scale = np.zeros(values.size)
     for i, parameter in enumerate(problem.free):
         scale[i] = values[i] * parameter.dimension[0]
@@ -147,6 +156,14 @@ def record_errors(
     else:
         exact.insert(0, FORCE)
     return RecordErrors(found, effective, tuple(exact), len(problem.records), exponents)
+
+
+def _beyond(larger: FloatArray, known: FloatArray, unit: FloatArray) -> FloatArray:
+    """Return by how much a covariance exceeds a known one, where it does; counted in a third."""
+    size = unit.diagonal()
+    size = np.sqrt(np.where(np.isfinite(size) & (size > 0.0), size, 1.0))
+    values, vectors = np.linalg.eigh((larger - known) / np.outer(size, size))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(size, size))
 
 
 def _by_displacement(
