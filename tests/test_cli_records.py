@@ -94,6 +94,17 @@ def test_the_force_is_predicted_although_the_model_has_a_mass(
     assert "--record" in why
 
 
+def test_models_of_records_are_not_compared_as_tables(
+    odd_columns: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, why = told(monkeypatch, capsys, "fit", odd_columns, "--record", "--compare")
+    assert code == 1
+    assert "compares models of tables alone" in why
+    fit = di.fit(recorded(DAHL, "random", 300, 1e-3), di.Dahl())
+    with pytest.raises(di.errors.ValidationError, match="takes a fit of a table"):
+        di.compare_models(fit)
+
+
 def test_a_waveform_of_a_plan_is_no_record(tmp_path: Path) -> None:
     limits = {"displacement": (1e-4, 3e-2), "frequency_hz": 5.0, "time": 60.0}
     plan = di.plan(

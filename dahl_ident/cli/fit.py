@@ -119,7 +119,10 @@ def fit(
         place_of(save, "a fit", FORMATS)
     if record:
         if compare:
-            raise ValidationError("--compare is given together with --record; it takes tables")
+            raise ValidationError(
+                "--compare is given together with --record, but compares models of tables alone; "
+                "leave it out, and fit each model to the records (hold_out() in Python)"
+            )
         how = refuse_for_tables(
             "fit", {**model.keywords(), **estimating.keywords()}, Estimating().keywords()
         )

@@ -298,6 +298,11 @@ def compare_models(fit: Compared, models: Mapping[str, Element] | None = None) -
     >>> compare_models(result).best.name
     'exponent free'
     """
+    if not isinstance(fit.optimum, Optimum):
+        raise ValidationError(
+            "compare_models got a fit of records; it takes a fit of a table. Compare models of "
+            "records by fitting each, and by what their hold_out() says"
+        )
     if not isinstance(models, Mapping | None):
         raise ValidationError(
             f"models is a {type(models).__name__}; expected a mapping of names to models, such as "
