@@ -164,7 +164,11 @@ def _estimates(fit: Judged) -> tuple[dict[str, float], Mapping[str, float]]:
     optimum, errors = fit.optimum, fit.errors
     values = parameter_values(optimum)
     values |= dict(zip(optimum.names, optimum.values.tolist(), strict=True))
-    return (values, optimum.stderr) if errors is None else (values | errors.values, errors.stderr)
+    return (
+        (values, optimum.stderr)
+        if errors is None
+        else (values | dict(errors.values), errors.stderr)
+    )
 
 
 def _below_zero(fit: Judged) -> Iterator[str]:
