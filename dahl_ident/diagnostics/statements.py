@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from dahl_ident.arrays import FloatArray
 from dahl_ident.data.tabular import doubts
 from dahl_ident.diagnostics.budget import taken_as_exact
 from dahl_ident.diagnostics.cross_validation import CrossValidation
@@ -22,9 +23,8 @@ from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Identifiability
-from dahl_ident.elements import Model
-from dahl_ident.fitting import Optimum, solve
-from dahl_ident.problem import Problem
+from dahl_ident.fitting import Optimum
+from dahl_ident.fitting.losses import LOSSES
 
 _TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
@@ -33,6 +33,7 @@ _ENOUGH_HELD_OUT = 16  # values, of which 80 % in bands of 95 % happen once in 1
 _DOUBTS_SHOWN = 5  # more would hide the verdict
 _CHANCE = 0.0027  # that data contradict a right constraint as much, as for a prior
 _CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chance
+_PASSES, _SETTLED = 100, 1e-3  # of a robust fit: far below the one uncertainty that matters
 
 
 class Judged(Protocol):
@@ -232,22 +233,11 @@ def _moved_by_outliers(fit: Judged) -> Iterator[str]:
     optimum, errors = fit.optimum, fit.errors
     if optimum.loss != "linear" or errors is None:
         return
-    problem = optimum.problem
-    values = parameter_values(optimum) | dict(errors.values)
-    here = [e.started([values[p.name] for p in e.parameters]) for e in problem.model.elements]
-    fixed = {name: errors.values[name] for name in errors.assumed}
-    same = Problem(
-        problem.data, Model(*here), noise=problem.noise, sensors=problem.sensors, fixed=fixed
-    )
-    robust = solve(same, loss="huber", limits=False)
-    if not robust.success:  # the estimate is no start for it
-        robust = solve(same, loss="huber")
-    if not robust.success:
-        return
+    robust = _robust_values(errors, optimum.scale)
     moved = [
         name
-        for name, after in zip(robust.names, robust.values.tolist(), strict=True)
-        if abs(after - errors.values[name]) > errors.stderr[name]
+        for name in optimum.names
+        if abs(robust[name] - errors.values[name]) > errors.stderr[name]
     ]
     if moved:
         named = "; ".join(point.name for point in fit.goodness.suspicious[:5])
@@ -256,6 +246,35 @@ def _moved_by_outliers(fit: Judged) -> Iterator[str]:
             f"A robust fit moves {listed(moved)} by more than one standard uncertainty: look at "
             f'{rows}, or fit with loss="huber".'
         )
+
+
+def _robust_values(errors: ErrorModel, scale: float) -> Mapping[str, float]:
+    """Return a robust fit's values about the estimate, by iterated weights of a linear model.
+
+    Assumed exponents stay where they are. The noise's scale, where it is not stated, is the robust
+    one of :mod:`dahl_ident.fitting.losses`, from `scale` on.
+    """
+    problem, loss = errors.problem, LOSSES["huber"]
+    y, J = problem.residuals_and_jacobian(errors.theta, tails=False)
+    free = [i for i, name in enumerate(problem.names) if name not in errors.assumed]
+    J, rows = J[:, free], problem.n_residuals // 2
+    variance = 1.0 if problem.scale_known else scale**2
+    move: FloatArray = np.zeros(len(free))
+    weight = np.ones(len(y))
+    for _ in range(_PASSES):
+        square = np.sum((y + J @ move)[: 2 * rows].reshape(rows, 2) ** 2, axis=1)
+        if not problem.scale_known:
+            variance *= loss.rescaled(square / variance, 2 * rows - len(free))
+        weight[: 2 * rows] = np.repeat(loss.slope(square / variance), 2)
+        weight[2 * rows :] = variance  # priors have their own
+        root = np.sqrt(weight)
+        last, found = move, np.linalg.lstsq(root[:, None] * J, -root * y, rcond=1e-10)
+        move = np.asarray(found[0])
+        if np.linalg.norm(J @ (move - last)) < _SETTLED * np.sqrt(variance):
+            break
+    theta = errors.theta.copy()
+    theta[free] += move
+    return dict(zip(problem.names, problem.to_values(theta).tolist(), strict=True))
 
 
 def assumptions(optimum: Optimum, errors: ErrorModel | None) -> Iterator[str]:
