@@ -248,3 +248,10 @@ def test_linear_history_derivatives() -> None:
         h[i] = 1e-5 * point[i]
         expected = (force(point + h) - force(point - h)) / (2.0 * h[i])
         np.testing.assert_allclose(slope, expected, rtol=0.0, atol=1e-8 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("alpha", [0.7, 1.0, 1.5])
+def test_a_start_at_the_limit_may_exceed_it_by_rounding(alpha: float) -> None:
+    x = np.sin(np.linspace(0.0, 20.0, 200))
+    above, at = (force_history(x, 1.0, 30.0, alpha, start) for start in (1.0 + 4e-16, 1.0))
+    np.testing.assert_allclose(above, at, atol=1e-9)

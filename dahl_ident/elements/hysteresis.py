@@ -239,7 +239,7 @@ def _general_turning_margins(start: float, legs: FloatArray, alpha: float) -> Fl
     margins = [z]
     append = margins.append
     for scaled in (p * legs).tolist():
-        used = scaled * (z or _TINY) ** power
+        used = scaled * max(z, _TINY) ** power  # rounding may leave less than nothing
         z = 2.0 - (z + z * expm1(log1p(-used) / p)) if used < 1.0 else 2.0
         append(z)
     return np.asarray(margins)
