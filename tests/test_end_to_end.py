@@ -162,3 +162,9 @@ def test_a_delayed_and_mis_scaled_sensor_is_caught() -> None:
     assert_recovered(corrected, true, "f_max", "sigma", "delay")
     unknown = di.fit(data, di.Dahl(), sensors=di.Sensors(force_gain=None, delay=None), throw=False)
     assert not unknown.trusted
+
+
+def test_friction_alone_that_a_drive_moves_without_bound_is_refused_with_what_to_add() -> None:
+    for throw in (False, True):
+        with pytest.raises(di.FitError, match=r"predict 0\.05 Hz, 1 mN.*add the mass, damper"):
+            di.fit(table("fig_7_plant"), di.Dahl(), throw=throw)

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, overload
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.data.row_names import row_names
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import FitError, ValidationError
-from dahl_ident.fitting import solve, solve_many
+from dahl_ident.fitting import Optimum, solve, solve_many
 from dahl_ident.problem import Problem, ProblemBatch
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
@@ -132,7 +134,7 @@ def fit(
         If a fit of records was stopped from the keyboard; its `result` holds the best so far.
     FitError
         If there is no finite optimum and `throw`; the error's `result` holds what was found.
-        Also if there are fewer numbers than parameters.
+        Also if there are fewer numbers than parameters, or no values tried predict every row.
     ModelError
         If nothing is free, or a name is unknown.
     DataError
@@ -188,11 +190,26 @@ def fit(
         raise ValidationError(f"{' and '.join(beyond)} given; only method='ipopt' takes that")
     else:
         optimum = solve(problem, method=method, loss=loss, start=start)
+    if not np.isfinite(optimum.residuals).all():
+        raise FitError(_no_prediction(optimum))
     result = FitResult(optimum, first_order=constraints is not None)
     if throw and not result.success:
         cause = result.goodness.cause
         raise FitError(f"{cause} {result.message}" if cause else result.message, result)
     return result
+
+
+def _no_prediction(optimum: Optimum) -> str:
+    """Return what to do where no values tried predict a finite response in every row."""
+    data = optimum.problem.data
+    (name,) = row_names(data, [int(np.flatnonzero(~np.isfinite(optimum.residuals))[0]) // 2])
+    cause = "the model has no finite response there; give a start, or another model"
+    if (data.controlled == "force").any():
+        cause = (
+            "the drive moves the model without bound; add the mass, damper or spring that friction "
+            "stands beside, or give a start"
+        )
+    return f"No parameters that were tried predict {name}: {cause}"
 
 
 def fit_many(
