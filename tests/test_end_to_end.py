@@ -13,6 +13,7 @@ import pytest
 
 import dahl_ident as di
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.errors import FitError
 from dahl_ident.extraction import extract
 
 PLANT = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
@@ -166,5 +167,5 @@ def test_a_delayed_and_mis_scaled_sensor_is_caught() -> None:
 
 def test_friction_alone_that_a_drive_moves_without_bound_is_refused_with_what_to_add() -> None:
     for throw in (False, True):
-        with pytest.raises(di.FitError, match=r"predict 0\.05 Hz, 1 mN.*add the mass, damper"):
+        with pytest.raises(FitError, match=r"predict 0\.05 Hz, 1 mN.*add the mass, damper"):
             di.fit(table("fig_7_plant"), di.Dahl(), throw=throw)
