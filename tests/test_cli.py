@@ -38,12 +38,16 @@ def test_fit_recovers_the_truth_and_ends_with_0(run: Runner) -> None:
 
 def test_command_line_and_python_give_the_same_numbers(run: Runner) -> None:
     table = run("datasets", "noisy", "-o", "-").out
-    told = json.loads(run("fit", "-", "--json", stdin=table).out)["params"]
+    whole = json.loads(run("fit", "-", "--json", stdin=table).out)
+    told = whole["params"]
     Path("noisy.csv").write_text(table, encoding="utf-8")
     fit = di.fit(di.read_frequency_response("noisy.csv"), di.Dahl())
     for name in ("f_max", "sigma"):
         assert told[name]["value"] == fit.params[name].value
         assert told[name]["stderr"] == fit.params[name].stderr
+        assert whole["budget"]["parameters"][name]["U"] == fit.budget()[name].U
+    alpha = whole["assumed"]["alpha"]
+    assert f"(here {alpha['value']:.3f} +- {alpha['stderr']:.3f})" in fit.verdict
 
 
 def test_a_missing_file_is_one_line_and_status_1(run: Runner) -> None:

@@ -169,3 +169,9 @@ def test_friction_alone_that_a_drive_moves_without_bound_is_refused_with_what_to
     for throw in (False, True):
         with pytest.raises(FitError, match=r"predict 0\.05 Hz, 1 mN.*add the mass, damper"):
             di.fit(table("fig_7_plant"), di.Dahl(), throw=throw)
+
+
+def test_degrees_of_freedom_without_bound_are_stated_alike_in_budget_and_intervals() -> None:
+    fit = di.fit(table("outliers"), di.Dahl(), throw=False)
+    assert fit.budget()["f_max"].dof == np.inf
+    assert "t with inf and inf degrees of freedom" in fit.conf_interval().note

@@ -291,6 +291,7 @@ def as_json(result: FitResult) -> dict[str, Any]:
     from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
 
     limits = result.conf_interval().at(CONFIDENCE)
+    stated, errors = result.stated_budget, result.errors
     return {
         "status": str(result.status),
         "trusted": result.trusted,
@@ -301,6 +302,13 @@ def as_json(result: FitResult) -> dict[str, Any]:
             name: {**vars(estimate), "interval": limits[name] if estimate.vary else None}
             for name, estimate in result.params.items()
         },
+        "assumed": {}
+        if errors is None
+        else {
+            name: {"value": errors.values[name], "stderr": errors.stderr[name]}
+            for name in errors.assumed
+        },
+        "budget": None if stated is None else stated.to_dict(),
         "determined": [str(c) for c in result.identifiability.combinations],
         "warnings": list(result.goodness.warnings),
         "suspicious": [str(point) for point in result.goodness.suspicious],

@@ -15,7 +15,7 @@ from scipy import special
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.combinations import candidates, runaway
-from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, MANY
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.error_sources import APART, LEVELS, MODEL_ERROR, NOISE, RUNS
 from dahl_ident.diagnostics.formatting import listed, rounded, table
@@ -26,8 +26,6 @@ from dahl_ident.fitting import Optimum
 _DETERMINED, _HARDLY = 0.25, 1.0  # u of a logarithm
 # What rounding leaves where a source has no part: variances relative to the combined one.
 _ROUNDING = 1e-18
-# Student's t with more degrees of freedom is normal to all digits that a budget shows.
-_MANY = 1e6
 _TYPE_A = (NOISE, MODEL_ERROR, RUNS, LEVELS, APART)
 _CHANNELS = {
     "force_gain": "force calibration",
@@ -354,7 +352,7 @@ def _parameter(
         rows.append(BudgetRow(source, kind, own**0.5, dof, own / total if total > 0.0 else 0.0))
     rows.sort(key=lambda row: -row.u)
     dof = errors.dof(direction)
-    dof = dof if dof < _MANY else np.inf
+    dof = dof if dof < MANY else np.inf
     return ParameterBudget(name, unit, value, tuple(rows), total**0.5, dof, coverage_factor(dof))
 
 

@@ -19,6 +19,8 @@ from dahl_ident.fitting import Optimum
 
 CONFIDENCE = 0.9545  # of intervals that are stated alone: k = 2, as JCGM 100 has U
 LEVELS = (0.6827, CONFIDENCE, 0.9973)  # one, two and three standard deviations
+# Student's t with more degrees of freedom is normal to all digits that a budget shows.
+MANY = 1e6
 
 
 def checked_levels(levels: Sequence[float] | float) -> FloatArray:

@@ -32,7 +32,13 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.budget import coverage_factor
-from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels, percent, thresholds
+from dahl_ident.diagnostics.confidence_levels import (
+    LEVELS,
+    MANY,
+    checked_levels,
+    percent,
+    thresholds,
+)
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.formatting import listed, table
 from dahl_ident.diagnostics.profile import Profiler
@@ -229,8 +235,8 @@ def combined_intervals(
     found = intervals_from_search(
         optimum, "combined", levels, theta - k * u * below, theta + k * u * above
     )
-    note = f"every source of the budget: t with {listed([f'{nu:.3g}' for nu in dof])}"
-    note += " degrees of freedom"
+    shown = listed([f"{nu:.3g}" for nu in np.where(dof < MANY, dof, np.inf)])
+    note = f"every source of the budget: t with {shown} degrees of freedom"
     return replace(found, estimate=errors.problem.to_values(errors.theta)[place], note=note)
 
 
