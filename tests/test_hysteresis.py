@@ -255,3 +255,25 @@ def test_a_start_at_the_limit_may_exceed_it_by_rounding(alpha: float) -> None:
     x = np.sin(np.linspace(0.0, 20.0, 200))
     above, at = (force_history(x, 1.0, 30.0, alpha, start) for start in (1.0 + 4e-16, 1.0))
     np.testing.assert_allclose(above, at, atol=1e-9)
+
+
+@pytest.mark.parametrize("alpha", [0.5, 1.0, 1.5])
+def test_force_beyond_the_limit_relaxes_towards_it(alpha: float) -> None:
+    # an estimate of the force at the first sample may lie there; against Runge and Kutta's rule
+    x = 1e-3 * np.sin(np.linspace(0.0, 12.0, 2001))
+    force, found = 1.3, [1.3]
+
+    def slope(force: float, heading: float) -> float:
+        margin = 1.0 - heading * force
+        return float(1000.0 * np.abs(margin) ** alpha * np.sign(margin))
+
+    for step in np.diff(x).tolist():
+        s = float(np.sign(step))
+        for _ in range(4):
+            h = 0.25 * step
+            k1 = slope(force, s)
+            k2 = slope(force + 0.5 * h * k1, s)
+            k3 = slope(force + 0.5 * h * k2, s)
+            force += h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + slope(force + h * k3, s))
+        found.append(force)
+    np.testing.assert_allclose(force_history(x, 1.0, 1000.0, alpha, 1.3), found, atol=1e-5)

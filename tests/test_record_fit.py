@@ -302,6 +302,35 @@ def test_what_is_not_determined_is_said_with_the_motion_that_would() -> None:
     assert "move farther" in fit.verdict
 
 
+def test_a_displacement_that_is_constant_determines_nothing(tmp_path: Path) -> None:
+    t = np.arange(400) / 100.0
+    force = 1e-3 * np.random.default_rng(0).standard_normal(400)
+    fit = di.fit(di.Record(t, displacement=0.0 * t, force=force), di.Dahl(), throw=False)
+    assert "f_max is not determined at all: the displacement is constant; move." in fit.verdict
+    assert fit.conf_interval()["f_max"] == (-np.inf, np.inf)
+    assert "nan" not in str(fit)
+    moving = di.Record(t, displacement=1e-3 * np.sin(t), force=force)
+    assert np.isinf(fit.predict(moving).upper[1:]).all()  # friction that nobody knows
+    assert not np.isnan([d.stderr for d in fit.derived([1e-3], 1.0)]).any()
+
+
+def test_records_that_differ_are_the_reason_why_a_parameter_is_not_determined() -> None:
+    runs = [recorded(di.Dahl(f_max, 30.0), "random", 800, 1e-5) for f_max in (0.03, 0.1)]
+    fit = di.fit(runs, di.Dahl(alpha=1.0), throw=False)
+    assert fit.budget()["f_max"].rows[0].source == "scatter between runs"
+    assert "because the records ask for different values" in fit.verdict
+
+
+def test_ratios_alone_are_refused() -> None:
+    t = np.arange(200) / 100.0
+    decay = di.Record(t, displacement=np.exp(-t) * np.cos(9.0 * t), force=0.0 * t)
+    with pytest.raises(DataError, match="the force is zero, so that the motion determines only"):
+        di.fit(decay, di.Dahl() + di.Mass() + di.Spring())
+    base = di.Record(t, displacement=np.sin(t), force=np.cos(t))
+    with pytest.raises(DataError, match="the base moves, so that"):
+        di.fit(base, di.Dahl() + di.Mass() + di.Spring(), excitation="base")
+
+
 def test_what_the_model_misses_from_place_to_place_is_in_the_budget() -> None:
     # friction whose level wanders by 10 % from one twentieth of the record to the next
     samples = 4000
@@ -380,6 +409,14 @@ def test_stored_and_read_again(tmp_path: Path) -> None:
     edited["values"][0] *= 1.01
     with pytest.raises(DataError, match="was changed after the fit was saved"):
         RecordFit.from_json(json.dumps(edited))
+    t = np.arange(300) / 100.0
+    calibrated = di.Record(
+        t, displacement=1e-2 * np.sin(t), drive=DAHL.force(1e-2 * np.sin(t)), drive_unit="V",
+        drive_factor=1.0, drive_factor_uncertainty=0.05, provenance={"file": "run.csv"},
+    )  # fmt: skip
+    other = di.fit(calibrated, di.Dahl())
+    assert str(RecordFit.from_json(other.to_json())) == str(other)
+    assert "force calibration" in str(other.budget())
     table = fit.summary()
     assert list(table.index[:3]) == ["sigma", "q", "p"]
     assert again.budget().to_dict() == fit.budget().to_dict()
@@ -447,6 +484,23 @@ def test_command_line(
     assert end.value.code in (0, None)
     assert (tmp_path / "a_pictures" / "record_loop_1.png").exists()
     assert "Trusted." in capsys.readouterr().out
+    saved, again = str(tmp_path / "fit.json"), str(tmp_path / "again.md")
+    for command in (
+        ["fit", str(place), "--record", "--save", saved, "--json"],
+        ["report", saved, "-o", again],
+    ):
+        monkeypatch.setattr("sys.argv", ["dahl-ident", *command])
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert end.value.code in (0, None)
+        if "--json" in command:
+            found = json.loads(capsys.readouterr().out)
+            limits = RecordFit.load(saved).conf_interval()
+            assert tuple(found["params"]["sigma"]["interval"]) == limits["sigma"]
+            assert found["trusted"]
+    text = Path(again).read_text("utf-8")
+    assert "run.csv, SHA-256" in text
+    assert "Not given: alpha between" in text
 
 
 @pytest.mark.parametrize("ending", ["json", "html"])

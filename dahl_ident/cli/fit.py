@@ -219,11 +219,20 @@ def _tell_records(
     if save is not None:
         result.save(save, overwrite=writing.overwrite)
     if general.json:
+        limits = result.conf_interval()
         console.write_json(
             {
                 "status": str(result.status),
+                "trusted": result.trusted,
                 "verdict": result.verdict,
-                "params": {name: vars(p) for name, p in result.params.items()},
+                "success": result.success,
+                "message": result.message,
+                "params": {
+                    name: {**vars(p), "interval": limits.get(name)}
+                    for name, p in result.params.items()
+                },
+                "effective_samples": result.effective_samples,
+                "share_left": result.goodness.share_left,
             }
         )
     elif report != STANDARD:

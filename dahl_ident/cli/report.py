@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,7 +14,10 @@ from dahl_ident.cli.fit import Estimating, check_reports, finish, fitted, write_
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import STANDARD, Files, General, Reading, Seed, Writing
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import DataError, ValidationError
+
+if TYPE_CHECKING:
+    from dahl_ident.results import ChainPosterior, FitResult, RecordFit, RecordPosterior
 
 
 @with_option_groups
@@ -59,7 +63,7 @@ def report(
     Example: dahl-ident datasets noisy -o - | dahl-ident report - -o report.html
     """
     from dahl_ident.data import read_record
-    from dahl_ident.results import ChainPosterior, FitResult
+    from dahl_ident.results import RecordFit
 
     writing.check(output, files, json=general.json)
     check_reports(*output)
@@ -75,14 +79,16 @@ def report(
     if len(files) > 1 and saved and (posterior or record is not None):
         raise ValidationError("--posterior and --record go with one fit; give one file")
     waveforms = None if record is None else read_record(record, columns=record_columns)
-    fits = (
-        [FitResult.load(file) for file in files]
+    fits: Sequence[FitResult | RecordFit] = (
+        [_saved_fit(file) for file in files]
         if saved
         else [fitted(files, reading, model, estimating)]
     )
-    results: list[FitResult | ChainPosterior] = [*fits]
+    results: list[FitResult | ChainPosterior | RecordFit | RecordPosterior] = [*fits]
     result = fits[0]
     for fit in fits if bootstrap else ():
+        if isinstance(fit, RecordFit):
+            raise ValidationError("--bootstrap is given with a fit of records; leave it out")
         fit.conf_interval("bootstrap", seed=seed)
     if posterior:
         from dahl_ident.results.bayesian_estimate import posterior as estimate_posterior
@@ -96,3 +102,16 @@ def report(
     elif STANDARD not in places:
         console.write("\n".join(places))
     finish(next((fit for fit in fits if not fit.status.usable), result))
+
+
+def _saved_fit(file: str) -> FitResult | RecordFit:
+    """Return the fit of a table or of records that a file holds."""
+    from dahl_ident.results import FitResult, RecordFit
+    from dahl_ident.results.record_fit import SCHEMA
+
+    try:
+        return FitResult.load(file)
+    except DataError as exc:
+        if repr(SCHEMA) not in str(exc):
+            raise
+        return RecordFit.load(file)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.diagnostics.formatting import percent, with_unit
 from dahl_ident.elements import Element, Parameter
 from dahl_ident.units import Motion, shown_unit
 
@@ -79,7 +79,7 @@ def slight(
     if parameter.free and share < misfit and value >= -_CLEARLY * error:
         yield (
             f"{parameter.name} = {with_unit(value, error, parameter.unit)} rests on "
-            f"{100.0 * share:.2g} % rms of the force, less than the model misses "
-            f"({100.0 * misfit:.2g} %), and may stand for that: give it if it is known, or leave "
+            f"{percent(share)} rms of the force, less than the model misses "
+            f"({percent(misfit)}), and may stand for that: give it if it is known, or leave "
             "it out."
         )

@@ -79,6 +79,8 @@ class RecordErrors:
     def dof_for(self, place: int) -> float:
         """Degrees of freedom of one value, by Welch and Satterthwaite."""
         own = {name: float(C[place, place]) for name, C in self.contributions.items()}
+        if np.isinf(sum(own.values())):  # which an infinite source alone decides
+            return min(self.dof_of(name) for name, u2 in own.items() if np.isinf(u2))
         loss = sum(u2**2 / self.dof_of(name) for name, u2 in own.items())
         return sum(own.values()) ** 2 / loss if loss > 0.0 else np.inf
 
@@ -226,7 +228,8 @@ def record_budget(problem: RecordProblem, values: FloatArray, errors: RecordErro
             kind: Literal["A", "B"] = "A" if source in (NOISE, MODEL, RUNS) else "B"
             own = float(covariance[i, i])
             dof = errors.dof_of(source)
-            rows.append(BudgetRow(source, kind, own**0.5, dof, own / u2 if u2 > 0.0 else 0.0))
+            share = float(np.isinf(own)) if np.isinf(u2) else own / u2 if u2 > 0.0 else 0.0
+            rows.append(BudgetRow(source, kind, own**0.5, dof, share))
         dof = errors.dof_for(i)
         rows.sort(key=lambda row: -row.u)
         parameters.append(
@@ -236,6 +239,22 @@ def record_budget(problem: RecordProblem, values: FloatArray, errors: RecordErro
             )
         )  # fmt: skip
     return Budget(tuple(parameters), total[:count, :count], errors.exact)
+
+
+def variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the variances of quantities with these derivatives by the estimate.
+
+    Infinite where one depends on a value that is not determined at all.
+
+    Examples
+    --------
+    >>> variances(np.array([[2.0, 0.0], [0.0, 1.0]]), np.diag([1.0, np.inf])).tolist()
+    [4.0, inf]
+    """
+    endless = np.isinf(covariance.diagonal())
+    finite = np.where(np.isfinite(covariance), covariance, 0.0)
+    found = np.einsum("ij,jk,ik->i", slopes, finite, slopes)
+    return np.where((slopes[:, endless] != 0.0).any(axis=1), np.inf, found)
 
 
 def record_assumptions(problem: RecordProblem, errors: RecordErrors) -> str:
@@ -300,7 +319,7 @@ def record_derived(
         step[i] = _STEP * abs(values[i])
         if step[i] > 0.0:
             slopes[:, i] = (quantities(values + step) - quantities(values - step)) / (2 * step[i])
-    errors = np.sqrt(np.einsum("ij,jk,ik->i", slopes, covariance[:count, :count], slopes))
+    errors = np.sqrt(variances(slopes, covariance[:count, :count]))
     return tuple(
         DerivedQuantity(name, unit, a, float(v), float(e))
         for (name, unit, a), v, e in zip(labels, centre, errors, strict=True)

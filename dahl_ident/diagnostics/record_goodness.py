@@ -9,6 +9,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
+from dahl_ident.diagnostics.formatting import percent
 
 _SEGMENTS = 50  # the worst one is 2 % of a record
 
@@ -53,7 +54,7 @@ class RecordGoodness:
         """The numbers as text."""
         return [
             f"unexplained share of variance {self.share_left:.3g} "
-            f"({100 * self.share_left**0.5:.2g} % rms)",
+            f"({percent(self.share_left**0.5)} rms)",
             f"residuals {self.rms:.3g} rms; {self.worst_text}",
             f"correlation of neighbouring residuals {self.correlation:.2f}",
         ]

@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
+from dahl_ident.diagnostics.error_model import EXPONENT
+from dahl_ident.diagnostics.error_sources import RUNS
+from dahl_ident.diagnostics.record_errors import MODEL
 from dahl_ident.elements import Model
 from dahl_ident.elements.recursion import stretches
 
 _UNCERTAIN = 0.3  # relative standard uncertainty of a parameter that is not determined
 _LONG_ENOUGH = 0.02  # share of samples near a reversal
 _ALIKE = 0.95  # correlation at which two parameters cannot be distinguished
+_BECAUSE = {  # by the source of most of the uncertainty
+    EXPONENT: "of the exponent, which was not given: give it if it is known, or estimate it too",
+    RUNS: "the records ask for different values: fit each alone, and look at what differs",
+    MODEL: "parts of the records ask for different values: choose a model that describes them",
+}
 
 
 def undetermined(
@@ -22,7 +31,7 @@ def undetermined(
     stderr: Mapping[str, float],
     covariance: FloatArray,
     names: Sequence[str],
-    by_exponents: Sequence[str] = (),
+    mostly: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[str, ...]:
     """Return one sentence for each parameter that the records do not determine.
 
@@ -37,8 +46,8 @@ def undetermined(
     covariance : ndarray, shape (P, P)
         Of the parameters `names`.
     names : sequence of str
-    by_exponents : sequence of str
-        Those whose uncertainty is mostly that of an exponent that nobody gave.
+    mostly : mapping of str to str
+        The source of most of the uncertainty, of parameters for which there is one.
 
     Returns
     -------
@@ -62,21 +71,25 @@ def undetermined(
                 continue
             start = f"{parameter.name} is not determined (standard uncertainty {error:.2g} "
             start += f"{parameter.unit})".replace(" )", ")")
-            if element.has_memory and farthest < 2.0 * low:
+            if np.isinf(error):
+                start = f"{parameter.name} is not determined at all"
+            if farthest == 0.0:
+                found.append(f"{start}: the displacement is constant; move.")
+            elif element.has_memory and farthest < 2.0 * low:
+                # an estimate within its own uncertainty of zero says nothing of where slip begins
+                known = error < abs(float(parameter.value or 0.0))
+                needs = f"{2.0 * high:.2g} m" if known else "more"
                 found.append(
                     f"{start}: the motion moves no farther than {farthest:.2g} m after a "
-                    f"reversal, and slip needs {2.0 * high:.2g} m; move farther."
+                    f"reversal, and slip needs {needs}; move farther."
                 )
             elif element.has_memory and near < _LONG_ENOUGH:
                 found.append(
                     f"{start}: the motion never stays below x_c = {low:.2g} m long enough; add "
                     "reversals and small motions of that size, sampled closely."
                 )
-            elif parameter.name in by_exponents:
-                found.append(
-                    f"{start} because of the exponent, which was not given: give it if it is "
-                    "known, or estimate it too."
-                )
+            elif mostly.get(parameter.name) in _BECAUSE:
+                found.append(f"{start} because {_BECAUSE[mostly[parameter.name]]}.")
             else:
                 found.append(f"{start}{_alike(parameter.name, covariance, names)}.")
     return tuple(found)

@@ -183,7 +183,7 @@ def margin_change(margin: FloatArray, path: FloatArray, alpha: float) -> FloatAr
     if alpha == 1.0:
         return margin * np.expm1(-path)
     p = 1.0 - alpha
-    used = np.maximum(margin, _TINY) ** -p
+    used = np.maximum(np.abs(margin), _TINY) ** -p
     with np.errstate(divide="ignore", over="ignore", under="ignore"):
         used *= p * path
         return np.asarray(margin * np.expm1(np.log1p(-np.minimum(used, 1.0)) / p))
@@ -239,7 +239,7 @@ def _general_turning_margins(start: float, legs: FloatArray, alpha: float) -> Fl
     margins = [z]
     append = margins.append
     for scaled in (p * legs).tolist():
-        used = scaled * max(z, _TINY) ** power  # rounding may leave less than nothing
+        used = scaled * (abs(z) or _TINY) ** power  # a start may be beyond the limit
         z = 2.0 - (z + z * expm1(log1p(-used) / p)) if used < 1.0 else 2.0
         append(z)
     return np.asarray(margins)

@@ -126,6 +126,7 @@ class RecordProblem:
         self.with_memory = [e for e in self.model.elements if e.has_memory]
         for number, record in enumerate(self.records, 1):
             self._check(record, f"record {number}" if len(self.records) > 1 else "the record")
+        self._check_scale()
         self.parameters = (*self.free, *self._nuisance())
         self.names = [p.name for p in self.parameters]
         low, high = (np.array([getattr(p, b) for p in self.parameters]) for b in ("lower", "upper"))
@@ -162,6 +163,22 @@ class RecordProblem:
             )
         if self.output == "motion":
             _ = record.force_samples
+
+    def _check_scale(self) -> None:
+        """Refuse a motion that masses and forces, all of them larger, would explain as well."""
+        elements = self.model.elements
+        if (
+            self.output == "force"
+            or any((not p.free and p.value and p.dimension[0]) for p in self.model.parameters)
+            or not all(any(p.free for p in e.parameters) for e in elements)
+        ):
+            return
+        if self.excitation == "base" or not any(r.force_samples.any() for r in self.records):
+            why = "the base moves" if self.excitation == "base" else "the force is zero"
+            raise DataError(
+                f"{why}, so that the motion determines only the ratios of masses, forces, dampers "
+                "and springs; give one of them, such as the mass: Mass(1.0), --mass 1.0"
+            )
 
     def _nuisance(self) -> list[Parameter]:
         found = []

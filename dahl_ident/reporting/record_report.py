@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dahl_ident.diagnostics.formatting import interval, rounded
+from dahl_ident.diagnostics.formatting import interval, percent, rounded
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.reporting import posterior_sections, provenance, tables
 from dahl_ident.reporting.document import (
@@ -79,10 +79,11 @@ def record_document(
         Paragraph(f"Made on {provenance.today()}."),
         *([Listing(command)] if command else []),
     ]
-    name = files[0]["file"] if files else f"{len(first.records)} records"
+    count = f"{len(first.records)} record{'s' if len(first.records) > 1 else ''}"
+    name = files[0]["file"] if files else count
     header = dict(given.header()) | {
         "Model": tuple(_model(first)),
-        "Data": (f"{len(first.records)} records, {first.problem.n_residuals} samples", *named),
+        "Data": (f"{count}, {first.problem.n_residuals} samples", *named),
         "Date of report": (provenance.today(),),
         "Software": (f"dahl_ident {__version__}",),
     }
@@ -146,9 +147,16 @@ def _answer(fit: RecordFit) -> Table:
 
 def _assumed(fit: RecordFit) -> Iterator[str]:
     yield _OUTPUTS[fit.problem.output]
-    fixed = [f"{p.name} = {p.value:g} {p.unit}".rstrip() for p in fit.params.values() if not p.vary]
+    assumed = {one.name for one in fit.errors.exponents}
+    fixed = [
+        f"{p.name} = {p.value:g} {p.unit}".rstrip()
+        for p in fit.params.values()
+        if not p.vary and p.name not in assumed
+    ]
     if fixed:
         yield f"Held fixed: {', '.join(fixed)}."
+    for one in fit.errors.exponents:
+        yield f"Not given: {one}; its range counts in the uncertainty."
     yield f"Taken as exact: {', '.join(fit.errors.exact)}."
     if fit.weighted:
         yield "Residuals are weighted by their spectrum, because slow noise dominates them."
@@ -157,8 +165,8 @@ def _assumed(fit: RecordFit) -> Iterator[str]:
 def _pictures(fit: RecordFit, number: int) -> Iterator[Picture]:
     worst = fit.goodness.worst_record - 1
     of = f" of record {worst + 1}, which is described worst" if len(fit.records) > 1 else ""
-    share = 100.0 * fit.goodness.share_left**0.5
-    left = f"the residuals are {share:.2g} % rms of the measured signal"
+    share = percent(fit.goodness.share_left**0.5)
+    left = f"the residuals are {share} rms of the measured signal"
     shown = [
         ("time", f"Measured and fitted {fit.problem.output}{of}"),
         ("residuals", f"Residuals over time{of}"),

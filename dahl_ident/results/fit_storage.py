@@ -113,12 +113,16 @@ def from_json(text: str, source: str = "the text") -> tuple[Optimum, bool]:
 
 def load(path: str | Path) -> tuple[Optimum, bool]:
     """Return the fit that a file holds."""
+    return from_json(read_text(path), str(path))
+
+
+def read_text(path: str | Path) -> str:
+    """Return the text of a file."""
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        return Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as exc:
         why = exc.strerror if isinstance(exc, OSError) else "it is no text"
         raise DataError(f"{path}: the file cannot be read: {why}") from exc
-    return from_json(text, str(path))
 
 
 def _check_schema(content: Any, source: str) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dahl_ident.diagnostics.formatting import table
+from dahl_ident.diagnostics.formatting import percent, table
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class HoldOut:
         rows += [
             [
                 str(part.record), f"{part.start:.4g}", f"{part.stop:.4g}",
-                f"{100.0 * part.rms_share:.2g}", f"{100.0 * part.inside:.1f} %",
+                percent(part.rms_share).removesuffix(" %"), f"{100.0 * part.inside:.1f} %",
             ]
             for part in self.parts
         ]  # fmt: skip

@@ -20,8 +20,7 @@ from dahl_ident.data import Record
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.doubtful_elements import below_zero, is_single, slight
-from dahl_ident.diagnostics.error_model import EXPONENT
-from dahl_ident.diagnostics.formatting import rounded, table
+from dahl_ident.diagnostics.formatting import percent, rounded, table
 from dahl_ident.diagnostics.record_errors import (
     MODEL,
     NOISE,
@@ -30,6 +29,7 @@ from dahl_ident.diagnostics.record_errors import (
     record_budget,
     record_derived,
     record_errors,
+    variances,
 )
 from dahl_ident.diagnostics.record_goodness import RecordGoodness, record_goodness
 from dahl_ident.diagnostics.record_identifiability import undetermined
@@ -41,7 +41,7 @@ from dahl_ident.errors import DataError, FitError, FitInterrupted, ValidationErr
 from dahl_ident.fitting.record_search import RecordOptimum, hold_model, solve_records
 from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.problem.record_problem import RecordProblem, cut
-from dahl_ident.results.fit_storage import check_digest, sealed
+from dahl_ident.results.fit_storage import check_digest, read_text, sealed
 from dahl_ident.results.hold_out import HeldOut, HoldOut
 from dahl_ident.results.progress import fit_progress
 from dahl_ident.results.result import Estimate, Result
@@ -237,15 +237,13 @@ class RecordFit(Result):
     def findings(self) -> tuple[str, ...]:
         """The undetermined parameters with the reasons, in words; empty if there are none."""
         stderr = {p.name: self.params[p.name].stderr or 0.0 for p in self.problem.free}
-        by_exponents = [
-            p.name
+        mostly = {
+            p.name: source
             for i, p in enumerate(self.problem.free)
-            if EXPONENT in self.errors.contributions
-            and self.errors.contributions[EXPONENT][i, i] > 0.5 * self.covar[i, i]
-        ]
-        return undetermined(
-            self.model, self.records, stderr, self.covar, self.var_names, by_exponents
-        )
+            for source, C in self.errors.contributions.items()
+            if np.isfinite(self.covar[i, i]) and C[i, i] > 0.5 * self.covar[i, i]
+        }
+        return undetermined(self.model, self.records, stderr, self.covar, self.var_names, mostly)
 
     @cached_property
     def _doubts(self) -> tuple[str, ...]:
@@ -314,7 +312,7 @@ class RecordFit(Result):
     def statements(self) -> tuple[str, ...]:
         """The verdict in its parts, most serious first."""
         left, within = (
-            100.0 * np.sqrt(share) for share in (self.goodness.share_left, self._share_left)
+            percent(share**0.5) for share in (self.goodness.share_left, self._share_left)
         )
         first = {
             VerdictStatus.TRUSTED: "Trusted.",
@@ -322,9 +320,11 @@ class RecordFit(Result):
             if self.misses
             else "Approximate. The estimates are those of no device, or of a wrong assumption.",
             VerdictStatus.NOT_DETERMINED: "Not determined. Not every parameter is determined.",
-            VerdictStatus.NOT_DESCRIBED: "Not described. The model does not describe the records.",
+            VerdictStatus.NOT_DESCRIBED: "Not described. The model does not describe the records."
+            if self._share_left > _FAIRLY
+            else "Not described. The search found no optimum.",
         }[self.status]
-        described = f"The residuals are {left:.2g} % rms of the measured {self.problem.output}"
+        described = f"The residuals are {left} rms of the measured {self.problem.output}"
         return (
             first,
             *(() if self.success else (self.message,)),
@@ -335,7 +335,7 @@ class RecordFit(Result):
             *self._slight,
             *(
                 (
-                    f"Most of this varies slowly, as noise in the drive causes it: {within:.2g} % "
+                    f"Most of this varies slowly, as noise in the drive causes it: {within} "
                     "rms remains at the drive's frequencies, and the residuals are weighted by "
                     "their spectrum.",
                 )
@@ -474,7 +474,7 @@ class RecordFit(Result):
         problem, full = self.started(record, self._optimum.values[:count], initial)
         found = problem.predict(full, 0)
         by = found.by[:, :count]
-        variance = np.einsum("ij,jk,ik->i", by, self.covar[:count, :count], by)
+        variance = variances(by, self.covar[:count, :count])
         return self.band(problem, found.output, variance)
 
     def hold_out(self, parts: int | None = None) -> HoldOut:
@@ -590,7 +590,9 @@ class RecordFit(Result):
                 **{c: getattr(r, c).tolist() for c in _CHANNELS if getattr(r, c) is not None},
                 "drive_unit": r.drive_unit,
                 "drive_factor": r.drive_factor,
+                "drive_factor_uncertainty": r.drive_factor_uncertainty,
                 "motion": r.motion,
+                "provenance": None if r.provenance is None else dict(r.provenance),
             }
             for r in self.records
         ]
@@ -650,7 +652,7 @@ class RecordFit(Result):
     @classmethod
     def load(cls, path: str | Path) -> RecordFit:
         """Return the fit that ``save`` wrote."""
-        return cls.from_json(Path(path).read_text(encoding="utf-8"))
+        return cls.from_json(read_text(path))
 
 
 def fit_records(
