@@ -175,3 +175,31 @@ def test_degrees_of_freedom_without_bound_are_stated_alike_in_budget_and_interva
     fit = di.fit(table("outliers"), di.Dahl(), throw=False)
     assert fit.budget()["f_max"].dof == np.inf
     assert "t with inf and inf degrees of freedom" in fit.conf_interval().note
+
+
+def test_limits_in_the_verdict_are_those_beside_the_parameters() -> None:
+    fit = di.fit(table("microslip"), di.Dahl(), throw=False)
+    limit = f"at least {fit.conf_interval()['f_max'][1].lower:.3g} N"
+    assert fit.conf_interval("profile")["f_max"][1].lower > fit.conf_interval()["f_max"][1].lower
+    assert f"f_max: {limit} (95.45 %), not determined" in fit.verdict
+
+
+def test_combinations_that_are_determined_have_the_uncertainty_of_their_budget() -> None:
+    A = np.geomspace(1e-6, 1e-5, 12)
+    exact = di.Dahl(0.1, 30.0).describing_function(A) + 100.0
+    rng = np.random.default_rng(5)
+    days = [
+        FrequencyResponse(
+            np.ones(12),
+            exact * (1.0 + 0.05 * scatter) * np.exp(1e-4 * rng.standard_normal((12, 2)) @ [1, 1j]),
+            A,
+            run=[f"day {scatter:+d}"] * 12,
+        )
+        for scatter in (-1, 0, 1)
+    ]
+    fit = di.fit(FrequencyResponse.concatenate(days), di.Dahl() + di.Spring(), throw=False)
+    (combination, *_) = (c for c in fit.identifiability.combinations if "+" in c.expression)
+    stated = fit.budget()[combination.expression]
+    assert stated.u > 2.0 * stated.rows[-1].u
+    assert (combination.value, combination.stderr) == (stated.value, stated.u)
+    assert str(combination) in fit.verdict

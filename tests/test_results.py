@@ -160,6 +160,9 @@ class TestFit:
         found = tied.conf_interval()
         assert found.method == "wald"
         assert "constraints" in found.note
+        assert tied.stated_budget is None
+        with pytest.raises(FitError, match="no uncertainty budget: the fit had constraints"):
+            tied.budget()
         again = FitResult.from_json(tied.to_json())
         assert again.conf_interval().note == found.note
 

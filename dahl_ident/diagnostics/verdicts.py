@@ -85,7 +85,7 @@ class ParameterVerdict:
     fisher_std, profile_std : float
         Standard deviation of its logarithm, first order and by its profile; infinite where open.
     interval : Interval
-        The 95.45 % profile interval.
+        The 95.45 % interval: the profile's, or the combined one where a fit states it.
     text : str
         All of it in words, with the reason and what to do where it is not identified.
     """
@@ -235,11 +235,15 @@ def identifiability(fit: Fit) -> Identifiability:
 
 
 def judged(
-    optimum: Optimum, intervals: ConfidenceIntervals, errors: ErrorModel | None = None
+    optimum: Optimum,
+    intervals: ConfidenceIntervals,
+    errors: ErrorModel | None = None,
+    stated: ConfidenceIntervals | None = None,
 ) -> Identifiability:
     """Return the verdicts on an optimum, given its profile intervals at the three LEVELS.
 
-    With `errors`, parameters that noise leaves determined and other sources do not are not.
+    With `errors`, parameters that noise leaves determined and other sources do not are not. The
+    limits in the texts are those of `stated`, by default of the profile.
     """
     information, problem = Information(optimum), optimum.problem
     natural = natural_sizes(optimum)
@@ -266,7 +270,7 @@ def judged(
     parameters = {}
     for i, (name, parameter) in enumerate(zip(problem.names, problem.parameters, strict=True)):
         unit = parameter.unit
-        limits = _shown(intervals[name], verdicts[name])
+        limits = _shown((stated or intervals)[name], verdicts[name])
         text = _text(optimum, name, unit, verdicts[name], limits, lost)
         if name in beyond and errors is not None:
             shown = with_unit(errors.values[name], errors.stderr[name], unit)

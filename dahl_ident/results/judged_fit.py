@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -19,7 +20,7 @@ from dahl_ident.diagnostics.bands import (
     response_band,
 )
 from dahl_ident.diagnostics.bootstrap import REPLICATES, bootstrap_intervals
-from dahl_ident.diagnostics.budget import Budget, budget
+from dahl_ident.diagnostics.budget import Budget, ParameterBudget, budget
 from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
 from dahl_ident.diagnostics.cross_validation import CrossValidation, cross_validation
 from dahl_ident.diagnostics.goodness import Goodness, goodness
@@ -150,7 +151,16 @@ class JudgedFit(FitNumbers):
     def identifiability(self) -> Identifiability:
         """Which parameters, or which combinations of them, the data determine."""
         method: Method = "wald" if self._first_order else "profile"
-        return judged(self._optimum, self.conf_interval(method), self.errors)
+        profile, stated = self.conf_interval(method), self.conf_interval()
+        found = judged(self._optimum, profile, self.errors, stated)
+        sources: Mapping[str, ParameterBudget] = self.stated_budget or {}
+        combinations = tuple(
+            replace(c, value=sources[c.expression].value, stderr=sources[c.expression].u)
+            if c.expression in sources
+            else c
+            for c in found.combinations
+        )
+        return replace(found, combinations=combinations)
 
     @cached_property
     def goodness(self) -> Goodness:
@@ -170,6 +180,11 @@ class JudgedFit(FitNumbers):
 
     @cached_property
     def _budget(self) -> Budget:
+        if self._first_order:
+            raise FitError(
+                "no uncertainty budget: the fit had constraints, which its sources do not keep; "
+                "its standard errors are from noise alone"
+            )
         return budget(self._optimum, self.errors_of_combinations)
 
     def budget(self) -> Budget:
