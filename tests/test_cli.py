@@ -561,3 +561,9 @@ def test_a_saved_fit_takes_no_other_model(run: Runner) -> None:
     outcome = run("report", "fit.json", "--mass", "free", "-o", "r.html")
     assert outcome.status == 1
     assert "saved fits are reported unchanged" in outcome.err
+
+
+def test_a_comparison_is_printed_once(run: Runner) -> None:
+    table = run("datasets", "alpha_2", "-o", "-").out
+    told = run("fit", "-", "-v", "--compare", stdin=table).out
+    assert told.count("model              reason") == 1

@@ -138,7 +138,7 @@ def fit(
         console.write_json(as_json(result))
     elif report != STANDARD:
         console.write_wrapped(result.fit_report(details=verbose))
-        if compare:
+        if compare and (result.goodness.acceptable or not verbose):  # else it is there already
             console.write(str(compare_models(result)))
         if not verbose:
             console.write("-v prints tests of the residuals, other models and the solver's numbers")
