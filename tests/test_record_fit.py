@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 from scipy.stats import binom
 
@@ -548,3 +550,30 @@ def test_derived_quantities_follow_from_the_estimate() -> None:
     assert energy.value == pytest.approx(np.pi * 4e-6 * N.imag)
     assert stiffness.value == pytest.approx(N.real)
     assert damping.value == pytest.approx(N.imag / (10.0 * np.pi))
+
+
+def test_friction_faster_than_the_sampling_is_resolved() -> None:
+    """x_c/v is a fifth of the sampling interval; an independent solver made the record."""
+    n, rate, rng = 512, 200.0, np.random.default_rng(0)
+    f = np.fft.rfftfreq(n, 1.0 / rate)
+    spectrum = np.where((f >= 1.0) & (f <= 40.0), np.exp(2j * np.pi * rng.random(f.size)), 0.0)
+    force = np.fft.irfft(spectrum, n)
+    spectrum, force = 5.0 / force.std() * spectrum, 5.0 / force.std() * force
+    fine = np.fft.irfft(np.pad(spectrum, (0, 31 * n // 2)), 32 * n) * 32.0  # the same band
+    drive = CubicSpline(np.arange(32 * n) / (32.0 * rate), fine)
+    t = np.arange(n) / rate
+
+    def motion(at: float, y: FloatArray) -> list[float]:
+        v = y[1]
+        pull = float(drive(at)) - v - 2000.0 * y[0] - y[2]
+        return [v, pull / 0.5, 3000.0 * v * (1.0 - np.sign(v) * y[2])]
+
+    x = solve_ivp(motion, (0.0, t[-1]), [0.0] * 3, t_eval=t, max_step=6e-4, rtol=1e-9, atol=1e-12)
+    record = di.Record(t, displacement=x.y[0] + 1e-6 * rng.standard_normal(n), force=force)
+    truth = {"f_max": 1.0, "sigma": 3000.0, "mass": 0.5, "damping": 1.0, "stiffness": 2000.0}
+    found = di.fit(record, di.Dahl() + di.Mass() + di.Damper() + di.Spring(), start=truth)
+    assert found.trusted
+    for name, value in truth.items():
+        p = found.params[name]
+        assert p.value == pytest.approx(value, abs=4.0 * (p.stderr or 0.0))
+    assert found.params["sigma"].stderr == pytest.approx(0.0, abs=3.0)

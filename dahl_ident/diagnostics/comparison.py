@@ -16,13 +16,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
 from scipy import special
 
-from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.formatting import listed, percent, table, with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.physics import is_spring, negative_parameters
@@ -258,15 +257,7 @@ def _change(value: float, before: float) -> str:
     return percent(ratio) if ratio < 0.0 or not np.isfinite(ratio) else f"+{percent(ratio)}"
 
 
-class Compared(Fit, Protocol):
-    """A fit that counts its sources of error."""
-
-    @property
-    def errors(self) -> ErrorModel | None:
-        """The sources of error."""
-
-
-def compare_models(fit: Compared, models: Mapping[str, Element] | None = None) -> ModelComparison:
+def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> ModelComparison:
     """Fit other models to the same data and compare how they predict tests left out.
 
     Parameters

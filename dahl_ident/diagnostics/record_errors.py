@@ -31,6 +31,7 @@ _SLIGHT = 1e-6  # relative: noise of the drive below does not count
 _MATTERS = 0.2  # standard errors that noise in the displacement may shift without being counted
 _DRAWS = 8  # of noise: the mean square of what they change is known to a half
 _STEP = 1e-5  # relative, of parameters, for slopes of derived quantities
+_NOT_FOUND = ", though it was not given: with another no motion was found"
 NOISE, DRIVE, FORCE = "noise", "noise in the drive", "force calibration"
 MODEL, DISPLACEMENT = "model error", "noise in the displacement"
 TURNS = "displacement at turning points"
@@ -262,7 +263,7 @@ def record_assumptions(problem: RecordProblem, errors: RecordErrors) -> str:
     parts = [str(one) for one in errors.exponents]
     known = {one.name for one in errors.exponents}
     parts += [
-        f"{p.name} = {p.value:g} exactly"
+        f"{p.name} = {p.value:g} exactly" + (_NOT_FOUND if p.assumed else "")
         for p in problem.model.parameters
         if p.prior is not None and not p.free and p.name not in known
     ]

@@ -68,6 +68,10 @@ class Fit(Protocol):
     def first_order(self) -> bool:
         """Whether there are no profiles."""
 
+    @property
+    def errors(self) -> ErrorModel | None:
+        """The sources of error."""
+
     def conf_interval(self, method: Any = ...) -> ConfidenceIntervals:
         """Return confidence intervals."""
 

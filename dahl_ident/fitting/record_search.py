@@ -29,6 +29,9 @@ _REPEATS = 12  # a limit for weights that do not settle
 _SETTLED = 0.03  # step in standard errors that no longer matters
 _BANDS = 3  # dead bands tried: one, two and four times the noise that differences show
 _CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that is no chance
+_MOST_SUBSTEPS = 64  # in a sampling interval
+_UNRESOLVED = 0.1  # of the residuals: errors of integration that hardly change the estimate
+_ROUNDING = 1e-7  # of the motion, below which errors of integration are none
 _LOOSE = 1e4  # of the step at which a search of a long record has converged
 
 
@@ -125,7 +128,7 @@ def solve_records(
         )
     problem.watch = trace = _Trace(tell)
     try:
-        found = _solved(problem, start)
+        found = _resolved(problem, start)
     except KeyboardInterrupt as stop:
         so_far = trace.optimum(problem)
         if so_far is None:
@@ -136,6 +139,39 @@ def solve_records(
         problem.watch = None
     found.problem.watch = None  # of a weighted problem
     return found
+
+
+def _resolved(problem: RecordProblem, start: Mapping[str, float] | None) -> RecordOptimum:
+    """Return the estimate whose motion the steps of integration resolve, if none were given.
+
+    A friction force follows the motion within x_c/v, which may be far less than the sampling
+    interval, and what a coarse step cannot follow looks like friction that is softer.
+    """
+    given = problem.output == "force" or problem.substeps is not None
+    while True:
+        try:
+            found = _solved(problem, start)
+        except FitError:
+            problem = problem.finer()
+            if given or (problem.substeps or 0) > _MOST_SUBSTEPS:
+                raise
+            continue
+        finer = found.problem.finer() if not given else problem
+        if given or (finer.substeps or 0) > _MOST_SUBSTEPS or _alike(found, finer):
+            return found
+        problem = problem.finer()
+        values = found.values[: len(problem.free)].tolist()
+        start = dict(zip((p.name for p in problem.free), values, strict=True))
+
+
+def _alike(found: RecordOptimum, finer: RecordProblem) -> bool:
+    """Return whether half the step leaves the residuals as they are, compared with their size."""
+    coarse, fine = (
+        np.concatenate(problem.split_residuals(found.values)) for problem in (found.problem, finer)
+    )
+    size = np.concatenate([y - y.mean() for y in finer.measured]).std()
+    allowed = max(_UNRESOLVED * float(np.std(fine)), _ROUNDING * float(size))
+    return bool(np.std(fine - coarse) < allowed)
 
 
 def _solved(problem: RecordProblem, start: Mapping[str, float] | None) -> RecordOptimum:

@@ -77,7 +77,8 @@ class RecordProblem:
         For the output "motion", what the records' force channel is: a force, or the acceleration
         of the base, m/s^2, the motion being relative to it.
     substeps : int, optional
-        Steps of integration in each sampling interval; left out, from the rates.
+        Steps of integration in each sampling interval; left out, from the rates; a search doubles
+        them until the residuals no longer notice.
 
     Raises
     ------
@@ -364,10 +365,20 @@ class RecordProblem:
         found = []
         for record in self.records:
             rate, wave = record.sample_rate, record.force_samples
-            substeps = self.substeps or max(self.substeps_for(record), self._pole_steps(rate))
-            drive = band_limited(wave, 1.0 / rate, substeps)
+            drive = band_limited(wave, 1.0 / rate, self._steps_in(record))
             found.append(ForcedMotion(self._plant, drive, 1.0 / rate))
         return tuple(found)
+
+    def _steps_in(self, record: Record) -> int:
+        """Return the steps of integration in each sampling interval of a record."""
+        return self.substeps or max(self.substeps_for(record), self._pole_steps(record.sample_rate))
+
+    def finer(self) -> RecordProblem:
+        """Return the same problem with twice the steps of integration."""
+        other = copy(self)
+        other.__dict__.pop("forced", None)
+        other.substeps = 2 * max(self._steps_in(record) for record in self.records)
+        return other
 
     def _pole_steps(self, rate: float) -> int:
         """Return the steps of integration that the poles of linear systems ask for."""

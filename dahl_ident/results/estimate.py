@@ -116,7 +116,8 @@ def fit(
         Of records whose motion is predicted: "base" where their force channel is the acceleration
         of the base, m/s^2, and the motion relative to it.
     substeps : int, optional
-        Of records whose motion is predicted: steps of integration in each sampling interval.
+        Of records whose motion is predicted: steps of integration in each sampling interval. Left
+        out, as many as the rates ask for, doubled until the residuals no longer notice.
     throw : bool, default True
         Raise where the data give no finite optimum; otherwise return what was found, with its
         `status`.

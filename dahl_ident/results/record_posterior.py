@@ -40,9 +40,9 @@ class RecordPosterior(ChainDraws):
     >>> x = 1e-3 * np.cumsum(np.random.default_rng(0).standard_normal(200))
     >>> force = di.Dahl(0.1, 30.0).force(x) + 1e-3 * np.random.default_rng(1).standard_normal(200)
     >>> record = di.Record(np.arange(200) / 100.0, displacement=x, force=force)
-    >>> chain = di.posterior(record, di.Dahl(), seed=1, steps=20, walkers=32)
+    >>> chain = di.posterior(record, di.Dahl(), seed=1, steps=50, walkers=32)
     >>> chain.names, chain.steps
-    (('f_max', 'sigma'), 20)
+    (('f_max', 'sigma'), 50)
     """
 
     _density: RecordDensity
