@@ -188,6 +188,10 @@ class TestAtInfinity:
                 continue
             kappa = found.budget()["sigma^2/f_max"]
             covered.append(abs(kappa.value - truth) < kappa.U)
+            mass = found.budget()["mass"]
+            _, low, high = found.conf_interval()["mass"][1]
+            assert (found.params["mass"].value, found.params["mass"].stderr) == (mass.value, mass.u)
+            assert (high - low) / 2.0 == pytest.approx(mass.U, rel=0.05)
             assert "sigma + stiffness" in found.budget()
             assert not {"f_max", "sigma", "stiffness", "f_max/sigma"} & set(found.budget())
             check = found.cross_validation

@@ -40,6 +40,7 @@ _SMOOTH = 8  # degree over ln A of what the gain may be whatever the frequency
 _FALSE_ALARM = 1e-4  # of a force that falls with the frequency: one more candidate, to no harm
 _SEEN = 3.0  # rms differences over noise that has been averaged over all rows
 _STATED = "every source"  # of error is counted in what the fit states
+_RUNAWAY = 100.0  # times as large: a candidate's parameter that the data leave open
 _PLACES = 6  # of a change: less is rounding
 _LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
 
@@ -254,6 +255,8 @@ def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
 def _change(value: float, before: float) -> str:
     with np.errstate(all="ignore"):
         ratio = round(float(np.float64(value) / before - 1.0), _PLACES)
+    if abs(ratio) > _RUNAWAY:
+        return "far more"
     return percent(ratio) if ratio < 0.0 or not np.isfinite(ratio) else f"+{percent(ratio)}"
 
 

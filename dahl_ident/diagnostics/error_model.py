@@ -179,6 +179,15 @@ class ErrorModel:
         errors = size * np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0))
         return dict(zip(self.names, errors.tolist(), strict=True))
 
+    def holds(self, name: str) -> bool:
+        """Return whether a parameter is determined, where the data leave some directions open."""
+        if self.basis is None:
+            return True
+        if not np.isfinite(self.optimum.stderr.get(name, 0.0)):
+            return False  # at the limit at which the optimum lies
+        direction = np.eye(len(self.names))[self.names.index(name)]
+        return bool(self.basis.holds(direction))
+
     def dof(self, direction: FloatArray, sources: Sequence[str] | None = None) -> float:
         """Return the effective degrees of freedom of the uncertainty of direction . theta.
 

@@ -221,11 +221,14 @@ def combined_intervals(
     if errors is None:
         return replace(profile, method="combined")
     levels = profile.levels
+    held = np.array([errors.holds(name) for name in optimum.names])
     noise = thresholds(optimum, levels)[:, None] * np.sqrt(np.diagonal(optimum.covariance))
     place = [errors.names.index(name) for name in optimum.names]
     directions = np.eye(len(errors.names))[place]
     u = np.sqrt(np.maximum(np.diagonal(errors.covariance)[place], 0.0))
-    dof = np.array([errors.dof(direction) for direction in directions])
+    dof = np.array(
+        [errors.dof(d) if known else np.inf for d, known in zip(directions, held, strict=True)]
+    )
     k = np.array([[coverage_factor(nu, level) for nu in dof] for level in levels.tolist()])
     theta = errors.theta[place]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -235,9 +238,16 @@ def combined_intervals(
     found = intervals_from_search(
         optimum, "combined", levels, theta - k * u * below, theta + k * u * above
     )
-    shown = listed([f"{nu:.3g}" for nu in np.where(dof < MANY, dof, np.inf)])
+    shown = listed([f"{nu:.3g}" for nu in np.where(dof < MANY, dof, np.inf)[held]])
     note = f"every source of the budget: t with {shown} degrees of freedom"
-    return replace(found, estimate=errors.problem.to_values(errors.theta)[place], note=note)
+    estimate = errors.problem.to_values(errors.theta)[place]
+    return replace(
+        found,
+        estimate=np.where(held, estimate, profile.estimate),
+        lower=np.where(held, found.lower, profile.lower),
+        upper=np.where(held, found.upper, profile.upper),
+        note=note,
+    )
 
 
 def intervals_from_search(

@@ -24,6 +24,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.advice import advice
+from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.combinations import Candidate, candidates, runaway, stiffness_seen
 from dahl_ident.diagnostics.confidence_levels import LEVELS, percent, thresholds
 from dahl_ident.diagnostics.error_model import EXPONENT, ErrorModel
@@ -262,8 +263,10 @@ def judged(
     verdicts |= dict.fromkeys((*beyond, *blind), Verdict.NOT_IDENTIFIED)
     if errors is not None:
         for name, size in zip(problem.names, natural.tolist(), strict=True):
-            u = float(errors.covariance[(errors.names.index(name),) * 2]) ** 0.5 / size
-            if verdicts[name] is Verdict.IDENTIFIED and u > IDENTIFIED_BELOW:
+            place = errors.names.index(name)
+            u = float(errors.covariance[place, place]) ** 0.5 / size
+            k = coverage_factor(errors.dof(np.eye(len(errors.names))[place]))
+            if verdicts[name] is Verdict.IDENTIFIED and 0.5 * k * u > IDENTIFIED_BELOW:
                 verdicts[name] = Verdict.WEAK
     for name in _set_by_prior(optimum, errors):
         if verdicts[name] is Verdict.IDENTIFIED:

@@ -89,9 +89,11 @@ class FitNumbers(Result):
         """Every parameter of model and sensors, by name, with combined uncertainties."""
         values = dict(zip(self.var_names, self._optimum.values.tolist(), strict=True))
         stderr = dict(self._optimum.stderr)
-        if self.errors is not None:
-            values |= {name: self.errors.values[name] for name in values}
-            stderr |= {name: self.errors.stderr[name] for name in values}
+        errors = self.errors_of_combinations
+        if errors is not None:
+            known = [name for name in values if errors.holds(name)]
+            values |= {name: errors.values[name] for name in known}
+            stderr |= {name: errors.stderr[name] for name in known}
         return MappingProxyType(estimates(self.problem, values, stderr))
 
     @property

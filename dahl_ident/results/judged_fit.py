@@ -115,7 +115,7 @@ class JudgedFit(FitNumbers):
             return wald_intervals(self._optimum, levels).noted(note)
         if method == "combined":
             profile = self.conf_interval("profile", levels)
-            return combined_intervals(profile, self._optimum, self.errors)
+            return combined_intervals(profile, self._optimum, self.errors_of_combinations)
         if method == "bootstrap":
             return bootstrap_intervals(self._optimum, levels, replicates, seed)
         quick = wald_intervals if method == "wald" else profile_intervals
