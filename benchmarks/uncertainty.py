@@ -74,6 +74,7 @@ REASONS = {
         "at the limit: 300 tables of another seed gave 93.3 %. Where three days happen to agree, "
         "the noise lends their scatter more than its two degrees of freedom."
     ),
+    "additive noise": "at the limit: twelve rows hardly tell additive noise from relative.",
     "force 2 ms late at 0.5 to 2 Hz": (
         "the intervals are longer than needed, because twelve rows hardly tell a delay from other "
         "departures."
