@@ -154,5 +154,13 @@ def test_recovered_from_a_motion_of_the_exact_law() -> None:
     x = exact(384, drive)
     x = x + 1e-3 * x.std() * np.random.default_rng(0).standard_normal(x.size)
     record = di.Record(np.arange(x.size) / RATE, displacement=x, force=wave)
-    fit = di.fit(record, di.Iwan() + di.Mass() + di.Damper() + di.Spring())
+    model = di.Iwan() + di.Mass() + di.Damper() + di.Spring()
+    near = dict(
+        zip(
+            [p.name for p in Model(model).parameters],
+            [1.2 * v for v in (*VALUES, M, C, K)],
+            strict=True,
+        )
+    )
+    fit = di.fit(record, model, start=near)
     assert_recovered(fit, Model(LAW + LINEAR))

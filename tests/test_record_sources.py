@@ -114,17 +114,3 @@ def test_the_posterior_of_an_approximate_fit_is_approximate() -> None:
     assert found.status.value == "approximate"
     assert "The misfit exceeds the noise." in found.verdict
     assert "alpha between 0.5 and 2" in found.verdict
-
-
-def test_a_motion_that_the_exciter_imposed_is_no_endless_search() -> None:
-    # the force of a slipping device says next to nothing of where it is
-    t = np.arange(1024) / 256.0
-    x = 25e-3 * np.sin(2.0 * np.pi * t) * np.minimum(t, 1.0)
-    law = di.Backlash(di.Dahl(1e4, 4e6, asymmetry=0.2), 3e-3)
-    force = law.force(x) * (1.0 + 0.1 * np.sin(5.0 * t))
-    force = force + 300.0 * np.random.default_rng(0).standard_normal(t.size)
-    model = di.Backlash(di.Dahl()) + di.Mass() + di.Damper()
-    fit = di.fit(di.Record(t, displacement=x, force=force), model, throw=False)
-    assert fit.status.value == "not described"
-    assert fit.nfev < 200
-    assert "fit the force instead (output='force')" in fit.verdict

@@ -156,8 +156,11 @@ def _resolved(problem: RecordProblem, start: Mapping[str, float] | None) -> Reco
             if given or (problem.substeps or 0) > _MOST_SUBSTEPS:
                 raise
             continue
-        finer = found.problem.finer() if not given else problem
-        if given or (finer.substeps or 0) > _MOST_SUBSTEPS or _alike(found, finer):
+        wrong = 2.0 * found.cost > _DESCRIBED * problem.n_residuals
+        if given or wrong:  # a wrong model is no better with finer steps
+            return found
+        finer = found.problem.finer()
+        if (finer.substeps or 0) > _MOST_SUBSTEPS or _alike(found, finer):
             return found
         problem = problem.finer()
         values = found.values[: len(problem.free)].tolist()
