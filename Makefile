@@ -44,7 +44,8 @@ unit: install  ## tests and doctests, warnings as errors
 # Without the longest, which depend on no version: printed pages, killed processes, damaged files,
 # statistics of many tables, the contract of the law that is integrated.
 SHORT := not test_docs and not test_readers_fuzz and not test_diagnostics_coverage \
-	and not killed and not (test_law_contract and lugre)
+	and not killed and not (test_law_contract and lugre) and not (test_driven_iwan and recovered) \
+	and not approximate_fit_is
 
 test-lowest: install  ## the same tests, but for the longest, on the lowest declared versions
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python .venv-lowest
