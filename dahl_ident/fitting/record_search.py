@@ -147,22 +147,21 @@ def _resolved(problem: RecordProblem, start: Mapping[str, float] | None) -> Reco
     A friction force follows the motion within x_c/v, which may be far less than the sampling
     interval, and what a coarse step cannot follow looks like friction that is softer.
     """
-    given = problem.output == "force" or problem.substeps is not None
+    if problem.output == "force" or problem.substeps is not None:
+        return _solved(problem, start)
     while True:
         try:
             found = _solved(problem, start)
         except FitError:
             problem = problem.finer()
-            if given or (problem.substeps or 0) > _MOST_SUBSTEPS:
+            if (problem.substeps or 0) > _MOST_SUBSTEPS:
                 raise
             continue
-        wrong = 2.0 * found.cost > _DESCRIBED * problem.n_residuals
-        if given or wrong:  # a wrong model is no better with finer steps
-            return found
-        finer = found.problem.finer()
-        if (finer.substeps or 0) > _MOST_SUBSTEPS or _alike(found, finer):
-            return found
+        if 2.0 * found.cost > _DESCRIBED * problem.n_residuals:
+            return found  # a wrong model is no better with finer steps
         problem = problem.finer()
+        if (problem.substeps or 0) > _MOST_SUBSTEPS or _alike(found, problem):
+            return found
         values = found.values[: len(problem.free)].tolist()
         start = dict(zip((p.name for p in problem.free), values, strict=True))
 

@@ -44,8 +44,8 @@ def one_state(inputs: Inputs, outputs: ca.SX) -> OneState:
     places = [np.zeros(max(1, len(group))) for group in inputs]
     found = np.zeros(function.nnz_out(0))
     for i, place in enumerate(places):
-        buffer.set_arg(i, memoryview(place))  # type: ignore[call-arg, arg-type]
-    buffer.set_res(0, memoryview(found))  # type: ignore[call-arg, arg-type]
+        buffer.set_arg(i, memoryview(place))  # type: ignore[call-arg, arg-type]  # stubs are wrong
+    buffer.set_res(0, memoryview(found))  # type: ignore[call-arg, arg-type]  # likewise
 
     def at(*arrays: ArrayLike) -> FloatArray:
         for place, group, array in zip(places, inputs, arrays, strict=True):
