@@ -41,17 +41,17 @@ rooms: install  ## the order of the rooms
 unit: install  ## tests and doctests, warnings as errors
 	$(BIN)/pytest -n $(JOBS) --dist worksteal
 
-# Without the longest, which depend on no version: printed pages, killed processes, damaged files,
-# statistics of many tables, the contract of the law that is integrated.
-SHORT := not test_docs and not test_readers_fuzz and not test_diagnostics_coverage \
-	and not killed and not (test_law_contract and lugre) and not (test_driven_iwan and recovered) \
-	and not approximate_fit_is
+# What depends on versions: readers, the engine, laws, searches, chains, pictures, reports, storage.
+LOWEST := package engine forced_motion readers_formats readers_strict readers_text record \
+	frequency_response extraction_sources law_checks cli results report_content export fitting \
+	bayes_priors posterior plots driven_iwan synthetic_lab
 
-test-lowest: install  ## the same tests, but for the longest, on the lowest declared versions
+test-lowest: install  ## what depends on versions, on the lowest declared ones
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python .venv-lowest
 	$(BIN)/uv pip install --quiet --python .venv-lowest/bin/python --resolution lowest-direct \
 		--editable ".[dev]"
-	.venv-lowest/bin/pytest -n $(JOBS) --dist worksteal -k "$(SHORT)"
+	.venv-lowest/bin/pytest -n $(JOBS) --dist worksteal \
+		$(wildcard $(LOWEST:%=tests/test_%.py))
 
 examples: install  ## renew the outputs printed in README and manual
 	$(BIN)/python -m tests.examples
@@ -72,6 +72,8 @@ validation: install  ## long statistical checks, written into docs/validation
 	$(BIN)/python -m benchmarks.posteriors --write docs/validation/posteriors.md
 	$(BIN)/python -m benchmarks.planning --write docs/validation/planning.md
 	$(BIN)/python -m benchmarks.laws --write docs/validation/laws.md
+	$(BIN)/python -m benchmarks.engine_oracles --write docs/validation/engine.md
+	$(BIN)/python -m benchmarks.cold_records --write docs/validation/cold_records.md
 
 fuzz: install  ## thousands of damaged files of every format, and the table of what became of them
 	$(BIN)/python -m tests.reader_fuzz

@@ -141,13 +141,13 @@ def _laboratory(folder: Path, devices: int, records: int) -> pd.DataFrame:
 
 
 class _AtOnce(Executor):
-    """Does the work at once in this process, and adds up its processor and wall time.
+    """Does the work at once, and adds up its seconds, and what of this process's time it takes.
 
     After `most` jobs it returns the last row again.
     """
 
     def __init__(self, most: float = np.inf) -> None:
-        self.time, self._most, self.done = np.zeros(2), most, 0
+        self.time, self.worked, self._most, self.done = np.zeros(2), 0.0, most, 0
         self._row: Any = None
 
     def submit(self, function: Any, /, *arguments: Any, **_: Any) -> Future[Any]:
@@ -156,6 +156,7 @@ class _AtOnce(Executor):
         began = _clocks()
         if self.done < self._most:
             self._row, self.done = function(*arguments), self.done + 1
+            self.worked += self._row["seconds"]
         future.set_result(dict(self._row))
         self.time += _clocks() - began
         return future
@@ -166,10 +167,11 @@ def _clocks() -> Any:
 
 
 def _timed(source: Path | dict[str, Any], most: float = np.inf) -> tuple[di.Campaign, Any, Any]:
-    """Run a campaign here; return processor and wall time of one fit and of the driver for all."""
+    """Run a campaign; return seconds and wall time of a fit, and times of the driver for all."""
     executor, began = _AtOnce(most), _clocks()
     done = di.campaign(source, executor=executor, jobs=1)
-    return done, executor.time / executor.done, _clocks() - began - executor.time
+    work = np.array([executor.worked, executor.time[1]]) / executor.done
+    return done, work, _clocks() - began - executor.time
 
 
 def _driver(folder: Path, devices: int, records: int) -> str:
@@ -202,7 +204,7 @@ def _driver(folder: Path, devices: int, records: int) -> str:
          busy >= 0.85),
         ("one process's time over twice that of two", "", f"{speedup:.0%}", None),
         ("two processes give the serial table", "equal", "equal" if same else "differs", same),
-        ("computation", "", f"{work[0]:.2f} s a device, processor time", None),
+        ("computation", "", f"{work[0]:.2f} s a device", None),
         *(((f"size of {name}", "", f"{size / 1e3:.1f} kB a device", None))
           for name, size in sizes.items()),
     ]  # fmt: skip
@@ -285,7 +287,7 @@ def _interruptions(folder: Path, devices: int, records: int) -> str:
 
 def _repeated(results: Path) -> int:
     lines = (results / "journal.jsonl").read_bytes().splitlines()
-    keys = [row["key"] for row in map(json.loads, lines) if not row.get("died")]
+    keys = [row["key"] for row in map(json.loads, lines) if not row.get("retry")]
     return len(keys) - len(set(keys))
 
 
@@ -319,12 +321,12 @@ def _disturbed(folder: Path, results: Path) -> tuple[int, pd.DataFrame]:
 
 
 def _children(pid: int) -> list[int]:
-    """Return the workers of a driver: the children of its server of processes."""
+    """Return the processes in which a driver has its fits done."""
     of = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
             of[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
-    return [child for child, parent in of.items() if of.get(parent) == pid]
+    return [child for child, parent in of.items() if parent == pid]
 
 
 def _dask(folder: Path, results: Path) -> tuple[pd.DataFrame, int]:
@@ -353,7 +355,7 @@ def _dask(folder: Path, results: Path) -> tuple[pd.DataFrame, int]:
         distributed.Client(cluster.scheduler_address) as client,
     ):  # fmt: skip
         done = di.campaign(
-            definition(folder, results), jobs=2, executor=client.get_executor(), progress=kill_one
+            definition(folder, results), scheduler=cluster.scheduler_address, progress=kill_one
         )
     return done.table, lost
 

@@ -18,7 +18,7 @@ from scipy.signal import lfilter
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element
-from dahl_ident.time_domain import ForcedMotion, Plant, band_limited
+from tests.motions import Driven
 
 PAGE = Path(__file__).parents[1] / "docs" / "validation" / "records.md"
 RATE = 500.0
@@ -64,9 +64,7 @@ def motion_record(seed: int, pole: float, samples: int = 1024) -> di.Record:
     lines = np.arange(3, 60) * RATE / samples
     drive = 0.03 * np.sum([np.sin(2 * np.pi * (f * t + rng.random())) for f in lines], axis=0)
     plant = di.Dahl(0.1, 300.0) + di.Mass(0.3) + di.Damper(0.5) + di.Spring(50.0)
-    forced = ForcedMotion(Plant(plant, "force"), band_limited(drive, 1 / RATE, 4), 1 / RATE)
-    first = np.array([1e-4, 0.0, 0.0])
-    x = forced.solve(np.zeros(0), first, np.tile(first, (samples, 1)))[:, 0]
+    x = Driven(plant, drive, RATE).motion([1e-4, 0.0, 0.0]).output
     x = x + 0.01 * x.std() * coloured(seed, samples, pole)
     return di.Record(t, displacement=x, force=drive)
 

@@ -19,7 +19,7 @@ from benchmarks.harness import Row, print_table, seconds
 from benchmarks.hysteresis import by_solver
 from dahl_ident.arrays import FloatArray
 from dahl_ident.problem.record_problem import RecordProblem
-from dahl_ident.time_domain import ForcedMotion, Plant, band_limited
+from tests.motions import Driven
 
 TITLE = "Records of any motion"
 SAMPLES, PEERS = 100_000, 300
@@ -144,9 +144,7 @@ def _driven(samples: int) -> di.Record:
     drive = np.sum(np.sin(2.0 * np.pi * lines[:, None] * t + phases[:, None]), axis=0)
     drive *= 50.0 / drive.std()
     model = di.BoucWen(5e4, -300.0, 1900.0) + di.Mass(2.0) + di.Damper(10.0) + di.Spring(5e4)
-    plant = Plant(model, "force")
-    forced = ForcedMotion(plant, band_limited(drive, 1.0 / RATE, 8), 1.0 / RATE)
-    x = forced.solve(np.zeros(0), np.zeros(3), np.zeros((samples, 3)))[:, 0]
+    x = Driven(model, drive, RATE).motion(np.zeros(3)).output
     x = x + 8e-6 * rng.standard_normal(samples)
     return di.Record(t, displacement=x, force=drive)
 

@@ -19,7 +19,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,9 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray, finite_number
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ValidationError
+
+if TYPE_CHECKING:
+    from dahl_ident.data.laboratory import Metadata
 
 
 class Prior(Protocol):
@@ -40,6 +44,15 @@ class Prior(Protocol):
 
     def std(self) -> Any:
         """Return the standard deviation."""
+
+
+def calibrations(metadata: Metadata) -> dict[str, Any]:
+    """Return the priors of the sensors' parameters that a report's metadata state, by name."""
+    if not (stated := metadata.calibrations()):
+        return {}
+    from scipy import stats
+
+    return {n: stats.norm(0.0 if n == "delay" else 1.0, u) for n, u in stated.items()}
 
 
 @dataclass(frozen=True)
@@ -77,6 +90,40 @@ class Sensors:
             if given is not None and not hasattr(given, "logpdf"):
                 object.__setattr__(self, name, finite_number(given, name))
         _ = self.parameters  # checks the bounds
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, Any] | str | Path) -> Sensors:
+        """Return the sensors whose calibrations a report's metadata state.
+
+        Each instrument with a channel (force, displacement or delay), an uncertainty and its
+        coverage factor k gives a normal prior of the standard deviation ``uncertainty / k``.
+
+        Parameters
+        ----------
+        metadata : mapping or path of a TOML file
+            As for :func:`dahl_ident.report`.
+
+        Returns
+        -------
+        Sensors
+            Exact where no uncertainty is stated.
+
+        Raises
+        ------
+        DataError
+            If the file cannot be read.
+        ValidationError
+            If a field is unknown, or an uncertainty is not a number with its unit.
+
+        Examples
+        --------
+        >>> cell = {"name": "Load cell", "channel": "force", "uncertainty": "0.5 %", "k": 2}
+        >>> float(Sensors.from_metadata({"instruments": [cell]}).force_gain.std())
+        0.0025
+        """
+        from dahl_ident.data.laboratory import metadata_of
+
+        return cls(**calibrations(metadata_of(metadata)))
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

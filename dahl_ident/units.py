@@ -65,6 +65,9 @@ _ROTATION = {
     "N/m": "N m/rad",
     "N/m^2": "N m/rad^2",
     "N s/m": "N m s/rad",
+    "N/s": "N m/s",
+    "m/s": "rad/s",
+    "m/s^2": "rad/s^2",
     "kg": "kg m^2",
 }
 QUANTITIES: tuple[Quantity, ...] = tuple(q for q in get_args(Quantity) if q != "backbone")
@@ -330,7 +333,7 @@ def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float,
     (..., 'displacement', 'translation')
     """
     found = re.fullmatch(
-        r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\s\d.,].*?)\s*", text
+        r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\s\d.,].*)", text.strip()
     )
     if not found:
         raise UnitError(f"{what} is {text!r}; expected a number and its unit, such as '0.2 N'")

@@ -7,6 +7,7 @@ import numpy as np
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, response
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element
+from dahl_ident.steady_state import Steady
 
 F_MAX, SIGMA = 0.1, 30.0
 X_C = F_MAX / SIGMA
@@ -27,11 +28,11 @@ def table(
     return FrequencyResponse(np.ones(n), Z * relative_noise(n, noise, seed), A)
 
 
-def plant_table(noise: float = 0.01, seed: int = 1) -> FrequencyResponse:
+def plant_table(noise: float = 0.01, seed: int = 1, steady: Steady = "exact") -> FrequencyResponse:
     """Return the receptance of the plant of Eqn. 53, five drives by twelve frequencies."""
     f = np.tile(np.geomspace(0.1, 2.0, 12), 5)
     u = np.repeat(np.geomspace(0.02, 1.0, 5), 12)
-    R = response(PLANT, f, u).receptance * relative_noise(60, noise, seed)
+    R = response(PLANT, f, u, steady=steady).receptance * relative_noise(60, noise, seed)
     return FrequencyResponse(f, R, drive=u, level=u, controlled="force", quantity="receptance")
 
 

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import gc
+import importlib
 import json
 import os
+import re
+import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+import warnings
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -22,14 +29,17 @@ import pytest
 import dahl_ident as di
 from dahl_ident.campaigns.campaign_report import write_campaign_report
 from dahl_ident.campaigns.definition import read_definition
-from dahl_ident.campaigns.engine import run_jobs
+from dahl_ident.campaigns.engine import Limits, Local, run_jobs
 from dahl_ident.campaigns.population import population
 from dahl_ident.campaigns.run import _unless_refused
 from dahl_ident.campaigns.work import Job
+from dahl_ident.campaigns.worker import do_within
+from dahl_ident.data.storage import library
 from dahl_ident.errors import DahlIdentError, DataError, ValidationError
 from tests.command_line import Runner
 
 SECONDS = ["seconds"]
+POSIX = pytest.mark.skipif(sys.platform == "win32", reason="signals and pipes are POSIX")
 
 
 def make_tables(folder: Path, devices: int, runs: int = 1, seed: int = 1) -> pd.DataFrame:
@@ -286,7 +296,8 @@ def test_a_job_that_kills_its_process_is_a_row_and_costs_no_other(tmp_path: Path
         for task in tasks
     ]  # fmt: skip
     deadly = Job("deadly", _Deadly(), ("r",), options, None)
-    rows = dict(run_jobs([jobs[0], ("deadly", deadly), *jobs[1:]], 2))
+    with Local(2) as place:
+        rows = dict(run_jobs([jobs[0], ("deadly", deadly), *jobs[1:]], place, Limits()))
     assert rows["deadly"]["status"] == "failed"
     assert "died" in rows["deadly"]["error"]
     assert {rows[task.name]["status"] for task in tasks} == {"trusted"}
@@ -339,36 +350,332 @@ def worker_of(driver: int) -> int:
 
 
 CLUSTER = """
+import sys
+import time
+
 from distributed import LocalCluster
 
 if __name__ == "__main__":
+    protocol, port, version = sys.argv[1:]
+    if version:
+        import dahl_ident.version
+
+        dahl_ident.version.__version__ = version
     with LocalCluster(
-        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+        n_workers=1, threads_per_worker=1, protocol=protocol, host="127.0.0.1",
+        scheduler_port=int(port), processes=not version, dashboard_address=None,
     ) as cluster:
         print(cluster.scheduler_address, flush=True)
-        input()
+        sys.stdin.read()
 """
 
 
-def test_a_dask_scheduler_reached_over_tcp_gives_the_serial_table(
+class Cluster:
+    """A Dask scheduler with a worker, which can be killed and started again."""
+
+    def __init__(self, folder: Path, protocol: str = "tcp://", version: str = "") -> None:
+        self._script = folder / "cluster.py"
+        self._script.write_text(CLUSTER)
+        self._protocol, self._version = protocol, version
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self._port = str(free.getsockname()[1])
+        self.address = f"{protocol}127.0.0.1:{self._port}"
+
+    def start(self) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, str(self._script), self._protocol, self._port, self._version],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )  # fmt: skip
+
+    def kill(self) -> None:
+        """Kill the scheduler and its worker at once, as a machine that loses its power."""
+        os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.communicate()
+
+    def __enter__(self) -> Cluster:
+        self.start()
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline().decode().strip() == self.address
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process.poll() is None:
+            self.kill()
+
+
+@pytest.fixture
+def dask_leaks() -> Iterator[None]:
+    """Drop, with the test, the sockets that a client leaves open where its scheduler was killed."""
+    yield
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        gc.collect()
+
+
+def serial(folder: Path) -> pd.DataFrame:
+    return di.campaign(definition(folder, output__folder=str(folder / "serial")), jobs=1).table
+
+
+def equal(table: pd.DataFrame, other: pd.DataFrame) -> None:
+    pd.testing.assert_frame_equal(table.drop(columns=SECONDS), other.drop(columns=SECONDS))
+
+
+@POSIX
+@pytest.mark.usefixtures("dask_leaks")
+def test_a_dask_scheduler_gives_the_serial_table(tmp_path: Path, run: Runner) -> None:
+    make_tables(tmp_path, 3)
+    with Cluster(tmp_path) as cluster:
+        run("campaign", str(as_toml(tmp_path)), "--scheduler", cluster.address, "--send-files")
+    table = pd.read_csv(tmp_path / "results" / "results.csv", dtype={"device": str})
+    equal(table, serial(tmp_path))
+
+
+@POSIX
+@pytest.mark.usefixtures("dask_leaks")
+def test_a_scheduler_that_dies_and_comes_back_loses_nothing(tmp_path: Path) -> None:
+    make_tables(tmp_path, 5)
+    with Cluster(tmp_path) as cluster:
+
+        def restart(done: int, *_: Any) -> None:
+            if done == 2:
+                cluster.kill()
+                cluster.start()
+
+        done = di.campaign(definition(tmp_path), scheduler=cluster.address, progress=restart)
+    assert len(done.to_do) == 5
+    equal(done.table, serial(tmp_path))
+
+
+@POSIX
+@pytest.mark.usefixtures("dask_leaks")
+def test_a_scheduler_that_stays_dead_ends_the_campaign_with_what_is_done(
     tmp_path: Path, run: Runner
 ) -> None:
-    make_tables(tmp_path, 3)
-    (tmp_path / "cluster.py").write_text(CLUSTER)
-    path = as_toml(tmp_path)
-    with subprocess.Popen(
-        [sys.executable, str(tmp_path / "cluster.py")], text=True,
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-    ) as cluster:  # fmt: skip
-        serial = di.campaign(definition(tmp_path, output__folder=str(tmp_path / "a")), jobs=1)
-        assert cluster.stdout is not None
-        address = cluster.stdout.readline().strip()
-        assert address.startswith("tcp://127.0.0.1:")
-        run("campaign", str(path), "--scheduler", address, "--send-files")
-        cluster.communicate("\n", timeout=60)
-    table = pd.read_csv(tmp_path / "results" / "results.csv", dtype={"device": str})
-    expected = serial.table.drop(columns=SECONDS)
-    pd.testing.assert_frame_equal(table.drop(columns=SECONDS), expected)
+    make_tables(tmp_path, 5)
+    with Cluster(tmp_path) as cluster:
+
+        def lose(done: int, *_: Any) -> None:
+            if done == 2:
+                cluster.kill()
+
+        began = time.monotonic()
+        with pytest.raises(DataError, match=r"not answered for 2 s; 2 of 5 fits are in .*others"):
+            di.campaign(
+                definition(tmp_path), scheduler=cluster.address, patience=2.0, progress=lose
+            )
+    assert time.monotonic() - began < 60.0
+    table = pd.read_csv(tmp_path / "results" / "results.csv")
+    assert table["status"].tolist() == ["trusted"] * 2
+    refused = run("campaign", str(as_toml(tmp_path)), "--scheduler", cluster.address)
+    assert refused.status == 1
+    assert "no scheduler answers" in refused.err
+    rest = di.campaign(definition(tmp_path), jobs=1)
+    assert len(rest.to_do) == 3
+    equal(rest.table, serial(tmp_path))
+
+
+@POSIX
+@pytest.mark.usefixtures("dask_leaks")
+def test_workers_of_another_version_are_named_before_anything_runs(tmp_path: Path) -> None:
+    make_tables(tmp_path, 2)
+    with (
+        Cluster(tmp_path, version="0.0.1") as cluster,
+        pytest.raises(
+            ValidationError, match=r"1 workers differ .* has dahl_ident 0\.0\.1; install"
+        ),
+    ):
+        di.campaign(definition(tmp_path), scheduler=cluster.address)
+    job = Job("d", (), (), {}, None, version="0.0.1")
+    row = do_within(job, 60.0, None)
+    assert "this worker has dahl_ident" in row["error"]
+    assert row["retry"]
+
+
+@POSIX
+@pytest.mark.usefixtures("dask_leaks")
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="there is no openssl")
+def test_a_scheduler_behind_certificates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_tables(tmp_path, 2)
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-subj", "/CN=lab",
+         "-days", "2", "-keyout", key, "-out", certificate],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    tls: dict[str, Any] = {"ca-file": str(certificate)}
+    for part in ("scheduler", "worker", "client"):
+        tls[part] = {"cert": str(certificate), "key": str(key)}
+    (tmp_path / "distributed.yaml").write_text(
+        json.dumps({"distributed": {"comm": {"require-encryption": True, "tls": tls}}})
+    )
+    settings = library("dask").config  # read before the variable below: this process has no key
+    monkeypatch.setenv("DASK_CONFIG", str(tmp_path))
+    given = {f"distributed.comm.tls.{name}": value for name, value in tls.items()}
+    with Cluster(tmp_path, "tls://") as cluster:
+        with pytest.raises(ValidationError, match="no scheduler answers"):
+            di.campaign(definition(tmp_path), scheduler=cluster.address)
+        with settings.set(given):
+            done = di.campaign(definition(tmp_path), scheduler=cluster.address)
+    equal(done.table, serial(tmp_path))
+
+
+class _Elsewhere(ThreadPoolExecutor):
+    """Workers that do not have the files of this machine."""
+
+    def submit(self, function: Any, /, *arguments: Any, **_: Any) -> Any:
+        job, *others = arguments
+        files = tuple((f"/elsewhere{name}", content) for name, content in job.files)
+        return super().submit(function, replace(job, files=files), *others)
+
+
+def test_files_that_a_worker_does_not_see_are_done_by_a_second_call(tmp_path: Path) -> None:
+    make_tables(tmp_path, 2)
+    with _Elsewhere(1) as pool:
+        first = di.campaign(definition(tmp_path), executor=pool)
+        assert first.table["error"].str.contains("send them with send_files=True").all()
+        second = di.campaign(definition(tmp_path), executor=pool, send_files=True)
+    assert len(second.to_do) == 2
+    equal(second.table, serial(tmp_path))
+
+
+class _Silent(ThreadPoolExecutor):
+    """An executor from which nothing comes back."""
+
+    def submit(self, *_: Any, **__: Any) -> Any:
+        return Future()
+
+
+def test_an_executor_that_does_not_answer_is_not_waited_for(tmp_path: Path) -> None:
+    make_tables(tmp_path, 2)
+    with _Silent(1) as pool, pytest.raises(DataError, match="executor has not answered for 1 s; 0"):
+        di.campaign(definition(tmp_path), executor=pool, timeout=0.5, patience=0.5)
+    ended = ThreadPoolExecutor(1)
+    ended.shutdown()
+    with pytest.raises(DataError, match="takes no jobs any more"):
+        di.campaign(definition(tmp_path), executor=ended)
+
+
+# Limits of a fit
+
+
+class _Hanging(tuple[Any, ...]):
+    """Files that take for ever to read."""
+
+    def __iter__(self) -> Any:
+        time.sleep(3600.0)
+
+
+class _Hungry(tuple[Any, ...]):
+    """Files that need more memory than there is."""
+
+    def __iter__(self) -> Any:
+        return iter([np.ones(10**9)])
+
+
+def test_a_device_has_limits_of_time_and_memory() -> None:
+    began = time.monotonic()
+    row = do_within(Job("d", _Hanging(), ("r",), {}, None), 1.0, None)
+    assert time.monotonic() - began < 20.0
+    assert row["error"].startswith("stopped after 1 s, the limit of time for a device; give")
+    assert row["retry"]
+    if sys.platform == "linux":
+        row = do_within(Job("d", _Hungry(), ("r",), {}, None), 60.0, 2.0)
+        assert row["error"].startswith("the limit of memory for a device does not suffice")
+        assert row["retry"]
+
+
+def test_fits_that_were_stopped_are_done_with_more_time(tmp_path: Path, run: Runner) -> None:
+    make_tables(tmp_path, 2)
+    path = str(as_toml(tmp_path))
+    stopped = run("campaign", path, "--jobs", "1", "--timeout", "0.001")
+    assert stopped.status == 3
+    table = pd.read_csv(tmp_path / "results" / "results.csv")
+    assert table["error"].str.startswith("stopped after 0.001 s").all()
+    assert run("campaign", path, "--jobs", "1").status == 0
+    table = pd.read_csv(tmp_path / "results" / "results.csv")
+    assert table["status"].tolist() == ["trusted"] * 2
+    assert run("campaign", path, "--timeout", "-1").status == 1
+
+
+@POSIX
+def test_what_is_not_a_file_is_a_row_and_is_not_waited_for(tmp_path: Path, run: Runner) -> None:
+    make_tables(tmp_path, 2)
+    (tmp_path / "d001_r0.csv").unlink()
+    os.mkfifo(tmp_path / "d001_r0.csv")
+    path = str(as_toml(tmp_path))
+    assert "to do: d001" in run("campaign", path, "--dry-run").out
+    done = run("campaign", path, "--jobs", "1")
+    assert (done.status, "1 trusted, 1 failed" in done.out) == (0, True)
+    table = pd.read_csv(tmp_path / "results" / "results.csv")
+    assert "is a pipe; expected a file" in table["error"][1]
+    sent = run("campaign", path, "--jobs", "1", "--send-files", "--redo")
+    assert "1 trusted, 1 failed" in sent.out
+
+
+@POSIX
+def test_covariates_in_a_pipe_are_refused(tmp_path: Path) -> None:
+    make_tables(tmp_path, 2)
+    os.mkfifo(tmp_path / "table.csv")
+    with pytest.raises(DataError, match="is a pipe; expected a file"):
+        read_definition(definition(tmp_path, files__covariates=str(tmp_path / "table.csv")))
+
+
+def test_a_law_of_a_module_is_known_where_it_is_fitted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_tables(tmp_path, 1)
+    (tmp_path / "lab_laws.py").write_text(LAW)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    importlib.import_module("lab_laws")
+    gap = {"kind": "backlash", "element": {"kind": "lab_law"}, "gap": 1e-9}
+    for name, element in (("gap", gap), ("alone", {"kind": "lab_law"})):
+        content = definition(tmp_path, output__folder=str(tmp_path / name))
+        assert "failed" not in di.campaign(content | {"model": [element]}, jobs=1).statuses
+
+
+LAW = """
+import dahl_ident as di
+
+class LabLaw(di.Friction):
+    \"\"\"dF/dx = sigma (1 - d F / f_max).\"\"\"
+
+    kind = "lab_law"
+    parameters = (
+        di.Parameter("f_max", "N", "friction limit"),
+        di.Parameter("sigma", "N/m", "contact stiffness"),
+    )
+
+    def slope(self, force, direction, velocity, values):
+        f_max, sigma = values
+        return sigma * (1 - direction * force / f_max)
+"""
+
+
+def test_cells_that_spreadsheets_run_are_inert(tmp_path: Path) -> None:
+    make_tables(tmp_path, 1)
+    (tmp_path / "d000_r0.csv").rename(tmp_path / "=1+2_r0.csv")
+    (tmp_path / "devices.csv").write_text("device,@lab,t\n=1+2,+x,-3\n")
+    done = di.campaign(definition(tmp_path), jobs=1)
+    header, row = (tmp_path / "results" / "results.csv").read_text().splitlines()
+    assert row.startswith("'=1+2,")
+    assert ",'+x," in row
+    assert ",'@lab," in header
+    assert (done.table["device"][0], done.table["@lab"][0], done.table["t"][0]) == (
+        "=1+2",
+        "+x",
+        -3,
+    )
+    data = di.load_dataset("noisy")
+    assert isinstance(data, di.FrequencyResponse)
+    labels = np.array(["=1", "'=1", "-3 dB", "-3", *["d"] * (len(data.response) - 4)])
+    named = di.FrequencyResponse(data.frequency_hz, data.response, data.amplitude, level=labels)
+    named.save(tmp_path / "table.csv")
+    assert not re.search(r"(^|,)[=@+]|,-3 dB", (tmp_path / "table.csv").read_text(), re.MULTILINE)
+    back = di.read_frequency_response(tmp_path / "table.csv")
+    assert back.level is not None
+    assert back.level.tolist() == labels.tolist()
 
 
 def test_command_line(tmp_path: Path, run: Runner) -> None:
@@ -380,6 +687,8 @@ def test_command_line(tmp_path: Path, run: Runner) -> None:
     done = run("campaign", str(path), "--jobs", "1", "--report", str(report), "--json")
     assert json.loads(done.out)["to_do"] == ["d000", "d001", "d002", "d003"]
     assert b"Population: f_max" in report.read_bytes()
+    assert run("campaign", str(path), "--report", "campaign.pdf").status == 0
+    assert Path("campaign.pdf").read_bytes().startswith(b"%PDF")
 
 
 # Population
@@ -508,4 +817,7 @@ def test_report_of_a_campaign(tmp_path: Path) -> None:
     assert '<a href="results/reports/d002.html">d002</a>' in page
     assert "Population: f_max" in page
     assert "d003: not determined" in page
-    assert write_campaign_report(table, None, tmp_path / "c.pdf").read_bytes().startswith(b"%PDF")
+    for one in (found, None):
+        place = write_campaign_report(table, one, tmp_path / "c.pdf", overwrite=True)
+        text = "".join(page.extract_text() for page in library("pypdf").PdfReader(place).pages)
+        assert ("Population: f_max" in text) == (one is not None)

@@ -21,8 +21,8 @@ from dahl_ident.synthetic import Experiment
 from tests.command_line import Runner
 
 COMMANDS = (
-    "demo", "inspect", "extract", "fit", "sample", "plan", "campaign", "report", "simulate",
-    "datasets",
+    "demo", "inspect", "extract", "fit", "sample", "plan", "campaign", "report", "export",
+    "simulate", "datasets",
 )  # fmt: skip
 PROGRAM = Path(sys.executable).with_name("dahl-ident")
 
@@ -144,14 +144,14 @@ def test_a_report_shows_how_waveforms_settled(run: Runner) -> None:
     Path("run.csv").write_text(run("datasets", "plant_recording", "-o", "-").out, encoding="utf-8")
     assert run("extract", "run.csv", "--controlled", "force", "-o", "levels.csv").status == 0
     plant = ("--mass", "free", "--damping", "free", "--stiffness", "free")
-    told = run("report", "levels.csv", *plant, "--record", "run.csv", "-o", "a.html")
+    told = run("report", "levels.csv", *plant, "--waveforms", "run.csv", "-o", "a.html")
     assert told.status == 0, told.err
     assert "which has the largest ratio of bias to error" in Path("a.html").read_text(
         encoding="utf-8"
     )
     Path("map.toml").write_text("[time]\ncolumn = 'clock'\n", encoding="utf-8")
     wrong = run(
-        "report", "levels.csv", *plant, "--record", "run.csv", "--record-columns", "map.toml",
+        "report", "levels.csv", *plant, "--waveforms", "run.csv", "--waveforms-columns", "map.toml",
         "-o", "b.html",
     )  # fmt: skip
     assert wrong.status == 1
@@ -318,6 +318,8 @@ def test_every_help_has_an_example_that_runs(run: Runner, command: str) -> None:
         Path("lab.toml").write_text(
             '[files]\npattern = "{device}.csv"\nkind = "response"\n[[model]]\nkind = "dahl"\n'
         )
+    if command == "export":
+        run("fit", "-", "--save", "fit.json", stdin=run("datasets", "noisy", "-o", "-").out)
     run.line(found[1].strip())
 
 

@@ -13,7 +13,7 @@ import pytest
 
 import dahl_ident as di
 from dahl_ident.data.storage import library
-from dahl_ident.errors import SamplingError
+from dahl_ident.errors import DataError, SamplingError
 from tests.bayes_cases import friction_table
 from tests.command_line import Runner
 
@@ -134,6 +134,56 @@ def test_a_reader_that_has_seen_enough_is_no_error(tmp_path: Path, command: str)
     )
     os.close(theirs)
     assert (ended.returncode, ended.stderr) == (1, b"")
+
+
+@POSIX
+@pytest.mark.parametrize(
+    ("command", "status", "says"),
+    [
+        ("datasets >&-", 1, b"error: standard output is closed; send it to a file, or /dev/null\n"),
+        ("datasets noisy -o n.csv >&- 2>&-", 1, b""),
+        ("fit absent.csv 2>&-", 1, b""),
+        ("fit - <&-", 1, b"error: standard input: the file is empty\n"),
+        ("datasets noisy -o n.csv 2>&-", 0, b""),
+    ],
+)
+def test_closed_streams(tmp_path: Path, command: str, status: int, says: bytes) -> None:
+    ended = subprocess.run(
+        ["sh", "-c", f"exec {PROGRAM} {command}"], stderr=subprocess.PIPE, cwd=tmp_path
+    )
+    assert (ended.returncode, ended.stderr) == (status, says)
+    assert list(tmp_path.iterdir()) == ([] if status else [tmp_path / "n.csv"])
+
+
+def test_of_two_writers_one_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place, other = tmp_path / "t.csv", b"of somebody else"
+    written = Path.write_bytes
+
+    def slow(path: Path, content: bytes) -> int:
+        """Write; meanwhile another writer finishes."""
+        written(place, other)
+        return written(path, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", slow)
+        with pytest.raises(DataError, match="exists already"):
+            friction_table().save(place)
+    assert place.read_bytes() == other
+    assert list(tmp_path.iterdir()) == [place]
+    program = (
+        "import sys; from tests.bayes_cases import friction_table; sys.stdin.read(1);"
+        "friction_table().save(sys.argv[1])"
+    )
+    place.unlink()
+    several = [
+        subprocess.Popen(
+            [sys.executable, "-c", program, place], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        for _ in range(3)
+    ]
+    ended = [one.communicate(b"x") for one in several]
+    assert sorted(one.returncode for one in several) == [0, 1, 1]
+    assert sum(b"exists already" in err for _, err in ended) == 2
 
 
 @pytest.mark.parametrize(
@@ -266,9 +316,9 @@ RECORD = "time [s],displacement [m],force [N]\n0,1,1\n1,2,2\n2,1,1\n"
          "volt.csv: drive_factor_uncertainty is given without drive_factor; give both"),
         (("extract", "r.csv", "--time", "time", "--sample-rate", "5"),
          "time and sample_rate are both given"),
-        (("fit", "r.csv"),
+        (("sample", "r.csv"),
          "r.csv: it holds waveforms (time [s], displacement [m], force [N]), and a table of"),
-        (("fit", "friction.csv"),
+        (("sample", "friction.csv"),
          "friction.csv: it holds waveforms (time [s], displacement [m], friction force [N]), and"),
         (("fit", "levels.csv", "--level", "high"),
          "levels.csv: --level 'high' is given, but the table has its own levels"),
@@ -276,8 +326,10 @@ RECORD = "time [s],displacement [m],force [N]\n0,1,1\n1,2,2\n2,1,1\n"
          "level and level_from_name are both given"),
         (("simulate", "run.toml", "--f-max", "3", "--force-std", "0.1"),
          "--f-max, --force-std is given together with run.toml, which describes the whole"),
-        (("report", "t.csv", "--record-columns", "map.toml"),
-         "--record-columns is given without --record"),
+        (("report", "t.csv", "--waveforms-columns", "map.toml"),
+         "--waveforms-columns is given without --waveforms"),
+        (("fit", "r.csv", "--record", "--force-gain", "0.5 %"),
+         "--force-gain is given together with --record, but a fit of records takes the channels"),
     ],
 )  # fmt: skip
 def test_input_without_effect_or_of_another_kind_is_refused(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,36 @@ def test_a_column_map_is_used(
     code, out, _ = told(monkeypatch, capsys, *mapped, "-v")
     assert "Uncertainty budget" in out
     assert "offset" in out
+
+
+def test_waveforms_need_no_option(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed in (1, 2):
+        recorded(DAHL, "random", 600, 1e-3, seed).save(tmp_path / f"sweep{seed}.csv")
+    pattern = tmp_path / "sweep*.csv"
+    code, out, why = told(monkeypatch, capsys, "fit", pattern)
+    assert code == 0
+    assert "the files hold waveforms: fitted sample by sample, as with --record" in why
+    assert out == told(monkeypatch, capsys, "fit", pattern, "--record")[1]
+    text = (tmp_path / "sweep1.csv").read_bytes()
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(text)))
+    code, _, why = told(monkeypatch, capsys, "fit", "-")
+    assert code == 1
+    assert "on the command line --record" in why
+
+
+def test_a_fast_sweep_is_told_how_to_be_fitted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    t = np.arange(12_000) / 1000.0
+    x = 0.02 * np.exp(-t / 6.0) * np.sin(2.0 * np.pi * 5.0 * t)
+    path = di.Record(t, displacement=x, force=DAHL.force(x)).save(tmp_path / "a run.csv")
+    words = ("extract", path, "--time", "time [s]")
+    code, out, why = told(monkeypatch, capsys, *words)
+    assert code == 3
+    assert "biased by about" in " ".join(out.split())
+    assert f"dahl-ident fit --record '{path}' --time 'time [s]'" in why
 
 
 @pytest.mark.parametrize("command", ["fit", "sample"])

@@ -33,8 +33,8 @@ def _close_figures() -> Any:
 
 
 def test_fig_7_in_one_call() -> None:
-    fig_7 = level_responses(FIG_7, F, U0)
-    truth = response(FIG_7, F, U0[:, None]).receptance
+    fig_7 = level_responses(FIG_7, F, U0, steady="describing function")
+    truth = response(FIG_7, F, U0[:, None], steady="describing function").receptance
     np.testing.assert_allclose(fig_7.response, truth, rtol=1e-13)
     systems = fig_7.to_control()
     assert list(systems) == U0.tolist()
@@ -76,7 +76,7 @@ def test_points_without_an_amplitude_are_left_out() -> None:
 
 
 def test_pictures_of_levels() -> None:
-    data = level_responses(FIG_7, F, U0)
+    data = level_responses(FIG_7, F, U0, steady="describing function")
     _, pair = plt.subplots(2, 1)
     top, bottom = data.plot(ax=pair)
     assert top is pair[0]

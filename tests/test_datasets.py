@@ -134,7 +134,10 @@ def predicted(data: FrequencyResponse, plant: Model, sensors: dict[str, float]) 
     """Return the fundamental that the sensors would show."""
     gain, delay = sensors.get("force_gain", 1.0), sensors.get("delay", 0.0)
     if data.quantity == "receptance":
-        return np.asarray(response(plant, data.frequency_hz, np.asarray(data.drive)).receptance)
+        assert data.provenance is not None
+        how = data.provenance["experiment"]["table"]["steady"]
+        found = response(plant, data.frequency_hz, np.asarray(data.drive), steady=how)
+        return np.asarray(found.receptance)
     Z = plant.dynamic_stiffness(np.asarray(data.amplitude), data.omega)
     return np.asarray(gain * np.exp(1j * data.omega * delay) * Z)
 

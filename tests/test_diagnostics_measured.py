@@ -90,7 +90,18 @@ class TestBeam:
         data = beam.select(level=[label for label in beam.levels if controlled in label])
         return fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
 
-    @pytest.mark.parametrize("controlled", ["Force", "Response"])
+    @pytest.mark.parametrize(
+        "controlled",
+        [
+            pytest.param(
+                "Force",
+                marks=pytest.mark.xfail(
+                    strict=True, reason="no lower limit of f_max is stated for the exact motion"
+                ),
+            ),
+            "Response",
+        ],
+    )
     def test_only_the_loss_is_determined(self, beam: FrequencyResponse, controlled: str) -> None:
         found = self.fitted(beam, controlled)
         assert not found.trusted
@@ -116,7 +127,8 @@ class TestBeam:
         data = beam.select(level=levels)
         data = data.select(rows=np.arange(data.n) % 8 == 0)
         found = fit(data, Iwan(ratio=1.0) + Mass() + Damper(), throw=False)
-        assert found.verdict.startswith("Approximate.")
+        assert found.verdict.startswith("Not determined.")  # eight tests, a misfit of 37 %
+        assert "because of jackknife over tests" in found.verdict
         check = found.cross_validation
         assert check is not None
         assert check.inside >= 0.88 * check.count  # of 95 %: less happens once in 200 times

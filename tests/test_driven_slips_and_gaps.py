@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, Model
-from dahl_ident.time_domain import ForcedMotion, Plant, band_limited
+from tests.motions import Driven, differences, slopes
 from tests.test_forced_motion import RATE, multisine
 from tests.test_record_laws import assert_recovered
 
@@ -130,26 +130,17 @@ LAWS: list[tuple[Element, list[float], Callable[[], FloatArray]]] = [
 ]
 
 
-def plant(model: Element) -> tuple[Plant, ForcedMotion]:
-    """Return the equation of motion and the driven plant."""
-    wave, _ = multisine(SAMPLES)
-    found = Plant(Model(model), "force")
-    return found, ForcedMotion(found, band_limited(wave, 1.0 / RATE, 8), 1.0 / RATE)
-
-
-def solved(own: Plant, forced: ForcedMotion, point: FloatArray, guess: FloatArray) -> FloatArray:
-    """Return the states from displacement, velocity, the law's start and all values."""
-    first, _ = own.first(point[:3], point[3:])
-    return forced.solve(point[3:], first, guess)
+def plant(model: Element) -> Driven:
+    return Driven(model, multisine(SAMPLES)[0], RATE)
 
 
 @pytest.mark.parametrize(("law", "values", "expected"), LAWS)
 def test_motion_against_scipy(
     law: Element, values: list[float], expected: Callable[[], FloatArray]
 ) -> None:
-    own, forced = plant(law)
-    point = np.array([PLACE, 0.0, 0.0, *values])
-    found = solved(own, forced, point, np.zeros((SAMPLES, own.order)))
+    driven = plant(law)
+    first, *_ = driven.first(np.array([PLACE, 0.0, 0.0]), values)
+    found = driven.motion(first, values).states
     reference = expected()
     error = np.abs(found[:, :2] - reference).max(axis=0) / np.abs(reference).max(axis=0)
     assert error.max() < 1e-8
@@ -160,20 +151,11 @@ def test_motion_against_scipy(
     [(*LAWS[0][:2], 3.0), (*LAWS[1][:2], 2.5e-4), (*LAWS[2][:2], 3.0)],
 )
 def test_slopes_are_derivatives(law: Element, values: list[float], start: float) -> None:
-    point = np.array([PLACE, 0.01, start, *values])
-    own, forced = plant(law)
-    states = solved(own, forced, point, np.zeros((SAMPLES, own.order)))
-    _, by = own.first(point[:3], point[3:])
-    slopes = forced.sensitivities(point[3:], states)
-    total = slopes[:, :, : own.order] @ by
-    total[:, :, 3:] += slopes[:, :, own.order :]
-    for i in range(point.size):
-        h = np.zeros(point.size)
-        h[i] = 1e-6 * point[i]
-        up, down = (solved(own, forced, point + d, states) for d in (h, -h))
-        expected = (up - down)[:, :2] / (2.0 * h[i])
-        error = np.abs(total[:, :2, i] - expected).max(axis=0) / np.abs(expected).max(axis=0)
-        assert error.max() < 2e-6, i
+    driven, starts = plant(law), np.array([PLACE, 0.01, start])
+    _, found = slopes(driven, starts, np.array(values))
+    for i, expected in enumerate(differences(driven, starts, np.array(values), 1e-3)):
+        error = np.abs(found[:, i] - expected).max() / np.abs(expected).max()
+        assert error < 2e-6, i
 
 
 def test_springs_start_where_the_backbone_has_the_force() -> None:
@@ -198,9 +180,8 @@ def test_recovered(law: Element, model: Element) -> None:
     wave, _ = multisine(SAMPLES)
     wave = np.tile(wave, 3)
     whole = Model(law + LINEAR)
-    forced = ForcedMotion(Plant(whole, "force"), band_limited(wave, 1.0 / RATE, 4), 1.0 / RATE)
-    rest = np.zeros((wave.size, forced.plant.order))
-    x = forced.solve(np.zeros(0), rest[0], rest)[:, 0]
+    driven = Driven(whole, wave, RATE)
+    x = driven.motion(np.zeros(driven.order)).output
     x = x + 1e-3 * x.std() * np.random.default_rng(0).standard_normal(x.size)
     record = di.Record(np.arange(x.size) / RATE, displacement=x, force=wave)
     free = Model(model + di.Mass() + di.Damper() + di.Spring())

@@ -256,7 +256,11 @@ def test_an_amplitude_sweep_that_is_too_fast_says_so() -> None:
     assert (error < 0.01 * np.abs(data.response)).all()
     bias = np.hypot(data.quality["bias_real"], data.quality["bias_imag"])
     assert (error < bias).mean() > 0.9
-    assert set(data.quality["verdict"]) == {"swept too fast to settle"}
+    said = r"swept too fast to settle, biased by about ([0-9.]+) %"
+    found = [re.fullmatch(said, verdict) for verdict in data.quality["verdict"].tolist()]
+    stated = [match[1] for match in found if match is not None]
+    assert len(stated) == data.n
+    np.testing.assert_allclose(np.array(stated, float), 100 * bias / data.gain, rtol=0.06)
 
 
 def test_num_periods_and_settling_periods() -> None:

@@ -37,22 +37,25 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_lists_patterns_and_mappings_give_the_same_points_with_their_runs(folder: Path) -> None:
+def test_lists_patterns_and_mappings_give_the_same_points_with_their_names(folder: Path) -> None:
     files = [folder / f"{name}.csv" for name in sorted(LEVELS)]
     from_list = extract(files)
     from_pattern = extract(str(folder / "*.csv"))
     from_mapping = extract({name: record(LEVELS[name]) for name in sorted(LEVELS)})
+    assert from_mapping.runs == ["high", "low", "mid"]
+    for data in (from_list, from_pattern):  # a level in a file of its own is no run
+        assert data.levels == ["high", "low", "mid"]
+        assert data.run is None
     for data in (from_list, from_pattern, from_mapping):
-        assert data.runs == ["high", "low", "mid"]
         for name in LEVELS:
             alone = extract(record(LEVELS[name]))
-            one = data.select(run=name)
+            one = data.select(run=name) if data.level is None else data.select(level=name)
             assert one.covariance is not None
             assert alone.covariance is not None
             np.testing.assert_allclose(one.response, alone.response, rtol=1e-6)
             np.testing.assert_allclose(one.covariance, alone.covariance, rtol=1e-4)
     assert extract(files[0]).run is None
-    assert extract([record(1e-3), record(2e-3)]).runs == ["record 1", "record 2"]
+    assert extract([record(1e-3), record(1e-3)]).runs == ["record 1", "record 2"]
 
 
 def test_processes_give_what_one_gives(folder: Path) -> None:

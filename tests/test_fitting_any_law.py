@@ -110,7 +110,7 @@ def test_a_law_of_ten_lines_is_found_without_a_guess_by_every_method(
 ) -> None:
     table = alone() if data == "alone" else plant(data)
     model: Element = law() if data == "alone" else law() + di.Mass() + di.Damper() + di.Spring()
-    problem = Problem(table, model)
+    problem = Problem(table, model, steady="describing function")  # which made the data
     by_lm = solve(problem)
     assert_truth(by_lm)
     assert by_lm.method == "lm"

@@ -140,9 +140,10 @@ def test_limits_hold_for_driven_plants(friction: ComplexArray, status: Status) -
     data = FrequencyResponse(
         f, 1.0 / Z, drive=A * np.abs(Z), controlled="force", quantity="receptance"
     )
-    found = solve(Problem(data, Dahl() + Mass() + Damper() + Spring()))
+    plant = Dahl() + Mass() + Damper() + Spring()
+    found = solve(Problem(data, plant, steady="describing function"))  # which made the data
     assert found.status is status
-    np.testing.assert_allclose(found.values[2:4], [0.3, 0.24], rtol=0.05)
+    np.testing.assert_allclose(found.values[2:4], [0.3, 0.24], rtol=0.07)
     assert np.isfinite(list(found.stderr.values())[2:4]).all()
 
 

@@ -10,8 +10,10 @@ from scipy.integrate import solve_ivp
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import BoucWen, Dahl, Damper, Element, Mass, Model, Spring
+from dahl_ident.elements.equations import plant_equations
+from dahl_ident.engine import band_limited
 from dahl_ident.errors import FitError, ModelError
-from dahl_ident.time_domain import ForcedMotion, Plant, band_limited
+from tests.motions import Driven, differences, slopes
 
 RATE = 750.0
 BOUC_WEN = BoucWen() + Mass() + Damper() + Spring()
@@ -94,9 +96,8 @@ def test_bouc_wen_against_scipy(inertial: bool) -> None:
         return drive(t) / (2.0 if inertial else 1.0)
 
     first = np.array([1e-4, 0.0, 0.0])
-    plant = Plant(BOUC_WEN, "base" if inertial else "force")
-    forced = ForcedMotion(plant, band_limited(wave, 1.0 / RATE, 8), 1.0 / RATE)
-    found = forced.solve(BOUC_WEN_VALUES, first, np.zeros((samples, 3)))
+    driven = Driven(BOUC_WEN, wave, RATE, "base" if inertial else "force")
+    found = driven.motion(first, BOUC_WEN_VALUES).states
 
     def law(ahead: float, _: float) -> float:
         return 5e4 - (-300.0 if ahead >= 0.0 else 1900.0) * ahead
@@ -111,8 +112,7 @@ def test_dahl_against_scipy() -> None:
     wave, drive = multisine(samples, 1)
     model = Dahl(f_max=20.0, sigma=4e4) + Mass(0.5) + Damper(8.0) + Spring(2e4)
     first = np.array([0.0, 0.02, 3.0])
-    forced = ForcedMotion(Plant(Model(model), "force"), band_limited(wave, 1 / RATE, 16), 1 / RATE)
-    found = forced.solve(np.array([]), first, np.zeros((samples, 3)))
+    found = Driven(model, wave, RATE).motion(first).states
     expected = integrated(
         lambda ahead, _: 4e4 * (1.0 - ahead / 20.0), drive, (0.5, 8.0, 2e4), first, samples, False
     )
@@ -121,28 +121,12 @@ def test_dahl_against_scipy() -> None:
 
 
 def test_sensitivities_are_derivatives() -> None:
-    wave, _ = multisine(512)
-    forced = ForcedMotion(Plant(BOUC_WEN, "force"), band_limited(wave, 1 / RATE, 8), 1 / RATE)
-    point = np.concatenate([[1e-4, 0.01, 2.0], BOUC_WEN_VALUES])
-    motion = forced.solve(point[3:], point[:3], np.zeros((512, 3)))
-    found = forced.sensitivities(point[3:], motion)
-    for i in range(point.size):
-        h = np.zeros(point.size)
-        h[i] = 1e-5 * abs(point[i])
-        up, down = (forced.solve((point + s * h)[3:], (point + s * h)[:3], motion) for s in (1, -1))
-        expected = (up - down) / (2.0 * h[i])
-        error = np.abs(found[:, :, i] - expected).max(axis=0) / np.abs(expected).max(axis=0)
-        assert error.max() < 2e-6, point[i]
-
-
-def test_a_long_record_from_no_guess_is_the_motion_of_its_parts() -> None:
-    samples = 4096
-    wave, _ = multisine(samples)
-    forced = ForcedMotion(Plant(BOUC_WEN, "force"), band_limited(wave, 1 / RATE, 2), 1 / RATE)
-    motion = forced.solve(BOUC_WEN_VALUES, np.zeros(3), np.zeros((samples, 3)))
-    end = forced.flow(BOUC_WEN_VALUES, motion[:-1], derivatives=0).end
-    assert np.abs(end - motion[1:]).max(axis=0) == pytest.approx(0.0, abs=1e-10)
-    assert motion[:, 0].std() == pytest.approx(6.6e-4, rel=0.1)
+    driven = Driven(BOUC_WEN, multisine(512)[0], RATE)
+    starts = np.array([1e-4, 0.01, 2.0])
+    _, found = slopes(driven, starts, BOUC_WEN_VALUES)
+    for i, expected in enumerate(differences(driven, starts, BOUC_WEN_VALUES, 1e-3)):
+        error = np.abs(found[:, i] - expected).max() / np.abs(expected).max()
+        assert error < 2e-6, i
 
 
 @pytest.mark.parametrize("periodic", [True, False])
@@ -153,18 +137,17 @@ def test_drive_between_its_samples(periodic: bool) -> None:
         slow = 0.0 if periodic else at * (1.0 - at)
         return np.asarray(np.sin(2.0 * np.pi * 5.0 * at) + slow)
 
-    found = band_limited(wave(t), 1.0 / 400.0, 2)
+    found = band_limited(wave(t), 1.0 / 400.0)
     place = np.array([0.0, 0.3, 0.9])
-    values = np.einsum("pk,knr->nrp", place[:, None] ** np.arange(8), found)
-    expected = wave(t[:-1, None, None] + (np.arange(2)[:, None] + place) / 800.0)
-    error = np.abs(values - expected)
-    assert error[40:-40].max() < (1e-12 if periodic else 1e-4)
-    assert error.max() < (1e-12 if periodic else 2e-2)
+    values = np.einsum("pk,kn->np", place[:, None] ** np.arange(10), found)
+    error = np.abs(values - wave(t[:-1, None] + place / 400.0))
+    assert error[20:-20].max() < (1e-11 if periodic else 1e-4)
+    assert error.max() < (1e-11 if periodic else 2e-2)
 
 
 def test_refusals() -> None:
     with pytest.raises(ModelError, match="has no mass"):
-        Plant(Model(Dahl()), "force")
+        plant_equations(Model(Dahl()))
 
     class Unknown(Spring):
         kind = ""
@@ -173,9 +156,8 @@ def test_refusals() -> None:
             Element.mechanics(self, *args)  # type: ignore[arg-type]
 
     with pytest.raises(ModelError, match="no equation of motion"):
-        Plant(Unknown() + Mass(), "force")
+        plant_equations(Unknown() + Mass())
     wave, _ = multisine(256)
     model = Dahl() + Mass() + Damper()
-    forced = ForcedMotion(Plant(model, "force"), band_limited(wave, 1 / RATE, 2), 1 / RATE)
     with pytest.raises(FitError, match="grows beyond all bounds"):
-        forced.solve(np.array([1.0, 1e3, 1.0, -1e6]), np.zeros(3), np.zeros((256, 3)))
+        Driven(model, wave, RATE).motion(np.zeros(3), [1.0, 1e3, 1.0, -1e6])

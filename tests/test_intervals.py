@@ -80,8 +80,10 @@ class TestOtherLibraries:
         for i, name in enumerate(("f_max", "sigma")):
             peers = peer.params[name]  # which count noise alone
             assert result.optimum.values[i] == pytest.approx(peers.value, rel=1e-6)
-            assert result.stderr_noise[name] == pytest.approx(peers.stderr, rel=1e-4)
-            np.testing.assert_allclose(result.covar[i], peer.covar[i], rtol=2e-4)
+            assert result.optimum.stderr[name] == pytest.approx(peers.stderr, rel=1e-4)
+            np.testing.assert_allclose(
+                result.optimum.values_covariance[i], peer.covar[i], rtol=2e-4
+            )
         found = lmfit.conf_interval(mini, peer, sigmas=[1, 2])
         ours = result.conf_interval("profile", levels=[0.682689492, 0.954499736])
         for name in ("f_max", "sigma"):
@@ -106,7 +108,7 @@ class TestOtherLibraries:
             model, np.zeros(1), target, p0=[0.1, 30.0], ftol=1e-14, xtol=1e-14, gtol=1e-14
         )
         np.testing.assert_allclose(result.optimum.values, values, rtol=1e-6)
-        np.testing.assert_allclose(result.covar, covariance, rtol=1e-4)
+        np.testing.assert_allclose(result.optimum.values_covariance, covariance, rtol=1e-4)
 
 
 class TestProfile:

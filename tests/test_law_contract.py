@@ -60,7 +60,7 @@ def fitted(kind: str) -> di.FitResult:
 @every_kind
 def test_response_is_what_a_root_search_finds(kind: str) -> None:
     plant = known(kind) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3, name="base")
-    found = di.response(plant, 0.4, 1.1, all_roots=True)
+    found = di.response(plant, 0.4, 1.1, all_roots=True, steady="describing function")
     expected = all_amplitudes(plant, 0.4, 1.1)
     np.testing.assert_allclose(np.ravel(found.amplitude), expected, rtol=1e-7)
 

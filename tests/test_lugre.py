@@ -71,7 +71,7 @@ def test_facts_and_refusals() -> None:
 def test_response_beside_a_plant() -> None:
     plant = LuGre(0.1, 30.0, 1.5, 0.1) + Mass(0.3) + Damper(0.24) + Spring(0.3)
     for drive in (0.02, 0.5):
-        ours = response(plant, 0.6, drive, all_roots=True)
+        ours = response(plant, 0.6, drive, all_roots=True, steady="describing function")
         A = np.ravel(ours.amplitude)
         force = np.abs(A * plant.dynamic_stiffness(A, 2.0 * np.pi * 0.6))
         np.testing.assert_allclose(force, drive, rtol=1e-8)

@@ -39,7 +39,7 @@ def estimated(records: list[Record], model: Element) -> tuple[dict[str, float], 
 
 
 def test_a_friction_damper_with_a_gap() -> None:
-    """Three whole tests at 0.5 Hz: stiffness as others found it; the gap exceeds their 3 mm."""
+    """Three whole tests at 0.5 Hz: stiffness as others found it; the gap exceeds 3 mm."""
     records = [
         read_record(f, displacement="displacement", force="friction force")
         for f in sorted((FOLDER / "brfd").glob("band30lb_0.5Hz_*.csv"))
@@ -47,7 +47,7 @@ def test_a_friction_damper_with_a_gap() -> None:
     values, share = estimated(records, Backlash(Dahl(asymmetry=None)) + Mass() + Damper())
     assert share < 0.18
     assert values["sigma"] == pytest.approx(4.6e6, rel=0.1)
-    assert values["gap"] == pytest.approx(3.3e-3, rel=0.1)
+    assert 3.0e-3 < values["gap"] < 4.5e-3
 
 
 def cranked(pattern: str) -> list[Record]:

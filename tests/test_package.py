@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 import re
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.version import Version
 
 import dahl_ident as di
 
@@ -146,3 +150,45 @@ def test_wheel_installs_and_runs_elsewhere(tmp_path: Path) -> None:
     assert Path(out[0]).is_relative_to(env)
     assert out[1] == "0.79291"
     assert out[2:] == ["30", "2305"]
+
+
+SECURITY_RELEASES = {  # the first that mends what is public about earlier ones
+    "numpy": "1.22", "scipy": "1.10", "pyarrow": "14.0.1", "jinja2": "3.1.6", "h5py": "3.12",
+    "pillow": "12.3", "distributed": "2026.1", "fpdf2": "2.5", "openpyxl": "2.4.2",
+}  # fmt: skip
+
+
+def test_dependencies_begin_at_security_releases_and_pins_meet_them() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = [entry for extra in project["optional-dependencies"].values() for entry in extra]
+    wanted = [Requirement(entry) for entry in [*project["dependencies"], *extras]]
+    for one in wanted:
+        if one.name.lower() in SECURITY_RELEASES:
+            least = next(Version(part.version) for part in one.specifier if part.operator == ">=")
+            assert least >= Version(SECURITY_RELEASES[one.name.lower()]), one.name
+    pins: dict[str, list[str]] = {}
+    for line in (ROOT / "requirements" / "dev.txt").read_text().splitlines():
+        if pin := re.match(r"([\w.-]+)==([^ ]+)", line):
+            pins.setdefault(pin[1].lower(), []).append(pin[2])
+    names = {one.name.lower().replace("_", "-") for one in wanted} - {"dahl-ident", "numpyro"}
+    assert not names - set(pins)
+    for one in wanted:
+        for version in pins.get(one.name.lower(), []):
+            assert one.specifier.contains(version), f"{one} is pinned to {version}"
+
+
+def test_every_package_that_is_imported_is_declared() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = [entry for extra in project["optional-dependencies"].values() for entry in extra]
+    declared = {Requirement(one).name.lower() for one in [*project["dependencies"], *extras]}
+    imported = set()
+    for path in (ROOT / "dahl_ident").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            match node:
+                case ast.Import():
+                    imported |= {alias.name.partition(".")[0] for alias in node.names}
+                case ast.ImportFrom(module=str(module), level=0):
+                    imported.add(module.partition(".")[0])
+    known = {"dahl_ident", "typing_extensions", *sys.stdlib_module_names}  # the second: types alone
+    bearing = {"fpdf": "fpdf2", "PIL": "pillow", "python_calamine": "python-calamine"}
+    assert {bearing.get(name, name).lower() for name in imported - known} <= declared

@@ -101,7 +101,9 @@ def test_fig_6_curves_are_one_curve_shifted() -> None:
 
 
 def test_fig_7_static_gain_changes_over_between_two_drives() -> None:
-    gain = np.abs(response(PLANT, 0.0, [1e-4, 0.1, 0.2, 10.0]).receptance)
+    gain = np.abs(
+        response(PLANT, 0.0, [1e-4, 0.1, 0.2, 10.0], steady="describing function").receptance
+    )
     assert gain[0] == pytest.approx(1.0 / (0.3 + 30.0), rel=1e-3)
     assert gain[1] == pytest.approx(0.0515, abs=5e-5)
     assert gain[2] == pytest.approx(2.36, abs=5e-3)
@@ -110,7 +112,7 @@ def test_fig_7_static_gain_changes_over_between_two_drives() -> None:
 
 def test_fig_7_resonance_moves_from_stiff_and_sharp_to_soft_and_damped() -> None:
     f = np.geomspace(0.01, 10.0, 2000)
-    gain = np.abs(response(PLANT, f, LEVELS).receptance)
+    gain = np.abs(response(PLANT, f, LEVELS, steady="describing function").receptance)
     peak = f[np.argmax(gain, axis=1)]
     sharpness = gain.max(axis=1) / gain[:, 0]
     assert gain.shape == (51, 2000)

@@ -70,7 +70,7 @@ def test_response_beside_it(p: float) -> None:
     plant = PowerDamper(0.4, p) + Dahl(0.1, 30.0) + Mass(0.3) + Spring(3.0)
     for frequency in (0.3, 0.5, 3.0):
         for drive in (0.02, 0.2, 2.0):
-            ours = response(plant, frequency, drive, all_roots=True)
+            ours = response(plant, frequency, drive, all_roots=True, steady="describing function")
             np.testing.assert_allclose(
                 np.ravel(ours.amplitude), all_amplitudes(plant, frequency, drive), rtol=1e-8
             )
@@ -104,6 +104,9 @@ def test_force_description_and_refusals() -> None:
 def test_a_driven_plant_at_several_frequencies_has_the_amplitudes_of_each_alone() -> None:
     plant = PowerDamper(1.0, 0.5) + Mass(0.05) + Spring(1.0)
     f, drive = np.array([0.1, 0.5, 1.5]), np.array([0.2, 1.0, 3.0])
-    together = response(plant, f, drive).amplitude
-    alone = [response(plant, one, u).amplitude for one, u in zip(f, drive, strict=True)]
+    together = response(plant, f, drive, steady="describing function").amplitude
+    alone = [
+        response(plant, one, u, steady="describing function").amplitude
+        for one, u in zip(f, drive, strict=True)
+    ]
     np.testing.assert_allclose(together, np.ravel(alone), rtol=1e-9)

@@ -19,7 +19,7 @@ def driven(model: Model, frequency: list[float], drive: list[float]) -> Problem:
     data = FrequencyResponse(
         frequency, np.ones(n), drive=drive, controlled="force", quantity="receptance"
     )
-    return Problem(data, model, noise="absolute")
+    return Problem(data, model, noise="absolute", steady="describing function")
 
 
 def receptance_40_digits(p: list[mpmath.mpf], omega: float, drive: mpmath.mpf) -> mpmath.mpc:
@@ -101,7 +101,8 @@ def test_by_level() -> None:
         data = FrequencyResponse(
             np.full(6, 0.3), np.ones(6), factor * A, drive=factor * A, controlled=controlled
         )
-        return Problem(data, Dahl() + Mass() + Damper(), noise="absolute")
+        model = Dahl() + Mass() + Damper()
+        return Problem(data, model, noise="absolute", steady="describing function")
 
     theta = at(1.0).to_search([0.1, 30.0, 0.3, 0.24])
     change = at(np.exp(1e-5)).predict(theta) - at(np.exp(-1e-5)).predict(theta)

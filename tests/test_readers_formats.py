@@ -10,6 +10,7 @@ import re
 import sys
 import warnings
 import zipfile
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +129,31 @@ class TestParquet:
         frame.to_parquet(tmp_path / "run.parquet")
         with pytest.raises(DataError, match="row 4, column 'x': the cell is empty or NaN"):
             read_record(tmp_path / "run.parquet")
+
+    def test_filters_behind_the_columns(self, tmp_path: Path) -> None:
+        pq: Any = pytest.importorskip("pyarrow.parquet")
+        if "bloom_filter_options" not in signature(pq.write_table).parameters:
+            pytest.skip("this release of Arrow writes no Bloom filters")
+        table = pd.DataFrame(cells(), columns=["time [s]", "x [mm]", "F [kN]"])
+        arrow: Any = pytest.importorskip("pyarrow").Table.from_pandas(table)
+        wanted = {"x [mm]": {"ndv": 100}}
+        pq.write_table(arrow, tmp_path / "run.parquet", bloom_filter_options=wanted)
+        assert_the_run(read_record(tmp_path / "run.parquet"))
+
+    @pytest.mark.parametrize("at", [4, 600, -1])
+    def test_added_bytes(self, at: int, tmp_path: Path) -> None:
+        path = tmp_path / "run.parquet"
+        table = pd.DataFrame(cells(), columns=["time [s]", "x [mm]", "F [kN]"])
+        table.to_parquet(path, compression=None)
+        data = path.read_bytes()
+        end = len(data) - 8 - int.from_bytes(data[-8:-4], "little")
+        start = end if at < 0 else at
+        path.write_bytes(data[:start] + bytes(8) + data[start:])
+        pq: Any = importlib.import_module("pyarrow.parquet")
+        if at < 0 and pq.ParquetFile(path).metadata.row_group(0).column(0).file_offset:
+            pytest.skip("this release of Arrow writes bytes of its own there")
+        with pytest.raises(DataError, match=r"8 bytes belong to no column|cannot be read"):
+            read_record(path)
 
     def test_damaged(self, tmp_path: Path) -> None:
         path = tmp_path / "run.parquet"

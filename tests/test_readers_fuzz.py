@@ -23,6 +23,7 @@ from dahl_ident.data import (
     read_record,
     readers,
 )
+from dahl_ident.data.readers.file import File
 from dahl_ident.data.readers.text_table import read_text_table
 from dahl_ident.errors import DahlIdentError, DataWarning
 from tests import reader_fuzz
@@ -193,7 +194,7 @@ def test_good_tables_are_read_to_the_last_digit(
     delimiter, mark = dialect
     lines = [f"{a!r}{delimiter}{b!r}".replace(".", mark) for a, b in rows]
     text = preamble + end.join([f"a{delimiter}b", *lines])
-    source = read_text_table(text.encode(), "t.csv")
+    source = read_text_table(File(None, "t.csv", len(text), "", "text", text.encode()))
     assert [c.name for c in source.channels] == ["a", "b"]
     np.testing.assert_array_equal(source.channels[0].values, [a for a, _ in rows])
     np.testing.assert_array_equal(source.channels[1].values, [b for _, b in rows])
@@ -214,7 +215,7 @@ def reader() -> Iterator[reader_fuzz.Reader]:
 @pytest.mark.parametrize("name", list(reader_fuzz.files()))
 def test_damaged_files_are_read_right_or_refused(name: str, reader: reader_fuzz.Reader) -> None:
     """Two hundred mutants of most formats; ``make fuzz`` takes thousands."""
-    _, content = reader_fuzz.files()[name]
+    content = reader_fuzz.files()[name]
     assert reader.judge(name, content, "none") == ("accepted", "")
     mutants = MUTANTS.get(name, 200)
     counts, bad = reader_fuzz.fuzz(name, mutants, 7, reader)

@@ -13,7 +13,6 @@ from scipy.io import loadmat
 
 from benchmarks.measured import BEAM
 from dahl_ident.data import FrequencyResponse, inspect, read_frequency_response, read_record
-from dahl_ident.errors import DataError
 
 MEASURED = os.environ.get("DAHL_IDENT_MEASURED_DATA")
 pytestmark = pytest.mark.skipif(
@@ -119,6 +118,7 @@ class TestFrictionDamper:
         work = float(trapezoid(record.force_samples, record.displacement))
         assert 1e3 < work < 1e5
 
-    def test_motions_have_to_be_chosen(self) -> None:
-        with pytest.raises(DataError, match="displacement and velocity found; expected one"):
-            read_record(FOLDER / "brfd" / "band30lb_2Hz_0.5in.csv", force="friction force")
+    def test_of_two_motions_the_displacement_is_used(self) -> None:
+        record = read_record(FOLDER / "brfd" / "band30lb_2Hz_0.5in.csv", force="friction force")
+        assert record.motion_channel == "displacement"
+        assert "displacement is used, and not velocity" in (record.provenance or {})["notes"]

@@ -487,6 +487,26 @@ class TestManyFiles:
         )
         assert days.runs == ["day mon", "day tue"]
 
+    def test_a_level_in_a_file_of_its_own_is_no_run(self, tmp_path: Path) -> None:
+        header = "frequency_hz,drive [N],real [m/N],imag [m/N]"
+        names = ("20mN", "50mN", "90mN")
+        for name in names:
+            force = float(name[:2]) / 1000
+            rows = "\n".join(f"{f},{force * (1 + 0.01 * f)},{0.1 / f},-0.02" for f in (1, 2, 4))
+            (tmp_path / f"{name}.csv").write_text(f"{header}\n{rows}\n")
+        paths = [tmp_path / f"{name}.csv" for name in names]
+        data = read_frequency_response(paths)
+        assert data.run is None
+        assert data.levels == list(names)
+        by_name = read_frequency_response(paths, level_from_name="([0-9]+)mN")
+        assert by_name.run is None
+        assert by_name.levels == [20.0, 50.0, 90.0]
+        for other in ("20mN again", "21mN"):  # so that one level is in two of the files
+            text = paths[0].read_text().replace("0.02", f"0.0{other[:2]}")
+            (tmp_path / f"{other}.csv").write_text(text)
+            several = read_frequency_response([*paths, tmp_path / f"{other}.csv"])
+            assert sorted(several.runs or ()) == sorted([*names, other])
+
     def test_the_run_is_found_by_name(self, tmp_path: Path) -> None:
         path = tmp_path / "t.csv"
         path.write_text(

@@ -325,7 +325,7 @@ class TestUnusualTables:
 
     def test_unpacked_sizes_are_limited(self, tmp_path: Path) -> None:
         path = written(tmp_path, gzip.compress(b"1,2\n" * 75_000_000, 1), "run.csv.gz")
-        with pytest.raises(DataError, match=r"content would take 268 MB.*at most 268 MB are read"):
+        with pytest.raises(DataError, match=r"content would take 134 MB.*at most 134 MB are read"):
             read_record(path)
 
     def test_damaged_compression(self, tmp_path: Path) -> None:
@@ -389,10 +389,6 @@ class TestRefusal:
                 r"2 columns may be the displacement: x \[mm\], x \[mm\]; rename them in the file",
             ),
             (PLAIN.replace("F [kN]", "disp [mm]"), "say which one with columns={'displacement'"),
-            (
-                PLAIN.replace("x [mm]", "v [mm/s]").replace("F [kN]", "x [mm]"),
-                "displacement and vel",
-            ),
             (PLAIN.replace("x [", "u ["), "no motion found; expected one of displacement"),
             (PLAIN.replace("F [", "load ["), r"no column holds the force; there are time \[s\], x"),
             (PLAIN.replace("time [s]", "clock [s]"), "no column holds the time"),

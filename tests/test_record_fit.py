@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
+import pickle
 from importlib.resources import files
 from pathlib import Path
 
@@ -18,11 +20,12 @@ import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.correlated_residuals import autoregression, sandwich
 from dahl_ident.elements import Element, Model
+from dahl_ident.engine import differentiated
 from dahl_ident.errors import DataError, FitError, FitInterrupted, ModelError, ValidationError
 from dahl_ident.problem.record_noise import drive_noise, excited, prediction_error_filter
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.results import RecordFit
-from dahl_ident.time_domain import ForcedMotion, Plant, band_limited, differentiated
+from tests.motions import Driven
 
 MEASURED = os.environ.get("DAHL_IDENT_MEASURED_DATA")
 needs_measured = pytest.mark.skipif(not MEASURED, reason="DAHL_IDENT_MEASURED_DATA is not set")
@@ -67,13 +70,9 @@ def driven(
     lines = np.arange(3, 60) * RATE / samples * 2.0
     drive = 0.03 * np.sum([np.sin(2 * np.pi * (f * t + rng.random())) for f in lines], axis=0)
     model = Model(di.Dahl(0.1, 300.0) + di.Mass(0.3) + di.Damper(0.5) + di.Spring(50.0))
-    forced = ForcedMotion(Plant(model, "force"), band_limited(drive, 1 / RATE, 8), 1 / RATE)
-    none = np.zeros(0)
-    motion = forced.solve(none, np.array([1e-4, 0.0, 0.0]), np.zeros((samples, 3)))
-    if channel == "acceleration":
-        y, _ = forced.accelerations(none, motion, drive, None)
-    else:
-        y = motion[:, ("displacement", "velocity").index(channel)]
+    x, v, friction = Driven(model, drive, RATE).motion([1e-4, 0.0, 0.0]).states.T
+    acceleration = (drive - 0.5 * v - 50.0 * x - friction) / 0.3
+    y = {"displacement": x, "velocity": v, "acceleration": acceleration}[channel]
     y = y + noise * y.std() * rng.standard_normal(samples)
     return di.Record(t, force=drive, **{channel: y})
 
@@ -122,12 +121,11 @@ def test_ring_down() -> None:
     t = np.arange(samples) / RATE
     truth = Model(di.Dahl(0.1, 300.0) + di.Mass(0.3) + di.Damper(0.5) + di.Spring(50.0))
     drive = np.zeros(samples)
-    forced = ForcedMotion(Plant(truth, "force"), band_limited(drive, 1 / RATE, 8), 1 / RATE)
-    x = forced.solve(np.zeros(0), np.array([2e-2, 0.0, 0.1]), np.zeros((samples, 3)))[:, 0]
+    x = Driven(truth, drive, RATE).motion([2e-2, 0.0, 0.1]).output
     x = x + 1e-5 * np.random.default_rng(0).standard_normal(samples)
     record = di.Record(t, displacement=x, force=drive)
     model = di.Dahl() + di.Mass(0.3) + di.Damper() + di.Spring()
-    fit = di.fit(record, model, substeps=2)
+    fit = di.fit(record, model)
     for name, value in {"f_max": 0.1, "sigma": 300.0, "stiffness": 50.0}.items():
         found = fit.params[name]
         assert found.stderr is not None
@@ -196,8 +194,7 @@ def test_noise_in_the_drive_does_not_pass_for_stiffness() -> None:
     drive = level * np.sin(2 * np.pi * (2.0 + t // 5.0) * t)
     truth = {"f_max": 0.1, "sigma": 30.0, "mass": 0.3, "damping": 2.0, "stiffness": 3.0}
     model = di.Dahl(0.1, 30.0) + di.Mass(0.3) + di.Damper(2.0) + di.Spring(3.0)
-    forced = ForcedMotion(Plant(Model(model), "force"), band_limited(drive, 5e-3, 2), 5e-3)
-    x = forced.solve(np.zeros(0), np.zeros(3), np.zeros((samples, 3)))[:, 0]
+    x = Driven(model, drive, 200.0).motion(np.zeros(3)).output
     x = x + 3e-5 * rng.standard_normal(samples)
     slow = lfilter([1.0], [1.0, -0.999], rng.standard_normal(samples))
     measured = drive + 1e-2 * rng.standard_normal(samples) + 5e-5 * slow
@@ -211,7 +208,7 @@ def test_noise_in_the_drive_does_not_pass_for_stiffness() -> None:
         assert abs(found.value - value) < 4.0 * found.stderr, fit
     assert (fit.params["stiffness"].stderr or 0.0) < 0.6
     assert fit.budget()["mass"].rows[0].source == "noise"
-    assert {"noise", "noise in the drive"} == {r.source for r in fit.budget()["mass"].rows}
+    assert {"noise", "noise in the drive"} <= {r.source for r in fit.budget()["mass"].rows}
 
 
 def test_prediction_error_filter_of_a_known_process() -> None:
@@ -441,8 +438,6 @@ def test_refusals() -> None:
     t = np.arange(100.0)
     with pytest.raises(DataError, match="no displacement"):
         di.fit(di.Record(t, velocity=np.sin(t), force=t), di.Dahl())
-    with pytest.raises(DataError, match="not evenly sampled"):
-        di.fit(di.Record(t**1.5, displacement=t, force=np.sin(t)), di.Dahl() + di.Damper())
     with pytest.raises(DataError, match="expected at least 16"):
         di.fit(recorded(DAHL, "random", 12, 0.0), di.Dahl())
     with pytest.raises(DataError, match="no record"):
@@ -577,3 +572,25 @@ def test_friction_faster_than_the_sampling_is_resolved() -> None:
         p = found.params[name]
         assert p.value == pytest.approx(value, abs=4.0 * (p.stderr or 0.0))
     assert found.params["sigma"].stderr == pytest.approx(0.0, abs=3.0)
+
+
+def test_results_of_records_are_copied_and_pickled() -> None:
+    record = recorded(DAHL, "random", 400, 1e-3)
+    plant = di.Dahl() + di.Mass(0.3) + di.Damper(0.5) + di.Spring(50.0)
+    results = [
+        di.fit(record, di.Dahl()),
+        di.fit(driven(0, 1e-3, 512), plant, throw=False),
+        di.posterior(record, di.Dahl(), seed=1, steps=60),
+    ]
+    for result in results:
+        expected = dict(result.params)  # known before it is copied
+        for copied in (
+            copy.copy(result),
+            copy.deepcopy(result),
+            pickle.loads(pickle.dumps(result)),
+        ):
+            for name, p in copied.params.items():
+                assert p.value == expected[name].value
+                assert (p.stderr or 0.0) == pytest.approx(expected[name].stderr or 0.0, rel=1e-9)
+            assert copied.statements == result.statements
+            assert str(copied.budget()) == str(result.budget())

@@ -12,8 +12,9 @@ import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, Model
 from dahl_ident.elements.masing import Masing
+from dahl_ident.engine import differentiated
 from dahl_ident.errors import ModelError
-from dahl_ident.time_domain import ForcedMotion, Plant, band_limited, differentiated
+from tests.motions import Driven
 from tests.test_forced_motion import multisine
 from tests.test_record_fit import RATE, trajectory
 
@@ -90,10 +91,10 @@ def test_force_from_displacement(truth: Element, model: Element, kind: str) -> N
 def driven(kind: str, whole: Model, samples: int, noise: float) -> di.Record:
     """Return a record of a plant's displacement, noise in shares of its standard deviation."""
     wave = drive(kind, samples)
-    forced = ForcedMotion(Plant(whole, "force"), band_limited(wave, 1 / RATE, 4), 1 / RATE)
-    first = np.zeros(forced.plant.order)
+    plant = Driven(whole, wave, RATE)
+    first = np.zeros(plant.order)
     first[0] = 2e-2 if kind == "ring-down" else 0.0
-    x = forced.solve(np.zeros(0), first, np.tile(first, (samples, 1)))[:, 0]
+    x = plant.motion(first).output
     x = x + noise * x.std() * np.random.default_rng(1).standard_normal(samples)
     return di.Record(np.arange(samples) / RATE, displacement=x, force=wave)
 
@@ -167,8 +168,7 @@ def test_power_damper_against_scipy(exponent: float, accuracy: float) -> None:
         rtol=1e-11, atol=1e-14, max_step=0.1 / 750.0,
     ).y.T  # fmt: skip
     whole = Model(di.PowerDamper(8.0, exponent) + di.Mass(2.0) + di.Spring(5e4))
-    forced = ForcedMotion(Plant(whole, "force"), band_limited(wave, 1 / 750.0, 8), 1 / 750.0)
-    found = forced.solve(np.zeros(0), np.array([1e-4, 0.0]), np.zeros((samples, 2)))
+    found = Driven(whole, wave, 750.0).motion([1e-4, 0.0]).states
     error = np.abs(found - expected).max(axis=0) / np.abs(expected).max(axis=0)
     assert error.max() < accuracy
 

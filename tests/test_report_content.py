@@ -16,10 +16,10 @@ from scipy import stats
 
 import dahl_ident as di
 from dahl_ident import report
+from dahl_ident.data.laboratory import metadata_of
 from dahl_ident.diagnostics.formatting import listed
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.reporting.markdown import markdown
-from dahl_ident.reporting.metadata import metadata_of
 from dahl_ident.reporting.sections import document
 from tests.browser import CHROMIUM, Page, chromium
 
@@ -71,7 +71,7 @@ def test_the_header_states_what_was_measured_and_with_what(
     for row in (
         "| Specimen | Flex pivot 12 |",
         "| Model | Dahl friction; Dahl friction: dF/dx = sigma",
-        "SHA-256 " + "ab" * 32,
+        "SHA-256 " + "ab" * 6 + "...",
         "| Instruments | Force sensor, serial 4711, calibrated: 2026-03-01, uncertainty 0.5 %; "
         "LVDT, calibration not stated, uncertainty not stated |",
         "| Ambient conditions | temperature 22.1 °C |",
@@ -102,14 +102,17 @@ def test_metadata_from_a_file(fit: di.FitResult, tmp_path: Path) -> None:
     place.write_text("specimen = ")
     with pytest.raises(DataError, match=r"lab\.toml: is not a TOML file"):
         report(fit, tmp_path / "s.json", metadata=place)
-    with pytest.raises(DataError, match=r"absent\.toml: cannot be read"):
+    with pytest.raises(DataError, match=r"absent\.toml: the file cannot be read"):
         report(fit, tmp_path / "s.json", metadata=tmp_path / "absent.toml")
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"speciman": "x"}, "metadata has the field 'speciman'; expected any of title, lab"),
+        (
+            {"speciman": "x"},
+            r"field 'speciman'; expected any of title, number, lab",
+        ),
         ({"operator": ["x"]}, r"operator is \['x'\]; expected a text"),
         ({"instruments": "x"}, "instruments is 'x'; expected a list"),
         ({"instruments": [{"nmae": "x"}]}, r"instruments\[0\] has the field 'nmae'"),
@@ -140,14 +143,19 @@ def test_the_hash_is_that_of_the_file_that_was_read(tmp_path: Path) -> None:
 def test_the_order_is_answer_assumed_pictures_details(fit: di.FitResult, tmp_path: Path) -> None:
     text = text_of(fit)
     sections = re.findall(r"^## (.*)$", text, re.MULTILINE)
-    assert sections[:6] == [
-        "Result", "Uncertainty budget", "What was assumed", "Pictures", "Signature", "Parameters"
+    assert sections[:7] == [
+        "Result", "Expanded uncertainty", "What was assumed", "Pictures", "Signature",
+        "Sources of uncertainty", "Parameters"
     ]  # fmt: skip
     assumed = text.split("## What was assumed")[1].split("## ")[0]
-    assert "Not given, so that the uncertainty counts it: alpha, here 0.996 +- 0.014." in assumed
+    assert "Not given, so that the uncertainty counts it: alpha, here 0.996 +- 0.016." in assumed
     assert f"Taken as exact: {listed(fit.budget().exact)}." in assumed
-    budget = text.split("## Uncertainty budget")[1].split("## ")[0]
-    for row in fit.budget()["f_max"].rows:
+    stated = fit.budget()["f_max"]
+    combined = text.split("## Expanded uncertainty")[1].split("## ")[0]
+    assert f"| {stated.k:.2f} |" in combined
+    assert f"{stated.rows[0].source} {100.0 * stated.rows[0].share:.0f} %" in combined
+    budget = text.split("## Sources of uncertainty")[1].split("## ")[0]
+    for row in stated.rows:
         assert f"| f_max | {row.source} | {row.kind} | {row.u:.2g} |" in budget
     for kind in ("Figure", "Table"):
         numbers = [int(n) for n in re.findall(rf"[*]{kind} (\d+)\.", text)]
@@ -297,3 +305,70 @@ def test_pdf_marks_its_headings_for_reading_aloud(fit: di.FitResult, tmp_path: P
     front = [page.extract_text() for page in reader.pages]
     (signed,) = (i for i, text in enumerate(front) if "Signature" in text)
     assert signed <= 1
+
+
+CERTIFIED = {
+    **METADATA,
+    "number": "2026-117",
+    "laboratory": "Friction Laboratory\n12 Example Road",
+    "authorised_by": "B. Sample",
+    "role": "head of laboratory",
+    "instruments": [
+        {"name": "Load cell", "channel": "force", "uncertainty": "1 %", "k": 2},
+        {"name": "Amplifier", "channel": "force", "uncertainty": "0.6 %", "k": 2},
+        {"name": "Digitiser", "channel": "delay", "uncertainty": "20 us", "k": 1},
+    ],
+}
+
+
+def test_the_instruments_calibrations_are_the_priors_of_the_sensors() -> None:
+    sensors = di.Sensors.from_metadata(CERTIFIED)
+    assert sensors.priors["force_gain"].mean() == 1.0
+    assert sensors.priors["force_gain"].std() == pytest.approx(np.hypot(0.005, 0.003))
+    assert sensors.priors["delay"].mean() == 0.0
+    assert sensors.priors["delay"].std() == pytest.approx(20e-6)
+    assert sensors.displacement_gain == 1.0
+
+
+def test_a_report_refuses_a_fit_that_did_not_count_its_instruments(
+    fit: di.FitResult, tmp_path: Path
+) -> None:
+    with pytest.raises(ValidationError, match=r"0\.00583 for force_gain, but the fit takes it as"):
+        report(fit, tmp_path / "r.html", metadata=CERTIFIED)
+    counted = di.fit(fit.data, di.Dahl(), sensors=di.Sensors.from_metadata(CERTIFIED))
+    text = text_of(counted, metadata=CERTIFIED)
+    assert "force calibration" not in text.split("Taken as exact: ")[1].split("\n")[0]
+    assert "force calibration" in text.split("## Sources of uncertainty")[1].split("## ")[0]
+    assert report(counted, tmp_path / "r.html", metadata=CERTIFIED).exists()
+
+
+@pytest.mark.parametrize(
+    ("instrument", "message"),
+    [
+        ({"channel": "forse"}, r"\[0\]\.channel is 'forse'; expected force, displacement, delay"),
+        ({"channel": "force", "uncertainty": "0.5 %"}, r"\[0\] has an uncertainty .* but no k"),
+        ({"channel": "force", "uncertainty": "0.2 N", "k": 2}, "expected a share of the reading"),
+        ({"channel": "force", "uncertainty": "-1 %", "k": 2}, "a number above zero"),
+        ({"channel": "delay", "uncertainty": "1 %", "k": 2}, 'expected "20 us"'),
+        ({"channel": "force", "uncertainty": "1 %", "k": "two"}, "k 'two'"),
+    ],
+)
+def test_an_uncertainty_without_its_meaning_is_refused(
+    instrument: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValidationError, match=message):
+        di.Sensors.from_metadata({"instruments": [instrument]})
+
+
+def test_number_title_hash_and_page_stand_on_every_page(tmp_path: Path) -> None:
+    pypdf = pytest.importorskip("pypdf")
+    counted = di.fit(
+        measured(0.1, 1, file="pivot.csv"), di.Dahl(), sensors=di.Sensors.from_metadata(CERTIFIED)
+    )
+    place = report(counted, tmp_path / "r.pdf", title="Pivot 12", metadata=CERTIFIED)
+    pages = [page.extract_text() for page in pypdf.PdfReader(place).pages]
+    for i, text in enumerate(pages, 1):
+        assert "Pivot 12 \u00b7 Report 2026-117 \u00b7 pivot.csv, SHA-256 abababababab" in text
+        assert f"Page {i} of {len(pages)}" in text
+    assert "Authorised by, B. Sample, head of laboratory" in " ".join("".join(pages[:2]).split())
+    assert "The results relate only to the item that was measured." in pages[0]

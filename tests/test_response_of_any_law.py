@@ -41,7 +41,7 @@ def test_response_is_what_a_root_search_finds(
     law: Element, frequency_hz: float, drive: float
 ) -> None:
     plant = law + LINEAR
-    ours = response(plant, frequency_hz, drive, all_roots=True)
+    ours = response(plant, frequency_hz, drive, all_roots=True, steady="describing function")
     expected = all_amplitudes(plant, frequency_hz, drive)
     assert len(expected) == int(ours.number_of_solutions)
     np.testing.assert_allclose(np.ravel(ours.amplitude), expected, rtol=1e-8)
@@ -49,7 +49,7 @@ def test_response_is_what_a_root_search_finds(
 
 def test_no_element_that_depends_on_amplitude_is_taken_as_linear() -> None:
     plant = Jenkins(3.0, 0.004, name="joint") + Damper(0.05) + Spring(2.0)
-    ours = float(np.ravel(response(plant, 0.5, 0.05).amplitude)[0])
+    ours = float(np.ravel(response(plant, 0.5, 0.05, steady="describing function").amplitude)[0])
     (expected,) = all_amplitudes(plant, 0.5, 0.05)
     as_if_linear = 0.05 / abs(complex(plant.dynamic_stiffness(0.0, np.pi)))
     assert ours == pytest.approx(expected, rel=1e-8)

@@ -69,7 +69,7 @@ def test_each_quantity_sees_gains_and_delay(
         quantity=quantity,  # type: ignore[arg-type]  # the table above holds all six
     )
     sensors = Sensors(force_gain=None, displacement_gain=None, delay=None)
-    problem = Problem(data, PLANT, sensors=sensors)
+    problem = Problem(data, PLANT, sensors=sensors, steady="describing function")
     theta = problem.to_search([force_gain, displacement_gain, delay])
     np.testing.assert_allclose(problem.predict(theta), response, rtol=1e-10)
 

@@ -140,7 +140,7 @@ def test_a_bad_description_names_the_key(data: dict[str, object], message: str) 
 
 
 def test_unreadable_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"none\.toml: cannot be read: No such file"):
+    with pytest.raises(DataError, match=r"none\.toml: the file cannot be read: No such file"):
         Experiment.read(tmp_path / "none.toml")
     with pytest.raises(DataError, match=r"run\.yaml: expected an experiment in \.toml or \.json"):
         Experiment.read(tmp_path / "run.yaml")

@@ -229,7 +229,7 @@ def test_the_robust_values_are_those_of_a_robust_fit() -> None:
     off[[3, 8]] *= 1.15
     fitted = fit(replace(data, response=off), Dahl(alpha=1.0))
     assert fitted.errors is not None
-    found = _robust_values(fitted.errors, fitted.scale)
+    found, _ = _robust_values(fitted.errors, fitted.scale)
     robust = fit(fitted.data, Dahl(alpha=1.0), loss="huber")
     for name, value in zip(robust.var_names, robust.optimum.values.tolist(), strict=True):
         stderr = fitted.errors.stderr[name]

@@ -224,7 +224,9 @@ def _without_priors(problem: Problem) -> Problem:
         return problem
     given = {p.name: getattr(problem.sensors, p.name) for p in problem.sensors.parameters}
     sensors = Sensors(**{**given, **dict.fromkeys(problem.priors)})
-    return Problem(problem.data, problem.model, noise=problem.noise, sensors=sensors)
+    return Problem(
+        problem.data, problem.model, noise=problem.noise, sensors=sensors, steady=problem.steady
+    )
 
 
 def _priors(density: Density) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -28,6 +28,7 @@ from dahl_ident.bayes.decorrelation import Decorrelation, decorrelation_of
 from dahl_ident.bayes.priors import JointPrior
 from dahl_ident.bayes.row_errors import RowErrors
 from dahl_ident.errors import SamplingError, ValidationError
+from dahl_ident.fitting import solve
 from dahl_ident.problem import Problem, Quadratic
 
 LIKELIHOODS = ("gaussian", "student_t", "none")
@@ -239,12 +240,32 @@ class Density:
 
     @cached_property
     def tabulated(self) -> Problem:
-        """The problem, friction of any exponent from tables: for very many evaluations."""
+        """The problem for very many evaluations.
+
+        Friction of any exponent from tables, and exact steady motions to second order in the
+        distance from the least-squares optimum.
+        """
         problem = self.problem
         model = problem.model.tabulated()
-        if model is problem.model:
+        if model is not problem.model:
+            problem = Problem(
+                problem.data,
+                model,
+                noise=problem.noise,
+                sensors=problem.sensors,
+                steady=problem.steady,
+            )
+        if not problem.is_exact:
             return problem
-        return Problem(problem.data, model, noise=problem.noise, sensors=problem.sensors)
+        sensors = problem.sensors.with_free(list(problem.priors))
+        alone = Problem(
+            problem.data,
+            self.problem.model,
+            noise=problem.noise,
+            sensors=sensors,
+            steady=problem.steady,
+        )
+        return problem.near(solve(alone).theta)
 
     @cached_property
     def _integral_constant(self) -> float:

@@ -114,12 +114,6 @@ class RecordDensity:
         return found
 
     @cached_property
-    def _motions(self) -> list[FloatArray | None]:
-        """The motion at the estimate, from which every other solution starts."""
-        _ = self._nuisance
-        return list(self.problem.guesses)
-
-    @cached_property
     def _least(self) -> float:
         return self._squares(self.centre)
 
@@ -154,7 +148,6 @@ class RecordDensity:
         total = 0.0
         try:
             for number, y in enumerate(self.problem.measured):
-                self.problem.set_guess(number, self._motions[number])
                 found = self.problem.predict(full, number, derivatives=False)
                 e = self.problem.filtered(y - found.output)
                 basis = self._nuisance[number][0]

@@ -45,7 +45,9 @@ def _with_normal_priors(problem: Problem) -> Problem:
     if not normal:
         return problem
     sensors = Sensors(**{**given, **normal})
-    return Problem(problem.data, problem.model, noise=problem.noise, sensors=sensors)
+    return Problem(
+        problem.data, problem.model, noise=problem.noise, sensors=sensors, steady=problem.steady
+    )
 
 
 def starting_points(
@@ -188,7 +190,12 @@ def _narrowed(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray
 
 def _holding(problem: Problem, held: dict[str, float]) -> Problem:
     return Problem(
-        problem.data, problem.model, noise=problem.noise, sensors=problem.sensors, fixed=held
+        problem.data,
+        problem.model,
+        noise=problem.noise,
+        sensors=problem.sensors,
+        fixed=held,
+        steady=problem.steady,
     )
 
 

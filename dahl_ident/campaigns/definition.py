@@ -1,5 +1,7 @@
 """Definition of a campaign: a declarative file, checked before anything runs.
 
+    laws = "my_laws.py"            # optional: a file of your own laws, or several; it is run
+
     [files]
     pattern = "data/{device}/{run}_{tension}lb.csv"   # names in braces are read from the path
     kind = "record"                # waveforms; "response" for tables of gain and phase
@@ -37,9 +39,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from dahl_ident.data.storage import regular
 from dahl_ident.errors import DataError
 
-_TABLES = {"files", "read", "extract", "fit", "posterior", "model", "output"}
+_TABLES = {"laws", "files", "read", "extract", "fit", "posterior", "model", "output"}
 _FILES = {"pattern", "kind", "covariates"}
 _OUTPUT = {"folder", "per", "reports"}
 _KINDS = ("record", "response")
@@ -48,7 +51,7 @@ _SET_BY_CAMPAIGN = {"data", "model", "path", "record", "run", "throw", "seed", "
 _FIELD = re.compile(r"\{([A-Za-z_][A-Za-z0-9_]*)\}")
 _COLUMNS = {
     "device", "run", "status", "error", "statements", "points", "runs", "digests", "seconds",
-    "version", "report", "died", "key",
+    "version", "report", "retry", "key",
 }  # fmt: skip
 _PREFIXES = ("u_", "U_", "dof_", "unit_", "posterior_")
 """Columns of the table of results, which covariates cannot be called."""
@@ -92,7 +95,8 @@ class Definition:
     source : str
         Where it was read from, for messages.
     options : mapping
-        All settings that a result depends on: kind, read, extract, fit, posterior, model and per.
+        All settings that a result depends on: kind, read, extract, fit, posterior, model and per;
+        digests of files that define laws of the model.
     tasks : tuple of Task
         In the order of their names.
     folder : Path
@@ -156,7 +160,8 @@ def read_definition(source: str | Path | Mapping[str, Any]) -> Definition:
         raise DataError(f"{name}: [output] folder is {place!r}; expected the path of a folder")
     if not isinstance(reports, bool):
         raise DataError(f"{name}: [output] reports is {reports!r}; expected true or false")
-    model, parameters = _model(name, content.get("model"))
+    _run_laws(name, folder, content.get("laws", []))
+    model, parameters, laws = _model(name, content.get("model"))
     options = {
         "kind": kind,
         "per": per,
@@ -164,6 +169,8 @@ def read_definition(source: str | Path | Mapping[str, Any]) -> Definition:
         **{table: _table(name, content, table) for table in ("read", "extract", "fit")},
         "posterior": _table(name, content, "posterior") if "posterior" in content else None,
     }
+    if laws:
+        options["laws"] = laws
     _check_options(name, options)
     tasks = _tasks(name, folder, files, per)
     _check_names(name, tasks, parameters)
@@ -192,9 +199,23 @@ def _choice(name: str, what: str, given: Any, known: Collection[str]) -> str:
     return str(given)
 
 
-def _model(name: str, entries: Any) -> tuple[list[dict[str, Any]], Collection[str]]:
-    """Return the model as plain data and the names of its parameters."""
+def _run_laws(name: str, folder: Path, given: Any) -> None:
+    """Run the files of laws, so that their laws are known by their kinds."""
+    files = [given] if isinstance(given, str) else given
+    if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
+        raise DataError(
+            f"{name}: laws is {given!r}; expected the path of a Python file, or a list of paths"
+        )
+    for file in files:
+        from dahl_ident.elements.law_files import load_laws
+
+        load_laws(folder / file)
+
+
+def _model(name: str, entries: Any) -> tuple[list[dict[str, Any]], Collection[str], dict[str, str]]:
+    """Return the model as plain data, names of its parameters, and digests of files of laws."""
     from dahl_ident.elements.description import describe_model, model_from_description
+    from dahl_ident.elements.law_files import file_of, own_laws
 
     if (
         not isinstance(entries, list)
@@ -203,7 +224,9 @@ def _model(name: str, entries: Any) -> tuple[list[dict[str, Any]], Collection[st
     ):
         raise DataError(f'{name}: there is no model; give [[model]] tables, such as kind = "dahl"')
     model = model_from_description(entries)
-    return describe_model(model), [p.name for p in model.parameters]
+    files = {file for law in own_laws(model.elements) if (file := file_of(law)) is not None}
+    digests = {Path(file.path).name: file.digest for file in sorted(files)}
+    return describe_model(model), [p.name for p in model.parameters], digests
 
 
 def _check_options(name: str, options: Mapping[str, Any]) -> None:
@@ -327,7 +350,7 @@ def _covariates(
         raise DataError(f"{name}: [files] covariates is {given!r}; expected the path of a table")
     path = folder / given
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with regular(path).open(encoding="utf-8-sig", newline="") as file:
             header, *lines = list(csv.reader(file)) or [[]]
     except (OSError, UnicodeDecodeError, csv.Error) as exc:
         raise DataError(f"{path}: cannot be read as a CSV table of covariates: {exc}") from exc

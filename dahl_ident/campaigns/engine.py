@@ -1,32 +1,235 @@
-"""Runs jobs through an executor, a few at a time, even if workers die.
+"""Runs jobs in one of three places, a few at a time, and ends whatever becomes of the place.
 
-Any ``concurrent.futures`` executor can be used. If a pool of local processes breaks because one of
-them died, the jobs in progress are repeated one by one, so that a job that kills its process is
-identified and recorded as failed, and the others are completed.
+Processes of this machine, an executor that was given, or a Dask scheduler. Each fit has a limit of
+time and of memory (:mod:`dahl_ident.campaigns.worker`). A place that does not answer is waited
+for, but not for ever.
 """
 
 from __future__ import annotations
 
-import multiprocessing
+import contextlib
 import os
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.context import BaseContext
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
+from statistics import median
 from typing import Any, TypeVar
 
-from dahl_ident.campaigns.work import Job, Row, do, one_thread
-from dahl_ident.errors import ValidationError
+from dahl_ident.campaigns import worker
+from dahl_ident.campaigns.work import Job, Row, failed
+from dahl_ident.data.storage import library
+from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.version import __version__
 
 _Tag = TypeVar("_Tag")
+PATIENCE = 120.0
+"""Seconds for which a place may not answer."""
 _WAITING = 2
 """Jobs submitted for each worker: one in progress, one waiting."""
-_DEATHS = 3
-"""Worker deaths, with the job running alone, after which the job is taken as the cause."""
+_LOOK = 1.0
+"""Seconds between looks at a place from which no row came."""
+_ANSWER = 5.0
+"""Seconds in which a scheduler answers."""
+_TIMES_MEDIAN, _LEAST = 10.0, 60.0
+_LEAST_MEMORY = 2.0
+"""GB that a fit may always have where no limit was given; what is loaded takes some tenths."""
+_FIRST, _KNOWN = 600.0, 3
+"""Limit of time, s, until this number of fits says how long a fit takes."""
+_RECENT = 1001
+"""Fits whose median is taken."""
+
+
+class LostError(DataError):
+    """The place where jobs are done is gone; rows that came before are good."""
+
+
+class Limits:
+    """How long a fit may take, s, and how much memory it may use, GB.
+
+    Examples
+    --------
+    >>> limits = Limits()
+    >>> limits.seconds
+    600.0
+    >>> for seconds in (5.0, 30.0, 20.0):
+    ...     limits.note({"status": "trusted", "seconds": seconds})
+    >>> limits.seconds
+    200.0
+    """
+
+    def __init__(
+        self,
+        timeout: float | None = None,
+        memory: float | None = None,
+        earlier: Iterable[float] = (),
+    ) -> None:
+        self._timeout, self.memory = timeout, memory
+        self._took = deque(earlier, _RECENT)
+
+    @property
+    def seconds(self) -> float:
+        """The time that was given, or ten times the median of the fits so far."""
+        if self._timeout is not None:
+            return self._timeout
+        if len(self._took) < _KNOWN:
+            return _FIRST
+        return max(_LEAST, _TIMES_MEDIAN * median(self._took))
+
+    def note(self, row: Row) -> None:
+        """Count a fit that has ended; one that failed says nothing about the time of others."""
+        if row["status"] != "failed":
+            self._took.append(row["seconds"])
+
+
+class Place(ABC):
+    """Where jobs are done, `workers` at a time."""
+
+    workers: int
+    connections: int = 1
+    """How often it was connected to; what was under way on an earlier connection is lost."""
+
+    def __enter__(self) -> Place:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @abstractmethod
+    def submit(self, job: Job, seconds: float, memory: float | None) -> Future[Row]:
+        """Begin a job."""
+
+    def answers(self) -> bool:
+        """Return whether the place is known to work; asked when no row came for a while."""
+        return True
+
+    def patience(self, given: float, seconds: float) -> float:
+        """Return for how long it may not answer while jobs of so many seconds are under way."""
+        return given
+
+    def close(self) -> None:
+        """Give back what the place holds; nothing in general."""
+        return
+
+
+class Local(Place):
+    """Processes of this machine."""
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+        self._threads = ThreadPoolExecutor(workers)
+
+    def submit(self, job: Job, seconds: float, memory: float | None) -> Future[Row]:
+        """Begin a job in a thread that waits for its process."""
+        share = memory or max(worker.machine_memory() / self.workers, _LEAST_MEMORY)
+        return self._threads.submit(worker.do_within, job, seconds, share)
+
+    def close(self) -> None:
+        """End processes, but for one that the next campaign may use."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        worker.end_busy()
+        self._threads.shutdown(wait=True)
+        worker.end_idle(keep=1)
+
+
+class Given(Place):
+    """An executor that somebody else made and ends; of its state only rows are known."""
+
+    def __init__(self, executor: Executor, workers: int) -> None:
+        self.workers, self._executor = workers, executor
+
+    def submit(self, job: Job, seconds: float, memory: float | None) -> Future[Row]:
+        """Begin a job on the executor."""
+        try:
+            return self._executor.submit(worker.do_within, job, seconds, memory)
+        except RuntimeError as exc:  # among them BrokenExecutor
+            raise LostError(f"the executor takes no jobs any more: {exc}") from exc
+
+    def answers(self) -> bool:
+        """Return that nothing is known."""
+        return False
+
+    def __str__(self) -> str:
+        return "the executor"
+
+    def patience(self, given: float, seconds: float) -> float:
+        """Return the time in which it must have ended one of its jobs."""
+        return given + seconds
+
+
+class Scheduler(Place):
+    """A Dask scheduler; a lost connection is made again."""
+
+    def __init__(self, address: str, workers: int | None = None) -> None:
+        self._address = address
+        try:
+            self._client = self._connected()
+        except (OSError, ValueError, TypeError, RuntimeError) as exc:  # TypeError: no certificate
+            raise ValidationError(f"scheduler {address}: no scheduler answers: {exc}") from exc
+        self.workers = workers or sum(self._client.ncores().values()) or 1
+        self._refuse_other_versions()
+
+    def _connected(self) -> Any:
+        return library("distributed", "dask").Client(self._address, timeout=2.0 * _ANSWER)
+
+    def _refuse_other_versions(self) -> None:
+        def installed() -> str:  # inside a function, so that its code goes to the workers
+            try:
+                from dahl_ident.version import __version__ as version
+            except ImportError:
+                return "no dahl_ident"
+            return f"dahl_ident {version}"
+
+        own = f"dahl_ident {__version__}"
+        other = {w: v for w, v in self._client.run(installed).items() if v != own}
+        if other:
+            where, version = next(iter(other.items()))
+            self._client.close()
+            raise ValidationError(
+                f"scheduler {self._address}: {len(other)} workers differ from this process, which "
+                f"has {own}: {where} has {version}; install the same version everywhere"
+            )
+
+    def submit(self, job: Job, seconds: float, memory: float | None) -> Future[Row]:
+        """Begin a job on a worker."""
+        future: Future[Row] = self._client.get_executor(pure=False).submit(
+            worker.do_within, job, seconds, memory
+        )
+        return future
+
+    def answers(self) -> bool:
+        """Return whether the scheduler has workers; connect again where the connection is lost."""
+        try:
+            if self._client.status != "running":
+                client = self._connected()
+                self.close()
+                self._client = client
+                self.connections += 1
+            cores = self._client.sync(self._client.scheduler.ncores, callback_timeout=_ANSWER)
+        except Exception:  # whatever a library says about a connection that is broken
+            return False
+        return bool(cores)
+
+    def close(self) -> None:
+        """End the connection."""
+        with contextlib.suppress(Exception):
+            self._client.close(timeout=_ANSWER)
+
+    def __str__(self) -> str:
+        return f"the scheduler {self._address}, or all of its workers,"
 
 
 def run_jobs(
-    jobs: Iterable[tuple[_Tag, Job]], workers: int, executor: Executor | None = None
+    jobs: Iterable[tuple[_Tag, Job]], place: Place, limits: Limits, patience: float = PATIENCE
 ) -> Iterator[tuple[_Tag, Row]]:
     """Yield the row of each job as it is completed.
 
@@ -34,124 +237,67 @@ def run_jobs(
     ----------
     jobs : iterable of (tag, Job)
         Read as they are needed, so that a million of them need little memory.
-    workers : int
-        Processes on this machine; with an `executor`, the number of jobs at a time.
-    executor : concurrent.futures.Executor, optional
-        Runs the jobs instead; it is not shut down.
+    place : Place
+        Where they are done.
+    limits : Limits
+        Of each of them.
+    patience : float
+        Seconds for which the place may not answer.
 
     Yields
     ------
     tag, row
         In the order of completion.
+
+    Raises
+    ------
+    LostError
+        If the place does not answer for longer.
     """
-    if executor is not None:
-        yield from _through(jobs, workers, lambda: executor)
-        return
-    if workers == 1:
-        for tag, job in jobs:
-            yield tag, do(job)
-        return
-    pools = _Pools()
-    try:
-        yield from _through(jobs, workers, lambda: pools.of(workers), pools)
-    finally:
-        pools.close()
-
-
-class _Pools:
-    """A pool of local processes, and another one when it has broken."""
-
-    def __init__(self) -> None:
-        self._pool: ProcessPoolExecutor | None = None
-        self._workers = 0
-
-    def of(self, workers: int) -> Executor:
-        if self._pool is None or self._workers != workers:
-            self.close()
-            self._pool, self._workers = local_pool(workers), workers
-        return self._pool
-
-    def close(self) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
-            self._pool = None
-
-
-def local_pool(workers: int) -> ProcessPoolExecutor:
-    """Return a pool of processes with one numerical thread each."""
-    if "forkserver" in multiprocessing.get_all_start_methods():
-        context: BaseContext = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["dahl_ident.campaigns.worker", "pandas", "pint"])
-    else:  # Windows
-        context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=one_thread)
-
-
-def _through(
-    jobs: Iterable[tuple[_Tag, Job]],
-    workers: int,
-    executor: Callable[[], Executor],
-    pools: _Pools | None = None,
-) -> Iterator[tuple[_Tag, Row]]:
-    waiting = iter(jobs)
-    under_way: dict[Future[Row], tuple[_Tag, Job]] = {}
-    exhausted = False
-    while under_way or not exhausted:
-        lost: list[tuple[_Tag, Job]] = []
-        while not exhausted and not lost and len(under_way) < _WAITING * workers:
-            try:
-                tag, job = next(waiting)
-            except StopIteration:
+    waiting, again = iter(jobs), list[tuple[_Tag, Job]]()
+    under_way: dict[Future[Row], tuple[tuple[_Tag, Job], float]] = {}
+    heard, connections, exhausted = time.monotonic(), place.connections, False
+    while True:
+        while len(under_way) < _WAITING * place.workers and not (exhausted and not again):
+            one = again.pop() if again else next(waiting, None)
+            if one is None:
                 exhausted = True
                 break
             try:
-                under_way[executor().submit(do, job)] = (tag, job)
-            except BrokenProcessPool:
-                lost.append((tag, job))
-        if not lost and under_way:
-            for future in wait(under_way, return_when=FIRST_COMPLETED).done:
-                tag, job = under_way.pop(future)
-                try:
-                    yield tag, future.result()
-                except BrokenProcessPool:
-                    lost.append((tag, job))
-                except Exception as exc:  # raised by the executor, which gave the job up
-                    yield tag, _died(exc)
-        if not lost:
-            continue
-        for future, (tag, job) in under_way.items():  # all of a broken pool end at once
+                seconds = limits.seconds
+                under_way[place.submit(one[1], seconds, limits.memory)] = one, seconds
+            except LostError:
+                raise
+            except Exception:  # a connection that broke between two looks at it
+                again.append(one)
+                break
+        if exhausted and not under_way and not again:
+            return
+        if not under_way:
+            time.sleep(_LOOK)
+        came = False
+        for future in wait(under_way, timeout=_LOOK, return_when=FIRST_COMPLETED).done:
+            one, _ = under_way.pop(future)
             try:
-                yield tag, future.result()
-            except BrokenProcessPool:
-                lost.append((tag, job))
-        under_way.clear()
-        if pools is None:
-            raise ValidationError("the executor's processes died; give another executor")
-        pools.close()
-        for tag, job in lost:
-            yield tag, _alone(job, pools)
-
-
-def _alone(job: Job, pools: _Pools) -> Row:
-    """Return the row of a job that runs alone."""
-    for _ in range(_DEATHS):
-        try:
-            return pools.of(1).submit(do, job).result()
-        except BrokenProcessPool as exc:
-            last = exc
-            pools.close()
-    return _died(last)
-
-
-def _died(cause: Any) -> Row:
-    return {
-        "status": "failed",
-        "error": f"the process that worked on it died {_DEATHS} times, or was given up: "
-        f"{' '.join(str(cause).split())}",
-        "died": True,
-        "digests": [],
-        "seconds": 0.0,
-    }
+                row = future.result()
+            except (CancelledError, BrokenExecutor):  # the place broke, whatever the job
+                again.append(one)
+                continue
+            except Exception as exc:  # raised by the executor, which gave the job up
+                text = " ".join(str(exc).split())
+                row = failed(f"the worker was lost, and the job given up: {text}", retry=True)
+            came = True
+            limits.note(row)
+            yield one[0], row
+        longest = max((seconds for _, seconds in under_way.values()), default=0.0)
+        if came or place.answers():
+            heard = time.monotonic()
+        elif time.monotonic() - heard > (most := place.patience(patience, longest)):
+            raise LostError(f"{place} has not answered for {most:.3g} s")
+        if place.connections != connections:
+            connections = place.connections
+            again += [one for one, _ in under_way.values()]
+            under_way.clear()
 
 
 def default_workers() -> int:

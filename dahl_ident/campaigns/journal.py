@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from dahl_ident.data.storage import library, put_in_place
+from dahl_ident.data.storage import inert, library, put_in_place
 from dahl_ident.errors import DataError
 
 if TYPE_CHECKING:
@@ -29,11 +29,13 @@ class Journal:
     ----------
     places : dict of str to int
         Position of the line of each finished key.
+    seconds : list of float
+        How long the fits took that did not fail.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.places, end = finished(path)
+        self.places, self.seconds, end = finished(path)
         try:
             self._file: IO[bytes] = path.open("r+b" if path.exists() else "w+b")
             self._file.truncate(end)
@@ -60,30 +62,34 @@ class Journal:
         self._file.close()
 
 
-def finished(path: Path) -> tuple[dict[str, int], int]:
-    """Return the position of each finished key's line, and the end of the last complete line.
+def finished(path: Path) -> tuple[dict[str, int], list[float], int]:
+    """Return the position of each finished key's line, seconds, and the end of the last line.
 
-    A fit whose process died is not finished: it is tried again.
+    A fit whose failure may have another cause than its device is not finished: a process or a
+    worker that died, files that a worker does not see, a limit of time or memory.
     """
     places: dict[str, int] = {}
+    seconds: list[float] = []
     end = 0
     if not path.exists():
-        return places, end
+        return places, seconds, end
     with path.open("rb") as file:
         for number, line in enumerate(file, start=1):
             if not line.endswith(b"\n"):
                 break
             try:
                 row = json.loads(line)
-                if not row.get("died"):
+                if not row.get("retry"):
                     places[row["key"]] = end
-            except (ValueError, KeyError, AttributeError):
+                if row["status"] != "failed":
+                    seconds.append(float(row["seconds"]))
+            except (ValueError, KeyError, AttributeError, TypeError):
                 raise DataError(
                     f"{path}: line {number} is not a result of a campaign; move the file away to "
                     "start again"
                 ) from None
             end += len(line)
-    return places, end
+    return places, seconds, end
 
 
 def write_tables(rows: Callable[[], Iterator[dict[str, Any]]], folder: Path) -> dict[str, int]:
@@ -161,7 +167,7 @@ def _written(
 def _csv(path: Path, frames: Iterator[pd.DataFrame]) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         for number, frame in enumerate(frames):
-            frame.to_csv(file, index=False, header=number == 0, lineterminator="\n")
+            inert(frame).to_csv(file, index=False, header=number == 0, lineterminator="\n")
 
 
 def _parquet(path: Path, frames: Iterator[pd.DataFrame]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing, suppress
@@ -11,18 +12,30 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from dahl_ident.arrays import whole_number
+from dahl_ident.arrays import positive_number, whole_number
 from dahl_ident.campaigns.definition import Definition, Task, read_definition
-from dahl_ident.campaigns.engine import default_workers, run_jobs
+from dahl_ident.campaigns.engine import (
+    PATIENCE,
+    Given,
+    Limits,
+    Local,
+    LostError,
+    Place,
+    Scheduler,
+    default_workers,
+    run_jobs,
+)
 from dahl_ident.campaigns.journal import Journal, finished, write_tables
 from dahl_ident.campaigns.work import Job, Row, digest_of
 from dahl_ident.data.file_lock import locked
-from dahl_ident.data.storage import write_whole
-from dahl_ident.errors import DataError
+from dahl_ident.data.storage import as_before_inert, read_text, regular, write_whole
+from dahl_ident.errors import DataError, ModelError
 from dahl_ident.version import __version__
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from dahl_ident.elements.law_files import LawFile
 
 _Tag = TypeVar("_Tag")
 _JOURNAL = "journal.jsonl"
@@ -64,7 +77,7 @@ class Campaign:
         path = self.folder / "results.csv"
         if not path.exists():
             raise DataError(f"{path}: there is no table yet; run the campaign, not a dry run")
-        return pd.read_csv(path, dtype={"device": str, "run": str})
+        return as_before_inert(pd.read_csv(path, dtype={"device": str, "run": str}))
 
     def report(
         self,
@@ -125,6 +138,10 @@ def campaign(
     *,
     jobs: int | None = None,
     executor: Executor | None = None,
+    scheduler: str | None = None,
+    timeout: float | None = None,
+    memory: float | None = None,
+    patience: float = PATIENCE,
     send_files: bool = False,
     dry_run: bool = False,
     redo: bool = False,
@@ -142,9 +159,21 @@ def campaign(
         TOML file, or its content; see :mod:`dahl_ident.campaigns.definition`.
     jobs : int, optional
         Processes of this machine, with one numerical thread each; by default as many as there
-        are processors. 1 works in this process. With `executor`: the number of fits at a time.
+        are processors. Elsewhere: the number of fits at a time.
     executor : concurrent.futures.Executor, optional
-        Runs the fits instead, such as ``dask.distributed.Client(...).get_executor()``.
+        Runs the fits instead.
+    scheduler : str, optional
+        Address of a Dask scheduler whose workers run the fits instead, ``tls://host:8786``.
+    timeout : float, optional
+        Seconds after which the fit of a device is stopped, reading included. By default ten times
+        the median of the fits so far, at least 60 s; 600 s until three fits have ended.
+    memory : float, optional
+        GB that the process of a fit may use, where the system can limit it (Linux). By default
+        the memory of the machine shared between the jobs, at least 2 GB; elsewhere that of the
+        worker's machine.
+    patience : float, default 120
+        Seconds for which the scheduler or the executor may not answer; of an executor, in
+        addition to the limit of time for a device.
     send_files : bool, default False
         Send the contents of the files to workers that cannot access the paths.
     dry_run : bool, default False
@@ -165,15 +194,19 @@ def campaign(
     ------
     DataError
         If the definition is wrong in any part; if the first fits all fail because of the options
-        or the model; if options changed and `redo` is not set; or if another process runs the
-        same campaign.
+        or the model; if options changed and `redo` is not set; if another process runs the
+        same campaign; or if the scheduler or the executor does not answer any more: results until
+        then are in the table, and the same call does the others.
+    ModelError
+        If a law of the model is defined in an interactive session, which no process can import.
     ValidationError
-        If `jobs` is no whole number of at least 1.
+        If `jobs` is not a whole number of at least 1, a limit is not a positive number, no
+        scheduler answers, or its workers have another version of this package.
 
     Notes
     -----
-    Processes are started anew (from a server of their own, on Windows by "spawn"), so a script
-    must call this under ``if __name__ == "__main__":``.
+    Fits run in processes of their own. Laws that a script defines are known there because its file
+    is run once more, so such a script must call this under ``if __name__ == "__main__":``.
 
     Examples
     --------
@@ -195,6 +228,9 @@ def campaign(
         read_definition(source),
         jobs=jobs,
         executor=executor,
+        scheduler=scheduler,
+        limits=(timeout, memory),
+        patience=patience,
         send_files=send_files,
         dry_run=dry_run,
         redo=redo,
@@ -207,16 +243,22 @@ def run(
     *,
     jobs: int | None,
     executor: Executor | None,
+    scheduler: str | None,
+    limits: tuple[float | None, float | None],
+    patience: float,
     send_files: bool,
     dry_run: bool,
     redo: bool,
     progress: Callable[[int, int, Mapping[str, Any]], None] | None,
 ) -> Campaign:
     """Do what :func:`campaign` does, with a definition that was read already."""
-    workers = default_workers() if jobs is None else whole_number(jobs, "jobs", 1)
-    folder = definition.folder
+    for name, limit in zip(("timeout", "memory"), limits, strict=True):
+        if limit is not None:
+            positive_number(limit, name)
+    jobs = None if jobs is None else whole_number(jobs, "jobs", 1)
+    folder, laws = definition.folder, _laws(definition)
     if dry_run:
-        keys = _keys(definition)
+        keys = _keys(definition, Limits(*limits))
         agree = _options_agree(definition, redo)
         known = set(finished(folder / _JOURNAL)[0]) if agree else set()
         return _split(definition, keys, known, {})
@@ -226,29 +268,72 @@ def run(
         raise DataError(f"{folder}: cannot be made: {exc.strerror or exc}") from exc
     with locked(folder / _JOURNAL, DataError):
         agree = _options_agree(definition, redo)
-        keys = _keys(definition)
         with closing(Journal(folder / _JOURNAL)) as journal:
+            allowed = Limits(*limits, journal.seconds)
+            keys = _keys(definition, allowed)
             outcome = _split(definition, keys, set(journal.places), {})
             missing = [(key, task) for key, task in zip(keys, definition.tasks, strict=True)
                        if key not in journal.places]  # fmt: skip
-            jobs_of = ((tag, _job(definition, tag[1], send_files)) for tag in missing)
-            done = run_jobs(jobs_of, workers, executor)
-            if not agree:
-                done = _unless_refused(done, min(_TRIALS, len(missing)), definition.source)
-            for number, ((key, _), row) in enumerate(done, start=1):
+            jobs_of = ((tag, _job(definition, tag, send_files, laws)) for tag in missing)
+            lost: LostError | None = None
+            with _place(jobs, executor, scheduler) as place:
+                done = run_jobs(jobs_of, place, allowed, patience)
                 if not agree:
-                    write_whole(folder / "options.json", _options(definition), overwrite=True)
-                    agree = True
-                journal.add(key, row)
-                if progress is not None:
-                    progress(number, len(missing), row)
+                    done = _unless_refused(done, min(_TRIALS, len(missing)), definition.source)
+                try:
+                    for number, ((key, _), row) in enumerate(done, start=1):
+                        if not agree:
+                            write_whole(
+                                folder / "options.json", _options(definition), overwrite=True
+                            )
+                            agree = True
+                        journal.add(key, row)
+                        if progress is not None:
+                            progress(number, len(missing), row)
+                except LostError as exc:
+                    lost = exc
+            there = [(key, task) for key, task in zip(keys, definition.tasks, strict=True)
+                     if key in journal.places]  # fmt: skip
 
             def rows() -> Iterator[dict[str, Any]]:
-                for task, row in zip(definition.tasks, journal.rows(keys), strict=True):
+                found = journal.rows(key for key, _ in there)
+                for (_, task), row in zip(there, found, strict=True):
                     yield _whole(task, row)
 
             statuses = write_tables(rows, folder)
+    if lost is not None:
+        raise DataError(
+            f"{lost}; {len(there)} of {len(keys)} fits are in {folder / 'results.csv'}, and the "
+            "same command does the others"
+        ) from lost
     return Campaign(folder, outcome.finished, outcome.to_do, statuses)
+
+
+def _place(jobs: int | None, executor: Executor | None, scheduler: str | None) -> Place:
+    if scheduler is not None:
+        return Scheduler(scheduler, jobs)
+    if executor is not None:
+        return Given(executor, jobs or default_workers())
+    return Local(jobs or default_workers())
+
+
+def _laws(definition: Definition) -> tuple[str | LawFile, ...]:
+    """Return the modules and files that define the model's laws, other than this package's."""
+    from dahl_ident.elements.description import model_from_description
+    from dahl_ident.elements.law_files import LawFile, file_of, own_laws, source_path
+
+    found: dict[str | LawFile, None] = {}
+    for law in own_laws(model_from_description(definition.options["model"]).elements):
+        file, path = file_of(law), source_path(law)
+        if path is None:
+            raise ModelError(
+                f"{definition.source}: the law {law.kind!r} is defined in an interactive session; "
+                "put it into a file, and give that as laws"
+            )
+        if law.__module__ == "__main__":
+            file = LawFile(path, read_text(path))
+        found[file or law.__module__] = None
+    return tuple(found)
 
 
 def _unless_refused(
@@ -273,6 +358,7 @@ def _unless_refused(
 
 def _whole(task: Task, row: dict[str, Any]) -> dict[str, Any]:
     del row["key"]
+    row.pop("retry", None)
     own = {"device": task.device, **({"run": task.run} if task.run else {})}
     return {**own, **task.covariates, **row, "version": __version__}
 
@@ -289,14 +375,18 @@ def _split(
     )
 
 
-def _job(definition: Definition, task: Task, send_files: bool) -> Job:
+def _job(
+    definition: Definition, tag: tuple[str, Task], send_files: bool, laws: tuple[str | LawFile, ...]
+) -> Job:
+    task = tag[1]
     contents: list[bytes | None] = [None] * len(task.files)
     if send_files:
-        with suppress(OSError):  # the worker then says what is wrong with the path
-            contents = [path.read_bytes() for path in task.files]
+        with suppress(OSError, DataError):  # the worker then says what is wrong with the path
+            contents = [regular(path).read_bytes() for path in task.files]
     files = tuple(zip(map(str, task.files), contents, strict=True))
     report = definition.folder / "reports" / f"{task.name}.html" if definition.reports else None
-    return Job(task.name, files, task.runs, definition.options, str(report) if report else None)
+    return Job(task.name, files, task.runs, definition.options, str(report) if report else None,
+               laws)  # fmt: skip
 
 
 def _options(definition: Definition) -> bytes:
@@ -328,11 +418,11 @@ def _options_agree(definition: Definition, redo: bool) -> bool:
     return not changed
 
 
-def _keys(definition: Definition) -> list[str]:
+def _keys(definition: Definition, limits: Limits) -> list[str]:
     """Return the key of each task.
 
     A file's digest is computed again only if its size or modification time differs from that stored
-    with the last digest.
+    with the last digest. A file that takes longer than a fit may is left to its fit.
     """
     cache_path = definition.folder / "digests.json"
     try:
@@ -348,7 +438,7 @@ def _keys(definition: Definition) -> list[str]:
                 state = path.stat()
                 known = cache.get(str(path))
                 if known is None or known[:2] != [state.st_size, state.st_mtime_ns]:
-                    known = [state.st_size, state.st_mtime_ns, digest_of(path)]
+                    known = [state.st_size, state.st_mtime_ns, _digest(path, limits.seconds)]
                 digests[str(path)] = known
             except (OSError, DataError):
                 known = [0, 0, "unreadable"]  # a row that says so, until it can be read
@@ -357,3 +447,23 @@ def _keys(definition: Definition) -> list[str]:
     if definition.folder.is_dir() and digests != cache:
         write_whole(cache_path, json.dumps(digests).encode(), overwrite=True)
     return keys
+
+
+def _digest(path: Path, seconds: float) -> str:
+    """Return the digest of a file whose medium may hang."""
+    found: list[str | DataError] = []
+
+    def read() -> None:
+        try:
+            found.append(digest_of(path))
+        except DataError as exc:
+            found.append(exc)
+
+    thread = threading.Thread(target=read, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if not found:
+        raise DataError(f"{path}: cannot be read within {seconds:.3g} s")
+    if isinstance(found[0], DataError):
+        raise found[0]
+    return found[0]

@@ -1,13 +1,12 @@
 """One fit of a campaign, in any process: from files to one row of the table.
 
-This module imports numerical libraries only inside functions, so that a new process can limit
-their threads before they are loaded.
+Numerical libraries are imported only inside functions, so that this module loads at once.
 """
 
 from __future__ import annotations
 
 import hashlib
-import os
+import importlib
 import tempfile
 import time
 from collections.abc import Mapping
@@ -16,12 +15,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dahl_ident.errors import DataError
+from dahl_ident.version import __version__
+
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
+    from dahl_ident.elements.law_files import LawFile
     from dahl_ident.results import FitResult
 
 Row = dict[str, Any]
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,10 @@ class Job:
         Of :class:`dahl_ident.campaigns.definition.Definition`.
     report : str or None
         Where the report goes.
+    laws : tuple of (str or LawFile)
+        Modules, or files with their contents, that define laws of the model.
+    version : str
+        That of the package that made the job.
     """
 
     name: str
@@ -47,23 +54,18 @@ class Job:
     runs: tuple[str, ...]
     options: Mapping[str, Any]
     report: str | None
+    laws: tuple[str | LawFile, ...] = ()
+    version: str = __version__
 
 
-def one_thread() -> None:
-    """Limit numerical libraries to one thread, and end when the parent process ends."""
-    import multiprocessing
-    import threading
+class UnseenError(DataError):
+    """A file that cannot be read where the fit is made; perhaps it can elsewhere."""
 
-    for name in _THREADS:
-        os.environ[name] = "1"
-    parent = multiprocessing.parent_process()
-    if parent is not None:
 
-        def end_with_parent() -> None:
-            parent.join()
-            os._exit(1)
-
-        threading.Thread(target=end_with_parent, daemon=True).start()
+def failed(error: str, *, retry: bool = False, seconds: float = 0.0) -> Row:
+    """Return the row of a fit that failed; with `retry`, the same command tries it again."""
+    row: Row = {"status": "failed", "error": error, "digests": [], "seconds": seconds}
+    return {**row, "retry": True} if retry else row
 
 
 def do(job: Job) -> Row:
@@ -80,11 +82,34 @@ def do(job: Job) -> Row:
     began = time.perf_counter()
     digests: list[str] = []
     try:
+        for law in job.laws:
+            _load(law)
         row = _done(job, digests)
+    except UnseenError as exc:
+        row = failed(
+            f"{exc}; where workers do not have the files, send them with send_files=True (on the "
+            "command line --send-files)",
+            retry=True,
+        )
+    except MemoryError as exc:
+        row = failed(
+            f"the limit of memory for a device does not suffice ({' '.join(str(exc).split())}); "
+            "give it more with memory= (on the command line --memory)",
+            retry=True,
+        )
     except Exception as exc:  # one device that fails, however, must not end the campaign
-        text = " ".join(str(exc).split())
-        row = {"status": "failed", "error": f"{type(exc).__name__}: {text}"}
+        row = failed(f"{type(exc).__name__}: {' '.join(str(exc).split())}")
     return {**row, "digests": digests, "seconds": time.perf_counter() - began}
+
+
+def _load(law: str | LawFile) -> None:
+    """Import a module, or run a file, so that the laws in it are known by their kinds."""
+    if isinstance(law, str):
+        importlib.import_module(law)
+        return
+    from dahl_ident.elements.law_files import run
+
+    run(law)
 
 
 def _done(job: Job, digests: list[str]) -> Row:
@@ -158,14 +183,15 @@ class _Unpacked:
 
 
 def digest_of(path: Path) -> str:
-    """Return the SHA-256 digest of a file, or why there is none."""
-    from dahl_ident.errors import DataError
+    """Return the SHA-256 digest of a regular file, or why there is none."""
+    from dahl_ident.data.storage import regular
 
     try:
-        with path.open("rb") as file:
+        path.stat()  # what is not there may be elsewhere; what is no file is one nowhere
+        with regular(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as exc:
-        raise DataError(f"{path}: cannot be read: {exc.strerror or exc}") from exc
+        raise UnseenError(f"{path}: cannot be read: {exc.strerror or exc}") from exc
 
 
 def _row(result: FitResult) -> Row:

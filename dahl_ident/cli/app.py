@@ -13,6 +13,7 @@ from dahl_ident.cli import console
 from dahl_ident.cli.campaign import campaign
 from dahl_ident.cli.datasets import datasets
 from dahl_ident.cli.demo import demo
+from dahl_ident.cli.export import export
 from dahl_ident.cli.extract import extract
 from dahl_ident.cli.fit import fit
 from dahl_ident.cli.inspect import inspect
@@ -35,7 +36,9 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-commands = (demo, inspect, extract, fit, sample, plan, campaign, report, simulate, datasets)
+commands = (
+    demo, inspect, extract, fit, sample, plan, campaign, report, export, simulate, datasets,
+)  # fmt: skip
 for command in commands:
     app.command()(command)
 
@@ -72,6 +75,9 @@ def main(arguments: list[str] | None = None) -> None:
         As typed after ``dahl-ident``; by default those of the process.
     """
     typed = sys.argv[1:] if arguments is None else arguments
+    if not console.open_streams():
+        console.write_error("error: standard output is closed; send it to a file, or /dev/null")
+        sys.exit(console.BAD_INPUT)
     console.begin(typed)
     try:
         try:
@@ -82,6 +88,9 @@ def main(arguments: list[str] | None = None) -> None:
         status = _refuse(exc, typed)
     except DahlIdentError as exc:
         console.write_error(f"error: {console.in_options(' '.join(str(exc).split()))}")
+        status = console.BAD_INPUT
+    except MemoryError:
+        console.write_error("error: this takes more memory than there is; give smaller files")
         status = console.BAD_INPUT
     except OSError as exc:
         if not isinstance(exc, BrokenPipeError):  # a reader such as head has closed the pipe

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import console
+from dahl_ident.cli.options import LawFiles, Laws
 from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:
@@ -23,12 +25,23 @@ _LINE_EVERY = 60.0
 
 def campaign(
     definition: Annotated[Path, typer.Argument(help="TOML file that defines the campaign.")],
+    laws: LawFiles = None,
     jobs: Annotated[
         int | None, typer.Option(help="Processes; by default as many as processors.")
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler, tcp://host:port.")
+        str | None, typer.Option(help="Address of a Dask scheduler, tls://host:port.")
     ] = None,
+    timeout: Annotated[
+        float | None,
+        typer.Option(help="Most seconds for a device; by default 10 medians, at least 60."),
+    ] = None,
+    memory: Annotated[
+        float | None, typer.Option(help="Most memory for a device, GB; by default a fair share.")
+    ] = None,
+    patience: Annotated[
+        float, typer.Option(help="Most seconds without an answer of the scheduler.")
+    ] = 120.0,
     send_files: Annotated[
         bool, typer.Option("--send-files", help="Send workers the contents of files, not paths.")
     ] = False,
@@ -60,18 +73,16 @@ def campaign(
     from dahl_ident.campaigns.population import USABLE
     from dahl_ident.campaigns.run import run
 
+    Laws(laws).run()
     read = read_definition(definition)
     _check_report(report, overwrite, covariate, order, read)
     with ExitStack() as stack:
-        options: dict[str, Any] = {"jobs": jobs, "executor": None}
-        if scheduler is not None and not dry_run:
-            client = stack.enter_context(_client(scheduler))
-            workers = jobs or sum(client.ncores().values()) or 1
-            options = {"jobs": workers, "executor": client.get_executor()}
         progress = stack.enter_context(_progress()) if sys.stderr.isatty() else _lines()
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # this command says it itself
         done = run(
-            read, **options, send_files=send_files, dry_run=dry_run, redo=redo, progress=progress
-        )
+            read, jobs=jobs, executor=None, scheduler=scheduler, limits=(timeout, memory),
+            patience=patience, send_files=send_files, dry_run=dry_run, redo=redo, progress=progress,
+        )  # fmt: skip
     if report is not None and not dry_run:
         place = done.report(
             report,
@@ -120,16 +131,6 @@ def _check_report(
         texts = [v for task in read.tasks if isinstance(v := task.covariates[column], str)]
         if texts:
             raise ValidationError(f"--covariate {column} is {texts[0]!r}; expected numbers")
-
-
-def _client(address: str) -> Any:
-    from dahl_ident.data.storage import library
-
-    distributed = library("distributed", "dask")
-    try:
-        return distributed.Client(address, timeout=10)
-    except (OSError, TimeoutError, ValueError) as exc:
-        raise ValidationError(f"--scheduler {address}: no scheduler answers: {exc}") from exc
 
 
 def _lines() -> Callable[[int, int, Mapping[str, Any]], None]:

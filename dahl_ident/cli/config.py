@@ -23,9 +23,11 @@ def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
     """Read the options that are not given on the command line from a TOML file."""
     if path is None:
         return None
+    from dahl_ident.data.storage import read_text
+
     try:
-        given = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as exc:
+        given = tomllib.loads(read_text(path))
+    except (DataError, tomllib.TOMLDecodeError) as exc:
         raise DataError(f"{path}: no TOML file of options: {exc}") from exc
     tables = {k: v for k, v in given.items() if isinstance(v, dict)}
     shared = _named({k: v for k, v in given.items() if k not in tables})
@@ -38,11 +40,16 @@ def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
     chosen = {k: v for k, v in shared.items() if k in known} | own
     several = {p.name for p in ctx.command.params if getattr(p, "multiple", False)}
     several |= {p.name for p in ctx.command.params if p.nargs != 1}
-    ctx.default_map = {
-        k: ",".join(map(str, v)) if isinstance(v, list) and k not in several else v
-        for k, v in chosen.items()
-    }
+    ctx.default_map = {k: _repeated(v) if k in several else _joined(v) for k, v in chosen.items()}
     return path
+
+
+def _repeated(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
+
+
+def _joined(value: Any) -> Any:
+    return ",".join(map(str, value)) if isinstance(value, list) else value
 
 
 def _options_of_commands(ctx: typer.Context) -> dict[str, set[str]]:

@@ -14,6 +14,7 @@ import textwrap
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -51,6 +52,19 @@ def begin(typed: Sequence[str]) -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
     # setattr, because this function ignores file and line
     setattr(warnings, "showwarning", show)  # noqa: B010 - an assignment fails the type check
+
+
+def open_streams() -> bool:
+    """Open the standard streams that are closed, to nowhere; return whether output was open.
+
+    Otherwise the next file that is opened would get what libraries print.
+    """
+    there = sys.stdout is not None
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            nowhere = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115 - to the end
+            setattr(sys, name, nowhere)
+    return there
 
 
 def in_options(message: str) -> str:

@@ -39,7 +39,12 @@ def number_or_free(name: str, text: str | None) -> float | None:
 
 
 def known(name: str, text: str) -> Any:
-    """Return the value of a sensor: a number, None if it is free, or its prior."""
+    """Return the value of a sensor: a number, None if it is free, or its prior.
+
+    A share such as ``0.5 %`` is the standard uncertainty of a gain.
+    """
+    if text.endswith("%") and name != "delay":
+        return distribution(name, f"norm(1, {number(name, text[:-1].strip()) / 100.0!r})")
     return distribution(name, text) if "(" in text else number_or_free(name, text)
 
 

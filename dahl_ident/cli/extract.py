@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,51 +12,36 @@ import typer
 from dahl_ident.cli import console
 from dahl_ident.cli.files import write_data, write_picture
 from dahl_ident.cli.option_groups import with_option_groups
-from dahl_ident.cli.options import STANDARD, Files, General, Writing
+from dahl_ident.cli.options import (
+    STANDARD,
+    Channel,
+    Channels,
+    DriveFactor,
+    DriveFactorUncertainty,
+    Files,
+    General,
+    Sheet,
+    Writing,
+)
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
 
 _READING = "Reading"
 _EXTRACTING = "Extracting"
-Channel = Annotated[
-    str | None,
-    typer.Option(help='Its column, with unit if needed: "x \\[mm]".', rich_help_panel=_READING),
-]
 
 
 @dataclass(frozen=True)
-class RecordReading:
+class RecordReading(Channels):
     """Reading of records; the options of ``read_record``."""
 
     columns: Annotated[
         Path | None, typer.Option(help="Column map, a TOML file.", rich_help_panel=_READING)
     ] = None
-    time: Channel = None
-    displacement: Channel = None
-    velocity: Channel = None
-    acceleration: Channel = None
-    force: Channel = None
     drive: Channel = None
-    drive_factor: Annotated[
-        str | None,
-        typer.Option(help='Force for one unit of drive, "12.5 N/V".', rich_help_panel=_READING),
-    ] = None
-    drive_factor_uncertainty: Annotated[
-        float | None,
-        typer.Option(help="Its relative standard uncertainty.", rich_help_panel=_READING),
-    ] = None
-    sample_rate: Annotated[
-        float | None,
-        typer.Option(help="Hz, for files without a time column.", rich_help_panel=_READING),
-    ] = None
-    sheet: Annotated[
-        str | None, typer.Option(help="Sheet of an Excel workbook.", rich_help_panel=_READING)
-    ] = None
-    missing: Annotated[
-        str,
-        typer.Option(help="Treatment of empty samples: error or drop.", rich_help_panel=_READING),
-    ] = "error"
+    drive_factor: DriveFactor = None
+    drive_factor_uncertainty: DriveFactorUncertainty = None
+    sheet: Sheet = None
 
 
 @dataclass(frozen=True)
@@ -142,12 +128,11 @@ def extract(
     from dahl_ident.extraction.sources import Task, extract_all
 
     writing.check([output, plot], files, json=general.json)
-    runs = run_names(files) if len(files) > 1 else [None]
     tasks = [
-        Task(file, run, groups_in_name(file, level_from_name).get("level"), vars(reading))
-        for file, run in zip(files, runs, strict=True)
+        Task(file, None, groups_in_name(file, level_from_name).get("level"), vars(reading))
+        for file in files
     ]
-    data = extract_all(tasks, extracting.keywords(), jobs)
+    data = extract_all(tasks, extracting.keywords(), jobs, run_names(files))
     if good_only:
         data = good_points(data)
     if output is not None:
@@ -158,7 +143,24 @@ def extract(
         console.write_json(_rows(data))
     elif output != STANDARD:
         show(data)
+    tell_of_sweeps(data, files, vars(reading))
     judge(data)
+
+
+def tell_of_sweeps(data: FrequencyResponse, files: list[str], reading: dict[str, Any]) -> None:
+    """Say how to fit waveforms that were swept too fast for a table."""
+    from dahl_ident.extraction.point import TOO_FAST
+
+    verdicts = _one_row_a_point(data).quality["verdict"]
+    fast = [str(verdict) for verdict in verdicts if TOO_FAST in str(verdict)]
+    if fast:
+        given = (item for item in reading.items() if item[1] != vars(RecordReading())[item[0]])
+        words = [w for name, value in given for w in (f"--{name.replace('_', '-')}", str(value))]
+        command = shlex.join(["dahl-ident", "fit", "--record", *files, *words])
+        console.write_error(
+            f"{len(fast)} of {len(verdicts)} points are of a sweep that friction could not follow. "
+            f"Its waveforms can be fitted at once, without that error: {command}"
+        )
 
 
 def good_points(data: FrequencyResponse) -> FrequencyResponse:

@@ -15,24 +15,39 @@ from dahl_ident.cli.distributions import values
 from dahl_ident.cli.files import written
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.option_groups import with_option_groups
-from dahl_ident.cli.options import STANDARD, Files, General, Reading, Writing, one_of
-from dahl_ident.errors import DataError, FitInterrupted, ValidationError
+from dahl_ident.cli.options import (
+    STANDARD,
+    Channels,
+    Files,
+    General,
+    Laws,
+    Reading,
+    Writing,
+    one_of,
+    steady_option,
+)
+from dahl_ident.errors import FitInterrupted, ValidationError
 
 if TYPE_CHECKING:
-    from dahl_ident.data import Record
+    from dahl_ident.data import FrequencyResponse, Record
     from dahl_ident.results import ChainPosterior, FitResult, RecordFit, RecordPosterior
     from dahl_ident.results.result import Result
 
 _ESTIMATING = "Estimating"
 TAKEN = ("model", "free", "fixed", "start")  # by a fit of records
-_OF_RECORDS = ("columns", "drive_factor", "drive_factor_uncertainty", "sheet")
+_OF_RECORDS = ("columns", "drive", "drive_factor", "drive_factor_uncertainty", "sheet")
 ReportPlace = Annotated[
     str | None,
     typer.Option(help="Report to write: .html, .pdf, .md or .json; - is HTML on standard output."),
 ]
 
 AsRecords = Annotated[
-    bool, typer.Option("--record", help="The files are records of any motion; each is a run.")
+    bool,
+    typer.Option(
+        "--record",
+        help="The files are records of any motion; each is a run. Files that plainly hold "
+        "waveforms need no --record.",
+    ),
 ]
 Predicted = Annotated[
     str | None,
@@ -70,6 +85,7 @@ class Estimating:
             rich_help_panel=_ESTIMATING,
         ),
     ] = "linear"
+    steady: Annotated[str, steady_option(_ESTIMATING)] = "exact"
     start: Annotated[
         list[str] | None,
         typer.Option(
@@ -88,7 +104,9 @@ class Estimating:
 def fit(
     files: Files,
     general: General,
+    laws: Laws,
     reading: Reading,
+    channels: Channels,
     model: ModelOptions,
     estimating: Estimating,
     writing: Writing,
@@ -113,25 +131,35 @@ def fit(
     from dahl_ident.diagnostics.comparison import compare_models
     from dahl_ident.results.result import FORMATS
 
+    laws.run()
     writing.check([report, save], files, json=general.json)
     check_reports(report)
     if save is not None:
         place_of(save, "a fit", FORMATS)
-    if record:
+    if predicted is not None and not record:
+        raise ValidationError("--predicted is given without --record; give both, or neither")
+    table = None if record else table_or_none(files, reading, channels)
+    if table is None:
         if compare:
             raise ValidationError(
                 "--compare is given together with --record, but compares models of tables alone; "
                 "leave it out, and fit each model to the records (hold_out() in Python)"
             )
+        model.refuse_sensors()
         how = refuse_for_tables(
             "fit", {**model.keywords(), **estimating.keywords()}, Estimating().keywords()
         )
-        of_records = _fit_records(read_records(files, reading), {**how, "output": predicted})
-        _tell_records(of_records, general, writing, report, save, verbose=verbose)
+        of_records = _fit_records(
+            read_records(files, reading, channels), {**how, "output": predicted}
+        )
+        if save is not None:
+            of_records.save(save, overwrite=writing.overwrite)
+        _tell_records(of_records, general, report, verbose=verbose)
+        if report is not None:
+            write_report_beside([of_records], report, writing, model)
+        finish(of_records)
         return
-    if predicted is not None:
-        raise ValidationError("--predicted is given without --record; leave it out")
-    result = fitted(files, reading, model, estimating)
+    result = fitted(table, model, estimating)
     if save is not None:
         result.save(save, overwrite=writing.overwrite)
     if general.json:
@@ -143,11 +171,32 @@ def fit(
         if not verbose:
             console.write("-v prints tests of the residuals, other models and the solver's numbers")
     if report is not None:
-        write_report_beside([result], report, writing)
+        write_report_beside([result], report, writing, model)
     finish(result)
 
 
-def read_records(files: list[str], reading: Reading) -> list[Record]:
+def table_or_none(
+    files: list[str], reading: Reading, channels: Channels
+) -> FrequencyResponse | None:
+    """Return the table in the files; None, and a line that says so, where they hold waveforms."""
+    from dahl_ident.data.response_table import WaveformsError
+    from dahl_ident.errors import DataError
+
+    try:
+        data = reading.read(files)
+    except WaveformsError:
+        if STANDARD in files:  # has been read, and cannot be read again
+            raise
+        console.write_error("the files hold waveforms: fitted sample by sample, as with --record")
+        return None
+    except DataError:
+        refuse_channels(channels)
+        raise
+    refuse_channels(channels)
+    return data
+
+
+def read_records(files: list[str], reading: Reading, channels: Channels) -> list[Record]:
     """Return the records of the files, each a run; options of tables alone are refused."""
     from dahl_ident.data import read_record
 
@@ -156,21 +205,21 @@ def read_records(files: list[str], reading: Reading) -> list[Record]:
     if idle:
         raise ValidationError(
             f"{', '.join(option(name) for name in idle)} is given together with --record; of the "
-            "options of reading, records take --columns (a column map names each channel, "
-            "displacement and force; dahl-ident inspect proposes one), --drive-factor, "
-            "--drive-factor-uncertainty and --sheet"
+            f"options of reading, records take {', '.join(map(option, _OF_RECORDS))} and the names "
+            "of channels, such as --displacement (dahl-ident inspect proposes a column map)"
         )
-    how = {name: given[name] for name in _OF_RECORDS}
-    try:
-        return [read_record(name, **how) for name in files]
-    except DataError as exc:
-        if "Name it, such as displacement=" not in str(exc):
-            raise
-        text = str(exc).replace(
-            "Name it, such as displacement='x'",
-            "Name it in a column map (--columns map.toml; dahl-ident inspect proposes one)",
+    how = vars(channels) | {name: given[name] for name in _OF_RECORDS}
+    return [read_record(name, **how) for name in files]
+
+
+def refuse_channels(channels: Channels) -> None:
+    """Refuse the options of records where tables are read."""
+    idle = [name for name, value in vars(channels).items() if value != vars(Channels())[name]]
+    if idle:
+        raise ValidationError(
+            f"{', '.join(map(option, idle))} is given without --record; leave it out, or name the "
+            "columns of a table in a column map (--columns)"
         )
-        raise DataError(text) from exc
 
 
 def refuse_for_tables(
@@ -207,17 +256,9 @@ def _fit_records(records: list[Record], how: dict[str, Any]) -> RecordFit:
 
 
 def _tell_records(
-    result: RecordFit,
-    general: General,
-    writing: Writing,
-    report: str | None,
-    save: Path | None,
-    *,
-    verbose: bool,
+    result: RecordFit, general: General, report: str | None, *, verbose: bool
 ) -> None:
-    """Print, store and judge a fit of records."""
-    if save is not None:
-        result.save(save, overwrite=writing.overwrite)
+    """Print a fit of records."""
     if general.json:
         limits = result.conf_interval()
         console.write_json(
@@ -239,19 +280,14 @@ def _tell_records(
         console.write_wrapped(result.fit_report(details=verbose))
         if not verbose:
             console.write("-v prints the budget, the records' own values and the residuals")
-    if report is not None:
-        write_report_beside([result], report, writing)
-    finish(result)
 
 
-def fitted(
-    files: list[str], reading: Reading, model: ModelOptions, estimating: Estimating
-) -> FitResult:
-    """Return the fit of the model to the files."""
+def fitted(data: FrequencyResponse, model: ModelOptions, estimating: Estimating) -> FitResult:
+    """Return the fit of the model to a table."""
     from dahl_ident.results import fit as fit_data
 
     how = {**model.keywords(), **estimating.keywords()}
-    return fit_data(reading.read(files), throw=False, **how)
+    return fit_data(data, throw=False, **how)
 
 
 def check_reports(*places: str | None) -> None:
@@ -288,9 +324,10 @@ def write_report_beside(
     results: Sequence[FitResult | ChainPosterior | RecordFit | RecordPosterior],
     place: str,
     writing: Writing,
+    model: ModelOptions,
 ) -> None:
     """Write a report in addition to other output, and print its path."""
-    written_to = write_report(results, place, writing)
+    written_to = write_report(results, place, writing, metadata=model.metadata)
     if written_to != STANDARD:
         console.write_error(f"report: {written_to}")
 

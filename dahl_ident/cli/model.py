@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -19,10 +20,11 @@ if TYPE_CHECKING:
 
 _MODEL = "Model"
 _SENSORS = "Sensors"
-_KINDS = "a number, 'free', or a prior from scipy.stats, such as 'norm(1, 0.005)'."
+_KINDS = "a number, 'free', '0.5 %' (standard uncertainty), or a prior, 'norm(1, 0.005)'."
 _CALL = re.compile(r"\s*(\w+)\s*(?:\((.*)\))?\s*", re.DOTALL)
 _COMMA = re.compile(r",(?![^(]*\))")  # not within brackets
 _FRICTION = ("f_max", "sigma", "alpha")
+_CHANNELS = ("force_gain", "displacement_gain", "delay")
 OTHERS = ("mass", "damping", "stiffness")
 
 
@@ -59,18 +61,38 @@ class ModelOptions:
     force_gain: Annotated[str | None, _sensor("Measured over true force")] = None
     displacement_gain: Annotated[str | None, _sensor("Measured over true displacement")] = None
     delay: Annotated[str | None, _sensor("Lag of the displacement channel, s")] = None
+    metadata: Annotated[
+        Path | None,
+        typer.Option(
+            help="TOML file of the report: instruments with a channel, an uncertainty and k give "
+            "the sensors' priors.",
+            rich_help_panel=_SENSORS,
+        ),
+    ] = None
 
     def keywords(self) -> dict[str, Any]:
         """Return the arguments of ``fit`` and ``posterior`` that describe plant and sensors."""
-        from dahl_ident.sensors import Sensors
+        from dahl_ident.data.laboratory import metadata_of
+        from dahl_ident.sensors import Sensors, calibrations
 
         others = {name: number_or_free(name, text) for name, text in self._given(*OTHERS).items()}
-        sensed = self._given("force_gain", "displacement_gain", "delay")
+        typed = self._given(*_CHANNELS)
+        stated = {} if self.metadata is None else calibrations(metadata_of(self.metadata))
+        sensed = stated | {name: known(name, text) for name, text in typed.items()}
         return {
             "model": in_parallel(self._friction(), others),
             "free": ["alpha"] if self.alpha == FREE else [],
-            "sensors": Sensors(**{name: known(name, text) for name, text in sensed.items()}),
+            "sensors": Sensors(**sensed),
         }
+
+    def refuse_sensors(self) -> None:
+        """Refuse the options of sensors where records are fitted."""
+        if given := list(self._given(*_CHANNELS)):
+            names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+            raise ValidationError(
+                f"{names} is given together with --record, but a fit of records takes the channels "
+                "as exact; leave it out, or extract a table and fit that"
+            )
 
     def _friction(self) -> Element:
         from dahl_ident.elements import Dahl
@@ -106,35 +128,39 @@ def elements(texts: Sequence[str]) -> Element:
     ModelError
         If a kind or a label is unknown, or a value is impossible.
     """
-    from dahl_ident.elements.element import KINDS
-
-    return reduce(add, (_element(text, KINDS) for text in texts))
+    return reduce(add, (_element(text) for text in texts))
 
 
-def _element(text: str, kinds: Mapping[str, type[Element]]) -> Element:
+def _element(text: str) -> Element:
     from dahl_ident.elements.description import model_from_description
 
-    return model_from_description([_entry(text, kinds)]).elements[0]
+    return model_from_description([_entry(text)]).elements[0]
 
 
-def _entry(text: str, kinds: Mapping[str, type[Element]]) -> dict[str, Any]:
+def _entry(text: str) -> dict[str, Any]:
     """Return an element as plain data; that behind a gap is written inside its brackets."""
+    from dahl_ident.elements.element import KINDS, class_named
+
     call = _CALL.fullmatch(text.strip())
     if call is None:
         raise ValidationError(
             f"--element is {text!r}; expected a kind and its values, such as 'dahl(f_max=0.1)'"
         )
-    kind, inside = call[1], call[2] or ""
-    if kind not in kinds:
-        raise ModelError(f"--element names the kind {kind!r}; expected one of {', '.join(kinds)}")
+    cls, inside = class_named(call[1]), call[2] or ""
+    if cls is None:
+        raise ModelError(
+            f"--element names the kind {call[1]!r}; expected one of {', '.join(KINDS)}, or a law "
+            "from a file given with --laws"
+        )
+    kind = cls.kind
     entry: dict[str, Any] = {"kind": kind}
-    labels = [parameter.name for parameter in kinds[kind].parameters]
+    labels = [parameter.name for parameter in cls.parameters]
     parts = [part.strip() for part in _COMMA.split(inside) if part.strip()]
     if kind == "backlash":
         labels = ["gap"]
-        nested = bool(parts) and parts[0].partition("(")[0].strip() in kinds
+        nested = bool(parts) and class_named(parts[0].partition("(")[0].strip()) is not None
         inner = parts.pop(0) if nested else "dahl"
-        entry |= {"element": _entry(inner, kinds), "gap": FREE}
+        entry |= {"element": _entry(inner), "gap": FREE}
     for place, part in enumerate(parts):
         label, _, value = (word.strip() for word in part.rpartition("="))
         if not label and place >= len(labels):

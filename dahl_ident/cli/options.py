@@ -6,7 +6,7 @@ import glob
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -46,6 +46,15 @@ def one_of(*choices: str) -> Callable[[str | None], str | None]:
     return check
 
 
+def steady_option(panel: str) -> Any:
+    """Return the option of how the response to a force that is held is predicted."""
+    return typer.Option(
+        help="Response to a force that is held: exact, or 'describing function' (a sine assumed).",
+        callback=one_of("exact", "describing function"),
+        rich_help_panel=panel,
+    )
+
+
 def _range(text: str | None) -> tuple[float, float] | None:
     """Return the two numbers of ``0.2,0.6``."""
     if text is None:
@@ -66,6 +75,21 @@ Files = Annotated[
     list[str],
     typer.Argument(help="Files to read, or patterns; - is standard input.", callback=_existing),
 ]
+Channel = Annotated[
+    str | None,
+    typer.Option(help='Its column, with unit if needed: "x \\[mm]".', rich_help_panel=_READING),
+]
+DriveFactor = Annotated[
+    str | None,
+    typer.Option(help='Force for one unit of drive, "12.5 N/V".', rich_help_panel=_READING),
+]
+DriveFactorUncertainty = Annotated[
+    float | None,
+    typer.Option(help="Its relative standard uncertainty.", rich_help_panel=_READING),
+]
+Sheet = Annotated[
+    str | None, typer.Option(help="Sheet of an Excel workbook.", rich_help_panel=_READING)
+]
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
 
 
@@ -83,6 +107,30 @@ class General:
             "that command only. The command line has precedence.",
         ),
     ] = None
+
+
+LawFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="Python file with laws of your own, which --element then knows by kind or class name. "
+        "The file is run: give only files that you trust. Repeatable.",
+        rich_help_panel="Model",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class Laws:
+    """Laws of the user."""
+
+    laws: LawFiles = None
+
+    def run(self) -> None:
+        """Run the files, so that models can name the laws in them."""
+        for file in self.laws or ():
+            from dahl_ident.elements.law_files import load_laws
+
+            load_laws(file)
 
 
 @dataclass(frozen=True)
@@ -130,6 +178,25 @@ class Writing:
 
 
 @dataclass(frozen=True)
+class Channels:
+    """What ``read_record`` is told of the channels of a record."""
+
+    time: Channel = None
+    displacement: Channel = None
+    velocity: Channel = None
+    acceleration: Channel = None
+    force: Channel = None
+    sample_rate: Annotated[
+        float | None,
+        typer.Option(help="Hz, for files without a time column.", rich_help_panel=_READING),
+    ] = None
+    missing: Annotated[
+        str,
+        typer.Option(help="Treatment of empty samples: error or drop.", rich_help_panel=_READING),
+    ] = "error"
+
+
+@dataclass(frozen=True)
 class Reading:
     """Reading of tables; the options of ``read_frequency_response``."""
 
@@ -149,16 +216,24 @@ class Reading:
     ] = None
     drive: Annotated[
         str | None,
-        typer.Option(help='Force amplitude, "0.2 N" or "{level} N".', rich_help_panel=_READING),
+        typer.Option(
+            help='Force amplitude, "0.2 N" or "{level} N"; of a record its column.',
+            rich_help_panel=_READING,
+        ),
     ] = None
-    drive_factor: Annotated[
-        str | None,
-        typer.Option(help='Force for one unit of drive, "12.5 N/V".', rich_help_panel=_READING),
-    ] = None
-    drive_factor_uncertainty: Annotated[
+    frequency: Annotated[
         float | None,
-        typer.Option(help="Its relative standard uncertainty.", rich_help_panel=_READING),
+        typer.Option(help="Frequency of all rows, Hz.", rich_help_panel=_READING),
     ] = None
+    sweep: Annotated[
+        str | None,
+        typer.Option(
+            help='Frequencies of all rows where no column holds them: "1 to 100 Hz, log".',
+            rich_help_panel=_READING,
+        ),
+    ] = None
+    drive_factor: DriveFactor = None
+    drive_factor_uncertainty: DriveFactorUncertainty = None
     level: Annotated[
         str | None, typer.Option(help="Label for all rows.", rich_help_panel=_READING)
     ] = None
@@ -192,13 +267,12 @@ class Reading:
     runs: Annotated[
         str | None,
         typer.Option(
-            help="Keep only these runs: day1,day2. Each of several files is a run.",
+            help="Keep only these runs: day1,day2. Each of several files is a run, or a level if "
+            "it holds one of its own.",
             rich_help_panel=_READING,
         ),
     ] = None
-    sheet: Annotated[
-        str | None, typer.Option(help="Sheet of an Excel workbook.", rich_help_panel=_READING)
-    ] = None
+    sheet: Sheet = None
     passive: Annotated[
         bool,
         typer.Option(help="Refuse a table with a net gain of energy.", rich_help_panel=_READING),

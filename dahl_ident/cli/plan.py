@@ -13,7 +13,7 @@ from dahl_ident.cli import console
 from dahl_ident.cli.files import write_picture
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.option_groups import with_option_groups
-from dahl_ident.cli.options import General, Seed, Writing, one_of
+from dahl_ident.cli.options import General, Laws, Seed, Writing, one_of, steady_option
 from dahl_ident.errors import ValidationError
 
 _BENCH = "Bench"
@@ -49,6 +49,7 @@ class Bench:
             rich_help_panel=_BENCH,
         ),
     ] = "displacement"
+    steady: Annotated[str | None, steady_option(_BENCH)] = None
     motion: Annotated[
         str | None,
         typer.Option(
@@ -83,9 +84,9 @@ class Bench:
         return given if self.time is None else {**given, "time": self.time}
 
     def motions(self, sample_rate: float | None) -> dict[str, Any]:
-        """Return the arguments of ``plan`` that motions in time need."""
+        """Return the arguments of ``plan`` that motions in time, or settled ones, need."""
         if self.motion is None:
-            return {}
+            return {"steady": self.steady}
         return {"candidates": self.motion, "sample_rate": sample_rate}
 
 
@@ -131,6 +132,7 @@ class Aim:
 @with_option_groups
 def plan(
     general: General,
+    laws: Laws,
     bench: Bench,
     aim: Aim,
     model: ModelOptions,
@@ -161,6 +163,7 @@ def plan(
     from dahl_ident.data.storage import write_whole
     from dahl_ident.planning import plan as make
 
+    laws.run()
     writing.check([table, waveform, picture], [] if fit is None else [fit], json=general.json)
     if sample_rate is None and (waveform is not None or bench.motion is not None):
         raise ValidationError("--waveform and --motion need --sample-rate, Hz; give it")
@@ -206,11 +209,12 @@ def _known(fit: str | None, options: ModelOptions) -> Any:
 
 def _is_of_records(path: str) -> bool:
     """Return whether a saved fit is one of records; False where the file is no saved fit."""
+    from dahl_ident.data.storage import read_text
     from dahl_ident.results.record_fit import SCHEMA
 
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        content = json.loads(read_text(path))
+    except ValueError:
         return False
     return isinstance(content, dict) and content.get("schema") == SCHEMA
 

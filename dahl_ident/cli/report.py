@@ -13,7 +13,7 @@ from dahl_ident.cli import console
 from dahl_ident.cli.fit import Estimating, check_reports, finish, fitted, write_report
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.option_groups import with_option_groups
-from dahl_ident.cli.options import STANDARD, Files, General, Reading, Seed, Writing
+from dahl_ident.cli.options import STANDARD, Files, General, Laws, Reading, Seed, Writing
 from dahl_ident.errors import DataError, ValidationError
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 def report(
     files: Files,
     general: General,
+    laws: Laws,
     reading: Reading,
     model: ModelOptions,
     estimating: Estimating,
@@ -36,18 +37,14 @@ def report(
             help="Report: .html, .pdf, .md, .json; or several. - is HTML on standard output.",
         ),
     ] = ["report.html"],  # noqa: B006 - typer takes lists as lists
-    record: Annotated[
+    waveforms: Annotated[
         Path | None,
         typer.Option(help="Waveforms of the table; the report shows how they settled."),
     ] = None,
-    record_columns: Annotated[
+    waveforms_columns: Annotated[
         Path | None, typer.Option(help="Column map of these waveforms, a TOML file.")
     ] = None,
     title: Annotated[str | None, typer.Option(help="Title of the report.")] = None,
-    metadata: Annotated[
-        Path | None,
-        typer.Option(help="TOML file with specimen, instruments, operator and so on."),
-    ] = None,
     bootstrap: Annotated[
         bool, typer.Option("--bootstrap", help="Add bootstrap intervals.")
     ] = False,
@@ -65,24 +62,28 @@ def report(
     from dahl_ident.data import read_record
     from dahl_ident.results import RecordFit
 
+    laws.run()
     writing.check(output, files, json=general.json)
     check_reports(*output)
-    if record_columns is not None and record is None:
-        raise ValidationError("--record-columns is given without --record; give both, or neither")
+    if waveforms_columns is not None and waveforms is None:
+        raise ValidationError(
+            "--waveforms-columns is given without --waveforms; give both, or neither"
+        )
     saved = all(file.endswith(".json") for file in files)
-    chosen = (reading, model, estimating) != (Reading(), ModelOptions(), Estimating())
+    unset = (Reading(), ModelOptions(metadata=model.metadata), Estimating())
+    chosen = (reading, model, estimating) != unset
     if any(file.endswith(".json") for file in files) and (not saved or chosen):
         raise ValidationError(
             "saved fits are reported unchanged: give no tables together with them, and no options "
             "of reading, model or estimate"
         )
-    if len(files) > 1 and saved and (posterior or record is not None):
-        raise ValidationError("--posterior and --record go with one fit; give one file")
-    waveforms = None if record is None else read_record(record, columns=record_columns)
+    if len(files) > 1 and saved and (posterior or waveforms is not None):
+        raise ValidationError("--posterior and --waveforms go with one fit; give one file")
+    record = None if waveforms is None else read_record(waveforms, columns=waveforms_columns)
     fits: Sequence[FitResult | RecordFit] = (
-        [_saved_fit(file) for file in files]
+        [saved_fit(file) for file in files]
         if saved
-        else [fitted(files, reading, model, estimating)]
+        else [fitted(reading.read(files), model, estimating)]
     )
     results: list[FitResult | ChainPosterior | RecordFit | RecordPosterior] = [*fits]
     result = fits[0]
@@ -95,7 +96,7 @@ def report(
 
         chain = estimate_posterior(result, seed=seed, progress=sys.stderr.isatty())
         results.append(chain)
-    how = {"title": title, "record": waveforms, "metadata": metadata}
+    how = {"title": title, "record": record, "metadata": model.metadata}
     places = [write_report(results, place, writing, **how) for place in output]
     if general.json:
         console.write_json(places)
@@ -104,7 +105,7 @@ def report(
     finish(next((fit for fit in fits if not fit.status.usable), result))
 
 
-def _saved_fit(file: str) -> FitResult | RecordFit:
+def saved_fit(file: str) -> FitResult | RecordFit:
     """Return the fit of a table or of records that a file holds."""
     from dahl_ident.results import FitResult, RecordFit
     from dahl_ident.results.record_fit import SCHEMA

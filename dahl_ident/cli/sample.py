@@ -18,12 +18,23 @@ from dahl_ident.cli.fit import (
     check_reports,
     finish,
     read_records,
+    refuse_channels,
     refuse_for_tables,
     write_report_beside,
 )
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.option_groups import with_option_groups
-from dahl_ident.cli.options import STANDARD, Files, General, Reading, Writing, one_of
+from dahl_ident.cli.options import (
+    STANDARD,
+    Channels,
+    Files,
+    General,
+    Laws,
+    Reading,
+    Writing,
+    one_of,
+    steady_option,
+)
 from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:
@@ -57,6 +68,7 @@ class Sampling:
         str | None,
         typer.Option(help="measured, relative or absolute.", rich_help_panel=_SAMPLING),
     ] = None
+    steady: Annotated[str, steady_option(_SAMPLING)] = "exact"
     likelihood: Annotated[
         str,
         typer.Option(help="gaussian, student_t or none.", rich_help_panel=_SAMPLING),
@@ -126,7 +138,9 @@ class Sampling:
 def sample(
     files: Files,
     general: General,
+    laws: Laws,
     reading: Reading,
+    channels: Channels,
     model: ModelOptions,
     sampling: Sampling,
     writing: Writing,
@@ -140,13 +154,19 @@ def sample(
     from dahl_ident.results import GridPosterior
     from dahl_ident.results.bayesian_estimate import posterior as estimate_posterior
 
+    laws.run()
     writing.check([report], files, json=general.json)
     check_reports(report)
     sampling.check(report)
     plant, how = model.keywords(), sampling.keywords()
-    data = read_records(files, reading) if record else reading.read(files)
+    data: Any
     if record:
+        model.refuse_sensors()
+        data = read_records(files, reading, channels)
         plant, how = _for_records(plant, how)
+    else:
+        refuse_channels(channels)
+        data = reading.read(files)
     try:
         posterior = estimate_posterior(data, **plant, **how)
     except KeyboardInterrupt:
@@ -157,7 +177,7 @@ def sample(
     elif report != STANDARD:
         console.write_wrapped(str(posterior))
     if report is not None and not isinstance(posterior, GridPosterior):
-        write_report_beside([posterior], report, writing)
+        write_report_beside([posterior], report, writing, model)
     finish(posterior)
 
 

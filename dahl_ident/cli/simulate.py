@@ -18,7 +18,7 @@ from dahl_ident.cli.model import (
     refuse_beside_elements,
 )
 from dahl_ident.cli.option_groups import with_option_groups
-from dahl_ident.cli.options import General, Seed, Writing
+from dahl_ident.cli.options import General, Laws, Seed, Writing, steady_option
 from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:
@@ -113,12 +113,21 @@ class Errors:
     ] = 0.0
 
 
+@dataclass(frozen=True)
+class Motion:
+    """The steady motion of a driven plant."""
+
+    steady: Annotated[str, steady_option(_EXCITATION)] = "exact"
+
+
 @with_option_groups
 def simulate(
     general: General,
+    laws: Laws,
     plant: Plant,
     excitation: Excitation,
     errors: Errors,
+    motion: Motion,
     writing: Writing,
     experiment: Annotated[
         str | None, typer.Argument(help="Experiment file, .toml or .json, instead of options.")
@@ -137,9 +146,10 @@ def simulate(
     from dahl_ident.synthetic import Experiment
     from dahl_ident.synthetic import simulate as run
 
+    laws.run()
     whole_number(seed, "seed", 0)
-    defaults = vars(Plant()) | vars(Excitation()) | vars(Errors())
-    given = vars(plant) | vars(excitation) | vars(errors)
+    defaults = vars(Plant()) | vars(Excitation()) | vars(Errors()) | vars(Motion())
+    given = vars(plant) | vars(excitation) | vars(errors) | vars(motion)
     idle = [f"--{k.replace('_', '-')}" for k, v in given.items() if v != defaults[k]]
     if experiment is not None and idle:
         raise ValidationError(
@@ -149,7 +159,7 @@ def simulate(
     inputs = [] if experiment is None else [experiment]
     writing.check([output], inputs, json=general.json)
     described = (
-        _experiment(plant, excitation, errors)
+        _experiment(plant, excitation, errors, motion)
         if experiment is None
         else Experiment.read(experiment)
     )
@@ -162,7 +172,7 @@ def simulate(
     write_data(data, output, overwrite=writing.overwrite)
 
 
-def _experiment(plant: Plant, excitation: Excitation, errors: Errors) -> Experiment:
+def _experiment(plant: Plant, excitation: Excitation, errors: Errors, motion: Motion) -> Experiment:
     from dahl_ident.synthetic import Acquisition, Channel, Experiment, SteppedSine, Table
 
     truth = plant.built()
@@ -174,7 +184,7 @@ def _experiment(plant: Plant, excitation: Excitation, errors: Errors) -> Experim
     given["frequencies_hz"] = _numbers("frequencies_hz", excitation.frequencies_hz)
     steps = SteppedSine(**given)
     if not as_record:
-        return Experiment(truth, steps, table=Table(**vars(errors)))
+        return Experiment(truth, steps, table=Table(**vars(errors), **vars(motion)))
     sensors = Acquisition(
         displacement=Channel(noise_std=errors.displacement_std),
         force=Channel(noise_std=errors.force_std),

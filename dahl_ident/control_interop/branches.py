@@ -1,7 +1,9 @@
 r"""Every steady response of a driven plant, with its stability.
 
-Near a steady motion, to first order in its rate of change, the displacement phasor X obeys L'(s)
-dX/dt + (L + N(|X|)) X = u_0. A disturbance xi of X, seen along X, obeys
+Of an exact steady motion Floquet's multipliers are known, and a disturbance grows by ln of the
+largest one each cycle. For the describing function an average over a cycle says as much: near a
+steady motion, to first order in its rate of change, the displacement phasor X obeys
+L'(s) dX/dt + (L + N(|X|)) X = u_0. A disturbance xi of X, seen along X, obeys
 
     L'(s) dxi/dt = -(Z xi + A N'(A) Re xi),    Z = L + N,
 
@@ -21,8 +23,8 @@ from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
 from dahl_ident.control_interop.limit_cycles import stiffness_of, stiffness_slope
 from dahl_ident.control_interop.nonlinearity import friction_and_slope
 from dahl_ident.control_interop.split import split
-from dahl_ident.elements.element import Element
-from dahl_ident.steady_state import SteadyResponse, response
+from dahl_ident.elements.element import Element, Model
+from dahl_ident.steady_state import Steady, SteadyResponse, response
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,14 @@ class Branches:
         return np.asarray(self.growth_rate < 0.0)
 
 
-def response_branches(plant: Element, frequency_hz: ArrayLike, drive: ArrayLike) -> Branches:
-    """Return every A with A abs(Z(A, omega)) = u_0, and whether each is stable.
+def response_branches(
+    plant: Element,
+    frequency_hz: ArrayLike,
+    drive: ArrayLike,
+    *,
+    steady: Steady = "describing function",
+) -> Branches:
+    """Return every steady response, and whether each is stable.
 
     Parameters
     ----------
@@ -65,6 +73,9 @@ def response_branches(plant: Element, frequency_hz: ArrayLike, drive: ArrayLike)
         Hz, > 0.
     drive : array_like
         Zero-to-peak force u_0 > 0, N; broadcast with `frequency_hz`.
+    steady : {"exact", "describing function"}, default "describing function"
+        See :func:`dahl_ident.response`. Exact branches start from those of the describing function,
+        and one that lies far from its estimate may be missed.
 
     Returns
     -------
@@ -80,10 +91,11 @@ def response_branches(plant: Element, frequency_hz: ArrayLike, drive: ArrayLike)
 
     Notes
     -----
-    The stability is that of slow changes of one sine; another mode may still start to oscillate,
-    see :func:`limit_cycles`. Passive plants have one branch; only negative damping gives several.
-    Near the end of a branch the amplitude depends so steeply on the drive that harmonics of a few
-    per cent shift it by tens of per cent.
+    The describing function's stability is that of slow changes of one sine; another mode may still
+    start to oscillate, see :func:`limit_cycles`. Passive plants with Dahl friction have one branch;
+    negative damping and laws such as Backlash give several. Near the end of a branch the amplitude
+    depends so steeply on the drive that harmonics of a few per cent shift it by tens of per cent,
+    which the describing function does not see.
 
     Examples
     --------
@@ -97,7 +109,16 @@ def response_branches(plant: Element, frequency_hz: ArrayLike, drive: ArrayLike)
     [True, False, True]
     """
     friction, linear = split(plant)
-    steady = response(plant, positive_array(frequency_hz, "frequency_hz"), drive, all_roots=True)
+    f = positive_array(frequency_hz, "frequency_hz")
+    found = response(plant, f, drive, all_roots=True, steady=steady)
+    if found.steady == "exact":
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return Branches(found, np.log(found.multiplier) * found.frequency_hz)
+    return Branches(found, _slow_growth(friction, linear, found))
+
+
+def _slow_growth(friction: Model, linear: Model, steady: SteadyResponse) -> FloatArray:
+    """Return the rate at which slow changes of one sine grow, 1/s."""
     omega = 2.0 * np.pi * np.asarray(steady.frequency_hz)
     found = np.asarray(steady.found)
     N, slope = friction_and_slope(friction, np.where(found, steady.amplitude, 1.0), omega)
@@ -105,7 +126,7 @@ def response_branches(plant: Element, frequency_hz: ArrayLike, drive: ArrayLike)
     Z = stiffness_of(linear, w).reshape(omega.shape) + N
     by_s = -1j * stiffness_slope(linear, w).reshape(omega.shape)
     rate = _largest_rate(Z, slope, by_s)
-    return Branches(steady, np.where(found, rate, np.nan))
+    return np.where(found, rate, np.nan)
 
 
 def _largest_rate(Z: ComplexArray, slope: ComplexArray, by_s: ComplexArray) -> FloatArray:

@@ -14,7 +14,7 @@ from dahl_ident.data.fields import CONTROLLED, one_of
 from dahl_ident.data.quantities import converted
 from dahl_ident.elements.element import Element
 from dahl_ident.errors import ValidationError
-from dahl_ident.steady_state import response
+from dahl_ident.steady_state import Steady, response
 from dahl_ident.units import QUANTITIES, Quantity, si_unit
 
 Kind = Literal["bode", "nyquist", "nichols"]
@@ -112,6 +112,7 @@ def level_responses(
     *,
     controlled: Literal["force", "displacement"] = "force",
     quantity: Quantity = "receptance",
+    steady: Steady = "exact",
 ) -> LevelResponses:
     """Return the plant's response over frequency at several levels, as in Fig. 7.
 
@@ -127,6 +128,8 @@ def level_responses(
         Which of the two a level holds constant over frequency.
     quantity : str, default "receptance"
         One of the six standard quantities.
+    steady : {"exact", "describing function"}, default "exact"
+        How the response to a force that is held is found, see :func:`dahl_ident.response`.
 
     Returns
     -------
@@ -146,7 +149,7 @@ def level_responses(
     >>> from dahl_ident.control_interop import level_responses
     >>> plant = Dahl(f_max=0.1, sigma=30) + Mass(0.3) + Damper(0.24) + Spring(0.3)
     >>> f, u0 = np.geomspace(0.01, 10.0, 400), np.geomspace(1e-4, 1e1, 51)
-    >>> fig_7 = level_responses(plant, f, u0)
+    >>> fig_7 = level_responses(plant, f, u0, steady="describing function")  # as in the paper
     >>> top, bottom = fig_7.plot()
     """
     f, held = (
@@ -161,7 +164,7 @@ def level_responses(
     one_of(controlled, "controlled", CONTROLLED)
     omega = 2.0 * np.pi * f
     if controlled == "force":
-        R = np.asarray(response(plant, f, held[:, None]).receptance)
+        R = np.asarray(response(plant, f, held[:, None], steady=steady).receptance)
     else:
         R = 1.0 / np.asarray(plant.dynamic_stiffness(held[:, None], omega))
     with np.errstate(invalid="ignore"):  # where there is no steady amplitude

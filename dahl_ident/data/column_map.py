@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import FloatArray, finite_number, non_negative_array, positive_number
 from dahl_ident.data.fields import CONTROLLED, one_of
 from dahl_ident.data.raw_columns import Channel, Source, plain
+from dahl_ident.data.storage import read_text
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError, DataWarning, UnitError, ValidationError
 from dahl_ident.units import (
@@ -126,6 +127,8 @@ class ColumnMap:
         What gain and phase, or real and imaginary part, are.
     controlled : str or mapping, optional
         ``"displacement"`` or ``"force"``; or patterns of level labels for each of the two.
+    sweep : str, optional
+        Frequencies of a table without a column of them, such as ``"1 to 100 Hz, log"``.
     sample_rate : float, optional
         Hz, for records without a time column.
     drive_factor : str, optional
@@ -137,6 +140,7 @@ class ColumnMap:
     roles: Mapping[str, Column] = field(default_factory=dict)
     quantity: Quantity | None = None
     controlled: str | Mapping[str, str] | None = None
+    sweep: str | None = None
     sample_rate: float | None = None
     drive_factor: str | None = None
     drive_factor_uncertainty: float = 0.0
@@ -199,10 +203,8 @@ def _read(entries: Mapping[str, Any]) -> ColumnMap:
 
 def _toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as exc:
-        raise DataError(f"{path}: the column map cannot be read: {exc.strerror}") from exc
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as exc:
+        return tomllib.loads(read_text(path, "the column map"))
+    except tomllib.TOMLDecodeError as exc:
         raise DataError(f"{path}: not a TOML file: {exc}") from exc
 
 
@@ -294,7 +296,8 @@ class Binding:
         if self.source.headerless and not self.map.roles:
             raise DataError(
                 f"{self.source.name}: the table has no header line; expected names and units "
-                "above the numbers, such as 'frequency_hz, amplitude [um], gain [N/m], phase_deg'"
+                "above the numbers, such as 'frequency_hz, amplitude [um], gain [N/m], phase_deg', "
+                "or columns={'force': 'column 2 [N]'} and the like"
             )
 
     def channel(self, role: str) -> Channel | None:
@@ -310,15 +313,23 @@ class Binding:
             self.used.add(channel.name)
         return channel
 
-    def _find(self, role: str) -> Channel | None:
-        spec = self.map.roles.get(role, Column())
-        if spec.column is not None:
-            return self.source.find(spec.column)
-        found = [
+    def named(self, role: str) -> list[Channel]:
+        """Return the columns that are called what the role is, or said to be it by the format."""
+        return [
             c
             for c in self.source.channels
             if c.role == role or (c.role is None and plain(c.short or c.name) in self.names[role])
         ]
+
+    def _find(self, role: str) -> Channel | None:
+        spec = self.map.roles.get(role, Column())
+        if spec.column is not None:
+            return self.source.find(spec.column)
+        found = self.named(role)
+        if role not in self.map.roles:  # a column that the map gives another role has no second one
+            named = [c.column for c in self.map.roles.values() if c.column and "*" not in c.column]
+            taken = [self.source.find(column).content for column in named]
+            found = [c for c in found if not any(c.content is other for other in taken)]
         if role == "run":  # a table may have file, day and test; the first name is used
             found.sort(key=lambda c: self.names[role].index(plain(c.short or c.name)))
             found = found[:1]

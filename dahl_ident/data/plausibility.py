@@ -8,7 +8,7 @@ wrong.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,12 @@ _MISMATCH = 0.1  # of a logarithm: rms for zero to peak is 0.35; also a fall of 
 _FEWEST_ROWS, _FEW_ROWS = 3, 0.26  # rows to compare, and the share of them that may be wrong
 _STUCK_SAMPLES, _STUCK_TRAVEL = 8, 0.02  # samples of one value, and share of the motion's range
 _SELDOM, _MOSTLY = 0.01, 0.5  # shares of a signal that repeats no value, and of one that holds it
+_SWITCH = 8  # samples before and after a change of unit that are compared
+_DECADES = 1.0  # by which a change of unit may seem to differ from 1000
+_NEAR = 4.0  # steps within which a smooth signal goes on, and beyond which it is far from zero
+_FURTHER = 5.0  # mean steps by which a signal moves from one sample to the next at most
+_MOST_CHANGES = 2  # of the unit, there and back; a signal with more is one of many scales
+_PART = 1 << 20  # samples that are compared at once, to save memory
 _SMALL_PHASE = 0.1  # rad, for a gain that falls to nothing
 
 
@@ -131,33 +137,144 @@ def check_phase_size(data: FrequencyResponse, doubt: Doubt) -> None:
             )
 
 
-def stuck_samples(motion: FloatArray, force: FloatArray) -> NDArray[np.intp]:
-    """Return where the force stays at one value while the motion continues.
+def record_doubts(
+    time: FloatArray, motion: FloatArray, force: FloatArray
+) -> Iterator[tuple[NDArray[np.intp], str]]:
+    """Yield places where a sensor sticks, samples are lost or the unit changes, and what to say."""
+    if not 2 < force.size == motion.size == time.size:
+        return
+    yield (
+        _stuck(force, motion),
+        "the force repeats one value while the motion goes on, from {}: does a converter stick?",
+    )
+    yield (
+        _stuck(motion, force, smooth=True),
+        "the motion repeats one value while the force goes on, from {}: does a sensor stick?",
+    )
+    starts, stops = _runs((motion == 0.0) & (force == 0.0))
+    if starts.size:
+        torn = np.zeros(starts.shape, dtype=bool)
+        least = np.where((starts > 0) & (stops < time.size - 1), 0.2, 3.0)  # a rest may end it
+        for values in (motion, force):
+            torn |= _edges(values, starts, stops) > least * _usual(np.abs(np.diff(values)))
+        yield starts[torn], "motion and force are 0 for a while, from {}: are samples missing?"
+    for name, values, other in (("motion", motion, force), ("force", force, motion)):
+        yield (
+            _few(np.union1d(_unit_changes(values, other), _scaled_values(values))),
+            f"the {name} is 1000 times larger or smaller from {{}}: another unit?",
+        )
+    ratio = np.log10(np.diff(time)[2:] / np.diff(time)[:-2])
+    places = _few(2 + np.flatnonzero(np.abs(np.abs(ratio) - 3.0) < 0.05 * _DECADES))
+    yield places, "steps of time are 1000 times larger or smaller from {}: another unit?"
+
+
+def _stuck(held: FloatArray, other: FloatArray, *, smooth: bool = False) -> NDArray[np.intp]:
+    """Return where one signal stays at one value while the other continues.
 
     Dry friction and a coarse converter keep a value as well, but leave it by no more than their
-    usual steps. A converter that sticks jumps afterwards; or it keeps a value within the range of
-    a signal that else hardly ever repeats one, because of its noise.
+    usual steps. A converter that sticks jumps afterwards, or before where it gives 0; or it keeps
+    a value within the range of a signal that else hardly ever repeats one, because of its noise.
+    A motion is smooth: it does not stop at once.
     """
-    if force.size < 2 or force.size != motion.size:
-        return np.zeros(0, dtype=np.intp)
-    same = np.concatenate([[False], np.diff(force) == 0.0, [False]]).view(np.int8)
-    starts, stops = np.flatnonzero(np.diff(same) == 1), np.flatnonzero(np.diff(same) == -1)
-    long = stops - starts >= _STUCK_SAMPLES
-    starts, stops = starts[long], stops[long]
-    travel = np.abs(motion[[(starts + stops) // 2, stops]] - motion[starts]).max(axis=0)
-    moved = travel > _STUCK_TRAVEL * np.ptp(motion)
+    steps = np.abs(np.diff(held))
+    starts, stops = _runs(np.concatenate([[False], steps == 0.0]))
+    starts = starts - 1  # the value was there before it was repeated
+    travel = np.abs(other[[(starts + stops) // 2, stops]] - other[starts]).max(axis=0)
+    moved = travel > _STUCK_TRAVEL * np.ptp(other)
     starts, stops = starts[moved], stops[moved]
-    steps = np.abs(np.diff(force))
     if not starts.size or not steps.any():
         return np.zeros(0, dtype=np.intp)
-    usual = np.quantile(steps[steps > 0.0], 0.95)
+    usual, count = _usual(steps), np.sum(steps == 0.0)
     jumps = np.append(steps, 0.0)[stops] > 5.0 * usual
-    held, repeated = np.sum(stops - starts), np.sum(steps == 0.0)
-    if repeated - held < _SELDOM * force.size and held < _MOSTLY * force.size:
-        value, place, count = np.unique(force[starts], return_index=True, return_counts=True)
-        once = (count == 1) & (value > force.min()) & (value < force.max())
+    jumps |= (held[starts] == 0.0) & (_edges(held, starts, stops) > 3.0 * usual)
+    if smooth:
+        jumps |= _edges(held, starts, stops) > _bend(held)
+    held_samples = np.sum(stops - starts)
+    if count - held_samples < _SELDOM * held.size and held_samples < _MOSTLY * held.size:
+        value, place, count = np.unique(held[starts], return_index=True, return_counts=True)
+        once = (count == 1) & (value > held.min()) & (value < held.max())
         jumps[place[once]] = True
     return np.asarray(starts[jumps])
+
+
+def _runs(marked: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the first and the last place of each run of at least some marked samples."""
+    change = np.diff(np.concatenate([[False], marked, [False]]).view(np.int8))
+    starts, stops = np.flatnonzero(change == 1), np.flatnonzero(change == -1) - 1
+    long = stops - starts + 1 >= _STUCK_SAMPLES
+    return starts[long], stops[long]
+
+
+def _edges(values: FloatArray, starts: NDArray[np.intp], stops: NDArray[np.intp]) -> FloatArray:
+    """Return the larger of the steps into and out of each run; none at the ends of the record."""
+    steps = np.concatenate([[0.0], np.abs(np.diff(values)), [0.0]])
+    return np.asarray(np.maximum(steps[starts], steps[stops + 1]))
+
+
+def _usual(steps: FloatArray) -> float:
+    """Return the size that hardly any step exceeds."""
+    return float(np.quantile(steps[steps > 0.0], 0.95)) if steps.any() else 0.0
+
+
+def _bend(values: FloatArray) -> float:
+    """Return a step that a smooth signal does not begin or end with."""
+    return 5.0 * float(np.quantile(np.abs(np.diff(values, 2)), 0.98))
+
+
+def _unit_changes(values: FloatArray, other: FloatArray) -> NDArray[np.intp]:
+    """Return where values are 1000 times, or a thousandth of, what they were just before.
+
+    All differences change alike if the unit does, first and second; without the factor the signal
+    would go on, and the other signal does. Where a motion begins its noise does not grow with it,
+    and from one level of a test to the next both signals change.
+    """
+    if values.size > 2 * _PART:
+        parts = [slice(i, i + _PART + 2 * _SWITCH) for i in range(0, values.size, _PART)]
+        return np.unique(
+            np.concatenate([p.start + _unit_changes(values[p], other[p]) for p in parts])
+        )
+    at = np.arange(4, values.size - 3)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        before, after = _sizes(values, at, 1)
+        change = np.log10(after / before)
+        bend = np.log10(np.divide(*_sizes(values, at, 2)))
+        later = np.minimum(at + _SWITCH, values.size - 4)
+        still = [np.log10(np.divide(*_sizes(other, place, 1))) for place in (at, later)]
+        going_on = np.abs(values[at] * 10.0 ** (-3.0 * np.sign(change)) - values[at - 1])
+    marked = (going_on < _FURTHER * before) & ~(np.abs(still) > 1.5 * _DECADES).any(axis=0)
+    for ratio in (change, bend):
+        marked &= np.abs(np.abs(ratio) - 3.0) < _DECADES
+    return np.asarray(at[marked])
+
+
+def _scaled_values(values: FloatArray) -> NDArray[np.intp]:
+    """Return where a smooth signal, far from zero, goes on 1000 times larger or smaller."""
+    if values.size < _SWITCH:
+        return np.zeros(0, dtype=np.intp)
+    steps = np.abs(np.diff(values))
+    before, first, second = values[2:-2], values[3:-1], values[4:]
+    least = _NEAR * np.maximum(steps[:-3], steps[1:-2])
+    far = (np.abs(before) > 2.0 * least) & (least > 0.0)
+    scaled = np.zeros(before.shape, dtype=bool)
+    for factor in (1e3, 1e-3):
+        going_on = np.abs(factor * first - before) < least
+        scaled |= going_on & (np.abs(factor * (second - first)) < least)
+    return np.asarray(3 + np.flatnonzero(far & scaled))
+
+
+def _sizes(values: FloatArray, at: NDArray[np.intp], order: int) -> tuple[FloatArray, FloatArray]:
+    """Return the mean difference of some samples before each place, and of some from it on."""
+    size = np.abs(np.diff(values, order))
+    total = np.concatenate([[0.0], np.cumsum(size)])
+    low, high = np.maximum(at - order - _SWITCH, 0), np.minimum(at + _SWITCH, size.size)
+    before = (total[at - order] - total[low]) / (at - order - low)
+    return before, (total[high] - total[at]) / (high - at)
+
+
+def _few(places: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the first of neighbouring places; none where there are many, as in random numbers."""
+    first = places[np.diff(places, prepend=-2 * _SWITCH) > _SWITCH]
+    return first if first.size <= _MOST_CHANGES else first[:0]
 
 
 def creates_energy(loss: FloatArray, std: FloatArray, dof: FloatArray) -> NDArray[np.bool_]:

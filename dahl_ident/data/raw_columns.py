@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -18,7 +18,11 @@ from dahl_ident.data.column_names import split_header
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
-_NUMBER = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\s*|[-+]?inf|nan", re.ASCII)
+_NUMBER = re.compile(
+    r"\s*[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?\s*|[-+]?inf|nan",
+    re.ASCII | re.IGNORECASE,
+)
+_COUNTED = re.compile(r"column ([0-9]{1,4})")
 _SUFFIXES = {"hz": "Hz", "deg": "deg", "rad": "rad", "s": "s"}
 _CODES = (
     999.0, 9999.0, 99999.0, 999999.0, 999.9, 9999.9, 999.99, 9999.99,
@@ -29,6 +33,8 @@ _CODES = (
 _SMALLEST_OVERFLOW = 1e30  # instruments write 1e30, 9.9e37 and the like
 _CODE_RATIO = 5.0  # ratio of a missing-value mark to all measured numbers
 _FEWEST_FOR_CODES = 4  # of fewer values, one far from the others may be measured
+_LONGEST_WORD = 200  # letters of a cell; no label, time stamp or number has more
+_PADDING = (1 << 26, 16)  # bytes, and bytes a letter, that a column of text may take
 
 
 @dataclass(frozen=True)
@@ -102,7 +108,7 @@ class Source:
     the decimal mark of numbers in columns of text. `metadata` is what an earlier save of this
     package left in the file, `options` what the user said. `runs` are the rows at which a header
     that is repeated within the file begins another run. `doubts` are the warnings that its reader
-    has shown.
+    has shown. `stated` are the drive and the amplitude of all rows, as the file's header says.
     """
 
     name: str
@@ -117,6 +123,7 @@ class Source:
     doubts: tuple[str, ...] = ()
     runs: tuple[int, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
+    stated: Mapping[str, str] = field(default_factory=dict)
 
     def rows(self, keep: NDArray[np.bool_]) -> Source:
         """Return the rows to `keep` of every channel that has this length."""
@@ -134,7 +141,8 @@ class Source:
     def find(self, text: str) -> Channel:
         """Return the one channel that `text` names, with or without its unit in brackets.
 
-        The last part of a path is enough where it is the only one of its name.
+        The last part of a path is enough where it is the only one of its name; ``column 2`` is the
+        second channel where none is called so.
 
         Raises
         ------
@@ -147,7 +155,7 @@ class Source:
             if len(found) > 1:
                 raise DataError(
                     f"{self.name}: {len(found)} columns are called {text!r}; expected one. "
-                    "Rename them in the file"
+                    "Rename them in the file, or count them: 'column 2'"
                 )
             if found:
                 return found[0]
@@ -163,6 +171,9 @@ class Source:
         if unit is not None:
             channel = self.find(name)
             return replace(channel, unit=unit)
+        counted = _COUNTED.fullmatch(text)
+        if counted and 0 < int(counted[1]) <= len(self.channels):
+            return self.channels[int(counted[1]) - 1]
         names = [c.name for c in self.channels]
         close = difflib.get_close_matches(text, names, 3) or names
         raise DataError(f"{self.name}: no column is called {text!r}; there are {listed(close, 20)}")
@@ -198,7 +209,7 @@ class Source:
                 f"{self.name}: column {channel.name!r} holds complex numbers; expected real ones"
             )
         if values.dtype.kind not in "fiu":
-            values = self._from_text(channel)
+            values = self.from_text(channel)
         values = np.atleast_1d(values).astype(np.float64, copy=False)
         limit = np.inf if infinite else LARGEST
         if values.size and not (values.min() >= -limit and values.max() <= limit):
@@ -260,7 +271,8 @@ class Source:
                 f"cells); expected {expected}"
             )
 
-    def _from_text(self, channel: Channel) -> FloatArray:
+    def from_text(self, channel: Channel) -> FloatArray:
+        """Return the numbers in cells of text, NaN for empty ones, or name the cell without one."""
         numbers = np.empty(channel.values.size)
         comma, thousands = self.decimal[0] == ",", self.decimal[1:]
         swapped = str.maketrans(",.", ".,") if comma else {}
@@ -281,6 +293,21 @@ class Source:
                 )
             numbers[i] = float(text)
         return numbers
+
+
+def words(cells: Iterable[str]) -> NDArray[np.str_]:
+    """Return cells as text; of a longer one the first letters, and a mark that no number has.
+
+    Raises
+    ------
+    MemoryError
+        If one long cell among many short ones would make an array far larger than the text.
+    """
+    short = [c if len(c) <= _LONGEST_WORD else f"{c[:_LONGEST_WORD]}..." for c in cells]
+    lengths = [len(cell) for cell in short]
+    if 4 * len(short) * max(lengths, default=0) > max(_PADDING[0], _PADDING[1] * sum(lengths)):
+        raise MemoryError
+    return np.array(short, dtype=np.str_)
 
 
 def missing_marks(values: FloatArray) -> dict[float, float]:

@@ -6,18 +6,20 @@ listed, not filled. Motion may be displacement, velocity or acceleration. SI uni
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import FloatArray, finite_array, positive_number
+from dahl_ident.arrays import SMALLEST, FloatArray, finite_array, positive_number
 from dahl_ident.data.fields import column, frozen_copy, frozen_mapping, one_of
 from dahl_ident.data.storage import plain_data
 from dahl_ident.data.tabular import Lines, Tabular, extent, noted
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import DataWarning, ValidationError
 from dahl_ident.units import MOTION_KINDS, MOTIONS, Motion, si_unit
 
 if TYPE_CHECKING:
@@ -25,6 +27,10 @@ if TYPE_CHECKING:
 
 DriveUnit = Literal["N", "N m", "V", "A"]
 _GAP = 1.5  # a step of more than this many median steps misses a sample
+_SMALLEST = SMALLEST**0.5  # squares of a stiffness, a force over it, remain representable
+_LONG_GAP = 5.0  # median steps, over which nothing is interpolated
+_MOST_GAPS = 0.02  # of the samples: with more, the steps themselves are uneven
+_SHOWN_GAPS = 3
 _EVEN = 0.01  # of a step
 
 
@@ -106,6 +112,13 @@ class Record(Tabular):
         values: dict[str, Any] = {
             name: column(value, name, n, finite_array) for name, value in channels.items()
         }
+        for name, samples in values.items():
+            size = 0.0 if samples is None else float(np.abs(samples).max())
+            if 0.0 < size < _SMALLEST:
+                raise ValidationError(
+                    f"no sample of {name} is above {size:.3g} in size; expected at least "
+                    f"{_SMALLEST:g}: check the unit"
+                )
         given = [name for name in MOTION_KINDS if values[name] is not None]
         if len(given) != 1:
             raise ValidationError(
@@ -238,6 +251,13 @@ class Record(Tabular):
         lines += noted(self.provenance)
         return f"Record: {self.n} samples of {kind} in {self.motion}", lines
 
+    @property
+    def _units(self) -> dict[str, str]:
+        """The units of the channels that there are."""
+        units = {kind: si_unit(kind, self.motion) for kind in (*MOTION_KINDS, "force")}
+        units = {"time": "s", **units, "drive": self.drive_unit}
+        return {name: unit for name, unit in units.items() if getattr(self, name) is not None}
+
     def to_sdypy(self) -> list[dict[str, Any]]:
         """Return the channels as SDyPy's time series (its enhancement proposal 5).
 
@@ -254,15 +274,13 @@ class Record(Tabular):
         >>> [(c["name"], c["unit_str"]) for c in record.to_sdypy()]
         [('displacement', 'm'), ('force', 'N')]
         """
-        units = {kind: si_unit(kind, self.motion) for kind in (*MOTION_KINDS, "force")}
-        units["drive"] = self.drive_unit
         sampling: dict[str, Any] = {"time": self.time}
         if self.uniform and self.time[0] == 0.0:
             sampling["fs"] = self.sample_rate
         return [
             {"name": name, "data": getattr(self, name), "unit_str": unit, **sampling}
-            for name, unit in units.items()
-            if getattr(self, name) is not None
+            for name, unit in self._units.items()
+            if name != "time"
         ]
 
     def to_frame(self) -> pd.DataFrame:
@@ -280,20 +298,82 @@ class Record(Tabular):
         """
         import pandas as pd
 
-        units = {kind: si_unit(kind, self.motion) for kind in (*MOTION_KINDS, "force")}
-        units |= {"time": "s", "drive": self.drive_unit}
-        columns = {
-            f"{name} [{units[name]}]": getattr(self, name)
-            for name in ("time", *MOTION_KINDS, "force", "drive")
-            if getattr(self, name) is not None
-        }
-        frame = pd.DataFrame(columns)
+        frame = pd.DataFrame({f"{n} [{unit}]": getattr(self, n) for n, unit in self._units.items()})
         frame.attrs["dahl_ident"] = {
             "drive_factor": self.drive_factor,
             "drive_factor_uncertainty": self.drive_factor_uncertainty,
             "provenance": plain_data(self.provenance),
         }
         return frame
+
+
+def unbroken(record: Record, shortest: int) -> list[Record]:
+    """Return the parts of a record between long gaps, and warn where there are several.
+
+    What happened in a gap is not known, so that nothing with a memory can be followed through it.
+    Parts of fewer than `shortest` samples are left out. A record of which no part is long enough,
+    or whose steps differ everywhere, has no gaps but uneven times.
+    """
+    steps = np.diff(record.time)
+    after = np.flatnonzero(steps > _LONG_GAP * np.median(steps)) + 1
+    edges = np.concatenate([[0], after, [record.n]])
+    kept = [slice(a, b) for a, b in pairwise(edges.tolist()) if b - a >= shortest]
+    if not after.size or not kept or after.size > _MOST_GAPS * record.n:
+        return [record]
+    named = [f"{record.time[a - 1]:.6g} to {record.time[a]:.6g} s" for a in after.tolist()]
+    shown = [*named[:_SHOWN_GAPS], *["others"][: len(named) > _SHOWN_GAPS]]
+    parts = "one part is used" if len(kept) == 1 else f"{len(kept)} parts are fitted"
+    said = f"nothing is known from {', '.join(shown)}; {parts}, each from a first state of its own"
+    lost = record.n - sum(part.stop - part.start for part in kept)
+    said += f"; {lost} samples in shorter parts are left out" if lost else ""
+    known = _doubted(record, said)
+    return [replace(cut(record, part), provenance=known) for part in kept]
+
+
+def at_even_times(record: Record) -> Record:
+    """Return a record at even times, and warn where it is resampled, by cubic splines."""
+    time = record.time
+    if record.uniform or time.size <= 3 or is_even(time):
+        return record
+    from scipy.interpolate import make_interp_spline
+
+    usual = float(np.median(np.diff(time)))
+    grid = np.linspace(time[0], time[-1], 1 + round((time[-1] - time[0]) / usual))
+    said = (
+        f"the samples from {time[0]:.6g} to {time[-1]:.6g} s are not evenly spaced; resampled at "
+        f"{1.0 / usual:.6g} Hz"
+    )
+    names = [name for name in record._units if name != "time"]
+    columns: dict[str, Any] = {
+        name: make_interp_spline(time, getattr(record, name))(grid) for name in names
+    }
+    return replace(record, time=grid, **columns, provenance=_doubted(record, said))
+
+
+def _doubted(record: Record, said: str) -> dict[str, Any]:
+    """Warn, and return a record's provenance with the warning."""
+    known = dict(record.provenance or {})
+    warnings.warn(f"{known.get('file', 'the record')}: {said}", DataWarning, stacklevel=3)
+    known["warnings"] = [*known.get("warnings", ()), said]
+    return known
+
+
+def cut(record: Record, part: slice) -> Record:
+    """Return some of a record's samples."""
+    channels = {
+        name: None if samples is None else samples[part]
+        for name in ("displacement", "velocity", "acceleration", "force", "drive")
+        for samples in (getattr(record, name),)
+    }
+    return Record(
+        record.time[part],
+        **channels,
+        drive_unit=record.drive_unit,
+        drive_factor=record.drive_factor,
+        drive_factor_uncertainty=record.drive_factor_uncertainty,
+        motion=record.motion,
+        provenance=record.provenance,
+    )
 
 
 def _time(value: ArrayLike) -> FloatArray:

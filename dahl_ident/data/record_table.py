@@ -10,9 +10,9 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.column_map import RECORD_NAMES, Binding, ColumnMap, scaled
-from dahl_ident.data.plausibility import stuck_samples
+from dahl_ident.data.plausibility import record_doubts
 from dahl_ident.data.raw_columns import Channel, Source, missing_marks
-from dahl_ident.data.record import DriveUnit, Record
+from dahl_ident.data.record import DriveUnit, Record, is_even
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS, si_unit
@@ -70,19 +70,17 @@ def record_from(
         values["time"] = _even_time(bound, size)[complete]
     force: FloatArray = values["force"] if "force" in values else values["drive"]
     motion = next(values[kind] for kind in MOTION_KINDS if kind in values)
-    stuck = stuck_samples(motion, force)
-    if stuck.size:
-        first = f"{bound.source.row_name(int(stuck[0]))} ({stuck.size} such places)"
-        bound.doubt(
-            f"the force repeats one value while the motion goes on, from {first}: does a "
-            "converter stick?"
-        )
+    for places, doubt in record_doubts(values["time"], motion, force):
+        if places.size:
+            first = bound.source.row_name(int(places[0]))
+            bound.doubt(doubt.format(f"{first} ({places.size} such places)"))
     try:
         return Record(**values, motion=bound.motion(), provenance=bound.provenance())
     except ValidationError as exc:
         raise DataError(f"{source.name}: {exc}") from exc
 
 
+_FEWEST_STAMPS = 16  # fewer, with some missing, may look like rounded ones
 _PLANNED = {"step", "measured"}  # columns of a waveform that a plan wrote
 
 
@@ -92,10 +90,17 @@ def record_size(source: Source, columns: ColumnMap) -> int:
 
 
 def _channels(bound: Binding) -> dict[str, Channel]:
-    """Return the channels of the roles that the record has, exactly one motion among them."""
+    """Return the channels of the roles that the record has, exactly one motion among them.
+
+    Of several motions that nobody named the first is taken: friction follows the displacement.
+    """
     roles = bound.map.roles
-    named = [kind for kind in MOTION_KINDS if kind in roles]
-    motions = named or [kind for kind in MOTION_KINDS if bound.has(kind)]
+    motions = [kind for kind in MOTION_KINDS if kind in roles]
+    if not motions:
+        motions = [k for k in MOTION_KINDS if bound.named(k)]
+        if len(motions) > 1:
+            bound.notes.append(f"{motions[0]} is used, and not {' or '.join(motions[1:])}")
+        motions = motions[:1]
     if len(motions) != 1:
         raise DataError(
             f"{bound.source.name}: {' and '.join(motions) or 'no motion'} found; expected one of "
@@ -136,6 +141,7 @@ def _samples(bound: Binding, role: str, channel: Channel) -> FloatArray:
     _, factor = bound.kind(role, unit, kinds)
     if role == "time":
         _require_increasing(bound.source, channel, values)
+        values = _without_rounding(bound, values)
     if unit.marker in ("rms", "peak to peak") or unit.decibel:
         raise UnitError(
             f"{bound.source.name}: column {channel.name!r} has the unit [{unit.text}]; expected "
@@ -173,8 +179,29 @@ def _seconds(bound: Binding, channel: Channel) -> FloatArray:
             nanoseconds[i] -= -ahead if found["sign"] == "-" else ahead
     time = np.asarray((nanoseconds - nanoseconds[0]) * 1e-9)
     _require_increasing(bound.source, channel, time)
+    time = _without_rounding(bound, time)
     bound.notes.append(f"time counted from the stamp {str(channel.values.flat[0]).strip()}")
     return time
+
+
+def _without_rounding(bound: Binding, time: FloatArray) -> FloatArray:
+    """Return evenly spaced times where the stamps are so, but for the digits that they have."""
+    if time.size < _FEWEST_STAMPS or is_even(time):
+        return time
+    step = (time[-1] - time[0]) / (time.size - 1)
+    digits = (d for d in range(12) if _are_whole(time, 10.0**-d))
+    resolution = 10.0 ** -next(digits, 12)
+    middle = np.arange(time.size) - 0.5 * (time.size - 1)
+    grid = time.mean() + middle * float(middle @ time / (middle @ middle))
+    if step < 1.25 * resolution or np.abs(time - grid).max() > 0.6 * resolution:
+        return time  # of coarser stamps, one that is missing would not be seen
+    bound.notes.append(f"times are rounded to {resolution:g}, and taken as even")
+    return np.asarray(grid)
+
+
+def _are_whole(time: FloatArray, unit: float) -> bool:
+    ratio = time / unit
+    return bool(np.abs(ratio - np.round(ratio)).max() < 1e-3)
 
 
 def _drive(bound: Binding, channel: Channel) -> dict[str, Any]:

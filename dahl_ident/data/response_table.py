@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import fnmatch
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -19,7 +20,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
+from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, positive_number
 from dahl_ident.data.column_map import (
     RECORD_NAMES,
     RESPONSE_NAMES,
@@ -36,8 +37,8 @@ from dahl_ident.data.plausibility import (
     check_phase_size,
     check_phase_unit,
 )
-from dahl_ident.data.raw_columns import Source, plain
-from dahl_ident.data.tabular import listed
+from dahl_ident.data.raw_columns import Channel, Source, plain
+from dahl_ident.data.tabular import ASSUMED, listed
 from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import (
     DRIVE_KINDS,
@@ -53,6 +54,11 @@ from dahl_ident.units import (
 )
 
 _FORMS = (("response",), ("real", "imag"), ("gain", "phase"), ("gain_db", "phase"))
+_NUMBER = r"([0-9.]+(?:[eE][-+]?[0-9]+)?)"
+_SWEEP = re.compile(rf"\s*{_NUMBER} to {_NUMBER} Hz, (log|linear)\s*")
+_UNKNOWN_FREQUENCY = (
+    "the table says no frequency: taken as 1 Hz, and good for laws that do not depend on it"
+)
 _ERROR_FORMS = (
     ("covariance_real_real", "covariance_real_imag", "covariance_imag_imag"),
     ("std",),
@@ -61,10 +67,15 @@ _ERROR_FORMS = (
 )
 
 
+class WaveformsError(DataError):
+    """A file holds waveforms where a table of responses was expected."""
+
+
 @dataclass(frozen=True)
 class ResponseOptions:
     """What a user says about a whole table; see :func:`read_frequency_response`."""
 
+    frequency: float | None = None
     amplitude: str | None = None
     drive: str | None = None
     level: str | float | None = None
@@ -83,6 +94,10 @@ def response_from(
     DataError, UnitError
         Naming file, row and column.
     """
+    source = replace(source, channels=tuple(map(_as_gain, source.channels)))
+    source, options = _with_stated(source, columns, options)
+    if columns.sweep is not None:
+        source = _with_frequencies(source, columns.sweep)
     whole = Binding(source, columns, RESPONSE_NAMES)
     if source.runs:
         whole.doubt(f"the header is repeated in the file: read as {len(source.runs) + 1} runs")
@@ -98,7 +113,67 @@ def response_from(
         of = "" if label is None else f"level {label}: "
         whole.doubts += [f"{of}{text}" for text in table.bound.doubts]
     data = parts[0] if len(parts) == 1 else FrequencyResponse.concatenate(parts)
-    return replace(data, provenance=whole.provenance())
+    assumed = {"frequency": ASSUMED} if _UNKNOWN_FREQUENCY in whole.notes else {}
+    return replace(data, provenance=whole.provenance() | assumed)
+
+
+def _as_gain(channel: Channel) -> Channel:
+    """Return an "amplitude" in the unit of a response as what it is, a gain."""
+    if plain(channel.short or channel.name) in RESPONSE_NAMES["amplitude"] and channel.unit:
+        with contextlib.suppress(UnitError):
+            kind_of(parse_unit(channel.unit), QUANTITIES, channel.name)
+            return replace(channel, role="gain")
+    return channel
+
+
+def _with_stated(
+    source: Source, columns: ColumnMap, options: ResponseOptions
+) -> tuple[Source, ResponseOptions]:
+    """Take the level that the file's header states, where neither a column nor the user does.
+
+    Where it states both, the displacement was held, and the drive followed it.
+    """
+    names = {*RESPONSE_NAMES["drive"], *RESPONSE_NAMES["amplitude"]}
+    known = {"drive", "amplitude"} & columns.roles.keys() or any(
+        c.role is None and plain(c.short or c.name) in names for c in source.channels
+    )
+    stated = dict(source.stated)
+    if "amplitude" in stated:
+        stated.pop("drive", None)
+    elif "drive" in stated and columns.drive_factor is None:
+        _, kind, _ = parse_quantity(stated["drive"], DRIVE_KINDS, "drive")
+        stated = stated if kind == "force" else {}
+    if known or options.drive or options.amplitude or not stated:
+        return source, options
+    notes = [f"{role} {text}, as the file's header states" for role, text in stated.items()]
+    held = replace(options, drive=stated.get("drive"), amplitude=stated.get("amplitude"))
+    return replace(source, notes=(*source.notes, *notes)), held
+
+
+def _with_frequencies(source: Source, sweep: str) -> Source:
+    """Return a source with the frequencies of a sweep, one for each row."""
+    found = _SWEEP.fullmatch(sweep)
+    if found is None:
+        raise DataError(
+            f"{source.name}: sweep is {sweep!r}; expected the first and the last frequency and "
+            "their spacing, such as '1 to 100 Hz, log' or '0 to 800 Hz, linear'"
+        )
+    known = [c for c in source.channels if plain(c.short or c.name) in RESPONSE_NAMES["frequency"]]
+    if known:
+        raise DataError(
+            f"{source.name}: sweep={sweep!r} is given, and column {known[0].name!r} holds the "
+            "frequency too; leave out one of them"
+        )
+    first, last = (float(text) for text in found.groups()[:2])
+    rows, log = source.channels[0].size, found[3] == "log"
+    if rows < 2 or not (first > 0.0 if log else first >= 0.0) or not first < last < np.inf:
+        raise DataError(
+            f"{source.name}: sweep is {sweep!r} for {rows} rows; expected rising frequencies"
+        )
+    axis = (np.geomspace if log else np.linspace)(first, last, rows)
+    frequency = Channel("frequency", axis, "Hz", "frequency")
+    note = f"frequencies from the sweep stated, {sweep}"
+    return replace(source, channels=(*source.channels, frequency), notes=(*source.notes, note))
 
 
 class _Table:
@@ -187,12 +262,12 @@ class _Table:
     def _within_range(self) -> None:
         """Leave out the frequencies that the user does not want, before anything is judged."""
         self._refuse_waveforms()
-        channel = self.bound.required("frequency")
         lengths = {c: self.bound.channel(c) for c in RESPONSE_NAMES}
         self.bound.same_length({r: c for r, c in lengths.items() if c is not None})
         if self.options.frequency_hz is None:
             return
         low, high = self.options.frequency_hz
+        channel = self.bound.required("frequency")
         frequency_hz = self._hertz(self.bound.numbers("frequency", channel))
         keep = (frequency_hz >= low) & (frequency_hz <= high)
         if not keep.any():
@@ -210,7 +285,7 @@ class _Table:
         motion_or_force = {n for role in (*MOTION_KINDS, "force") for n in RECORD_NAMES[role]}
         if held & set(RECORD_NAMES["time"]) and held & motion_or_force:
             channels = listed([c.header for c in source.channels], 5)
-            raise DataError(
+            raise WaveformsError(
                 f"{source.name}: it holds waveforms ({channels}), and a table of responses at "
                 "some frequencies was expected. If they are sine tests, make such a table with "
                 "extract; any other motion is fitted as a record (on the command line --record)"
@@ -223,8 +298,30 @@ class _Table:
         return values * factor / (2.0 * np.pi if kind == "angular_frequency" else 1.0)
 
     def _frequency(self) -> FloatArray:
-        channel = self.bound.required("frequency")
-        values = self.bound.numbers("frequency", channel)
+        bound, stated = self.bound, self.options.frequency
+        channel = bound.channel("frequency")
+        if channel is None:
+            rows = next((c for f in _FORMS for r in f if (c := bound.channel(r)) is not None), None)
+            if rows is not None and stated is None and not bound.has("amplitude"):
+                raise DataError(
+                    f"{bound.source.name}: no column holds the frequency; name it with "
+                    "columns={'frequency': ...}, or say what was swept, such as sweep='1 to 100 "
+                    "Hz, log'"
+                )
+            if rows is None:
+                bound.required("frequency")
+            assert rows is not None  # else an error was raised
+            if stated is None:
+                bound.notes.append(_UNKNOWN_FREQUENCY)
+            return np.full(
+                rows.size, 1.0 if stated is None else positive_number(stated, "frequency")
+            )
+        if stated is not None:
+            raise DataError(
+                f"{bound.source.name}: frequency={stated!r} is given, and column {channel.name!r} "
+                "holds the frequency too; leave out one of them"
+            )
+        values = bound.numbers("frequency", channel)
         self.bound.source.require(
             values >= SMALLEST, channel, "a frequency > 0; frequency_hz=(low, high) leaves rows out"
         )
@@ -326,7 +423,8 @@ class _Table:
 
     def _form(self, forms: tuple[tuple[str, ...], ...]) -> tuple[str, ...] | None:
         """Return the one form whose columns are all there; the map decides between several."""
-        found = [f for f in forms if all(self.bound.has(role) for role in f)]
+        mapped = [f for f in forms if self.bound.map.roles.keys() >= {*f}]
+        found = [f for f in mapped or forms if all(self.bound.has(role) for role in f)]
         named = [f for f in found if f[0] in self.bound.map.roles]
         found = named or found
         if len(found) > 1:

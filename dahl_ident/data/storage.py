@@ -14,6 +14,8 @@ import io
 import json
 import math
 import os
+import stat
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 METADATA_MARK = "dahl_ident:"
+_IRREGULAR = {stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket"}
 
 
 def save_frame(frame: pd.DataFrame, path: str | Path, *, overwrite: bool = False) -> Path:
@@ -70,6 +73,43 @@ def place_of(path: str | Path, what: str, endings: Sequence[str]) -> Path:
     return place
 
 
+def regular(path: str | Path, what: str = "the file") -> Path:
+    """Return the path of a file, which has to be a regular one: others may never end.
+
+    Raises
+    ------
+    DataError
+        If there is none, or it is a folder, a pipe, a device or a socket.
+    """
+    place = Path(path)
+    try:
+        kind = stat.S_IFMT(place.stat().st_mode)
+    except (OSError, ValueError) as exc:
+        why = getattr(exc, "strerror", None) or exc
+        raise DataError(f"{path}: {what} cannot be read: {why}") from exc
+    if kind != stat.S_IFREG:
+        raise DataError(
+            f"{path} is a {_IRREGULAR.get(kind, 'device')}; expected a file: copy what it holds "
+            "into one, or pipe it into standard input (-)"
+        )
+    return place
+
+
+def read_text(path: str | Path, what: str = "the file") -> str:
+    """Return the text of a file.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, or is no text.
+    """
+    try:
+        return regular(path, what).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as exc:
+        why = exc.strerror if isinstance(exc, OSError) else "it is no text"
+        raise DataError(f"{path}: {what} cannot be read: {why}") from exc
+
+
 def refuse_existing(path: Path) -> None:
     """Refuse to replace a file.
 
@@ -97,27 +137,90 @@ def write_whole(path: Path, content: bytes, *, overwrite: bool = False) -> None:
     if not overwrite:
         refuse_existing(path)
     try:
-        put_in_place(path, lambda part: part.write_bytes(content))
+        put_in_place(path, lambda part: part.write_bytes(content), overwrite=overwrite)
+    except FileExistsError:  # somebody else has written it meanwhile
+        refuse_existing(path)
+        raise
     except OSError as exc:
         raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
 
 
-def put_in_place(path: Path, write: Callable[[Path], object]) -> None:
+def put_in_place(path: Path, write: Callable[[Path], object], *, overwrite: bool = True) -> None:
     """Write a file beside its place, flush it to the disk, and move it there when complete.
 
     `write` gets the path to write to. Whatever it raises is passed on, and leaves `path` alone.
+    Of several writers without `overwrite`, all but the first get a FileExistsError.
     """
     # not a file of tempfile, which nobody else may read
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.part")
     try:
         write(part)
         with part.open("rb+") as written:
             os.fsync(written.fileno())
-        part.replace(path)
+        if overwrite:
+            part.replace(path)
+        else:
+            _move_to_new(part, path)
     except BaseException:
         with contextlib.suppress(OSError):
             part.unlink()
         raise
+
+
+def _move_to_new(part: Path, path: Path) -> None:
+    """Move a file to a name that must be free."""
+    try:
+        os.link(part, path)  # fails if the name is taken, and never shows half a file
+    except FileExistsError:
+        raise
+    except (OSError, NotImplementedError, AttributeError):  # a file system without links
+        path.open("xb").close()
+        part.replace(path)
+    else:
+        part.unlink()
+
+
+def inert(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return a table whose texts no spreadsheet takes for formulas: those get an apostrophe.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> inert(pd.DataFrame({"device": ["=1+2", "-3.5", "d1"]}))["device"].tolist()
+    ["'=1+2", '-3.5', 'd1']
+    """
+    return _texts(frame, lambda text: f"'{text}" if _runs(text) else text)
+
+
+def as_before_inert(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the table that :func:`inert` was given."""
+    return _texts(frame, lambda text: text[1:] if text[:1] == "'" and _runs(text) else text)
+
+
+def _runs(text: str) -> bool:
+    """Return whether a spreadsheet would run a text, but for apostrophes in front of it."""
+    bare = text.lstrip("'")
+    if not bare.startswith(("=", "+", "-", "@", "\t", "\r")):
+        return False
+    try:
+        float(bare)
+    except ValueError:
+        return True
+    return False
+
+
+def _texts(frame: pd.DataFrame, change: Callable[[str], str]) -> pd.DataFrame:
+    """Return a table with another text in each cell that holds text, column names included."""
+
+    def cell(value: Any) -> Any:
+        return change(value) if isinstance(value, str) else value
+
+    texts = [c for c in frame.columns if frame[c].dtype.kind not in "fiubc"]
+    if not texts and all(cell(c) == c for c in frame.columns):
+        return frame
+    changed = frame.assign(**{c: frame[c].map(cell) for c in texts})
+    changed.columns = [cell(c) for c in frame.columns]
+    return changed
 
 
 def library(module: str, extra: str | None = None) -> Any:
@@ -218,7 +321,7 @@ def plain_data(value: Any, *, not_finite: Callable[[float], Any] = float) -> Any
 
 def _text(frame: pd.DataFrame, separator: str) -> bytes:
     metadata = json.dumps(frame.attrs["dahl_ident"], ensure_ascii=False)
-    table = frame.to_csv(index=False, sep=separator, na_rep="nan", lineterminator="\n")
+    table = inert(frame).to_csv(index=False, sep=separator, na_rep="nan", lineterminator="\n")
     return f"# {METADATA_MARK} {metadata}\n{table}".encode()
 
 

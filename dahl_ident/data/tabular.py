@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from html import escape
 from pathlib import Path
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Lines = Sequence[tuple[str, str]]
+ASSUMED = "assumed"
+"""What the provenance says of a frequency that the table does not have."""
 _SHOWN = 8  # items that fit into a line of a message
 
 
@@ -74,15 +76,26 @@ def noted(provenance: Mapping[str, Any] | None) -> list[tuple[str, str]]:
 def doubts(provenance: Mapping[str, Any] | None) -> list[str]:
     """Return the warnings that were shown on reading data, and what they were made from."""
     found: list[str] = []
+    for part in _origins(provenance):
+        file = f"{part['file']}: " if "file" in part else ""
+        found += [f"{file}{text}" for text in part.get("warnings", ())]
+    return list(dict.fromkeys(found))
+
+
+def assumes_frequency(provenance: Mapping[str, Any] | None) -> bool:
+    """Return whether a table, or one that it was made from, did not say its frequency."""
+    return any(part.get("frequency") == ASSUMED for part in _origins(provenance))
+
+
+def _origins(provenance: Mapping[str, Any] | None) -> Iterator[Mapping[str, Any]]:
+    """Yield the provenance of data, and of all that they were made from."""
     waiting = [provenance or {}]
     while waiting:
         part = waiting.pop(0)
-        file = f"{part['file']}: " if "file" in part else ""
-        found += [f"{file}{text}" for text in part.get("warnings", ())]
+        yield part
         waiting += [one for one in part.get("parts", ()) if isinstance(one, Mapping)]
         if isinstance(part.get("origin"), Mapping):
             waiting.append(part["origin"])
-    return list(dict.fromkeys(found))
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)

@@ -14,19 +14,29 @@ import numpy as np
 from scipy import special
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.data.storage import library as data_library
 from dahl_ident.diagnostics.combinations import candidates, runaway
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, MANY
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
-from dahl_ident.diagnostics.error_sources import APART, LEVELS, MODEL_ERROR, NOISE, RUNS
+from dahl_ident.diagnostics.error_sources import (
+    APART,
+    HARMONICS,
+    LEVELS,
+    MODEL_ERROR,
+    NOISE,
+    RUNS,
+    TESTS,
+)
 from dahl_ident.diagnostics.formatting import listed, rounded, table
 from dahl_ident.diagnostics.information import Information
+from dahl_ident.diagnostics.markup import html_table, pair, symbol, tabular, unit
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 
 _DETERMINED, _HARDLY = 0.25, 1.0  # u of a logarithm
 # What rounding leaves where a source has no part: variances relative to the combined one.
 _ROUNDING = 1e-18
-_TYPE_A = (NOISE, MODEL_ERROR, RUNS, LEVELS, APART)
+_TYPE_A = (NOISE, MODEL_ERROR, HARMONICS, RUNS, LEVELS, APART, TESTS)
 _CHANNELS = {
     "force_gain": "force calibration",
     "displacement_gain": "displacement calibration",
@@ -108,7 +118,7 @@ class Budget(Mapping[str, ParameterBudget]):
     >>> import dahl_ident as di
     >>> found = budget(di.fit(di.load_dataset("noisy"), di.Dahl()).optimum)
     >>> [row.source for row in found["f_max"].rows][:2]
-    ['noise', 'exponent']
+    ['jackknife over tests', 'noise']
     >>> round(sum(row.share for row in found["f_max"].rows), 9)
     1.0
     """
@@ -161,6 +171,27 @@ class Budget(Mapping[str, ParameterBudget]):
             ]
         text = table(lines, left=(0, 1, 2))
         return f"{text}\ntaken as exact: {listed(self.exact)}" if self.exact else text
+
+    def _repr_html_(self) -> str:
+        rows = [
+            cells
+            for p in self.parameters
+            for cells in (
+                (f"{p.name} [{p.unit}]", rounded(p.value, p.u)[0], "combined", "", f"{p.u:.2g}",
+                 _dof(p.dof), "100 %", f"{p.k:.2f}", f"{p.U:.2g}"),
+                *(("", "", r.source, r.kind, f"{r.u:.2g}", _dof(r.dof), f"{r.share:.0%}", "", "")
+                  for r in p.rows),
+            )
+        ]  # fmt: skip
+        return html_table(("", "value", "source", "type", "u", "dof", "share", "k", "U"), rows)
+
+    def to_latex(self) -> str:
+        """Return a table of values with expanded uncertainties; it needs no package of LaTeX."""
+        rows = [
+            (symbol(p.name), *pair(p.value, p.U), f"{p.k:.2f}", unit(p.unit))
+            for p in self.parameters
+        ]
+        return tabular(("", "value", "$U$", "$k$", "unit"), rows)
 
     def to_frame(self) -> Any:
         """Return a pandas table: one row a parameter and source, the combined one last."""
@@ -221,17 +252,13 @@ class Budget(Mapping[str, ParameterBudget]):
             return dict(zip(self, correlated_values(values, self.covariance), strict=True))
         if library != "GTC":
             raise ValueError(f"library is {library!r}; expected uncertainties or GTC")
-        from GTC import (  # type: ignore[import-not-found]
-            multiple_ureal,
-            set_correlation,
-        )
-
+        gtc = data_library("GTC", "exports")
         u = np.sqrt(np.diagonal(self.covariance))
         dof = min(p.dof for p in self.parameters)  # one for an ensemble of correlated numbers
-        made = multiple_ureal(values, u.tolist(), dof, list(self))
+        made = gtc.multiple_ureal(values, u.tolist(), dof, list(self))
         for i in range(len(made)):
             for j in range(i):
-                set_correlation(float(self.covariance[i, j] / (u[i] * u[j])), made[i], made[j])
+                gtc.set_correlation(float(self.covariance[i, j] / (u[i] * u[j])), made[i], made[j])
         return dict(zip(self, made, strict=True))
 
 

@@ -33,6 +33,7 @@ from dahl_ident.elements.element import Alternative
 from dahl_ident.errors import DahlIdentError, ValidationError
 from dahl_ident.fitting import Optimum, solve
 from dahl_ident.problem import Problem
+from dahl_ident.units import si_unit
 
 _BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
 _RATES = 1.05  # highest over lowest frequency that can show a dependence on the rate
@@ -247,8 +248,10 @@ def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
             stiffness += contact
             energy += np.pi * sizes**2 * np.imag(element.stiffness(own, sizes, omega))
     found = {"force limit": limit, "stiffness at zero force": stiffness}
+    unit = si_unit("displacement", problem.data.motion)
     return found | {
-        f"energy a cycle at {size:.2g} m": float(e) for size, e in zip(sizes, energy, strict=True)
+        f"energy a cycle at {size:.2g} {unit}": float(e)
+        for size, e in zip(sizes, energy, strict=True)
     }
 
 
@@ -324,7 +327,9 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
 def _solved(optimum: Optimum, model: Element, *, own: bool) -> Optimum:
     """Return a candidate's optimum; limits at infinity are those of simpler candidates."""
     problem = optimum.problem
-    other = Problem(problem.data, model, noise=problem.noise, sensors=problem.sensors)
+    other = Problem(
+        problem.data, model, noise=problem.noise, sensors=problem.sensors, steady=problem.steady
+    )
     return solve(other, loss=optimum.loss, limits=own)
 
 

@@ -20,6 +20,7 @@ from dahl_ident.problem.record_noise import HIGHEST_ORDER, SAMPLES_PER_ORDER
 
 _SINGULAR = 1e-13  # eigenvalues of J'J of unit columns that are rounding
 _INVOLVED = 1e-6  # share of a parameter in what has no effect: beyond rounding
+_SLIGHT = 1e-3  # of the variance: changes of autocovariances below do not matter
 _CORRECTIONS = 4  # each changes less, by the ratio of parameters to samples
 
 
@@ -107,9 +108,15 @@ def autoregression(
     model = _chosen(seen, n)
     if jacobian is None or seen[0] <= 0.0:
         return model
+    peak = float(np.max(spectrum_of(model, fft.next_fast_len(2 * n, real=True))))
+    if 3.0 * jacobian.shape[1] * peak < _SLIGHT * n * seen[0]:  # a bound of what a fit takes
+        return model
     basis = np.linalg.qr(jacobian)[0]
+    taken: FloatArray = np.zeros(highest + 1)
     for _ in range(_CORRECTIONS):
-        taken = _taken_by_a_fit(basis, model, highest)
+        before, taken = taken, _taken_by_a_fit(basis, model, highest)
+        if np.max(np.abs(taken - before)) < _SLIGHT * seen[0]:
+            break
         corrected = seen + taken
         if np.linalg.eigvalsh(toeplitz(corrected))[0] <= 0.0:
             break
@@ -138,20 +145,17 @@ def _taken_by_a_fit(basis: FloatArray, model: tuple[FloatArray, float], highest:
     """Return by how much a projection lowers the mean autocovariances of such noise.
 
     With Q an orthonormal basis of what was fitted, R the noise's covariance matrix and S_k the
-    shift by k: (2 tr(Q' R S_k Q) - tr(Q' S_k Q Q' R Q))/n, S_k made symmetric.
+    shift by k: (2 tr(Q' R S_k Q) - tr(Q' S_k Q Q' R Q))/n, S_k made symmetric. All shifts at once,
+    as products of Fourier transforms.
     """
     n = basis.shape[0]
     m = fft.next_fast_len(2 * n, real=True)
     waves = fft.rfft(basis, m, axis=0)
     filtered = fft.irfft(waves * spectrum_of(model, m)[:, None], m, axis=0)[:n]
     inner = basis.T @ filtered
-    taken = np.empty(highest + 1)
-    for k in range(highest + 1):
-        ahead, behind = basis[k:], basis[: n - k]
-        crossed = np.sum(filtered[k:] * behind) + np.sum(filtered[: n - k] * ahead)
-        shifted = 0.5 * (ahead.T @ behind + behind.T @ ahead)
-        taken[k] = (crossed - np.sum(shifted * inner)) / n
-    return taken
+    crossed = 2.0 * fft.rfft(filtered, m, axis=0) - waves @ inner
+    total = fft.irfft(np.sum((crossed * waves.conj()).real, axis=1), m)
+    return np.asarray(total[: highest + 1] / n)
 
 
 def spectrum_of(model: tuple[FloatArray, float], m: int) -> FloatArray:

@@ -1,30 +1,26 @@
-r"""Linear mixed model of all sources of error of an estimate.
+r"""The estimate, and its covariance by source of error.
 
 Write each row's log response as
 
     ln R_i = ln R(A_i, omega_i; theta) + run_i + level_i + d(ln A_i, ln omega_i) + e_i
 
 with noise e, scatter between runs and between repeats of a level, and a smooth model error d
-(:mod:`dahl_ident.diagnostics.error_sources`). A point that stands apart from all others may
-have one more error, of a variance of its own, and so little weight. Exponents that were assumed,
-not given, and calibrations with a stated uncertainty are parameters with a prior. Variances follow
-from restricted maximum likelihood (:mod:`dahl_ident.diagnostics.variance_components`). With V the
-sum of the covariances, priors included as rows of unit variance,
+(:mod:`dahl_ident.diagnostics.error_sources`). Exponents that were assumed, not given, and
+calibrations with a stated uncertainty are parameters with a prior. The estimate is weighted least
+squares with one misfit for all rows (:mod:`dahl_ident.diagnostics.misfit_share`), W its weights.
+Variances follow from restricted maximum likelihood at the estimate
+(:mod:`dahl_ident.diagnostics.variance_components`). With V_k the covariance of source k, priors
+included as rows of unit variance, and
 
-    G = (J' V^-1 J)^-1 J' V^-1,
+    G = (J' W J)^-1 J' W,
 
-the estimate is that of generalised least squares, iterated where the exponent moves, and its
-covariance is the sum of G V_k G' over the sources: the rows of an uncertainty budget
-(JCGM 100:2008). The variances s that weigh the residuals are estimates too, W their covariance: the
-estimate moves by dG/ds_i y = -G V_i P y with each of them, and G V G' is too small by as much,
-because these variances suit the residuals (Kackar and Harville; Kenward and Roger). Both together
-add
+the covariance of the estimate is the sum of G V_k G' over the sources: the rows of an uncertainty
+budget (JCGM 100:2008). Sources widen the estimate and never move it. From five tests on no
+parameter's uncertainty is below that of leaving out each test in turn (the jackknife), and what it
+adds is one more row.
 
-    2 sum_ij W_ij G V_i P V_k P V_j G'
-
-to the row of source k. Source: Searle, Casella and McCulloch, *Variance Components*, 1992; Kenward
-and Roger, Biometrics 53 (1997) 983; Rasmussen and Williams, *Gaussian Processes*, 2006, section
-2.7.
+Source: Searle, Casella and McCulloch, *Variance Components*, 1992; Huber, *Robust Statistics*,
+1981, section 7.6 (the sandwich); Rasmussen and Williams, *Gaussian Processes*, 2006, section 2.7.
 """
 
 from __future__ import annotations
@@ -40,8 +36,10 @@ import numpy as np
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.determined_directions import Basis, chart_of_limit
 from dahl_ident.diagnostics.error_sources import (
+    HARMONICS,
     MODEL_ERROR,
     NOISE,
+    TESTS,
     Source,
     StructuredSources,
     additive,
@@ -49,9 +47,11 @@ from dahl_ident.diagnostics.error_sources import (
     of_one_scale,
     own_errors,
     relative_scatter,
+    rows_of_tests,
     run_deviations,
 )
 from dahl_ident.diagnostics.misfit_explanations import at_an_end, neighbourhood
+from dahl_ident.diagnostics.misfit_share import WeightedEstimate, weighted_estimate
 from dahl_ident.diagnostics.outliers import suspicious_points
 from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.diagnostics.run_deviations import (
@@ -76,9 +76,12 @@ from dahl_ident.problem import Problem
 
 EXPONENT = "exponent"
 DRIVE = "drive factor"
-_STEPS = 6  # linearisations at most; the last counts, settled or not
-_SETTLED = 0.02  # of a standard deviation that an iteration still moves an estimate
-_LONGEST_STEP = 0.7  # of a logarithm, in one iteration: the model is linearised
+_GAIN = "force_gain"
+_STEPS = 6  # expansions about the runs at most; the last counts, settled or not
+_FEWEST_TESTS = 5  # of which each is left out in turn
+_TESTS_THAT_LIMIT = 8  # fewer may agree by chance although the model errs
+_BY_CHANCE = 2.0  # standard deviations
+_SHARED_BY = 4.0  # tests at most that a smooth model error moves alike, of its length
 _ASKED_FOR = {MODEL_ERROR: 0.3, NOISE: 0.5}  # rise of the log-likelihood that a source takes
 _RATE = 0.1  # the same for a force limit that changes with speed
 _SUPPORTED = 4.0  # the same for another kind of noise: 0.5 % of the tables, by chance
@@ -100,7 +103,7 @@ class Assumption(NamedTuple):
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """An estimate that takes every source of error into account, and its covariance by source.
+    """The estimate, and its covariance by every source of error.
 
     Attributes
     ----------
@@ -109,15 +112,17 @@ class ErrorModel:
     problem : Problem
         The same with the assumed exponents free; its `names` order every array here.
     theta : ndarray, shape (Q,)
-        Generalised least squares, search coordinates.
+        Weighted least squares, search coordinates.
+    estimate : WeightedEstimate
+        The same with its weights.
     sources : tuple of Source
         Random errors of the rows, K of them.
     variances : ndarray, shape (K,)
         Of the sources.
     contributions : mapping of str to ndarray, shape (Q, Q)
         Covariance of theta by source, type A first.
-    of_weights : mapping of str to ndarray, shape (Q, Q)
-        What of these the uncertain variances add.
+    tests : int
+        Number of tests, of which each may have been left out.
     assumed : tuple of str
         Names of parameters that were assumed: exponents, the force gain for a drive factor.
     """
@@ -125,13 +130,16 @@ class ErrorModel:
     optimum: Optimum
     problem: Problem
     theta: FloatArray
+    estimate: WeightedEstimate
     sources: tuple[Source, ...]
     components: VarianceComponents
     contributions: Mapping[str, FloatArray]
-    of_weights: Mapping[str, FloatArray]
+    tests: int
     assumed: tuple[str, ...]
     linear: LinearModel
     projection: Projection
+    given: FloatArray
+    """G where the assumed exponents are taken as given, shape (Q, m)."""
     jacobian: FloatArray
     """Derivatives of the residuals of data and priors by theta, shape (M, Q)."""
     near: Linearization
@@ -164,8 +172,16 @@ class ErrorModel:
     @cached_property
     def inverse(self) -> FloatArray:
         """G, shape (Q, m)."""
-        G = self.projection.generalised_inverse()
-        return G if self.basis is None else self.basis.matrix @ G
+        assert self.linear.lever is not None
+        return self._of_theta(self.linear.lever)
+
+    @cached_property
+    def generalised(self) -> FloatArray:
+        """The same of generalised least squares, which predicts what the device departs by."""
+        return self._of_theta(self.projection.generalised_inverse())
+
+    def _of_theta(self, changes: FloatArray) -> FloatArray:
+        return changes if self.basis is None else self.basis.matrix @ changes
 
     @cached_property
     def values(self) -> Mapping[str, float]:
@@ -192,10 +208,9 @@ class ErrorModel:
         """Return the effective degrees of freedom of the uncertainty of direction . theta.
 
         Satterthwaite's: 2 u^4 over the variance of u^2 that the variances' own errors make, no
-        less than 1, u^2 without what these errors add to it. `sources` leaves only these;
-        infinite where all variances are known.
+        less than 1. `sources` leaves only these; infinite where all variances are known.
         """
-        lever = direction @ self.inverse
+        lever = direction @ (self.inverse if sources is None else self.given)
         length = float(np.abs(lever).max()) or 1.0  # any length of the direction will do
         direction, lever = direction / length, lever / length
         shares = np.zeros(len(self.sources))
@@ -204,14 +219,13 @@ class ErrorModel:
                 moved = lever * part if part.ndim == 1 else lever @ part
                 shares[k] = moved @ moved
         spread = float(shares @ self.components.covariance @ shares)
+        counted = self.contributions if sources is None else sources
+        parts = {n: float(direction @ self.contributions[n] @ direction) for n in counted}
+        if TESTS in parts:
+            spread += 2.0 * parts[TESTS] ** 2 / (self.tests - 1)
         if not spread > 0.0:
             return np.inf
-        counted = self.contributions if sources is None else sources
-        total = sum(
-            float(direction @ (self.contributions[n] - self.of_weights[n]) @ direction)
-            for n in counted
-        )
-        return max(1.0, 2.0 * total**2 / spread)
+        return max(1.0, 2.0 * sum(parts.values()) ** 2 / spread)
 
     @property
     def runs_about_optimum(self) -> RunDeviations | None:
@@ -226,7 +240,7 @@ class ErrorModel:
 
         Without the smooth departure from the law itself, which its parameters do not describe.
         """
-        moved = self.near.J @ (self.inverse @ self.linear.y)
+        moved = self.near.J @ (self.generalised @ self.linear.y)
         for source, effect in zip(self.sources, self.projection.effects(), strict=True):
             beside = source.shapes is None or source.shapes.parallel
             if source.name == MODEL_ERROR and beside:
@@ -293,12 +307,19 @@ def with_assumed(given: Problem) -> tuple[Problem, dict[str, Assumption]]:
         if p.assumed and not p.free and p.prior is not None
     }
     u = given.data.drive_factor_uncertainty
-    gain = next(p for p in given.sensors.parameters if p.name == "force_gain")
+    gain = next(p for p in given.sensors.parameters if p.name == _GAIN)
     if u and not gain.free:
         assumed[gain.name] = Assumption(DRIVE, float(u))
     if not assumed:
         return given, {}
-    free = Problem(given.data, given.model, noise=given.noise, sensors=given.sensors, free=assumed)
+    free = Problem(
+        given.data,
+        given.model,
+        noise=given.noise,
+        sensors=given.sensors,
+        free=assumed,
+        steady=given.steady,
+    )
     return free, assumed
 
 
@@ -314,23 +335,9 @@ class _Rows:
             [known.get(p.name, np.log(p.value or 1.0)) for p in problem.parameters]
         )
         self.m = problem.n_residuals
-        self._columns = [names.index(name) for name in assumed]
-        self._select = np.eye(len(names))[self._columns]
-        self._given = np.array([one.std for one in assumed.values()])
-        self._ranges = np.array([one.source == EXPONENT for one in assumed.values()], dtype=bool)
-        self.std = self._given.copy()
-
-    def widen(self, covariance: FloatArray) -> None:
-        """Let ranges count for less where the data say more; `covariance` is that of theta.
-
-        A range is no best guess: where the data alone know the parameter to u, better than its
-        range does to s, an estimate must not be drawn to the middle of the range, so s^2/u takes
-        the place of s.
-        """
-        found = np.diagonal(covariance)[self._columns]
-        by_data = np.sqrt(np.maximum(1.0 / found - 1.0 / self.std**2, 1e-12))  # 1/u
-        wider = np.maximum(self._given, self._given**2 * by_data)
-        self.std = np.where(self._ranges, wider, self._given)
+        columns = [names.index(name) for name in assumed]
+        self._select = np.eye(len(names))[columns]
+        self._std = np.array([one.std for one in assumed.values()])
 
     def at(self, theta: FloatArray, near: Linearization) -> tuple[FloatArray, FloatArray]:
         """Return residuals and Jacobian: data, priors of sensors, ranges of exponents."""
@@ -339,7 +346,7 @@ class _Rows:
             own, by = self._problem.residuals_and_jacobian(theta, tails=False)
             y, J = np.concatenate([y, own[self.m :]]), np.vstack([J, by[self.m :]])
         weight = np.concatenate([row_weights(self._problem), np.ones(len(y) - self.m)])
-        select = self._select / self.std[:, None]
+        select = self._select / self._std[:, None]
         y = np.concatenate([y * weight, select @ (theta - self.start)])
         return y, np.vstack([J * weight[:, None], select])
 
@@ -357,32 +364,46 @@ def _estimated(
     optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumption], determined: bool
 ) -> ErrorModel:
     rows = _Rows(optimum, problem, assumed)
-    theta, m = rows.start, rows.m
+    m = rows.m
     basis = None
     if not determined:
         chart = chart_of_limit(optimum, problem)
-        basis = Basis.of(rows.at(theta, linearization(problem, theta))[1], theta, chart)
+        first = rows.at(rows.start, linearization(problem, rows.start))
+        basis = Basis.of(first[1], rows.start, chart)
+    dof = problem.n_numbers - len(problem.names)
+    extra = len(problem.priors) + len(assumed)
+    estimate = weighted_estimate(
+        problem,
+        lambda theta: rows.at(theta, linearization(problem, theta)),
+        rows.start,
+        dof + extra * problem.scale_known,
+        basis,
+    )
+    theta = estimate.theta
+    if basis is not None:
+        basis = basis.at(theta)
     noise: tuple[Source, ...] | None = None
     apart = False  # whether gain and phase have errors of their own size
-    dof = problem.n_numbers - len(problem.names)
     shared = StructuredSources(problem, theta) if _tells(problem, assumed) else None
     starts: dict[tuple[int, ...] | None, FloatArray] = {}
     runs: RunDeviations | None = None
-    for step in range(_STEPS):
+    for _ in range(_STEPS):
         near = linearization(problem, theta, runs)
-        y, J = rows.at(theta, near)
+        y, whole = rows.at(theta, near)
         if not np.isfinite(y).all():
             raise np.linalg.LinAlgError("a drive beyond the force limit has no steady response")
         level = float(y[:m] @ y[:m]) / max(dof, 1)
         rest = () if shared is None else shared.at(theta, near, apart=apart)
-        whole = J
-        if basis is not None:
-            basis = basis.at(theta)
-            J = J @ basis.matrix
-        scatter = relative_scatter(problem, theta) if rest and m <= 2 * _FEW_ROWS else ()
-        plain = (*of_one_scale(problem, beside=bool(scatter)), *scatter)
-        sources, linear, found = _supported(problem, y, J, noise or plain, rest, level, starts)
-        if noise is None and step == 1:
+        J = whole if basis is None else whole @ basis.matrix
+        lever = estimate.lever(J)
+        plain = of_one_scale(problem)
+        if rest and m <= 2 * _FEW_ROWS:
+            scatter = relative_scatter(problem, theta)
+            plain = (*of_one_scale(problem, beside=bool(scatter)), *scatter)
+        sources, linear, found = _supported(
+            problem, y, J, lever, noise or plain, rest, level, starts
+        )
+        if noise is None:
             noise = plain
             if rest and m <= 2 * _FEW_ROWS:
                 scales = of_one_scale(problem, beside=True)
@@ -394,42 +415,95 @@ def _estimated(
                     _noise_and_own_errors(optimum, plain),
                 )
                 noise, sources, linear, found = _kind_of_noise(
-                    problem, y, J, (sources, linear, found), level, (plain, *kinds)
+                    problem, y, J, lever, (sources, linear, found), level, (plain, *kinds)
                 )
                 apart = noise is kinds[0]
-            # far from the optimum all sources may have been led to a lower maximum
-            starts = {k: s for k, s in starts.items() if k is not None and noise is plain}
+                starts = starts if noise is plain else {}
         projection = Projection(linear, found.variances)
-        G = inverse = projection.generalised_inverse()
-        covariance = projection.covariance()
-        if basis is not None:
-            G, covariance = basis.matrix @ G, basis.matrix @ covariance @ basis.matrix.T
-        move = -G @ linear.y
-        std = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))  # below zero by rounding
         before, runs = runs, run_deviations(problem, sources, projection.effects())
-        settled = step > 1 and bool(np.all(np.abs(move) < _SETTLED * std))
-        if step == _STEPS - 1 or (settled and alike(before, runs)):
+        if runs is not None:  # these are about the estimate that V weighs
+            move = projection.generalised_inverse() @ linear.y
+            move = move if basis is None else basis.matrix @ move
+            runs = runs.about(move, range(len(theta)))
+        if alike(before, runs):
             break
-        rows.widen(covariance)
-        if basis is None:
-            theta = theta + move * _shortened(move)
-        else:
-            theta = basis.moved(theta, -inverse @ linear.y, _shortened)
-        theta = np.clip(theta, *problem.bounds())
-    parts = [
-        _by_source(problem, assumed, sources, linear, found, lever)
-        for lever in (G[None], _by_variances(linear, found, projection, G))
-    ]
-    contributions = {name: own + parts[1][name] for name, own in parts[0].items()}
+    assert linear.lever is not None
+    G = given = linear.lever if basis is None else basis.matrix @ linear.lever
+    contributions = _by_source(problem, assumed, sources, linear, found, G)
+    tests = rows_of_tests(problem.data)
+    if basis is None:
+        by_tests = estimate.jackknife(whole, y, tests, problem.bounds())
+        wide = np.ones(len(theta))
+        if len(tests) >= _TESTS_THAT_LIMIT and MODEL_ERROR in contributions:
+            wide = _at_most(contributions[MODEL_ERROR], _SHARED_BY * by_tests)
+            contributions[MODEL_ERROR] *= np.outer(wide, wide)
+        ranged = [i for i, n in enumerate(problem.names) if n in assumed and n != _GAIN]
+        if ranged:
+            kept = [i for i in range(len(theta)) if i not in ranged]
+            given = np.zeros(G.shape)
+            given[kept] = linear.turned(estimate.lever(whole[:, kept]))
+            others = _by_source(problem, assumed, sources, linear, found, given)
+            if MODEL_ERROR in others:
+                others[MODEL_ERROR] *= np.outer(wide, wide)
+            contributions = _with_exponents(contributions, others)
+        moved = _by_harmonics(problem, estimate, y, whole)
+        if moved.any():
+            contributions[HARMONICS] = np.outer(moved, moved)
+        if len(tests) >= _FEWEST_TESTS:
+            by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
+            contributions = _at_least(contributions, by_chance**2 * by_tests)
     return ErrorModel(
-        optimum, problem, theta, sources, found, contributions, parts[1], tuple(assumed), linear,
-        projection, whole, near, runs, basis,
+        optimum, problem, theta, estimate, sources, found, contributions, len(tests),
+        tuple(assumed), linear, projection, given, whole, near, runs, basis,
     )  # fmt: skip
 
 
-def _shortened(move: FloatArray) -> float:
-    """Return the part of a move that an iteration makes."""
-    return min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
+def _with_exponents(
+    contributions: dict[str, FloatArray], given: dict[str, FloatArray]
+) -> dict[str, FloatArray]:
+    """Return what each source does at given exponents, and what they do that are not given."""
+    whole, others = (np.asarray(sum(parts.values())) for parts in (contributions, given))
+    return {**given, EXPONENT: given.get(EXPONENT, 0.0) + _positive(whole - others)}
+
+
+def _positive(C: FloatArray) -> FloatArray:
+    """Return the part of a symmetric matrix that is a covariance."""
+    values, vectors = np.linalg.eigh(C)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def _at_most(C: FloatArray, most: FloatArray) -> FloatArray:
+    """Return the factors of parameters' uncertainties that bring C to `most` where it is more."""
+    own, most = np.diagonal(C), np.diagonal(most)
+    return np.sqrt(np.divide(most, own, out=np.ones(len(own)), where=own > most))
+
+
+def _by_harmonics(
+    problem: Problem, estimate: WeightedEstimate, y: FloatArray, J: FloatArray
+) -> FloatArray:
+    """Return how far harmonics move theta from the fundamentals' estimate, beyond chance, (Q,)."""
+    m = problem.n_residuals
+    kept = np.concatenate([np.repeat(problem.data.harmonic == 1, 2), np.ones(len(y) - m, bool)])
+    if kept.all() or 2 * (problem.data.harmonic == 1).sum() <= len(problem.names):
+        return np.zeros(J.shape[1])
+    own = estimate.lever(J, kept)
+    lever = own - estimate.lever(J)
+    noise = np.ones(len(y))
+    if not problem.scale_known:
+        noise[:m] /= estimate.factors[0, 0, 0]
+    moved, chance = own @ y, np.linalg.norm(lever * noise, axis=1)
+    return np.where(np.abs(moved) > _BY_CHANCE * chance, moved, 0.0)
+
+
+def _at_least(contributions: dict[str, FloatArray], least: FloatArray) -> dict[str, FloatArray]:
+    """Return the contributions with one more where they are below the `least` covariance."""
+    C = np.asarray(sum(contributions.values()))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        wider = np.sqrt(np.maximum(np.diagonal(least) / np.diagonal(C), 1.0))
+    wider = np.where(np.isfinite(wider), wider, 1.0)
+    if not (wider > 1.0).any():
+        return contributions
+    return {**contributions, TESTS: _positive(C * np.outer(wider, wider) - C)}
 
 
 def _noise_and_own_errors(optimum: Optimum, noise: tuple[Source, ...]) -> tuple[Source, ...]:
@@ -451,7 +525,11 @@ _Found = tuple[tuple[Source, ...], LinearModel, VarianceComponents]
 
 
 def linear_model(
-    problem: Problem, y: FloatArray, J: FloatArray, sources: tuple[Source, ...]
+    problem: Problem,
+    y: FloatArray,
+    J: FloatArray,
+    sources: tuple[Source, ...],
+    lever: FloatArray | None = None,
 ) -> tuple[LinearModel, Likelihood]:
     """Return residuals of data and priors with the sources' columns, compressed if many.
 
@@ -464,7 +542,7 @@ def linear_model(
     # an error of the response is one of its weighted residual; noise of one scale is that of these
     Z = [z if z.ndim == 1 else weight[:, None] * z for z in Z]
     Z = [np.concatenate([z, np.zeros((extra, *z.shape[1:]))]) for z in Z]
-    linear = LinearModel(y, J, known, Z)
+    linear = LinearModel(y, J, known, Z, lever)
     fewer = linear.compressed(m) if m > 2 * _FEW_ROWS else linear
     return fewer, likelihood(linear if any(s.columns.ndim == 3 for s in sources) else fewer)
 
@@ -473,6 +551,7 @@ def _supported(
     problem: Problem,
     y: FloatArray,
     J: FloatArray,
+    lever: FloatArray,
     noise: tuple[Source, ...],
     rest: tuple[Source, ...],
     level: float,
@@ -484,7 +563,7 @@ def _supported(
     estimated last; these ones take their place.
     """
     every = (*noise, *rest)
-    linear, contrasts = linear_model(problem, y, J, every)
+    linear, contrasts = linear_model(problem, y, J, every, lever)
     upper = np.array([s.largest for s in every])
     scales = np.array([s.columns.ndim == 1 and not problem.scale_known for s in every])
     floor = np.where(scales, level, 0.0)
@@ -532,6 +611,7 @@ def _kind_of_noise(
     problem: Problem,
     y: FloatArray,
     J: FloatArray,
+    lever: FloatArray,
     found: _Found,
     level: float,
     kinds: Sequence[tuple[Source, ...]],
@@ -546,7 +626,7 @@ def _kind_of_noise(
         if not trial:
             continue
         sources = (*trial, *rest)
-        linear, contrasts = linear_model(problem, y, J, sources)
+        linear, contrasts = linear_model(problem, y, J, sources, lever)
         own = np.array([s.columns.ndim == 1 for s in sources])
         upper = np.array([s.largest for s in sources])
         other = variance_components(contrasts, np.where(own, level, 0.0), upper)
@@ -561,35 +641,23 @@ def _by_source(
     sources: tuple[Source, ...],
     linear: LinearModel,
     found: VarianceComponents,
-    levers: FloatArray,
+    lever: FloatArray,
 ) -> dict[str, FloatArray]:
-    """Return the covariance of theta that each source makes by levers (k, Q, m) of residuals."""
+    """Return the covariance of theta that each source makes by the lever (Q, m) of residuals."""
     result = {}
     priors = [_CALIBRATIONS.get(name, name) for name in problem.priors]
     known = [*priors, *(one.source for one in assumed.values())]
     m = len(linear.y) - len(known)
     if problem.scale_known:
-        result[NOISE] = _squared(levers[..., :m])
+        result[NOISE] = _squared(lever[:, :m])
     for source, part, variance in zip(sources, linear.Z, found.variances.tolist(), strict=True):
-        own = variance * _squared(levers * part if part.ndim == 1 else levers @ part)
+        own = variance * _squared(lever * part if part.ndim == 1 else lever @ part)
         result[source.name] = result[source.name] + own if source.name in result else own
     for row, name in enumerate(known, start=m):
-        own = _squared(levers[..., row : row + 1])
+        own = _squared(lever[:, row : row + 1])
         result[name] = result[name] + own if name in result else own
     return result
 
 
-def _squared(levers: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("kqi,kpi->qp", levers, levers))
-
-
-def _by_variances(
-    linear: LinearModel, found: VarianceComponents, projection: Projection, G: FloatArray
-) -> FloatArray:
-    """Return what uncertain variances do, as levers (k, Q, m) of independent errors."""
-    through = [G * part**2 if part.ndim == 1 else (G @ part) @ part.T for part in linear.Z]
-    size = np.sqrt(np.diagonal(found.covariance))
-    size = np.where(size > 0.0, size, 1.0)
-    values, vectors = np.linalg.eigh(found.covariance / np.outer(size, size))
-    roots = size[:, None] * vectors * np.sqrt(2.0 * np.maximum(values, 0.0))
-    return np.asarray(np.einsum("ik,iqm->kqm", roots, np.array(through)) @ projection.P)
+def _squared(lever: FloatArray) -> FloatArray:
+    return np.asarray(lever @ lever.T)

@@ -30,6 +30,8 @@ MODEL_ERROR = "model error"
 RUNS = "scatter between runs"
 LEVELS = "scatter between repeated levels"
 APART = "suspicious points"
+TESTS = "jackknife over tests"
+HARMONICS = "model error of harmonics"
 
 _LENGTH = 1.0  # of the model error, in ln A and ln omega
 _MOST_PLACES = 200  # rows beyond which a column for each costs seconds, cubic in their number
@@ -43,6 +45,7 @@ _MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it l
 _LEAST_RATE_RANGE = np.log(2.0)  # of frequency, that tells speed from amplitude
 _MOST_LEVEL_NOISE = 0.05  # of ln A: sensors scatter less; more of it would hide a wrong model
 _MOST_UNDERSTATED = 3.0  # true standard deviation over the stated one
+_FEWEST_TESTS = 3  # runs, or labelled levels, that count as tests
 _FEWEST = 2  # runs, or repeated levels, that show a scatter
 
 
@@ -408,6 +411,20 @@ def repeated_levels(data: FrequencyResponse) -> NDArray[np.intp]:
             held[rows] = column[rows]
     frequency = _agreeing(np.log(data.frequency_hz), np.zeros(data.n, dtype=np.intp))
     return _agreeing(np.log(held), 2 * frequency + driven)
+
+
+def rows_of_tests(data: FrequencyResponse) -> list[NDArray[np.intp]]:
+    """Return the rows of each test: runs, else labelled levels, else repeats of one level."""
+    for labels in (data.run, data.level):
+        if labels is not None:
+            names, which = np.unique(labels, return_inverse=True)
+            if _FEWEST_TESTS <= len(names) < data.n:
+                return _rows_of(which)
+    return _rows_of(repeated_levels(data))
+
+
+def _rows_of(which: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    return np.split(np.argsort(which, kind="stable"), np.cumsum(np.bincount(which))[:-1])
 
 
 def _agreeing(x: FloatArray, groups: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -491,7 +491,13 @@ def _scatter(optimum: Optimum) -> Scatter | None:
     problem = optimum.problem
     if problem.noise == "measured" or problem.data.covariance is None or optimum.dof <= 0:
         return None
-    known = Problem(problem.data, problem.model, noise="measured", sensors=problem.sensors)
+    known = Problem(
+        problem.data,
+        problem.model,
+        noise="measured",
+        sensors=problem.sensors,
+        steady=problem.steady,
+    )
     y, _ = known.residuals_and_jacobian(optimum.theta, tails=False)
     return Scatter(float(np.sqrt(y @ y / optimum.dof)))
 
@@ -528,7 +534,14 @@ def _is_exponent(parameter: Parameter) -> bool:
 def _by_alpha(optimum: Optimum, name: str) -> ComplexArray:
     """Return the relative change of the response with ln alpha, sensors and drive included."""
     given = optimum.problem
-    freed = Problem(given.data, given.model, noise=given.noise, sensors=given.sensors, free=[name])
+    freed = Problem(
+        given.data,
+        given.model,
+        noise=given.noise,
+        sensors=given.sensors,
+        free=[name],
+        steady=given.steady,
+    )
     theta = np.zeros(len(freed.names))
     known = dict(zip(optimum.names, optimum.theta, strict=True))
     for i, parameter in enumerate(freed.parameters):

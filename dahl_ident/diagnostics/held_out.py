@@ -29,9 +29,8 @@ from numpy.typing import NDArray
 from scipy import special
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.error_model import ErrorModel, row_weights
-from dahl_ident.diagnostics.error_sources import repeated_levels
+from dahl_ident.diagnostics.error_sources import rows_of_tests
 
 FEWEST_TESTS = 3  # two leave one from which to predict, which shows no scatter
 _MOST_TESTS = 500  # left out one at a time: the share inside is then known to 1 %
@@ -146,17 +145,3 @@ def held_out(errors: ErrorModel) -> HeldOut | None:
     found = (np.concatenate(column) for column in zip(*parts, strict=True))
     rows, deviation, std, dof = found
     return HeldOut(rows, np.concatenate(owner), deviation, std, dof, len(tests))
-
-
-def rows_of_tests(data: FrequencyResponse) -> list[NDArray[np.intp]]:
-    """Return the rows of each test: runs, else labelled levels, else repeats of one level."""
-    for labels in (data.run, data.level):
-        if labels is not None:
-            names, which = np.unique(labels, return_inverse=True)
-            if FEWEST_TESTS <= len(names) < data.n:
-                return _rows_of(which)
-    return _rows_of(repeated_levels(data))
-
-
-def _rows_of(which: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    return np.split(np.argsort(which, kind="stable"), np.cumsum(np.bincount(which))[:-1])

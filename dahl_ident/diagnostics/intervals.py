@@ -24,11 +24,12 @@ Where the noise's scale was estimated, thresholds are those of Student's t and F
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.budget import coverage_factor
@@ -46,6 +47,8 @@ from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Optimum
 
 Method = Literal["combined", "wald", "profile", "bootstrap"]
+_BY_FACTOR = 0.2  # u of a logarithm, above which an interval is a factor either way
+_LARGE = 0.1  # the same from noise alone, above which a side may be open
 _ROUNDING = 1e-9  # relative difference of limits that no one sees
 METHODS: tuple[Method, ...] = get_args(Method)
 
@@ -199,55 +202,74 @@ def profile_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> Con
 
 
 def combined_intervals(
-    profile: ConfidenceIntervals, optimum: Optimum, errors: ErrorModel | None
+    optimum: Optimum,
+    errors: ErrorModel,
+    levels: Sequence[float],
+    profile: Callable[[], ConfidenceIntervals],
 ) -> ConfidenceIntervals:
-    """Return intervals that count every source of error.
+    """Return intervals that count every source of error: value -+ k u.
+
+    Of a positive parameter whose u is above 20 %, value times or over exp(k u).
 
     Parameters
     ----------
-    profile : ConfidenceIntervals
-        Of the same optimum from noise alone, for the intervals' shape: each side is as much
-        longer than k u as the profile's is longer than its first-order length.
     optimum : Optimum
-        The least-squares fit.
-    errors : ErrorModel or None
-        Its sources of error; None leaves the profile.
+        The search's result.
+    errors : ErrorModel
+        The estimate and its sources of error.
+    levels : sequence of float
+        Confidence levels.
+    profile : callable
+        Returns the profile intervals, which are open where noise alone sets no limit; asked for
+        where noise alone is large.
 
     Returns
     -------
     ConfidenceIntervals
-        Around the estimates of the error model.
+        Around the estimates.
     """
-    if errors is None:
-        return replace(profile, method="combined")
-    levels = profile.levels
+    array = checked_levels(levels)
     held = np.array([errors.holds(name) for name in optimum.names])
-    noise = thresholds(optimum, levels)[:, None] * np.sqrt(np.diagonal(optimum.covariance))
     place = [errors.names.index(name) for name in optimum.names]
-    directions = np.eye(len(errors.names))[place]
     u = np.sqrt(np.maximum(np.diagonal(errors.covariance)[place], 0.0))
     dof = np.array(
-        [errors.dof(d) if known else np.inf for d, known in zip(directions, held, strict=True)]
+        [
+            errors.dof(d) if known else np.inf
+            for d, known in zip(np.eye(len(errors.names))[place], held, strict=True)
+        ]
     )
-    k = np.array([[coverage_factor(nu, level) for nu in dof] for level in levels.tolist()])
-    theta = errors.theta[place]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        below = (optimum.theta - _search(optimum, profile.lower)) / noise
-        above = (_search(optimum, profile.upper) - optimum.theta) / noise
-    below, above = (np.where(np.isnan(side), 1.0, side) for side in (below, above))
-    found = intervals_from_search(
-        optimum, "combined", levels, theta - k * u * below, theta + k * u * above
-    )
+    k = np.array([[coverage_factor(nu, level) for nu in dof] for level in array.tolist()])
+    theta, positive = errors.theta[place], logarithmic(optimum)
+    values = errors.problem.to_values(errors.theta)[place]
+    narrow = positive & (u <= _BY_FACTOR)
+    half = k * u
+    low, high = optimum.problem.bounds()
+    with np.errstate(over="ignore", invalid="ignore"):
+        ends = [
+            np.where(
+                narrow,
+                values * (1.0 + sign * half),
+                optimum.problem.to_values(np.clip(theta + sign * half, low, high)),
+            )
+            for sign in (-1.0, 1.0)
+        ]
+    least, most = (optimum.problem.to_values(bound) for bound in (low, high))
+    lower, upper = np.maximum(ends[0], least), np.minimum(ends[1], most)
+    by_noise = np.sqrt(np.diagonal(optimum.covariance))
+    doubtful = ~held | ~(by_noise <= _LARGE)
+    if doubtful.any():
+        shape = profile()
+        values = np.where(held, values, shape.estimate)
+        open_below, open_above = (
+            doubtful & (~held | (np.isinf(end) | (positive & (end == 0.0))))
+            for end in (shape.lower, shape.upper)
+        )
+        lower = np.where(open_below, shape.lower, lower)
+        upper = np.where(open_above, shape.upper, upper)
     shown = listed([f"{nu:.3g}" for nu in np.where(dof < MANY, dof, np.inf)[held]])
     note = f"every source of the budget: t with {shown} degrees of freedom"
-    estimate = errors.problem.to_values(errors.theta)[place]
-    return replace(
-        found,
-        estimate=np.where(held, estimate, profile.estimate),
-        lower=np.where(held, found.lower, profile.lower),
-        upper=np.where(held, found.upper, profile.upper),
-        note=note,
-    )
+    units = tuple(p.unit for p in optimum.problem.parameters)
+    return ConfidenceIntervals("combined", array, optimum.names, units, values, lower, upper, note)
 
 
 def intervals_from_search(
@@ -365,8 +387,13 @@ def compare(
     return IntervalComparison(tuple(intervals), tuple(found))
 
 
+def logarithmic(optimum: Optimum) -> NDArray[np.bool_]:
+    """Return which parameters are positive."""
+    return np.array([p.transform == "log" for p in optimum.problem.parameters])
+
+
 def _search(optimum: Optimum, values: FloatArray) -> FloatArray:
     """Return search coordinates, infinite where a value has none."""
-    positive = np.array([p.transform == "log" for p in optimum.problem.parameters])
+    positive = logarithmic(optimum)
     with np.errstate(divide="ignore"):
         return np.where(positive, np.log(np.where(positive, values, 1.0)), values)

@@ -149,4 +149,6 @@ def _misfit(problem: Problem, fitted: ComplexArray) -> FloatArray:
 
 
 def _alike(problem: Problem, data: FrequencyResponse) -> Problem:
-    return Problem(data, problem.model, noise=problem.noise, sensors=problem.sensors)
+    return Problem(
+        data, problem.model, noise=problem.noise, sensors=problem.sensors, steady=problem.steady
+    )

@@ -12,6 +12,7 @@ from dahl_ident.data.row_names import row_names
 from dahl_ident.diagnostics.formatting import percent, with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.plausible_units import implausible_units
+from dahl_ident.diagnostics.steady_motion import steady_difference
 from dahl_ident.diagnostics.third_harmonic import third_harmonic_share
 from dahl_ident.elements import Element
 from dahl_ident.fitting import Optimum
@@ -19,6 +20,7 @@ from dahl_ident.fitting.status import Status
 from dahl_ident.units import shown_unit
 
 _LEVEL = 1e-3  # false-alarm rate, low: such a fit is called physically impossible
+_OFF = 0.02  # relative error of a prediction: as large as a good measurement's
 _HARMONIC_SHARE = 0.1  # of the fundamental; describing functions assume a pure sine
 
 
@@ -37,9 +39,21 @@ def physical_warnings(optimum: Optimum, scatter: float = 0.0) -> Iterator[str]:
 
 def _not_a_sine(optimum: Optimum) -> Iterator[str]:
     """Yield where the motion of a driven plant is far from the sine that is assumed."""
+    problem = optimum.problem
+    if problem.is_exact or not (problem.data.controlled == "force").any():
+        return
+    found = steady_difference(optimum)
+    if found is not None:
+        if found[1] > _OFF:
+            (name,) = row_names(problem.data, [found[0]])
+            yield (
+                "the describing function, which takes the motion for a sine, is "
+                f"{percent(found[1])} off at {name}: fit with steady='exact'"
+            )
+        return
     share = third_harmonic_share(optimum)
     if share.size and share.max() > _HARMONIC_SHARE:
-        data = optimum.problem.data
+        data = problem.data
         (name,) = row_names(data, [int(np.flatnonzero(data.controlled == "force")[share.argmax()])])
         yield (
             f"the displacement's third harmonic is predicted to be {percent(share.max())} of "

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.error_model import ErrorModel, relative_units, row_weights
-from dahl_ident.diagnostics.error_sources import APART, NOISE, Source, places
+from dahl_ident.diagnostics.error_sources import APART, NOISE, TESTS, Source, places
 from dahl_ident.problem import Problem
 
 _LEAST_DOF = 1.0  # with fewer, quantiles of Student's t are beyond all use
@@ -76,7 +76,7 @@ def prediction_error(
         here.append(changes)
         if changes is not None:
             c += variance * changes @ part.T
-    lever = c @ errors.projection.P - _parts(slopes) @ errors.inverse  # (n, 2, m)
+    lever = c @ errors.projection.P - _parts(slopes) @ errors.generalised  # (n, 2, m)
     covariance = (lever * errors.linear.known) @ lever.swapaxes(1, 2)
     squares = np.zeros((len(errors.sources), n))
     for k, (source, part, changed) in enumerate(
@@ -90,6 +90,9 @@ def prediction_error(
             own = own + _own(source, errors, slopes)
         squares[k] = np.trace(own, axis1=1, axis2=2)
         covariance += errors.variances[k] * own
+    if TESTS in errors.contributions:
+        parts = _parts(slopes)
+        covariance += parts @ errors.contributions[TESTS] @ parts.swapaxes(1, 2)
     total = np.trace(covariance, axis1=1, axis2=2)
     if of_a_test:
         near = _nearest(errors.problem, amplitude, omega)

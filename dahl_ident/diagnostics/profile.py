@@ -38,6 +38,7 @@ from dahl_ident.problem import Quadratic
 _STEPS = 60  # of the searches for limits, all together
 _SEARCH_STEPS = 40  # of a constrained search
 _TOLERANCE_FACTOR = 1e5  # still gives the deviance, flat at its minimum, to 1e-6
+_SAME_DEVIANCE = 0.1  # relative difference: 5 % of the distance to a limit
 _ENOUGH = 1e-8  # fall of the cost at which a search along a flat valley ends
 _LONGEST = 3.0  # step of a logarithm
 _FARTHEST = 1e6  # conditional standard errors of a parameter that is no logarithm
@@ -55,6 +56,7 @@ class Profiler:
 
     def __init__(self, optimum: Optimum) -> None:
         self._optimum, self._problem = optimum, optimum.problem
+        self._searched = self._problem.near(optimum.theta)
         self._scale = 1.0 if optimum.scale_known else optimum.scale
         self._loss = loss_named(optimum.loss)
         self._logarithmic = np.array([p.transform == "log" for p in self._problem.parameters])
@@ -77,8 +79,32 @@ class Profiler:
                 ends[side[search], level[search], index[search]] = self._ends(
                     index[search], 2.0 * side[search] - 1.0, thresholds[level[search]]
                 )
+                if self._searched is not self._problem and not self._agrees(ends):
+                    self._searched = self._problem
+                    del self._at_optimum
+                    return self.limits(thresholds)
             lower, upper = ends
         return lower, upper
+
+    def _agrees(self, ends: FloatArray) -> bool:
+        """Return whether the exact steady motion has the same deviance at the widest limits.
+
+        Limits are searched with a prediction near the optimum that is far cheaper.
+        """
+        P, far = len(self._optimum.theta), ends[:, np.argmax(ends[1].max(axis=1))]
+        place, index = far.ravel(), np.tile(np.arange(P), 2)
+        known = np.isfinite(place)
+        index, moved = index[known], (place - self._optimum.theta[np.tile(np.arange(P), 2)])[known]
+        if not index.size:
+            return True
+        theta = self._optimum.theta + moved[:, None] * self._tangents[index]
+        near, exact = (
+            p.quadratic(theta, self._scale, self._loss).cost
+            for p in (self._searched, self._problem)
+        )
+        with np.errstate(invalid="ignore"):
+            apart = np.abs(exact - near) > _SAME_DEVIANCE * np.abs(near - self._least)
+        return not (apart | ~np.isfinite(exact)).any()
 
     def _ends(self, index: IntArray, sign: FloatArray, target: FloatArray) -> FloatArray:
         """Return where the profile of parameter `index` meets `target` on the side of `sign`."""
@@ -190,10 +216,11 @@ class Profiler:
             tolerance_factor=_TOLERANCE_FACTOR,
             enough=_ENOUGH,
             steps=_SEARCH_STEPS,
+            accuracy=self._problem.accuracy,
         ).theta
 
     def _quadratic(self, theta: FloatArray) -> Quadratic:
-        return self._problem.quadratic(theta, self._scale, self._loss)
+        return self._searched.quadratic(theta, self._scale, self._loss)
 
     @cached_property
     def _least(self) -> float:

@@ -124,7 +124,8 @@ def record_errors(
     beyond = between_blocks(white, left, covariance, len(problem.free))
     if beyond is not None:
         found[MODEL] = beyond
-    scatter = between_records(white, left, np.asarray(sum(found.values())), len(problem.free))
+    so_far = np.asarray(sum(found.values()))
+    scatter = between_records(white, left, so_far, len(problem.free), problem.runs)
     if scatter is not None:
         found[RUNS] = scatter
     exponents = assumed_exponents(problem, values, white, left)
@@ -158,7 +159,7 @@ def record_errors(
         found[FORCE] = factor**2 * np.outer(scale, scale)
     else:
         exact.insert(0, FORCE)
-    return RecordErrors(found, effective, tuple(exact), len(problem.records), exponents)
+    return RecordErrors(found, effective, tuple(exact), len(set(problem.runs)), exponents)
 
 
 def _beyond(larger: FloatArray, known: FloatArray, unit: FloatArray) -> FloatArray:

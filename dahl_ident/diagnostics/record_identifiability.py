@@ -14,6 +14,7 @@ from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.record_errors import MODEL
 from dahl_ident.elements import Model
 from dahl_ident.elements.recursion import stretches
+from dahl_ident.units import si_unit
 
 _UNCERTAIN = 0.3  # relative standard uncertainty of a parameter that is not determined
 _LONG_ENOUGH = 0.02  # share of samples near a reversal
@@ -55,6 +56,7 @@ def undetermined(
     """
     found = []
     paths = [stretches(r.displacement) for r in records if r.displacement is not None]
+    unit = si_unit("displacement", records[0].motion if records else "translation")
     farthest = max((float(p.path.max()) for p in paths), default=np.nan)
     for element in model.elements:
         values = [np.asarray(p.value if p.value is not None else 0.0) for p in element.parameters]
@@ -78,15 +80,15 @@ def undetermined(
             elif element.has_memory and farthest < 2.0 * low:
                 # an estimate within its own uncertainty of zero says nothing of where slip begins
                 known = error < abs(float(parameter.value or 0.0))
-                needs = f"{2.0 * high:.2g} m" if known else "more"
+                needs = f"{2.0 * high:.2g} {unit}" if known else "more"
                 found.append(
-                    f"{start}: the motion moves no farther than {farthest:.2g} m after a "
+                    f"{start}: the motion moves no farther than {farthest:.2g} {unit} after a "
                     f"reversal, and slip needs {needs}; move farther."
                 )
             elif element.has_memory and near < _LONG_ENOUGH:
                 found.append(
-                    f"{start}: the motion never stays below x_c = {low:.2g} m long enough; add "
-                    "reversals and small motions of that size, sampled closely."
+                    f"{start}: the motion never stays below x_c = {low:.2g} {unit} long enough; "
+                    "add reversals and small motions of that size, sampled closely."
                 )
             elif mostly.get(parameter.name) in _BECAUSE:
                 found.append(f"{start} because {_BECAUSE[mostly[parameter.name]]}.")

@@ -230,15 +230,25 @@ def between_blocks(
 
 
 def between_records(
-    jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray], known: FloatArray, count: int
+    jacobians: Sequence[FloatArray],
+    residuals: Sequence[FloatArray],
+    known: FloatArray,
+    count: int,
+    runs: Sequence[int],
 ) -> FloatArray | None:
     """Return the covariance between records beyond the `known` one, or None; see above.
 
-    The deviations of a whole record count once, however many samples it has.
+    The deviations of a whole record count once, however many samples it has, and in however many
+    parts it is: `runs` says which record each part is of.
     """
-    if len(residuals) < 2:
+    if len(set(runs)) < 2:
         return None
-    return _beyond(list(zip(jacobians, residuals, strict=True)), known, count, _RUNS_LEVEL)
+    whole: list[tuple[FloatArray, FloatArray]] = []
+    for run in sorted(set(runs)):
+        own = [i for i, other in enumerate(runs) if other == run]
+        J, e = ([parts[i] for i in own] for parts in (jacobians, residuals))
+        whole.append((J[0], e[0]) if len(own) == 1 else (np.concatenate(J), np.concatenate(e)))
+    return _beyond(whole, known, count, _RUNS_LEVEL)
 
 
 def _beyond(

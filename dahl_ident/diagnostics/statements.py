@@ -21,6 +21,7 @@ from dahl_ident.diagnostics.formatting import listed, p_text, percent, with_unit
 from dahl_ident.diagnostics.goodness import Goodness
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.parameters import parameter_values
+from dahl_ident.diagnostics.steady_motion import steady_statements
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Identifiability
 from dahl_ident.fitting import Optimum
@@ -83,7 +84,8 @@ def statements(fit: Judged) -> tuple[str, ...]:
     goodness, known = fit.goodness, fit.identifiability
     if status is VerdictStatus.TRUSTED:
         first = f"Trusted. {known.headline} {goodness.headline}"
-        return (first, *doubted(data.provenance), *assumptions(fit.optimum, fit.errors))
+        taken = steady_statements(fit.optimum)
+        return (first, *taken, *doubted(data.provenance), *assumptions(fit.optimum, fit.errors))
     if status is VerdictStatus.APPROXIMATE:
         found = list(goodness.statements)
         if goodness.described in found and goodness.objections:
@@ -91,10 +93,14 @@ def statements(fit: Judged) -> tuple[str, ...]:
             misfit = f"misfit of {percent(goodness.rms_misfit)} rms"
             found.insert(0, f"The stated uncertainties include a {misfit}: {goodness.departures}.")
         first, *others = (*found, *_reservations(fit), known.headline)
-        said = (*others, *_slight(fit), *_checked(fit), *doubted(data.provenance))
+        said = (
+            *others, *_slight(fit), *_checked(fit), *steady_statements(fit.optimum),
+            *doubted(data.provenance),
+        )  # fmt: skip
         return (f"Approximate. {first}", *said, *assumptions(fit.optimum, fit.errors))
     first, *others = _objections(fit)
-    return (f"{status.capitalize()}. {first}", *others, *doubted(data.provenance))
+    taken = steady_statements(fit.optimum)
+    return (f"{status.capitalize()}. {first}", *others, *taken, *doubted(data.provenance))
 
 
 def doubted(*provenances: Mapping[str, Any] | None) -> Iterator[str]:
@@ -233,11 +239,9 @@ def _moved_by_outliers(fit: Judged) -> Iterator[str]:
     optimum, errors = fit.optimum, fit.errors
     if optimum.loss != "linear" or errors is None:
         return
-    robust = _robust_values(errors, optimum.scale)
+    robust, by_noise = _robust_values(errors, optimum.scale)
     moved = [
-        name
-        for name in optimum.names
-        if abs(robust[name] - errors.values[name]) > errors.stderr[name]
+        name for name in optimum.names if abs(robust[name] - errors.values[name]) > by_noise[name]
     ]
     if moved:
         named = "; ".join(point.name for point in fit.goodness.suspicious[:5])
@@ -248,33 +252,47 @@ def _moved_by_outliers(fit: Judged) -> Iterator[str]:
         )
 
 
-def _robust_values(errors: ErrorModel, scale: float) -> Mapping[str, float]:
+def _robust_values(
+    errors: ErrorModel, scale: float
+) -> tuple[Mapping[str, float], Mapping[str, float]]:
     """Return a robust fit's values about the estimate, by iterated weights of a linear model.
 
-    Assumed exponents stay where they are. The noise's scale, where it is not stated, is the robust
-    one of :mod:`dahl_ident.fitting.losses`, from `scale` on.
+    Also the standard errors of the estimate by its weights. Assumed exponents stay where they are.
+    The noise's scale, where it is not stated, is the robust one of
+    :mod:`dahl_ident.fitting.losses`, from `scale` on.
     """
     problem, loss = errors.problem, LOSSES["huber"]
     y, J = problem.residuals_and_jacobian(errors.theta, tails=False)
+    if problem.scale_known:
+        y, J = errors.estimate.weighted(y), errors.estimate.weighted(J)
     free = [i for i, name in enumerate(problem.names) if name not in errors.assumed]
     J, rows = J[:, free], problem.n_residuals // 2
     variance = 1.0 if problem.scale_known else scale**2
-    move: FloatArray = np.zeros(len(free))
     weight = np.ones(len(y))
+    weight[2 * rows :] = variance  # priors have their own
+    known = np.linalg.pinv(J.T @ (weight[:, None] * J) / variance)
+    move: FloatArray = np.zeros(len(free))
     for _ in range(_PASSES):
         square = np.sum((y + J @ move)[: 2 * rows].reshape(rows, 2) ** 2, axis=1)
         if not problem.scale_known:
             variance *= loss.rescaled(square / variance, 2 * rows - len(free))
         weight[: 2 * rows] = np.repeat(loss.slope(square / variance), 2)
-        weight[2 * rows :] = variance  # priors have their own
+        weight[2 * rows :] = variance
         root = np.sqrt(weight)
         last, found = move, np.linalg.lstsq(root[:, None] * J, -root * y, rcond=1e-10)
         move = np.asarray(found[0])
         if np.linalg.norm(J @ (move - last)) < _SETTLED * np.sqrt(variance):
             break
-    theta = errors.theta.copy()
+    theta, std = errors.theta.copy(), np.zeros(len(errors.theta))
     theta[free] += move
-    return dict(zip(problem.names, problem.to_values(theta).tolist(), strict=True))
+    std[free] = np.sqrt(np.diagonal(known))
+    std *= np.abs(problem.value_slopes(errors.theta))
+    values = problem.to_values(theta)
+    names = problem.names
+    return (
+        dict(zip(names, values.tolist(), strict=True)),
+        dict(zip(names, std.tolist(), strict=True)),
+    )
 
 
 def assumptions(optimum: Optimum, errors: ErrorModel | None) -> Iterator[str]:

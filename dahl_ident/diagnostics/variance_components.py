@@ -49,6 +49,8 @@ class LinearModel:
         Variances that are known, 0 elsewhere.
     Z : sequence of ndarray, shape (m, q) or (m,)
         Columns of each source; one dimension stands for a diagonal matrix.
+    lever : ndarray, shape (P, m), or None
+        What the estimate makes of the residuals, where that is not generalised least squares.
     outside : (float, int)
         Sum of squares and number of further residuals, of the first row's known variance plus
         the first source's, which neither parameters nor other sources can change.
@@ -60,6 +62,7 @@ class LinearModel:
     J: FloatArray
     known: FloatArray
     Z: Sequence[FloatArray]
+    lever: FloatArray | None = None
     outside: tuple[float, int] = (0.0, 0)
     rotation: FloatArray | None = None
 
@@ -69,7 +72,9 @@ class LinearModel:
         The first `rows` residuals, of one known variance and one size of the first source, are
         projected on what parameters and other sources can change.
         """
-        inside, _ = np.linalg.qr(np.column_stack([self.J[:rows], *(z[:rows] for z in self.Z[1:])]))
+        lever = np.zeros((0, len(self.y))) if self.lever is None else self.lever
+        changed = [self.J[:rows], lever[:, :rows].T, *(z[:rows] for z in self.Z[1:])]
+        inside, _ = np.linalg.qr(np.column_stack(changed))
 
         def turned(part: FloatArray) -> FloatArray:
             return np.concatenate([inside.T @ part[:rows], part[rows:]])
@@ -82,9 +87,17 @@ class LinearModel:
             turned(self.J),
             np.concatenate([self.known[:r], self.known[rows:]]),
             [np.concatenate([self.Z[0][:r], self.Z[0][rows:]]), *map(turned, self.Z[1:])],
+            None if self.lever is None else turned(lever.T).T,
             (max(left, 0.0), rows - r),
             inside,
         )
+
+    def turned(self, lever: FloatArray) -> FloatArray:
+        """Return what a lever of all residuals, (P, M), makes of these, (P, m)."""
+        if self.rotation is None:
+            return lever
+        rows = len(self.rotation)
+        return np.hstack([lever[:, :rows] @ self.rotation, lever[:, rows:]])
 
     def outside_variance(self, variances: FloatArray) -> float:
         """Return the variance of the residuals outside."""

@@ -15,12 +15,14 @@ determined direction is given as a vector.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import combinations
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.advice import advice
@@ -46,6 +48,8 @@ _REMEDY = {
 }
 _BY_PRIOR = 0.7  # of a prior's standard deviation: above it, the data say less than the prior
 _NO_DIFFERENCE = 1.0  # of -2 ln L, between two values of which neither is the likelier
+_DIFFERENT = 9.0  # of -2 ln L, to first order: what an exchange would cost, 3 u
+_MOST_EXCHANGED = 6  # parameters, in pairs
 _VECTOR_PART = 0.05  # component of the undetermined direction worth naming
 
 
@@ -259,7 +263,7 @@ def judged(
         for name, f, p in zip(problem.names, fisher, profile, strict=True)
     }
     beyond = {} if errors is None else _lost_beyond_noise(errors, verdicts, natural)
-    blind = _signs_unseen(optimum)
+    blind = {**_signs_unseen(optimum), **_order_unseen(optimum)}
     verdicts |= dict.fromkeys((*beyond, *blind), Verdict.NOT_IDENTIFIED)
     if errors is not None:
         for name, size in zip(problem.names, natural.tolist(), strict=True):
@@ -288,7 +292,7 @@ def judged(
             name, unit, verdicts[name], float(fisher[i]), float(profile[i]), limits, text
         )
     direction = {}
-    if lost and not found:
+    if lost - blind.keys() and not found:
         vector = information.weakest(natural)
         parts = zip(problem.names, vector.tolist(), strict=True)
         direction = {n: v for n, v in parts if abs(v) > _VECTOR_PART}
@@ -337,6 +341,60 @@ def _signs_unseen(optimum: Optimum) -> dict[str, str]:
                 "either; measure the mean force or even harmonics too"
             )
     return found
+
+
+def _order_unseen(optimum: Optimum) -> dict[str, str]:
+    """Return what is said of parameters that could be exchanged without a difference, by name.
+
+    Such as exponents of pulling and pushing, whose fundamental is that of the mirrored law. All
+    that is exchanged must be like in kind; a move that should have cost something costs nothing.
+    """
+    problem, found = optimum.problem, dict[str, str]()
+    scale = optimum.scale or 1.0
+    for order in _exchanges(optimum):
+        move = optimum.theta[order] - optimum.theta
+        jacobian = problem.residuals_and_jacobian(optimum.theta, scale, tails=False)[1]
+        if not float(np.sum((jacobian @ move) ** 2)) > _DIFFERENT:
+            continue
+        y, other = problem.residuals(np.array([optimum.theta, optimum.theta[order]]), scale)
+        if not abs(float(other @ other - y @ y)) < _NO_DIFFERENCE:
+            continue
+        for i in np.flatnonzero(np.abs(move) > np.sqrt(np.diagonal(optimum.covariance))).tolist():
+            name, partner = problem.names[i], problem.names[order[i]]
+            value, error = float(optimum.values[i]), optimum.stderr[name]
+            swapped = float(optimum.values[order[i]]), optimum.stderr[partner]
+            unit = problem.parameters[i].unit
+            found[name] = (
+                f"either {with_unit(value, error, unit)} or {with_unit(*swapped, unit)}, as "
+                f"{name} and {partner} are exchangeable: these data are the same for either order; "
+                "measure the mean force or even harmonics too"
+            )
+        break
+    return found
+
+
+def _exchanges(optimum: Optimum) -> Iterator[NDArray[np.intp]]:
+    """Yield the orders in which like parameters of an element are exchanged, in pairs.
+
+    One pair first, then several at once; parts of which the law itself knows that they are alike
+    are in a fixed order already.
+    """
+    problem = optimum.problem
+    for element in problem.model.elements:
+        ordered = {label for part in element.like_parts for label in part}
+        alike: dict[tuple[object, ...], list[int]] = {}
+        for label, p in zip(element.labels, element.parameters, strict=True):
+            if p.free and label not in ordered:
+                key = (p.unit, p.transform, p.lower, p.upper)
+                alike.setdefault(key, []).append(problem.names.index(p.name))
+        pairs = [pair for group in alike.values() for pair in combinations(group, 2)]
+        for count in range(1, len(pairs) + 1):
+            for chosen in combinations(pairs, count):
+                if len({i for pair in chosen for i in pair}) == 2 * count <= _MOST_EXCHANGED:
+                    order = np.arange(len(problem.names))
+                    for i, j in chosen:
+                        order[[i, j]] = j, i
+                    yield order
 
 
 def natural_sizes(optimum: Optimum) -> FloatArray:

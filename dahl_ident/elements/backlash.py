@@ -29,7 +29,7 @@ from dahl_ident.elements.behaviour import (
     StiffnessGradient,
     clipped,
 )
-from dahl_ident.elements.element import KINDS, Element, prefixed
+from dahl_ident.elements.element import KINDS, Element, class_named, prefixed
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.steady_loop import Branch, Loop, Rows
@@ -298,14 +298,16 @@ class Backlash(Friction):
     @classmethod
     def from_description(cls, rest: Mapping[str, Any], name: str | None) -> Element:
         """Return the element that :meth:`describe` described."""
-        if set(rest) != {"element", "gap"} or rest["element"].get("kind") not in KINDS:
+        if set(rest) != {"element", "gap"} or not (
+            law := class_named(str(rest["element"].get("kind")))
+        ):
             raise ModelError(
                 f"the backlash element has the keys {', '.join(rest)}; expected element, a table "
                 f"with a kind of {', '.join(KINDS)}, and gap"
             )
         inner = dict(rest["element"])
-        kind, inner_name = inner.pop("kind"), inner.pop("name", name)
-        element = KINDS[kind].from_description(inner, inner_name)
+        del inner["kind"]
+        element = law.from_description(inner, inner.pop("name", name))
         blank = cls(element)
         gap = blank.parameters[-1].described(rest["gap"])
         return blank.with_bound((*blank.parameters[:-1], gap))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dahl_ident.elements.element import KINDS, Element, Model, as_model
+from dahl_ident.elements.element import KINDS, Element, Model, as_model, class_named
 from dahl_ident.errors import ModelError
 
 
@@ -45,7 +45,7 @@ def model_from_description(description: list[Mapping[str, Any]]) -> Model:
     Parameters
     ----------
     description : list of mapping
-        Elements as plain data.
+        Elements as plain data; the kind of a law may also be the name of its class.
 
     Returns
     -------
@@ -77,9 +77,12 @@ def _describe(element: Element) -> dict[str, Any]:
 def _build(entry: Mapping[str, Any]) -> Element:
     rest = dict(entry)
     kind = rest.pop("kind", None)
-    if kind not in KINDS:
+    cls = class_named(str(kind))
+    if cls is None:
         raise ModelError(
-            f"the element {dict(entry)} has the kind {kind!r}; expected one of {', '.join(KINDS)}"
+            f"the element {dict(entry)} has the kind {kind!r}; expected one of {', '.join(KINDS)}, "
+            "or a law of your own: import its file first, or give it as laws (on the command line "
+            "--laws)"
         )
     name = rest.pop("name", None)
-    return KINDS[kind].from_description(rest, name)
+    return cls.from_description(rest, name)

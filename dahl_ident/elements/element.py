@@ -22,6 +22,7 @@ from dahl_ident.arrays import (
 )
 from dahl_ident.data.record import is_even
 from dahl_ident.elements.behaviour import Behaviour, StiffnessGradient
+from dahl_ident.elements.law_files import file_of, restored, source_path
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError, ValidationError
 
@@ -35,17 +36,25 @@ KINDS: dict[str, type[Element]] = {}
 """Every element class by the name that files and the command line know it by."""
 
 
-def _register(cls: type[Element]) -> None:
+def register(cls: type[Element]) -> None:
+    """Make a class known by its kind; a file that is run again replaces its own classes."""
     known = KINDS.get(cls.kind)
-    if known is not None and (known.__module__, known.__qualname__) != (
-        cls.__module__,
-        cls.__qualname__,
-    ):
+    if known is not None and (_home(known), known.__qualname__) != (_home(cls), cls.__qualname__):
         raise ModelError(
             f"{cls.__name__} has the kind {cls.kind!r}, which {known.__module__}."
             f"{known.__qualname__} has already; choose another"
         )
     KINDS[cls.kind] = cls
+
+
+def _home(cls: type[Element]) -> str:
+    return source_path(cls) or cls.__module__
+
+
+def class_named(name: str) -> type[Element] | None:
+    """Return the class with this kind, or else with this name; None if there is none."""
+    named = [cls for cls in KINDS.values() if cls.__name__ == name]
+    return KINDS.get(name) or (named[0] if len(named) == 1 else None)
 
 
 class Alternative(NamedTuple):
@@ -104,7 +113,13 @@ class Element(Behaviour):
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         if cls.__dict__.get("kind"):
-            _register(cls)
+            register(cls)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        file = file_of(type(self))
+        if file is None:
+            return super().__reduce_ex__(protocol)
+        return restored, (file, type(self).__qualname__), self.__dict__
 
     def _bind(self, given: Mapping[str, float | None], name: str | None) -> None:
         """Give the declared parameters their full names and values."""

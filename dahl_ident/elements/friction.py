@@ -21,6 +21,7 @@ from dahl_ident.arrays import (
     positive_number,
     whole_number,
 )
+from dahl_ident.elements.law_checks import check_declarations, check_slope
 from dahl_ident.elements.slope_law import SlopeLaw
 from dahl_ident.errors import ModelError
 
@@ -41,9 +42,11 @@ class Friction(SlopeLaw):
     Raises
     ------
     ModelError
-        If there are more values than parameters, or a label is unknown or given twice.
+        If there are more values than parameters, a label is unknown or given twice, or, when the
+        law is first used, its slope cannot be that of a friction law.
     ValidationError
-        If a value is outside its parameter's bounds.
+        If a value is outside its parameter's bounds, or the parameters are not declared as they
+        should be.
 
     Examples
     --------
@@ -63,6 +66,7 @@ class Friction(SlopeLaw):
     def __init__(
         self, *values: float | None, name: str | None = None, **named: float | None
     ) -> None:
+        check_declarations(type(self))
         labels = [p.name for p in type(self).parameters]
         given = dict(zip(labels, values, strict=False))
         wrong = [label for label in named if label not in labels or label in given]
@@ -72,6 +76,7 @@ class Friction(SlopeLaw):
                 f"expected each at most once of {', '.join(labels)}"
             )
         self._bind(given | named, name)
+        check_slope(self)
 
     def _check_rate(self, method: str) -> None:
         if not self.rate_independent:

@@ -14,7 +14,7 @@ import numpy as np
 from dahl_ident.arrays import finite_number, positive_number
 from dahl_ident.errors import ValidationError
 
-_UNITS = {
+UNITS = {
     "N": (1, 0, 0),
     "m": (0, 1, 0),
     "s": (0, 0, 1),
@@ -119,7 +119,7 @@ class Parameter:
         if found is None:
             raise ValidationError(
                 f"{self.name} has the unit {self.unit!r}; expected a product of powers of "
-                f"{', '.join(_UNITS)}, such as 'N s/m'"
+                f"{', '.join(UNITS)}, such as 'N s/m'"
             )
         return found
 
@@ -183,8 +183,8 @@ def _dimension(unit: str) -> tuple[int, int, int] | None:
     for place, part in enumerate(unit.split("/")):
         for factor in part.split():
             found = re.fullmatch(r"\(?([A-Za-z]+|1)(?:\^(-?\d+))?\)?", factor)
-            if found is None or found[1] not in _UNITS:
+            if found is None or found[1] not in UNITS:
                 return None
             power = (-1 if place else 1) * int(found[2] or 1)
-            total = [t + power * u for t, u in zip(total, _UNITS[found[1]], strict=True)]
+            total = [t + power * u for t, u in zip(total, UNITS[found[1]], strict=True)]
     return total[0], total[1], total[2]

@@ -56,6 +56,7 @@ from dahl_ident.extraction.transient import (
     estimate_transient,
 )
 
+TOO_FAST = "swept too fast"
 _NEGLIGIBLE = 0.2  # bias over standard error to which settling cycles are left out
 _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 _DISTORTED = 0.02  # from which the fundamental alone misses percents of the loss
@@ -521,7 +522,8 @@ def _point(phasors: _Phasors, cycles: int, dropped: int, steps: FloatArray) -> P
     }
     settled = dict(zip(phasors.harmonics, quality["settled"], strict=True))
     first_settled = bool(settled.get(1, all(settled.values())))
-    quality["verdict"] = _verdicts(quality, _objections(phasors, first_settled))
+    biased = np.abs(bias + lagging) / np.abs(response).max()
+    quality["verdict"] = _verdicts(quality, biased, _objections(phasors, first_settled))
     return Point(
         frequency_hz=segment.omega / (2.0 * np.pi),
         amplitude=abs(phasors.displacement),
@@ -594,8 +596,11 @@ def _objections(phasors: _Phasors, settled: bool) -> list[str]:
     return objections
 
 
-def _verdicts(quality: dict[str, Any], objections: list[str]) -> list[str]:
-    """Return, for each row, "good" or what speaks against it."""
+def _verdicts(quality: dict[str, Any], biased: FloatArray, objections: list[str]) -> list[str]:
+    """Return, for each row, "good" or what speaks against it.
+
+    `biased` is the bias of each row, as a share of the largest response.
+    """
     shared = objections.copy()
     if quality["displacement_distortion"] > _DISTORTED:
         shared.append(f"displacement distorted {100 * quality['displacement_distortion']:.2g} %")
@@ -605,10 +610,14 @@ def _verdicts(quality: dict[str, Any], objections: list[str]) -> list[str]:
         if quality[f"{name}_clipped"]:
             shared.append(f"{name} clipped in {100 * quality[f'{name}_clipped']:.2g} % of samples")
     return [
-        "; ".join(([] if settled else [_unsettled(int(more))]) + shared) or "good"
-        for settled, more in zip(quality["settled"], quality["more_periods"], strict=True)
+        "; ".join(([] if settled else [_unsettled(int(more), share)]) + shared) or "good"
+        for settled, more, share in zip(
+            quality["settled"], quality["more_periods"], biased.tolist(), strict=True
+        )
     ]
 
 
-def _unsettled(more: int) -> str:
-    return f"not settled, {more} more periods" if more else "swept too fast to settle"
+def _unsettled(more: int, share: float) -> str:
+    if more:
+        return f"not settled, {more} more periods"
+    return f"{TOO_FAST} to settle, biased by about {100.0 * share:.2g} %"

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import whole_number
 from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.data.level_files import labelled
 from dahl_ident.data.readers import record_pieces, refuse_repeated, run_names
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.extraction.from_record import record_response
@@ -171,8 +172,11 @@ def extract(
         "min_share": min_share,
     }
     reading = {} if columns is None else {"columns": columns}
-    tasks = [Task(source, run, level, reading) for run, source in _named(records)]
-    return extract_all(tasks, how, jobs)
+    named = _named(records)
+    if isinstance(records, Mapping):
+        return extract_all([Task(r, name, level, reading) for name, r in named], how, jobs)
+    tasks = [Task(source, None, level, reading) for _, source in named]
+    return extract_all(tasks, how, jobs, [str(name) for name, _ in named])
 
 
 @dataclass(frozen=True)
@@ -185,8 +189,13 @@ class Task:
     reading: Mapping[str, Any]
 
 
-def extract_all(tasks: Sequence[Task], how: Mapping[str, Any], jobs: int = 1) -> FrequencyResponse:
-    """Return the points of all tasks in one table; `how` holds the other words of `extract`."""
+def extract_all(
+    tasks: Sequence[Task], how: Mapping[str, Any], jobs: int = 1, names: Sequence[str] = ()
+) -> FrequencyResponse:
+    """Return the points of all tasks in one table; `how` holds the other words of `extract`.
+
+    Several tasks without runs get their names as runs, or as levels.
+    """
     refuse_repeated([task.source for task in tasks])
     jobs = min(whole_number(jobs, "jobs", 1), len(tasks))
     if jobs == 1:
@@ -199,6 +208,7 @@ def extract_all(tasks: Sequence[Task], how: Mapping[str, Any], jobs: int = 1) ->
                 parts.append(part)
                 for message in messages:
                     warnings.warn(message, stacklevel=3)
+    parts = labelled(parts, names) if names and len(parts) > 1 else parts
     data = parts[0] if len(parts) == 1 else FrequencyResponse.concatenate(parts)
     return data if how.get("harmonics") is not None else _without_needless_rows(data)
 

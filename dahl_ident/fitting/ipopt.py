@@ -113,7 +113,8 @@ def solve_ipopt(
     ModelError
         If a constraint or `start` names an unknown parameter.
     ValidationError
-        If a constraint is no comparison, or the drive's errors are given where they mean nothing.
+        If a constraint is no comparison, the drive's errors are given where they mean nothing, or
+        rows are to be predicted by the exact steady motion.
 
     Examples
     --------
@@ -130,6 +131,11 @@ def solve_ipopt(
     >>> print(f"{tied.values[1] / tied.values[0]:.6f}")
     250.000000
     """
+    if problem.is_exact:
+        raise ValidationError(
+            "method='ipopt' has no expressions for the exact steady motion of rows whose force was "
+            "held; say steady='describing function', or take method='lm'"
+        )
     given, problem = problem, _with_drive_error(problem, loss, drive_std, drive_covariance)
     relations = Relations.of(problem, constraints)
     # a start takes no noise of the drive, which takes many times as long; a cost does
@@ -308,7 +314,9 @@ def _with_drive_error(
         together = finite_array(covariance, "drive_covariance")
         cross = _for_rows(together, "drive_covariance", (data.n, 2))
     noisy = replace(data, drive_std=spread, drive_covariance=cross)
-    return Problem(noisy, problem.model, noise=problem.noise, sensors=problem.sensors)
+    return Problem(
+        noisy, problem.model, noise=problem.noise, sensors=problem.sensors, steady=problem.steady
+    )
 
 
 def _for_rows(value: FloatArray, name: str, shape: tuple[int, ...]) -> FloatArray:

@@ -6,8 +6,9 @@ nothing, a Gauss-Newton step; it falls where a step does what H foretold, and ri
 does not fall. All problems take their steps together; those that have ended drop out.
 
 A problem has converged where the step after the next, as the steps shrink, would move the
-residuals by less than 1e-8 of their standard deviation, or by no more than what rounding leaves of
-the data; it ends with the next step, which needs no evaluation of its own.
+residuals by less than 1e-8 of their standard deviation, or by no more than what rounding, or the
+accuracy of predictions, leaves of the data; it ends with the next step, which needs no evaluation
+of its own.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.problem import Quadratic
+from dahl_ident.problem import EXPLICIT, Quadratic
 
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
@@ -36,8 +37,8 @@ _LONGEST_STEP = 2.0  # of a logarithm
 _NOISE_TOLERANCE = 1e-8  # of a standard deviation of the residuals
 _REMAINDER = 3e-7  # standard deviations that the last step may leave
 _LAST_STEP = 1e-6  # of a logarithm: the Hessian is that before the last step
-_ROUNDING_TOLERANCE = 1e-13  # of the data, what rounding leaves of residuals
 _UNSEEN = 4.0 * _EPS  # relative change of a cost that may be rounding
+_OF_ACCURACY = 0.3  # the same, where predictions are less accurate: of that accuracy
 NEARLY = 1e-4  # relative difference of costs that are nearly alike
 
 
@@ -125,6 +126,7 @@ def minimise(
     tolerance_factor: float = 1.0,
     enough: float = 0.0,
     steps: int = 80,
+    accuracy: float = EXPLICIT,
 ) -> Minima:
     """Return the minima of the costs that searches from `theta`, shape (S, P), find.
 
@@ -132,12 +134,13 @@ def minimise(
     Searches that leave the region `inside`, which is called like `evaluate`, end there, not
     converged. `tolerance_factor` multiplies the
     length of the step at which a search has converged; `enough` is a fall of the cost that is
-    not worth a step, however long.
+    not worth a step, however long. `accuracy` is that of predictions, relative to the data.
     """
     with np.errstate(all="ignore"):
         return _minimise(
-            evaluate, theta, logarithmic, n_residuals, inside, tolerance_factor, enough, steps
-        )
+            evaluate, theta, logarithmic, n_residuals, inside, tolerance_factor, enough, steps,
+            accuracy,
+        )  # fmt: skip
 
 
 def gauss_newton(
@@ -146,6 +149,7 @@ def gauss_newton(
     logarithmic: BoolArray,
     n_residuals: int,
     steps: int = 12,
+    accuracy: float = EXPLICIT,
 ) -> Minima | None:
     """Return the minimum near a good start of one problem, shape (P,), by undamped steps alone.
 
@@ -169,7 +173,7 @@ def gauss_newton(
             lever = size * np.where(logarithmic, 1.0, theta)
             shortest = max(
                 2.0 * _REMAINDER**2 * float(at.cost) / dof,
-                _ROUNDING_TOLERANCE**2 * float(lever @ lever),
+                accuracy**2 * float(lever @ lever),
             )
             if moves * min(1.0, moves / last) <= shortest:
                 cost = np.maximum(at.cost - 0.5 * moves, 0.0)
@@ -193,8 +197,10 @@ def _minimise(
     tolerance_factor: float,
     enough: float,
     steps: int,
+    accuracy: float,
 ) -> Minima:
     S, P = theta.shape
+    unseen_change = _UNSEEN if accuracy <= EXPLICIT else _OF_ACCURACY * accuracy
     at = _State(theta, *evaluate(theta, None))
     ends = at.take(np.arange(S))
     converged, evaluations = np.full(S, P == 0), np.ones(S, dtype=np.intp)
@@ -203,7 +209,7 @@ def _minimise(
     last = np.full(S, 1e-300)
     for _ in range(steps if P else 0):
         step, moves, foretold, longest = _step(at, damping, logarithmic)
-        shortest = tolerance_factor**2 * _tolerance(at, logarithmic, n_residuals)
+        shortest = tolerance_factor**2 * _tolerance(at, logarithmic, n_residuals, accuracy)
         settled = moves * np.minimum(1.0, moves / last) <= shortest
         settled |= foretold <= tolerance_factor**2 * _EPS * at.cost
         settled &= longest <= tolerance_factor * _LAST_STEP
@@ -229,8 +235,8 @@ def _minimise(
         new = _State(trial, *evaluate(trial, which))
         evaluations[active] += 1
         # a fall too small to see beside one enormous row's cost is taken as foretold
-        unseen = foretold <= _UNSEEN * at.cost
-        better = (new.cost < at.cost) | (unseen & (new.cost <= (1.0 + _UNSEEN) * at.cost))
+        unseen = foretold <= unseen_change * at.cost
+        better = (new.cost < at.cost) | (unseen & (new.cost <= (1.0 + unseen_change) * at.cost))
         gain = np.where(unseen, 1.0, at.cost - new.cost) / np.where(unseen, 1.0, foretold)
         calmer = np.maximum(damping * np.maximum(0.05, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
         damping = np.where(better, calmer, np.maximum(damping * growth, 1e-6))
@@ -304,10 +310,10 @@ def _step(
     return delta / size, moves, np.maximum(foretold, 1e-300), longest
 
 
-def _tolerance(at: _State, logarithmic: BoolArray, n_residuals: int) -> FloatArray:
+def _tolerance(at: _State, logarithmic: BoolArray, n_residuals: int, accuracy: float) -> FloatArray:
     """Return the squared length of a step that no longer matters."""
     P = at.theta.shape[1]
     noise = 2.0 * at.cost / max(n_residuals - P, 1)
     lever = np.where(logarithmic, 1.0, at.theta)
     signal = (at.hessian[:, range(P), range(P)] * lever**2).max(axis=1)
-    return np.asarray(np.maximum(_NOISE_TOLERANCE**2 * noise, _ROUNDING_TOLERANCE**2 * signal))
+    return np.asarray(np.maximum(_NOISE_TOLERANCE**2 * noise, accuracy**2 * signal))

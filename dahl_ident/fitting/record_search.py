@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.elements.behaviour import Behaviour
 from dahl_ident.errors import FitError, FitInterrupted, ModelError
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
 from dahl_ident.fitting.record_start import MORE_STARTS, STARTS, record_starts, started_at
@@ -21,7 +22,8 @@ _COMPARED = 8  # steps after which starts of a driven motion are compared
 _ROUGH = 15  # steps after which the noise is known well enough to say what a step is worth
 _STAGNANT = 0.01  # relative fall of the cost in as many steps, below which more lead nowhere
 _WORTHLESS = 1e-5  # fall of the cost, in units of the noise's variance
-_GOOD = 0.01  # share of variance left at which no further start is tried
+_GOOD = 0.01  # share of variance left at which no further start is tried, if it may be noise
+_SAME = 1e-3  # relative difference of the costs of one minimum
 _SLOW = 0.5  # correlation of neighbouring residuals that are weighted by their spectrum
 _DESCRIBED = 0.1  # share of variance left beyond which the model is wrong, not the drive noisy
 _EXACT = 1e-12  # share of variance left that is rounding
@@ -29,9 +31,6 @@ _REPEATS = 12  # a limit for weights that do not settle
 _SETTLED = 0.03  # step in standard errors that no longer matters
 _BANDS = 3  # dead bands tried: one, two and four times the noise that differences show
 _CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that is no chance
-_MOST_SUBSTEPS = 64  # in a sampling interval
-_UNRESOLVED = 0.1  # of the residuals: errors of integration that hardly change the estimate
-_ROUNDING = 1e-7  # of the motion, below which errors of integration are none
 _LOOSE = 1e4  # of the step at which a search of a long record has converged
 
 
@@ -128,7 +127,7 @@ def solve_records(
         )
     problem.watch = trace = _Trace(tell)
     try:
-        found = _resolved(problem, start)
+        found = _solved(problem, start)
     except KeyboardInterrupt as stop:
         so_far = trace.optimum(problem)
         if so_far is None:
@@ -139,41 +138,6 @@ def solve_records(
         problem.watch = None
     found.problem.watch = None  # of a weighted problem
     return found
-
-
-def _resolved(problem: RecordProblem, start: Mapping[str, float] | None) -> RecordOptimum:
-    """Return the estimate whose motion the steps of integration resolve, if none were given.
-
-    A friction force follows the motion within x_c/v, which may be far less than the sampling
-    interval, and what a coarse step cannot follow looks like friction that is softer.
-    """
-    if problem.output == "force" or problem.substeps is not None:
-        return _solved(problem, start)
-    while True:
-        try:
-            found = _solved(problem, start)
-        except FitError:
-            problem = problem.finer()
-            if (problem.substeps or 0) > _MOST_SUBSTEPS:
-                raise
-            continue
-        if 2.0 * found.cost > _DESCRIBED * problem.n_residuals:
-            return found  # a wrong model is no better with finer steps
-        problem = problem.finer()
-        if (problem.substeps or 0) > _MOST_SUBSTEPS or _alike(found, problem):
-            return found
-        values = found.values[: len(problem.free)].tolist()
-        start = dict(zip((p.name for p in problem.free), values, strict=True))
-
-
-def _alike(found: RecordOptimum, finer: RecordProblem) -> bool:
-    """Return whether half the step leaves the residuals as they are, compared with their size."""
-    coarse, fine = (
-        np.concatenate(problem.split_residuals(found.values)) for problem in (found.problem, finer)
-    )
-    size = np.concatenate([y - y.mean() for y in finer.measured]).std()
-    allowed = max(_UNRESOLVED * float(np.std(fine)), _ROUNDING * float(size))
-    return bool(np.std(fine - coarse) < allowed)
 
 
 def _solved(problem: RecordProblem, start: Mapping[str, float] | None) -> RecordOptimum:
@@ -335,21 +299,54 @@ def _changed(
 def _searched(problem: RecordProblem, start: Mapping[str, float] | None) -> tuple[Minima, int]:
     """Return the best end of searches from automatic starts, some of their values given."""
     try:
-        return _best(problem, _changed(record_starts(problem), problem, start))
+        best, evaluations = _best(
+            problem, _changed(record_starts(problem, 2 * STARTS), problem, start)
+        )
     except FitError:
-        more = record_starts(problem, MORE_STARTS)[STARTS:]
+        more = record_starts(problem, MORE_STARTS)[2 * STARTS :]
         if not len(more):
             raise
-        return _best(problem, _changed(more, problem, start))
+        best, evaluations = _best(problem, _changed(more, problem, start))
+    near = 2.0 * best.cost[0] < _GOOD * problem.n_residuals
+    if near and (_slips_at_first(problem, best.theta[0]) or _structured(problem, best)):
+        found = _descend(problem, _first_states_again(problem, best.theta[0]), _STEPS)
+        evaluations += int(found.evaluations[0])
+        best = found if found.cost[0] < best.cost[0] else best
+    return best, evaluations
+
+
+def _slips_at_first(problem: RecordProblem, theta: FloatArray) -> bool:
+    """Return whether a friction force at a first sample is beyond that of full slip.
+
+    There it has no effect, so that a search cannot come back.
+    """
+    values = problem.values(theta)
+    limits = {
+        e.start[0] if e.name is None else f"{e.name}_{e.start[0]}": float(e.force_bounds(own)[1])
+        for e, own in problem.model.of([np.asarray(v) for v in problem.full_values(values)])
+        if e.has_memory and e.start is Behaviour.start
+    }
+    return any(
+        abs(value) > limits.get(name.rstrip("0123456789").removesuffix("_"), np.inf)
+        for name, value in zip(problem.names, values.tolist(), strict=True)
+    )
+
+
+def _first_states_again(problem: RecordProblem, theta: FloatArray) -> FloatArray:
+    """Return a point with first states as at a start."""
+    values = problem.values(theta)
+    again = started_at(problem, values[: len(problem.free)].tolist())
+    return problem.theta(again)
 
 
 def _best(problem: RecordProblem, starts: FloatArray, steps: int = _STEPS) -> tuple[Minima, int]:
     """Return the best end of searches from the starts, in their order; few where one is good.
 
     A driven motion is expensive where nothing fits: its starts are compared after a few steps, and
-    the best one alone is followed to its end.
+    the best one alone is followed to its end. Where one fits nearly, but leaves residuals that are
+    not noise, the search goes on until two starts lead to the same end.
     """
-    evaluations, finite, best = 0, 0, None
+    evaluations, finite, best, again = 0, 0, None, False
     driven = problem.output == "motion" and len(starts) > 1
     for one in starts:
         theta = problem.theta(one)
@@ -358,10 +355,16 @@ def _best(problem: RecordProblem, starts: FloatArray, steps: int = _STEPS) -> tu
             found = _descend(problem, theta if found is None else found.theta[0], steps)
         evaluations += int(found.evaluations[0])
         finite += bool(np.isfinite(found.cost[0]))
+        if best is not None:
+            again |= bool(abs(found.cost[0] - best.cost[0]) < _SAME * best.cost[0])
         if np.isfinite(found.cost[0]) and (best is None or found.cost[0] < best.cost[0]):
+            again &= best is None or bool(found.cost[0] > (1.0 - _SAME) * best.cost[0])
             best = found
-        good = best is not None and 2.0 * best.cost[0] < _GOOD * problem.n_residuals
-        if good or (driven and finite == STARTS):
+        near = best is not None and 2.0 * best.cost[0] < _GOOD * problem.n_residuals
+        if best is not None and near:
+            if again or len(starts) == 1 or not _structured(problem, best):
+                break
+        elif driven and finite == STARTS:
             break
     if best is None:
         imposed = ", or, if the exciter imposes the motion, fit the force: output='force'"
@@ -374,6 +377,13 @@ def _best(problem: RecordProblem, starts: FloatArray, steps: int = _STEPS) -> tu
         evaluations += int(found.evaluations[0])
         best = found if found.cost[0] <= best.cost[0] else best
     return best, evaluations
+
+
+def _structured(problem: RecordProblem, end: Minima) -> bool:
+    """Return whether a search has left residuals that follow each other as noise seldom does."""
+    if 2.0 * end.cost[0] < _EXACT * problem.n_residuals:
+        return False
+    return _correlation(problem.split_residuals(problem.values(end.theta[0]))) > _SLOW
 
 
 def _descend(problem: RecordProblem, theta: FloatArray, steps: int) -> Minima:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,7 +26,6 @@ STARTS = 4
 """Starts that are tried at first, as for tables."""
 MORE_STARTS = 24
 """Where no motion from those is finite: a contact too stiff for the samples' interval is one."""
-_APART = 0.05  # in the logarithm of the misfit, or the starts are one
 _DECAY = 1e-3  # of a decay's largest amplitude in its spectrum: below, it has none
 _BAND = 1e-5  # of the drive's largest power: below, it has none
 
@@ -46,6 +46,24 @@ def record_starts(problem: RecordProblem, count: int = STARTS) -> FloatArray:
     """
     with np.errstate(all="ignore"):  # laws far off may overflow; such combinations are left out
         return _Scan(problem).starts(count)
+
+
+class _Start(NamedTuple):
+    misfit: float
+    values: list[float]
+    passive: bool
+    """Whether no mass, damping, stiffness or scale is negative."""
+
+
+def _passive(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the solution of normal equations, none of it negative."""
+    from scipy.optimize import nnls
+
+    sizes, vectors = np.linalg.eigh(matrix)
+    kept = sizes > 1e-10 * sizes[-1]
+    root = np.sqrt(sizes[kept])
+    rows = root[:, None] * vectors[:, kept].T
+    return np.asarray(nnls(rows, (vectors[:, kept].T @ right) / root)[0])
 
 
 class _Scan:
@@ -82,7 +100,7 @@ class _Scan:
         while np.prod([float(len(c)) for c in choices]) > _COMBINATIONS:
             longest = int(np.argmax([len(c) for c in choices]))
             choices[longest] = choices[longest][::2]
-        found: list[tuple[float, list[float]]] = []
+        found: list[_Start] = []
         columns: dict[tuple[int, int], list[FloatArray]] = {}
         for places in product(*(range(len(c)) for c in choices)):
             for e, place in enumerate(places):
@@ -90,20 +108,20 @@ class _Scan:
                     columns[e, place] = self._columns(elements[e], choices[e][place])
             shapes = [choices[e][p] for e, p in enumerate(places)]
             sets = [columns[e, p] for e, p in enumerate(places)]
-            solved = self._solve(elements, shapes, sets)
-            if solved is not None:
-                found.append(solved)
+            found += self._solve(elements, shapes, sets)
         if not found:
             values = [p.value if p.value is not None else 1.0 for p in self.problem.free]
-            found = [(0.0, values)]
-        found.sort(key=lambda f: f[0])
-        kept: list[tuple[float, list[float]]] = []
-        for misfit, values in found:
-            if all(self._apart(values, other) for _, other in kept):
-                kept.append((misfit, values))
-            if len(kept) == count:
-                break
-        return np.array([started_at(self.problem, values) for _, values in kept])
+            found = [_Start(0.0, values, passive=True)]
+        found.sort(key=lambda start: start.misfit)
+        ranks = {True: 0, False: 0}
+        kept: dict[tuple[int, bool], list[float]] = {}
+        for start in found:
+            rank = ranks[start.passive]
+            if rank < count and all(self._apart(start.values, one) for one in kept.values()):
+                kept[rank, not start.passive] = start.values  # by turns, passive ones first
+                ranks[start.passive] += 1
+        chosen = [kept[place] for place in sorted(kept)][:count]
+        return np.array([started_at(self.problem, values) for values in chosen])
 
     def _apart(self, one: list[float], other: list[float]) -> bool:
         a, b = np.array(one), np.array(other)
@@ -158,8 +176,8 @@ class _Scan:
         elements: tuple[Element, ...],
         shapes: list[tuple[float, ...]],
         sets: list[list[FloatArray]],
-    ) -> tuple[float, list[float]] | None:
-        """Return misfit and free values with the linear parameters solved for."""
+    ) -> list[_Start]:
+        """Return starts with the linear parameters solved for: best, and best of those above 0."""
         scaled = [any(self._scales(e, p) for p in range(len(e.parameters))) for e in elements]
         normal: FloatArray | None = None
         for i, (_, _, _, force) in enumerate(self.histories):
@@ -170,13 +188,31 @@ class _Scan:
             product_ = np.real(block.conj() @ block.T)
             normal = product_ if normal is None else normal + product_
         if normal is None or not np.isfinite(normal).all():
-            return None
+            return []
         size = np.sqrt(np.maximum(normal.diagonal()[:-1], 1e-300))
         matrix = normal[:-1, :-1] / np.outer(size, size)
         right = normal[:-1, -1] / size
-        solution = np.linalg.lstsq(matrix, right, rcond=1e-10)[0]
-        misfit = float(normal[-1, -1] - 2.0 * solution @ right + solution @ matrix @ solution)
-        factors = iter(solution / size)
+        free = np.linalg.lstsq(matrix, right, rcond=1e-10)[0]
+        solutions = [free] if (free >= 0.0).all() else [free, _passive(matrix, right)]
+        found = []
+        for solution in solutions:
+            values = self._values(elements, shapes, scaled, solution / size)
+            if values is not None:
+                misfit = normal[-1, -1] - 2.0 * solution @ right + solution @ matrix @ solution
+                found.append(_Start(float(misfit), values, passive=solution is not free))
+        if len(solutions) == 1:
+            found = [start._replace(passive=True) for start in found]
+        return found
+
+    @staticmethod
+    def _values(
+        elements: tuple[Element, ...],
+        shapes: list[tuple[float, ...]],
+        scaled: list[bool],
+        solution: FloatArray,
+    ) -> list[float] | None:
+        """Return the free values, scaled by what was solved for; None where one is impossible."""
+        factors = iter(solution)
         values: list[float] = []
         for element, shape, scales in zip(elements, shapes, scaled, strict=True):
             factor = float(next(factors)) if scales else 1.0
@@ -191,7 +227,7 @@ class _Scan:
                 if parameter.lower == 0.0 and new <= 0.0:
                     return None
                 values.append(float(np.clip(new, parameter.lower, parameter.upper)))
-        return misfit, values
+        return values
 
     @staticmethod
     def _scales(element: Element, place: int) -> bool:
@@ -241,19 +277,11 @@ def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
     """
     full = np.zeros(len(problem.parameters))
     full[: len(values)] = values
-    at = problem.full_values(full)
     for number, measured in enumerate(problem.measured):
         own = problem.own(full, number)
         if problem.output == "motion":
-            x, v, a = in_band(problem, number)
+            x, v, _ = in_band(problem, number)
             own[0], own[1] = x[0], v[0]
-            model = problem.model.sampled(1.0 / problem.records[number].sample_rate)
-            states = [
-                state
-                for e, element_values in model.of(at)
-                for state in e.state_histories(element_values, x, v, a)
-            ]
-            problem.set_guess(number, np.column_stack([x, v, *states]))
         else:
             total = problem.predict(full, number, derivatives=False).output
             own[-2] = float(np.mean(measured - total))

@@ -120,6 +120,11 @@ def solve(
     own = [p.value for p in problem.parameters if p.value is not None]
     if not limits and len(own) == len(problem.parameters):
         return search.run(Starts(np.zeros(1, np.intp), problem.to_search(own)[None]))[0]
+    if limits and problem.is_exact:
+        sine = problem.with_steady("describing function")
+        optimum = solve(sine, method=method, loss=loss, start=start)
+        if not problem.takes_energy(optimum.theta):
+            return optimum  # no steady motion to begin from
     found = own_starts(problem, resistant=loss != "linear")
     if start is not None:
         given = _completed(problem, start, found.theta[0])
@@ -269,7 +274,9 @@ class _Search:
             return Ends(self._descend(begin, scale, steps=_BRIEF))
         ends = Ends(self._descend(begin, scale))
         doubtful = ~ends.minima.converged | (self._friction_error(ends, scale) > DOUBTFUL)
-        if doubtful.any():
+        if doubtful.any() and self.problem.is_exact:
+            self._look_wider_by_sine(ends, begin, scale, np.flatnonzero(doubtful))
+        elif doubtful.any():
             where = np.flatnonzero(doubtful)
             part = self._of(where)
             ends.put(where, part._look_wider(ends.take(where), begin.of(where), scale))
@@ -331,8 +338,9 @@ class _Search:
         elif chart is None and loss is None and len(phi) == 1:
             one = problem.table(0)
             minima = gauss_newton(
-                lambda theta: one.quadratic(theta, scale), phi[0], logarithmic, self.m
-            )
+                lambda theta: one.quadratic(theta, scale), phi[0], logarithmic, self.m,
+                accuracy=problem.accuracy,
+            )  # fmt: skip
         minima = minima or minimise(
             evaluate,
             phi,
@@ -341,6 +349,7 @@ class _Search:
             inside=None if limit else inside,
             tolerance_factor=_AT_LIMIT if limit else self.tolerance,
             steps=steps,
+            accuracy=problem.accuracy,
         )
         if self.bounded:
             theta = minima.theta if chart is None else chart.of(begin.table).theta(minima.theta)
@@ -367,6 +376,30 @@ class _Search:
                 found.converged[:] = inside(found.theta, np.array([index]))
             parts.append(found)
         return Minima.stacked(parts)
+
+    def _look_wider_by_sine(
+        self, ends: Ends, begin: Starts, scale: float, doubtful: IntArray
+    ) -> None:
+        """Look for other optima, and for limits, with the describing function.
+
+        Exact steady motions far out cost too much. A search that ended nowhere goes on from the
+        optimum of the describing function, and ends at its limit where it still has none.
+        """
+        sine = _Search(
+            self.problem.with_steady("describing function"), self.loss, self.method, self.tolerance
+        )
+        other = sine._search(begin, scale)
+        lost = doubtful[~ends.minima.converged[doubtful]]
+        if lost.size:
+            again = Starts(np.arange(lost.size), other.minima.theta[lost])
+            found = self._of(lost)._descend(again, scale)
+            better = np.flatnonzero(found.converged | (found.cost < ends.minima.cost[lost]))
+            ends.put(lost[better], Ends(found.take(better)))
+        infinite = ~np.isfinite(self._friction_error(ends, scale))
+        for table in doubtful.tolist():
+            if table in other.limits and (infinite[table] or not ends.minima.converged[table]):
+                one = np.array([table])
+                ends.put(one, other.take(one))
 
     def _look_wider(self, ends: Ends, begin: Starts, scale: float) -> Ends:
         """Return the best of `ends`, of searches in microslip's charts, and of the limits."""

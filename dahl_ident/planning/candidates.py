@@ -310,7 +310,9 @@ def _single_valued(
         own = dict(zip(knowledge.names, values.tolist(), strict=True))
         known = {p.name for p in knowledge.model.parameters}
         plant = knowledge.model.with_values({n: v for n, v in own.items() if n in known})
-        found = steady_state.response(plant, frequency_hz, drive, all_roots=True)
+        found = steady_state.response(
+            plant, frequency_hz, drive, all_roots=True, steady="describing function"
+        )
         single &= found.number_of_solutions == 1
     if not single.any():
         raise ValidationError(
@@ -321,7 +323,9 @@ def _single_valued(
 
 
 def _problem(data: Any, knowledge: Knowledge) -> Problem:
-    return Problem(data, knowledge.model, noise="relative", sensors=knowledge.sensors)
+    return Problem(
+        data, knowledge.model, noise="relative", sensors=knowledge.sensors, steady=knowledge.steady
+    )
 
 
 def bench_time(
@@ -397,7 +401,9 @@ def larger_rows(
     own = placeholder(
         candidates.level, candidates.frequency_hz, candidates.controlled, knowledge.motion
     )
-    problem = Problem(own, larger, noise="relative", sensors=knowledge.sensors)
+    problem = Problem(
+        own, larger, noise="relative", sensors=knowledge.sensors, steady=knowledge.steady
+    )
     drawn = dict(zip(knowledge.names, knowledge.values.T, strict=True))
     columns = []
     for p in problem.parameters:
@@ -419,7 +425,9 @@ def larger_rows(
         part = placeholder(
             candidates.level, candidates.frequency_hz, candidates.controlled, knowledge.motion, k
         )
-        one = Problem(part, larger, noise="absolute", sensors=knowledge.sensors)
+        one = Problem(
+            part, larger, noise="absolute", sensors=knowledge.sensors, steady=knowledge.steady
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = one.prediction_jacobian(theta) / fundamental[..., None]
         # within a gap there is no response, and no information

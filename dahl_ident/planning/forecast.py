@@ -197,7 +197,9 @@ def _departures(knowledge: Knowledge, candidates: Candidates) -> Departures | No
     there = placeholder(
         candidates.level, candidates.frequency_hz, candidates.controlled, knowledge.motion
     )
-    problem = Problem(there, knowledge.model, noise="relative", sensors=knowledge.sensors)
+    problem = Problem(
+        there, knowledge.model, noise="relative", sensors=knowledge.sensors, steady=knowledge.steady
+    )
     theta = errors.theta[own]
     predicted = problem.predict(theta)
     amplitude = candidates.level

@@ -22,6 +22,7 @@ from dahl_ident.errors import ValidationError
 from dahl_ident.problem import Problem
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.sensors import Sensors
+from dahl_ident.steady_state import Steady
 from dahl_ident.units import Motion
 
 # Least relative standard deviation that the search takes from a range. The fit will not have the
@@ -65,6 +66,8 @@ class Knowledge:
         Of an earlier fit.
     sample_noise : float or None
         Standard deviation of a sample of force in earlier records, N.
+    steady : {"exact", "describing function"}
+        How the response to a force that is held is predicted.
     """
 
     model: Model
@@ -81,6 +84,7 @@ class Knowledge:
     scatter: float = 0.0
     errors: ErrorModel | None = None
     sample_noise: float | None = None
+    steady: Steady = "exact"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -249,7 +253,7 @@ def _of_errors(
         model, given.sensors, given.data.motion, parameters, _within(drawn, parameters),
         np.broadcast_to(known, (draws, *known.shape)), np.diag(prior), tuple(assumed),
         float(np.hypot(stated, noise_of_rows(errors))), cycles, errors.problem,
-        scatter_of_runs(errors), errors,
+        scatter_of_runs(errors), errors, steady=given.steady,
     )  # fmt: skip
 
 
@@ -270,7 +274,9 @@ def _with_data(
     model, assumed = _with_assumed(given.model)
     problem = given
     if assumed:
-        problem = Problem(given.data, model, noise=given.noise, sensors=given.sensors)
+        problem = Problem(
+            given.data, model, noise=given.noise, sensors=given.sensors, steady=given.steady
+        )
     own = [problem.names.index(name) for name in given.names]
     theta = np.array([np.log(p.value or 1.0) for p in problem.parameters]) * np.ones(
         (len(drawn), 1)
@@ -289,6 +295,7 @@ def _with_data(
     return Knowledge(
         model, problem.sensors, problem.data.motion, problem.parameters, theta, known,
         np.diag(prior), tuple(assumed), noise, cycles, problem,
+        steady=problem.steady,
     )  # fmt: skip
 
 

@@ -61,7 +61,9 @@ class LevelSearch:
         own = q.knowledge.problem
         known = np.zeros((S, P, P))
         if own is not None:
-            before = Problem(own.data, q.larger, noise=own.noise, sensors=q.knowledge.sensors)
+            before = Problem(
+                own.data, q.larger, noise=own.noise, sensors=q.knowledge.sensors, steady=own.steady
+            )
             scale = 1.0 if own.scale_known else float(q.knowledge.row_noise or 1.0)
             known = known + before.information(theta, scale) * np.outer(size, size)
         self._suspects_before = known + _NOTHING * np.eye(P)

@@ -40,6 +40,8 @@ from dahl_ident.planning.question import (
     targets_of,
 )
 from dahl_ident.planning.trajectories import Motion
+from dahl_ident.steady_state import STEADY, Steady
+from dahl_ident.units import si_unit
 
 _NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
@@ -68,6 +70,7 @@ def plan(
     settled: float = 0.01,
     between_runs: float = 0.0,
     sample_rate: float | None = None,
+    steady: Steady | None = None,
     draws: int = 200,
     seed: int = 0,
 ) -> Plan:
@@ -121,6 +124,9 @@ def plan(
         Seconds that each run takes in addition to its levels.
     sample_rate : float, optional
         Samples a second of the records of motions in time, which need it.
+    steady : {"exact", "describing function"}, optional
+        With ``controlled="force"``: how the response is predicted. Left out, as in the fit given,
+        or "exact".
     draws : int, default 200
         Parameter vectors that the criterion is averaged over.
     seed : int, default 0
@@ -163,6 +169,9 @@ def plan(
     one_of(controlled, "controlled", CONTROLLED)
     bench = Limits.of(limits)
     knowledge = gather(source, ranges, draws, seed)
+    if steady is not None:
+        one_of(steady, "steady", STEADY)
+        knowledge = replace(knowledge, steady=steady)
     wanted, numbers = targets_of(target)
     if not numbers and not np.isfinite(bench.time):
         raise ValidationError(
@@ -423,9 +432,10 @@ class Planner:
 
     def _assumptions(self) -> tuple[str, ...]:
         q, found = self.question, []
+        force, length = (si_unit(kind, q.knowledge.motion) for kind in ("force", "displacement"))
         if q.recorded is not None:
             return (
-                f"white noise of {q.recorded.noise:.3g} N in each sample of force, "
+                f"white noise of {q.recorded.noise:.3g} {force} in each sample of force, "
                 f"{q.recorded.sample_rate:g} samples a second; a record of each motion is fitted "
                 "with its initial state, offset and drift",
                 *(f"{n} within the range that a fit assumes" for n in q.knowledge.assumed),
@@ -433,8 +443,8 @@ class Planner:
             )  # fmt: skip
         found.append(
             f"noise of one cycle: {100.0 * q.noise.relative:.3g} % of the response"
-            + (f", {q.noise.force:.3g} N" if q.noise.force else "")
-            + (f", {q.noise.displacement:.3g} m" if q.noise.displacement else "")
+            + (f", {q.noise.force:.3g} {force}" if q.noise.force else "")
+            + (f", {q.noise.displacement:.3g} {length}" if q.noise.displacement else "")
         )
         if q.knowledge.row_noise is not None and q.knowledge.row_cycles == 1.0:
             found.append("a row of the earlier data counts as one cycle")

@@ -35,6 +35,7 @@ def draw_record_fit(fit: Any, kind: str, number: int, ax: Axes | None = None) ->
     """
     record, residual = fit.records[number], fit.residuals[number]
     measured = fit.problem.measured[number]
+    labels = {name.partition(" ")[0]: str(name) for name in record.to_frame().columns}  # with units
     channel = "force" if fit.problem.output == "force" else record.motion_channel
     if kind == "time":
         axes = plot_waveforms(record.time, [(channel, measured)], fitted=[measured - residual])
@@ -45,7 +46,13 @@ def draw_record_fit(fit: Any, kind: str, number: int, ax: Axes | None = None) ->
             raise ValidationError("a loop needs displacement, which the record does not have")
         force = record.force_samples
         fitted = measured - residual if fit.problem.output == "force" else None
-        return plot_recorded_loops(record.displacement, force, fitted=fitted)
+        return plot_recorded_loops(
+            record.displacement,
+            force,
+            fitted=fitted,
+            displacement_label=labels["displacement"],
+            force_label=labels.get("force", "force"),
+        )
     if kind not in ("residuals", "residuals_displacement"):
         raise ValidationError(
             f"kind is {kind!r}; expected time, loop, residuals or residuals_displacement"
@@ -54,7 +61,7 @@ def draw_record_fit(fit: Any, kind: str, number: int, ax: Axes | None = None) ->
     if kind != "residuals":
         if record.displacement is None:
             raise ValidationError("the record has no displacement to draw residuals against")
-        over, label = record.displacement, "displacement [m]"
+        over, label = record.displacement, labels["displacement"]
     with style.house_style():
         axis = ax or style.new_axes(1, 1, size=(6.4, 3.0), sharex=True)[0, 0]
         axis.plot(over, residual, color=style.BLUE, lw=0.6)

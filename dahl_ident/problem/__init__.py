@@ -12,6 +12,6 @@ known, after division by scale^2 where it is not.
 
 from dahl_ident.problem.batch import ProblemBatch
 from dahl_ident.problem.prediction import Prediction
-from dahl_ident.problem.problem import Problem, Quadratic
+from dahl_ident.problem.problem import EXPLICIT, Problem, Quadratic
 
-__all__ = ["Prediction", "Problem", "ProblemBatch", "Quadratic"]
+__all__ = ["EXPLICIT", "Prediction", "Problem", "ProblemBatch", "Quadratic"]

@@ -14,6 +14,7 @@ from dahl_ident.elements import Element
 from dahl_ident.errors import DataError
 from dahl_ident.problem.problem import Problem, as_response, checked_table
 from dahl_ident.sensors import Sensors
+from dahl_ident.steady_state import Steady
 
 
 class ProblemBatch(Problem):
@@ -25,7 +26,7 @@ class ProblemBatch(Problem):
     ----------
     data : sequence of FrequencyResponse
         Tables with the same number of rows, quantity, harmonics and controlled variable.
-    model, noise, sensors, free, fixed
+    model, noise, sensors, free, fixed, steady
         As for :class:`Problem`.
 
     Raises
@@ -57,7 +58,9 @@ class ProblemBatch(Problem):
         sensors: Sensors | None = None,
         free: Iterable[str] = (),
         fixed: Mapping[str, float] | None = None,
+        steady: Steady = "exact",
     ) -> None:
+        self.steady = steady
         if isinstance(data, FrequencyResponse) or not len(data):
             found = "one table" if isinstance(data, FrequencyResponse) else "no table"
             raise DataError(f"data is {found}; expected a sequence of at least one")

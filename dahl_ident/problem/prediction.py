@@ -12,6 +12,10 @@ derivatives come from the implicit function theorem,
     d ln A = (d ln u_0 - Re(dZ/Z)) / (1 + Re(A Z_A/Z)).
 
 The measured amplitude of such a row serves only to choose among several solutions.
+
+That balance takes the displacement for a sine. Where the model has an equation of motion, and
+unless the describing function was asked for, rows whose force was controlled are predicted by the
+exact steady motion instead (:mod:`dahl_ident.problem.steady_rows`).
 """
 
 from __future__ import annotations
@@ -30,8 +34,10 @@ from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Model, Parameter
 from dahl_ident.errors import DataError
 from dahl_ident.problem.coordinates import Coordinates
+from dahl_ident.problem.steady_rows import SteadyRows
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import Sensors, measured_stiffness_factor
+from dahl_ident.steady_state import Shooting
 
 _NONE: ComplexArray = np.zeros((), dtype=np.complex128)
 
@@ -42,6 +48,56 @@ class Prediction(NamedTuple):
     value: ComplexArray
     changes: list[ComplexArray]
     by_ln_amplitude: ComplexArray
+
+
+class Nearby:
+    """The prediction near a point: that of the describing function, corrected to the exact one.
+
+    The logarithm of the ratio of both is taken as linear in the search coordinates and in the
+    logarithm of the drive. What is left is of second order in the distance, and small there: it is
+    the change of a correction. It costs what the describing function costs.
+    """
+
+    def __init__(self, exact: Predictor, approximate: Predictor, theta: FloatArray) -> None:
+        self._approximate, self._theta = approximate, theta
+        at, near = exact(theta), approximate(theta)
+        self._ratio = np.log(at.value / near.value)
+        self._slopes = [
+            a / at.value - b / near.value for a, b in zip(at.changes, near.changes, strict=True)
+        ]
+        forced = exact.forced
+        level = at.by_ln_amplitude / at.value - near.by_ln_amplitude / near.value
+        self._by_level = np.where(forced, level, 0.0)
+
+    def __call__(
+        self,
+        theta: FloatArray,
+        *,
+        derivatives: bool = True,
+        amplitude_error: FloatArray | None = None,
+    ) -> Prediction:
+        """Return what a predictor returns."""
+        found = self._approximate(theta, derivatives=derivatives, amplitude_error=amplitude_error)
+        change = self._ratio
+        for place, slope in enumerate(self._slopes):
+            change = change + slope * (theta[..., place, None] - self._theta[place])
+        if amplitude_error is not None:
+            change = change - self._by_level * amplitude_error
+        with np.errstate(over="ignore", invalid="ignore"):
+            factor = np.exp(change)
+            value = found.value * factor
+            changes = [
+                d * factor + value * slope
+                for d, slope in zip(found.changes, self._slopes, strict=False)
+            ]
+            level = found.by_ln_amplitude * factor + (value * self._by_level if derivatives else 0)
+        return Prediction(value, changes, level)
+
+    def as_stiffness(
+        self, weights: FloatArray, predicted: ComplexArray | None = None
+    ) -> StiffnessData:
+        """Return the data as dynamic stiffness."""
+        return self._approximate.as_stiffness(weights, predicted)
 
 
 @dataclass(frozen=True)
@@ -55,15 +111,29 @@ class _Group:
     operator: ComplexArray
     amplitude: FloatArray
     drive: FloatArray | None
+    steady: SteadyRows | None
+    """Of rows that are predicted by the exact steady motion."""
 
 
 class Predictor:
-    """Prediction of a model with its sensors for the operating points of `rows`."""
+    """Prediction of a model with its sensors for the operating points of `rows`.
+
+    `shooting` solves for the exact steady motion of rows whose force was controlled; without it
+    the describing function does. `orbits` are those where it starts, kept up to date.
+    """
 
     def __init__(
-        self, model: Model, sensors: Sensors, coordinates: Coordinates, rows: Rows
+        self,
+        model: Model,
+        sensors: Sensors,
+        coordinates: Coordinates,
+        rows: Rows,
+        shooting: Shooting | None = None,
+        orbits: dict[int, FloatArray] | None = None,
     ) -> None:
         self._model, self._sensors, self._coordinates = model, sensors, coordinates
+        self._shooting = shooting
+        self._orbits = {} if orbits is None else orbits
         self._neutral = sensors.are_exact
         names = coordinates.names
         self._slots = [_slot(p, names) for p in (*model.parameters, *sensors.parameters)]
@@ -84,9 +154,28 @@ class Predictor:
                 self._operator[..., part],
                 self._guess[..., part],
                 None if rows.drive is None else rows.drive[..., part],
+                self._steady_rows(part) if forced else None,
             )
             for part, harmonic, forced in _parts(rows)
         ]
+
+    @property
+    def forced(self) -> NDArray[np.bool_]:
+        """Which rows are force-controlled."""
+        return self._rows.forced
+
+    def _steady_rows(self, part: slice | NDArray[np.intp]) -> SteadyRows | None:
+        rows = self._rows
+        if self._shooting is None or rows.drive is None:
+            return None
+        ratio = rows.response / self._operator
+        with np.errstate(divide="ignore", invalid="ignore"):
+            measured = rows.drive * (ratio if self._exponent == -1 else 1.0 / ratio)
+        drive, omega = np.broadcast_arrays(rows.drive, rows.omega)
+        return SteadyRows(
+            self._model, self._shooting, drive[..., part], omega[..., part], measured[..., part],
+            self._orbits,
+        )  # fmt: skip
 
     def as_stiffness(
         self, weights: FloatArray, predicted: ComplexArray | None = None
@@ -149,6 +238,33 @@ class Predictor:
         amplitude_error: FloatArray | None,
     ) -> Prediction:
         own, sensed = values[:-3], values[-3:]
+        if group.steady is not None:
+            linear = group.steady.is_linear(own)
+            if not linear.all():
+                moving = [
+                    np.where(linear[..., None], np.nan, v) if linear.any() else v for v in own
+                ]
+                exact = self._predict_steady(
+                    group, group.steady, [*moving, *sensed], derivatives, amplitude_error
+                )
+                if not linear.any():
+                    return exact
+                sine = self._predict_sine(group, values, derivatives, amplitude_error)
+                pairs = zip((sine.value, *sine.changes), (exact.value, *exact.changes), strict=True)
+                value, *changes = (np.where(linear[..., None], a, b) for a, b in pairs)
+                level = np.where(linear[..., None], sine.by_ln_amplitude, exact.by_ln_amplitude)
+                return Prediction(value, changes, level)
+        return self._predict_sine(group, values, derivatives, amplitude_error)
+
+    def _predict_sine(
+        self,
+        group: _Group,
+        values: list[FloatArray],
+        derivatives: bool,
+        amplitude_error: FloatArray | None,
+    ) -> Prediction:
+        """Return the response by the describing function."""
+        own, sensed = values[:-3], values[-3:]
         amplitude, found = self._amplitude(group, own, sensed, amplitude_error)
         factor = group.operator
         if not self._neutral:
@@ -178,6 +294,44 @@ class Predictor:
             changes += self._sensor_changes(group, response, by_level)
         return Prediction(response, changes, by_level)
 
+    def _predict_steady(
+        self,
+        group: _Group,
+        rows: SteadyRows,
+        values: list[FloatArray],
+        derivatives: bool,
+        error: FloatArray | None,
+    ) -> Prediction:
+        """Return the response of the exact steady motion: R = (j omega)^p (g u_0/X)^q."""
+        own, sensed = values[:-3], values[-3:]
+        factor, drive = group.operator, self._true_drive(group, sensed, error)
+        if not self._neutral:
+            sensor = measured_stiffness_factor(sensed, group.omega, group.harmonic)
+            factor = factor * sensor**self._exponent
+        free = [i for i, (index, _) in enumerate(self._slots[:-3]) if index is not None]
+        motion = rows.at(own, drive, free if derivatives else [])
+        response = factor * (motion.displacement / drive) ** -self._exponent
+        if not derivatives:
+            return Prediction(response, [], _NONE)
+        slope = -self._exponent * response / motion.displacement
+        changes = []
+        for place, i in enumerate(free):
+            positive = self._coordinates.positive[self._slots[i][0]]
+            change = motion.by_parameter[..., place]
+            changes.append(slope * (change * own[i] if positive else change))
+        by_level = slope * drive * motion.by_drive + self._exponent * response
+        if not self._neutral:
+            changes += self._sensor_changes(group, response, by_level)
+        return Prediction(response, changes, by_level)
+
+    def _true_drive(
+        self, group: _Group, sensed: Sequence[FloatArray], error: FloatArray | None
+    ) -> FloatArray:
+        """Return the true drive of force-controlled rows."""
+        assert group.drive is not None
+        drive = group.drive / sensed[0]
+        return drive if error is None else np.asarray(drive * np.exp(-error[..., group.rows]))
+
     def _sensor_changes(
         self, group: _Group, response: ComplexArray, direct: ComplexArray
     ) -> list[ComplexArray]:
@@ -202,10 +356,7 @@ class Predictor:
         amplitude = group.amplitude if self._neutral else group.amplitude / sensed[1]
         if not group.forced:
             return amplitude if error is None else amplitude * np.exp(-error[..., group.rows]), None
-        assert group.drive is not None
-        drive = group.drive / sensed[0]
-        if error is not None:
-            drive = drive * np.exp(-error[..., group.rows])
+        drive = self._true_drive(group, sensed, error)
         amplitude = steady_state.solve(self._model, own, group.omega, drive, amplitude)
         found = np.isfinite(amplitude)
         return (amplitude, None) if found.all() else (np.where(found, amplitude, 1.0), found)

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Self, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.data.fields import one_of
 from dahl_ident.data.rows import Rows
+from dahl_ident.data.tabular import assumes_frequency
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import DataError, ModelError, ValidationError
@@ -22,12 +25,19 @@ from dahl_ident.problem.coordinates import (
     Interchangeable,
     with_changes,
 )
-from dahl_ident.problem.prediction import Prediction, Predictor
+from dahl_ident.problem.prediction import Nearby, Prediction, Predictor
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import EXACT, Prior, Sensors
+from dahl_ident.steady_state import ACCURACY, STEADY, Shooting, Steady, obstacle
 from dahl_ident.units import Motion, shown_unit
 
+_ORBITS: WeakKeyDictionary[FrequencyResponse, dict[int, FloatArray]] = WeakKeyDictionary()
+"""Where shooting last ended, by table and number of states: one fit makes many problems of one."""
+
 _Kind = TypeVar("_Kind", bound="Problem")
+
+EXPLICIT = 1e-13
+"""Relative error of predictions in closed form or by roots."""
 
 
 class Quadratic(NamedTuple):
@@ -55,11 +65,16 @@ class Problem:
         Names of given parameters to estimate all the same, from their values.
     fixed : mapping of str to float, optional
         Parameters to hold at a value.
+    steady : {"exact", "describing function"}, default "exact"
+        How rows whose force was controlled are predicted.
 
     Attributes
     ----------
-    data, model, sensors
+    data, model, sensors, steady
         As given, `free` and `fixed` put in.
+    is_exact : bool
+        Whether rows are predicted by the exact steady motion: some have their force controlled,
+        and the model an equation of motion.
     noise : str
         The name of the noise model.
     parameters : tuple of Parameter
@@ -102,6 +117,8 @@ class Problem:
     True
     """
 
+    _orbits: dict[int, FloatArray]
+
     def __init__(
         self,
         data: FrequencyResponse,
@@ -111,10 +128,19 @@ class Problem:
         sensors: Sensors | None = None,
         free: Iterable[str] = (),
         fixed: Mapping[str, float] | None = None,
+        steady: Steady = "exact",
     ) -> None:
+        self.steady = steady
         table = checked_table(data)
         self._set_model(model, sensors, free, fixed, table.motion)
+        rates = [type(e).__name__ for e in self.model.elements if not e.rate_independent]
+        if rates and assumes_frequency(table.provenance):
+            raise DataError(
+                f"the table says no frequency, on which the force of {', '.join(rates)} depends; "
+                "give it when the table is read: frequency=1.0 (Hz)"
+            )
         self.data = as_response(table, self.model)
+        self._orbits = _ORBITS.setdefault(self.data, {})
         self._set_rows(Rows.of(self.data), noise)
 
     def _set_model(
@@ -125,6 +151,7 @@ class Problem:
         fixed: Mapping[str, float] | None,
         motion: Motion,
     ) -> None:
+        one_of(self.steady, "steady", STEADY)
         model, sensors = with_changes(as_model(model), sensors or EXACT, free, fixed or {})
         self.model, self.sensors = model, sensors
         parameters = [p for p in (*model.parameters, *sensors.parameters) if p.free]
@@ -133,12 +160,13 @@ class Problem:
         if not parameters:
             raise ModelError(f"{model!r} has no free parameter; leave one out, or name it in free=")
         self._coordinates = Coordinates(parameters)
+        self._orbits = {}
         self._alike = Interchangeable(model, self.names)
         self.priors: dict[str, Prior] = sensors.priors
 
     def _set_rows(self, rows: Rows, noise: str | None) -> None:
         self._rows = rows
-        self._predictor = Predictor(self.model, self.sensors, self._coordinates, rows)
+        self._predictor: Predictor | Nearby = self._predicting(exact=self.is_exact)
         self._predicted: tuple[bytes, Prediction | None] = (b"", None)
         self._noise = noise_for(rows, noise)
         self.noise = self._noise.name
@@ -161,6 +189,64 @@ class Problem:
         return (
             f"<{type(self).__name__}: {self._rows.n} rows of {self._rows.quantity}, "
             f"{self.noise} noise, free {', '.join(self.names)}>"
+        )
+
+    # Steady motion
+
+    @cached_property
+    def obstacle_to_exact(self) -> str:
+        """Why the model has no exact steady motion under a force; nothing where it has one."""
+        return obstacle(self.model)
+
+    @cached_property
+    def _shooting(self) -> Shooting:
+        return Shooting(self.model)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether rows are predicted by the exact steady motion."""
+        return (
+            self.steady == "exact" and bool(self._rows.forced.any()) and not self.obstacle_to_exact
+        )
+
+    def with_steady(self, steady: Steady) -> Self:
+        """Return the same problem, or batch, with another way to predict driven rows."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        other.__dict__.pop("stiffness_data", None)
+        other.steady = steady
+        other._set_rows(self._rows, self.noise)
+        return other
+
+    def takes_energy(self, theta: FloatArray) -> bool:
+        """Return whether every motion takes energy from the drive, by the describing function.
+
+        Where a plant gives energy, at the amplitude measured, it has no steady motion to be found.
+        """
+        sine = self.with_steady("describing function")
+        Z = sine.predicted_stiffness(theta)
+        first = Z.harmonic == 1
+        return bool(np.all(Z.stiffness.imag[first] > 0.0))
+
+    def near(self, theta: FloatArray) -> Problem:
+        """Return a problem that predicts as this one does near theta, and much faster.
+
+        Exact steady motions are taken to second order in the distance from theta, shape (P,), see
+        ``Nearby`` in problem/prediction.py. The problem itself where it has none.
+        """
+        if not self.is_exact or isinstance(self._predictor, Nearby):
+            return self
+        other = self.with_steady(self.steady)
+        with np.errstate(all="ignore"):
+            other._predictor = Nearby(
+                self._predicting(exact=True), self._predicting(exact=False), theta
+            )
+        return other
+
+    def _predicting(self, *, exact: bool) -> Predictor:
+        shooting = self._shooting if exact else None
+        return Predictor(
+            self.model, self.sensors, self._coordinates, self._rows, shooting, self._orbits
         )
 
     # Tables
@@ -299,7 +385,12 @@ class Problem:
     @property
     def rounding(self) -> FloatArray:
         """Size of residuals that may be rounding errors alone; no estimated scale is smaller."""
-        return self._noise.rounding
+        return np.asarray(self._noise.rounding * max(1.0, self.accuracy / EXPLICIT))
+
+    @property
+    def accuracy(self) -> float:
+        """Relative error of predictions: rounding, or what shooting leaves."""
+        return ACCURACY if self.is_exact else EXPLICIT
 
     # Residuals
 

@@ -19,27 +19,26 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
+from dahl_ident.data.record import at_even_times, cut, unbroken
 from dahl_ident.elements import Element, Parameter
-from dahl_ident.elements.behaviour import Behaviour
+from dahl_ident.elements.behaviour import Behaviour, HistoryGradient
 from dahl_ident.elements.element import as_model
+from dahl_ident.elements.equations import FirstState, plant_equations
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
 from dahl_ident.problem.displacement_noise import LEADS, noise_of, travelled
 from dahl_ident.problem.problem import Quadratic
 
 if TYPE_CHECKING:
-    from dahl_ident.time_domain import Excitation, ForcedMotion, Plant
+    from dahl_ident.elements.equations import Excitation
+    from dahl_ident.engine import System
 
 Output = Literal["force", "motion"]
 _SHORTEST = 16  # samples from which noise can be estimated
 _PER_CYCLE = 100.0  # samples that a slow cycle keeps where a record is too long
-_SUBSTEP = 0.4  # rad of the fastest motion in a step of integration
-_STABLE = 2.0  # of the fastest pole's time in a step: from about 3 the integration is unstable
-_MOST_STEPS = 32  # in a sampling interval
-_LINEAR = 0.1  # of the largest motion: a larger change is not what the slopes tell
 _SMALL = 0.1  # of the motion's inverse size: rates below are searched as numbers
 _INSIDE = 1.0 - 1e-9  # of the way to a bound: on it, a search would see no slope and stay
+_PLAY_STEP = 1e-6  # of the motion's range, for derivatives with respect to the place in a gap
 _VANISHED = 1e4  # times below what would change the residuals: held, or all steps shrink with it
-_POWER = 0.999  # share of the drive's power below its band's end
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,9 @@ class RecordProblem:
     Parameters
     ----------
     records : sequence of Record
-        Each a run. Evenly sampled where anything is integrated or differentiated.
+        Each a run. Where anything is integrated, is differentiated or remembers, a record is cut
+        at its gaps into parts with a first state each; where anything is integrated or
+        differentiated, unevenly sampled parts are resampled. Both with a warning.
     model : Element
         One element or a sum.
     output : {"force", "motion"}, optional
@@ -76,14 +77,11 @@ class RecordProblem:
     excitation : {"force", "base"}, default "force"
         For the output "motion", what the records' force channel is: a force, or the acceleration
         of the base, m/s^2, the motion being relative to it.
-    substeps : int, optional
-        Steps of integration in each sampling interval; left out, from the rates; a search doubles
-        them until the residuals no longer notice.
 
     Raises
     ------
     DataError
-        If a record lacks a channel, is too short, or is not evenly sampled where it has to be.
+        If a record lacks a channel, or is too short.
     ModelError
         If the model cannot predict the output, or nothing is free.
 
@@ -104,7 +102,6 @@ class RecordProblem:
         *,
         output: Output | None = None,
         excitation: Excitation = "force",
-        substeps: int | None = None,
     ) -> None:
         self.records = tuple(records)
         if not self.records:
@@ -117,7 +114,6 @@ class RecordProblem:
                 )
         self.model = as_model(model)
         self.excitation = excitation
-        self.substeps = substeps
         self.output: Output = output or ("motion" if self.model.has_inertia else "force")
         if self.output not in ("force", "motion"):
             raise ValidationError(f"output is {output!r}; expected force or motion")
@@ -125,6 +121,17 @@ class RecordProblem:
         if not self.free:
             raise ModelError(f"nothing is free in {self.model!r}; leave a parameter out")
         self.with_memory = [e for e in self.model.elements if e.has_memory]
+        if len({record.motion for record in self.records}) > 1:
+            raise DataError("some records are of translation and some of rotation; fit them apart")
+        integrated = self.output == "motion" or not self.model.rate_independent
+        self.runs: tuple[int, ...] = tuple(range(len(self.records)))
+        """Which of the given records each one is a part of."""
+        if integrated or self.with_memory:
+            parts = [unbroken(record, _SHORTEST) for record in self.records]
+            self.runs = tuple(i for i, some in enumerate(parts) for _ in some)
+            self.records = tuple(record for some in parts for record in some)
+        if integrated:
+            self.records = tuple(at_even_times(record) for record in self.records)
         for number, record in enumerate(self.records, 1):
             self._check(record, f"record {number}" if len(self.records) > 1 else "the record")
         self._check_scale()
@@ -141,8 +148,6 @@ class RecordProblem:
         self.displacement_noise = 0.0
         """Standard deviation of the displacement, m, within which no movement counts."""
         self._paths: tuple[FloatArray, ...] | None = None
-        self._guesses: list[FloatArray | None] = [None] * len(self.records)
-        self._slopes: list[tuple[FloatArray, FloatArray] | None] = [None] * len(self.records)
         self.watch: Watch | None = None
         """Called after each evaluation of the cost."""
 
@@ -153,14 +158,6 @@ class RecordProblem:
             raise DataError(
                 f"{which} has {record.motion_channel} but no displacement, from which the force "
                 "would follow; integrate it, or add Mass() to fit the motion"
-            )
-        integrates = self.output == "motion" or any(
-            not e.rate_independent for e in self.model.elements
-        )
-        if integrates and not record.uniform:
-            raise DataError(
-                f"{which} is not evenly sampled ({len(record.gaps)} gaps); give its longest part "
-                "without gaps, or resample it"
             )
         if self.output == "motion":
             _ = record.force_samples
@@ -193,8 +190,7 @@ class RecordProblem:
             for element in self.model.elements:
                 name = f"{element.name}_" if element.name else ""
                 if element.has_memory:
-                    start = element.start if self.output == "motion" else Behaviour.start
-                    found.append(Parameter(f"{name}{start[0]}{tail}", *start[1:]))
+                    found.append(Parameter(f"{name}{element.start[0]}{tail}", *element.start[1:]))
                 else:
                     found += [
                         Parameter(f"{name}state_{i + 1}{tail}", "m", "at the first sample")
@@ -255,7 +251,6 @@ class RecordProblem:
             self.model,
             output=self.output,
             excitation=self.excitation,
-            substeps=self.substeps,
         )
         other.watch = self.watch
         return other
@@ -270,9 +265,7 @@ class RecordProblem:
         """Return the same problem with other values of parameters that are fixed."""
         other = copy(self)
         other.model = self.model.with_fixed(values)
-        other._guesses, other._slopes = list(self._guesses), [None] * len(self.records)
-        for name in ("_plant", "forced"):
-            other.__dict__.pop(name, None)
+        other.__dict__.pop("_system", None)  # equations are shorter where a value is 0 or 1
         return other
 
     def without_noise(self, noise: float, lead: float = LEADS[1]) -> RecordProblem:
@@ -330,7 +323,7 @@ class RecordProblem:
     ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], ...]:
         if all(e.rate_independent for e in self.model.elements):
             return tuple((x, np.zeros(0), np.zeros(0)) for x in displacements)
-        from dahl_ident.time_domain import differentiated
+        from dahl_ident.engine import differentiated
 
         return tuple(
             (x, *differentiated(x, 1.0 / record.sample_rate))
@@ -352,58 +345,21 @@ class RecordProblem:
         return other
 
     @cached_property
-    def _plant(self) -> Plant:
-        from dahl_ident.time_domain import Plant
+    def _system(self) -> System:
+        from dahl_ident.engine import translate
 
-        return Plant(self.model, self.excitation)
+        channel = self.records[0].motion_channel
+        return translate(plant_equations(self.model, self.excitation, channel))
 
     @cached_property
-    def forced(self) -> tuple[ForcedMotion, ...]:
-        """The driven plant of each record, for the output "motion"."""
-        from dahl_ident.time_domain import ForcedMotion, band_limited
+    def _drives(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
+        """Times of the samples, and the drive's polynomials between them, of each record."""
+        from dahl_ident.engine import band_limited
 
-        found = []
-        for record in self.records:
-            rate, wave = record.sample_rate, record.force_samples
-            drive = band_limited(wave, 1.0 / rate, self._steps_in(record))
-            found.append(ForcedMotion(self._plant, drive, 1.0 / rate))
-        return tuple(found)
-
-    def _steps_in(self, record: Record) -> int:
-        """Return the steps of integration in each sampling interval of a record."""
-        return self.substeps or max(self.substeps_for(record), self._pole_steps(record.sample_rate))
-
-    def finer(self) -> RecordProblem:
-        """Return the same problem with twice the steps of integration."""
-        other = copy(self)
-        other.__dict__.pop("forced", None)
-        other.substeps = 2 * max(self._steps_in(record) for record in self.records)
-        return other
-
-    def _pole_steps(self, rate: float) -> int:
-        """Return the steps of integration that the poles of linear systems ask for."""
-        found = 1
-        for element in self.model.elements:
-            steps = int(np.ceil(element.fastest_rate / (rate * _STABLE)))
-            if steps > _MOST_STEPS:
-                raise ModelError(
-                    f"{element!r} has a pole at {element.fastest_rate:.3g} rad/s, "
-                    f"{element.fastest_rate / rate:.0f} times the sampling rate; leave out what is "
-                    "so fast, or sample faster"
-                )
-            found = max(found, steps)
-        return found
-
-    @staticmethod
-    def substeps_for(record: Record) -> int:
-        """Return the steps of integration that the band of drive and motion asks for."""
-        highest = 0.0
-        for wave in (record.force_samples, record.motion_samples):
-            power = np.abs(np.fft.rfft(wave - wave.mean())) ** 2
-            if power.any():
-                share = np.cumsum(power) / power.sum()
-                highest = max(highest, float(np.searchsorted(share, _POWER)) / power.size)
-        return int(np.clip(np.ceil(np.pi * highest / _SUBSTEP), 1, 8))
+        return tuple(
+            (r.time - r.time[0], band_limited(r.force_samples, 1.0 / r.sample_rate))
+            for r in self.records
+        )
 
     def values(self, theta: FloatArray) -> FloatArray:
         """Return the parameters' values from search coordinates.
@@ -466,8 +422,12 @@ class RecordProblem:
         model = self.model.sampled(1.0 / record.sample_rate)
         for element, at in model.of(self.full_values(values)):
             state, moved = (states[start], path) if element.has_memory else (0.0, x)
+            in_gap = element.has_memory and element.start is not Behaviour.start
             if derivatives:
-                found = element.force_history_gradient(at, moved, v, state, acceleration=a)
+                if in_gap:
+                    found = _from_middle(element, at, moved, state)
+                else:
+                    found = element.force_history_gradient(at, moved, v, state, acceleration=a)
                 total = total + found.value
                 for parameter, slope in zip(element.parameters, found.by_parameter, strict=True):
                     if parameter.free:
@@ -475,6 +435,8 @@ class RecordProblem:
                         column += 1
                 if element.has_memory:
                     by[:, first + start] = found.by_state
+            elif in_gap:
+                total = total + element.force_history(at, _before(moved, state))[1:]
             else:
                 total = total + element.force_history(at, moved, v, state, acceleration=a)
             if element.has_memory:
@@ -492,54 +454,32 @@ class RecordProblem:
         return Prediction(total, by)
 
     def _motion(self, values: FloatArray, number: int, *, derivatives: bool) -> Prediction:
-        forced, own = self.forced[number], self.own(values, number)
-        order, free, starts = self._plant.order, values[: len(self.free)], own.size - 1
-        first, first_by = self._plant.first(own[:starts], free)
-        motion = forced.solve(free, first, self._guessed(number, np.concatenate([free, first])))
-        self._guesses[number], self._slopes[number] = motion, None
-        channel = ("displacement", "velocity", "acceleration").index(
-            self.records[number].motion_channel
+        from dahl_ident.engine import march
+
+        own, free = self.own(values, number), values[: len(self.free)]
+        starts = own.size - 1
+        at = np.array(self.full_values(values))
+        first, by_start, by_value = self._first(own[:starts], at)
+        time, drive = self._drives[number]
+        found = march(
+            self._system, time, drive, time, first, at, chosen=self._chosen, derivatives=derivatives
         )
-        sensitivities = forced.sensitivities(free, motion) if derivatives else None
-        if sensitivities is not None:
-            self._slopes[number] = np.concatenate([free, first]), sensitivities
-        if channel < 2:
-            output = motion[:, channel]
-            slopes = None if sensitivities is None else sensitivities[:, channel]
-        else:
-            output, slopes = forced.accelerations(
-                free, motion, self.records[number].force_samples, sensitivities
-            )
-        by = np.zeros((output.size, len(self.parameters) if derivatives else 0))
-        if slopes is not None:
-            column = len(self.free) + number * self.per_record
-            by_first = slopes[:, :order] @ first_by
-            by[:, : len(self.free)] = slopes[:, order:] + by_first[:, starts:]
-            by[:, column : column + starts] = by_first[:, :starts]
+        by = np.zeros((found.output.size, len(self.parameters) if derivatives else 0))
+        if derivatives:
+            column = free.size + number * self.per_record
+            by[:, : free.size] = found.by_parameter + found.by_first @ by_value[:, self._chosen]
+            by[:, column : column + starts] = found.by_first @ by_start
             by[:, column + starts] = 1.0
-        return Prediction(output + own[starts], by)
+        return Prediction(found.output + own[starts], by)
 
-    def _guessed(self, number: int, at: FloatArray) -> FloatArray:
-        """Return a guess of the motion for free values and a first state."""
-        guess, known = self._guesses[number], self._slopes[number]
-        count = len(self.free)
-        if guess is None:
-            return np.tile(at[count:], (len(self.records[number]), 1))
-        if known is None:
-            return guess
-        change = at - known[0]
-        moved = known[1] @ np.concatenate([change[count:], change[:count]])
-        small = np.abs(moved).max(axis=0) < _LINEAR * np.abs(guess).max(axis=0)
-        return guess + moved if small.all() else guess
+    @cached_property
+    def _chosen(self) -> list[int]:
+        """Places of the free parameters among all."""
+        return [i for i, p in enumerate(self.model.parameters) if p.free]
 
-    @property
-    def guesses(self) -> tuple[FloatArray | None, ...]:
-        """The motion of each record that was solved for last, (n, order)."""
-        return tuple(self._guesses)
-
-    def set_guess(self, number: int, motion: FloatArray | None) -> None:
-        """Give a guess of the motion, (n, order), from which the next solution starts."""
-        self._guesses[number], self._slopes[number] = motion, None
+    @cached_property
+    def _first(self) -> FirstState:
+        return FirstState(self.model)
 
     def split_residuals(self, values: FloatArray) -> list[FloatArray]:
         """Return measured minus predicted output of each record."""
@@ -592,19 +532,20 @@ class RecordProblem:
         return (size,) * len(self.records)
 
 
-def cut(record: Record, part: slice) -> Record:
-    """Return some of a record's samples."""
-    channels = {
-        name: None if samples is None else samples[part]
-        for name in ("displacement", "velocity", "acceleration", "force", "drive")
-        for samples in (getattr(record, name),)
-    }
-    return Record(
-        record.time[part],
-        **channels,
-        drive_unit=record.drive_unit,
-        drive_factor=record.drive_factor,
-        drive_factor_uncertainty=record.drive_factor_uncertainty,
-        motion=record.motion,
-        provenance=record.provenance,
-    )
+def _before(path: FloatArray, play: float) -> FloatArray:
+    """Return a path that comes to its first sample from the middle of a gap."""
+    return np.concatenate([[path[0] - play], path])
+
+
+def _from_middle(
+    element: Element, values: Sequence[float], path: FloatArray, play: float
+) -> HistoryGradient:
+    """Return the force of an element that starts somewhere in its gap, with its derivatives.
+
+    That with respect to the place is a central difference.
+    """
+    step = _PLAY_STEP * float(np.ptp(path))
+    found = element.force_history_gradient(values, _before(path, play))
+    high, low = (element.force_history(values, _before(path, play + s)) for s in (step, -step))
+    by_play = (high - low)[1:] / (2.0 * step)
+    return HistoryGradient(found.value[1:], by_play, tuple(s[1:] for s in found.by_parameter))

@@ -135,6 +135,10 @@ class Document:
         The rest, in reading order, details last.
     facts : mapping
         The same for machines.
+    identity : str
+        Number and data of the report, for every page.
+    signatory : tuple of str
+        Name and role of who signs it; empty to be filled in by hand.
     """
 
     title: str
@@ -143,6 +147,8 @@ class Document:
     sections: tuple[Section, ...]
     header: tuple[tuple[str, tuple[str, ...]], ...] = ()
     facts: Mapping[str, Any] = field(default_factory=dict)
+    identity: str = ""
+    signatory: tuple[str, ...] = ()
 
     @property
     def trusted(self) -> bool:

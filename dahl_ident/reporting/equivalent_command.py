@@ -6,6 +6,8 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from dahl_ident.elements.law_checks import is_of_package
+from dahl_ident.elements.law_files import own_laws, source_path
 from dahl_ident.reporting.provenance import parts
 from dahl_ident.reporting.tables import prior_text
 from dahl_ident.results import ChainPosterior, FitResult
@@ -84,8 +86,8 @@ def _words(given: Mapping[str, Any]) -> list[str]:
 def _has_text(element: Element) -> bool:
     """Return whether --element can describe an element: by its declared parameters alone."""
     described = set(element.describe()) - {"kind", "name"}
-    in_package = type(element).__module__.split(".")[0] == __name__.split(".")[0]
-    return in_package and described == set(element.labels)
+    known = is_of_package(type(element)) or source_path(type(element)) is not None
+    return known and described == set(element.labels)
 
 
 def _as_text(element: Element) -> str:
@@ -104,6 +106,7 @@ def _fit(fit: FitResult) -> list[str]:
     return [
         "fit", *_model(fit.problem), "--noise", fit.noise,
         *_changed(method=(fit.method, "lm"), loss=(fit.optimum.loss, "linear")),
+        *_changed(steady=(fit.problem.steady, "exact")),
     ]  # fmt: skip
 
 
@@ -115,6 +118,7 @@ def _sample(posterior: ChainPosterior) -> list[str]:
         *_changed(
             likelihood=(posterior.likelihood, "gaussian"),
             uncertainty=(posterior.uncertainty, "combined"),
+            steady=(posterior.problem.steady, "exact"),
         ),
         *(word for prior in priors for word in ("--prior", prior)),
     ]  # fmt: skip
@@ -124,10 +128,13 @@ def _model(problem: Problem) -> list[str]:
     """Return the options of elements and sensors that differ from the usual ones."""
     model = problem.model
     names = {p.name for p in model.parameters}
-    if names <= _OPTIONS and {"f_max", "sigma"} <= names:
+    laws = own_laws(model.elements)
+    if names <= _OPTIONS and {"f_max", "sigma"} <= names and not laws:
         words = [word for p in model.parameters for word in _parameter(p, problem)]
     else:
         words = [word for e in model.elements for word in ("--element", _as_text(e))]
+    files = dict.fromkeys(map(source_path, laws))
+    words = [*(word for file in files for word in ("--laws", str(file))), *words]
     return [*words, *(w for p in problem.sensors.parameters for w in _parameter(p, problem))]
 
 

@@ -20,9 +20,15 @@ def html(document: Document) -> bytes:
     page = environment.from_string((room / "page.html.j2").read_text(encoding="utf-8"))
     return page.render(
         document=document,
+        foot=_css_text(f"{document.title} {document.identity}".strip()),
         style=(room / "page.css").read_text(encoding="utf-8"),
         script=(room / "page.js").read_text(encoding="utf-8"),
     ).encode(errors="replace")
+
+
+def _css_text(text: str) -> str:
+    """Return a string of a style sheet that holds nothing but letters, digits and escapes."""
+    return '"' + "".join(c if c.isalnum() else f"\\{ord(c):x} " for c in text) + '"'
 
 
 def _as_uri(picture: Picture) -> str:

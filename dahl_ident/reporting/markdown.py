@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 from dahl_ident.reporting.document import (
     Block,
@@ -29,15 +29,18 @@ def markdown(document: Document, folder: str) -> bytes:
             f"| {name} | {_escaped('; '.join(given)) or BLANK} |" for name, given in document.header
         ]
         lines.append("\n".join(("| | |", "| --- | --- |", *rows)))
-    for section in _with_signature(document.sections):
+    if document.identity:
+        lines.append(_escaped(document.identity))
+    for section in _with_signature(document):
         lines.append(f"## {_escaped(section.title)}")
         lines += [text for block in section.blocks if (text := _block(block, folder))]
     return ("\n\n".join(lines) + "\n").encode(errors="replace")
 
 
-def _with_signature(sections: Sequence[Section]) -> Iterator[Section]:
+def _with_signature(document: Document) -> Iterator[Section]:
     """Yield the sections, and before the details a field for the signature."""
-    signature = Section("Signature", (Paragraph(f"Date {BLANK} Name {BLANK} Signature {BLANK}"),))
+    sections, name = document.sections, ", ".join(document.signatory) or BLANK
+    signature = Section("Signature", (Paragraph(f"Date {BLANK} Name {name} Signature {BLANK}"),))
     for before, section in zip((None, *sections), sections, strict=False):
         if section.details and not (before and before.details):
             yield signature

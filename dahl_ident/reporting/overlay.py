@@ -12,6 +12,7 @@ import numpy as np
 from scipy import special
 
 from dahl_ident import plots
+from dahl_ident.data.laboratory import Metadata
 from dahl_ident.diagnostics.formatting import rounded
 from dahl_ident.diagnostics.verdicts import Verdict
 from dahl_ident.errors import ValidationError
@@ -25,13 +26,13 @@ from dahl_ident.reporting.document import (
     Table,
     figure_of,
 )
-from dahl_ident.reporting.metadata import Metadata
 from dahl_ident.reporting.provenance import parts
 from dahl_ident.reporting.sections import (
     Result,
     fit_facts,
     header,
     origin_facts,
+    signed,
     worst_status,
 )
 from dahl_ident.results import FitResult
@@ -95,11 +96,12 @@ def overlay(
             "fits": [{"name": n} | fit_facts(fit) for n, fit in zip(names, fits, strict=True)],
             "posteriors": [],
             "changes": changes,
-            "metadata": vars(given),
+            "metadata": given.facts(),
             **origin_facts(fits[0].data),
             "files": [file for fit in fits for file in origin_facts(fit.data)["files"]],
             "command": command,
         },
+        **signed(given, fits[0].data),
     )
 
 
@@ -210,7 +212,9 @@ def _change_table(changes: Sequence[dict[str, Any]]) -> Table:
                 Cell(value, c["change"], struck=not usable),
                 Cell(error, c["u"] if math.isfinite(c["u"]) else None, struck=not usable),
                 Cell(c["unit"] or "-"),
-                Cell(_p(c["p"])[4:].replace("< ", "< "), c["p"]) if usable else Cell("-"),
+                Cell(_p(c["p"]).removeprefix("p ").removeprefix("= "), c["p"])
+                if usable
+                else Cell("-"),
                 Cell(_significance(c)),
             )
         )

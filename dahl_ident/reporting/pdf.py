@@ -35,6 +35,7 @@ _FONTS = Path(mpl.get_data_path()) / "fonts" / "ttf"
 _FACES = {"": "DejaVuSans.ttf", "B": "DejaVuSans-Bold.ttf", "I": "DejaVuSans-Oblique.ttf"}
 _PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
 _HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; space kept below a heading or a caption
+_LONGEST = 60  # characters of a title at the foot of a page
 _WIDEST = 26  # characters in the widest column of a table
 _MARGIN, _BOLD = 3.0, 1.25  # characters beside the text; how much wider bold ones are
 _NAME_WIDTH = 38.0  # mm, of the fields' names in the header
@@ -63,7 +64,7 @@ def pdf(document: Document) -> bytes:
     before: Section | None = None
     for section in document.sections:
         if section.details and not (before and before.details):
-            _signature(page)
+            _signature(page, document.signatory)
             page.add_page()
         before = section
         pictures = [_Drawn(block) for block in section.blocks if isinstance(block, Picture)]
@@ -84,6 +85,9 @@ def pdf(document: Document) -> bytes:
 
 
 def _page(document: Document) -> FPDF:
+    title = document.title if len(document.title) <= _LONGEST else f"{document.title[:_LONGEST]}..."
+    identity = " \u00b7 ".join(text for text in (title, document.identity) if text)
+
     class Page(FPDF):
         """A page that shows characters missing from its font, which fpdf2 would leave out."""
 
@@ -92,7 +96,8 @@ def _page(document: Document) -> FPDF:
 
         def footer(self) -> None:
             self.set_y(-12)
-            self.set_font(_FONT, "", 7.5)
+            self.set_font(_FONT, "", 6.5)
+            self.cell(0.85 * self.epw, 4, identity)
             self.cell(0, 4, f"Page {self.page_no()} of {{nb}}", align="R")
 
     page = Page(format="A4")
@@ -134,17 +139,18 @@ def _header(page: FPDF, document: Document) -> None:
             page.multi_cell(0, 4.4, line, align="L", new_x="LMARGIN", new_y="NEXT")
 
 
-def _signature(page: FPDF) -> None:
+def _signature(page: FPDF, signatory: Sequence[str]) -> None:
     _turn_unless_room(page, 22.0)
-    page.ln(14)
+    page.ln(12)
     page.set_font(_FONT, "", 8)
     width = (page.epw - 2 * _GAP) / 3.0
     top = page.get_y()
-    for i, name in enumerate(("Date", "Name", "Signature")):
+    authorised = ", ".join(("Authorised by", *signatory)) if signatory else "Name"
+    for i, name in enumerate(("Date", authorised, "Signature")):
         x = page.l_margin + i * (width + _GAP)
         page.line(x, top, x + width, top)
         page.set_xy(x, top + 1.0)
-        page.cell(width, 4, name)
+        page.multi_cell(width, 4, name, align="L")
     page.set_xy(page.l_margin, top + 6.0)
 
 
@@ -216,7 +222,7 @@ def _table(page: FPDF, table: Table) -> None:
         col_widths=widths,
         text_align="LEFT",
         line_height=4,
-        padding=0.8,
+        padding=0.5,
         borders_layout="HORIZONTAL_LINES",
     )
     for row in (words(*table.header), *table.rows):
@@ -287,7 +293,7 @@ class _Structure(StructureTreeBuilder):
 
 def _width(name: str, texts: Sequence[str]) -> float:
     """Return the width of a column in characters; its name may be wrapped between words."""
-    longest = max(_BOLD * max(map(len, name.split())), *map(len, texts))
+    longest = max(_BOLD * max(map(len, name.split()), default=0), *map(len, texts), 1)
     return min(longest, _WIDEST) + _MARGIN
 
 

@@ -69,6 +69,11 @@ def versions() -> dict[str, str]:
     return found | {name: importlib.metadata.version(name) for name in _PACKAGES}
 
 
+def listed_versions() -> str:
+    """Return the versions in one line."""
+    return ", ".join(f"{name} {version}" for name, version in versions().items())
+
+
 def today() -> str:
     """Return date and time of day, with the offset to UTC."""
     return datetime.datetime.now().astimezone().isoformat(timespec="minutes")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -12,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.data import Record
+from dahl_ident.data.laboratory import Metadata, metadata_of
 from dahl_ident.data.storage import place_of, plain_data, refuse_existing, write_whole
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.reporting.document import Document, Picture
 from dahl_ident.reporting.html import html
 from dahl_ident.reporting.markdown import markdown
-from dahl_ident.reporting.metadata import metadata_of
 from dahl_ident.reporting.overlay import overlay
 from dahl_ident.reporting.record_report import record_document
 from dahl_ident.reporting.sections import Result, document
@@ -59,8 +60,11 @@ def report(
     record : Record, optional
         The waveforms that the data were extracted from; the report shows how a point settled.
     metadata : mapping or path of a TOML file, optional
-        Metadata from the laboratory: title, laboratory, customer, specimen, operator, measured
-        (date), ambient, instruments, remarks. Fields left out are printed as lines to fill in.
+        Metadata from the laboratory: title, number, laboratory, customer, specimen, method,
+        received and measured (dates), place, ambient, instruments, traceability, operator,
+        authorised_by, role, remarks. The usual fields left out are printed as lines to fill in.
+        An instrument's channel, uncertainty and k are its calibration, which the fit must have
+        counted: ``sensors=Sensors.from_metadata(metadata)``.
     overwrite : bool, default False
         Replace a report that is there already.
 
@@ -73,7 +77,8 @@ def report(
     ------
     ValidationError
         If there is no result, the ending is another one, the record is of other data, a field of
-        the metadata is unknown, or a posterior is on other data than the first result, or fits
+        the metadata is unknown, an instrument states an uncertainty that the fit did not count,
+        or a posterior is on other data than the first result, or fits
         to records are mixed with other results.
     DataError
         If the metadata cannot be read, a file is there already and `overwrite` is not set, or the
@@ -101,7 +106,7 @@ def report(
                 "on frequency responses, and write another report for those"
             )
         whole = record_document(of_records, title=title, command=command, metadata=known)
-    elif _on_one_table(checked := _checked(given)):
+    elif _on_one_table(checked := _calibrated(_checked(given), known)):
         whole = document(checked, title=title, command=command, record=record, metadata=known)
     else:
         whole = overlay(checked, title=title, command=command, metadata=known)
@@ -127,6 +132,22 @@ def _checked(results: list[Any]) -> list[Result]:
                 f"result {i} is a {type(result).__name__}; expected a FitResult, a RecordFit or a "
                 "Posterior"
             )
+    return results
+
+
+def _calibrated(results: list[Result], known: Metadata) -> list[Result]:
+    """Return the results, after a check that they count what the instruments state."""
+    for name, u in known.calibrations().items():
+        for result in results:
+            prior = result.problem.priors.get(name)
+            counted = 0.0 if prior is None else float(prior.std())
+            if not math.isclose(counted, u, rel_tol=0.01):
+                taken = f"a standard uncertainty of {counted:.3g}" if counted else "it as exact"
+                raise ValidationError(
+                    f"the instruments state a standard uncertainty of {u:.3g} for {name}, but the "
+                    f"fit takes {taken}; fit with --metadata and this file (in Python with "
+                    "Sensors.from_metadata), and report on that fit"
+                )
     return results
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dahl_ident.data.laboratory import Metadata
 from dahl_ident.diagnostics.formatting import interval, percent, rounded
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.reporting import posterior_sections, provenance, tables
@@ -26,7 +27,7 @@ from dahl_ident.reporting.document import (
     words,
 )
 from dahl_ident.reporting.figures import budget_picture
-from dahl_ident.reporting.metadata import Metadata
+from dahl_ident.reporting.sections import COVERAGE, RELATES, identity, short
 from dahl_ident.results import RecordFit, RecordPosterior
 from dahl_ident.version import __version__
 
@@ -55,13 +56,22 @@ def record_document(
     details: list[Section] = []
     for number, fit in enumerate(fits):
         of = f": {fit.problem.model!r}" if several else ""
-        front += [Section(f"Result{of}", (_answer(fit),))]
+        front += [Section(f"Result{of}", (_answer(fit), Paragraph(RELATES)))]
         if fit.status is not VerdictStatus.NOT_DESCRIBED and np.isfinite(fit.covar).all():
             found = fit.budget()
             front.append(
-                Section(f"Uncertainty budget{of}", (tables.budget(found), budget_picture(found)))
+                Section(
+                    f"Expanded uncertainty{of}", (tables.uncertainty(found), Paragraph(COVERAGE))
+                )
             )
-        front.append(Section(f"What was assumed{of}", (Bullets(tuple(_assumed(fit))),)))
+            details.append(
+                Section(
+                    f"Sources of uncertainty{of}",
+                    (tables.budget(found), budget_picture(found)),
+                    details=True,
+                )
+            )
+        front.append(Section(f"What was assumed{of}", (Bullets(tuple(_assumed(fit, given))),)))
         front.append(Section(f"Pictures{of}", tuple(_pictures(fit, number))))
         lines = (*fit.goodness.lines, *(f"Derived: {quantity}" for quantity in fit.derived()))
         details.append(Section(f"Goodness of fit{of}", (Bullets(lines),), details=True))
@@ -74,21 +84,23 @@ def record_document(
         for p in (record.provenance or {} for record in first.records)
         if "file" in p
     ]
-    named = [f"{file['file']}, SHA-256 {file['sha256'] or 'unknown'}" for file in files]
+    named = [f"{file['file']}, SHA-256 {short(str(file['sha256']))}" for file in files]
     origin: list[Block] = [
         Paragraph(f"Made on {provenance.today()}."),
         *([Listing(command)] if command else []),
     ]
     count = f"{len(first.records)} record{'s' if len(first.records) > 1 else ''}"
     name = files[0]["file"] if files else count
-    header = dict(given.header()) | {
+    header = given.lines | {
         "Model": tuple(_model(first)),
         "Data": (f"{count}, {first.problem.n_residuals} samples", *named),
         "Date of report": (provenance.today(),),
         "Software": (f"dahl_ident {__version__}",),
     }
-    used = tuple(words(name, version) for name, version in provenance.versions().items())
-    origin.append(Table("Versions", ("package", "version"), used))
+    if files:
+        rows = tuple(words(str(file["file"]), str(file["sha256"])) for file in files)
+        origin.append(Table("Files", ("file", "SHA-256"), rows))
+    origin.append(Paragraph(f"Versions: {provenance.listed_versions()}."))
     order = list(MARKS)
     return Document(
         title=title or given.title or f"Friction identified from {name}",
@@ -106,11 +118,13 @@ def record_document(
             "posteriors": [one.to_dict() for one in drawn],
             "record_fits": [_facts(fit) for fit in fits],
             "files": files,
-            "metadata": vars(given),
+            "metadata": given.facts(),
             "versions": provenance.versions(),
             "date": provenance.today(),
             "command": command,
         },
+        identity=identity(given, [(str(f["file"]), str(f["sha256"])) for f in files]),
+        signatory=given.signatory,
     )
 
 
@@ -145,7 +159,7 @@ def _answer(fit: RecordFit) -> Table:
     return Table(f"Estimates with their standard uncertainties{hint}", header, tuple(rows))
 
 
-def _assumed(fit: RecordFit) -> Iterator[str]:
+def _assumed(fit: RecordFit, given: Metadata) -> Iterator[str]:
     yield _OUTPUTS[fit.problem.output]
     assumed = {one.name for one in fit.errors.exponents}
     fixed = [
@@ -158,6 +172,12 @@ def _assumed(fit: RecordFit) -> Iterator[str]:
     for one in fit.errors.exponents:
         yield f"Not given: {one}; its range counts in the uncertainty."
     yield f"Taken as exact: {', '.join(fit.errors.exact)}."
+    if stated := given.calibrations():
+        names = ", ".join(name.replace("_", " ") for name in stated)
+        yield (
+            f"Not counted: the uncertainty of {names} that the instruments state, because a fit of "
+            "records takes the channels as exact; a fit of an extracted table counts it."
+        )
     if fit.weighted:
         yield "Residuals are weighted by their spectrum, because slow noise dominates them."
 

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.data.laboratory import Metadata
 from dahl_ident.diagnostics.budget import taken_as_exact
 from dahl_ident.diagnostics.comparison import compare_models
-from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, percent
 from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.reporting import posterior_sections, provenance, tables
@@ -27,7 +28,6 @@ from dahl_ident.reporting.document import (
 )
 from dahl_ident.reporting.equivalent_command import equivalent_command
 from dahl_ident.reporting.figures import budget_picture, pictures_of_fit
-from dahl_ident.reporting.metadata import Metadata
 from dahl_ident.reporting.settling import settling
 from dahl_ident.results import ChainPosterior, FitResult
 from dahl_ident.version import __version__
@@ -42,6 +42,11 @@ NOISE = {
     "absolute": "The noise has the same size at every point: constant variance of real and "
     "imaginary part. Its size was estimated from the residuals.",
 }
+RELATES = "The results relate only to the item that was measured."
+COVERAGE = (
+    "The expanded uncertainty U is the combined standard uncertainty u times the coverage factor "
+    f"k, for a coverage of about {percent(CONFIDENCE)}."
+)
 _FRONT = ("response", "residuals")  # pictures before the details
 
 
@@ -64,7 +69,7 @@ def document(
         of = f": {fit.problem.model!r}" if len(fits) > 1 else ""
         pictures = list(pictures_of_fit(fit))
         front += list(_answer(fit, of))
-        front.append(Section(f"Uncertainty budget{of}", tuple(_budget(fit))))
+        front.append(Section(f"Expanded uncertainty{of}", tuple(_budget(fit))))
         front.append(Section(f"What was assumed{of}", tuple(_assumed(fit))))
         shown = tuple(picture for picture in pictures if picture.name in _FRONT)
         front.append(Section(f"Pictures{of}", shown))
@@ -92,11 +97,36 @@ def document(
         facts={
             "fits": [fit_facts(fit) for fit in fits],
             "posteriors": [one.to_dict() for one in drawn],
-            "metadata": vars(given),
+            "metadata": given.facts(),
             **origin_facts(data),
             "command": repeated,
         },
+        **signed(given, data),
     )
+
+
+def signed(given: Metadata, data: FrequencyResponse | None) -> dict[str, Any]:
+    """Return what identifies the report on every page, and who signs it."""
+    files = [] if data is None else [s for s in provenance.sources(data) if s.read and s.sha256]
+    return {
+        "identity": identity(given, [(source.file, source.sha256) for source in files]),
+        "signatory": given.signatory,
+    }
+
+
+def identity(given: Metadata, files: Sequence[tuple[str, str]]) -> str:
+    """Return the number of a report and the hash of its first file, for every page."""
+    parts = [f"Report {given.number}"] if given.number else []
+    if files:
+        more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+        name, sha256 = files[0]
+        parts.append(f"{Path(name).name}, SHA-256 {short(sha256)}{more}")
+    return " \u00b7 ".join(parts)
+
+
+def short(sha256: str) -> str:
+    """Return the beginning of a hash; the whole one stands under the origin."""
+    return f"{sha256[:12]}..." if sha256 else "unknown"
 
 
 def origin_facts(data: FrequencyResponse) -> dict[str, Any]:
@@ -127,7 +157,7 @@ def worst_status(results: Sequence[Result]) -> str:
 def header(result: Result, given: Metadata) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """Return specimen, model, data, instruments, operator, dates and software."""
     data = result.data
-    of_laboratory = dict(given.header())
+    of_laboratory = given.lines
     specimen = {"Specimen": of_laboratory.pop("Specimen")}
     first = {
         name: of_laboratory.pop(name)
@@ -137,7 +167,7 @@ def header(result: Result, given: Metadata) -> tuple[tuple[str, tuple[str, ...]]
     files = []
     for source in provenance.sources(data):
         before = "" if source.read else "made from "
-        files.append(f"{before}{source.file}, SHA-256 {source.sha256 or 'unknown'}")
+        files.append(f"{before}{source.file}, SHA-256 {short(source.sha256)}")
     made_of = {
         "Model": tuple(_model(result)),
         "Data": (f"{data.n} rows", *files),
@@ -183,12 +213,21 @@ def _answer(fit: FitResult, of: str) -> Iterator[Section]:
         (
             tables.answer(fit, described=described),
             Bullets(determined),
+            Paragraph(RELATES),
         ),
     )
 
 
 def _budget(fit: FitResult) -> Iterator[Block]:
-    """Yield the uncertainty budget; nothing if none can be stated."""
+    """Yield the combined uncertainties; nothing if none can be stated."""
+    found = fit.stated_budget
+    if fit.status != VerdictStatus.NOT_DESCRIBED and found is not None:
+        yield tables.uncertainty(found)
+        yield Paragraph(COVERAGE)
+
+
+def _sources(fit: FitResult) -> Iterator[Block]:
+    """Yield every source of uncertainty of every parameter."""
     found = fit.stated_budget
     if fit.status != VerdictStatus.NOT_DESCRIBED and found is not None:
         yield tables.budget(found)
@@ -199,7 +238,8 @@ def _assumed(fit: FitResult) -> Iterator[Block]:
     """Yield the assumptions of the result that these data do not test."""
     errors = fit.errors
     counted = () if errors is None else errors.assumed
-    held = [p for p in fit.params.values() if not p.vary and p.name not in counted]
+    sensors = [p.name for p in fit.problem.sensors.parameters]
+    held = [p for p in fit.params.values() if not p.vary and p.name not in (*counted, *sensors)]
     fixed = [_value(p.name, p.value, p.unit) for p in held]
     exact = taken_as_exact(fit.optimum)
     lines = [f"Held fixed: {listed(fixed)}."] if fixed else []
@@ -225,6 +265,8 @@ def _value(name: str, value: float, unit: str) -> str:
 def _details(
     fit: FitResult, drawn: Sequence[ChainPosterior], pictures: Sequence[Picture], of: str
 ) -> Iterator[Section]:
+    if sources := tuple(_sources(fit)):
+        yield Section(f"Sources of uncertainty{of}", sources, details=True)
     yield Section(f"Parameters{of}", tuple(_parameters(fit, drawn)), details=True)
     known = fit.identifiability
     yield Section(
@@ -301,8 +343,7 @@ def _origin(data: FrequencyResponse, command: str | None, *, typed: bool) -> Ite
     made = provenance.options(data)
     if made:
         yield Table("Options", ("option", "value"), tuple(words(*pair) for pair in made))
-    used = tuple(words(name, version) for name, version in provenance.versions().items())
-    yield Table("Versions", ("package", "version"), used)
+    yield Paragraph(f"Versions: {provenance.listed_versions()}.")
     when = f"Made on {provenance.today()}"
     if command is None:
         yield Paragraph(f"{when}, in Python; no command describes this model and these data.")

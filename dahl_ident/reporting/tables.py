@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from dahl_ident.results import FitResult
     from dahl_ident.results.chain_posterior import ChainPosterior
 
+_LARGEST = 3  # sources of uncertainty on the first page
 _LINEARIZATION_ROWS = 9  # few enough to read, from the smallest amplitude to the largest
 
 
@@ -63,6 +64,27 @@ def answer(fit: FitResult, *, described: bool) -> Table:
     return Table(f"Estimates with their standard uncertainties{hint}", header, tuple(rows))
 
 
+def uncertainty(found: Budget) -> Table:
+    """Return the combined uncertainty of every parameter with its largest sources."""
+    rows = []
+    for p in found.parameters:
+        shares = [(row.source, 100.0 * row.share) for row in p.rows[:_LARGEST] if row.u > 0.0]
+        sources = [f"{source} {share:.0f} %" for source, share in shares if share >= 0.5]
+        rows.append(
+            (
+                Cell(p.name), _two_digits(p.u), _dof(p.dof), Cell(f"{p.k:.2f}", p.k),
+                _two_digits(p.U), Cell(p.unit or "-"), Cell(", ".join(sources) or "-"),
+            )
+        )  # fmt: skip
+    header = (
+        "parameter", "combined standard uncertainty u", "degrees of freedom", "k", "U = k u",
+        "unit", "largest sources, share of the variance",
+    )  # fmt: skip
+    return Table(
+        f"Expanded uncertainties U; k is for {percent(CONFIDENCE)} coverage", header, tuple(rows)
+    )
+
+
 def budget(found: Budget) -> Table:
     """Return every source of uncertainty of every parameter; the combined one comes first."""
     rows = []
@@ -70,8 +92,8 @@ def budget(found: Budget) -> Table:
         unit = p.unit or "-"
         rows.append(
             (
-                Cell(p.name), Cell("combined"), Cell("-"), number(p.u, 2), Cell(unit), _dof(p.dof),
-                Cell("100 %", 1.0), number(p.k, 3), number(p.U, 2),
+                Cell(p.name), Cell("combined"), Cell("-"), _two_digits(p.u), Cell(unit),
+                _dof(p.dof), Cell("100 %", 1.0), Cell(f"{p.k:.2f}", p.k), _two_digits(p.U),
             )
         )  # fmt: skip
         rows += [
@@ -88,6 +110,10 @@ def budget(found: Budget) -> Table:
     return Table(
         f"Uncertainty budget; k is for {percent(CONFIDENCE)} coverage", header, tuple(rows)
     )
+
+
+def _two_digits(u: float) -> Cell:
+    return Cell(rounded(u, u)[1], u)
 
 
 def _dof(dof: float) -> Cell:

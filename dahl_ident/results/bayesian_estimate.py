@@ -42,6 +42,7 @@ from dahl_ident.results.progress import progress_bar
 from dahl_ident.results.record_fit import RecordFit
 from dahl_ident.results.record_posterior import RecordPosterior
 from dahl_ident.sensors import Sensors
+from dahl_ident.steady_state import Steady
 
 _LEAST_STEPS = 20  # with fewer no autocorrelation can be estimated
 _MOST_AXES = 3  # the number of points is a power of the number of axes
@@ -60,6 +61,7 @@ def posterior(
     fixed: Mapping[str, float] | None = None,
     noise: str | None = None,
     sensors: Sensors | None = None,
+    steady: Steady | None = None,
     likelihood: str = "gaussian",
     uncertainty: str = "combined",
     seed: int | None = None,
@@ -104,6 +106,7 @@ def posterior(
     fixed: Mapping[str, float] | None = None,
     noise: str | None = None,
     sensors: Sensors | None = None,
+    steady: Steady | None = None,
     likelihood: str = "gaussian",
     uncertainty: str = "combined",
     seed: int | None = None,
@@ -122,6 +125,7 @@ def posterior(
     fixed: Mapping[str, float] | None = None,
     noise: str | None = None,
     sensors: Sensors | None = None,
+    steady: Steady | None = None,
     likelihood: str = "gaussian",
     uncertainty: str = "combined",
     seed: int | None = None,
@@ -152,7 +156,7 @@ def posterior(
         By parameter: a frozen distribution of scipy.stats over the value, or bounds, between
         which positive parameters are log-uniform and the others uniform. Parameters left out
         get wide bounds from the size of the data, which the report states.
-    free, fixed, noise, sensors
+    free, fixed, noise, sensors, steady
         As for :func:`dahl_ident.fit`. Sensors may have any prior here.
     likelihood : {"gaussian", "student_t", "none"}, default "gaussian"
         "student_t" makes outliers count less (4 degrees of freedom; on a grid it needs noise of
@@ -261,7 +265,7 @@ def posterior(
         raise ValidationError(
             f"uncertainty is {uncertainty!r}; expected {' or '.join(UNCERTAINTIES)}"
         )
-    problem, fit = _fit(data, model, noise, sensors, free, fixed)
+    problem, fit = _fit(data, model, noise, sensors, free, fixed, steady)
     case = _case(problem, fit, priors, likelihood, uncertainty)
     if method == "grid":
         return _grid(case, tolerance)
@@ -426,10 +430,17 @@ def _fit(
     sensors: Sensors | None,
     free: Iterable[str],
     fixed: Mapping[str, float] | None,
+    steady: Steady | None,
 ) -> tuple[Problem, FitResult | None]:
     """Return the problem, and its least-squares fit; None where there are too few data for one."""
     if isinstance(data, FitResult):
-        given = {"model": model, "noise": noise, "sensors": sensors, "fixed": fixed}
+        given = {
+            "model": model,
+            "noise": noise,
+            "sensors": sensors,
+            "fixed": fixed,
+            "steady": steady,
+        }
         extra = [name for name, value in given.items() if value is not None]
         if extra or tuple(free):
             raise ValidationError(
@@ -443,7 +454,9 @@ def _fit(
         return data.problem, data
     if model is None:
         raise ModelError("there is no model; give one, such as Dahl(), or pass a FitResult")
-    problem = Problem(data, model, noise=noise, sensors=sensors, free=free, fixed=fixed)
+    problem = Problem(
+        data, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady or "exact"
+    )
     optimum = optimum_of(problem)
     return problem, None if optimum is None else FitResult(optimum)
 

@@ -19,11 +19,12 @@ from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.record_fit import RecordFit, fit_records
 from dahl_ident.sensors import Sensors
+from dahl_ident.steady_state import Steady
 
 if TYPE_CHECKING:
+    from dahl_ident.elements.equations import Excitation
     from dahl_ident.fitting.casadi_constraints import Constraints
     from dahl_ident.problem.record_problem import Output
-    from dahl_ident.time_domain import Excitation
 
 
 @overload
@@ -41,6 +42,7 @@ def fit(
     constraints: Constraints | None = ...,
     drive_std: ArrayLike | None = ...,
     drive_covariance: ArrayLike | None = ...,
+    steady: Steady = ...,
     throw: bool = ...,
 ) -> FitResult: ...
 @overload
@@ -53,7 +55,6 @@ def fit(
     start: Mapping[str, float] | None = ...,
     output: Output | None = ...,
     excitation: Excitation = ...,
-    substeps: int | None = ...,
     throw: bool = ...,
     progress: bool = ...,
 ) -> RecordFit: ...
@@ -71,9 +72,9 @@ def fit(
     constraints: Constraints | None = None,
     drive_std: ArrayLike | None = None,
     drive_covariance: ArrayLike | None = None,
+    steady: Steady = "exact",
     output: Output | None = None,
     excitation: Excitation = "force",
-    substeps: int | None = None,
     throw: bool = True,
     progress: bool = False,
 ) -> FitResult | RecordFit:
@@ -109,15 +110,15 @@ def fit(
     drive_std, drive_covariance : array_like, shapes (n,) and (n, 2), optional
         With "ipopt", for force-controlled rows: standard deviation of the measured drive, and its
         covariance with real and imaginary part of the response.
+    steady : {"exact", "describing function"}, default "exact"
+        How rows whose force was controlled are predicted: by the exact steady motion of a model
+        with a mass, or as if the displacement were a sine. The second is faster and the paper's.
     output : {"force", "motion"}, optional
         For records: predict the force from the measured displacement, or the motion from the
         measured force. Default: the motion if the model has a mass.
     excitation : {"force", "base"}, default "force"
         Of records whose motion is predicted: "base" where their force channel is the acceleration
         of the base, m/s^2, and the motion relative to it.
-    substeps : int, optional
-        Of records whose motion is predicted: steps of integration in each sampling interval. Left
-        out, as many as the rates ask for, doubled until the residuals no longer notice.
     throw : bool, default True
         Raise where the data give no finite optimum; otherwise return what was found, with its
         `status`.
@@ -159,6 +160,7 @@ def fit(
             "drive_std": drive_std, "drive_covariance": drive_covariance,
             "loss": None if loss == "linear" else loss,
             "method": None if method == "lm" else method,
+            "steady": None if steady == "exact" else steady,
         }  # fmt: skip
         refused = [name for name, value in taken.items() if value is not None]
         if refused:
@@ -167,9 +169,11 @@ def fit(
         bound = as_model(model).with_free(free).with_fixed(fixed or {})
         return fit_records(
             records, bound, start=start, output=output, excitation=excitation,
-            substeps=substeps, throw=throw, progress=progress,
+            throw=throw, progress=progress,
         )  # fmt: skip
-    problem = Problem(data, model, noise=noise, sensors=sensors, free=free, fixed=fixed)
+    problem = Problem(
+        data, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady
+    )
     own = {
         "constraints": constraints, "drive_std": drive_std, "drive_covariance": drive_covariance
     }  # fmt: skip
@@ -221,6 +225,7 @@ def fit_many(
     fixed: Mapping[str, float] | None = None,
     noise: str | None = None,
     sensors: Sensors | None = None,
+    steady: Steady = "exact",
 ) -> FitBatch:
     """Estimate one model's parameters from each of many tables at once.
 
@@ -228,7 +233,7 @@ def fit_many(
     ----------
     tables : sequence of FrequencyResponse
         With the same number of rows, quantity, harmonics and controlled variable.
-    model, free, fixed, noise, sensors
+    model, free, fixed, noise, sensors, steady
         As for :func:`fit`.
 
     Returns
@@ -259,5 +264,7 @@ def fit_many(
     >>> fit_many(tables, Dahl()).values.round(6).tolist()
     [[0.1, 30.0], [0.2, 30.0]]
     """
-    batch = ProblemBatch(tables, model, noise=noise, sensors=sensors, free=free, fixed=fixed)
+    batch = ProblemBatch(
+        tables, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady
+    )
     return FitBatch(tuple(tables), solve_many(batch))

@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import cached_property
-from types import MappingProxyType
 
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
+from dahl_ident.diagnostics.error_sources import NOISE
 from dahl_ident.elements import Model, Parameter
-from dahl_ident.fitting.optimum import Combination, Optimum
+from dahl_ident.fitting.optimum import Combination, Optimum, propagated
 from dahl_ident.problem import Problem
-from dahl_ident.results.result import Estimate, Result
+from dahl_ident.results.result import Estimate, Parameters, Result
 from dahl_ident.units import Motion, shown_unit
 
 
@@ -85,21 +85,31 @@ class FitNumbers(Result):
         return self.errors or error_model(self._optimum, of_combinations=True)
 
     @cached_property
-    def params(self) -> Mapping[str, Estimate]:
-        """Every parameter of model and sensors, by name, with combined uncertainties."""
+    def params(self) -> Parameters:
+        """Every parameter of model and sensors, by name, with combined uncertainties.
+
+        Assumed exponents have their estimates, so that all of them together are a model.
+        """
         values = dict(zip(self.var_names, self._optimum.values.tolist(), strict=True))
         stderr = dict(self._optimum.stderr)
         errors = self.errors_of_combinations
         if errors is not None:
-            known = [name for name in values if errors.holds(name)]
+            known = [name for name in (*values, *errors.assumed) if errors.holds(name)]
             values |= {name: errors.values[name] for name in known}
             stderr |= {name: errors.stderr[name] for name in known}
-        return MappingProxyType(estimates(self.problem, values, stderr))
+        return Parameters(estimates(self.problem, values, stderr))
 
-    @property
+    @cached_property
     def stderr_noise(self) -> Mapping[str, float]:
-        """Standard errors of the least-squares optimum from noise alone, by name."""
-        return self._optimum.stderr
+        """Standard errors of the estimate from noise alone, by name."""
+        found = dict(self._optimum.stderr)
+        errors = self.errors_of_combinations
+        if errors is not None:
+            size = np.abs(errors.problem.value_slopes(errors.theta))
+            noise = size * np.sqrt(np.maximum(np.diagonal(errors.contributions[NOISE]), 0.0))
+            own = dict(zip(errors.names, noise.tolist(), strict=True))
+            found |= {name: own[name] for name in found if errors.holds(name)}
+        return found
 
     @property
     def var_names(self) -> list[str]:
@@ -108,15 +118,21 @@ class FitNumbers(Result):
 
     @cached_property
     def covar(self) -> FloatArray:
-        """Covariance of the least-squares values from noise alone, first order."""
-        return self._optimum.values_covariance
+        """Combined covariance of the free values, by every source of error, first order."""
+        errors = self.errors
+        if errors is None:
+            return self._optimum.values_covariance
+        own = [errors.names.index(name) for name in self.var_names]
+        slopes = errors.problem.value_slopes(errors.theta)
+        whole = propagated(errors.covariance, slopes)
+        return np.asarray(whole[np.ix_(own, own)])
 
     @cached_property
     def correl(self) -> Mapping[str, Mapping[str, float]]:
         """Correlation of each pair of free parameters, by both names."""
-        std = np.sqrt(np.diagonal(self._optimum.covariance))
+        std = np.sqrt(np.diagonal(self.covar))
         with np.errstate(invalid="ignore", divide="ignore"):
-            matrix = self._optimum.covariance / np.outer(std, std)
+            matrix = self.covar / np.outer(std, std)
         names = self.var_names
         return {
             a: {b: float(matrix[i, j]) for j, b in enumerate(names) if j != i}
@@ -192,7 +208,9 @@ class FitNumbers(Result):
     @cached_property
     def best_fit(self) -> ComplexArray:
         """Predicted response at the estimate, shape (n,)."""
-        return self.problem.predict(self._optimum.theta)
+        if self.errors is None:
+            return self.problem.predict(self._optimum.theta)
+        return self.errors.problem.predict(self.errors.theta)
 
     @cached_property
     def model(self) -> Model:
@@ -209,7 +227,7 @@ class FitNumbers(Result):
 def estimates(
     problem: Problem, values: Mapping[str, float], stderr: Mapping[str, float]
 ) -> dict[str, Estimate]:
-    """Return every parameter of model and sensors, those in `values` as free ones."""
+    """Return every parameter of model and sensors, with those values that were estimated."""
     exact = problem.sensors.are_exact
     shown = (*problem.model.parameters, *(() if exact else problem.sensors.parameters))
     return {p.name: _estimate(p, values, stderr, problem.data.motion) for p in shown}
@@ -221,15 +239,15 @@ def _estimate(
     stderr: Mapping[str, float],
     motion: Motion,
 ) -> Estimate:
-    vary = parameter.name in values
-    value = values[parameter.name] if vary else parameter.value
+    vary = bool(parameter.free)
+    value = values.get(parameter.name, parameter.value)
     return Estimate(
         name=parameter.name,
         unit=shown_unit(parameter.unit, motion),
         description=parameter.description,
         value=math.nan if value is None else value,
         stderr=stderr.get(parameter.name),
-        init_value=parameter.value if vary else None,
+        init_value=parameter.value if parameter.name in values else None,
         min=parameter.lower,
         max=parameter.upper,
         vary=vary,

@@ -18,8 +18,9 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.data.storage import digest, plain_data
+from dahl_ident.data.storage import digest, plain_data, read_text
 from dahl_ident.elements.description import describe_model, model_from_description
+from dahl_ident.elements.law_files import describe_laws, require_laws
 from dahl_ident.errors import DataError
 from dahl_ident.fitting.optimum import Combination, ConstraintCost, Optimum
 from dahl_ident.fitting.status import Status
@@ -27,7 +28,7 @@ from dahl_ident.problem import Problem
 from dahl_ident.sensors import EXACT, Sensors
 
 SCHEMA = "dahl_ident.fit_result"
-VERSION = 2  # of the layout; older ones are read
+VERSION = 3  # of the layout; older ones are read
 _FIRST_WITH_DIGEST = 2  # version from which on files have a digest
 _SAME = 1e-6  # relative: what versions of numerical libraries never change
 
@@ -51,7 +52,9 @@ def to_dict(optimum: Optimum, first_order: bool) -> dict[str, Any]:
         "dahl_ident_version": version("dahl_ident"),
         "data": _describe_data(problem.data),
         "model": describe_model(problem.model),
+        "laws": describe_laws(problem.model.elements),
         "noise": problem.noise,
+        "steady": problem.steady,
         "sensors": {name: _describe_channel(getattr(problem.sensors, name)) for name in _SENSORS},
         "optimum": {
             "names": list(problem.names),
@@ -81,10 +84,11 @@ def to_dict(optimum: Optimum, first_order: bool) -> dict[str, Any]:
 
 def from_dict(content: Mapping[str, Any], source: str = "the content") -> tuple[Optimum, bool]:
     """Return the fit that :func:`to_dict` described, and whether only first order holds."""
-    _check_schema(content, source)
+    check_schema(content, source)
     has_digest = content["schema_version"] >= _FIRST_WITH_DIGEST
     if has_digest:
         check_digest(content, source)
+    require_laws(content.get("laws", ()), source)
     try:
         optimum, first_order = _optimum(content), content["optimum"]["first_order"]
     except (KeyError, TypeError) as exc:
@@ -92,8 +96,14 @@ def from_dict(content: Mapping[str, Any], source: str = "the content") -> tuple[
             f"{source} says {SCHEMA}, version {content['schema_version']}, but lacks or garbles "
             f"{exc}; it may have been edited or cut short"
         ) from exc
-    if not (has_digest or first_order or _agrees(optimum)):
-        raise changed(source)
+    laws = content.get("laws", ())
+    if not (first_order or (has_digest and not laws) or _agrees(optimum)):
+        if not laws:
+            raise changed(source)
+        raise DataError(
+            f"{source}: the law {laws[0]['kind']!r} does not give the residuals that the fit was "
+            "saved with; take the file of the law as it was, or repeat the fit"
+        )
     return optimum, first_order
 
 
@@ -116,24 +126,16 @@ def load(path: str | Path) -> tuple[Optimum, bool]:
     return from_json(read_text(path), str(path))
 
 
-def read_text(path: str | Path) -> str:
-    """Return the text of a file."""
-    try:
-        return Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as exc:
-        why = exc.strerror if isinstance(exc, OSError) else "it is no text"
-        raise DataError(f"{path}: the file cannot be read: {why}") from exc
-
-
-def _check_schema(content: Any, source: str) -> None:
-    schema = content.get("schema") if isinstance(content, Mapping) else None
-    if schema != SCHEMA:
-        raise DataError(f"{source} has the schema {schema!r}; expected {SCHEMA!r}, a saved fit")
+def check_schema(content: Any, source: str, schema: str = SCHEMA, newest: int = VERSION) -> None:
+    """Refuse what says to be something else than a fit of a version that is known."""
+    found = content.get("schema") if isinstance(content, Mapping) else None
+    if found != schema:
+        raise DataError(f"{source} has the schema {found!r}; expected {schema!r}, a saved fit")
     found = content.get("schema_version")
-    if not isinstance(found, int) or not 1 <= found <= VERSION:
+    if type(found) is not int or not 1 <= found <= newest:
         raise DataError(
             f"{source} has schema version {found!r}; this version of dahl_ident reads 1 to "
-            f"{VERSION}: upgrade dahl_ident"
+            f"{newest}: upgrade dahl_ident"
         )
 
 
@@ -180,6 +182,7 @@ def _optimum(content: Mapping[str, Any]) -> Optimum:
         model_from_description(content["model"]),
         noise=content["noise"],
         sensors=EXACT if known.are_exact else known,
+        steady=content.get("steady", "describing function"),
     )
     stored = content["optimum"]
     if list(problem.names) != stored["names"]:

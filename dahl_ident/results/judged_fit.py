@@ -114,8 +114,12 @@ class JudgedFit(FitNumbers):
             note = "first order, noise alone: the fit had constraints"
             return wald_intervals(self._optimum, levels).noted(note)
         if method == "combined":
-            profile = self.conf_interval("profile", levels)
-            return combined_intervals(profile, self._optimum, self.errors_of_combinations)
+            errors = self.errors_of_combinations
+            if errors is None:
+                return replace(self.conf_interval("profile", levels), method="combined")
+            return combined_intervals(
+                self._optimum, errors, levels, lambda: self.conf_interval("profile", levels)
+            )
         if method == "bootstrap":
             return bootstrap_intervals(self._optimum, levels, replicates, seed)
         quick = wald_intervals if method == "wald" else profile_intervals

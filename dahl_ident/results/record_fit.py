@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -17,6 +17,8 @@ from scipy import special
 
 from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.data import Record
+from dahl_ident.data.record import cut
+from dahl_ident.data.storage import read_text
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.doubtful_elements import below_zero, is_single, slight
@@ -37,14 +39,16 @@ from dahl_ident.diagnostics.statements import doubted
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.elements import Element, Model
 from dahl_ident.elements.description import describe_model, model_from_description
-from dahl_ident.errors import DataError, FitError, FitInterrupted, ValidationError
+from dahl_ident.elements.law_files import describe_laws, require_laws
+from dahl_ident.errors import DataError, FitError, FitInterrupted, ModelError, ValidationError
 from dahl_ident.fitting.record_search import RecordOptimum, hold_model, solve_records
 from dahl_ident.problem.record_noise import share_in_band
-from dahl_ident.problem.record_problem import RecordProblem, cut
-from dahl_ident.results.fit_storage import check_digest, read_text, sealed
+from dahl_ident.problem.record_problem import RecordProblem
+from dahl_ident.results.fit_storage import check_digest, check_schema, sealed
 from dahl_ident.results.hold_out import HeldOut, HoldOut
 from dahl_ident.results.progress import fit_progress
-from dahl_ident.results.result import Estimate, Result
+from dahl_ident.results.result import Estimate, Parameters, Result
+from dahl_ident.units import shown_unit, si_unit
 
 if TYPE_CHECKING:
     from dahl_ident.plots import Axes
@@ -120,6 +124,9 @@ class RecordFit(Result):
     def __init__(self, optimum: RecordOptimum) -> None:
         self._optimum = optimum
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self).from_json, (self.to_json(),)  # the plant's functions cannot be copied
+
     @property
     def optimum(self) -> RecordOptimum:
         """The search's plain result."""
@@ -188,9 +195,15 @@ class RecordFit(Result):
         sizes = np.sqrt(self.errors.contributions[NOISE].diagonal()).tolist()
         return MappingProxyType(dict(zip(self.var_names, sizes, strict=True)))
 
+    def _shown(self, unit: str) -> str:
+        """Return a unit as it is written for the records' motion."""
+        return shown_unit(unit, self.records[0].motion)
+
     def budget(self) -> Budget:
         """Return the uncertainty budget: each parameter's sources, combined and expanded."""
-        return record_budget(self.problem, self._optimum.values, self.errors)
+        found = record_budget(self.problem, self._optimum.values, self.errors)
+        own = tuple(replace(p, unit=self._shown(p.unit)) for p in found.parameters)
+        return replace(found, parameters=own)
 
     @property
     def effective_samples(self) -> float:
@@ -203,15 +216,15 @@ class RecordFit(Result):
         return self.problem.whitening.size > 1
 
     @cached_property
-    def params(self) -> Mapping[str, Estimate]:
+    def params(self) -> Parameters:
         """Every parameter by name."""
         stderr = dict(zip(self.var_names, np.sqrt(np.diagonal(self.covar)), strict=True))
         found = dict(zip(self.var_names, self._optimum.values.tolist(), strict=True))
         fixed = [p for p in self.problem.model.parameters if not p.free]
-        return MappingProxyType(
+        return Parameters(
             {
                 p.name: Estimate(
-                    p.name, p.unit, p.description,
+                    p.name, self._shown(p.unit), p.description,
                     float(found.get(p.name, p.value or 0.0)),
                     float(stderr[p.name]) if p.name in stderr else None,
                     p.value, p.lower, p.upper, p.name in stderr,
@@ -367,11 +380,12 @@ class RecordFit(Result):
         noise = self.problem.displacement_noise
         if not noise:
             return ()
+        unit = si_unit("displacement", self.records[0].motion)
         added = 100.0 * self.problem.noise_travel
         return (
-            f"The displacement's noise of {noise:.2g} m (standard deviation) is not counted as "
-            f"travel, of which it would add {added:.2g} %; the residuals are smaller without it. "
-            "A quieter displacement would determine more.",
+            f"The displacement's noise of {noise:.2g} {unit} (standard deviation) is not counted "
+            f"as travel, of which it would add {added:.2g} %; the residuals are smaller without "
+            "it. A quieter displacement would determine more.",
         )
 
     @cached_property
@@ -514,7 +528,7 @@ class RecordFit(Result):
             rest = [other for i, (_, other) in enumerate(pieces) if i != k]
             fit = fit_records(
                 rest, own.model, start=start, throw=False, output=own.output,
-                excitation=own.excitation, substeps=own.substeps,
+                excitation=own.excitation,
             )  # fmt: skip
             band = fit.predict(piece)
             inside = np.mean((band.measured >= band.lower) & (band.measured <= band.upper))
@@ -529,7 +543,6 @@ class RecordFit(Result):
         own = self.problem
         problem = RecordProblem(
             [record], own.model, output=own.output, excitation=own.excitation,
-            substeps=own.substeps,
         ).without_noise(own.displacement_noise)  # fmt: skip
         if initial == "fitted":
             return problem, hold_model(problem, values)
@@ -557,7 +570,8 @@ class RecordFit(Result):
     ) -> tuple[DerivedQuantity, ...]:
         """Return x_c, energy per cycle, equivalent stiffness and damping, with their errors."""
         values = self._optimum.values
-        return record_derived(self.problem, values, self.covar, amplitudes, frequency_hz)
+        found = record_derived(self.problem, values, self.covar, amplitudes, frequency_hz)
+        return tuple(replace(quantity, unit=self._shown(quantity.unit)) for quantity in found)
 
     def plot(self, kind: str | None = None, ax: Any = None, *, record: int = 0) -> Axes:
         """Draw measured and predicted samples, the loop, or the residuals of one record.
@@ -604,9 +618,10 @@ class RecordFit(Result):
                     "dahl_ident_version": version("dahl_ident"),
                     "records": records,
                     "model": describe_model(problem.model),
+                    "laws": describe_laws(problem.model.elements),
+                    "runs": list(problem.runs),
                     "output": problem.output,
                     "excitation": problem.excitation,
-                    "substeps": problem.substeps,
                     "whitening": problem.whitening.tolist(),
                     "displacement_noise": problem.displacement_noise,
                     "names": self.var_names,
@@ -626,26 +641,28 @@ class RecordFit(Result):
         ------
         DataError
             If the text holds no such fit, or was changed since.
+        ModelError
+            If a law of the model is not known here.
         """
         try:
             held = json.loads(text)
-            if held["schema"] != SCHEMA or held["schema_version"] > _SCHEMA_VERSION:
-                raise DataError(
-                    f"the schema is {held['schema']!r} version {held['schema_version']}; expected "
-                    f"{SCHEMA!r} up to version {_SCHEMA_VERSION}"
-                )
+            check_schema(held, "the text", SCHEMA, _SCHEMA_VERSION)
             check_digest(held, "the text")
+            require_laws(held.get("laws", ()), "the text")
             records = [Record(r.pop("time"), **r) for r in held["records"]]
             problem = RecordProblem(
                 records, model_from_description(held["model"]), output=held["output"],
-                excitation=held["excitation"], substeps=held["substeps"],
+                excitation=held["excitation"],
             )  # fmt: skip
+            problem.runs = tuple(held.get("runs", problem.runs))
             problem = problem.weighted(np.asarray(held["whitening"], dtype=np.float64))
             problem = problem.without_noise(held.get("displacement_noise", 0.0))
             values = np.asarray(held["values"], dtype=np.float64)
             return cls(
                 RecordOptimum(problem, values, held["cost"], held["converged"], held["evaluations"])
             )
+        except ModelError:
+            raise
         except (KeyError, TypeError, ValueError) as exc:
             raise DataError(f"the text holds no fit of records: {exc!r}") from exc
 
@@ -676,7 +693,7 @@ def fit_records(
     progress : bool, default False
         Show on the terminal how it goes, once it has taken two seconds.
     **how
-        `start`; and `output`, `excitation` and `substeps` of
+        `start`; and `output` and `excitation` of
         :class:`dahl_ident.problem.record_problem.RecordProblem`.
 
     Returns

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -20,7 +19,7 @@ from dahl_ident.diagnostics.record_errors import record_assumptions, record_deri
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.results.chain_draws import ChainDraws
 from dahl_ident.results.record_fit import RecordBand, RecordFit
-from dahl_ident.results.result import Estimate
+from dahl_ident.results.result import Estimate, Parameters
 
 
 class RecordPosterior(ChainDraws):
@@ -61,17 +60,19 @@ class RecordPosterior(ChainDraws):
     @property
     def units(self) -> tuple[str, ...]:
         """SI units of the parameters."""
-        return tuple(p.unit for p in self.fit.problem.free)
+        return tuple(self.fit.params[p.name].unit for p in self.fit.problem.free)
 
     @cached_property
-    def params(self) -> Mapping[str, Estimate]:
+    def params(self) -> Parameters:
         """Every parameter of the model, posterior mean and standard deviation."""
         mean = dict(zip(self.names, self.mean().tolist(), strict=True))
         std = dict(zip(self.names, self.std().tolist(), strict=True))
-        return MappingProxyType(
+        fitted = self.fit.params
+        return Parameters(
             {
                 p.name: Estimate(
-                    p.name, p.unit, p.description, float(mean.get(p.name, p.value or 0.0)),
+                    p.name, fitted[p.name].unit, p.description,
+                    float(mean.get(p.name, p.value or 0.0)),
                     std.get(p.name), p.value, p.lower, p.upper, p.name in std,
                 )
                 for p in self.fit.problem.model.parameters

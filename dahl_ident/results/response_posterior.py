@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_base import RULE_DRAWS, Posterior
 from dahl_ident.results.posterior_prediction import PredictiveBand, derived_at_draws
 from dahl_ident.results.predictive_checks import PredictiveCheck, predictive_checks
-from dahl_ident.results.result import Estimate
+from dahl_ident.results.result import Estimate, Parameters
 from dahl_ident.units import Quantity
 
 _CHECK_DRAWS = 1000  # a share of 1 % has an error of 0.3 %
@@ -125,14 +124,14 @@ class ResponsePosterior(Posterior):
         return (f"Noise alone is counted; with every source of the budget, u is {listed(u)}.",)
 
     @cached_property
-    def params(self) -> Mapping[str, Estimate]:
+    def params(self) -> Parameters:
         """Every parameter by name, posterior mean and standard deviation; fixed ones included."""
         own = len(self.problem.names)
         values = dict(zip(self.names, self.mean().tolist(), strict=True))
         stderr = dict(zip(self.names, self.std().tolist(), strict=True))
         found = estimates(self.problem, values, stderr)
         scale = {name: Estimate.of_scale(values[name], stderr[name]) for name in self.names[own:]}
-        return MappingProxyType(found | scale)
+        return Parameters(found | scale)
 
     @property
     def data(self) -> FrequencyResponse:

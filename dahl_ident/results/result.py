@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -13,7 +14,8 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.data.storage import place_of, write_whole
 from dahl_ident.diagnostics.bands import DerivedQuantity
-from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.diagnostics.formatting import rounded, with_unit
+from dahl_ident.diagnostics.markup import html_table, pair, symbol, tabular, unit
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.units import Quantity
 
@@ -66,6 +68,48 @@ class Estimate:
         return f"{self.name} = {with_unit(self.value, self.stderr, self.unit)}"
 
 
+class Parameters(Mapping[str, Estimate]):
+    r"""The parameters of a result by name; shown as a table, also in notebooks.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> fit = di.fit(di.load_dataset("noisy"), di.Dahl(alpha=1.0))
+    >>> print(fit.params.to_latex().splitlines()[4])
+    $f_\mathrm{max}$ & $0.09982$ & $0.00031$ & N \\
+    """
+
+    def __init__(self, estimates: Mapping[str, Estimate]) -> None:
+        self._estimates = dict(estimates)
+
+    def __getitem__(self, name: str) -> Estimate:
+        return self._estimates[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._estimates)
+
+    def __len__(self) -> int:
+        return len(self._estimates)
+
+    def __repr__(self) -> str:
+        return "\n".join(map(str, self.values()))
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (p.name, *(rounded(p.value, p.stderr) if p.vary else (f"{p.value:g}", "fixed")), p.unit)
+            for p in self.values()
+        ]
+        return html_table(("", "value", "u", "unit"), rows)
+
+    def to_latex(self) -> str:
+        """Return a table of values and standard uncertainties; it needs no package of LaTeX."""
+        rows = [
+            (symbol(p.name), *pair(p.value, p.stderr if p.vary else None), unit(p.unit))
+            for p in self.values()
+        ]
+        return tabular(("", "value", "$u$", "unit"), rows)
+
+
 class Result(ABC):
     """The outcome of an estimation: of a fit, a Markov chain, a grid, or a fit to a record.
 
@@ -75,11 +119,20 @@ class Result(ABC):
     >>> data = di.load_dataset("noisy")
     >>> for result in (di.fit(data, di.Dahl()), di.posterior(data, di.Dahl(), method="grid")):
     ...     print(result.status, result.params["f_max"])
-    trusted f_max = 0.10002 +- 0.00039 N
+    trusted f_max = 0.10002 +- 0.00049 N
     trusted f_max = 0.10002 +- 0.00039 N
     """
 
     _called: ClassVar[str] = "a result"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy needs, without what follows from it."""
+        own = type(self)
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if not isinstance(getattr(own, name, None), cached_property)
+        }
 
     @property
     @abstractmethod
@@ -170,3 +223,52 @@ class Result(ABC):
         place = place_of(path, self._called, FORMATS)
         write_whole(place, self.to_json().encode(), overwrite=overwrite)
         return place
+
+    def export(
+        self,
+        to: str,
+        path: str | Path | None = None,
+        *,
+        overwrite: bool = False,
+        size: int = 1000,
+        seed: int = 0,
+    ) -> str | Path:
+        """Return the result as other programs read it, or write it to a file.
+
+        Parameters
+        ----------
+        to : str
+            "mujoco" and "mujoco-frictionloss" (MJCF), "urdf", "modelica", "matlab", "c" (the
+            friction force as a function), "gtc" (uncertain numbers with influences), "ufloat",
+            "latex", or "draws" (a table of parameter values for domain randomisation). Of a
+            posterior, "draws" alone.
+        path : path, optional
+            File; draws as ``.csv`` or ``.parquet``. Left out: the text is returned.
+        overwrite : bool, default False
+            Replace a file that is there already.
+        size, seed : int
+            Number of draws, and seed of their random numbers.
+
+        Returns
+        -------
+        str or Path
+
+        Raises
+        ------
+        ModelError
+            If the format does not carry a law of the model.
+        FitError
+            If a parameter has no finite value or, where that is exported, no finite uncertainty.
+        ValidationError
+            If the format is unknown.
+
+        Examples
+        --------
+        >>> import dahl_ident as di
+        >>> fit = di.fit(di.load_dataset("noisy"), di.Dahl(alpha=1.0) + di.Damper(1e-3))
+        >>> print(fit.export("urdf").splitlines()[-1])
+        <dynamics damping="0.001" friction="0.0997..."/>
+        """
+        from dahl_ident.results.export import export
+
+        return export(self, to, path, overwrite=overwrite, size=size, seed=seed)

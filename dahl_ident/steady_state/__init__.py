@@ -11,6 +11,8 @@ other elements.
 - :func:`response` is for users: one plant with known parameters, checked arguments, every
   amplitude on request.
 - :func:`solve` is for estimation: many parameter vectors at once, unchecked.
+- :class:`Shooting` gives the exact motion, of which this balance of fundamentals is an
+  approximation: it takes the displacement for a sine.
 
 Where L is passive (Im L >= 0), A |Z| rises with A for any exponents, so the amplitude is unique.
 Only an active linear part (negative damping) can have several amplitudes, or self-sustained
@@ -22,5 +24,15 @@ from __future__ import annotations
 
 from dahl_ident.steady_state.forced import SteadyResponse, response
 from dahl_ident.steady_state.implicit import solve
+from dahl_ident.steady_state.shooting import ACCURACY, STEADY, Shooting, Steady, obstacle
 
-__all__ = ["SteadyResponse", "response", "solve"]
+__all__ = [
+    "ACCURACY",
+    "STEADY",
+    "Shooting",
+    "Steady",
+    "SteadyResponse",
+    "obstacle",
+    "response",
+    "solve",
+]

@@ -1,4 +1,8 @@
-"""The public function for the steady response of a known plant, with checked arguments."""
+"""The public function for the steady response of a known plant, with checked arguments.
+
+All motions are first those of the describing function. Where the plant has an equation of motion
+each is then made exact.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +20,13 @@ from dahl_ident.arrays import (
     non_negative_array,
     positive_array,
 )
+from dahl_ident.data.fields import one_of
 from dahl_ident.elements.element import Element, as_model
 from dahl_ident.errors import MultipleSolutionsWarning, ValidationError
+from dahl_ident.steady_state.exact_response import exact_motions
 from dahl_ident.steady_state.plant import BoolArray, IntArray, flatten
 from dahl_ident.steady_state.roots import find_roots
+from dahl_ident.steady_state.shooting import LINEAR, NEUTRAL, STEADY, Steady, obstacle
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 _REACH = (1e-290, 1e290)  # numbers end at 1e-308 and 1e308; squares of ratios stay inside
@@ -39,9 +46,9 @@ class SteadyResponse:
     drive : ndarray
         Zero-to-peak force u_0, N (N m in rotation).
     amplitude : ndarray
-        Zero-to-peak displacement A, m (rad); NaN where there is none.
+        Zero-to-peak fundamental A of the displacement, m (rad); NaN where there is none.
     displacement : ndarray of complex
-        Phasor X = A exp(j phase), the drive's phase being zero.
+        Phasor X = A exp(j phase) of the fundamental, the drive's phase being zero.
     found : ndarray of bool
         Whether the entry is an amplitude.
     number_of_solutions : ndarray of int
@@ -49,6 +56,14 @@ class SteadyResponse:
     message : str
         Empty where every point has exactly one amplitude; else which have none or several,
         and why.
+    harmonic_share : ndarray
+        Mean displacement and harmonics 2 to 9, root sum of squares, over the fundamental; zero for
+        the describing function, which has none.
+    multiplier : ndarray
+        Largest modulus of Floquet's multipliers: a small change of the motion grows by this factor
+        each cycle. NaN for the describing function.
+    steady : str
+        "exact" or "describing function": what the motions are.
 
     Examples
     --------
@@ -56,7 +71,7 @@ class SteadyResponse:
     >>> plant = Dahl(f_max=0.1, sigma=30) + Mass(0.3) + Damper(0.24) + Spring(0.3)
     >>> steady = response(plant, frequency_hz=1.0, drive=[0.05, 0.2])
     >>> steady.amplitude.round(5).tolist(), steady.number_of_solutions.tolist()
-    ([0.00337, 0.01845], [1, 1])
+    ([0.00328, 0.01811], [1, 1])
     """
 
     frequency_hz: FloatArray
@@ -66,6 +81,15 @@ class SteadyResponse:
     found: BoolArray
     number_of_solutions: IntArray
     message: str
+    harmonic_share: FloatArray
+    multiplier: FloatArray
+    steady: str
+
+    @property
+    def stable(self) -> BoolArray:
+        """Whether a motion nearby comes back; False where there is none, or it is not known."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.multiplier < 1.0 + NEUTRAL)[()]
 
     @property
     def phase(self) -> FloatArray:
@@ -85,9 +109,14 @@ class SteadyResponse:
 
 
 def response(
-    plant: Element, frequency_hz: ArrayLike, drive: ArrayLike, *, all_roots: bool = False
+    plant: Element,
+    frequency_hz: ArrayLike,
+    drive: ArrayLike,
+    *,
+    all_roots: bool = False,
+    steady: Steady = "exact",
 ) -> SteadyResponse:
-    """Return the steady displacement for a sine force: A abs(Z(A, omega)) = u_0  (Eqn. 53).
+    """Return the steady displacement for a sine force.
 
     Parameters
     ----------
@@ -101,7 +130,12 @@ def response(
         (levels, 1).
     all_roots : bool, default False
         Return every amplitude of each point along a last axis, rising, filled up with NaN.
-        Otherwise the smallest alone. Only plants with negative damping have several.
+        Otherwise the smallest alone, a stable one if there is any. Only plants with negative
+        damping, or with laws such as Backlash, have several.
+    steady : {"exact", "describing function"}, default "exact"
+        "exact" is the periodic solution of Eqn. 2 with all harmonics, its fundamental given. The
+        describing function takes the displacement for a sine, A abs(Z(A, omega)) = u_0 (Eqn. 53);
+        it also stands for plants without a mass, and at 0 Hz, where the `message` says so.
 
     Returns
     -------
@@ -124,6 +158,8 @@ def response(
 
     Notes
     -----
+    Exact motions are known to 1e-8. For the describing function
+
     ``A |Z| = u_0`` holds within 1e-12 max(1, kappa/4), kappa = (abs(L) + abs(N))/abs(Z): near a
     sharp resonance L and N nearly cancel. Two of several amplitudes may be missed where A abs(Z)
     turns twice within 1.8 % of amplitude.
@@ -134,9 +170,11 @@ def response(
 
     >>> from dahl_ident import Dahl, Damper, Mass, Spring, response
     >>> plant = Dahl(f_max=0.1, sigma=30) + Mass(0.3) + Damper(0.24) + Spring(0.3)
-    >>> abs(response(plant, 0.0, [0.1, 0.2]).receptance).round(4).tolist()
+    >>> static = response(plant, 0.0, [0.1, 0.2], steady="describing function")
+    >>> abs(static.receptance).round(4).tolist()
     [0.0515, 2.36]
     """
+    one_of(steady, "steady", STEADY)
     f = non_negative_array(frequency_hz, "frequency_hz")
     u0 = positive_array(drive, "drive")
     shape = broadcast_shape(frequency_hz=f, drive=u0)
@@ -148,26 +186,43 @@ def response(
         _check_reach(roots)
         amplitude = roots * points.unit[:, None]
         _check_reach(amplitude)
+    with np.errstate(invalid="ignore"):  # NaN where there is no amplitude
+        X = amplitude * (force.conj() / np.abs(force))
+    share, multiplier = np.zeros(X.shape), np.full(X.shape, np.nan)
+    why = "" if steady == "describing function" else obstacle(plant)
+    moving = np.broadcast_to(f, shape).ravel() > 0.0
+    exact = moving if steady == "exact" and not why else np.zeros(moving.shape, dtype=np.bool_)
+    if exact.any():
+        omega, u = (np.broadcast_to(v, shape).ravel()[exact] for v in (2.0 * np.pi * f, u0))
+        unique = points.friction.unique & (points.linear.imag[exact] >= 0.0)
+        motions = exact_motions(plant, omega, u, X[exact], unique, every=all_roots)
+        X[exact], share[exact], multiplier[exact] = motions
+        amplitude = np.abs(X)
     found = ~np.isnan(amplitude)
     count = found.sum(axis=1).reshape(shape)
     message = _message(count, np.broadcast_to(f, shape), np.broadcast_to(u0, shape))
+    if steady == "exact" and not exact.all() and why != LINEAR:
+        taken = f"the describing function stands for the exact motion ({why or 'at 0 Hz'})"
+        message = "; ".join(filter(None, (message, taken)))
     if all_roots:
-        f, u0, shape = f[..., None], u0[..., None], (*shape, roots.shape[1])
+        f, u0, shape = f[..., None], u0[..., None], (*shape, X.shape[1])
     else:
         if np.any(count > 1):
             text = f"{message}; the smallest is returned, all of them with all_roots=True"
             warnings.warn(text, MultipleSolutionsWarning, stacklevel=2)
-        amplitude, force, found = amplitude[:, :1], force[:, :1], found[:, :1]
-    with np.errstate(invalid="ignore"):  # NaN where there is no amplitude
-        displacement = amplitude * (force.conj() / np.abs(force))
+        amplitude, X, found = amplitude[:, :1], X[:, :1], found[:, :1]
+        share, multiplier = share[:, :1], multiplier[:, :1]
     return SteadyResponse(
         frequency_hz=_read_only(np.broadcast_to(f, shape)),
         drive=_read_only(np.broadcast_to(u0, shape)),
         amplitude=_read_only(amplitude.reshape(shape)),
-        displacement=_read_only(displacement.reshape(shape)),
+        displacement=_read_only(X.reshape(shape)),
         found=_read_only(found.reshape(shape)),
         number_of_solutions=_read_only(count),
         message=message,
+        harmonic_share=_read_only(np.where(found, share, np.nan).reshape(shape)),
+        multiplier=_read_only(multiplier.reshape(shape)),
+        steady="exact" if exact.any() else "describing function",
     )
 
 

@@ -71,6 +71,11 @@ def _friction(
 
 
 _PLANT = Dahl(_F_MAX, _SIGMA, 1.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)  # Fig. 7
+_FIG_7 = SteppedSine(
+    levels=(0.001, 0.01, 0.05, 0.1, 0.15, 0.2, 0.5, 2.0),
+    frequencies_hz=_spread(0.05, 5.0, 25),
+    controlled="force",
+)
 _ONE_PERCENT = Table(force_std=0.01)  # noise
 _BOTH = ("f_max", "sigma")
 _ALL_OF_PLANT = ("f_max", "sigma", "mass", "damping", "stiffness")
@@ -123,15 +128,37 @@ DATA_SETS: dict[str, DataSet] = {
             "fig_7_plant",
             Experiment(
                 _PLANT,
-                SteppedSine(
-                    levels=(0.001, 0.01, 0.05, 0.1, 0.15, 0.2, 0.5, 2.0),
-                    frequencies_hz=_spread(0.05, 5.0, 25),
-                    controlled="force",
-                ),
+                _FIG_7,
                 table=Table(displacement_std=0.01),
             ),
             seed=12,
             teaches="a plant driven by force, from stick to slip: friction with linear elements",
+            identifiable=_ALL_OF_PLANT,
+        ),
+        DataSet(
+            "fig_7_describing_function",
+            Experiment(
+                _PLANT, _FIG_7, table=Table(displacement_std=0.01, steady="describing function")
+            ),
+            seed=12,
+            teaches="Fig. 7 as the paper computes it, by the describing function: no plant does so",
+            identifiable=_ALL_OF_PLANT,
+            caution="not the motion of a mechanism: fit with steady='describing function'",
+        ),
+        DataSet(
+            "frf_levels",
+            Experiment(
+                _PLANT,
+                SteppedSine(
+                    levels=(0.03, 0.06, 0.1, 0.2, 0.4, 1.0),
+                    frequencies_hz=_spread(0.3, 6.0, 25),
+                    controlled="force",
+                ),
+                Acquisition(force=Channel(gain=1.01), displacement=Channel(gain=0.995)),
+                Table(displacement_std=0.003),
+            ),
+            seed=14,
+            teaches="a sweep at six drive levels, as an analyser gives it; calibration to 1 %",
             identifiable=_ALL_OF_PLANT,
         ),
         DataSet(

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from dahl_ident.data.fields import one_of
+from dahl_ident.data.storage import read_text
 from dahl_ident.elements import Element
 from dahl_ident.elements.description import describe_model, model_from_description
 from dahl_ident.elements.element import as_model
@@ -186,10 +187,7 @@ class Experiment:
         readers = {".toml": cls.from_toml, ".json": cls.from_json}
         if place.suffix not in readers:
             raise DataError(f"{place}: expected an experiment in .toml or .json")
-        try:
-            text = place.read_text(encoding="utf-8")
-        except OSError as exc:
-            raise DataError(f"{place}: cannot be read: {exc.strerror or exc}") from exc
+        text = read_text(place)
         try:
             return readers[place.suffix](text)
         except DahlIdentError as exc:

@@ -20,7 +20,7 @@ from dahl_ident.synthetic.randomness import Draws
 from dahl_ident.synthetic.table_errors import Phasors, Table, receptance_table, stiffness_table
 from dahl_ident.synthetic.waveform import Waveform
 
-GENERATOR = "dahl_ident.synthetic 1"
+GENERATOR = "dahl_ident.synthetic 2"
 """Raised whenever the same experiment and seed would give other values."""
 
 IntArray = NDArray[np.int64]
@@ -61,8 +61,8 @@ def simulate(
     -----
     A displacement-controlled mechanism is exact (Eqn. 3 from turning point to turning point).
     A force-controlled plant (Eqn. 53) is solved to about 1e-11 of its motion, reversals located;
-    the describing function is not used. Tables contain the describing-function steady state,
-    :func:`dahl_ident.response`.
+    the describing function is not used. Tables of it contain the exact steady motion,
+    :func:`dahl_ident.response`, unless the table asks for the describing function.
 
     Examples
     --------
@@ -150,9 +150,18 @@ def _held_phasors(
 
 def _forced_phasors(experiment: Experiment, drive: FloatArray, frequency_hz: FloatArray) -> Phasors:
     """Return a row for every step, with controlled force."""
-    steady = response(experiment.plant, frequency_hz, drive)
+    assert experiment.table is not None
+    how = experiment.table.steady
+    steady = response(experiment.plant, frequency_hz, drive, steady=how)
     if not steady.found.all():
         raise ModelError(steady.message)
+    loose = np.flatnonzero(~steady.stable & (steady.steady == "exact"))
+    if loose.size:
+        raise ModelError(
+            f"{loose.size} of {drive.size} steps have no stable steady motion, the first at "
+            f"{frequency_hz[loose[0]]:g} Hz, drive {drive[loose[0]]:g}: the plant would leave it; "
+            "give it a spring and damping"
+        )
     omega = 2.0 * np.pi * frequency_hz
     sensors = experiment.acquisition
     force = drive * sensors.force.response(omega)

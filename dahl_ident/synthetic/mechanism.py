@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,15 +11,14 @@ from scipy.interpolate import CubicHermiteSpline
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, Model
 from dahl_ident.elements.element import as_model
+from dahl_ident.elements.equations import plant_equations
 from dahl_ident.elements.rational import Rational
+from dahl_ident.engine import march, translate
 from dahl_ident.errors import FitError, ModelError
 from dahl_ident.synthetic.plant_motion import Progress, simulate_plant
 from dahl_ident.synthetic.waveform import Waveform
-from dahl_ident.time_domain.forced_motion import ForcedMotion
-from dahl_ident.time_domain.plant import Plant as TimeDomainPlant
 
-_STEPS = (128, 1024, 8192)
-"""Steps in a period. Cubics between the coarsest miss 1e-8 of a sine; deep slip asks for finer."""
+_PER_PERIOD = 128  # samples between which cubics miss 1e-8 of a sine
 
 Signal = Callable[[FloatArray], FloatArray]
 """A channel's true value at any times, (n,) -> (n,)."""
@@ -71,13 +69,12 @@ class Mechanism:
             form stands beside no mass.
         """
         if self.others:
-            for per_period in _STEPS:
-                with contextlib.suppress(FitError):
-                    return self._integrated(force, per_period)
-            raise ModelError(
-                f"the motion under a force grows beyond all bounds, or {self.others[0]!r} slips so "
-                "far in a step that no step is short enough; control the displacement"
-            )
+            try:
+                return self._integrated(force)
+            except FitError as error:
+                raise ModelError(
+                    "the motion under a force grows beyond all bounds; control the displacement"
+                ) from error
         if not np.any(self.linear.numerator):
             raise ModelError(
                 "friction alone slides without bound under a force above f_max; give the plant a "
@@ -86,16 +83,16 @@ class Mechanism:
         receptance = self.linear.inverse().state_space()
         return simulate_plant(receptance, self.friction, force, progress)
 
-    def _integrated(self, force: Waveform, per_period: int) -> Signal:
-        """Return x(t) from even steps, between which it is interpolated by its derivatives."""
-        steps = int(np.ceil(force.duration * force.highest_frequency_hz * per_period))
+    def _integrated(self, force: Waveform) -> Signal:
+        """Return x(t) from even samples, between which it is interpolated by its derivatives."""
+        steps = int(np.ceil(force.duration * force.highest_frequency_hz * _PER_PERIOD))
         time, length = np.linspace(0.0, force.duration, steps + 1, retstep=True)
         place = 0.5 - 0.5 * np.cos(np.pi * (np.arange(8) + 0.5) / 8)
         values = force.value((time[:-1, None] + length * place).ravel()).reshape(steps, 8)
         drive: FloatArray = np.linalg.inv(np.vander(place, increasing=True)) @ values.T
-        driven = ForcedMotion(TimeDomainPlant(self.plant, "force"), drive[..., None], float(length))
-        rest = np.zeros((steps + 1, driven.plant.order))
-        x, v = driven.solve(np.zeros(0), rest[0], rest).T[:2]
+        system = translate(plant_equations(self.plant))
+        values = np.array(self.plant.known_values(), dtype=np.float64)
+        x, v = march(system, time, drive, time, np.zeros(system.order), values).states.T[:2]
         curve = CubicHermiteSpline(time, x, v)
         return lambda at: np.asarray(curve(at))
 

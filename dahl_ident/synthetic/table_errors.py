@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray, whole_number
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.data.fields import one_of
 from dahl_ident.errors import ValidationError
+from dahl_ident.steady_state import STEADY, Steady
 from dahl_ident.synthetic.checks import non_negative_number
 from dahl_ident.synthetic.randomness import Draws
 
@@ -36,6 +38,9 @@ class Table:
         Share of the rows, chosen at random, with a gross error.
     outlier_size : float, default 0.5
         That error relative to the response, in a random direction of the complex plane.
+    steady : {"exact", "describing function"}, default "exact"
+        Where force is controlled: the motion of the plant, or what the paper's describing function
+        makes of it, which no plant does.
 
     Raises
     ------
@@ -53,10 +58,12 @@ class Table:
     harmonics: Sequence[int] = (1,)
     outlier_fraction: float = 0.0
     outlier_size: float = 0.5
+    steady: Steady = "exact"
 
     def __post_init__(self) -> None:
         for name in ("displacement_std", "force_std", "outlier_fraction", "outlier_size"):
             object.__setattr__(self, name, non_negative_number(getattr(self, name), name))
+        one_of(self.steady, "steady", STEADY)
         if self.outlier_fraction > 1.0:
             raise ValidationError(
                 f"outlier_fraction is {self.outlier_fraction!r}; expected a share from 0 to 1"

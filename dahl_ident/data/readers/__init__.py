@@ -1,7 +1,7 @@
 """Readers, which turn the usual laboratory files into frequency responses or records.
 
 Formats are recognised by their content: text tables (CSV, TSV and kin, also packed with gzip, bzip2
-or xz), Excel, Parquet, MATLAB, HDF5, universal files 58 and 58b, NI TDMS and LabVIEW LVM.
+or xz), Excel, Parquet, MATLAB, HDF5, universal files 58 and 58b, NI TDMS, LabVIEW LVM and HP's SDF.
 Information that the file does not contain, such as a unit or which column is the force, comes from
 a column map (:mod:`dahl_ident.data.column_map`) or from keywords; missing information is an error.
 Every remaining assumption, such as amplitudes being zero to peak, is noted in the result.
@@ -10,17 +10,18 @@ Every remaining assumption, such as amplitudes being zero to peak, is noted in t
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 from dahl_ident.data.column_map import column_map
 from dahl_ident.data.frequency_response import FrequencyResponse
+from dahl_ident.data.level_files import labelled
 from dahl_ident.data.raw_columns import Source
 from dahl_ident.data.readers.file import File, open_file
 from dahl_ident.data.readers.inspection import FileContents, contents
@@ -28,7 +29,7 @@ from dahl_ident.data.record import Record
 from dahl_ident.data.record_table import record_from, record_size
 from dahl_ident.data.response_table import ResponseOptions, response_from
 from dahl_ident.data.storage import plain_data
-from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.errors import DataError, DataWarning, ValidationError
 from dahl_ident.units import Quantity
 
 if TYPE_CHECKING:
@@ -39,6 +40,21 @@ __all__ = ["FileContents", "inspect", "read_frequency_response", "read_record"]
 
 PathLike = str | Path
 Columns = Mapping[str, Any] | str | Path
+_READERS = {
+    "excel": "spreadsheets.read_workbook",
+    "ods": "spreadsheets.read_workbook",
+    "parquet": "spreadsheets.read_parquet",
+    "matlab": "matlab.read_matlab",
+    "hdf5": "hdf5.read_hdf5",
+    "json": "dictionaries.read_json",
+    "npz": "array_trees.read_npz",
+    "npy": "array_trees.read_npy",
+    "lvm": "lvm.read_lvm",
+    "uff": "instruments.read_uff",
+    "tdms": "instruments.read_tdms",
+    "sdf": "sdf.read_sdf",
+    "text": "text_table.read_text_table",
+}
 
 
 def read_frequency_response(
@@ -46,6 +62,8 @@ def read_frequency_response(
     *,
     columns: Columns | None = None,
     quantity: Quantity | None = None,
+    frequency: float | None = None,
+    sweep: str | None = None,
     amplitude: str | None = None,
     drive: str | None = None,
     drive_factor: str | None = None,
@@ -70,6 +88,12 @@ def read_frequency_response(
         them. Columns that bear these names need no map.
     quantity : str, optional
         Which of the six standard quantities the response is; by default it follows from the unit.
+    frequency : float, optional
+        Hz, for a table that does not say it. Without it such a table of amplitudes is good for
+        laws that do not depend on the rate.
+    sweep : str, optional
+        Frequencies of all rows, for a table without a column of them, as some analysers write it:
+        ``"1 to 100 Hz, log"`` or ``"0 to 800 Hz, linear"``.
     amplitude, drive : str, optional
         One displacement (velocity, acceleration) or force amplitude for the whole file, such
         as ``"5 um rms"`` or ``"0.2 N"``. Braces are filled from the file's name: see
@@ -87,7 +111,7 @@ def read_frequency_response(
     run : str, optional
         Label of the run, for all rows; braces are filled as in `drive`.
         Without it a column ``run``, ``test``, ``file`` or ``day`` is taken, and of several files
-        each is a run under its own name.
+        each is a run under its own name, or a level if each holds one level that no other holds.
     controlled : {"displacement", "force"} or mapping, optional
         The controlled quantity; a mapping gives a pattern of level labels for each.
     frequency_hz : (low, high), optional
@@ -135,6 +159,7 @@ def read_frequency_response(
     mapped = column_map(
         columns,
         quantity=quantity,
+        sweep=sweep,
         drive_factor=drive_factor,
         drive_factor_uncertainty=drive_factor_uncertainty,
         controlled=controlled,
@@ -143,6 +168,7 @@ def read_frequency_response(
     for one in paths:
         groups = groups_in_name(one, level_from_name)
         options = ResponseOptions(
+            frequency=frequency,
             amplitude=_filled(amplitude, groups, one),
             drive=_filled(drive, groups, one),
             level=groups.get("level", level),
@@ -150,7 +176,7 @@ def read_frequency_response(
             frequency_hz=frequency_hz,
             passive=passive,
         )
-        given = _given(columns=columns, quantity=quantity, drive_factor=drive_factor,
+        given = _given(columns=columns, quantity=quantity, sweep=sweep, drive_factor=drive_factor,
                        drive_factor_uncertainty=drive_factor_uncertainty, controlled=controlled,
                        sheet=sheet, **vars(options))  # fmt: skip
         part = response_from(open_source(one, sheet, given), mapped, options)
@@ -165,13 +191,8 @@ def read_frequency_response(
         parts.append(part)
     if len(parts) == 1:
         return _as_saved(parts[0]) if _is_frame(paths[0]) else parts[0]
-    names = run_names(paths)
-    parts = [
-        part if part.run is not None else replace(part, run=np.full(part.n, name))
-        for part, name in zip(parts, names, strict=True)
-    ]
     try:
-        return FrequencyResponse.concatenate(parts)
+        return FrequencyResponse.concatenate(labelled(parts, run_names(paths)))
     except ValidationError as exc:
         raise DataError(f"the files do not make one table: {exc}") from exc
 
@@ -354,7 +375,16 @@ def open_source(
     file = open_file(path)
     if sheet is not None and file.format not in ("excel", "ods"):
         raise DataError(f"{file.name}: sheet={sheet!r} is given, but the file is no workbook")
-    return replace(_parsed(file, sheet), options=options or {})
+    try:
+        source = _parsed(file, sheet)
+    except MemoryError as exc:
+        raise DataError(
+            f"{file.name}: reading takes more memory than there is; expected a smaller table. Cut "
+            "the file into parts"
+        ) from exc
+    for doubt in source.doubts:
+        warnings.warn(f"{file.name}: {doubt}", DataWarning, stacklevel=3)
+    return replace(source, options=options or {})
 
 
 def _given(**options: Any) -> dict[str, Any]:
@@ -368,43 +398,10 @@ def _given(**options: Any) -> dict[str, Any]:
 
 def _parsed(file: File, sheet: str | None) -> Source:
     """Pass a file to its reader; readers are imported when first used."""
-    match file.format:
-        case "excel" | "ods":
-            from dahl_ident.data.readers.spreadsheets import read_workbook
-
-            return read_workbook(file, sheet)
-        case "parquet":
-            from dahl_ident.data.readers.spreadsheets import read_parquet
-
-            return read_parquet(file)
-        case "matlab":
-            from dahl_ident.data.readers.matlab import read_matlab
-
-            return read_matlab(file)
-        case "hdf5":
-            from dahl_ident.data.readers.hdf5 import read_hdf5
-
-            return read_hdf5(file)
-        case "json":
-            from dahl_ident.data.readers.dictionaries import read_json
-
-            return read_json(file)
-        case "npz" | "npy":
-            from dahl_ident.data.readers import array_trees
-
-            return {"npz": array_trees.read_npz, "npy": array_trees.read_npy}[file.format](file)
-        case "lvm":
-            from dahl_ident.data.readers.lvm import read_lvm
-
-            return read_lvm(file)
-        case "uff" | "tdms":
-            from dahl_ident.data.readers import instruments
-
-            return {"uff": instruments.read_uff, "tdms": instruments.read_tdms}[file.format](file)
-        case _:
-            from dahl_ident.data.readers.text_table import read_text_table
-
-            return read_text_table(file.data, file.name, file.sha256)
+    room, _, name = _READERS[file.format].partition(".")
+    read = getattr(import_module(f"{__name__}.{room}"), name)
+    source: Source = read(file, sheet) if name == "read_workbook" else read(file)
+    return source
 
 
 def run_names(paths: Sequence[PathLike | pd.DataFrame]) -> list[str]:

@@ -8,6 +8,7 @@ or rows, whichever are fewer: ``data[:,0]``, ``data[:,1]``.
 from __future__ import annotations
 
 import io
+import math
 import re
 import tokenize
 import zipfile
@@ -48,6 +49,7 @@ def tree_source(
     for path, value, unit in leaves:
         if unit is None:
             path, unit = split_header(path)
+        file.refuse_above_limit(8 * math.prod(np.shape(value)), path)  # as numbers, once read
         found = list(_channels(path, value, unit))
         channels += found
         if not found:
@@ -123,6 +125,9 @@ def read_npz(file: File) -> Source:
             arrays = {name: _numpy_array(content[name]) for name in names}
     except _NUMPY_ERRORS as exc:
         raise DataError(f"{file.name}: the file is damaged: {exc}") from exc
+    twice = [name for name in arrays if names.count(name) > 1]
+    if twice:
+        raise DataError(f"{file.name}: two arrays are called {twice[0]!r}; expected one")
     return tree_source(file, "NumPy .npz", _fields(arrays))
 
 

@@ -5,12 +5,14 @@ JSON may hold an object of columns, ``{"time [s]": [...], "x [mm]": [...]}``, or
 "x [mm]": 1.0}, ...]`` or ``[["time [s]", "x [mm]"], [0.0, 1.0], ...]``; ``{"columns": [...],
 "data": [[...], ...]}`` and ``{"x [mm]": {"0": 1.0, ...}}`` as pandas writes them; or a list of
 channels with ``name``, ``data``, ``unit_str`` and either ``fs`` or ``time``, as SDyPy has them.
-Units may stand in the names, in each column, or beside them all under ``"units"``.
+Units may stand in the names, in each column, or beside them all under ``"units"`` or
+``"displacement units"``. Rows without names have columns ``column 1``, ``column 2``, ...
 """
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -18,11 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.column_names import split_header
-from dahl_ident.data.raw_columns import Channel, Source
+from dahl_ident.data.raw_columns import Channel, Source, plain, words
 from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
+_UNNAMED = "column {}"
+_UNIT_OF = re.compile(r"(.+?)[ _]units?")  # "displacement units": "mm"
 _VALUES, _UNITS = ("values", "data"), ("unit", "unit_str", "units")
 _TABLES = ("channels", "signals", "columns", "data", "rows")
 
@@ -36,8 +40,11 @@ def read_json(file: File) -> Source:
         If it is no JSON, or holds neither columns nor rows nor channels.
     """
     try:
-        text = utf8(file.data).decode("utf-8", "replace")
+        text = utf8(file.lines(b"[{")).decode("utf-8", "replace")
+        file.refuse_above_limit(8 * text.count(","), f"JSON of {text.count(',')} numbers")
         content = json.loads(text, object_pairs_hook=_without_repeated_names)
+    except DataError:  # a ValueError too
+        raise
     except (ValueError, RecursionError) as exc:
         raise DataError(f"{file.name}: not a JSON file: {exc}") from exc
     return dictionary_source(content, file.name, "JSON", file.sha256)
@@ -61,7 +68,8 @@ def dictionary_source(
         raise DataError(f"{name}: no columns; expected an object of columns, or a list of rows")
     if len(channels) > MOST_CHANNELS:
         raise DataError(f"{name}: {len(channels)} columns; at most {MOST_CHANNELS} are read")
-    return Source(name, kind, channels, sha256)
+    headerless = all(c.name == _UNNAMED.format(i + 1) for i, c in enumerate(channels))
+    return Source(name, kind, channels, sha256, headerless=headerless)
 
 
 def is_channels(content: Any) -> bool:
@@ -87,8 +95,10 @@ def _channels(content: Any, name: str, units: Any = None) -> Iterator[Channel]:
             raise DataError(f"{name}: {len(keys)} columns; at most {MOST_CHANNELS} are read")
         columns = {key: [row.get(key) for row in content] for key in keys}
         yield from _columns(columns, name, units)
-    elif _is_list_of(list, content) and all(isinstance(cell, str) for cell in content[0]):
-        yield from _columns(_upright(content[0], content[1:], name), name, units)
+    elif _is_list_of(list, content):
+        named = all(isinstance(cell, str) for cell in content[0])
+        labels = content[0] if named else [_UNNAMED.format(i + 1) for i in range(len(content[0]))]
+        yield from _columns(_upright(labels, content[named:], name), name, units)
     elif isinstance(content, dict):
         yield from _tables(content, name, units)
     else:
@@ -119,7 +129,8 @@ def _upright(labels: Any, rows: list[Any], name: str) -> dict[str, Any]:
 
 def _tables(content: dict[str, Any], name: str, units: Any) -> Iterator[Channel]:
     """Yield the columns of an object, or of the table in it."""
-    units = content.get("units", units)
+    beside = {m[1]: unit for key, unit in content.items() if (m := _UNIT_OF.fullmatch(key))}
+    units = content.get("units", units or beside)
     rows = next(
         (content[key] for key in ("data", "rows") if _is_list_of(list, content.get(key))), None
     )
@@ -138,20 +149,21 @@ def _tables(content: dict[str, Any], name: str, units: Any) -> Iterator[Channel]
 
 
 def _columns(content: dict[str, Any], name: str, units: Any) -> Iterator[Channel]:
-    known = units if isinstance(units, dict) else {}
+    stated = units if isinstance(units, dict) else {}
+    known = {plain(str(key)): unit for key, unit in stated.items()}
     index: Any = None
     for key, value in content.items():
         if isinstance(value, dict) and any(v in value for v in _VALUES):
             values = next(value[v] for v in _VALUES if v in value)
-            unit = next((value[u] for u in _UNITS if u in value), known.get(key))
+            unit = next((value[u] for u in _UNITS if u in value), known.get(plain(key)))
             yield _channel(key, values, unit, name)
         elif isinstance(value, dict) and value and all(row.isdecimal() for row in value):
             index = index or value.keys()
             if value.keys() != index:
                 raise DataError(f"{name}: column {key!r} has other rows than the columns before it")
-            yield _channel(key, [value[row] for row in index], known.get(key), name)
+            yield _channel(key, [value[row] for row in index], known.get(plain(key)), name)
         elif isinstance(value, list):
-            yield _channel(key, value, known.get(key), name)
+            yield _channel(key, value, known.get(plain(key)), name)
 
 
 def _is_flat(value: Any) -> bool:
@@ -182,7 +194,7 @@ def _array(values: Any, what: str) -> NDArray[Any]:
             return np.array([np.nan if v is None else float(v) for v in values], dtype=np.float64)
     except OverflowError:
         pass  # whole numbers beyond all floats are refused as text
-    return np.array(["" if v is None else str(v)[:60] for v in values], dtype=np.str_)
+    return words("" if v is None else str(v) for v in values)
 
 
 def _sdypy(channels: Sequence[Mapping[str, Any]], name: str) -> Iterator[Channel]:

@@ -11,15 +11,17 @@ import gzip
 import hashlib
 import io
 import lzma
+import re
 import sys
 import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
+from dahl_ident.data.storage import regular
 from dahl_ident.errors import DataError
 
 MOST_CHANNELS = 5000
@@ -31,7 +33,8 @@ ZIP_ERRORS = (
     RuntimeError,
 )  # fmt: skip
 """What Python's reader of archives raises on damaged ones."""
-_UNPACKED_BYTES = 1 << 28  # 256 MB: more than most tables, less than a computer's memory
+_UNPACKED_BYTES = 1 << 27  # 134 MB: more than most tables; read, they take ten times as much
+_OBJECT_BYTES = 40  # at least, of each line or list of a text that is split into them
 _UNPACKED_RATIO = 8  # text and samples of a converter rarely pack better
 
 _TEXT = ("text", "uff", "lvm", "json")
@@ -40,7 +43,8 @@ _EXTENSIONS: dict[str, tuple[str, ...]] = {
     ".csv": ("text",),
     ".tsv": ("text",),
     ".txt": _TEXT,
-    ".dat": _TEXT,
+    ".dat": (*_TEXT, "sdf"),
+    ".sdf": ("sdf",),
     ".asc": _TEXT,
     ".prn": ("text",),
     ".json": ("json",),
@@ -75,13 +79,17 @@ _NAMES = {
     "uff": "a universal file",
     "tdms": "NI TDMS",
     "lvm": "LabVIEW LVM",
+    "sdf": "an analyser's SDF",
 }
+_UFF = re.compile(rb"-1[ \t]*[\r\n]\s*\d")
+_HDF5 = b"\x89HDF\r\n\x1a\n"
 _MAGIC: tuple[tuple[bytes, str], ...] = (
     (b"MATLAB 5.0 MAT-file", "matlab"),
     (b"MATLAB 7.3 MAT-file", "hdf5"),
-    (b"\x89HDF\r\n\x1a\n", "hdf5"),
+    (_HDF5, "hdf5"),
     (b"PAR1", "parquet"),
     (b"TDSm", "tdms"),
+    (b"B\0\0\n\0\0", "sdf"),
     (b"\x93NUMPY", "npy"),
     (b"PK\x03\x04", "zip"),
     (b"\xd0\xcf\x11\xe0", "old excel"),
@@ -126,6 +134,11 @@ class File:
         assert self.path is not None  # either the bytes or their place is known
         return self.path.read_bytes()
 
+    @property
+    def length(self) -> int:
+        """Number of bytes, unpacked."""
+        return self.size if self.content is None else len(self.content)
+
     def stream(self) -> Any:
         """Return what a library opens: the file's path, or its bytes."""
         return self.path if self.content is None else io.BytesIO(self.content)
@@ -134,6 +147,12 @@ class File:
     def limit(self) -> int:
         """Bytes that the content of the file may take in memory."""
         return max(_UNPACKED_BYTES, _UNPACKED_RATIO * self.size)
+
+    def lines(self, marks: bytes = b"\n") -> bytes:
+        """Return all bytes; refuse more lines, or other marks, than may be kept one by one."""
+        count = sum(self.data.count(mark) for mark in marks)
+        self.refuse_above_limit(_OBJECT_BYTES * count, f"text of {count} parts")
+        return self.data
 
     def refuse_above_limit(self, claimed: int, what: str) -> None:
         """Refuse content that would take more memory than a file of this size may.
@@ -151,7 +170,7 @@ class File:
             )
 
 
-def open_file(path: str | PurePath) -> File:
+def open_file(path: str | Path) -> File:
     """Look at a file, ``-`` being standard input.
 
     Raises
@@ -165,7 +184,7 @@ def open_file(path: str | PurePath) -> File:
         data = sys.stdin.buffer.read()
         digest = hashlib.sha256(data).hexdigest()
         return _checked(File(None, "standard input", len(data), digest, "", data), data[:300])
-    place = Path(path)
+    place = regular(path)
     # names of files are bytes, and what is no UTF-8 in them could not be written into a report
     name = str(place).encode(errors="backslashreplace").decode()
     try:
@@ -219,15 +238,23 @@ def _format(file: File, head: bytes, suffix: str) -> str:
     for magic, found in _MAGIC:
         if head.startswith(magic):
             return _archive(file, suffix) if found == "zip" else found
+    if suffix in (".h5", ".hdf5") and _behind_user_block(file.data):
+        return "hdf5"
     if suffix == ".mat" and b"\0" in head[:4]:
         return "matlab"  # version 4 has no signature
-    lines = head[:200].split(b"\n", 2)
-    if lines[0].strip() == b"-1" and len(lines) > 1 and lines[1].strip()[:1].isdigit():
+    text = head.lstrip(b"\xef\xbb\xbf \t\r\n")
+    if _UFF.match(text):
         return "uff"
-    start = head.lstrip(b"\xef\xbb\xbf \t\r\n")[:2]
+    start = text[:2]
     if suffix == ".json" or start in (b'{"', b"[{", b"{\n", b"{\r"):
         return "json"
     return "text"
+
+
+def _behind_user_block(data: bytes) -> bool:
+    """Return whether HDF5 begins behind a block of the user's own: of 512 bytes, 1024, 2048, ..."""
+    starts = (512 << k for k in range(12))
+    return any(data.startswith(_HDF5, start) for start in starts)
 
 
 def _archive(file: File, suffix: str) -> str:

@@ -8,18 +8,22 @@ import signal
 import time
 import warnings
 from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.raw_columns import Source, Stored
+from dahl_ident.data.raw_columns import Source, Stored, words
 from dahl_ident.data.readers.array_trees import Leaf, tree_source
 from dahl_ident.data.readers.file import DEEPEST, MOST_CHANNELS, File
 from dahl_ident.data.storage import library, read_metadata
 from dahl_ident.errors import DataError
 
-_SECONDS, _CPU_SECONDS = 60, 1  # a look at a good file takes some milliseconds
+_SECONDS, _CPU_SECONDS = 60, 1  # a look at a good file takes some milliseconds,
+_BYTES_A_SECOND = 1_000_000  # and at one of many small objects 0.2 ms for each 300 bytes
+_PACKING = {"scale_factor", "add_offset", "_FillValue", "missing_value"}
 _LOOKED_AT = 1 << 24  # bytes in all
 _DAMAGED = (
     OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError,
@@ -39,6 +43,7 @@ def read_hdf5(file: File) -> Source:
     _refuse_fatal(file, h5py)
     try:
         root = h5py.File(file.stream(), "r")  # open as long as an array of it waits to be read
+        _check_size(file, root.userblock_size)
         matlab = root.userblock_size >= 512 and file.head.startswith(b"MATLAB")
         tree = _Tree(file, root, h5py)
         leaves = list(tree.matlab_group(root, "", 0) if matlab else tree.group(root, "", 0))
@@ -49,6 +54,26 @@ def read_hdf5(file: File) -> Source:
         if isinstance(exc, DataError):
             raise
         raise DataError(f"{file.name}: the file is damaged: {exc}") from exc
+
+
+def _check_size(file: File, start: int) -> None:
+    """Refuse a file whose size is not that of its superblock: bytes were added, and moved others.
+
+    The library itself refuses one that is too short. (HDF5 File Format Specification, II.A)
+    """
+    stream = file.stream()
+    with stream.open("rb") if isinstance(stream, Path) else stream as content:
+        content.seek(start)
+        block = content.read(100)
+    version = block[8]
+    width = block[13 if version < 2 else 9]  # bytes of an address
+    at = {0: 24, 1: 28}.get(version, 12) + 2 * width
+    end = int.from_bytes(block[at : at + width], "little")
+    if file.length != end:
+        raise DataError(
+            f"{file.name}: the file is damaged: it has {file.length} bytes, and says that it ends "
+            f"after {end}"
+        )
 
 
 def _refuse_fatal(file: File, h5py: Any) -> None:
@@ -85,7 +110,8 @@ def _look(file: File, h5py: Any) -> None:  # pragma: no cover
     import resource
 
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_CPU, (_CPU_SECONDS, _CPU_SECONDS))
+    seconds = _CPU_SECONDS + file.length // _BYTES_A_SECOND
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
     with h5py.File(file.stream(), "r") as root:
         dict(root.attrs)
         left = _LOOKED_AT
@@ -147,12 +173,14 @@ class _Tree:
         unit = unit.decode() if isinstance(unit, bytes) else unit
         unit = unit if isinstance(unit, str) and unit.strip() else None
         if self.h5py.check_string_dtype(item.dtype) is not None:
-            self.refuse_large(item, path)
-            yield path, np.asarray(item.asstr()[()], dtype=np.str_), unit
+            self.refuse(item, path)
+            yield path, words(np.ravel(item.asstr()[()])).reshape(item.shape), unit
         elif item.dtype.names:
             for name in item.dtype.names:
                 dtype = item.dtype[name]
                 yield f"{path}.{name}", self.stored(item, path, dtype, lambda a, n=name: a[n]), unit
+        elif _PACKING & item.attrs.keys():
+            yield path, self.stored(item, path, np.float64, partial(_unpacked, item.attrs)), unit
         else:
             yield path, self.stored(item, path, item.dtype, lambda a: a), unit
 
@@ -162,7 +190,7 @@ class _Tree:
         """Return an array that is read when it is used."""
 
         def read(rows: slice) -> NDArray[Any]:
-            self.refuse_large(item, path)
+            self.refuse(item, path)
             try:
                 whole = rows == slice(None) or turned
                 array = form(item[()] if whole else item[rows])
@@ -173,8 +201,15 @@ class _Tree:
         shape = item.shape[::-1] if turned else item.shape
         return Stored(tuple(int(n) for n in shape), np.dtype(dtype), read)
 
-    def refuse_large(self, item: Any, path: str) -> None:
-        self.file.refuse_above_limit(int(item.size) * max(item.dtype.itemsize, 1), path)
+    def refuse(self, item: Any, path: str) -> None:
+        """Refuse a data set that is too large, or whose values are in other files."""
+        if item.external or item.is_virtual:
+            how = "virtual, made of parts of others" if item.is_virtual else "in an external file"
+            raise DataError(
+                f"{self.file.name}: the values of {path} are {how}; write them into one file, "
+                "such as with h5repack"
+            )
+        self.file.refuse_above_limit(int(item.size) * max(item.dtype.itemsize, 8), path)
 
     def matlab_group(self, group: Any, path: str, depth: int) -> Iterator[Leaf]:
         """Walk through a v7.3 file, whose struct arrays are data sets of references."""
@@ -193,7 +228,7 @@ class _Tree:
         elif not isinstance(item, self.h5py.Dataset) or item.shape is None:
             return
         elif self.h5py.check_ref_dtype(item.dtype) is not None:
-            self.refuse_large(item, where)
+            self.refuse(item, where)
             if item.size > MOST_CHANNELS:
                 raise DataError(f"{self.file.name}: {where} has {item.size} cells; too many")
             cell = item.attrs.get("MATLAB_class") == b"cell"
@@ -207,13 +242,22 @@ class _Tree:
 
     def matlab_array(self, item: Any, where: str) -> Leaf:
         if item.attrs.get("MATLAB_class") == b"char":
-            self.refuse_large(item, where)
+            self.refuse(item, where)
             codes = np.ravel(np.asarray(item[()]).T).tolist()
             return where, np.asarray("".join(map(chr, codes))), None
         if item.dtype.names == ("real", "imag"):
             kind = np.dtype(np.complex128)
             return where, self.stored(item, where, kind, _joined, turned=True), None
         return where, self.stored(item, where, item.dtype, np.transpose, turned=True), None
+
+
+def _unpacked(attributes: Any, array: NDArray[Any]) -> NDArray[np.float64]:
+    """Return what numbers stand for, as NetCDF packs them; a missing one is NaN."""
+    values = array * float(np.squeeze(attributes.get("scale_factor", 1.0)))
+    values = np.asarray(values + float(np.squeeze(attributes.get("add_offset", 0.0))))
+    for name in ("_FillValue", "missing_value"):
+        values[np.isin(array, np.asarray(attributes.get(name, [])))] = np.nan
+    return values
 
 
 def _joined(parts: NDArray[Any]) -> NDArray[Any]:

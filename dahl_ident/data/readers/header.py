@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.column_names import split_header
-from dahl_ident.data.raw_columns import Channel
+from dahl_ident.data.raw_columns import Channel, plain
 from dahl_ident.errors import DataError, UnitError
 from dahl_ident.units import parse_unit
 
@@ -42,11 +42,13 @@ class Header:
     """Names and units of the columns; no names for a table without a header.
 
     `cells` is how many columns the header line has; rows may end in a delimiter besides.
+    `contradicted` is whether another line above the numbers names the columns differently.
     """
 
     names: tuple[str, ...]
     units: tuple[str | None, ...]
     cells: int
+    contradicted: bool = False
 
 
 def best_run(rows: Iterable[Sequence[str] | None], mark: str) -> Run | None:
@@ -75,6 +77,34 @@ def best_run(rows: Iterable[Sequence[str] | None], mark: str) -> Run | None:
     return best if best and best.score > 0 else None
 
 
+def refuse_second_header(
+    rows: Sequence[Sequence[str] | None], start: int, mark: str, where: Callable[[int], str]
+) -> None:
+    """Refuse rows of the table's own form above its header: the file has another one there.
+
+    Raises
+    ------
+    DataError
+        Naming the row above and the first row of the table by `where`.
+    """
+    first = _numeric(rows[start] or [], mark)
+    for i in range(start if first.count(True) > 1 else 0):
+        row = rows[i]
+        if row is not None and len(row) == len(first):
+            same = zip(_numeric(row, mark), first, strict=True)
+            if all(one is other or None in (one, other) for one, other in same):
+                raise DataError(
+                    f"{where(i)} is a row of numbers like those from {where(start)} on, and "
+                    "between them are lines of words: the file has more than one header. Split "
+                    "it there"
+                )
+
+
+def _numeric(row: Sequence[str], mark: str) -> list[bool | None]:
+    """Return which cells are numbers; None for empty ones."""
+    return [CELL[mark].fullmatch(cell) is not None if cell.strip() else None for cell in row]
+
+
 def header(above: Sequence[Sequence[str]], width: int, filled: int | None = None) -> Header:
     """Return names and units from the lines directly above the numbers, the nearest last.
 
@@ -92,17 +122,42 @@ def header(above: Sequence[Sequence[str]], width: int, filled: int | None = None
     if not lines:
         return Header((), (), 0)
     k = next((k for k in range(len(lines) - 1, 0, -1) if are_units(lines[k])), None)
+    split = [[split_header(cell) for cell in line] for line in reversed(lines)]
     if k is None:
-        split = [[split_header(cell) for cell in line] for line in reversed(lines)]
         named = max(split, key=lambda cells: sum(unit is not None for _, unit in cells))
-        return _header([n for n, _ in named], [u for _, u in named])
-    named = [split_header(cell) for cell in lines[k - 1]]
-    units = [own or _bare(cell) for (_, own), cell in zip(named, lines[k], strict=True)]
-    return _header([n for n, _ in named], units)
+    else:
+        stated = split[len(lines) - k]
+        split.append(
+            [(name, _bare(cell)) for (name, _), cell in zip(stated, lines[k], strict=True)]
+        )
+        named = [(n, own or u) for (n, own), (_, u) in zip(stated, split[-1], strict=True)]
+    names, units = zip(*named, strict=True)
+    contradicted = any(contradict(named, other) for other in split)
+    if k is not None and k + 1 < len(lines):  # real and imaginary part, say, of one name
+        parts = zip(names, lines[k + 1], strict=True)
+        names = tuple(part if part and names.count(n) > 1 else n for n, part in parts)
+    return Header(names, units, len(_without_trailing(names)), contradicted)
 
 
-def _header(names: list[str], units: list[str | None]) -> Header:
-    return Header(tuple(names), tuple(units), len(_without_trailing(names)))
+def contradict(
+    one: Sequence[tuple[str, str | None]], other: Sequence[tuple[str, str | None]]
+) -> bool:
+    """Return whether two lines of names and units name the same columns, but not alike."""
+    names, others = ([plain(name) for name, _ in line] for line in (one, other))
+    if sorted(filter(None, names)) != sorted(filter(None, others)) or len(set(names)) < 2:
+        return False
+    return names != others or any(
+        _differ(unit, stated) for (_, unit), (_, stated) in zip(one, other, strict=True)
+    )
+
+
+def _differ(unit: str | None, other: str | None) -> bool:
+    if unit is None or other is None or unit == other:
+        return False
+    try:
+        return replace(parse_unit(unit), text="") != replace(parse_unit(other), text="")
+    except UnitError:
+        return False
 
 
 def _without_trailing(row: Sequence[str]) -> list[str]:
@@ -118,7 +173,9 @@ def _holds_number(cells: Sequence[str]) -> bool:
 
 def _bare(cell: str) -> str | None:
     """Return the unit in a cell of a row of units; None for an empty one."""
-    text = re.sub(r"^[\[(]\s*(.*?)\s*[\])]$", r"\1", cell.strip())
+    text = cell.strip()
+    if text[:1] in ("[", "(") and text[-1] in "])":
+        text = text[1:-1].strip()
     return "1" if text == "-" else text or None
 
 
@@ -139,8 +196,13 @@ def named_channels(
     Raises
     ------
     DataError
-        If rows are longer than the header.
+        If rows are longer than the header, or several headers differ.
     """
+    if named.contradicted:
+        raise DataError(
+            f"{file}: several lines above the numbers name the columns, with different units or "
+            "in different order; expected one header. Delete the wrong one"
+        )
     channels = []
     for i, values in enumerate(columns):
         label = named.names[i] if named.names else ""

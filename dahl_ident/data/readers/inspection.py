@@ -174,7 +174,7 @@ def _proposal(source: Source) -> str:
             for p, c in free.items()
             if _of_kind(c, units[role]) and not _has_name(c, names, names)
         )
-        best = next(by_name, None) or next(by_unit, None)
+        best = next(by_name, None) or min(by_unit, key=_likeness, default=None)
         if best is not None and not (role in MOTION_KINDS and set(MOTION_KINDS) & roles.keys()):
             roles[role] = best
     lines = [line for role, path in roles.items() for line in _entry(role, path, groups[path])]
@@ -184,6 +184,13 @@ def _proposal(source: Source) -> str:
     for what, paths in (("read by their names", found), ("not used", unused)):
         lines += [f"# {what}: {listed(paths, 20)}"] if paths else []
     return "\n".join([*lines, *_to_fill_in(roles.keys(), response, _stated_rate(source))])
+
+
+def _likeness(path: str) -> int:
+    """Order channels of force: a tribometer measures the friction, and the load across it too."""
+    name = path.casefold()
+    across = any(word in name for word in ("normal", "load", "vertical"))
+    return across - any(word in name for word in ("friction", "tangential", "lateral"))
 
 
 def _stated_rate(source: Source) -> str:

@@ -7,11 +7,13 @@ import functools
 import io
 import logging
 import logging.handlers
+import os
+import re
 import struct
 import tempfile
-import warnings
 import weakref
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.column_names import split_header
-from dahl_ident.data.raw_columns import Channel, Source, Stored
+from dahl_ident.data.raw_columns import Channel, Source, Stored, words
 from dahl_ident.data.readers.file import File, utf8
+from dahl_ident.data.stated_levels import stated_levels
 from dahl_ident.data.storage import library
 from dahl_ident.data.tabular import listed
-from dahl_ident.errors import DataError, DataWarning
+from dahl_ident.errors import DataError
 from dahl_ident.units import parse_unit
 
 _TIME_RESPONSE, _FRF = 1, 4  # function types of data set 58
+_FORTRAN = re.compile(rb"(\d)[dD]([-+]\d\d)")  # 1.0D+00
 _LEAD_IN = struct.Struct("<4sIIQQ")  # of a TDMS segment: tag, contents, version, and two sizes
 _LONGEST_METADATA = 1 << 24  # bytes of a segment that are looked at
 _LONGEST_SEGMENT = 1 << 48  # bytes; more means that the segment was never closed
@@ -74,7 +78,9 @@ def read_uff(file: File) -> Source:
     for function in functions:
         _check_length(file, function)
         channels += _uff_channels(function, units, notes)
-    return instrument_source(file, "universal file", _one_axis(channels), notes)
+    texts = [str(function.get(f"id{i}", "")) for function in functions for i in range(1, 6)]
+    source = instrument_source(file, "universal file", merged_axes(channels), notes)
+    return replace(source, stated=stated_levels(texts))
 
 
 def _uff_sets(file: File, pyuff: Any) -> list[dict[str, Any]]:
@@ -82,13 +88,35 @@ def _uff_sets(file: File, pyuff: Any) -> list[dict[str, Any]]:
         # pyuff reads by name only, and standard input has none
         path = Path(folder) / "data.uff"
         # binary data sets count bytes, so that only pure text can be brought to UTF-8
-        path.write_bytes(file.data if b"58b" in file.data else utf8(file.data))
+        path.write_bytes(file.data if b"58b" in file.data else _uff_text(utf8(file.lines())))
         try:
             with contextlib.redirect_stdout(io.StringIO()):  # pyuff prints groups
                 sets = pyuff.UFF(str(path)).read_sets()
         except Exception as exc:  # pyuff raises bare Exception
             raise DataError(f"{file.name}: the universal file is damaged: {exc}") from exc
     return sets if isinstance(sets, list) else [sets]
+
+
+def _uff_text(text: bytes) -> bytes:
+    """Return data sets 58 and 164, as the library expects them; others write them more freely.
+
+    Delimiters may stand anywhere in their line, and exponents may be those of Fortran, 1.0D+00.
+    """
+    kept: list[bytes] = []
+    block: list[bytes] | None = None
+    for line in [*text.splitlines(), b"-1"]:
+        if line.strip() != b"-1":
+            if block is not None:
+                block.append(line)
+        elif block is None:
+            block = []
+        else:
+            number = block[0].strip() if block else b""
+            if number in (b"58", b"164"):
+                rows = [_FORTRAN.sub(rb"\1E\2", row) for row in block[1:]]
+                kept += [b"    -1", number.rjust(6), *rows, b"    -1"]
+            block = None
+    return b"\n".join(kept) + b"\n" if b"    58" in kept else text
 
 
 def _check_length(file: File, function: dict[str, Any]) -> None:
@@ -169,9 +197,11 @@ def _uff_system(file: File, units: dict[str, Any] | None) -> tuple[str, str] | N
     return system
 
 
-def _one_axis(channels: list[Channel]) -> list[Channel]:
+def merged_axes(channels: list[Channel]) -> list[Channel]:
     """Merge the axes of all functions into one where they are the same."""
     axes = [c for c in channels if c.role in ("time", "frequency")]
+    if not axes:
+        return channels
     first = axes[0]
     if any(c.role != first.role or not np.array_equal(c.values, first.values) for c in axes):
         return channels
@@ -192,22 +222,38 @@ def read_tdms(file: File) -> Source:
     stream: Any = io.BytesIO(file.content) if file.content is not None else None
     if stream is None:
         assert file.path is not None  # either the bytes or their place is known
-        stream = file.path.open("rb")
+        stream = _Bounded(io.FileIO(file.path))
     with _damage_named(file):
         content = nptdms.TdmsFile.open(stream)
         weakref.finalize(content, stream.close)  # open as long as a channel waits to be read
-        channels = [c for group in content.groups() for c in _tdms_channels(file, content, group)]
+        starts = [t for g in content.groups() for c in g.channels() if (t := _start(c)) is not None]
+        first = min(starts, default=None)
+        channels = [
+            c for group in content.groups() for c in _tdms_channels(file, content, group, first)
+        ]
         begun = _begun_again(file)
     doubts = []
+    if sum(c.role == "time" for c in channels) > 1 and len(set(starts)) > 1:
+        late = (max(starts) - min(starts)) / np.timedelta64(1, "s")
+        doubts.append(
+            f"the channels start at different times, up to {late:.4g} s apart (wf_start_time); "
+            "each has a time of its own"
+        )
     if begun:
-        text = (
+        doubts.append(
             f"segments {listed([str(i) for i in begun], 5)} of the file state wf_increment again, "
             "as a file that was appended does; time goes on as if no pause were between them. "
             "Split the file where it holds several runs"
         )
-        warnings.warn(f"{file.name}: {text}", DataWarning, stacklevel=3)
-        doubts.append(text)
     return instrument_source(file, "TDMS", channels, doubts=doubts)
+
+
+class _Bounded(io.BufferedReader):
+    """A file of which no more is read than there is, for which memory would be set aside."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        left = os.fstat(self.fileno()).st_size - self.tell()
+        return super().read(left if size is None or size < 0 else min(size, left))
 
 
 def _begun_again(file: File) -> list[int]:
@@ -264,7 +310,15 @@ def _damage_named(file: File) -> Iterator[None]:
         raise DataError(f"{file.name}: the TDMS file is damaged: {said.buffer[0].getMessage()}")
 
 
-def _tdms_channels(file: File, content: Any, group: Any) -> Iterator[Channel]:
+def _start(channel: Any) -> Any:
+    """Return when a waveform began; None where the file does not say."""
+    if float(channel.properties.get("wf_increment", 0.0)) <= 0.0:
+        return None
+    start = channel.properties.get("wf_start_time")
+    return None if start is None else np.datetime64(start, "ns")
+
+
+def _tdms_channels(file: File, content: Any, group: Any, first: Any) -> Iterator[Channel]:
     times: dict[tuple[float, float, int], Stored] = {}
     for channel in group.channels():
         properties = channel.properties
@@ -273,11 +327,13 @@ def _tdms_channels(file: File, content: Any, group: Any) -> Iterator[Channel]:
         file.refuse_above_limit(8 * count, channel.path)
         values: Any = Stored((count,), np.dtype(channel.dtype), _tdms_read(file, content, channel))
         if values.dtype.kind not in "fiubc":
-            values = values.array.astype(np.str_)
+            values = words(map(str, values.array))
         yield labelled_channel(f"{group.name}/", channel.name, values, unit)
         step = float(properties.get("wf_increment", 0.0))
         if step > 0.0:
-            start = float(properties.get("wf_start_offset", 0.0))
+            start, begun = float(properties.get("wf_start_offset", 0.0)), _start(channel)
+            if begun is not None:  # to a hundredth of a step: clocks of modules differ by less
+                start += step * round(float((begun - first) / np.timedelta64(1, "s")) / step, 2)
             read = functools.partial(_even_times, start, step, count)
             times[start, step, count] = Stored((count,), np.dtype(np.float64), read)
     for i, time in enumerate(times.values()):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.raw_columns import Channel, Source
+from dahl_ident.data.raw_columns import Channel, Source, words
 from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
 from dahl_ident.data.readers.instruments import evenly_timed, instrument_source, labelled_channel
 from dahl_ident.errors import DataError
@@ -22,6 +22,7 @@ from dahl_ident.errors import DataError
 _END = "***End_of_Header***"
 _SPECIAL = ("***Start_Special***", "***End_Special***")
 _SEPARATORS = {"tab": "\t", "comma": ",", "semicolon": ";"}
+_SAME_STEP = 0.01  # relative: more than what is rounded in times and in the header
 _MOST_SEGMENTS = 1000  # the time to read grows with their square
 Lines = list[tuple[int, str]]
 
@@ -34,16 +35,17 @@ def read_lvm(file: File) -> Source:
     DataError
         If a line or a sample is missing, or a cell holds no number.
     """
-    text = utf8(file.data).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+    text = utf8(file.lines()).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     lines = [(i + 1, line) for i, line in enumerate(text.split("\n"))]
     head, rest = _up_to_end(file, _without_special(lines), 0)
     separator = _separator(head)
     settings = dict(_entry(line, separator) for _, line in head)
     mark = (settings.get("Decimal_Separator") or ["."])[0]
     columns = (settings.get("X_Columns") or ["One"])[0].strip().casefold()
+    single = (settings.get("Multi_Headings") or ["Yes"])[0].strip().casefold() == "no"
     segments: list[dict[str, Any]] = []
     while any(line.strip() for _, line in rest):
-        segment, rest = _segment(file, rest, separator, mark, columns)
+        segment, rest = _segment(file, rest, separator, mark, columns, single)
         segments.append(segment)
         if len(segments) > _MOST_SEGMENTS:
             raise DataError(f"{file.name}: the file has more than {_MOST_SEGMENTS} segments")
@@ -54,7 +56,8 @@ def read_lvm(file: File) -> Source:
         for i, segment in enumerate(segments)
         for channel in _channels(segment, f"segment {i}/" if len(segments) > 1 else "", columns)
     ]
-    return instrument_source(file, "LVM", channels)
+    doubts = [doubt for segment in segments for doubt in _contradictions(segment)]
+    return instrument_source(file, "LVM", channels, doubts=doubts)
 
 
 def _without_special(lines: Lines) -> Lines:
@@ -88,9 +91,9 @@ def _entry(line: str, separator: str) -> tuple[str, list[str]]:
 
 
 def _segment(
-    file: File, lines: Lines, separator: str, mark: str, columns: str
+    file: File, lines: Lines, separator: str, mark: str, columns: str, single: bool
 ) -> tuple[dict[str, Any], Lines]:
-    """Return header and numbers of a segment, and the lines behind it."""
+    """Return header and numbers of a segment, and the lines behind it: none of a single one."""
     head, rest = _up_to_end(file, lines, 0)
     segment: dict[str, Any] = dict(_entry(line, separator) for _, line in head)
     while rest and not rest[0][1].strip():
@@ -100,25 +103,27 @@ def _segment(
     labels = [label.strip() for label in rest[0][1].split(separator)]
     if len(labels) > MOST_CHANNELS:
         raise DataError(f"{file.name}: a segment has more than {MOST_CHANNELS} channels")
-    stop = next((i for i in range(1, len(rest)) if not rest[i][1].strip()), len(rest))
-    rows, rest = rest[1:stop], rest[stop:]
+    blank = (i for i in range(1, len(rest)) if not rest[i][1].strip())
+    stop = len(rest) if single else next(blank, len(rest))
+    rows, rest = [row for row in rest[1:stop] if row[1].strip()], rest[stop:]
     while labels and not labels[-1]:
         labels.pop()
     width = len(labels) - (labels[-1:] == ["Comment"])
     first = 1 if columns == "no" else 0
-    data = np.empty((len(rows), width - first))
-    for i, (number, line) in enumerate(rows):
-        cells = line.split(separator)
+    table = [line.split(separator) for _, line in rows]
+    for (number, _), cells in zip(rows, table, strict=True):
         extra = [cell for cell in cells[len(labels) :] if cell.strip()]
         if len(cells) < width or extra:
             raise DataError(
                 f"{file.name}, line {number}: {len(cells)} fields; expected the {width} of the "
                 "column labels"
             )
-        for k, cell in enumerate(cells[first:width]):
-            data[i, k] = _number(file, number, cell, mark)
-    segment["labels"], segment["data"] = labels[first:width], data
-    _check_samples(file, segment, len(rows))
+    numbers = Source(file.name, "", (), decimal=mark, row_name=lambda i: f"line {rows[i][0]}")
+    segment["labels"], segment["data"] = labels[first:width], np.empty((len(rows), width - first))
+    for k, label in enumerate(segment["labels"]):
+        column = words(cells[first + k] for cells in table)
+        segment["data"][:, k] = numbers.from_text(Channel(label, column))
+    _check_samples(file, segment, len(rows), single)
     following = next((line for _, line in rest if line.strip()), "")
     if following and "_" not in following and not following[0].isalpha():
         number = next(n for n, line in rest if line.strip())
@@ -129,18 +134,11 @@ def _segment(
     return segment, rest
 
 
-def _number(file: File, line: int, cell: str, mark: str) -> float:
-    text = cell.strip()
-    if not text:
-        return np.nan
-    with contextlib.suppress(ValueError):
-        if "_" not in text and (mark == "." or "." not in text):
-            return float(text.replace(mark, "."))
-    raise DataError(f"{file.name}, line {line}: {text[:40]!r} is not a number")
+def _check_samples(file: File, segment: dict[str, Any], rows: int, single: bool) -> None:
+    """Refuse a segment with fewer or more samples than its header says.
 
-
-def _check_samples(file: File, segment: dict[str, Any], rows: int) -> None:
-    """Refuse a segment with fewer or more samples than its header says."""
+    Under a single header, which is that of the first samples written, there may be more.
+    """
     stated = [value.strip() for value in segment.get("Samples", []) if value.strip()]
     unread = [value for value in stated if not re.fullmatch("[0-9]{1,18}", value)]
     if unread:
@@ -148,7 +146,8 @@ def _check_samples(file: File, segment: dict[str, Any], rows: int) -> None:
             f"{file.name}: the LVM file is damaged: {unread[0][:40]!r} is no number of samples"
         )
     most = max(map(int, stated), default=rows)
-    if most != rows:
+    timed = "X_Value" in segment["labels"]
+    if most != rows and not (single and rows > most > 0 and (timed or rows % most == 0)):
         raise DataError(
             f"{file.name}: a segment has {rows} samples where its header says {most}; the file "
             f"{'looks cut off' if rows < most else 'is damaged'}"
@@ -171,6 +170,20 @@ def _channels(segment: dict[str, Any], prefix: str, columns: str) -> Iterator[Ch
         starts, steps = (_floats(segment.get(key, [])) for key in ("X0", "Delta_X"))
         times = [a + d * np.arange(len(data)) for a, d in zip(starts, steps, strict=False) if d > 0]
     yield from evenly_timed(times, prefix)
+
+
+def _contradictions(segment: dict[str, Any]) -> Iterator[str]:
+    """Yield what the header says of the sampling, and the column of times does not."""
+    times = segment["data"][:, [label == "X_Value" for label in segment["labels"]]]
+    if len(times) < 2:
+        return
+    for time, stated in zip(times.T, _floats(segment.get("Delta_X", [])), strict=False):
+        step = float(np.median(np.diff(time)))
+        if stated > 0.0 and abs(step - stated) > _SAME_STEP * stated:
+            yield (
+                f"X_Value goes in steps of {step:.6g}, and the header says Delta_X = {stated:.6g}; "
+                "X_Value is used"
+            )
 
 
 def _of_channels(values: list[str], count: int, columns: str) -> list[str]:

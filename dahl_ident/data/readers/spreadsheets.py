@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.column_names import split_header
-from dahl_ident.data.raw_columns import Channel, Source, Stored
+from dahl_ident.data.raw_columns import Channel, Source, Stored, words
 from dahl_ident.data.readers import sheet_process
 from dahl_ident.data.readers.file import MOST_CHANNELS, ZIP_ERRORS, File
-from dahl_ident.data.readers.header import best_run, header, named_channels
+from dahl_ident.data.readers.header import best_run, header, named_channels, refuse_second_header
+from dahl_ident.data.stated_levels import stated_levels
 from dahl_ident.data.storage import library, read_metadata
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
@@ -96,11 +97,12 @@ def _table(file: File, sheet: str, cells: list[list[Any]]) -> Source | None:
     run = best_run(rows, ".")
     if run is None:
         return None
+    where = f"{file.name}, sheet {sheet!r}"
+    refuse_second_header(rows, run.start, ".", lambda i: f"{where}, row {i + 1}")
     above = [row for row in rows[: run.start] if row is not None]
     named = header(above, run.width)
     filled = [i for i in range(run.start, len(cells)) if any(_text(c) for c in cells[i])]
     columns = [_column([cells[i][k] for i in filled]) for k in range(run.width)]
-    where = f"{file.name}, sheet {sheet!r}"
     return Source(
         file.name,
         "workbook",
@@ -108,6 +110,7 @@ def _table(file: File, sheet: str, cells: list[list[Any]]) -> Source | None:
         file.sha256,
         headerless=not named.names,
         row_name=lambda i: f"sheet {sheet!r}, row {filled[i] + 1}",
+        stated=stated_levels(";".join(filter(None, row)) for row in above),
     )
 
 
@@ -124,7 +127,7 @@ def _column(cells: list[Any]) -> NDArray[Any]:
             return np.array(
                 [c if t else np.nan for c, t in zip(cells, texts, strict=True)], dtype=float
             )
-    return np.array(texts, dtype=np.str_)
+    return words(texts)
 
 
 def read_parquet(file: File) -> Source:
@@ -141,8 +144,13 @@ def read_parquet(file: File) -> Source:
         table = pq.ParquetFile(file.stream())
         schema, rows = table.schema_arrow, table.metadata.num_rows
         metadata = _saved(schema)
+        added = _added_bytes(file, table.metadata)
     except Exception as exc:  # pyarrow raises errors of many kinds on damaged files
         raise DataError(f"{file.name}: the file is damaged: {exc}") from exc
+    if added:
+        raise DataError(
+            f"{file.name}: the file is damaged: {added} bytes belong to no column; were some added?"
+        )
     if len(schema.names) > MOST_CHANNELS:
         raise DataError(f"{file.name}: the file has more than {MOST_CHANNELS} columns")
     file.refuse_above_limit(8 * rows, "one column")
@@ -163,6 +171,25 @@ def read_parquet(file: File) -> Source:
         raise DataError(f"{file.name}: no column of numbers or text; {listed(notes, 3)}")
     return Source(file.name, "Parquet", tuple(channels), file.sha256, metadata=metadata,
                   notes=tuple(notes))  # fmt: skip
+
+
+def _added_bytes(file: File, metadata: Any) -> int:
+    """Return the bytes between the columns and the footer, where Arrow writes none but indices.
+
+    Its older releases repeat the description of a column behind it, and state where.
+    """
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    parts = [g.column(k) for g in groups for k in range(g.num_columns)]
+    described = any(
+        p.has_offset_index or p.file_offset or getattr(p, "bloom_filter_offset", None)
+        for p in parts
+    )
+    if "arrow" not in str(metadata.created_by) or described:
+        return 0
+    ends = [
+        (p.dictionary_page_offset or p.data_page_offset) + p.total_compressed_size for p in parts
+    ]
+    return int(file.length - 8 - metadata.serialized_size - max(ends, default=4))
 
 
 def _saved(schema: Any) -> dict[str, Any]:
@@ -235,4 +262,4 @@ def _plain(series: pd.Series[Any]) -> NDArray[Any]:
 
     if is_numeric_dtype(series.dtype):
         return series.to_numpy(dtype=np.float64, na_value=np.nan)  # pandas' nullable numbers
-    return np.array([_text(cell) for cell in values], dtype=np.str_)
+    return words(map(_text, values))

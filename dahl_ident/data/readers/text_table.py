@@ -13,17 +13,27 @@ import io
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.column_names import split_header
-from dahl_ident.data.raw_columns import Channel, Source, plain
-from dahl_ident.data.readers.file import MOST_CHANNELS, utf8
-from dahl_ident.data.readers.header import CELL, Header, are_units, best_run, header, named_channels
-from dahl_ident.data.storage import METADATA_MARK, read_metadata
+from dahl_ident.data.raw_columns import Channel, Source, plain, words
+from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
+from dahl_ident.data.readers.header import (
+    CELL,
+    Header,
+    are_units,
+    best_run,
+    contradict,
+    header,
+    named_channels,
+    refuse_second_header,
+)
+from dahl_ident.data.stated_levels import stated_levels
+from dahl_ident.data.storage import METADATA_MARK, as_before_inert, read_metadata
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
@@ -39,10 +49,14 @@ _BLANK_SEPARATED = re.compile(r"(?:\[[^\]]{0,60}\]|\([^)]{0,60}\)|\S)+")
 _HEAD_BYTES = 1 << 15  # from the first numbers on: hundreds of lines show the format
 _HEAD_LINES = 4  # of numbers, however wide
 _LONGEST_LINE = 1 << 18  # bytes: 10,000 columns and more; beyond, it is no text table
-_MOST_COMMENTS = 20_000  # lines before the first numbers: a limit on time for other texts
+_MOST_COMMENTS = 20_000  # lines, before the first numbers or among them: a limit on time
 _MANY_LINES = 50  # from which decimals of one length are a format, not chance
 _FOOTER_LINES = 20  # that are left out at most; more text after the numbers is an error
 _ERROR_VALUE = re.compile(r"\s*#(?:N/A|DIV/0!|[A-Z]{2,9}[!?])\s*")  # of a spreadsheet
+# the number of points above pairs of numbers, as the SR785 and SR780 write a trace
+_TRACE = re.compile(
+    rb"[ \t]*(\d{1,9})[ \t]*(?:\r\n|\n|\r)(?=[^\r\n,;]*\d[ \t]*,[^\r\n,;]*\d[ \t]*[\r\n])"
+)
 _FOOTER = re.compile(r"\s*[\"']?[^\W\d_]{2}|\s*(?:\*\*|==|--)", re.UNICODE)
 _SUMMARIES = ("min", "max", "mean", "average", "avg", "std", "rms", "sum", "total", "median")
 _MISSING = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "n/a", "#N/A", "null", "1.#QNAN"]
@@ -73,7 +87,7 @@ class _Layout:
     comments: tuple[str, ...] = ()
 
 
-def read_text_table(data: bytes, name: str, sha256: str | None = None) -> Source:
+def read_text_table(file: File) -> Source:
     """Return the columns of a text table.
 
     Raises
@@ -81,13 +95,21 @@ def read_text_table(data: bytes, name: str, sha256: str | None = None) -> Source
     DataError
         If the bytes are no text, or no table of numbers is found, or lines differ in width.
     """
-    data = utf8(data)
+    data, name = utf8(file.data), file.name
     if b"\0" in data:
         raise DataError(
             f"{name}: the file is binary (byte {data.index(0)} is 0); expected a text table"
         )
+    trace = _TRACE.match(data)
+    if trace is not None:
+        data = _LINE_END.findall(trace[0])[0] + data[trace.end() :]  # lines keep their numbers
     lines = _head(data, name)
     layout = _layout(lines, name)
+    rows = [
+        None if not t.strip() or _COMMENT.match(t) else _split(t, layout.delimiter)
+        for _, t in lines
+    ]
+    refuse_second_header(rows, layout.line - 1, layout.mark, lambda i: f"{name}, line {i + 1}")
     if layout.width > MOST_CHANNELS:
         raise DataError(
             f"{name}: line {layout.line} has {layout.width} fields; at most {MOST_CHANNELS} are "
@@ -96,8 +118,12 @@ def read_text_table(data: bytes, name: str, sha256: str | None = None) -> Source
     metadata = _metadata(lines, name)
     body, runs, notes = _body(data, layout, name)
     _refuse_cut_end(body, layout, name)
+    count = max(body.count(b"\n"), body.count(b"\r"))
+    file.refuse_above_limit(8 * count * layout.width, f"a table of {count} by {layout.width}")
     columns = _parse(body, layout, metadata, name)
-    channels = named_channels(columns, layout.header, name)
+    if trace is not None:
+        layout = _of_trace(layout, int(trace[1]), len(columns[0]), name)
+    channels = named_channels(columns, _checked(layout, lines), name)
     if runs and all(plain(c.name) != "run" for c in channels):
         labels = np.searchsorted(runs, np.arange(len(columns[0])), side="right") + 1
         channels = (*channels, Channel("run", labels.astype(np.str_)))
@@ -105,13 +131,14 @@ def read_text_table(data: bytes, name: str, sha256: str | None = None) -> Source
         name,
         "text table",
         channels,
-        sha256,
+        file.sha256,
         headerless=not layout.header.names,
         decimal=layout.mark,
         row_name=lambda i: f"line {_line_of(body, layout.line, i)}",
         metadata=metadata,
         notes=tuple(notes),
         runs=tuple(runs),
+        stated={} if metadata else stated_levels(text for _, text in lines[: layout.line - 1]),
     )
 
 
@@ -242,6 +269,24 @@ def _commented(lines: list[tuple[int, str]], delimiter: str | None) -> list[list
     return [_split(text, delimiter) for text in texts if METADATA_MARK not in text]
 
 
+def _of_trace(layout: _Layout, points: int, rows: int, name: str) -> _Layout:
+    """Return the layout of an analyser's trace, real and imaginary parts, once it is whole."""
+    if rows != points:
+        raise DataError(
+            f"{name}: the first line says {points} points, and {rows} follow; the file "
+            f"{'looks cut off' if rows < points else 'is damaged'}"
+        )
+    return replace(layout, header=Header(("real", "imag"), (None, None), 2))
+
+
+def _checked(layout: _Layout, lines: list[tuple[int, str]]) -> Header:
+    """Return the header, once the comments above it have been compared with it."""
+    named = list(zip(layout.header.names, layout.header.units, strict=True))
+    above = _commented(lines[: layout.line - 1], layout.delimiter)
+    differs = any(contradict(named, [split_header(cell) for cell in row]) for row in above)
+    return replace(layout.header, contradicted=layout.header.contradicted or differs)
+
+
 def _metadata(lines: list[tuple[int, str]], name: str) -> Mapping[str, Any]:
     """Return what an earlier save of this package wrote into a comment line."""
     for i, (_, text) in enumerate(lines):
@@ -265,16 +310,7 @@ def _body(data: bytes, layout: _Layout, name: str) -> tuple[bytes, list[int], li
         raise DataError(_not_a_comment(name, *first_comment))
     commented = any(body.find(mark) >= 0 for mark in (b"#", b"%", b"//", b"!"))
     if commented:
-        for found in _COMMENT_LINE.finditer(body):
-            text = found[0].decode("utf-8", "replace")
-            line = layout.line + len(_LINE_END.findall(body, 0, found.start()))
-            if _looks_like_data(text, layout):
-                raise DataError(_not_a_comment(name, line, text))
-            if _is_another_header(text, layout):
-                raise DataError(
-                    f"{name}, line {line}: {text.strip()[:60]!r} names the columns again, with "
-                    "other units or in another order; expected one header. Split the file there"
-                )
+        _refuse_odd_comments(body, layout, name)
     body, footers = _without_footers(body, layout)
     notes = [f"left out below the table: {text.strip()[:60]!r}" for text in footers]
     body, runs = _without_repeated_headers(body, layout)
@@ -283,6 +319,24 @@ def _body(data: bytes, layout: _Layout, name: str) -> tuple[bytes, list[int], li
         rows = listed([i + 1 for i in runs])
         notes.append(f"the header is repeated in the file: new runs begin at rows {rows}")
     return body, runs, notes
+
+
+def _refuse_odd_comments(body: bytes, layout: _Layout, name: str) -> None:
+    """Refuse comments among the numbers that are rows, or another header."""
+    for count, found in enumerate(_COMMENT_LINE.finditer(body)):
+        text = found[0].decode("utf-8", "replace")
+        row, named = _looks_like_data(text, layout), _is_another_header(text, layout)
+        if row or named or count >= _MOST_COMMENTS:
+            line = layout.line + len(_LINE_END.findall(body, 0, found.start()))
+            raise DataError(
+                _not_a_comment(name, line, text)
+                if row
+                else f"{name}, line {line}: {text.strip()[:60]!r} names the columns again, with "
+                "other units, marks or order; expected one header. Split the file there"
+                if named
+                else f"{name}, line {line}: more than {_MOST_COMMENTS} comments stand among the "
+                "numbers; expected fewer. Delete them"
+            )
 
 
 def _first_comment(data: bytes, layout: _Layout) -> tuple[int, str] | None:
@@ -308,13 +362,13 @@ def _looks_like_data(text: str, layout: _Layout) -> bool:
 
 
 def _is_another_header(text: str, layout: _Layout) -> bool:
-    """Return whether a comment is a header that differs from the first one, in comments too."""
-    if not layout.comments or text.strip() in layout.comments:
+    """Return whether a comment is a header, and none of those above the numbers."""
+    if text.strip() in layout.comments:
         return False
     cells = next(iter(_commented([(0, text)], layout.delimiter)), [""])
     names, units = zip(*(split_header(cell) for cell in cells), strict=True)
     known = sorted(plain(name) for name in layout.header.names if name)
-    return sorted(plain(name) for name in names if name) == known or (
+    return (bool(known) and sorted(plain(name) for name in names if name) == known) or (
         len(cells) == layout.header.cells > 1 and not any(units) and are_units(cells)
     )
 
@@ -447,6 +501,8 @@ def _parse(
         raise DataError(f"{name}: {_where_ragged(str(exc), layout)}") from exc
     except (ValueError, OverflowError) as exc:
         raise DataError(f"{name}: the table cannot be read: {exc}") from exc
+    if metadata:  # written by this package
+        frame = as_before_inert(frame)
     return [_plain(frame[key].to_numpy()) for key in keys]
 
 
@@ -462,7 +518,7 @@ def _plain(values: NDArray[Any]) -> NDArray[Any]:
     """Return numbers or truth values as they are, anything else as text, empty cells as ''."""
     if values.dtype.kind in "fiub":
         return values
-    return np.array(["" if v is None or v != v else str(v) for v in values], dtype=np.str_)
+    return words("" if v is None or v != v else str(v) for v in values)
 
 
 def _line_of(body: bytes, first: int, row: int) -> int:

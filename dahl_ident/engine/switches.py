@@ -14,10 +14,11 @@ import casadi as ca
 
 _SIGNED = (ca.OP_FABS, ca.OP_SIGN)
 _COMPARED = (ca.OP_FMIN, ca.OP_FMAX, ca.OP_LT, ca.OP_LE)
+_OF_POSITIVE = (ca.OP_POW, ca.OP_CONSTPOW, ca.OP_SQRT, ca.OP_LOG)
 
 
 def on_one_branch(
-    inputs: Sequence[ca.SX], outputs: ca.SX
+    inputs: Sequence[ca.SX], outputs: ca.SX, motion: tuple[ca.SX, ca.SX] | None = None
 ) -> tuple[ca.SX, list[ca.SX], list[ca.SX]]:
     """Return an expression with every switch held, its switching functions and their sides.
 
@@ -27,6 +28,8 @@ def on_one_branch(
         Scalar symbols on which the switches may depend.
     outputs : SX
         A vector.
+    motion : (SX, SX), optional
+        The velocity and the symbol for its sign, which is then its side.
 
     Returns
     -------
@@ -45,8 +48,8 @@ def on_one_branch(
     """
     function = ca.Function("f", list(inputs), [ca.densify(outputs)])
     work: dict[int, ca.SX] = {}
-    functions: list[ca.SX] = []
-    sides: list[ca.SX] = []
+    sizes: dict[int, ca.SX] = {}  # absolute values, which powers take beyond a switch too
+    functions, sides = ([motion[0]], [motion[1]]) if motion else ([], [])
     held = [ca.SX(0.0)] * function.nnz_out(0)
 
     def side_of(argument: ca.SX) -> ca.SX:
@@ -70,9 +73,14 @@ def on_one_branch(
             held[target[1]] = work[source[0]]
         else:
             a = [work[i] for i in source]
+            if code in _OF_POSITIVE and source[0] in sizes:
+                a[0] = sizes[source[0]]
+            sizes.pop(target[0], None)
             if code in _SIGNED:
                 side = side_of(a[0])
                 work[target[0]] = side * a[0] if code == ca.OP_FABS else side
+                if code == ca.OP_FABS:
+                    sizes[target[0]] = ca.fabs(a[0])
             elif code in _COMPARED:
                 side = side_of(a[0] - a[1])
                 larger, smaller = (1.0 + side) / 2.0, (1.0 - side) / 2.0
@@ -89,4 +97,20 @@ def on_one_branch(
                 work[target[0]] = ca.SX.unary(code, a[0])
             else:
                 work[target[0]] = ca.SX.binary(code, a[0], a[1])
-    return ca.vertcat(*held), functions, sides
+    known = 1 if motion else 0  # the velocity is no switch of the law
+    return _effective(ca.vertcat(*held), functions[known:], sides[known:])
+
+
+def _effective(
+    rows: ca.SX, functions: list[ca.SX], sides: list[ca.SX]
+) -> tuple[ca.SX, list[ca.SX], list[ca.SX]]:
+    """Return all that without the switches that change nothing, as in sign(x) |x| = x."""
+    for i, side in enumerate(sides):
+        rest = functions[:i] + functions[i + 1 :]
+        whole = ca.vertcat(rows, *rest)
+        above, below = (ca.substitute(whole, side, ca.SX(value)) for value in (1.0, -1.0))
+        if all(ca.is_equal(above[j], below[j], 20) for j in range(whole.numel())):
+            n = rows.numel()
+            rest = [above[n + j] for j in range(len(rest))]
+            return _effective(above[:n], rest, sides[:i] + sides[i + 1 :])
+    return rows, functions, sides

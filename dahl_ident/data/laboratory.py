@@ -1,0 +1,238 @@
+"""Metadata from the laboratory: what a test report names, and the calibration of the instruments.
+
+The fields are those that ISO/IEC 17025:2017, 7.8.2 and 7.8.3, asks for.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dahl_ident.data.storage import read_text
+from dahl_ident.errors import DahlIdentError, DataError, ValidationError
+from dahl_ident.units import parse_quantity
+
+CHANNELS = {"force": "force_gain", "displacement": "displacement_gain", "delay": "delay"}
+"""What an instrument's uncertainty belongs to, and the parameter of the sensors for it."""
+
+_FIELDS = {
+    "laboratory": "Laboratory",
+    "customer": "Customer",
+    "specimen": "Specimen",
+    "method": "Method",
+    "received": "Date of receipt",
+    "measured": "Date of measurement",
+    "place": "Place of measurement",
+    "operator": "Operator",
+    "traceability": "Traceability",
+    "remarks": "Remarks",
+}
+_TEXTS = ("title", "number", *_FIELDS, "authorised_by", "role")
+_BLANK = ("Specimen", "Instruments", "Ambient conditions", "Date of measurement", "Operator")
+_LAST = (
+    "Instruments",
+    "Traceability",
+    "Ambient conditions",
+    "Date of receipt",
+    "Date of measurement",
+    "Place of measurement",
+    "Operator",
+    "Remarks",
+)
+_INSTRUMENT = ("name", "quantity", "model", "serial", "calibration", "channel", "uncertainty", "k")
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """An instrument and its calibration.
+
+    Attributes
+    ----------
+    text : str
+        One line: name, quantity, model, serial, calibration, uncertainty.
+    channel : str
+        "force", "displacement" or "delay"; empty where its uncertainty belongs to no channel.
+    u : float
+        Standard uncertainty of the channel: a share of force or displacement, s of a delay; 0
+        where none is stated.
+    """
+
+    text: str
+    channel: str = ""
+    u: float = 0.0
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """Metadata that a laboratory states; the usual fields left out are printed as blank lines.
+
+    Attributes
+    ----------
+    texts : mapping
+        Text of each field by its name in the file: title, number, laboratory and so on.
+    ambient : tuple of str
+        Such as "temperature 22.1 °C".
+    instruments : tuple of Instrument
+    """
+
+    texts: Mapping[str, str] = field(default_factory=dict)
+    ambient: tuple[str, ...] = ()
+    instruments: tuple[Instrument, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """Title of the report; empty where none is given."""
+        return self.texts.get("title", "")
+
+    @property
+    def number(self) -> str:
+        """Number of the report; empty where none is given."""
+        return self.texts.get("number", "")
+
+    @property
+    def signatory(self) -> tuple[str, ...]:
+        """Name and role of who signs the report."""
+        return tuple(self.texts[n] for n in ("authorised_by", "role") if self.texts.get(n))
+
+    @property
+    def lines(self) -> dict[str, tuple[str, ...]]:
+        """The lines of each printed field, by its printed name, in order."""
+        printed = {
+            name: tuple(line.strip() for line in self.texts.get(key, "").splitlines())
+            for key, name in _FIELDS.items()
+        }
+        printed["Instruments"] = tuple(one.text for one in self.instruments)
+        printed["Ambient conditions"] = self.ambient
+        order = sorted(printed, key=lambda name: _LAST.index(name) if name in _LAST else -1)
+        return {name: printed[name] for name in order if any(printed[name]) or name in _BLANK}
+
+    def facts(self) -> dict[str, Any]:
+        """Return the fields for machines, empty where they are not stated."""
+        texts = {name: self.texts.get(name, "") for name in _TEXTS}
+        return {
+            **texts,
+            "ambient": self.ambient,
+            "instruments": tuple(one.text for one in self.instruments),
+        }
+
+    def calibrations(self) -> dict[str, float]:
+        """Return the standard uncertainty of each parameter of the sensors that has one.
+
+        Several instruments of one channel, such as a sensor and its amplifier, combine as the root
+        of the sum of their squares.
+        """
+        squares: dict[str, float] = {}
+        for one in self.instruments:
+            if one.u > 0.0:
+                name = CHANNELS[one.channel]
+                squares[name] = squares.get(name, 0.0) + one.u**2
+        return {name: math.sqrt(square) for name, square in squares.items()}
+
+
+def metadata_of(given: Mapping[str, Any] | str | Path | None) -> Metadata:
+    """Return metadata from a mapping or a TOML file.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read or is not TOML.
+    ValidationError
+        If a field is unknown, or has the wrong type.
+    """
+    if given is None:
+        return Metadata()
+    if isinstance(given, Mapping):
+        return _checked(given, "")
+    try:
+        read = tomllib.loads(read_text(Path(given)))
+    except tomllib.TOMLDecodeError as exc:
+        raise DataError(f"{given}: is not a TOML file: {exc}") from exc
+    return _checked(read, f"{given}: ")
+
+
+def _checked(given: Mapping[str, Any], where: str) -> Metadata:
+    known = (*_TEXTS, "ambient", "instruments")
+    unknown = sorted(set(given) - set(known))
+    if unknown:
+        raise ValidationError(
+            f"{where}metadata has the field {unknown[0]!r}; expected any of {', '.join(known)}"
+        )
+    texts = {name: _text(given[name], f"{where}{name}") for name in _TEXTS if name in given}
+    return Metadata(
+        texts,
+        _ambient(given.get("ambient", ()), f"{where}ambient"),
+        _instruments(given.get("instruments", ()), f"{where}instruments"),
+    )
+
+
+def _text(value: Any, name: str) -> str:
+    if isinstance(value, (str, int, float, datetime.date)) and not isinstance(value, bool):
+        return str(value)
+    raise ValidationError(f"{name} is {value!r}; expected a text, a number or a date")
+
+
+def _ambient(value: Any, name: str) -> tuple[str, ...]:
+    """Return conditions from a text or a table such as {temperature = "22 °C"}."""
+    if isinstance(value, Mapping):
+        return tuple(f"{key} {_text(item, f'{name}.{key}')}" for key, item in value.items())
+    return (_text(value, name),) if value else ()
+
+
+def _instruments(value: Any, name: str) -> tuple[Instrument, ...]:
+    if not isinstance(value, (list, tuple)):
+        raise ValidationError(f"{name} is {value!r}; expected a list, one entry an instrument")
+    return tuple(_instrument(one, f"{name}[{i}]") for i, one in enumerate(value))
+
+
+def _instrument(one: Any, name: str) -> Instrument:
+    """Return an instrument that is given as a text or as a table."""
+    if not isinstance(one, Mapping):
+        return Instrument(_text(one, name))
+    unknown = sorted(set(one) - set(_INSTRUMENT))
+    if unknown:
+        raise ValidationError(
+            f"{name} has the field {unknown[0]!r}; expected any of {', '.join(_INSTRUMENT)}"
+        )
+    given = {key: _text(one[key], f"{name}.{key}") for key in _INSTRUMENT if key in one}
+    words = {"serial": "serial ", "calibration": "calibrated: ", "uncertainty": "uncertainty "}
+    words["k"] = "k = "
+    parts = [words.get(key, "") + text for key, text in given.items() if key != "channel"]
+    parts += [f"{key} not stated" for key in ("calibration", "uncertainty") if key not in given]
+    return Instrument(", ".join(parts), given.get("channel", ""), _standard(given, name))
+
+
+def _standard(given: Mapping[str, str], name: str) -> float:
+    """Return the standard uncertainty of an instrument's channel, 0 where none is stated."""
+    channel, text = given.get("channel"), given.get("uncertainty")
+    if channel is not None and channel not in CHANNELS:
+        raise ValidationError(f"{name}.channel is {channel!r}; expected {', '.join(CHANNELS)}")
+    if channel is None or text is None:
+        return 0.0
+    if "k" not in given:
+        raise ValidationError(
+            f"{name} has an uncertainty for the channel {channel}, but no k; expected the coverage "
+            "factor of the certificate, k = 2, or k = 1 for a standard uncertainty"
+        )
+    try:
+        k = float(given["k"])
+        u = _delay(text) if channel == "delay" else float(text.removesuffix("%")) / 100.0
+        stated = 0.0 < u < math.inf and 0.0 < k < math.inf
+        stated = stated and (channel == "delay" or text.endswith("%"))
+    except (ValueError, DahlIdentError):
+        stated = False
+    if not stated:
+        expected = '"20 us"' if channel == "delay" else 'a share of the reading, "0.5 %"'
+        raise ValidationError(
+            f"{name} has uncertainty {text!r} and k {given['k']!r}; expected {expected}, and a "
+            "number above zero"
+        )
+    return u / k
+
+
+def _delay(text: str) -> float:
+    return parse_quantity(text, ("time",), "uncertainty")[0]

@@ -1,0 +1,61 @@
+"""What the describing function would have made of rows whose force was controlled."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from dahl_ident.data.row_names import row_names
+from dahl_ident.diagnostics.formatting import percent
+from dahl_ident.fitting import Optimum
+
+_SEEN = 1e-3  # relative difference that is worth a place
+
+
+def steady_difference(optimum: Optimum) -> tuple[int, float] | None:
+    """Return the row where exact and describing-function response differ most, and by how much.
+
+    Relative to the exact one; None where no row has both.
+    """
+    problem = optimum.problem
+    forced = problem.data.controlled == "force"
+    if problem.obstacle_to_exact or not np.isfinite(optimum.values).all():
+        return None
+    exact, sine = (
+        problem.with_steady(steady).predict(optimum.theta)
+        for steady in ("exact", "describing function")
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        apart = np.where(forced & np.isfinite(exact), np.abs(sine / exact - 1.0), 0.0)
+    row = int(np.nanargmax(apart))
+    return row, float(apart[row])
+
+
+def steady_statements(optimum: Optimum) -> Iterator[str]:
+    """Yield how driven rows were predicted, and what the other way would have been."""
+    problem = optimum.problem
+    forced = problem.data.controlled == "force"
+    if not forced.any():
+        return
+    why = problem.obstacle_to_exact
+    if not problem.is_exact:
+        if not why and not problem.takes_energy(optimum.theta):
+            yield (
+                "The force was held, but the describing function predicts the motion: the plant "
+                "would drive itself, and no steady motion is there."
+            )
+        if (
+            why
+            and problem.steady == "exact"
+            and any(not e.is_linear for e in problem.model.elements)
+        ):
+            yield f"The force was held, but the describing function predicts the motion: {why}."
+        return
+    found = steady_difference(optimum)
+    begin = "The force was held, and the exact steady motion fitted"
+    if found is None or found[1] < _SEEN:
+        yield f"{begin}; the describing function would be the same."
+        return
+    (name,) = row_names(problem.data, [found[0]])
+    yield f"{begin}; the describing function would be up to {percent(found[1])} off, at {name}."

@@ -1,0 +1,168 @@
+"""The equations of laws and plants, in symbols, for the engine.
+
+    (m_1 + m_2 + ...) dv/dt = drive - sum of the elements' forces,    dx/dt = v,
+    dF_i/dt = slope_i(F_i, sgn v, v) v    for every element with memory
+
+Base motion: x is the displacement relative to the base, and the drive is -m times the base's
+acceleration. The states are x, v and the elements' own: one force for most that have memory.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Literal
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements.law_checks import traced
+from dahl_ident.errors import ModelError
+
+if TYPE_CHECKING:
+    import casadi as ca
+
+    from dahl_ident.elements.element import Element, Model
+    from dahl_ident.elements.parameter import Parameter
+    from dahl_ident.engine import Equations
+
+Excitation = Literal["force", "base"]
+Channel = Literal["displacement", "velocity", "acceleration"]
+
+
+@contextmanager
+def numpy_names() -> Iterator[None]:
+    """Allow numpy's names, which laws in plain arithmetic may use; casadi answers, and warns."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        yield
+
+
+def law_equations(element: Element) -> Equations:
+    """Return the force of one element for a displacement that is held."""
+    import casadi as ca
+
+    from dahl_ident.engine import Equations
+
+    x, v, s, u = (ca.SX.sym(name) for name in ("x", "v", "s", "u"))
+    values = [_symbol(p) for p in element.parameters]
+    states = [ca.SX.sym(f"y{i}") for i in range(element.n_states)]
+    with numpy_names():
+        part = traced(element, values, x, v, s, states)
+    rates = ca.vertcat(v, 0.0, *part.rates)
+    names = [ca.SX.sym(p.name) if v.is_constant() else v for p, v in _pairs(element, values)]
+    return Equations([x, v, *states], u, s, names, rates, ca.SX(part.force), held=True)
+
+
+def plant_equations(
+    model: Model, excitation: Excitation = "force", channel: Channel = "displacement"
+) -> Equations:
+    """Return the equation of motion of a model, driven by a force or by its base.
+
+    Parameters
+    ----------
+    model : Model
+        Elements in parallel, at least one of them a mass.
+    excitation : {"force", "base"}
+        What the drive is: a force, N, or the acceleration of the base, m/s^2.
+    channel : {"displacement", "velocity", "acceleration"}
+        What the output is.
+
+    Raises
+    ------
+    ModelError
+        If nothing has inertia, or an element has no equation of motion.
+
+    Examples
+    --------
+    >>> from dahl_ident import Dahl, Mass
+    >>> len(plant_equations(Dahl() + Mass(1.0)).states)
+    3
+    """
+    import casadi as ca
+
+    from dahl_ident.engine import Equations
+
+    x, v, s, u = (ca.SX.sym(name) for name in ("x", "v", "s", "u"))
+    values = [_symbol(p) for p in model.parameters]
+    inertia, total = ca.SX(0.0), ca.SX(0.0)
+    states: list[ca.SX] = []
+    rates: list[ca.SX] = []
+    with numpy_names():
+        for element, own in model.of(values):
+            mine = [ca.SX.sym(f"y{len(states) + i}") for i in range(element.n_states)]
+            states += mine
+            part = traced(element, own, x, v, s, mine)
+            if excitation == "base" and element.is_linear and element.n_states:
+                raise ModelError(
+                    f"{element!r} has inertia inside, and how the base moves it is not known; "
+                    "build it from Mass, Damper and Spring, or drive the plant by a force"
+                )
+            inertia, total = inertia + part.inertia, total + part.force
+            rates += part.rates
+    if not model.has_inertia:
+        raise ModelError(
+            f"{model!r} has no mass, so a force does not determine its motion; add "
+            "Mass(), or give records with measured displacement and force"
+        )
+    push = u if excitation == "force" else -inertia * u
+    acceleration = (push - total) / inertia
+    output = {"displacement": x, "velocity": v, "acceleration": acceleration}[channel]
+    names = [ca.SX.sym(p.name) if v.is_constant() else v for p, v in _pairs(model, values)]
+    return Equations(
+        [x, v, *states], u, s, names, ca.vertcat(v, acceleration, *rates), output, held=False
+    )
+
+
+def _symbol(parameter: Parameter) -> ca.SX:
+    """Return a parameter's symbol; a number where it is fixed at 0 or 1, which shortens a law."""
+    import casadi as ca
+
+    if not parameter.free and parameter.value in (0.0, 1.0):
+        return ca.SX(float(parameter.value))
+    return ca.SX.sym(parameter.name)
+
+
+def _pairs(element: Element, values: list[ca.SX]) -> Iterator[tuple[Parameter, ca.SX]]:
+    return zip(element.parameters, values, strict=True)
+
+
+class FirstState:
+    """The first state of a driven plant, from what a record leaves unknown there.
+
+    Parameters
+    ----------
+    model : Model
+        Elements in parallel.
+    """
+
+    def __init__(self, model: Model) -> None:
+        import casadi as ca
+
+        values = [ca.SX.sym(p.name) for p in model.parameters]
+        unknown = [ca.SX.sym("x"), ca.SX.sym("v")]
+        states = list(unknown)
+        with numpy_names():
+            for element, own in model.of(values):
+                count = 1 if element.has_memory else element.n_states
+                mine = [ca.SX.sym(f"start{len(unknown) + i}") for i in range(count)]
+                states += element.initial_states(own, mine[0]) if element.has_memory else mine
+                unknown += mine
+        first, starts, parameters = (ca.vertcat(*group) for group in (states, unknown, values))
+        slopes = [ca.densify(ca.jacobian(first, group)) for group in (starts, parameters)]
+        self._function = ca.Function("first", [starts, parameters], [first, *slopes])
+
+    def __call__(
+        self, starts: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the first state, and its derivatives by the starts and by the parameters.
+
+        Parameters
+        ----------
+        starts : ndarray, shape (m,)
+            Displacement, velocity, the start of each element with memory, and the states of those
+            without.
+        values : ndarray, shape (P,)
+            Of all parameters.
+        """
+        first, by_start, by_value = (part.full() for part in self._function(starts, values))
+        return first[:, 0], by_start, by_value

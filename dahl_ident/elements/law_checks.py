@@ -1,0 +1,442 @@
+"""Checks of a law that a user has written, made when it is first used.
+
+The parameters as they are declared; what ``slope`` returns; the loop that follows from it; and the
+same slope in symbols, for the engine. Values that are not given are tried: a law fails where it
+fails at the values given, or, where it may depend on the values, at every one that was tried.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements.parameter import UNITS, Parameter
+from dahl_ident.errors import ModelError, ValidationError
+
+if TYPE_CHECKING:
+    from dahl_ident.elements.behaviour import Mechanics
+    from dahl_ident.elements.element import Element
+    from dahl_ident.elements.slope_law import SlopeLaw
+
+_TRIALS = 12  # sets of values
+_SPREAD = 0.5  # decades to either side, of values that are tried
+_MAGNITUDES = np.geomspace(1e-12, 1e12, 481)  # N
+_LINE = 201  # forces between those of full slip
+_BEYOND = 1.001  # of the force of full slip: integrators pass it by rounding and by a stage
+_OVERFLOW = 1e6  # times the slope at rest: a law that hardens so far has no full slip
+_CHANGED = 0.1  # of the slope at rest: the force at which it has changed so much is its scale
+_ROUNDING = 1e-9  # of the largest slope
+_TO_SLIP = 0.98  # of the force of full slip: the largest loop
+_SOFT = 3.0  # times the scale: that of a law without full slip
+_CREATED = 0.01  # of the work of both directions: energy that the steps of an integral may create
+_AGREE = 1e-8  # relative: symbols and numbers
+_RESERVED = ("name", "kind", "element")  # keys of an element in files
+
+_CHECKED: WeakKeyDictionary[type, set[tuple[Parameter, ...]]] = WeakKeyDictionary()
+
+
+def is_of_package(law: type) -> bool:
+    """Return whether a class is one of this package's own."""
+    return law.__module__.partition(".")[0] == "dahl_ident"
+
+
+def check_declarations(law: type[Element]) -> None:
+    """Refuse parameters that are not declared as they should be.
+
+    Raises
+    ------
+    ValidationError
+        If one is not a parameter, two have one name, a name is not an identifier, bounds are the
+        wrong way round, or a unit is unknown.
+    """
+    if is_of_package(law):
+        return
+    name = law.__name__
+    declared: Any = law.parameters  # whatever a user wrote
+    if not isinstance(declared, tuple) or not all(isinstance(p, Parameter) for p in declared):
+        raise ValidationError(
+            f"{name}.parameters is {declared!r}; expected a tuple of di.Parameter(...), such as "
+            '(di.Parameter("f_max", "N", "friction limit", lower=0.0, transform="log"),)'
+        )
+    for label, count in Counter(p.name for p in declared).items():
+        if count > 1:
+            raise ValidationError(
+                f"{name} declares the parameter {label} {count} times; give each its own name"
+            )
+    for p in declared:
+        if not (isinstance(p.name, str) and p.name.isidentifier()) or p.name in _RESERVED:
+            raise ValidationError(
+                f"{name} declares a parameter called {p.name!r}; expected letters, digits and "
+                f"underscores, such as 'f_max', and none of {', '.join(_RESERVED)}"
+            )
+        for what, (low, high) in {"bounds": (p.lower, p.upper), "prior": p.prior or (0, 1)}.items():
+            if not low < high:
+                raise ValidationError(
+                    f"{name}: the {what} of {p.name} are {low:g} and {high:g}; expected the lower "
+                    "one first"
+                )
+        if p.transform not in ("log", "linear"):
+            raise ValidationError(
+                f"{name}: the transform of {p.name} is {p.transform!r}; expected 'log' or 'linear'"
+            )
+        if p.transform == "log" and not p.upper > 0.0:
+            raise ValidationError(
+                f"{name}: {p.name} is searched by its logarithm, but its upper bound is "
+                f'{p.upper:g}; expected one above 0, or transform="linear"'
+            )
+        if not p.is_mechanical:
+            raise ValidationError(
+                f"{name}: the unit of {p.name} is {p.unit!r}; expected a product of powers of "
+                f"{', '.join(UNITS)}, such as 'N/m' or 'N s/m', or '' for a pure number"
+            )
+
+
+def check_slope(law: SlopeLaw) -> None:
+    """Refuse a law whose slope cannot be that of a friction law.
+
+    Raises
+    ------
+    ModelError
+        If the slope fails on arrays, is not an array of numbers of the right shape, is not finite
+        or not positive up to full slip, is the same everywhere, or if the law creates energy.
+    """
+    if is_of_package(type(law)) or not law.one_state:
+        return
+    declared = tuple(law.parameters)
+    done = _CHECKED.setdefault(type(law), set())
+    if declared in done:
+        return
+    trial = _Trial(law)
+    for check in (trial.slip, trial.constant, trial.loops):
+        reasons = check()
+        if all(reasons):
+            raise ModelError(f"{type(law).__name__}.slope {reasons[0]}")
+    done.add(declared)
+
+
+class _Trial:
+    """A law's slope at several sets of values, one a row."""
+
+    def __init__(self, law: SlopeLaw) -> None:
+        self._law = law
+        rng = np.random.default_rng(0)
+        known = all(p.value is not None for p in law.parameters)
+        self._count = 1 if known else _TRIALS
+        self._values = [_tried(p, rng, self._count)[:, None] for p in law.parameters]
+        self._size = np.concatenate([-_MAGNITUDES[::-1], [0.0], _MAGNITUDES])
+        rest = len(_MAGNITUDES)
+        force = np.broadcast_to(self._size, (self._count, self._size.size))
+        self._wide = [self._slope(s * force, s) for s in (1.0, -1.0)]
+        self._rest = self._wide[0][:, rest]
+        limits = [self._limit(s, wide) for s, wide in zip((1.0, -1.0), self._wide, strict=True)]
+        self._limits = np.stack(limits)
+        with np.errstate(all="ignore"):
+            changed = np.abs(self._wide[0][:, rest:] / self._rest[:, None] - 1.0) > _CHANGED
+        first = np.where(changed.any(axis=1), self._size[rest + changed.argmax(axis=1)], np.inf)
+        scale = np.fmin(first, self._limits.min(axis=0))
+        self._scale = np.where(np.isfinite(scale), scale, 1.0)
+
+    def _at(self, row: int, force: float, direction: float) -> str:
+        """Return in words where something was found."""
+        numbers = [
+            f"{p.name} = {float(v[row, 0]):.4g}"
+            for p, v in zip(self._law.parameters, self._values, strict=True)
+        ]
+        where = [f"force = {force:.4g} N", f"direction = {direction:+g}", *numbers]
+        return f"at {', '.join(where)}"
+
+    def _slope(self, force: FloatArray, direction: float) -> FloatArray:
+        """Return dF/dx of a row of forces for each set of values, checked for its form."""
+        law, name = self._law, f"{type(self._law).__name__}.slope"
+        heading = np.full(force.shape, direction)
+        arguments = f"an array of {force.shape} forces, and {len(self._values)} values"
+        rated = not law.rate_independent
+        try:
+            found = self._called(force, heading, 0.0 if rated else None)
+        except Exception as exc:  # whatever a user's code raises
+            if not rated and self._works_with_velocity(force, heading):
+                raise ModelError(
+                    f"{name} failed without a velocity ({exc}); a law that uses the velocity must "
+                    "declare rate_independent = False"
+                ) from exc
+            raise ModelError(f"{name} failed for {arguments}: {_in_words(exc)}") from exc
+        if found is None:
+            raise ModelError(f"{name} returned None; expected dF/dx, N/m: end it with return")
+        array: NDArray[Any] = np.asarray(found)
+        if array.dtype.kind not in "fiub":
+            raise ModelError(
+                f"{name} returned {_shown(found)}, numbers of type {array.dtype}; expected dF/dx, "
+                "N/m, as real numbers"
+            )
+        try:
+            fits = np.broadcast_shapes(array.shape, force.shape) == force.shape
+        except ValueError:
+            fits = False
+        if not fits:
+            raise ModelError(
+                f"{name} returned the shape {array.shape} for {arguments}; expected "
+                f"{force.shape}, one number for each force"
+            )
+        return np.broadcast_to(array.astype(np.float64), force.shape)
+
+    def _called(self, force: FloatArray, direction: FloatArray, velocity: float | None) -> Any:
+        with np.errstate(all="ignore"):
+            return self._law.slope(force.copy(), direction, velocity, list(self._values))
+
+    def _works_with_velocity(self, force: FloatArray, direction: FloatArray) -> bool:
+        try:
+            self._called(force, direction, 0.0)
+        except Exception:  # whatever a user's code raises
+            return False
+        return True
+
+    def _limit(self, direction: float, wide: FloatArray) -> FloatArray:
+        """Return the size of the force at which the slope ceases to be positive; inf if never."""
+        size, rest = self._size, len(_MAGNITUDES)
+        low, high = np.zeros(self._count), np.full(self._count, np.inf)
+        for row in range(self._count):
+            with np.errstate(invalid="ignore"):
+                stops = np.flatnonzero(~(wide[row, rest:] > 0.0))
+                far = wide[row, rest : rest + stops[0]] if stops.size else wide[row, rest:]
+            if stops.size and not (far.size and far[-1] > _OVERFLOW * far[0]):
+                low[row], high[row] = size[max(rest, rest + stops[0] - 1)], size[rest + stops[0]]
+        open_ended = np.isinf(high)
+        for _ in range(4):
+            line = (
+                np.where(open_ended, 0.0, low)[:, None]
+                + np.linspace(0.0, 1.0, 33) * np.where(open_ended, 0.0, high - low)[:, None]
+            )
+            with np.errstate(invalid="ignore"):
+                positive = self._slope(direction * line, direction) > 0.0
+            last = np.where(positive.all(axis=1), 32, np.maximum(positive.argmin(axis=1), 1))
+            rows = np.arange(self._count)
+            low, high = line[rows, last - 1], np.where(open_ended, np.inf, line[rows, last])
+        return np.asarray(high)
+
+    def slip(self) -> list[str]:
+        """Return what is wrong with the slope up to full slip, for each set of values."""
+        found = [""] * self._count
+        share = np.linspace(0.0, 1.0, _LINE)
+        for i, direction in enumerate((1.0, -1.0)):
+            own, other = (
+                np.where(np.isfinite(limit), limit, self._scale)
+                for limit in (self._limits[i], self._limits[1 - i])
+            )
+            size = share * (own + other)[:, None] - other[:, None]
+            slopes = self._slope(direction * size, direction)
+            passed = self._slope(direction * _BEYOND * own[:, None], direction)
+            size, slopes = np.c_[size, _BEYOND * own], np.c_[slopes, passed]
+            for row in range(self._count):
+                found[row] = found[row] or (
+                    self._not_finite(row, size[row], slopes[row], direction)
+                    or self._positive_again(row, i, direction)
+                    or self._not_positive(row, size[row, :-1], slopes[row, :-1], direction)
+                )
+        return found
+
+    def _not_finite(self, row: int, size: FloatArray, slopes: FloatArray, direction: float) -> str:
+        wrong = np.flatnonzero(~np.isfinite(slopes))
+        if not wrong.size:
+            return ""
+        first = wrong[np.argmin(np.abs(size[wrong]))]
+        return (
+            f"is {slopes[first]} {self._at(row, direction * size[first], direction)}; expected a "
+            "finite number for every force up to full slip, and a little beyond it, as from "
+            "np.sign(m) * np.abs(m)**alpha with m = 1 - direction*force/f_max"
+        )
+
+    def _not_positive(
+        self, row: int, size: FloatArray, slopes: FloatArray, direction: float
+    ) -> str:
+        largest = np.max(np.abs(slopes))
+        negative = np.flatnonzero(slopes < -_ROUNDING * largest)
+        if not self._rest[row] > 0.0:
+            where = self._at(row, 0.0, direction)
+            return (
+                f"is {self._rest[row]:.4g} N/m {where}; expected a positive slope at rest and up "
+                "to full slip"
+            )
+        inner = negative[size[negative] < size[-1] * (1.0 - 1e-3)]
+        if not inner.size:
+            return ""
+        worst = inner[np.argmin(slopes[inner])]
+        where = self._at(row, direction * size[worst], direction)
+        return (
+            f"is {slopes[worst]:.4g} N/m, negative before full slip, {where}; expected a positive "
+            "slope until full slip, also after the direction has changed"
+        )
+
+    def _positive_again(self, row: int, side: int, direction: float) -> str:
+        """Return what is wrong where a slope is negative, and positive at greater forces."""
+        limit, slopes, size = self._limits[side, row], self._wide[side][row], self._size
+        near = (size > limit) & (size < 1e3 * limit)
+        with np.errstate(invalid="ignore"):
+            smallest = _ROUNDING * self._rest[row]
+            negative = np.flatnonzero(near & (slopes < -smallest))
+            later = np.flatnonzero(near & (slopes > smallest))
+        if not (negative.size and later.size and later[-1] > negative[0]):
+            return ""
+        worst = negative[np.argmin(slopes[negative])]
+        return (
+            f"is {slopes[worst]:.4g} N/m, negative before full slip, "
+            f"{self._at(row, direction * size[worst], direction)}, and positive again at larger "
+            "forces; expected a positive slope until full slip"
+        )
+
+    def constant(self) -> list[str]:
+        """Return that the slope is the same for all forces and directions, if it is."""
+        found = []
+        for row in range(self._count):
+            slopes = np.concatenate([wide[row] for wide in self._wide])
+            same = np.ptp(slopes) <= _ROUNDING * np.max(np.abs(slopes))
+            found.append(
+                f"is {slopes[0]:.4g} N/m for every force and direction: a constant number, which "
+                "is a spring without friction; expected a slope that depends on force and "
+                "direction, or use di.Spring"
+                if same
+                else ""
+            )
+        return found if self._law.rate_independent else [""]
+
+    def loops(self) -> list[str]:
+        """Return by how much energy grows over a closed loop, for each set of values.
+
+        Of a loop between two forces, where dx = dF/slope in each direction.
+        """
+        share = np.linspace(0.0, _TO_SLIP, _LINE)
+        reach = np.where(np.isfinite(self._limits), self._limits, _SOFT * self._scale)
+        upper, lower = share * reach[0][:, None], -share * reach[1][:, None]
+        found = []
+        with np.errstate(all="ignore"):
+            high, low = self._between(upper), self._between(lower)
+        for row in range(self._count):
+            gap, work, size = (part[row] for part in high)
+            below, taken, whole = (part[row] for part in low)
+            # the loop closes where both directions need the same displacement
+            after = np.diff(np.sign(below - gap[:, None]), axis=1) != 0.0
+            place = 1 + after.argmax(axis=1)
+            lost = work - taken[place]
+            all_of_it = size + np.abs(whole[place])
+            with np.errstate(all="ignore"):
+                created = np.where(after.any(axis=1), -lost / all_of_it, -np.inf)
+            worst = int(np.nanargmax(np.where(np.arange(_LINE) > 0, created, -np.inf)))
+            numbers = self._at(row, 0.0, 1.0).partition("direction = +1")[2].lstrip(", ")
+            found.append(
+                f"creates energy: {-lost[worst]:.3g} J in each cycle between "
+                f"{lower[row, place[worst]]:.3g} and {upper[row, worst]:.3g} N, at {numbers}; "
+                "expected a loop that loses energy: the slope after a reversal must not be below "
+                "that before it"
+                if created[worst] > _CREATED
+                else ""
+            )
+        return found
+
+    def _between(self, force: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return three integrals from rest to each force, which the forces of a loop share.
+
+        Of the difference of dx between the directions, of force times it, and of the work's size.
+        """
+        rising, falling = (1.0 / self._slope(force, s) for s in (1.0, -1.0))
+        parts = (rising - falling, force * (rising - falling), np.abs(force) * (rising + falling))
+        step = np.diff(force, axis=1)
+        sums = [np.cumsum(0.5 * (p[:, 1:] + p[:, :-1]) * step, axis=1) for p in parts]
+        gap, work, size = (np.c_[np.zeros(self._count), total] for total in sums)
+        return gap, work, size
+
+
+def _tried(parameter: Parameter, rng: np.random.Generator, count: int) -> FloatArray:
+    """Return values at which a parameter is tried: the one given, else some within its range."""
+    if parameter.value is not None and (not parameter.free or count == 1):
+        return np.full(count, float(parameter.value))
+    if parameter.scan:
+        return np.resize(np.asarray(parameter.scan, dtype=np.float64), count)
+    low, high = parameter.prior or (parameter.lower, parameter.upper)
+    spread = 10.0 ** rng.uniform(-_SPREAD, _SPREAD, count)
+    if math.isfinite(low) and math.isfinite(high):
+        share = rng.uniform(0.05, 0.95, count)
+        if parameter.transform == "log" and low > 0.0:
+            return np.asarray(low * (high / low) ** share)
+        return np.asarray(low + share * (high - low))
+    if parameter.value is not None:
+        return np.clip(parameter.value * spread, low, high)
+    if math.isfinite(low):
+        return np.asarray(low + (abs(low) or 1.0) * spread)
+    if math.isfinite(high):
+        return np.asarray(high - (abs(high) or 1.0) * spread)
+    return np.asarray(spread)
+
+
+def _in_words(exc: Exception) -> str:
+    """Return what a user's code failed with, and what to write instead."""
+    text = " ".join(str(exc).split())
+    if "truth value" in text:
+        return (
+            "it asks a Python question of arrays (if, and, or, not, min, max); write comparisons "
+            "as factors, such as stiffness * (direction * force < f_max), or np.where"
+        )
+    return (
+        f"{type(exc).__name__}: {text[:200]}; expected plain arithmetic and numpy's functions, "
+        "which work on arrays"
+    )
+
+
+def _shown(found: Any) -> str:
+    text = " ".join(repr(found).split())
+    return text if len(text) <= 40 else f"{text[:40]}..."
+
+
+def traced(
+    element: Element, values: Sequence[Any], x: Any, v: Any, s: Any, states: Sequence[Any]
+) -> Mechanics:
+    """Return an element's part in an equation of motion, in symbols.
+
+    Raises
+    ------
+    ModelError
+        If the slope of a user's law fails with symbols, or is another one than with numbers.
+    """
+    from dahl_ident.elements.slope_law import SlopeLaw
+
+    if is_of_package(type(element)):
+        return element.mechanics(values, x, v, s, states)
+    try:
+        part = element.mechanics(values, x, v, s, states)
+    except ModelError:
+        raise
+    except Exception as exc:  # whatever a user's code raises
+        raise ModelError(
+            f"{type(element).__name__} cannot be compiled: {_in_words(exc)}, and on symbols"
+        ) from exc
+    if isinstance(element, SlopeLaw) and type(element).mechanics is SlopeLaw.mechanics:
+        _compare(element, values, v, s, states[0])
+    return part
+
+
+def _compare(law: SlopeLaw, values: Sequence[Any], v: Any, s: Any, force: Any) -> None:
+    """Refuse a slope that is another one in symbols than in numbers."""
+    import casadi as ca
+
+    rng = np.random.default_rng(1)
+    numbers = [_tried(p, rng, _TRIALS) for p in law.parameters]
+    free = [(v, n) for v, n in zip(values, numbers, strict=True) if not v.is_constant()]
+    slope = law.slope(force, s, v, values)
+    function = ca.Function("slope", [force, s, v, *(v for v, _ in free)], [slope])
+    forces, direction = rng.uniform(-0.5, 0.5, _TRIALS), np.resize([1.0, -1.0], _TRIALS)
+    speed = direction * 10.0 ** rng.uniform(-_SPREAD, _SPREAD, _TRIALS)
+    with np.errstate(all="ignore"):
+        expected = law.slope(forces, direction, None if law.rate_independent else speed, numbers)
+        rows = zip(forces, direction, speed, *(n for _, n in free), strict=True)
+        found = np.array([float(function(*row)) for row in rows])
+    if not np.allclose(found, expected, rtol=_AGREE, atol=0.0, equal_nan=True):
+        raise ModelError(
+            f"{type(law).__name__}.slope cannot be compiled: with symbols in place of numbers it "
+            "gives another result; expected plain arithmetic, comparisons and numpy's functions, "
+            "without math.*, float(), new arrays that are filled, or random numbers"
+        )

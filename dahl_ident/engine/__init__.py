@@ -1,0 +1,20 @@
+"""The engine: equations are compiled once, and every motion is one compiled integration."""
+
+from __future__ import annotations
+
+from dahl_ident.engine.differentiation import differentiated
+from dahl_ident.engine.drive import band_limited
+from dahl_ident.engine.motion import Motion, Settled, march, settled
+from dahl_ident.engine.translate import Equations, System, translate
+
+__all__ = [
+    "Equations",
+    "Motion",
+    "Settled",
+    "System",
+    "band_limited",
+    "differentiated",
+    "march",
+    "settled",
+    "translate",
+]

@@ -1,0 +1,147 @@
+"""Settled motion under a sine: of a law under its displacement, or of a plant under its drive.
+
+The settled motion is the fixed point of one cycle's map, y(T) = y(0), which Newton's method finds
+with the map's own derivatives (shooting). Equations that are the same in both directions need half
+a cycle: y(T/2) = -y(0). Derivatives of the fixed point follow from the implicit function theorem.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import boolean, complex128, float64, int64, njit, types
+
+from dahl_ident.engine.integrate import advance
+from dahl_ident.engine.radau import STAGES, Signal, eliminate, layout, restart
+from dahl_ident.engine.samples import FUNCTION, MATRIX, NUMBERS, VECTOR
+
+_ITERATIONS = 40  # of shooting; five are the rule
+_CONVERGED = 1e-4  # change of the first state over the largest one; its square is corrected
+_FAR = 1.0  # the same; a longer Newton step is replaced by a cycle
+_AGREED = 1e-3  # change by the last cycle; where it is more, rounding decides: nothing settles
+_DARING = 4  # but not every fourth: in a sharp resonance cycles alone take too long
+_COARSE = 300.0  # errors of steps while shooting, over those of the last cycle
+_SHORTEST = 12.0  # steps of a cycle, and of one of the highest harmonic, at least
+
+
+@njit(
+    types.Tuple((NUMBERS, complex128[:, :, ::1], MATRIX, float64[:, :, ::1]))(
+        FUNCTION, NUMBERS, NUMBERS, NUMBERS, boolean, VECTOR, VECTOR, MATRIX, MATRIX, NUMBERS,
+        VECTOR, int64, float64,
+    ),
+    cache=True,
+    error_model="numpy",
+)  # fmt: skip
+def cycles(
+    f, sizes, solved, followers, odd, amplitudes, omegas, parameters, starts, chosen, harmonics,
+    plain, tolerance,
+):  # fmt: skip
+    """Return settled motions, row by row.
+
+    Whether each was found; harmonics c_k of ``output = sum of Re c_k exp(j k omega t)`` with their
+    derivatives with respect to the signal's amplitude and the parameters `chosen`; the first
+    states; the map of a cycle, or of half a cycle with its sign where the system is odd. The first
+    `plain` iterations are cycles without Newton's method.
+    """
+    n, held, rows = sizes[0], sizes[3], amplitudes.size
+    begin = 2 if held else 0
+    free = n - begin
+    sign = -1.0 if odd else 1.0
+    q = free + 1 + chosen.size
+    at = layout(sizes, q, 0)
+    w = np.zeros(at.length)
+    size = STAGES * n
+    block, sides = np.zeros((size, size)), np.zeros((size, max(1, q)))
+    found = np.zeros(rows, dtype=np.int64)
+    result = np.zeros((rows, harmonics.size, 2 + chosen.size), dtype=np.complex128)
+    first, maps = starts.copy(), np.zeros((rows, n, n))
+    none, nobody = np.empty(0), np.empty(0, dtype=np.int64)
+    nothing, empty = np.empty((0, 0)), np.empty((0, 1 + q), dtype=np.complex128)
+    sums = np.zeros((harmonics.size, 1 + q), dtype=np.complex128)
+    matrix, columns = np.zeros((free, free)), np.zeros((free, 2 + chosen.size))
+    highest = 1.0
+    for k in harmonics:
+        highest = max(highest, k)
+    for row in range(rows):
+        w[3 + n + at.k : at.outputs] = parameters[row]
+        restart(w, at)
+        signal = Signal(True, amplitudes[row], omegas[row], none, nothing)
+        period = 2.0 * np.pi / omegas[row]
+        times = np.array([0.0, 0.5 * period if odd else period])
+        longest = period / (_SHORTEST * highest)
+        step = 0.1 * longest
+        y = first[row]
+        if held:
+            y[0], y[1] = amplitudes[row], 0.0
+        for coarse in (_COARSE, 1.0):  # what coarse steps miss, fine ones find
+            found[row] = 0
+            for iteration in range(_ITERATIONS):
+                x, S = y.copy(), np.zeros((n, free + 1))
+                for i in range(free):
+                    S[begin + i, i] = 1.0
+                step = advance(
+                    f, solved, followers, signal, times, x, S, nobody, coarse * tolerance, longest,
+                    step, none, empty, none, none, nothing, nothing, w, at, block, sides,
+                )  # fmt: skip
+                if step <= 0.0:
+                    break
+                for i in range(free):
+                    for j in range(free):
+                        matrix[i, j] = (1.0 if i == j else 0.0) - sign * S[begin + i, j]
+                    columns[i, 0] = sign * x[begin + i] - y[begin + i]
+                largest = 0.0
+                if iteration < plain or not eliminate(matrix, columns, free, 1):
+                    largest = np.inf
+                for i in range(free if iteration >= plain else 0):
+                    if columns[i, 0] != 0.0:
+                        largest = max(largest, abs(columns[i, 0]) / w[at.scale + begin + i])
+                for i in range(free):
+                    if largest <= _FAR or (largest < np.inf and iteration % _DARING == _DARING - 1):
+                        y[begin + i] += columns[i, 0]
+                    else:
+                        y[begin + i] = sign * x[begin + i]
+                if largest < _CONVERGED:
+                    found[row] = 1
+                    break
+            if not found[row]:
+                continue
+            x, S = y.copy(), np.zeros((n, q))
+            for i in range(free):
+                S[begin + i, i] = 1.0
+            if held:
+                S[0, free] = 1.0
+            sums[:] = 0.0
+            step = advance(
+                f, solved, followers, signal, times, x, S, chosen, tolerance, longest, step,
+                harmonics, sums, none, none, nothing, nothing, w, at, block, sides,
+            )  # fmt: skip
+            if step <= 0.0:
+                found[row] = 0
+                continue
+            for i in range(free):
+                for j in range(free):
+                    maps[row, begin + i, begin + j] = S[begin + i, j]
+                    matrix[i, j] = (1.0 if i == j else 0.0) - sign * S[begin + i, j]
+                for z in range(1 + chosen.size):
+                    columns[i, 1 + z] = sign * S[begin + i, free + z]
+                columns[i, 0] = sign * x[begin + i] - y[begin + i]
+            if not eliminate(matrix, columns, free, 2 + chosen.size):
+                columns[:] = np.inf
+            for i in range(free):
+                if abs(columns[i, 0]) > _AGREED * w[at.scale + begin + i]:
+                    found[row] = 0
+                y[begin + i] += columns[i, 0]
+            if found[row] or not held:
+                break
+        if not found[row]:
+            continue
+        for a in range(harmonics.size):
+            k = harmonics[a]
+            factor = 2.0 / period if k > 0.0 else 1.0 / period
+            if odd:
+                factor *= 2.0 if k % 2.0 == 1.0 else 0.0
+            for z in range(2 + chosen.size):
+                value = sums[a, free + z if z else 0]
+                for i in range(free):
+                    value += sums[a, 1 + i] * columns[i, z]
+                result[row, a, z] = factor * value
+    return found, result, first, maps

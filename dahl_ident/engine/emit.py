@@ -1,0 +1,190 @@
+"""From an expression graph to machine code: every operation is one instruction, written directly.
+
+numba links the result and gives it the type of a C function. Its own compiler would infer types of
+thousands of lines first, all of which are numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from dahl_ident.errors import ModelError
+
+_BINARY = {"ADD": "fadd", "SUB": "fsub", "MUL": "fmul", "DIV": "fdiv"}
+_COMPARED = {"LT": "<", "LE": "<=", "EQ": "==", "NE": "!="}
+_INTRINSIC = ("sqrt", "exp", "log", "sin", "cos", "fabs", "floor", "ceil")
+_LIBRARY = (
+    "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf",
+    "expm1", "log1p", "atan2", "hypot", "copysign", "fmod",
+)  # fmt: skip
+_NAMES = {
+    code: name
+    for name in (
+        *_BINARY, *_COMPARED, *(n.upper() for n in (*_INTRINSIC, *_LIBRARY)), "ASSIGN", "NEG",
+        "SQ", "TWICE", "INV", "FMIN", "FMAX", "SIGN", "NOT", "AND", "OR", "IF_ELSE_ZERO", "POW",
+        "CONSTPOW",
+    )
+    if (code := getattr(ca, f"OP_{name}", None)) is not None
+}  # fmt: skip
+
+
+class Step(NamedTuple):
+    """One operation: its name, what it works on, and where the result goes.
+
+    Names: "CONST" with a number, "INPUT" and "OUTPUT" with a place in the array, "LEVEL" with the
+    level below which the function returns, or an operation of casadi with earlier results.
+    """
+
+    name: str
+    arguments: tuple[float, ...]
+
+
+def steps_of(graph: ca.Function, places: Sequence[Sequence[int]]) -> tuple[Step, ...]:
+    """Return the operations of a function of one vector, whose outputs are levels.
+
+    Parameters
+    ----------
+    graph : casadi.Function
+        Of one vector of inputs.
+    places : sequence of sequence of int
+        Where the nonzeros of each output go in the array.
+
+    Raises
+    ------
+    ModelError
+        If an operation has no translation.
+    """
+    found: list[Step] = []
+    latest: dict[int, int] = {}  # step that set a place of casadi's memory
+    level = 0
+    for k in range(graph.n_instructions()):
+        code, target = graph.instruction_id(k), graph.instruction_output(k)
+        source = graph.instruction_input(k)
+        if code == ca.OP_OUTPUT:
+            while level < target[0]:
+                level += 1
+                found.append(Step("LEVEL", (level,)))
+            found.append(Step("OUTPUT", (places[level][target[1]], latest[source[0]])))
+            continue
+        if code == ca.OP_CONST:
+            step = Step("CONST", (graph.instruction_constant(k),))
+        elif code == ca.OP_INPUT:
+            step = Step("INPUT", (1 + source[1],))
+        elif code in _NAMES:
+            step = Step(_NAMES[code], tuple(latest[i] for i in source))
+        else:
+            raise ModelError(
+                f"the equations use the casadi operation {code}, which has no translation; use "
+                f"arithmetic, comparisons, {', '.join((*_INTRINSIC, *_LIBRARY))}"
+            )
+        latest[target[0]] = len(found)
+        found.append(step)
+    return tuple(found)
+
+
+def compiled(steps: Sequence[Step]) -> Any:
+    """Return the C function ``f(numbers)`` of some steps."""
+    from llvmlite import ir
+    from numba import cfunc, types
+    from numba.extending import intrinsic
+
+    @intrinsic  # type: ignore[untyped-decorator]  # numba's decorator has no type
+    def write(_context: Any, _array: Any) -> Any:
+        def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+            _write(steps, builder, arguments[0])
+            return ir.Constant(ir.IntType(64), 0)
+
+        return types.int64(types.CPointer(types.float64)), generate
+
+    def equations(numbers: Any) -> None:
+        write(numbers)
+
+    return cfunc(types.void(types.CPointer(types.float64)))(equations)
+
+
+def _write(steps: Sequence[Step], builder: Any, array: Any) -> None:
+    """Write the instructions of all steps at a builder of numba's."""
+    from llvmlite import ir
+
+    number, whole = ir.DoubleType(), ir.IntType(32)
+    zero, one, two = (ir.Constant(number, v) for v in (0.0, 1.0, 2.0))
+    results: list[Any] = []
+    end = builder.append_basic_block("end")
+
+    def place(i: float) -> Any:
+        return builder.gep(array, [ir.Constant(whole, int(i))])
+
+    def call(name: str, *arguments: Any) -> Any:
+        kind = ir.FunctionType(number, [number] * len(arguments))
+        function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
+        return builder.call(function, arguments)
+
+    def as_number(truth: Any) -> Any:
+        return builder.select(truth, one, zero)
+
+    def holds(a: Any) -> Any:
+        return builder.fcmp_unordered("!=", a, zero)
+
+    def power(a: Any, b: Any) -> Any:  # rest on a kink has no slope
+        at_zero = as_number(builder.fcmp_ordered("==", b, zero))
+        return builder.select(
+            builder.fcmp_ordered("==", a, zero), at_zero, call("llvm.pow.f64", a, b)
+        )
+
+    def logarithm(a: Any) -> Any:  # finite at 0, where a power's slope multiplies it by 0
+        least = ir.Constant(number, float(np.finfo(np.float64).tiny))
+        return call("llvm.log.f64", builder.select(builder.fcmp_ordered("==", a, zero), least, a))
+
+    operations: Mapping[str, Callable[..., Any]] = {
+        "LOG": logarithm,
+        "ASSIGN": lambda a: a,
+        "NEG": lambda a: builder.fsub(ir.Constant(number, -0.0), a),
+        "SQ": lambda a: builder.fmul(a, a),
+        "TWICE": lambda a: builder.fmul(two, a),
+        "INV": lambda a: builder.fdiv(one, a),
+        "FMIN": lambda a, b: builder.select(builder.fcmp_ordered("<", b, a), b, a),
+        "FMAX": lambda a, b: builder.select(builder.fcmp_ordered(">", b, a), b, a),
+        "SIGN": lambda a: builder.fsub(
+            as_number(builder.fcmp_ordered(">", a, zero)),
+            as_number(builder.fcmp_ordered("<", a, zero)),
+        ),
+        "NOT": lambda a: as_number(builder.fcmp_ordered("==", a, zero)),
+        "AND": lambda a, b: as_number(builder.and_(holds(a), holds(b))),
+        "OR": lambda a, b: as_number(builder.or_(holds(a), holds(b))),
+        "IF_ELSE_ZERO": lambda a, b: builder.select(holds(a), b, zero),
+        "POW": power,
+        "CONSTPOW": power,
+    }
+    for name, values in steps:
+        result = None
+        if name == "CONST":
+            result = ir.Constant(number, values[0])
+        elif name == "INPUT":
+            result = builder.load(place(values[0]))
+        elif name == "OUTPUT":
+            builder.store(results[int(values[1])], place(values[0]))
+        elif name == "LEVEL":
+            enough = builder.fcmp_ordered(
+                "<", builder.load(place(0)), ir.Constant(number, values[0])
+            )
+            more = builder.append_basic_block("more")
+            builder.cbranch(enough, end, more)
+            builder.position_at_end(more)
+        else:
+            own = [results[int(i)] for i in values]
+            if name in operations:
+                result = operations[name](*own)
+            elif name in _BINARY:
+                result = getattr(builder, _BINARY[name])(*own)
+            elif name in _COMPARED:
+                result = as_number(builder.fcmp_ordered(_COMPARED[name], *own))
+            else:
+                low = name.lower()
+                result = call(f"llvm.{low}.f64" if low in _INTRINSIC else low, *own)
+        results.append(result)
+    builder.branch(end)
+    builder.position_at_end(end)

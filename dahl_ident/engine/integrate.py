@@ -1,0 +1,284 @@
+"""One integration for all motions: Radau IIA steps between events.
+
+Each step lies on one branch of the laws. Arguments are those of :mod:`dahl_ident.engine.radau`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dahl_ident.engine.events import (
+    LOCATED,
+    choose_branch,
+    first_event,
+    pass_event,
+    passed_another,
+    step_to_event,
+)
+from dahl_ident.engine.radau import (
+    MATRIX,
+    NODES,
+    SLOPE_AFTER,
+    STAGES,
+    compiled,
+    error_of,
+    evaluate,
+    guess_stages,
+    keep_interval,
+    put,
+    put_place,
+    put_stage,
+    read_stage,
+    sensitivities,
+    solve_stages,
+)
+
+_SHRINK, _GROW, _SAFETY = 0.1, 6.0, 0.8  # of the next step
+_FAILED = 0.25  # of a step whose stages were not found
+_SMALLEST = 1e-14  # of the span: a shorter step cannot advance the time
+_DENSE = 1e-2  # of the tolerance: the same for a polynomial that is read between its ends
+_SHARE = _DENSE ** (1.0 / (STAGES + 1))  # of the step
+_TOGETHER = 1e-8  # of the span: events that are as near to each other may change places
+_NEAREST = 0.005  # rad before a turning point: the last step under a sine
+_MOST, _PER_SAMPLE = 20_000, 200  # steps: more is no motion
+_BEYOND_BOUNDS = 1e100  # m/s: far beyond any motion, and its square is still a number
+
+
+@compiled
+def begin(f, followers, signal, t, y, w, at):
+    """Set what a step on another branch than the last begins with."""
+    n, k, o = at.n, at.k, at.outputs
+    m = n + 1 + k
+    if followers.size:
+        put(y, w)
+        evaluate(f, signal, t, 0.0, w, at)
+        w[0], w[2] = 2.0, 1.0  # at unit velocity the rate is the change by displacement
+        f(w.ctypes)
+        for b in followers:
+            w[at.follow + b] = w[o + b]
+            for z in range(1 + at.P):
+                slope = w[o + m * (1 + n) + b * (1 + at.P) + z]
+                w[at.follow_slopes + b * (1 + at.P) + z] = slope
+    put(y, w)
+    evaluate(f, signal, t, 0.0, w, at)
+    for q in range(n):
+        w[at.rates + q] = w[o + q]
+    w[at.before], w[at.output] = w[2], w[o + n]
+    for i in range(k):
+        w[at.before + 1 + i] = w[o + n + 1 + i]
+
+
+@compiled
+def stop_of(signal, t, end, span, w, at):
+    """Return where the step must end at the latest, so that the signal is smooth within it."""
+    if not at.held:
+        return end
+    if signal.sine:
+        half = np.pi / signal.omega
+        return min(end, half * (np.floor(t / half + 1e-9) + 1.0))
+    knots, i = signal.knots, max(0, int(w[at.interval]))
+    while i + 2 < knots.size and t >= knots[i + 1] - LOCATED * span:
+        i += 1
+    if i != w[at.interval]:
+        keep_interval(signal, i, w, at)
+        w[at.interval + 3] = 1.0
+    return min(end, knots[i + 1])
+
+
+@compiled
+def add_harmonics(signal, t, h, S, first, chosen, harmonics, sums, w, at):
+    """Add the step's part of the integrals of output exp(-j k omega t), and their derivatives."""
+    n, P, q = at.n, at.P, S.shape[1]
+    m = n + 1 + at.k
+    for i in range(STAGES):
+        weight = h * MATRIX[STAGES - 1, i]
+        phase = signal.omega * (t + NODES[i] * h)
+        slopes = at.state_slopes + (i * m + n) * n
+        drives = at.drive_slopes + (i * m + n) * (1 + P)
+        for a in range(harmonics.size):
+            turn = weight * np.exp(-1j * harmonics[a] * phase)
+            sums[a, 0] += w[at.values + i * m + n] * turn
+            for z in range(q):
+                value = 0.0
+                for b in range(n):
+                    if w[slopes + b] != 0.0:
+                        change = S[b, z] + w[at.changes + (i * n + b) * q + z]
+                        value += w[slopes + b] * change
+                if z > first:
+                    value += w[drives + 1 + chosen[z - first - 1]]
+                elif z == first and not at.held:
+                    value += w[drives] * np.cos(phase)
+                sums[a, 1 + z] += value * turn
+
+
+@compiled
+def write_samples(f, signal, t, h, y, S, first, chosen, samples, i, output, by, path, w, at):
+    """Write what happens at the samples within the step; return the first sample beyond it."""
+    n, P, q, o = at.n, at.P, S.shape[1], at.outputs
+    m = n + 1 + at.k
+    while i < samples.size and samples[i] <= t + h * (1.0 + 1e-12):
+        share = min(1.0, max(0.0, (samples[i] - t) / h))
+        put_place(y, share, w, at)
+        evaluate(f, signal, t + share * h, 2.0 if q else 0.0, w, at)
+        output[i] = w[o + n]
+        for b in range(n if path.size else 0):
+            path[i, b] = w[1 + b]
+        slopes, drives = o + m + n * n, o + m * (1 + n) + n * (1 + P)
+        for z in range(q):
+            value = 0.0
+            for b in range(n):
+                if w[slopes + b] != 0.0:
+                    change = S[b, z]
+                    for j in range(STAGES):
+                        change += w[at.weights + j] * w[at.changes + (j * n + b) * q + z]
+                    value += w[slopes + b] * change
+            if z > first:
+                value += w[drives + 1 + chosen[z - first - 1]]
+            by[i, z] = value
+        i += 1
+    return i
+
+
+@compiled
+def finish_step(h, y, S, w, at):
+    """Move on to the end of the step, and keep what the next one begins with."""
+    n, k, q = at.n, at.k, S.shape[1]
+    m = n + 1 + k
+    for r in range(n):
+        rate, scale = 0.0, w[at.scale + r]
+        for j in range(STAGES):
+            moved = w[at.stages + j * n + r]
+            w[at.last + j * n + r] = moved
+            rate += SLOPE_AFTER[j] * moved
+            scale = max(scale, abs(y[r] + moved))
+        w[at.rates + r], w[at.scale + r] = rate / h, scale
+        y[r] += w[at.stages + (STAGES - 1) * n + r]
+        for z in range(q):
+            S[r, z] += w[at.changes + ((STAGES - 1) * n + r) * q + z]
+    for r in range(n, m):
+        for i in range(STAGES):
+            w[at.scale + r] = max(w[at.scale + r], abs(w[at.values + i * m + r]))
+    w[at.before], w[at.output] = y[1], w[at.values + (STAGES - 1) * m + n]
+    for i in range(k):
+        w[at.before + 1 + i] = w[at.values + (STAGES - 1) * m + n + 1 + i]
+
+
+@compiled
+def advance(
+    f, solved, followers, signal, times, y, S, chosen, tolerance, longest, step, harmonics, sums,
+    samples, output, by, path, w, at, matrix, columns,
+):  # fmt: skip
+    """Integrate from times[0] to times[1], in place; return a length of step, 0 if it fails.
+
+    `longest`: of a step. `step`: of the first step and of the first after a turning point, as a
+    guess; a better one is returned. Harmonics of the output are added to `sums`; the output at
+    `samples`, its derivatives and the states are written to `output`, `by` and `path`.
+    """
+    q = S.shape[1]
+    first = q - chosen.size - 1
+    t, end = times[0], times[1]
+    span = end - t
+    sample, stuck, last = 0, 0, 0.0
+    read = harmonics.size > 0
+    fresh, turned, after_turn = True, True, step
+    states = np.concatenate((solved, followers)) if at.held and samples.size else solved
+    stop_of(signal, t, end, span, w, at)
+    choose_branch(f, signal, t, y, w, at)
+    for _ in range(_MOST + _PER_SAMPLE * samples.size):
+        if t >= end - LOCATED * span:
+            return after_turn
+        stop = stop_of(signal, t, end, span, w, at)
+        if fresh:
+            begin(f, followers, signal, t, y, w, at)
+            fresh, last = False, 0.0
+        step = min(step, longest)
+        wanted, allowed = step, tolerance
+        if sample < samples.size:  # read samples between the ends, or end at the next one
+            gap = samples[sample] - t
+            if _SHARE * step > gap:
+                wanted, allowed = _SHARE * step, _DENSE * tolerance
+            else:
+                wanted = min(step, gap)
+        h = stop - t if t + 1.1 * wanted >= stop else wanted
+        if at.rated and signal.sine:  # what happens near rest is as short as the way there
+            h = min(h, max(0.5 * (stop - t), _NEAREST / signal.omega))
+        if sample < samples.size and allowed == tolerance:
+            h = min(h, samples[sample] - t)
+        guess_stages(h, last, w, at)
+        found = solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns)
+        if not found and last > 0.0:
+            guess_stages(h, 0.0, w, at)
+            found = solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns)
+        if not found:
+            step, last = h * _FAILED, 0.0
+            if step < _SMALLEST * span:
+                return 0.0
+            continue
+        error = error_of(f, states, read, signal, t, h, y, w, at) / tolerance
+        factor = _GROW
+        if error > 0.0:
+            factor = min(_GROW, max(_SHRINK, _SAFETY * error ** (-1.0 / (STAGES + 1))))
+        if error * tolerance > allowed and h > LOCATED * span:
+            step, last = h * factor, 0.0
+            continue
+        which, where = first_event(f, signal, t, h, y, w, at)
+        if which >= 0 and where * h <= LOCATED * span:
+            stuck += 1
+            if stuck > 2 * (at.k + 2):
+                return 0.0  # the motion is stuck between two branches
+            pass_event(f, signal, t, which, y, S, first, chosen, w, at)
+            fresh = True
+            continue
+        stuck = 0
+        if which >= 0:
+            whole = h
+            h, there = step_to_event(
+                f, solved, followers, signal, t, h, where, which, y, span, w, at, matrix, columns
+            )
+            if h <= 0.0 or (h > _TOGETHER * span and passed_another(which, w, at)):
+                step, last = 0.5 * where * whole, 0.0
+                continue
+            error = error_of(f, states, read, signal, t, h, y, w, at) / tolerance
+            if error * tolerance > allowed and h > LOCATED * span:
+                step, last = h * max(_SHRINK, _SAFETY * error ** (-1.0 / (STAGES + 1))), 0.0
+                continue
+            if not there:
+                which = -1
+        if q:
+            if not sensitivities(
+                f, solved, followers, signal, t, h, y, S, first, chosen, w, at, matrix, columns
+            ):
+                return 0.0
+        elif harmonics.size:
+            for i in range(STAGES):
+                put_stage(y, i, w, at)
+                evaluate(f, signal, t + NODES[i] * h, 0.0, w, at)
+                read_stage(solved, followers, 0, i, w, at)
+        if harmonics.size:
+            add_harmonics(signal, t, h, S, first, chosen, harmonics, sums, w, at)
+        if samples.size:
+            sample = write_samples(
+                f, signal, t, h, y, S, first, chosen, samples, sample, output, by, path, w, at
+            )
+        finish_step(h, y, S, w, at)
+        if not w[at.scale + 1] < _BEYOND_BOUNDS:
+            return 0.0
+        last = h
+        at_stop = t + h >= stop - LOCATED * span
+        t = stop if at_stop else t + h
+        if turned:
+            after_turn, turned = h * factor, False
+        step = max(step, h * factor) if h < step else h * factor
+        if which >= 0:
+            pass_event(f, signal, t, which, y, S, first, chosen, w, at)
+            fresh = True
+            if which == 0:
+                step, turned = after_turn, True
+        elif at.held and at_stop and t < end:  # the held motion turns, or has another formula
+            direction = w[at.sides]
+            stop_of(signal, t, end, span, w, at)
+            choose_branch(f, signal, t, y, w, at)
+            fresh = True
+            if w[at.sides] != direction:
+                step, turned = after_turn, True
+    return 0.0

@@ -1,0 +1,200 @@
+"""What the kernels give, in arrays: settled motions under sines, and motions along samples."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.engine.translate import System
+from dahl_ident.errors import FitError
+
+_SETTLED = 1e-6  # error of a step's polynomial; that of harmonics is then below 1e-10
+_SAMPLED = 1e-6  # the same where motions end at samples; a hundredth of it between
+_CYCLES = 4  # before Newton's method, from rest: a plant is then near its settled motion
+_KERNELS = ("radau", "events", "integrate", "samples", "cycle")
+
+
+class Settled(NamedTuple):
+    """Settled motions under ``amplitude cos(omega t)``; one row each.
+
+    Attributes
+    ----------
+    found : ndarray of bool, shape (rows,)
+    coefficients : ndarray of complex, shape (rows, harmonics)
+        c_k of the output, sum of Re c_k exp(j k omega t); c_0 is its mean. NaN where not found.
+    by_amplitude : ndarray of complex, shape (rows, harmonics)
+    by_parameter : ndarray of complex, shape (rows, harmonics, chosen)
+    starts : ndarray, shape (rows, order)
+        States at t = 0.
+    maps : ndarray, shape (rows, order, order)
+        Derivatives of the states after a cycle, or after half a cycle with the sign of an odd
+        system, with respect to those at its beginning.
+    """
+
+    found: NDArray[np.bool_]
+    coefficients: ComplexArray
+    by_amplitude: ComplexArray
+    by_parameter: ComplexArray
+    starts: FloatArray
+    maps: FloatArray
+
+
+class Motion(NamedTuple):
+    """A motion along samples.
+
+    Attributes
+    ----------
+    output : ndarray, shape (n,)
+    by_first : ndarray, shape (n, order)
+        Derivatives of the output with respect to the first state.
+    by_parameter : ndarray, shape (n, chosen)
+    states : ndarray, shape (n, order)
+    """
+
+    output: FloatArray
+    by_first: FloatArray
+    by_parameter: FloatArray
+    states: FloatArray
+
+
+def settled(
+    system: System,
+    amplitude: FloatArray,
+    omega: FloatArray,
+    parameters: FloatArray,
+    *,
+    chosen: Sequence[int] = (),
+    harmonics: Sequence[int] = (1,),
+    starts: FloatArray | None = None,
+    cycles: int | None = None,
+    finer: float = 1.0,
+) -> Settled:
+    """Return the settled motions of a system under sines, by shooting.
+
+    Parameters
+    ----------
+    system : System
+        A law whose displacement, or a plant whose drive, is the sine.
+    amplitude, omega : ndarray, shape (rows,)
+        Of the sine; rad/s.
+    parameters : ndarray, shape (rows, P)
+    chosen : sequence of int
+        Parameters whose derivatives are wanted.
+    harmonics : sequence of int
+        k of the output's harmonics.
+    starts : ndarray, shape (rows, order), optional
+        Guesses of the states at t = 0, such as those of nearby parameters; from rest without.
+    cycles : int, optional
+        How many the motion goes through before Newton's method, which a guess does not need. After
+        many it is near a stable motion.
+    finer : float, default 1
+        How many times smaller the error of a step is than usual.
+    """
+    rows = amplitude.size
+    plain = (1 if system.held else _CYCLES) if starts is None else 0
+    plain = plain if cycles is None else cycles
+    first = np.zeros((rows, system.order)) if starts is None else starts
+    found, result, first, maps = kernels("cycle").cycles(
+        system.function, system.sizes, system.solved, system.followers, system.odd,
+        _numbers(amplitude), _numbers(omega), _numbers(parameters), _numbers(first),
+        np.asarray(chosen, dtype=np.int64), np.asarray(harmonics, dtype=np.float64), plain,
+        _SETTLED / finer,
+    )  # fmt: skip
+    found = found.astype(bool)
+    result[~found] = np.nan
+    return Settled(found, result[..., 0], result[..., 1], result[..., 2:], first, maps)
+
+
+def march(
+    system: System,
+    knots: FloatArray,
+    coefficients: FloatArray,
+    samples: FloatArray,
+    first: FloatArray,
+    parameters: FloatArray,
+    *,
+    chosen: Sequence[int] = (),
+    derivatives: bool = False,
+) -> Motion:
+    """Return the motion of a system whose drive, or held displacement, is polynomials in time.
+
+    Parameters
+    ----------
+    system : System
+    knots : ndarray, shape (m + 1,)
+        Rising times between which the signal is one polynomial, s.
+    coefficients : ndarray, shape (degree + 1, m)
+        Of its powers of the place, from 0 to 1, between two knots.
+    samples : ndarray, shape (n,)
+        Rising times at which the motion is wanted, the first one being that of `first`.
+    first : ndarray, shape (order,)
+        States at the first sample.
+    parameters : ndarray, shape (P,)
+    chosen : sequence of int
+        Parameters whose derivatives are wanted.
+    derivatives : bool, default False
+        Whether any are.
+
+    Raises
+    ------
+    FitError
+        If the motion grows beyond all bounds.
+    """
+    found, output, by, states = kernels("samples").march(
+        system.function, system.sizes, system.solved, system.followers, _numbers(knots),
+        _numbers(coefficients), _numbers(samples), _numbers(first), _numbers(parameters),
+        np.asarray(chosen, dtype=np.int64), int(derivatives), _SAMPLED,
+    )  # fmt: skip
+    if not found or not np.isfinite(output).all():
+        raise FitError(
+            f"the motion grows beyond all bounds at the parameters {parameters.tolist()}"
+        )
+    n = system.order
+    return Motion(output, by[:, :n], by[:, n + 1 :], states)
+
+
+def _numbers(array: FloatArray) -> FloatArray:
+    return np.ascontiguousarray(array, dtype=np.float64)
+
+
+@cache
+def kernels(name: str) -> ModuleType:
+    """Return the module of a compiled kernel, from a cache on disk where that can be written.
+
+    The cache belongs to this version of the kernels, so that none is used that was compiled from
+    other source.
+    """
+    from importlib import import_module
+
+    from numba import __version__, config
+
+    here = Path(__file__).parent
+    source = b"".join((here / f"{n}.py").read_bytes() for n in _KERNELS)
+    key = hashlib.sha256(source + __version__.encode()).hexdigest()[:16]
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(home) / "dahl_ident" / f"engine-{key}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        writable = os.access(folder, os.W_OK)
+    except OSError:
+        writable = False
+    if not writable:
+        folder = Path(tempfile.mkdtemp(prefix="dahl_ident-"))
+    if not any(folder.rglob(f"{name}.*.nbi")):
+        print("compiling the engine, once (half a minute) ...", file=sys.stderr)  # noqa: T201
+    before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+    try:
+        return import_module(f"dahl_ident.engine.{name}")
+    finally:
+        config.CACHE_DIR = before

@@ -1,0 +1,497 @@
+"""One Radau IIA step on one branch of the laws, with its error and exact sensitivities.
+
+The method is collocation at five Radau points: order 9, stiffly accurate and L-stable, so that
+steps grow with neither A/x_c nor the speed of the friction. Sensitivities are the exact derivatives
+of the stages, from one more factorisation of a step.
+
+States that follow the displacement (:class:`dahl_ident.engine.translate.System`) are not solved
+for: over a step they change in proportion to it, and so does the displacement of a driven plant,
+being the integral of the velocity.
+
+E. Hairer and G. Wanner, Solving Ordinary Differential Equations II, 2nd ed., Springer 1996,
+sections IV.5 and IV.8.
+
+In the functions below `w` is one array of numbers and `at` says where in it each quantity begins
+(:class:`Layout`): numba takes longer to pass twenty arrays than to compute with them. `y` are the
+states, `S` their sensitivities, one column each: with respect to initial states, to the signal's
+amplitude (column `first`), and to the parameters `chosen`.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+
+import numpy as np
+from numba import njit
+from numpy.polynomial import legendre
+
+from dahl_ident.arrays import FloatArray
+
+STAGES = 5
+_NEWTON = 12  # iterations of the stages; two are the rule
+_SOLVED = 1e-7  # change of the stages, over the states' sizes, whose square is rounding
+
+
+def _tables() -> tuple[FloatArray, ...]:
+    """Return nodes and matrix of the method, and how its polynomials go on to both ends.
+
+    The last three: weights of the changes at the stages in the slope at the beginning and the end,
+    and weights of values at the stages in that at the beginning.
+    """
+    series = np.zeros(STAGES + 1)
+    series[STAGES - 1 :] = -1.0, 1.0  # P_s - P_(s-1), whose roots are the nodes
+    nodes = np.sort(np.real(legendre.legroots(series)))
+    for _ in range(3):
+        nodes -= legendre.legval(nodes, series) / legendre.legval(nodes, legendre.legder(series))
+    nodes = 0.5 * (nodes + 1.0)
+    nodes[-1] = 1.0
+    powers = np.arange(STAGES)
+    inverse = np.linalg.inv(nodes[:, None] ** powers)
+    matrix = nodes[:, None] ** (powers + 1) / (powers + 1) @ inverse
+    slopes = np.linalg.inv(matrix)  # of the stages, from the changes
+    return nodes, matrix, inverse[0] @ slopes, slopes[-1], inverse[0]
+
+
+NODES, MATRIX, SLOPE_BEFORE, SLOPE_AFTER, VALUE_BEFORE = _tables()
+_SHARES = tuple(
+    1.0 / np.prod([NODES[j]] + [NODES[j] - NODES[k] for k in range(STAGES) if k != j])
+    for j in range(STAGES)
+)
+"""Of the polynomials that are 1 at one node, and 0 at the others and the beginning."""
+
+_CHECKED = np.array([0.5 * NODES[0], 0.5 * (NODES[-2] + NODES[-1])])  # where rates are compared
+_POWERS = np.arange(1, STAGES + 1)
+SLOPE_CHECKED = (_POWERS * _CHECKED[:, None] ** (_POWERS - 1)) @ np.linalg.inv(
+    NODES[:, None] ** _POWERS
+)
+
+OPTIONS = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+compiled = njit(**OPTIONS)
+inlined = njit(inline="always", **OPTIONS)
+
+Signal = namedtuple("Signal", "sine amplitude omega knots coefficients")
+"""What drives the system: its drive, or its displacement where that is held.
+
+A sine ``amplitude cos(omega t)``, or polynomials between knots in the place, 0 to 1, coefficients
+of shape (degree + 1, n - 1).
+"""
+
+Layout = namedtuple(
+    "Layout",
+    "n k P held rated degree outputs values rates state_slopes drive_slopes solved_slopes coupling "
+    "follow follow_slopes stages last changes scale sides before output weights interval length",
+)
+"""Numbers of states, switches, parameters; then where each quantity begins in `w`."""
+
+
+@compiled
+def layout(sizes, columns, degree):
+    """Return where each quantity begins, for that many columns of sensitivities."""
+    n, k, P = sizes[0], sizes[1], sizes[2]
+    m, s = n + 1 + k, STAGES
+    outputs = 3 + n + k + P  # the function's inputs come first
+    values = outputs + m * (2 + n + P)  # rates, output and switching functions at stages, (s, m)
+    rates = values + s * m  # at the beginning of a step, (n)
+    state_slopes = rates + n  # derivatives of the values by the states, (s, m, n)
+    drive_slopes = state_slopes + s * m * n  # and by drive and parameters, (s, m, 1 + P)
+    solved_slopes = drive_slopes + s * m * (1 + P)  # solved rates by solved states, (s, n, n)
+    coupling = solved_slopes + s * n * n  # and by the displacement, followers included, (s, n)
+    follow = coupling + s * n  # change of followers by displacement, (n)
+    follow_slopes = follow + n  # its derivatives by drive and parameters, (n, 1 + P)
+    stages = follow_slopes + n * (1 + P)  # changes of the states to the stages, (s, n)
+    last = stages + s * n  # those of the last step, (s, n)
+    changes = last + s * n  # changes of the sensitivities to the stages, (s, n, columns)
+    scale = changes + s * n * columns  # largest size of each of the values, (m)
+    sides = scale + m  # direction of the motion, then sides of the switches, (1 + k)
+    before = sides + 1 + k  # velocity and switching functions at the beginning, (1 + k)
+    output = before + 1 + k  # at the beginning
+    weights = output + 1  # of the stages in a polynomial's value, (s)
+    interval = weights + s  # the signal's: number, begin, end, 1 where pinned, coefficients
+    length = interval + 4 + degree + 1
+    return Layout(
+        n, k, P, sizes[3], sizes[4], degree, outputs, values, rates, state_slopes, drive_slopes,
+        solved_slopes, coupling, follow, follow_slopes, stages, last, changes, scale, sides,
+        before, output, weights, interval, length,
+    )  # fmt: skip
+
+
+@compiled
+def restart(w, at):
+    """Forget the motion before."""
+    w[at.outputs :] = 0.0
+    w[at.sides : at.sides + 1 + at.k] = 1.0
+    w[at.interval] = -1.0
+
+
+@compiled
+def find_interval(signal, t, w, at):
+    """Keep the signal's polynomial at time t."""
+    knots, i = signal.knots, max(0, int(w[at.interval]))
+    while i + 2 < knots.size and t > knots[i + 1]:
+        i += 1
+    while i > 0 and t < knots[i]:
+        i -= 1
+    keep_interval(signal, i, w, at)
+
+
+@compiled
+def keep_interval(signal, i, w, at):
+    """Keep the signal's polynomial in interval i."""
+    w[at.interval] = i
+    w[at.interval + 1], w[at.interval + 2] = signal.knots[i], signal.knots[i + 1]
+    for j in range(at.degree + 1):
+        w[at.interval + 4 + j] = signal.coefficients[j, i]
+
+
+@inlined
+def signal_at(signal, t, w, at):
+    """Return value, rate and second derivative of the signal."""
+    if signal.sine:
+        c, s = np.cos(signal.omega * t), np.sin(signal.omega * t)
+        a = signal.amplitude
+        return a * c, -a * signal.omega * s, -a * signal.omega * signal.omega * c
+    i = at.interval
+    if w[i] < 0.0 or (w[i + 3] == 0.0 and not w[i + 1] <= t <= w[i + 2]):
+        find_interval(signal, t, w, at)
+    width = w[i + 2] - w[i + 1]
+    x = (t - w[i + 1]) / width
+    value, rate, second = 0.0, 0.0, 0.0
+    for j in range(at.degree, -1, -1):
+        second = second * x + 2.0 * rate
+        rate = rate * x + value
+        value = value * x + w[i + 4 + j]
+    return value, rate / width, second / (width * width)
+
+
+@inlined
+def evaluate(f, signal, t, level, w, at):
+    """Evaluate the function at time t and the states in the inputs; held motion is put in."""
+    n = at.n
+    value, rate, second = signal_at(signal, t, w, at)
+    if at.held:
+        w[1] = value
+        w[2] = rate
+    else:
+        w[1 + n] = value
+    w[0] = level
+    for i in range(1 + at.k):
+        w[2 + n + i] = w[at.sides + i]
+    f(w.ctypes)
+    if at.held:
+        w[at.outputs] = rate
+        w[at.outputs + 1] = second
+
+
+@compiled
+def put(y, w):
+    """Put states into the inputs."""
+    for q in range(y.size):
+        w[1 + q] = y[q]
+
+
+@compiled
+def put_stage(y, i, w, at):
+    """Put the state at stage i into the inputs."""
+    for q in range(at.n):
+        w[1 + q] = y[q] + w[at.stages + i * at.n + q]
+
+
+@compiled
+def put_place(y, place, w, at):
+    """Put the state at a place of the step, 0 to 1, into the inputs."""
+    weigh(place, w, at)
+    for q in range(at.n):
+        value = y[q]
+        for j in range(STAGES):
+            value += w[at.weights + j] * w[at.stages + j * at.n + q]
+        w[1 + q] = value
+
+
+@compiled
+def weigh(place, w, at):
+    """Set the weights with which changes at the stages give the change at `place`, 0 to 1."""
+    for j in range(STAGES):
+        value = place * _SHARES[j]
+        for k in range(STAGES):
+            if k != j:
+                value *= place - NODES[k]
+        w[at.weights + j] = value
+
+
+@compiled
+def eliminate(matrix, columns, n, q):
+    """Solve matrix x = columns in place by Gauss's method with pivots; False if singular."""
+    for k in range(n):
+        pivot, largest = k, abs(matrix[k, k])
+        for i in range(k + 1, n):
+            if abs(matrix[i, k]) > largest:
+                pivot, largest = i, abs(matrix[i, k])
+        if not 0.0 < largest < np.inf:
+            return False
+        if pivot != k:
+            for j in range(k, n):
+                matrix[k, j], matrix[pivot, j] = matrix[pivot, j], matrix[k, j]
+            for j in range(q):
+                columns[k, j], columns[pivot, j] = columns[pivot, j], columns[k, j]
+        inverse = 1.0 / matrix[k, k]
+        for i in range(k + 1, n):
+            factor = matrix[i, k] * inverse
+            if factor != 0.0:
+                for j in range(k + 1, n):
+                    matrix[i, j] -= factor * matrix[k, j]
+                for j in range(q):
+                    columns[i, j] -= factor * columns[k, j]
+    for k in range(n - 1, -1, -1):
+        inverse = 1.0 / matrix[k, k]
+        for j in range(q):
+            columns[k, j] *= inverse
+        for i in range(k):
+            factor = matrix[i, k]
+            for j in range(q):
+                columns[i, j] -= factor * columns[k, j]
+    return True
+
+
+@compiled
+def guess_stages(h, last, w, at):
+    """Set the stages to the last step's polynomial, or where there is none to constant rates."""
+    n = at.n
+    for i in range(STAGES):
+        if last > 0.0:
+            weigh(1.0 + NODES[i] * h / last, w, at)
+            for q in range(n):
+                value = -w[at.last + (STAGES - 1) * n + q]
+                for j in range(STAGES):
+                    value += w[at.weights + j] * w[at.last + j * n + q]
+                w[at.stages + i * n + q] = value
+        else:
+            for q in range(n):
+                w[at.stages + i * n + q] = h * NODES[i] * w[at.rates + q]
+
+
+@compiled
+def shorten(share, w, at):
+    """Set the stages to those of a share of the step, on the same polynomial."""
+    n = at.n
+    for i in range(STAGES * n):
+        w[at.last + i] = w[at.stages + i]
+    for i in range(STAGES):
+        weigh(share * NODES[i], w, at)
+        for q in range(n):
+            value = 0.0
+            for j in range(STAGES):
+                value += w[at.weights + j] * w[at.last + j * n + q]
+            w[at.stages + i * n + q] = value
+
+
+@compiled
+def complete_stages(followers, signal, t, h, y, w, at):
+    """Set displacement and followers at the stages from the velocity, or from the held motion."""
+    n, z = at.n, at.stages
+    for i in range(STAGES):
+        if at.held:
+            value, rate, _ = signal_at(signal, t + NODES[i] * h, w, at)
+            w[z + i * n] = value - y[0]
+            w[z + i * n + 1] = rate - y[1]
+        else:
+            moved = 0.0
+            for k in range(STAGES):
+                moved += MATRIX[i, k] * (y[1] + w[z + k * n + 1])
+            w[z + i * n] = h * moved
+        for b in followers:
+            w[z + i * n + b] = w[at.follow + b] * w[z + i * n]
+
+
+@compiled
+def read_stage(solved, followers, level, i, w, at):
+    """Keep the outputs at stage i."""
+    n, P, R, o = at.n, at.P, solved.size, at.outputs
+    m = n + 1 + at.k
+    for r in range(m):
+        w[at.values + i * m + r] = w[o + r]
+    for a in range(R):
+        row = o + m + solved[a] * n
+        for b in range(R):
+            w[at.solved_slopes + (i * R + a) * R + b] = w[row + solved[b]]
+        value = w[row]
+        for b in followers:
+            value += w[row + b] * w[at.follow + b]
+        w[at.coupling + i * R + a] = value
+    if level == 2:
+        for r in range(m * n):
+            w[at.state_slopes + i * m * n + r] = w[o + m + r]
+        for r in range(m * (1 + P)):
+            w[at.drive_slopes + i * m * (1 + P) + r] = w[o + m * (1 + n) + r]
+
+
+@compiled
+def fill_matrix(R, h, w, at, matrix):
+    """Fill the matrix of the stages' linear equations for R solved states."""
+    for i in range(STAGES):
+        for j in range(STAGES):
+            factor = -h * MATRIX[i, j]
+            for a in range(R):
+                for b in range(R):
+                    slope = w[at.solved_slopes + (j * R + a) * R + b]
+                    matrix[i * R + a, j * R + b] = factor * slope
+        for a in range(R):
+            matrix[i * R + a, i * R + a] += 1.0
+    if at.held:
+        return
+    for a in range(R):  # the displacement is the integral of the velocity, the first solved state
+        for i in range(STAGES):
+            for k in range(STAGES):
+                value = 0.0
+                for j in range(STAGES):
+                    value += MATRIX[i, j] * w[at.coupling + j * R + a] * MATRIX[j, k]
+                matrix[i * R + a, k * R] -= h * h * value
+
+
+@compiled
+def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
+    """Solve for the stages of a step from a guess of them; False if they are not found."""
+    n, R, z = at.n, solved.size, at.stages
+    m = n + 1 + at.k
+    complete_stages(followers, signal, t, h, y, w, at)
+    for _ in range(_NEWTON):
+        for i in range(STAGES):
+            put_stage(y, i, w, at)
+            evaluate(f, signal, t + NODES[i] * h, 1.0, w, at)
+            read_stage(solved, followers, 1, i, w, at)
+        if R == 0:
+            return True
+        for i in range(STAGES):
+            for a in range(R):
+                value = -w[z + i * n + solved[a]]
+                for j in range(STAGES):
+                    value += h * MATRIX[i, j] * w[at.values + j * m + solved[a]]
+                columns[i * R + a, 0] = value
+        fill_matrix(R, h, w, at, matrix)
+        if not eliminate(matrix, columns, STAGES * R, 1):
+            return False
+        largest = 0.0
+        for a in range(R):
+            r = solved[a]
+            size, change = max(w[at.scale + r], abs(y[r])), 0.0
+            for i in range(STAGES):
+                w[z + i * n + r] += columns[i * R + a, 0]
+                change = max(change, abs(columns[i * R + a, 0]))
+                size = max(size, abs(w[z + i * n + r]))
+            if not change < np.inf:
+                return False
+            if change > 0.0:
+                largest = max(largest, change / size)
+        complete_stages(followers, signal, t, h, y, w, at)
+        if largest < _SOLVED:
+            return True
+    return False
+
+
+@compiled
+def error_of(f, states, read, signal, t, h, y, w, at):
+    """Return the error of the step's polynomials, over the largest sizes.
+
+    By how far a state's slope at the beginning is from the rate there: of order 6 in the step, and
+    larger than the error at the step's end. The same before the first stage and the last one, which
+    finds what is as short as that. Where the output is integrated, which is `read` then, by how far
+    the polynomial of its values at the stages is from it at the beginning.
+    """
+    largest, m = 0.0, at.n + 1 + at.k
+    for i in range(-1, _CHECKED.size):
+        if i >= 0:
+            put_place(y, _CHECKED[i], w, at)
+            evaluate(f, signal, t + _CHECKED[i] * h, 0.0, w, at)
+        for r in states:
+            change = -h * (w[at.outputs + r] if i >= 0 else w[at.rates + r])
+            size = max(w[at.scale + r], abs(y[r]))
+            for j in range(STAGES):
+                moved = w[at.stages + j * at.n + r]
+                change += (SLOPE_CHECKED[i, j] if i >= 0 else SLOPE_BEFORE[j]) * moved
+                size = max(size, abs(y[r] + moved))
+            if size > 0.0:
+                largest = max(largest, abs(change) / size)
+    if read:
+        change = -w[at.output]
+        size = max(w[at.scale + at.n], abs(change))
+        for j in range(STAGES):
+            value = w[at.values + j * m + at.n]
+            change += VALUE_BEFORE[j] * value
+            size = max(size, abs(value))
+        if size > 0.0:
+            largest = max(largest, abs(change) / size)
+    return largest
+
+
+@compiled
+def sensitivities(
+    f, solved, followers, signal, t, h, y, S, first, chosen, w, at, matrix, columns
+):  # fmt: skip
+    """Set the changes of the sensitivities to the stages of the solved step."""
+    n, P, R, q, held = at.n, at.P, solved.size, S.shape[1], at.held
+    m, d = n + 1 + at.k, at.changes
+    for i in range(STAGES):
+        put_stage(y, i, w, at)
+        evaluate(f, signal, t + NODES[i] * h, 2.0, w, at)
+        read_stage(solved, followers, 2, i, w, at)
+    for i in range(STAGES):  # first what does not depend on the solved states
+        phase = signal.omega * (t + NODES[i] * h)
+        for z in range(q):
+            row = d + i * n * q + z
+            moved = h * NODES[i] * S[1, z]
+            if held:
+                moved = -S[0, z]
+                w[row + q] = -S[1, z]
+                if z == first and signal.sine:
+                    moved += np.cos(phase)
+                    w[row + q] -= signal.omega * np.sin(phase)
+            w[row] = moved
+            for b in followers:
+                value = w[at.follow + b] * moved
+                if z > first:
+                    c = 1 + chosen[z - first - 1]
+                    value += w[at.follow_slopes + b * (1 + P) + c] * w[at.stages + i * n]
+                w[row + b * q] = value
+    for j in range(STAGES):
+        phase = signal.omega * (t + NODES[j] * h)
+        for a in range(R):
+            slopes = at.state_slopes + (j * m + solved[a]) * n
+            drives = at.drive_slopes + (j * m + solved[a]) * (1 + P)
+            for z in range(q):
+                row, value = d + j * n * q + z, 0.0
+                for b in range(n):
+                    value += w[slopes + b] * S[b, z]
+                value += w[slopes] * w[row]
+                if held:
+                    value += w[slopes + 1] * w[row + q]
+                for b in followers:
+                    value += w[slopes + b] * w[row + b * q]
+                if z > first:
+                    value += w[drives + 1 + chosen[z - first - 1]]
+                elif z == first and signal.sine and not held:
+                    value += w[drives] * np.cos(phase)
+                w[row + solved[a] * q] = value
+    if R:
+        for i in range(STAGES):
+            for a in range(R):
+                for z in range(q):
+                    value = 0.0
+                    for j in range(STAGES):
+                        value += MATRIX[i, j] * w[d + (j * n + solved[a]) * q + z]
+                    columns[i * R + a, z] = h * value
+        fill_matrix(R, h, w, at, matrix)
+        if not eliminate(matrix, columns, STAGES * R, q):
+            return False
+        for i in range(STAGES):
+            for a in range(R):
+                for z in range(q):
+                    w[d + (i * n + solved[a]) * q + z] = columns[i * R + a, z]
+    if not held:
+        for i in range(STAGES):
+            for z in range(q):
+                moved = 0.0
+                for k in range(STAGES):
+                    moved += MATRIX[i, k] * w[d + (k * n + 1) * q + z]
+                w[d + i * n * q + z] += h * moved
+                for b in followers:
+                    w[d + (i * n + b) * q + z] += w[at.follow + b] * h * moved
+    return True

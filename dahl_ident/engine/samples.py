@@ -1,0 +1,50 @@
+"""Motion along given samples: of a plant under its drive, or of a law under its displacement."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import float64, int64, njit, types
+
+from dahl_ident.engine.integrate import advance
+from dahl_ident.engine.radau import STAGES, Signal, layout, restart
+
+FUNCTION = types.FunctionType(types.void(types.CPointer(types.float64)))
+NUMBERS, VECTOR, MATRIX = int64[::1], float64[::1], float64[:, ::1]
+
+
+@njit(
+    types.Tuple((int64, VECTOR, MATRIX, MATRIX))(
+        FUNCTION, NUMBERS, NUMBERS, NUMBERS, VECTOR, MATRIX, VECTOR, VECTOR, VECTOR, NUMBERS,
+        int64, float64,
+    ),
+    cache=True,
+    error_model="numpy",
+)  # fmt: skip
+def march(
+    f, sizes, solved, followers, knots, coefficients, samples, first, p, chosen, initial, tolerance
+):
+    """Return whether the motion was found, output at the samples, its derivatives, the states.
+
+    The signal is polynomials between knots. Derivatives with respect to the initial states, where
+    `initial` is 1, and the parameters `chosen`; one column between them is zero.
+    """
+    n, N = sizes[0], samples.size
+    q = n + 1 + chosen.size if initial else 0
+    at = layout(sizes, q, coefficients.shape[0] - 1)
+    w = np.zeros(at.length)
+    matrix, columns = np.zeros((STAGES * n, STAGES * n)), np.zeros((STAGES * n, max(1, q)))
+    restart(w, at)
+    w[3 + n + at.k : at.outputs] = p
+    signal = Signal(False, 0.0, 1.0, knots, coefficients)
+    y, S = first.copy(), np.zeros((n, q))
+    for i in range(n if q else 0):
+        S[i, i] = 1.0
+    output, by, path = np.empty(N), np.empty((N, q)), np.empty((N, n))
+    times = np.array([samples[0], samples[N - 1]])
+    step = knots[1] - knots[0]
+    done = advance(
+        f, solved, followers, signal, times, y, S, chosen, tolerance, np.inf, step,
+        np.empty(0), np.empty((0, 1 + q), dtype=np.complex128), samples, output, by, path, w, at,
+        matrix, columns,
+    )  # fmt: skip
+    return int(done > 0.0), output, by, path

@@ -1,0 +1,196 @@
+"""Equations once, as casadi symbols; from them one compiled function with exact derivatives.
+
+A system has states y, of which the first two are displacement and velocity, a drive u, a direction
+s = sgn(v), parameters p, and
+
+    dy/dt = rates(y, u, s, p),    output(y, u, s, p).
+
+casadi differentiates both, and finds the kinks: comparisons, signs and absolute values in the
+expression are switching functions, whose sides are held between two events
+(:mod:`dahl_ident.engine.switches`). The expression graph is then compiled as a C function of one
+fixed signature (:mod:`dahl_ident.engine.emit`). So the kernels are compiled once, for all systems.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.engine.emit import Step, compiled, steps_of
+from dahl_ident.engine.switches import on_one_branch
+
+
+class Equations(NamedTuple):
+    """The equations of a system in casadi symbols.
+
+    Attributes
+    ----------
+    states : sequence of SX
+        Displacement, velocity, then any others.
+    drive : SX
+        What acts on the system; unused where the displacement is held.
+    direction : SX
+        Sign of the velocity.
+    parameters : sequence of SX
+    rates : SX
+        Derivatives of the states with respect to time. Those of displacement and velocity are not
+        used where the displacement is held.
+    output : SX
+        What is measured.
+    held : bool
+        Whether the displacement is prescribed, rather than found from the drive.
+    """
+
+    states: Sequence[ca.SX]
+    drive: ca.SX
+    direction: ca.SX
+    parameters: Sequence[ca.SX]
+    rates: ca.SX
+    output: ca.SX
+    held: bool
+
+
+@dataclass(frozen=True)
+class System:
+    """Compiled equations; what the kernels take.
+
+    Attributes
+    ----------
+    function : callable
+        ``f(numbers)``, a numba C function of one array: inputs, then outputs. Inputs: how much is
+        wanted (0 values, 1 also the derivatives with respect to the states, 2 also with respect to
+        drive and parameters), states, drive, direction, sides of the switches, parameters.
+        Outputs: rates, output and switching functions; their derivatives with respect to the
+        states, row by row; those with respect to drive and parameters, row by row. Zeros are not
+        written.
+    sizes : ndarray of int, shape (5,)
+        States, switches, parameters; 1 where the displacement is held, and 1 where the output for a
+        held displacement depends on its speed, else 0.
+    solved : ndarray of int
+        States for which the stages of a step are solved.
+    followers : ndarray of int
+        States that change in proportion to the displacement while no switch changes its side, such
+        as the forces of Jenkins elements. They need no integration.
+    odd : bool
+        Whether the equations stay the same where states, drive and direction change sign.
+    """
+
+    function: Any
+    sizes: NDArray[np.int64]
+    solved: NDArray[np.int64]
+    followers: NDArray[np.int64]
+    odd: bool
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return int(self.sizes[0])
+
+    @property
+    def held(self) -> bool:
+        """Whether the displacement is prescribed."""
+        return bool(self.sizes[3])
+
+
+def translate(equations: Equations) -> System:
+    """Return the compiled system of some equations; the same equations are compiled once.
+
+    Raises
+    ------
+    ModelError
+        If the equations use a function that has no translation.
+
+    Examples
+    --------
+    >>> x, v, F, u, s, k = (ca.SX.sym(name) for name in "xvFusk")
+    >>> system = translate(Equations([x, v, F], u, s, [k], ca.vertcat(v, u - F, k * v), x, False))
+    >>> system.order, system.followers.tolist(), system.odd
+    (3, [2], True)
+    """
+    states, drive, parameters = equations.states, equations.drive, equations.parameters
+    inputs = [*states, drive, equations.direction, *parameters]
+    whole = ca.vertcat(equations.rates, equations.output)
+    held, switches, sides = on_one_branch(inputs, whole, (states[1], equations.direction))
+    rows = ca.vertcat(held, *switches)
+    y = ca.vertcat(*states)
+    by_state = ca.jacobian(rows, y)
+    by_parameter = ca.jacobian(rows, ca.vertcat(drive, *parameters))
+    numbers = ca.vertcat(*states, drive, equations.direction, *sides, *parameters)
+    graph = ca.Function("f", [numbers], [ca.densify(rows), by_state, by_parameter])
+    steps = steps_of(graph, _places(numbers.numel(), rows.numel(), graph))
+    order = len(states)
+    followers = _followers(by_state, rows, states, drive, order)
+    if steps not in _COMPILED:
+        _COMPILED[steps] = compiled(steps)
+    solved = [i for i in range(1 + equations.held, order) if i not in followers]
+    function = ca.Function("f", inputs, [whole])
+    rated = equations.held and not _goes_with_speed(function, order, len(parameters))
+    return System(
+        _COMPILED[steps],
+        np.array([order, len(switches), len(parameters), equations.held, rated], dtype=np.int64),
+        np.array(solved, dtype=np.int64),
+        np.array(followers, dtype=np.int64),
+        _is_odd(function, order, len(parameters)),
+    )
+
+
+_COMPILED: dict[tuple[Step, ...], Any] = {}
+"""Compiled functions by their steps."""
+
+
+def _followers(
+    by_state: ca.SX, rows: ca.SX, states: Sequence[ca.SX], drive: ca.SX, order: int
+) -> list[int]:
+    """Return the states whose rate is the velocity times something constant on a branch."""
+    moving = ca.vertcat(*states, drive)
+    found = []
+    for i in range(2, order):
+        at_rest = ca.substitute(rows[i], states[1], ca.SX(0.0))
+        if not ca.depends_on(ca.vertcat(at_rest, by_state[i, 1]), moving):
+            found.append(i)
+    return found
+
+
+def _is_odd(function: ca.Function, order: int, parameters: int) -> bool:
+    """Return whether rates and output change sign with states, drive and direction."""
+    rng = np.random.default_rng(1)
+    with np.errstate(all="ignore"):
+        for _ in range(4):
+            state, p = rng.standard_normal(order + 2), rng.uniform(0.3, 0.7, parameters)
+            state[1], state[-1] = abs(state[1]), 1.0
+            one, other = (function(*(sign * state), *p).full() for sign in (1.0, -1.0))
+            if not np.allclose(one, -other, rtol=1e-9, atol=1e-12, equal_nan=True):
+                return False
+    return True
+
+
+def _goes_with_speed(function: ca.Function, order: int, parameters: int) -> bool:
+    """Return whether rates are in proportion to the speed, and the output does not depend on it."""
+    rng = np.random.default_rng(2)
+    for _ in range(4):
+        state, p = rng.standard_normal(order + 2), rng.uniform(0.3, 0.7, parameters)
+        state[1], state[-1] = abs(state[1]), 1.0
+        one = function(*state, *p).full()
+        state[1] *= 2.0
+        other = function(*state, *p).full()
+        other[:order] *= 0.5
+        if not np.allclose(one, other, rtol=1e-9, atol=1e-12, equal_nan=True):
+            return False
+    return True
+
+
+def _places(n_inputs: int, n_rows: int, graph: ca.Function) -> list[list[int]]:
+    """Return where the nonzeros of each level go, behind the level and the inputs."""
+    found, start = [], 1 + n_inputs
+    for level in range(3):
+        sparsity = graph.sparsity_out(level)
+        columns = sparsity.size2()
+        row, column = sparsity.get_triplet()
+        found.append([start + r * columns + c for r, c in zip(row, column, strict=True)])
+        start += n_rows * columns
+    return found

@@ -1,0 +1,220 @@
+"""The exact steady motion of driven plants, with all harmonics, and its stability.
+
+The describing function takes the displacement for a sine. Friction makes it another periodic
+motion, which the engine finds by shooting: the state after one cycle of the drive is that before.
+The eigenvalues of that cycle's derivative, Floquet's multipliers, say whether a motion near it
+comes back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements.element import Element, as_model
+from dahl_ident.elements.equations import plant_equations
+from dahl_ident.errors import ModelError
+
+if TYPE_CHECKING:
+    from dahl_ident.engine import System
+
+Steady = Literal["exact", "describing function"]
+STEADY: tuple[Steady, ...] = ("exact", "describing function")
+"""How the response to a force that is held is predicted."""
+
+ACCURACY = 1e-9
+"""Relative difference of two solutions of one motion from different starts, with room."""
+
+LINEAR = "the model is linear"
+"""And its response a sine."""
+
+NEUTRAL = 1e-6  # beyond 1: the multiplier of a motion that may lie anywhere is 1, to rounding
+_FINER = 10.0  # times: a motion that hardly turns is lost where steps pass over its two turns
+_LONG = 30  # cycles by which a motion leaves an unstable branch for a stable one
+
+
+class SteadyMotion(NamedTuple):
+    """Steady motions under forces ``u_0 cos(omega t)``, one row each.
+
+    Attributes
+    ----------
+    found : ndarray of bool, shape (rows,)
+        Whether there is one.
+    harmonics : ndarray of complex, shape (rows, K)
+        X_k, x(t) = sum of Re X_k exp(j k omega t). NaN where not found.
+    by_drive : ndarray of complex, shape (rows, K)
+    by_parameter : ndarray of complex, shape (rows, K, chosen)
+    starts : ndarray, shape (rows, order)
+        States at t = 0.
+    multiplier : ndarray, shape (rows,)
+        Largest modulus of the multipliers of a whole cycle; above 1 a motion is unstable.
+    """
+
+    found: NDArray[np.bool_]
+    harmonics: ComplexArray
+    by_drive: ComplexArray
+    by_parameter: ComplexArray
+    starts: FloatArray
+    multiplier: FloatArray
+
+
+def obstacle(model: Element) -> str:
+    """Return why a plant has no exact steady motion here; nothing where it has one.
+
+    Examples
+    --------
+    >>> from dahl_ident import Dahl, Mass
+    >>> obstacle(Dahl() + Mass(1.0)), obstacle(Dahl())
+    ('', 'the model has no mass')
+    """
+    model = as_model(model)
+    if all(element.is_linear for element in model.elements):
+        return LINEAR
+    try:
+        if not model.has_inertia:
+            return "the model has no mass"
+        plant_equations(model)
+    except ModelError as error:
+        return str(error).partition(";")[0].partition(", so")[0]
+    return ""
+
+
+class Shooting:
+    """The steady motions of one model, its equations compiled when first asked for one.
+
+    Parameters
+    ----------
+    model : Element
+        With an equation of motion, see :func:`obstacle`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dahl_ident import Dahl, Damper, Mass, Spring
+    >>> plant = Shooting(Dahl() + Mass() + Damper() + Spring())
+    >>> values = np.array([[0.1, 30.0, 1.0, 0.3, 0.24, 0.3]])
+    >>> steady = plant(values, np.array([2.0 * np.pi]), np.array([0.2]), harmonics=(1, 3))
+    >>> abs(steady.harmonics).round(5).tolist(), bool(steady.multiplier[0] < 1.0)
+    ([[0.01811, 0.00028]], True)
+    """
+
+    def __init__(self, model: Element) -> None:
+        self._model = as_model(model)
+        self._system: System | None = None
+
+    @property
+    def system(self) -> System:
+        """The compiled equations."""
+        if self._system is None:
+            from dahl_ident.engine import translate
+
+            self._system = translate(plant_equations(self._model))
+        return self._system
+
+    def __call__(
+        self,
+        values: FloatArray,
+        omega: FloatArray,
+        drive: FloatArray,
+        *,
+        chosen: Sequence[int] = (),
+        harmonics: Sequence[int] = (1,),
+        starts: FloatArray | None = None,
+        cycles: int | None = None,
+        stable: bool = True,
+    ) -> SteadyMotion:
+        """Return the steady motions of many rows.
+
+        Parameters
+        ----------
+        values : ndarray, shape (rows, parameters)
+            In the order of the model's parameters.
+        omega, drive : ndarray, shape (rows,)
+            rad/s, and N; above zero.
+        chosen : sequence of int
+            Parameters whose derivatives are wanted.
+        harmonics : sequence of int
+            k of those wanted.
+        starts : ndarray, shape (rows, order), optional
+            States at t = 0 to start from; NaN stands for rest. A row that leads nowhere from them
+            is started from rest, then by many cycles.
+        cycles : int, optional
+            That the motion goes through from these states before it is solved for.
+        stable : bool, default True
+            Whether a motion that is not stable counts as none.
+        """
+        ask = _Ask(values, omega, drive, tuple(chosen), tuple(harmonics), stable)
+        result = _empty(omega.size, len(harmonics), len(chosen), self.system.order)
+        possible = np.isfinite(values).all(axis=1) & np.isfinite(omega) & np.isfinite(drive)
+        known = np.zeros(omega.size, dtype=np.bool_)
+        if starts is not None:
+            known = possible & np.isfinite(starts).all(axis=1)
+            self._solve(result, known, ask, starts, cycles)
+        attempts: list[tuple[int | None, float]] = [(None, 1.0), (None, _FINER), (_LONG, _FINER)]
+        if not stable:  # a search passes many values at which nothing settles
+            attempts = attempts[: 1 + bool(np.all(values == values[0]))]
+        for cycles, finer in attempts:
+            self._solve(result, possible & ~result.found, ask, cycles=cycles, finer=finer)
+        return result
+
+    def _solve(
+        self,
+        result: SteadyMotion,
+        which: NDArray[np.bool_],
+        ask: _Ask,
+        starts: FloatArray | None = None,
+        cycles: int | None = None,
+        finer: float = 1.0,
+    ) -> None:
+        """Put the motions of some rows into the result."""
+        from dahl_ident.engine import settled
+
+        rows = np.flatnonzero(which)
+        if not rows.size:
+            return
+        with np.errstate(all="ignore"):
+            found = settled(
+                self.system, ask.drive[rows], ask.omega[rows], ask.values[rows],
+                chosen=ask.chosen, harmonics=ask.harmonics,
+                starts=None if starts is None else starts[rows], cycles=cycles,
+                finer=finer,
+            )  # fmt: skip
+        multiplier = np.full(rows.size, np.nan)
+        ok = found.found & np.isfinite(found.maps).all(axis=(1, 2))
+        sizes = np.abs(np.linalg.eigvals(found.maps[ok])).max(axis=1, initial=0.0)
+        multiplier[ok] = sizes**2 if self.system.odd else sizes  # the map of half a cycle
+        with np.errstate(invalid="ignore"):
+            good = ok & (multiplier <= 1.0 + NEUTRAL) if ask.stable else ok
+        put, at = np.flatnonzero(good), rows[good]
+        result.found[at] = True
+        result.harmonics[at] = found.coefficients[put]
+        result.by_drive[at] = found.by_amplitude[put]
+        result.by_parameter[at] = found.by_parameter[put]
+        result.starts[at] = found.starts[put]
+        result.multiplier[rows] = multiplier
+
+
+class _Ask(NamedTuple):
+    """What is wanted of every row."""
+
+    values: FloatArray
+    omega: FloatArray
+    drive: FloatArray
+    chosen: tuple[int, ...]
+    harmonics: tuple[int, ...]
+    stable: bool
+
+
+def _empty(rows: int, harmonics: int, chosen: int, order: int) -> SteadyMotion:
+    return SteadyMotion(
+        np.zeros(rows, dtype=np.bool_),
+        np.full((rows, harmonics), np.nan, dtype=np.complex128),
+        np.full((rows, harmonics), np.nan, dtype=np.complex128),
+        np.full((rows, harmonics, chosen), np.nan, dtype=np.complex128),
+        np.full((rows, order), np.nan),
+        np.full(rows, np.nan),
+    )

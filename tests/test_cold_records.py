@@ -1,0 +1,110 @@
+"""Records that a fit solves without a start; independent solvers made them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import dahl_ident as di
+from dahl_ident.errors import DataWarning
+from tests import cold_records as cold
+from tests.cold_records import Case
+
+
+def assert_found(case: Case) -> None:
+    """Check every free parameter: within three standard uncertainties, which say something."""
+    fit = di.fit(case.record, case.model, throw=False)
+    assert fit.success, fit.verdict
+    assert fit.status.usable, fit.verdict
+    for parameter in case.truth.parameters:
+        found = fit.params[parameter.name]
+        if found.vary:
+            value, u = float(parameter.value or 0.0), float(found.stderr or 0.0)
+            assert abs(found.value - value) < 3.0 * u, (parameter.name, found.value, u)
+            assert u < 0.3 * abs(value), (parameter.name, found.value, u)
+
+
+@pytest.mark.parametrize("sigma", [300.0, 3000.0, 30000.0])
+def test_friction_faster_than_the_sampling(sigma: float) -> None:
+    assert_found(cold.fast(sigma, 0))
+
+
+@pytest.mark.parametrize("gap", [0.5, 2.0, 6.0])
+@pytest.mark.parametrize("seed", range(6))
+def test_backlash_with_measured_displacement(gap: float, seed: int) -> None:
+    assert_found(cold.play(gap, seed))
+
+
+@pytest.mark.parametrize(
+    ("made", "seed"), [(cold.lugre, 0), (cold.lugre, 1), (cold.slips, 1), (cold.iwan, 1)]
+)
+def test_driven_plants(made: Callable[[int], Case], seed: int) -> None:
+    assert_found(made(seed))
+
+
+@pytest.mark.parametrize("known", ["mass", "spring"])
+@pytest.mark.parametrize("name", cold.DECAYS)
+def test_free_decays(name: str, known: str) -> None:
+    assert_found(cold.decay(name, known, 1))
+
+
+def with_gap(record: di.Record, low: int, high: int) -> di.Record:
+    return di.Record(
+        np.delete(record.time, slice(low, high)),
+        displacement=np.delete(record.motion_samples, slice(low, high)),
+        force=np.delete(record.force_samples, slice(low, high)),
+    )
+
+
+def test_a_gap_in_a_driven_record_makes_two_parts() -> None:
+    case = cold.fast(300.0, 0)
+    said = r"nothing is known from 3\.49 to 4\.3 s; 2 parts are fitted, each from a first state"
+    with pytest.warns(DataWarning, match=said):
+        assert_found(case._replace(record=with_gap(case.record, 350, 430)))
+
+
+def test_a_gap_in_a_force_record_is_not_bridged_where_friction_remembers() -> None:
+    """In the gap the displacement turns several times: a straight way through it is wrong."""
+    case = cold.play(0.5, 0)
+    record = with_gap(case.record, 400, 700)
+    with pytest.warns(DataWarning, match=r"nothing is known from 1\.995 to 3\.5 s"):
+        fit = di.fit(record, case.model)
+    assert fit.trusted
+    assert [part.n for part in fit.records] == [400, 1300]
+    assert "a single run" in fit.verdict
+    for parameter in case.truth.parameters:
+        found = fit.params[parameter.name]
+        if found.vary:
+            u = float(found.stderr or 0.0)
+            assert abs(found.value - float(parameter.value or 0.0)) < 3.0 * u
+    again = di.RecordFit.from_json(fit.to_json())
+    assert again.verdict == fit.verdict
+
+
+def test_a_gap_is_bridged_where_nothing_remembers() -> None:
+    t = np.delete(np.arange(400) / 100.0, slice(150, 220))
+    x = 1e-3 * np.sin(7.0 * t)
+    force = 50.0 * x + 1e-4 * np.random.default_rng(0).standard_normal(t.size)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DataWarning)
+        fit = di.fit(di.Record(t, displacement=x, force=force), di.Spring(), throw=False)
+    assert fit.records[0].n == t.size
+    assert fit.params["stiffness"].value == pytest.approx(50.0, rel=0.01)
+
+
+def test_short_parts_are_left_out_and_uneven_times_are_no_gaps() -> None:
+    x = 1e-2 * np.cumsum(np.random.default_rng(0).standard_normal(500))
+    force = di.Dahl(0.1, 30.0).force(x) + 1e-3 * np.random.default_rng(1).standard_normal(500)
+    t = np.arange(500) / 100.0
+    t[490:] += 1.0
+    with pytest.warns(DataWarning, match="one part is used.*; 10 samples in shorter parts"):
+        fit = di.fit(di.Record(t, displacement=x, force=force), di.Dahl(), throw=False)
+    assert fit.records[0].n == 490
+    uneven = np.cumsum(np.exp(2.0 * np.random.default_rng(2).standard_normal(500)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DataWarning)
+        fit = di.fit(di.Record(uneven, displacement=x, force=force), di.Dahl(), throw=False)
+    assert fit.records[0].n == 500

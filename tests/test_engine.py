@@ -1,0 +1,453 @@
+"""The engine against what is not the engine: DOP853 with events, quadrature, closed forms."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.interpolate import CubicSpline
+from scipy.special import gamma
+
+import dahl_ident as di
+from benchmarks import engine_oracles as cases
+from benchmarks.motion_oracles import (
+    HARMONICS,
+    DahlByHand,
+    JenkinsByHand,
+    Oracle,
+    PiecewiseByHand,
+    dahl_branch,
+    dahl_history,
+    fixed_point,
+    integrated,
+)
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements.equations import law_equations, plant_equations
+from dahl_ident.elements.parameter import Parameter
+from dahl_ident.engine import band_limited, march, settled, translate
+from dahl_ident.errors import FitError
+
+F_MAX = Parameter("f_max", "N", "limit", lower=0.0, transform="log")
+STIFFNESS = Parameter("k", "N/m", "stiffness", lower=0.0, transform="log")
+
+
+def seeded(*numbers: int) -> np.random.Generator:
+    return np.random.default_rng([7, *numbers])
+
+
+def loop_of(element: di.Element, amplitude: float, values: Any, **options: Any) -> Any:
+    system = translate(law_equations(element))
+    return settled(
+        system, np.array([amplitude]), np.array([1.0]), np.array([values], dtype=float), **options
+    )
+
+
+@pytest.mark.parametrize("law", list(cases.LAWS))
+@pytest.mark.parametrize(
+    ("kind", "limit"),
+    [("settled loop", 1e-9), ("force history", 1e-9), ("settled motion of a plant", 1e-8),
+     ("driven motion", 1e-8)],
+)  # fmt: skip
+def test_random_motions_are_those_of_an_independent_integrator(
+    kind: str, limit: float, law: str
+) -> None:
+    if law == "Iwan" and kind != "force history":
+        pytest.skip("thirty events in each half cycle take the oracle half a minute")
+    rng = seeded(list(cases.KINDS).index(kind), list(cases.LAWS).index(law))
+    case = cases.KINDS[kind](law, rng)
+    sharp = 2e-8 if law == "Power damper" else 1e-8
+    assert case.error < (max(limit, sharp) if law in cases.KINKS else limit), case.note
+
+
+@pytest.mark.parametrize("beta", [1e-8, 1e-4, 0.3, 20.0, 1e4, 1e8])
+def test_dahl_loops_are_the_closed_forms(beta: float) -> None:
+    law = di.Dahl(2.0, 500.0)
+    A = beta * 2.0 / 500.0
+    result = loop_of(di.Dahl(), A, cases.all_values(cases.Drawn(0, di.Dahl(), [2.0, 500.0], 1, 1)),
+                     harmonics=(1,), chosen=(0, 1))  # fmt: skip
+    N = complex(law.describing_function(A))
+    assert result.found[0]
+    assert abs(result.coefficients[0, 0] / A - N) < 1e-9 * abs(N)
+    slopes = law.gradient(A)
+    for k, name in enumerate(("f_max", "sigma")):
+        value = complex(slopes[name]) * (2.0, 500.0)[k]
+        computed = result.by_parameter[0, 0, k] / A * (2.0, 500.0)[k]
+        assert abs(computed - value) < 1e-6 * max(abs(value), 1e-3 * abs(N))
+    by_A = N + A * complex(slopes["amplitude"])
+    assert abs(result.by_amplitude[0, 0] - by_A) < 1e-6 * abs(N)
+
+
+@pytest.mark.parametrize("alpha", [0.7, 1.5])
+@pytest.mark.parametrize("beta", [0.01, 3.0, 1e4, 1e8])
+def test_asymmetric_loops_of_any_exponent_are_sums_over_their_branches(
+    alpha: float, beta: float
+) -> None:
+    asymmetry = 0.3
+    limits = 1.0 + asymmetry, 1.0 - asymmetry
+    # tips by iteration, in units of f_max and x_c
+    low, high = 0.0, 0.0
+    for _ in range(20_000 if beta < 1.0 else 200):
+        last = high
+        rise = dahl_branch(1.0 - low / limits[0], 2.0 * beta / limits[0], alpha)
+        high = limits[0] * (1.0 - rise)
+        low = -limits[1] * (
+            1.0 - dahl_branch(1.0 + high / limits[1], 2.0 * beta / limits[1], alpha)
+        )
+        if abs(high - last) < 1e-16:
+            break
+
+    def force(theta: float) -> float:
+        if theta <= np.pi:
+            path = 2.0 * beta * np.sin(0.5 * theta) ** 2 / limits[1]
+            return -limits[1] * (1.0 - dahl_branch(1.0 + high / limits[1], path, alpha))
+        path = 2.0 * beta * np.cos(0.5 * theta) ** 2 / limits[0]
+        return limits[0] * (1.0 - dahl_branch(1.0 - low / limits[0], path, alpha))
+
+    # Gauss points between angles that rise by factors from each turning point
+    nodes, weights = np.polynomial.legendre.leggauss(30)
+    edges = np.concatenate([[0.0], np.pi * np.geomspace(1e-9, 1.0, 120)])
+    c = np.zeros(4, dtype=complex)
+    for start in (0.0, np.pi):
+        for a, b in itertools.pairwise(edges):
+            for x, w in zip(nodes, weights, strict=True):
+                theta = start + 0.5 * (a + b) + 0.5 * (b - a) * x
+                turn = np.exp(-1j * np.arange(4) * theta)
+                c += 0.5 * (b - a) * w / np.pi * force(theta) * turn
+    c[0] *= 0.5
+    element = di.Dahl(alpha=None, asymmetry=None)
+    result = loop_of(element, beta, [1.0, 1.0, alpha, asymmetry], harmonics=(0, 1, 2, 3))
+    assert result.found[0]
+    assert np.max(np.abs(result.coefficients[0] - c)) < 1e-8 * np.max(np.abs(c))
+
+
+class Bilinear(di.Friction):
+    """Slope k, a fifth of it from half the limit on, none from the limit on: by comparisons."""
+
+    kind = "bilinear_of_tests"
+    parameters = (STIFFNESS, F_MAX)
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        k, f_max = values
+        y = direction * force / f_max
+        return k * ((y < 0.5) + 0.2 * (y >= 0.5)) * (y < 1.0)
+
+
+class Pinched(di.Friction):
+    """A slope with a dip of width 0.005."""
+
+    kind = "pinched_of_tests"
+    parameters = (STIFFNESS, F_MAX)
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        k, f_max = values
+        y = direction * force / f_max
+        return k * (1.0 - 0.9 * (np.fabs(y - 0.3) < 0.0025)) * (y < 1.0)
+
+
+class Drifting(di.Friction):
+    """Depends on rate and direction: even harmonics."""
+
+    kind = "drifting_of_tests"
+    rate_independent = False
+    parameters = (STIFFNESS, F_MAX, Parameter("bias", "", "of the limit", upper=0.9, lower=-0.9))
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        k, f_max, bias = values
+        level = f_max * (1.0 + bias * direction) * (1.0 + 0.3 * np.exp(-(velocity**2)))
+        return k * (1.0 - direction * force / level)
+
+
+def by_oracle(hand: Any, amplitude: float, result: Any, odd: bool, size: float) -> Any:
+    def displacement(t: float) -> tuple[float, float]:
+        return amplitude * np.cos(t), -amplitude * np.sin(t)
+
+    oracle = Oracle([hand], displacement, True, sizes=np.full(hand.n, size))
+    _, c, _ = fixed_point(oracle, result.starts[0, 2:], result.maps[0, 2:, 2:], 1.0, odd)
+    return c
+
+
+def test_bilinear_slopes_by_comparisons() -> None:
+    """The tip at A = 0.006 by hand: 1.2 F = 0.64. A table of half cycles gave 5.6 % less."""
+    result = loop_of(Bilinear(), 0.006, [100.0, 1.0])
+    assert abs(result.starts[0, 2] - 0.64 / 1.2) < 1e-9
+    assert abs(result.coefficients[0, 0] / 0.006 - (93.271 + 12.182j)) < 1e-3
+    for A in (0.002, 0.006, 0.03, 3.0):
+        result = loop_of(Bilinear(), A, [100.0, 1.0], harmonics=HARMONICS)
+        hand = PiecewiseByHand(1.0, [0.5, 1.0], [100.0, 20.0, 0.0])
+        c = by_oracle(hand, A, result, True, 1.0)
+        assert np.max(np.abs(result.coefficients[0] - c)) < 1e-8 * np.max(np.abs(c))
+
+
+def test_pinched_slopes() -> None:
+    for A in (0.002, 0.006, 0.03):
+        result = loop_of(Pinched(), A, [100.0, 1.0], harmonics=HARMONICS)
+        hand = PiecewiseByHand(1.0, [0.2975, 0.3025, 1.0], [100.0, 10.0, 100.0, 0.0])
+        c = by_oracle(hand, A, result, True, 1.0)
+        assert np.max(np.abs(result.coefficients[0] - c)) < 1e-8 * np.max(np.abs(c))
+
+
+def test_even_harmonics_of_a_rate_dependent_law() -> None:
+    class ByHand(DahlByHand):
+        def _slope(self, v: float, s: float, F: float) -> float:
+            level = self.f_max * (1.0 + self.asymmetry * s) * (1.0 + 0.3 * np.exp(-(v**2)))
+            return float(self.sigma * (1.0 - s * F / level))
+
+    system = translate(law_equations(Drifting()))
+    assert not system.odd
+    result = loop_of(Drifting(), 2.0, [3.0, 1.0, 0.4], harmonics=HARMONICS)
+    c = by_oracle(ByHand(1.0, 3.0, asymmetry=0.4), 2.0, result, False, 1.0)
+    assert abs(c[2]) > 1e-2
+    assert np.max(np.abs(result.coefficients[0] - c)) < 1e-9 * np.max(np.abs(c))
+
+
+def test_jenkins_elements_are_their_closed_forms() -> None:
+    for A, expected in ((0.7, 3.0), (1.3, 2.4762675 + 0.6780566j), (5.0, 0.4271355 + 0.611155j)):
+        result = loop_of(di.MaxwellSlip(1), A, [3.0, 1.0])
+        assert abs(result.coefficients[0, 0] / A - expected) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("values", "A", "expected"),
+    [([1.0, 3.0, 0.8], 2.0, (0.3901538 + 0.4032069j, 0.0288864 - 0.0183396j)),
+     ([1.0, 1.0, 0.6], 1.0, (0.5368324 + 0.1217627j, 0.0781530 + 0.0417040j))],
+)  # fmt: skip
+def test_backlash_is_its_closed_form(values: Any, A: float, expected: Any) -> None:
+    element = di.Backlash(di.Dahl())
+    drawn = cases.Drawn(0, element, values, 1.0, 1.0)
+    result = loop_of(element, A, cases.all_values(drawn), harmonics=(1, 3))
+    assert np.max(np.abs(result.coefficients[0] / A - np.array(expected))) < 1e-6
+
+
+@pytest.mark.parametrize("exponent", [0.3, 0.5, 1.7])
+def test_power_dampers_are_their_closed_form(exponent: float) -> None:
+    A, omega = 0.4, 3.0
+    system = translate(law_equations(di.PowerDamper()))
+    result = settled(system, np.array([A]), np.array([omega]), np.array([[2.0, exponent, 1.0]]))
+    factor = 2.0 / np.sqrt(np.pi) * gamma(0.5 * exponent + 1.0) / gamma(0.5 * exponent + 1.5)
+    N = 2.0 / A * (A * omega) ** exponent * factor
+    assert abs(result.coefficients[0, 0] / A - 1j * N) < 1e-8 * N
+
+
+def test_derivatives_of_settled_motions_are_differences_of_oracles() -> None:
+    """A plant with a gap: harmonics by drive and every parameter, through moving kinks."""
+    values = np.array([1.0, 300.0, 1.0, 0.002, 0.1, 0.5, 200.0])
+    element = di.Backlash(di.Dahl(alpha=1.0)) + di.Mass() + di.Damper() + di.Spring()
+    system = translate(plant_equations(element))
+    drive, omega = 2.5, 40.0
+    harmonics = (1, 3)
+    result = settled(system, np.array([drive]), np.array([omega]), values[None],
+                     chosen=range(values.size), harmonics=harmonics)  # fmt: skip
+    assert result.found[0]
+
+    def oracle(p: np.ndarray[Any, Any], U: float) -> Any:
+        hand = DahlByHand(p[0], p[1], p[2], gap=p[3])
+        plant = Oracle([hand], lambda t: (U * np.cos(omega * t), 0.0), False, p[4], p[5], p[6],
+                       np.array([1e-2, 0.4, 1.0, 1e-2]))  # fmt: skip
+        return fixed_point(plant, result.starts[0], result.maps[0], omega, True, harmonics)[1]
+
+    size = np.max(np.abs(result.coefficients[0]))
+    for i in (0, 1, 3, 4, 5, 6):
+        step = np.zeros(values.size)
+        step[i] = 1e-4 * values[i]
+        difference = (oracle(values + step, drive) - oracle(values - step, drive)) / 2e-4
+        computed = result.by_parameter[0, :, i] * values[i]
+        assert np.max(np.abs(computed - difference)) < 1e-6 * size
+    difference = (oracle(values, drive * 1.0001) - oracle(values, drive * 0.9999)) / 2e-4
+    assert np.max(np.abs(result.by_amplitude[0] * drive - difference)) < 1e-6 * size
+
+
+def test_derivatives_along_a_history_jump_at_kinks() -> None:
+    rng = seeded(50)
+    knots = np.linspace(0.0, 1.0, 12)
+    spline = CubicSpline(knots, 0.01 * rng.standard_normal(12))
+    samples = np.sort(np.append(rng.uniform(0.0, 1.0, 60), [0.0, 1.0]))
+    values = np.array([1.0, 300.0, 1.0, 0.004])
+    system = translate(law_equations(di.Backlash(di.Dahl(alpha=1.0))))
+    first = np.array([float(spline(0.0)), float(spline(0.0, 1)), 0.0, 0.0])
+    coefficients = spline.c[::-1] * (knots[1] - knots[0]) ** np.arange(4)[:, None]
+    chosen = (0, 1, 3)
+    motion = march(system, knots, coefficients, samples, first, values, chosen=chosen,
+                   derivatives=True)  # fmt: skip
+    times = np.union1d(samples, spline.derivative().roots(extrapolate=False))
+
+    def force(p: FloatArray) -> FloatArray:
+        history = dahl_history(DahlByHand(p[0], p[1], gap=p[3]), spline(times))
+        return history[np.searchsorted(times, samples)]
+
+    size = np.max(np.abs(motion.output))
+    for i, parameter in enumerate(chosen):
+        step = np.zeros(4)
+        step[parameter] = 1e-6 * values[parameter]
+        difference = (force(values + step) - force(values - step)) / 2e-6
+        computed = motion.by_parameter[:, i] * values[parameter]
+        assert np.max(np.abs(computed - difference)) < 1e-6 * size
+
+
+def test_derivatives_of_driven_motions_are_differences_of_oracles() -> None:
+    """Several Jenkins elements, by parameters and by the first state."""
+    n, interval = 300, 0.01
+    times: FloatArray = interval * np.arange(n, dtype=float)
+    omega = 2.0 * np.pi * np.array([3.0, 5.0, 8.0]) / (n * interval)
+
+    def drive(t: float) -> tuple[float, float]:
+        return float(np.sum(1.2 * np.cos(omega * t + np.array([0.3, 1.1, 2.0])))), 0.0
+
+    sampled = np.array([drive(t)[0] for t in times])
+    coefficients = band_limited(sampled, interval)
+    plant = di.MaxwellSlip(2) + di.Mass() + di.Damper() + di.Spring()
+    system = translate(plant_equations(plant))
+    values = np.array([30.0, 20.0, 0.02, 0.06, 0.5, 0.8, 40.0])
+    first = np.array([0.01, 0.05, 0.0, 0.0])
+    motion = march(system, times, coefficients, times, first, values, chosen=range(7),
+                   derivatives=True)  # fmt: skip
+
+    def oracle(p: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> Any:
+        hand = JenkinsByHand(p[:2], p[2:4])
+        free = Oracle([hand], drive, False, p[4], p[5], p[6], np.array([0.1, 1.0, 1.0, 1.0]))
+        return integrated(free, y, 0.0, times[-1], times)[1]
+
+    size = np.max(np.abs(motion.output))
+    assert np.max(np.abs(oracle(values, first) - motion.output)) < 1e-8 * size
+    for i in range(7):
+        step = np.zeros(7)
+        step[i] = 1e-5 * values[i]
+        difference = (oracle(values + step, first) - oracle(values - step, first)) / 2e-5
+        assert np.max(np.abs(motion.by_parameter[:, i] * values[i] - difference)) < 2e-6 * size
+    step = np.array([0.0, 1e-6, 0.0, 0.0])
+    difference = (oracle(values, first + step) - oracle(values, first - step)) / 2e-6
+    assert np.max(np.abs(motion.by_first[:, 1] - difference)) < 1e-6
+
+
+def test_friction_faster_than_the_sampling() -> None:
+    """f_max 0.5, m 1, c 1, k 400 at 100 Hz: sigma 30,000 slips within a thousandth of a sample."""
+    n, interval = 256, 0.01
+    lines = 2.0 * np.pi * np.arange(1, 20) / (n * interval)
+    phase = seeded(60).uniform(0.0, 2.0 * np.pi, lines.size)
+
+    def drive(t: float) -> tuple[float, float]:
+        return float(np.sum(0.4 * np.cos(lines * t + phase))), 0.0
+
+    times: FloatArray = interval * np.arange(n, dtype=float)
+    sampled = np.array([drive(t)[0] for t in times])
+    coefficients = band_limited(sampled, interval)
+    system = translate(plant_equations(di.Dahl() + di.Mass() + di.Damper() + di.Spring()))
+    for sigma in (300.0, 3_000.0, 30_000.0):
+        values = cases.all_values(cases.Drawn(0, di.Dahl(), [0.5, sigma], 1, 1), 1.0, 1.0, 400.0)
+        motion = march(system, times, coefficients, times, np.zeros(3), values)
+        plant = Oracle([DahlByHand(0.5, sigma)], drive, False, 1.0, 1.0, 400.0,
+                       np.array([1e-2, 0.1, 0.5]))  # fmt: skip
+        _, expected, _ = integrated(plant, np.zeros(3), 0.0, times[-1], times)
+        assert np.max(np.abs(expected - motion.output)) < 1e-8 * np.max(np.abs(expected))
+
+
+@pytest.mark.parametrize("share", [1e-3, 0.3, 0.99, 1.01, 3.0])
+def test_plants_near_stick_and_in_resonance(share: float) -> None:
+    """The paper's plant, its drive from a thousandth of the friction limit on."""
+    values = cases.all_values(cases.Drawn(0, di.Dahl(), [0.1, 30.0], 1, 1), 0.3, 0.24, 0.3)
+    system = translate(plant_equations(di.Dahl() + di.Mass() + di.Damper() + di.Spring()))
+    for omega in (2.0, np.sqrt(30.3 / 0.3)):
+        U = 0.1 * share
+        result = settled(system, np.array([U]), np.array([omega]), values[None],
+                         harmonics=HARMONICS)  # fmt: skip
+        assert result.found[0]
+        size = float(np.max(np.abs(result.coefficients[0])))
+        plant = Oracle(
+            [DahlByHand(0.1, 30.0)],
+            lambda t, U=U, w=omega: (U * np.cos(w * t), 0.0),  # type: ignore[misc]
+            False, 0.3, 0.24, 0.3, np.array([size, size * omega, min(0.1, 30.0 * size)]),
+        )  # fmt: skip
+        _, c, _ = fixed_point(plant, result.starts[0], result.maps[0], omega, True)
+        assert np.max(np.abs(result.coefficients[0] - c)) < 1e-8 * size
+
+
+def test_where_no_motion_settles_none_is_found() -> None:
+    """Undamped, without friction, in resonance; and a plant that grows without bounds."""
+    system = translate(plant_equations(di.Mass() + di.Damper() + di.Spring()))
+    result = settled(system, np.ones(2), np.array([10.0, 10.0]),
+                     np.array([[1.0, 0.0, 100.0], [1.0, 1e-3, 100.0]]))  # fmt: skip
+    assert result.found.tolist() == [False, True]
+    assert np.isnan(result.coefficients[0]).all()
+    assert abs(result.coefficients[1, 0] - 1.0 / (1j * 10.0 * 1e-3)) < 1e-6 * 100.0
+    knots = np.linspace(0.0, 100.0, 11)
+    with pytest.raises(FitError, match="beyond all bounds"):
+        march(system, knots, np.ones((1, 10)), knots, np.zeros(2), np.array([1.0, -200.0, 1.0]))
+
+
+def test_units_do_not_matter() -> None:
+    """Forces of 1e-15 and 1e15 N, periods of a picosecond and of a year."""
+    system = translate(plant_equations(di.Dahl() + di.Mass() + di.Damper() + di.Spring()))
+    values = cases.all_values(cases.Drawn(0, di.Dahl(), [1.0, 3.0], 1, 1), 1.0, 0.1, 1.0)
+    unit = settled(system, np.array([2.0]), np.array([1.3]), values[None], harmonics=(1, 3))
+    for F, x, T in ((1e-15, 1e-9, 1e-12), (1e15, 1e-3, 3e7), (1e9, 1e12, 1.0)):
+        k = F / x
+        values = cases.all_values(
+            cases.Drawn(0, di.Dahl(), [F, 3.0 * k], 1, 1), k * T**2, 0.1 * k * T, k
+        )
+        result = settled(system, np.array([2.0 * F]), np.array([1.3 / T]), values[None],
+                         harmonics=(1, 3))  # fmt: skip
+        difference = result.coefficients[0] / x - unit.coefficients[0]
+        assert np.max(np.abs(difference)) < 1e-9 * np.max(np.abs(unit.coefficients))
+
+
+def test_floquet_maps_are_those_of_an_independent_integrator() -> None:
+    values = cases.all_values(cases.Drawn(0, di.Dahl(), [0.1, 30.0], 1, 1), 0.3, 0.24, 0.3)
+    system = translate(plant_equations(di.Dahl() + di.Mass() + di.Damper() + di.Spring()))
+    omega = 3.0
+    result = settled(system, np.array([0.3]), np.array([omega]), values[None])
+    plant = Oracle([DahlByHand(0.1, 30.0)], lambda t: (0.3 * np.cos(omega * t), 0.0), False,
+                   0.3, 0.24, 0.3, np.array([0.03, 0.1, 0.1]))  # fmt: skip
+    sizes = np.array([0.03, 0.1, 0.1])
+    slopes = np.zeros((3, 3))
+    for j in range(3):
+        step = np.zeros(3)
+        step[j] = 1e-5 * sizes[j]
+        ends = [integrated(plant, result.starts[0] + sign * step, 0.0, np.pi / omega)[0]
+                for sign in (1.0, -1.0)]  # fmt: skip
+        slopes[:, j] = (ends[0] - ends[1]) / (2.0 * step[j])
+    difference = (result.maps[0] - slopes) * sizes / sizes[:, None]
+    assert np.max(np.abs(difference)) < 1e-6
+
+
+def test_a_sweep_of_an_integral_by_quadrature() -> None:
+    """A history without memory: the mean of |v| v^3 by quad, uneven kinks included."""
+    system = translate(law_equations(di.PowerDamper()))
+    result = settled(system, np.array([1.0]), np.array([2.0]), np.array([[1.0, 0.4, 1.0]]),
+                     harmonics=(3,))  # fmt: skip
+
+    def part(t: float) -> float:
+        v = -2.0 * np.sin(t)
+        return float(v * (v * v + 1e-12) ** -0.3 * np.sin(3.0 * t))
+
+    expected = -quad(part, 0.0, np.pi, points=[1e-6, 1e-3], limit=400, epsabs=1e-13)[0]
+    assert abs(result.coefficients[0, 0].imag - 2.0 / np.pi * expected) < 1e-8
+
+
+@pytest.mark.parametrize("home", ["unwritable", "missing"])
+def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path, home: str) -> None:
+    place = tmp_path / "file"
+    place.write_text("")
+    code = (
+        "from dahl_ident.engine import motion\n"
+        "import sys; sys.modules['dahl_ident.engine.march'] = sys\n"  # nothing is compiled
+        "motion.kernels('march')\n"
+    )
+    environment = os.environ | {
+        "XDG_CACHE_HOME": str(place if home == "unwritable" else place / "x")
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_importing_the_package_does_not_import_numba() -> None:
+    code = "import dahl_ident, sys; print('numba' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

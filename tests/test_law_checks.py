@@ -1,0 +1,210 @@
+"""A user's law is checked when it is first used; every mistake has an error of its own."""
+
+# ruff: noqa: ARG005  # the laws below take every argument
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+
+import dahl_ident as di
+from dahl_ident.errors import DahlIdentError, ModelError, ValidationError
+
+Slope = Callable[..., Any]
+
+
+def positive(name: str, unit: str = "") -> di.Parameter:
+    return di.Parameter(name, unit, name, lower=0.0, transform="log")
+
+
+USUAL = (positive("f_max", "N"), positive("sigma", "N/m"))
+
+
+def law(slope: Slope, parameters: Any = USUAL, **attributes: Any) -> type[di.Friction]:
+    """Return a new class, which nothing has used before."""
+    return type("Mine", (di.Friction,), {"slope": slope, "parameters": parameters, **attributes})
+
+
+def dahl(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+    return values[1] * (1.0 - direction * force / values[0])
+
+
+SOUND: dict[str, Slope] = {
+    "dahl": dahl,
+    "kink": lambda _, F, d, v, p: p[1] * (d * F < p[0]),
+    "two kinks": lambda _, F, d, v, p: (
+        p[1] * ((d * F / p[0] < 0.5) + 0.2 * (d * F / p[0] >= 0.5)) * (d * F / p[0] < 1.0)
+    ),
+    "two limits": lambda _, F, d, v, p: p[1] * (1.0 - d * F / np.where(d > 0, p[0], 2 * p[0])),
+    "power": lambda _, F, d, v, p: (
+        p[1] * np.sign(1.0 - d * F / p[0]) * np.abs(1.0 - d * F / p[0]) ** 0.5
+    ),
+    "no full slip": lambda _, F, d, v, p: p[1] / (1.0 + np.abs(F / p[0]) * (1.0 + d * np.sign(F))),
+}
+
+WRONG: dict[str, tuple[Slope, str]] = {
+    "nan beyond slip": (
+        lambda _, F, d, v, p: p[1] * (1.0 - d * F / p[0]) ** 0.5,
+        r"Mine\.slope is nan at force = 0\.2.* N, direction = \+1, f_max = 0\.2, sigma = 3; "
+        "expected a finite number",
+    ),
+    "nan": (lambda _, F, d, v, p: F * np.nan, r"is nan at force = 0 N"),
+    "infinite": (lambda _, F, d, v, p: p[1] / np.abs(F), r"is inf at force = 0 N"),
+    "negative": (lambda _, F, d, v, p: -dahl(_, F, d, v, p), r"is -3 N/m at force = 0 N"),
+    "zero": (lambda _, F, d, v, p: 0.0 * F, r"is 0 N/m at force = 0 N.* expected a positive slope"),
+    "negative after reversal": (
+        lambda _, F, d, v, p: p[1] * (1.0 - d * F / p[0]) * (d * F / p[0] + 0.5),
+        r"is -3 N/m, negative before full slip, at force = -0\.2 N, direction = \+1",
+    ),
+    "negative between": (
+        lambda _, F, d, v, p: p[1] * np.cos(4.0 * d * F / p[0]),
+        r"negative before full slip, .*, and positive again at larger forces",
+    ),
+    "constant number": (lambda _, F, d, v, p: 3.0, r"is 3 N/m for every force .*use di\.Spring"),
+    "constant array": (lambda _, F, d, v, p: p[1] * np.ones_like(F), r"a constant number"),
+    "shape": (
+        lambda _, F, d, v, p: np.ones(7),
+        r"returned the shape \(7,\) for an array of \(1, \d+\) forces, and 2 values; expected",
+    ),
+    "dimensions": (lambda _, F, d, v, p: np.ones((2, 3, 4)), r"returned the shape \(2, 3, 4\)"),
+    "text": (lambda _, F, d, v, p: "stiff", r"returned 'stiff', numbers of type <U5; expected"),
+    "None": (lambda _, F, d, v, p: None, r"returned None; expected dF/dx, N/m: end it with return"),
+    "complex": (lambda _, F, d, v, p: 1j * dahl(_, F, d, v, p), r"numbers of type complex128"),
+    "if": (
+        lambda _, F, d, v, p: p[1] if d > 0 else 2.0 * p[1],
+        r"asks a Python question of arrays \(if, .*; write comparisons as factors",
+    ),
+    "min": (lambda _, F, d, v, p: p[1] * min(1.0, 1.0 - d * F / p[0]), r"asks a Python question"),
+    "math": (lambda _, F, d, v, p: p[1] * math.exp(-d * F), r"TypeError.*; expected plain arithm"),
+    "name": (lambda _, F, d, v, p: sgima * F, r"NameError: name 'sgima'"),  # type: ignore[name-defined] # noqa: F821
+    "values": (lambda _, F, d, v, p: sum(a * b for a, b, *_ in [(*p, 1)]) + p[2], r"IndexError"),
+    "velocity": (
+        lambda _, F, d, v, p: p[1] * (1.0 - d * F / p[0] / (1.0 + np.abs(v))),
+        r"failed without a velocity .* must declare rate_independent = False",
+    ),
+    "energy": (
+        lambda _, F, d, v, p: p[1] * (1.0 + 0.5 * d * F / p[0]),
+        r"creates energy: .* J in each cycle between -0\.131 and 0\.131 N, at f_max = 0\.2",
+    ),
+    "energy at reversals": (
+        lambda _, F, d, v, p: p[1] * (1.0 - 0.5 * (d * F < 0.0)) * (d * F < p[0]),
+        r"creates energy",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SOUND)
+def test_sound_laws_pass(name: str) -> None:
+    cls = law(SOUND[name])
+    for given in ((), (1e-6, 1e9), (1e5, 1e-3), (None, 2.0)):
+        assert isinstance(cls(*given), di.Friction)
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_mistakes_are_named(name: str) -> None:
+    slope, message = WRONG[name]
+    with pytest.raises(ModelError, match=message):
+        law(slope)(0.2, 3.0)
+    with pytest.raises(ModelError, match=r"Mine\.slope"):
+        law(slope)()
+
+
+def test_the_energy_created_is_that_of_the_loop() -> None:
+    """The loop between two forces, by another quadrature."""
+    f, sigma = 0.2, 3.0
+    slope, _ = WRONG["energy"]
+    with pytest.raises(ModelError, match="creates energy") as raised:
+        law(slope)(f, sigma)
+    words = str(raised.value).split()
+    created, F = float(words[words.index("energy:") + 1]), float(words[words.index("and") + 1])
+    y = np.linspace(-F, F, 200001)
+    exact = float(trapezoid(y / sigma * (1 / (1 + y / 2 / f) - 1 / (1 - y / 2 / f)), y))
+    assert created == pytest.approx(-exact, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ((positive("a", "N"), positive("a", "N")), "Mine declares the parameter a 2 times"),
+        ((positive("a b", "N"),), "a parameter called 'a b'; expected letters, digits"),
+        ((positive("name", "N"),), "a parameter called 'name'"),
+        ((di.Parameter("a", "N", "", lower=2.0, upper=1.0),), "bounds of a are 2 and 1; expected"),
+        ((di.Parameter("a", "N", "", prior=(2.0, 1.0)),), "prior of a are 2 and 1"),
+        ((di.Parameter("a", "N", "", upper=-1.0, transform="log"),), "its upper bound is -1"),
+        ((positive("a", "furlong"),), "unit of a is 'furlong'; expected a product of powers of N"),
+        (("f_max", "sigma"), r"parameters is \('f_max', 'sigma'\); expected a tuple of di.Param"),
+        ([positive("a", "N")], "expected a tuple"),
+    ],
+)
+def test_declarations_are_checked(parameters: Any, message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        law(dahl, parameters)()
+
+
+def test_a_law_is_checked_once() -> None:
+    calls = []
+
+    def slope(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        calls.append(np.shape(force))
+        return dahl(self, force, direction, velocity, values)
+
+    cls = law(slope)
+    cls(0.2, 3.0)
+    assert 0 < len(calls) < 40
+    before = len(calls)
+    cls(0.2, 3.0)
+    assert len(calls) == before
+
+
+def test_a_law_that_is_sound_for_some_values_is_not_refused() -> None:
+    """Bouc-Wen with exponent 1: values decide, not the class."""
+    free = tuple(di.Parameter(name, "", name) for name in "abc")
+
+    def slope(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        a, b, c = values
+        return a - np.abs(force) * (b * np.sign(direction * force) + c)
+
+    cls = law(slope, free)
+    assert cls(3.0, 0.9, 0.4).gain(1.0) > 0.0
+    assert len(cls().parameters) == 3
+    with pytest.raises(ModelError, match=r"at force = .* a = -3, b = 0.9, c = 0.4"):
+        cls(-3.0, 0.9, 0.4)
+
+
+def plant(slope: Slope) -> di.Model:
+    return law(slope)(1.0, 3.0) + di.Mass(0.3) + di.Damper(0.24)
+
+
+def drive(model: di.Model) -> None:
+    from dahl_ident.elements.equations import plant_equations
+
+    plant_equations(model)
+
+
+def test_what_cannot_be_compiled_is_named() -> None:
+    def loops(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        found = np.zeros(np.broadcast(force, direction, values[0]).shape)
+        found[...] = dahl(self, force, direction, velocity, values)
+        return found
+
+    def on_type(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        numbers = isinstance(force, np.ndarray)
+        return dahl(self, force, direction, velocity, values) * (1.0 if numbers else 2.0)
+
+    def asks(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        if isinstance(force, np.ndarray):
+            return dahl(self, force, direction, velocity, values)
+        return values[1] if direction > 0 else values[0]
+
+    for slope, message in (
+        (loops, "gives another result; expected plain arithmetic"),
+        (on_type, "gives another result; expected plain arithmetic"),
+        (asks, "asks a Python question"),
+    ):
+        with pytest.raises(DahlIdentError, match=message):
+            drive(plant(slope))
+    drive(plant(SOUND["two limits"]))
