@@ -73,6 +73,7 @@ validation: install  ## long statistical checks, written into docs/validation
 	$(BIN)/python -m benchmarks.planning --write docs/validation/planning.md
 	$(BIN)/python -m benchmarks.laws --write docs/validation/laws.md
 	$(BIN)/python -m benchmarks.engine_oracles --write docs/validation/engine.md
+	$(BIN)/python -m benchmarks.driven_plants
 	$(BIN)/python -m benchmarks.cold_records --write docs/validation/cold_records.md
 
 fuzz: install  ## thousands of damaged files of every format, and the table of what became of them

@@ -14,6 +14,7 @@ cycle makes the data; the change between the two cycles says how far it is from 
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -55,13 +56,13 @@ class Plant(NamedTuple):
         return friction + di.Mass(self.mass) + linear
 
     @property
-    def band(self) -> FloatArray:
-        """Frequencies from below the resonance of the sliding plant to above that of the stuck."""
+    def band(self) -> tuple[float, float]:
+        """Lowest and highest frequency: around the resonances of the sliding and stuck plant."""
         low, high = (
             np.sqrt(k / self.mass) / (2.0 * np.pi)
             for k in (self.stiffness, self.stiffness + self.sigma)
         )
-        return np.geomspace(0.6 * low, 1.3 * high, FREQUENCIES)
+        return 0.6 * float(low), 1.3 * float(high)
 
 
 PLANTS = (
@@ -78,10 +79,13 @@ PLANTS = (
 )
 
 
-def simulated(plant: Plant) -> tuple[FloatArray, FloatArray, ComplexArray, float]:
+def simulated(
+    plant: Plant, n_levels: int = LEVELS, n_frequencies: int = FREQUENCIES
+) -> tuple[FloatArray, FloatArray, ComplexArray, float]:
     """Return frequencies, drives and receptance of a sweep, and the largest change in a cycle."""
-    levels = plant.f_max * np.geomspace(*plant.drives, LEVELS)
-    u, f = (g.ravel() for g in np.meshgrid(levels, plant.band, indexing="ij"))
+    levels = plant.f_max * np.geomspace(*plant.drives, n_levels)
+    band = np.geomspace(*plant.band, n_frequencies)
+    u, f = (g.ravel() for g in np.meshgrid(levels, band, indexing="ij"))
     values = np.tile(plant[:6], (u.size, 1)).astype(np.float64)
     orbits = Shooting(plant.element)(values, 2.0 * np.pi * f, u)
     assert orbits.found.all()
@@ -95,10 +99,10 @@ def _two_cycles(plant: Plant, u: float, omega: float, start: FloatArray) -> list
     """Return the fundamentals of two cycles of Eqn. 2, integrated from turn to turn."""
 
     def rates(t: float, y: FloatArray, side: float) -> list[float]:
-        x, v, force = y
+        x, v, force = y.tolist()
         margin = 1.0 - side * force / plant.f_max
-        slope = plant.sigma * np.sign(margin) * abs(margin) ** plant.alpha
-        push = u * np.cos(omega * t) - force - plant.damping * v - plant.stiffness * x
+        slope = plant.sigma * math.copysign(abs(margin) ** plant.alpha, margin)
+        push = u * math.cos(omega * t) - force - plant.damping * v - plant.stiffness * x
         return [v, push / plant.mass, slope * v]
 
     def turn(_t: float, y: FloatArray, _side: float) -> float:

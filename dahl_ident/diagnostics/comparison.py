@@ -446,6 +446,8 @@ def _falling_force(optimum: Optimum) -> str:
 
 def _jenkins(optimum: Optimum, left: PredictiveDensity) -> str:
     """Return what parallel Jenkins elements would leave where that is far less, else ""."""
+    if optimum.problem.is_exact:
+        return ""  # the bound is that of displacements that are sines
     try:
         least = least_misfit(optimum.problem.data, optimum.problem.model)
     except DahlIdentError:
