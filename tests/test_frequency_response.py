@@ -122,7 +122,7 @@ class TestValidation:
             ({"response": ["a", "b"]}, "expected complex numbers"),
             ({"amplitude": [1e-3, 0.0]}, r"amplitude\[1\] is 0.0"),
             ({"amplitude": [1e-3]}, "one entry for each point"),
-            ({"dof": 3.0}, "without the covariance"),
+            ({"dof": 3.0}, "without covariance"),
             ({"covariance": np.eye(2)[None] * [[[1.0]], [[-1.0]]]}, r"covariance\[1\]"),
             ({"covariance": [[[1.0, 2.0], [2.0, 1.0]]] * 2}, "positive semidefinite"),
             ({"covariance": [[[1.0, 0.1], [0.2, 1.0]]] * 2}, "symmetric"),

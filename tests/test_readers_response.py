@@ -252,7 +252,7 @@ class TestErrors:
             ),
             ({"amplitude_std [N]": 1.0}, UnitError, r"unit \[N\]; expected .* of m"),
             ({"std": 1.0, "dof": [1.0, 0.0, 1.0]}, DataError, r"dof\[1\] is 0.0"),
-            ({"dof": 3.0}, DataError, "dof is given without the covariance"),
+            ({"dof": 3.0}, DataError, "dof is given without covariance"),
         ],
     )
     def test_bad_errors(self, columns: Any, error: type[Exception], message: str) -> None:

@@ -165,7 +165,7 @@ def tell_of_sweeps(data: FrequencyResponse, files: list[str], reading: dict[str,
 
 def good_points(data: FrequencyResponse) -> FrequencyResponse:
     """Return the points whose verdict is good, and name the others."""
-    from dahl_ident.data.row_names import row_names
+    from dahl_ident.data.rows import row_names
     from dahl_ident.errors import ExtractionError
 
     good = data.quality["verdict"] == "good"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
-from dahl_ident.data.fields import CONTROLLED, one_of
+from dahl_ident.data.columns import CONTROLLED, one_of
 from dahl_ident.data.quantities import converted
 from dahl_ident.elements.element import Element
 from dahl_ident.errors import ValidationError

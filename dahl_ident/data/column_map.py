@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray, finite_number, non_negative_array, positive_number
-from dahl_ident.data.fields import CONTROLLED, one_of
+from dahl_ident.data.columns import CONTROLLED, FILE_COLUMNS, FileColumn, one_of
 from dahl_ident.data.raw_columns import Channel, Source, plain
 from dahl_ident.data.storage import read_text
 from dahl_ident.data.tabular import listed
@@ -50,49 +50,6 @@ from dahl_ident.units import (
 )
 
 _SHOWN = 10  # rows that a warning names
-# Names under which a column is found without a map.
-RECORD_NAMES: dict[str, tuple[str, ...]] = {
-    "time": ("time", "t", "time_s", "timestamp"),
-    "displacement": ("displacement", "disp", "position", "x"),
-    "velocity": ("velocity", "vel", "v"),
-    "acceleration": ("acceleration", "accel", "acc", "a"),
-    "force": ("force", "f", "torque"),
-    "drive": ("drive", "voltage", "current"),
-}
-RESPONSE_NAMES: dict[str, tuple[str, ...]] = {
-    "frequency": ("frequency", "freq", "frequency_hz", "freq_hz"),
-    "amplitude": ("amplitude", "displacement_amplitude"),
-    "drive": ("drive", "force", "force_amplitude", "drive_amplitude", "torque"),
-    "level": ("level",),
-    "run": ("run", "test", "file", "day"),
-    "harmonic": ("harmonic",),
-    "controlled": ("controlled",),
-    "response": ("response", "frf"),
-    "real": ("real", "re", "real_part"),
-    "imag": ("imag", "im", "imaginary", "imag_part"),
-    "gain": ("gain", "magnitude", "mag"),
-    "gain_db": ("gain_db", "magnitude_db", "mag_db"),
-    "phase": ("phase", "phase_deg", "phase_rad"),
-    "damping_ratio": ("damping_ratio", "zeta"),
-    "frequency_std": ("frequency_std",),
-    "damping_ratio_std": ("damping_ratio_std", "zeta_std"),
-    "std": ("std",),
-    "real_std": ("real_std",),
-    "imag_std": ("imag_std",),
-    "gain_std": ("gain_std",),
-    "phase_std": ("phase_std", "phase_std_deg", "phase_std_rad"),
-    "covariance_real_real": ("covariance_real_real",),
-    "covariance_real_imag": ("covariance_real_imag",),
-    "covariance_imag_imag": ("covariance_imag_imag",),
-    "dof": ("dof",),
-    "amplitude_std": ("amplitude_std",),
-    "covariance_amplitude_real": ("covariance_amplitude_real",),
-    "covariance_amplitude_imag": ("covariance_amplitude_imag",),
-    "drive_std": ("drive_std",),
-    "covariance_drive_real": ("covariance_drive_real",),
-    "covariance_drive_imag": ("covariance_drive_imag",),
-}
-ROLES = tuple(dict.fromkeys((*RECORD_NAMES, *RESPONSE_NAMES)))
 
 
 @dataclass(frozen=True)
@@ -190,13 +147,13 @@ def _read(entries: Mapping[str, Any]) -> ColumnMap:
     for key, entry in entries.items():
         if key == "controlled" and not _is_column(entry):
             settings[key] = _controlled(entry)
-        elif key in ROLES:
+        elif key in FILE_COLUMNS:
             roles[key] = _column(entry, key)
         elif key in _SETTINGS:
             settings[key] = _setting(key, entry)
         else:
             raise ValidationError(
-                f"unknown entry {key!r}; expected one of {', '.join((*ROLES, *_SETTINGS))}"
+                f"unknown entry {key!r}; expected one of {', '.join((*FILE_COLUMNS, *_SETTINGS))}"
             )
     return ColumnMap(roles, **settings)
 
@@ -260,33 +217,16 @@ def _setting(key: str, entry: Any) -> Any:
             return entry
 
 
-_EXAMPLES = {
-    "time": "s",
-    "frequency": "Hz",
-    "drive": "N",
-    "force": "N",
-    "gain": "N/m",
-    "gain_db": "N/m",
-    "real": "N/m",
-    "imag": "N/m",
-    "response": "N/m",
-    "phase": "deg",
-    "velocity": "mm/s",
-    "acceleration": "m/s^2",
-}
-
-
 @dataclass
 class Binding:
     """Roles looked up in one source, with the assumptions that were made.
 
-    `names` are the column names under which each role is found without a map; `doubts` are the
-    warnings that were shown.
+    `columns` are those that are looked for; `doubts` are the warnings that were shown.
     """
 
     source: Source
     map: ColumnMap
-    names: Mapping[str, tuple[str, ...]]
+    columns: Mapping[str, FileColumn]
     motions: dict[str, Motion] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
@@ -318,20 +258,21 @@ class Binding:
         return [
             c
             for c in self.source.channels
-            if c.role == role or (c.role is None and plain(c.short or c.name) in self.names[role])
+            if c.role == role
+            or (c.role is None and plain(c.short or c.name) in self.columns[role].names)
         ]
 
     def _find(self, role: str) -> Channel | None:
         spec = self.map.roles.get(role, Column())
         if spec.column is not None:
             return self.source.find(spec.column)
-        found = self.named(role)
+        found, names = self.named(role), self.columns[role].names
         if role not in self.map.roles:  # a column that the map gives another role has no second one
             named = [c.column for c in self.map.roles.values() if c.column and "*" not in c.column]
             taken = [self.source.find(column).content for column in named]
             found = [c for c in found if not any(c.content is other for other in taken)]
         if role == "run":  # a table may have file, day and test; the first name is used
-            found.sort(key=lambda c: self.names[role].index(plain(c.short or c.name)))
+            found.sort(key=lambda c: names.index(plain(c.short or c.name)))
             found = found[:1]
         if len(found) > 1:
             distinct = len({c.name for c in found}) == len(found)
@@ -343,7 +284,7 @@ class Binding:
             )
         if not found and role in self.map.roles:
             raise DataError(
-                f"{self.source.name}: no column is called {' or '.join(self.names[role])}; name "
+                f"{self.source.name}: no column is called {' or '.join(names)}; name "
                 f"the column of the {role} too"
             )
         return found[0] if found else None
@@ -368,8 +309,8 @@ class Binding:
         spec = self.map.roles.get(role, Column())
         return scaled(self.source.numbers(channel), spec.sign * spec.factor)
 
-    def unit(self, role: str, channel: Channel, default: str | None = None) -> Unit:
-        """Return the unit: the map's, the header's, the one in the name, or the default's.
+    def unit(self, role: str, channel: Channel) -> Unit:
+        """Return the unit: the map's, the header's, the one in the name, or another column's.
 
         Raises
         ------
@@ -377,11 +318,11 @@ class Binding:
             If there is none, or it cannot be read.
         """
         text = self.map.roles.get(role, Column()).unit or channel.unit
-        if text is None and plain(channel.short or channel.name) in self.names[role]:
+        if text is None and plain(channel.short or channel.name) in self.columns[role].names:
             text = channel.unit_in_name
-        text = text or default
+        text = text or self._inherited(self.columns[role])
         if text is None:
-            example = _EXAMPLES.get(role, "um")
+            example = self.columns[role].example
             raise UnitError(
                 f"{self.source.name}: column {channel.name!r} has no unit; write it in the "
                 f"header, such as '{channel.name} [{example}]', or give "
@@ -391,6 +332,15 @@ class Binding:
             return parse_unit(text)
         except UnitError as exc:
             raise UnitError(f"{self.source.name}: column {channel.name!r}: {exc}") from exc
+
+    def _inherited(self, column: FileColumn) -> str | None:
+        """Return the unit that a column without one has from the column that it belongs to."""
+        for role in column.like:
+            channel = self.channel(role)
+            if channel is not None:
+                unit = self.unit(role, channel)
+                return None if unit.decibel else unit.text
+        return "1" if column.unit == "1" else None
 
     def kind(self, role: str, unit: Unit, kinds: tuple[str, ...]) -> tuple[str, float]:
         """Return which kind a unit is, and its factor; its motion is remembered."""

@@ -19,29 +19,24 @@ from numpy.typing import ArrayLike, NDArray
 from dahl_ident.arrays import (
     ComplexArray,
     FloatArray,
-    finite_array,
     finite_number,
     non_negative_array,
     positive_array,
 )
-from dahl_ident.data.column_map import ROLES
-from dahl_ident.data.fields import (
+from dahl_ident.data.columns import (
+    COLUMNS,
+    FILE_COLUMNS,
+    RESPONSE_COLUMNS,
+    backbone_std,
     check_covariance,
     check_mean_covariance,
     column,
-    complex_values,
-    controlled_words,
-    degrees_of_freedom,
     frozen_copy,
     frozen_mapping,
-    harmonic_numbers,
-    labels,
     one_of,
     plain_values,
-    run_labels,
-    spread,
 )
-from dahl_ident.data.quantities import converted, jacobian, polar_std
+from dahl_ident.data.quantities import converted, jacobian
 from dahl_ident.data.storage import plain_data
 from dahl_ident.data.tabular import Lines, Tabular, distinct, extent, listed, noted
 from dahl_ident.errors import ValidationError
@@ -49,23 +44,6 @@ from dahl_ident.units import MOTIONS, QUANTITIES, Motion, Quantity, si_unit
 
 if TYPE_CHECKING:
     import pandas as pd
-
-_COLUMNS = (
-    "frequency_hz",
-    "response",
-    "amplitude",
-    "drive",
-    "covariance",
-    "dof",
-    "amplitude_std",
-    "amplitude_covariance",
-    "drive_std",
-    "drive_covariance",
-    "level",
-    "run",
-    "controlled",
-    "harmonic",
-)
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -175,31 +153,14 @@ class FrequencyResponse(Tabular):
         quality: Mapping[str, ArrayLike] | None = None,
         provenance: Mapping[str, Any] | None = None,
     ) -> None:
-        frequency = positive_array(frequency_hz, "frequency_hz")
+        given = {name: value for name, value in locals().items() if name in COLUMNS}
+        given["frequency_hz"] = frequency = positive_array(frequency_hz, "frequency_hz")
         if frequency.ndim != 1 or frequency.size == 0:
             raise ValidationError(
                 f"frequency_hz: expected one number for each point, got shape {frequency.shape}"
             )
         n = frequency.size
-        values = {
-            "frequency_hz": frozen_copy(frequency),
-            "response": column(response, "response", n, complex_values),
-            "amplitude": column(amplitude, "amplitude", n, positive_array),
-            "drive": column(drive, "drive", n, positive_array),
-            "covariance": column(covariance, "covariance", n, finite_array, shape=(2, 2)),
-            "dof": spread(dof, "dof", n, degrees_of_freedom),
-            "amplitude_std": column(amplitude_std, "amplitude_std", n, non_negative_array),
-            "amplitude_covariance": column(
-                amplitude_covariance, "amplitude_covariance", n, finite_array, shape=(2,)
-            ),
-            "drive_std": column(drive_std, "drive_std", n, non_negative_array),
-            "drive_covariance": column(
-                drive_covariance, "drive_covariance", n, finite_array, shape=(2,)
-            ),
-            "level": spread(level, "level", n, labels),
-            "run": spread(run, "run", n, run_labels),
-            "controlled": spread(controlled, "controlled", n, controlled_words),
-            "harmonic": spread(harmonic, "harmonic", n, harmonic_numbers),
+        values = {name: one.checked(given[name], name, n) for name, one in COLUMNS.items()} | {
             "quantity": one_of(quantity, "quantity", (*QUANTITIES, "backbone")),
             "motion": one_of(motion, "motion", MOTIONS),
             "drive_factor_uncertainty": finite_number(
@@ -225,24 +186,12 @@ class FrequencyResponse(Tabular):
                 "neither amplitude nor drive is given; a response with friction means nothing "
                 "without the amplitude it was measured at"
             )
-        if self.amplitude_std is not None and self.amplitude is None:
-            raise ValidationError("amplitude_std is given without amplitude")
-        if self.drive_std is not None and self.drive is None:
-            raise ValidationError("drive_std is given without drive")
+        for name, one in COLUMNS.items():
+            absent = [need for need in one.needs if getattr(self, need) is None]
+            if absent and getattr(self, name) is not None:
+                raise ValidationError(f"{name} is given without {' and '.join(absent)}")
         if self.quantity == "backbone":
             self._check_backbone()
-        if self.dof is not None and self.covariance is None:
-            raise ValidationError("dof is given without the covariance that it belongs to")
-        if self.amplitude_covariance is not None and (
-            self.amplitude_std is None or self.covariance is None
-        ):
-            raise ValidationError(
-                "amplitude_covariance is given without amplitude_std and covariance"
-            )
-        if self.drive_covariance is not None and (
-            self.drive_std is None or self.covariance is None
-        ):
-            raise ValidationError("drive_covariance is given without drive_std and covariance")
         if self.quantity != "dynamic_stiffness" and (self.harmonic != 1).any():
             row = int(np.argmax(self.harmonic != 1))
             raise ValidationError(
@@ -609,38 +558,19 @@ class FrequencyResponse(Tabular):
         import pandas as pd
 
         clashing = sorted(
-            {name for name in self.quality if name in ROLES or name == "frequency_hz"}
+            {name for name in self.quality if name in (*FILE_COLUMNS, "frequency_hz")}
         )
         if clashing:
             raise ValidationError(
                 f"quality {clashing[0]!r} is also the name of a column of the table; rename it"
             )
-        m, r = si_unit("displacement", self.motion), self.unit
+        form = "backbone" if self.quantity == "backbone" else "polar" if polar else "rectangular"
         columns: dict[str, Any] = {
-            "frequency_hz": self.frequency_hz,
-            "level": self.level,
-            "run": self.run,
-            f"amplitude [{m}]": self.amplitude,
-            f"drive [{si_unit('force', self.motion)}]": self.drive,
-            **(
-                _backbone(self)
-                if self.quantity == "backbone"
-                else _polar(self)
-                if polar
-                else _rectangular(self)
-            ),
-            "dof": self.dof,
-            f"amplitude_std [{m}]": self.amplitude_std,
-            f"drive_std [{si_unit('force', self.motion)}]": self.drive_std,
+            one.header_of(self): one.saved(self)
+            for one in RESPONSE_COLUMNS.values()
+            if one.saved is not None and one.form in ("", form)
         }
-        levels = (("amplitude", m), ("drive", si_unit("force", self.motion)))
-        for (level, unit), cross in zip(
-            levels, (self.amplitude_covariance, self.drive_covariance), strict=True
-        ):
-            if cross is not None and not polar:
-                for i, part in enumerate(("real", "imag")):
-                    columns[f"covariance_{level}_{part} [({unit})*({r})]"] = cross[:, i]
-        columns |= {"controlled": self.controlled, "harmonic": self.harmonic, **self.quality}
+        columns |= self.quality
         frame = pd.DataFrame({name: c for name, c in columns.items() if c is not None})
         frame.attrs["dahl_ident"] = {
             "quality": {name: verdict.dtype.kind for name, verdict in self.quality.items()},
@@ -716,46 +646,8 @@ class FrequencyResponse(Tabular):
         from dahl_ident.data.curves import draw, draw_backbone
 
         if self.quantity == "backbone":
-            return draw_backbone(self, backbone_std(self), ax)
+            return draw_backbone(self, (backbone_std(self, 0), backbone_std(self, 1)), ax)
         return draw(self, ax)
-
-
-def _rectangular(data: FrequencyResponse) -> dict[str, Any]:
-    r = data.unit
-    columns: dict[str, Any] = {f"real [{r}]": data.response.real, f"imag [{r}]": data.response.imag}
-    if data.covariance is not None:
-        for name, i, j in (("real_real", 0, 0), ("real_imag", 0, 1), ("imag_imag", 1, 1)):
-            columns[f"covariance_{name} [({r})^2]"] = data.covariance[:, i, j]
-    return columns
-
-
-def _backbone(data: FrequencyResponse) -> dict[str, Any]:
-    frequency_std, damping_std = backbone_std(data)
-    return {
-        "damping_ratio": data.response.imag,
-        "frequency_std [Hz]": frequency_std,
-        "damping_ratio_std": damping_std,
-    }
-
-
-def backbone_std(data: FrequencyResponse) -> tuple[FloatArray, FloatArray]:
-    """Return the standard deviations of a backbone's frequencies, Hz, and damping ratios."""
-    assert data.covariance is not None  # a backbone has one
-    stds = np.sqrt(data.covariance[:, [0, 1], [0, 1]])
-    return data.frequency_hz * stds[:, 0], stds[:, 1]
-
-
-def _polar(data: FrequencyResponse) -> dict[str, Any]:
-    """Return gain and phase; their standard deviations to first order."""
-    columns: dict[str, Any] = {
-        f"gain [{data.unit}]": data.gain,
-        "phase_deg": np.degrees(data.phase),
-    }
-    if data.covariance is not None:
-        gain_std, phase_std = polar_std(data.response, data.covariance)
-        columns[f"gain_std [{data.unit}]"] = gain_std
-        columns["phase_std_deg"] = np.degrees(phase_std)
-    return columns
 
 
 def _combined(
@@ -764,7 +656,7 @@ def _combined(
     """Apply `combine` to each column of all parts; returns constructor arguments."""
     columns: dict[str, Any] = {
         name: combine([getattr(part, name) for part in parts])
-        for name in _COLUMNS
+        for name in COLUMNS
         if getattr(parts[0], name) is not None
     }
     columns["quality"] = {
@@ -775,7 +667,7 @@ def _combined(
 
 def _shape_of(data: FrequencyResponse) -> set[str]:
     """Return the properties that two tables must share to be concatenated."""
-    columns = {name for name in _COLUMNS if getattr(data, name) is not None}
+    columns = {name for name in COLUMNS if getattr(data, name) is not None}
     columns.add(f"a drive factor uncertain by {data.drive_factor_uncertainty:.3g}")
     if data.level is not None:
         columns.add("text levels" if data.level.dtype.kind == "U" else "numeric levels")

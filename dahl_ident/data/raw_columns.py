@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import LARGEST, ComplexArray, FloatArray
-from dahl_ident.data.column_names import split_header
 from dahl_ident.data.tabular import listed
-from dahl_ident.errors import DataError
+from dahl_ident.errors import DataError, UnitError
+from dahl_ident.units import parse_unit
 
 _NUMBER = re.compile(
     r"\s*[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?\s*|[-+]?inf|nan",
@@ -34,6 +34,10 @@ _SMALLEST_OVERFLOW = 1e30  # instruments write 1e30, 9.9e37 and the like
 _CODE_RATIO = 5.0  # ratio of a missing-value mark to all measured numbers
 _FEWEST_FOR_CODES = 4  # of fewer values, one far from the others may be measured
 _LONGEST_WORD = 200  # letters of a cell; no label, time stamp or number has more
+_LONGEST_HEADER = 400  # from which a cell holds no name and unit
+_INDEX = re.compile(r"[\d:, ]+")
+_UNBRACKETED = re.compile(r"\s*(.*\S)\s+(?:/|in)\s+(\S.*)")  # as ISO 80000 has it, F / N
+_CURVED = re.compile(r"\s*(.*?\S)\s*\((.*)\)\s*")
 _PADDING = (1 << 26, 16)  # bytes, and bytes a letter, that a column of text may take
 
 
@@ -329,3 +333,26 @@ def missing_marks(values: FloatArray) -> dict[float, float]:
 def plain(name: str) -> str:
     """Return a name without case, and with any run of blanks, dots and hyphens as one _."""
     return re.sub(r"[\s._-]+", "_", name.strip().casefold())
+
+
+def split_header(text: str) -> tuple[str, str | None]:
+    """Split ``"force [kN]"``, ``"force (kN)"``, ``"F / kN"`` or ``"force in kN"``.
+
+    What stands in square brackets is the unit, unless it is an index; the other ways count
+    only where they lead to a unit.
+    """
+    if len(text) > _LONGEST_HEADER:
+        return text.strip(), None
+    square = re.fullmatch(r"\s*(.*?)(\s*)\[([^\[\]]*)\]\s*", text)
+    if square and square[1] and square[3].strip():
+        unit = square[3].strip()
+        if not _INDEX.fullmatch(unit) or (unit == "1" and square[2]):
+            return square[1], unit
+    for found in filter(None, (p.fullmatch(text) for p in (_CURVED, _UNBRACKETED))):
+        if found[2].strip() == "dB":
+            return found[1], "dB"  # of what, whoever needs the gain will ask
+        try:
+            return found[1], parse_unit(found[2]).text
+        except UnitError:
+            continue
+    return text.strip(), None

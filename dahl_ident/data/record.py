@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import SMALLEST, FloatArray, finite_array, positive_number
-from dahl_ident.data.fields import column, frozen_copy, frozen_mapping, one_of
+from dahl_ident.data.columns import column, frozen_copy, frozen_mapping, one_of
 from dahl_ident.data.storage import plain_data
 from dahl_ident.data.tabular import Lines, Tabular, extent, noted
 from dahl_ident.errors import DataWarning, ValidationError

@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data.column_map import RECORD_NAMES, Binding, ColumnMap, scaled
+from dahl_ident.data.column_map import Binding, ColumnMap, scaled
+from dahl_ident.data.columns import RECORD_COLUMNS
 from dahl_ident.data.plausibility import record_doubts
 from dahl_ident.data.raw_columns import Channel, Source, missing_marks
 from dahl_ident.data.record import DriveUnit, Record, is_even
@@ -34,7 +35,7 @@ def record_from(
     DataError, UnitError
         Naming file, row and column.
     """
-    bound = Binding(source, columns, RECORD_NAMES)
+    bound = Binding(source, columns, RECORD_COLUMNS)
     channels = _channels(bound)
     bound.same_length(channels)
     if source.runs:
@@ -86,7 +87,7 @@ _PLANNED = {"step", "measured"}  # columns of a waveform that a plan wrote
 
 def record_size(source: Source, columns: ColumnMap) -> int:
     """Return how many samples the record of a source has; nothing is read."""
-    return next(iter(_channels(Binding(source, columns, RECORD_NAMES)).values())).size
+    return next(iter(_channels(Binding(source, columns, RECORD_COLUMNS)).values())).size
 
 
 def _channels(bound: Binding) -> dict[str, Channel]:

@@ -21,15 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, positive_number
-from dahl_ident.data.column_map import (
-    RECORD_NAMES,
-    RESPONSE_NAMES,
-    Binding,
-    ColumnMap,
-    by_level,
-    per_frequency,
-)
-from dahl_ident.data.fields import CONTROLLED
+from dahl_ident.data.column_map import Binding, ColumnMap, by_level, per_frequency
+from dahl_ident.data.columns import CONTROLLED, RECORD_COLUMNS, RESPONSE_COLUMNS
 from dahl_ident.data.frequency_response import FrequencyResponse
 from dahl_ident.data.plausibility import (
     check_drive,
@@ -50,7 +43,6 @@ from dahl_ident.units import (
     kind_of,
     parse_quantity,
     parse_unit,
-    si_unit,
 )
 
 _FORMS = (("response",), ("real", "imag"), ("gain", "phase"), ("gain_db", "phase"))
@@ -98,7 +90,7 @@ def response_from(
     source, options = _with_stated(source, columns, options)
     if columns.sweep is not None:
         source = _with_frequencies(source, columns.sweep)
-    whole = Binding(source, columns, RESPONSE_NAMES)
+    whole = Binding(source, columns, RESPONSE_COLUMNS)
     if source.runs:
         whole.doubt(f"the header is repeated in the file: read as {len(source.runs) + 1} runs")
     parts = []
@@ -119,7 +111,7 @@ def response_from(
 
 def _as_gain(channel: Channel) -> Channel:
     """Return an "amplitude" in the unit of a response as what it is, a gain."""
-    if plain(channel.short or channel.name) in RESPONSE_NAMES["amplitude"] and channel.unit:
+    if plain(channel.short or channel.name) in RESPONSE_COLUMNS["amplitude"].names and channel.unit:
         with contextlib.suppress(UnitError):
             kind_of(parse_unit(channel.unit), QUANTITIES, channel.name)
             return replace(channel, role="gain")
@@ -133,7 +125,7 @@ def _with_stated(
 
     Where it states both, the displacement was held, and the drive followed it.
     """
-    names = {*RESPONSE_NAMES["drive"], *RESPONSE_NAMES["amplitude"]}
+    names = {*RESPONSE_COLUMNS["drive"].names, *RESPONSE_COLUMNS["amplitude"].names}
     known = {"drive", "amplitude"} & columns.roles.keys() or any(
         c.role is None and plain(c.short or c.name) in names for c in source.channels
     )
@@ -158,7 +150,8 @@ def _with_frequencies(source: Source, sweep: str) -> Source:
             f"{source.name}: sweep is {sweep!r}; expected the first and the last frequency and "
             "their spacing, such as '1 to 100 Hz, log' or '0 to 800 Hz, linear'"
         )
-    known = [c for c in source.channels if plain(c.short or c.name) in RESPONSE_NAMES["frequency"]]
+    names = RESPONSE_COLUMNS["frequency"].names
+    known = [c for c in source.channels if plain(c.short or c.name) in names]
     if known:
         raise DataError(
             f"{source.name}: sweep={sweep!r} is given, and column {known[0].name!r} holds the "
@@ -181,7 +174,7 @@ class _Table:
 
     def __init__(self, source: Source, columns: ColumnMap, options: ResponseOptions) -> None:
         self.options = options
-        self.bound = Binding(source, columns, RESPONSE_NAMES)
+        self.bound = Binding(source, columns, RESPONSE_COLUMNS)
         self.factor_uncertainty = 0.0
         self._within_range()
 
@@ -197,22 +190,24 @@ class _Table:
                 "(inspect proposes a column map), or give drive='0.2 N' or amplitude='5 um' for "
                 "the whole file"
             )
-        if bound.has("damping_ratio"):
-            return self._backbone(frequency_hz, amplitude)
-        quantity, response = self._response(frequency_hz, amplitude, drive)
         harmonic = self._whole_numbers("harmonic")
-        self._refuse_zero(response, harmonic)
-        errors = self._errors(quantity, response)
-        if harmonic is not None:
-            _make_real(response, errors, harmonic == 0)
+        if bound.has("damping_ratio"):
+            quantity, response, errors = self._backbone(frequency_hz, amplitude)
+        else:
+            quantity, response = self._response(frequency_hz, amplitude, drive)
+            self._refuse_zero(response, harmonic)
+            errors = self._errors(quantity, response)
+            if harmonic is not None:
+                _make_real(response, errors, harmonic == 0)
+        options = self.options
         try:
             data = FrequencyResponse(
                 frequency_hz,
                 response,
                 amplitude,
                 drive,
-                level=self._level(),
-                run=self._run(),
+                level=self._labels("level", self._stated_level),
+                run=self._labels("run", options.run),
                 controlled=self._controlled(drive is not None and amplitude is None),
                 harmonic=1 if harmonic is None else harmonic,
                 quantity=quantity,
@@ -223,46 +218,39 @@ class _Table:
             )
         except ValidationError as exc:
             raise DataError(f"{source.name}: {exc}") from exc
-        check_drive(data, bound.doubt_rows)
-        check_phase_size(data, bound.doubt_rows)
-        if self.options.passive:
-            check_energy(source.name, data, bound.doubt_rows)
+        if quantity != "backbone":
+            check_drive(data, bound.doubt_rows)
+            check_phase_size(data, bound.doubt_rows)
+            if options.passive:
+                check_energy(source.name, data, bound.doubt_rows)
         return data
 
     def _backbone(
         self, frequency_hz: FloatArray, amplitude: FloatArray | None
-    ) -> FrequencyResponse:
-        """Return natural frequencies and damping ratios against amplitude."""
-        source = self.bound.source
-        frequency_std = self._scaled("frequency_std", "Hz", self._unit_text("frequency"))
-        ratio_std = self._scaled("damping_ratio_std", "1", "1")
+    ) -> tuple[Quantity, ComplexArray, dict[str, Any]]:
+        """Return damping ratios against amplitude, and their errors."""
+        roles = ("damping_ratio", "frequency_std", "damping_ratio_std")
+        ratio, frequency_std, ratio_std = (self._scaled(role) for role in roles)
         if amplitude is None or frequency_std is None or ratio_std is None:
             raise DataError(
-                f"{source.name}: a table of damping ratios is a backbone; expected the columns "
-                "amplitude, frequency_std and damping_ratio_std beside frequency and damping_ratio"
+                f"{self.bound.source.name}: a table of damping ratios is a backbone; expected the "
+                "columns amplitude, frequency_std and damping_ratio_std in addition to frequency "
+                "and damping_ratio"
             )
         try:
-            return FrequencyResponse.backbone(
-                amplitude,
-                frequency_hz,
-                self._scaled("damping_ratio", "1", "1"),
-                frequency_std=frequency_std,
-                damping_ratio_std=ratio_std,
-                amplitude_std=self._scaled(
-                    "amplitude_std", si_unit("displacement", self.bound.motion()),
-                    self._error_unit("amplitude"),
-                ),
-                level=self._level(),
-                run=self._run(),
-                motion=self.bound.motion(),
+            data = FrequencyResponse.backbone(
+                amplitude, frequency_hz, ratio,
+                frequency_std=frequency_std, damping_ratio_std=ratio_std,
             )  # fmt: skip
         except ValidationError as exc:
-            raise DataError(f"{source.name}: {exc}") from exc
+            raise DataError(f"{self.bound.source.name}: {exc}") from exc
+        errors = self._errors("backbone", data.response) | {"covariance": data.covariance}
+        return "backbone", data.response, errors
 
     def _within_range(self) -> None:
         """Leave out the frequencies that the user does not want, before anything is judged."""
         self._refuse_waveforms()
-        lengths = {c: self.bound.channel(c) for c in RESPONSE_NAMES}
+        lengths = {c: self.bound.channel(c) for c in RESPONSE_COLUMNS}
         self.bound.same_length({r: c for r, c in lengths.items() if c is not None})
         if self.options.frequency_hz is None:
             return
@@ -282,8 +270,8 @@ class _Table:
         if self.bound.has("frequency"):
             return
         held = {plain(c.short or c.name) for c in source.channels}
-        motion_or_force = {n for role in (*MOTION_KINDS, "force") for n in RECORD_NAMES[role]}
-        if held & set(RECORD_NAMES["time"]) and held & motion_or_force:
+        motion_or_force = {n for r in (*MOTION_KINDS, "force") for n in RECORD_COLUMNS[r].names}
+        if held & set(RECORD_COLUMNS["time"].names) and held & motion_or_force:
             channels = listed([c.header for c in source.channels], 5)
             raise WaveformsError(
                 f"{source.name}: it holds waveforms ({channels}), and a table of responses at "
@@ -395,7 +383,7 @@ class _Table:
                 return self._complex()
             case ("real", "imag"):
                 quantity, real = self._part("real")
-                other, imag = self._part("imag", default=self._unit_text("real"))
+                other, imag = self._part("imag")
                 if other != quantity:
                     raise UnitError(
                         f"{self.bound.source.name}: units disagree: real is {quantity}, imag "
@@ -434,13 +422,10 @@ class _Table:
             )
         return found[0] if found else None
 
-    def _unit_text(self, role: str) -> str:
-        return self.bound.unit(role, self.bound.required(role)).text
-
-    def _factor(self, role: str, default: str | None = None) -> tuple[Quantity, float, bool]:
+    def _factor(self, role: str) -> tuple[Quantity, float, bool]:
         """Return which quantity a column's unit makes it, its factor, and whether it is in dB."""
         bound = self.bound
-        unit = bound.unit(role, bound.required(role), default)
+        unit = bound.unit(role, bound.required(role))
         per_drive = _per_drive(unit.text) if bound.map.drive_factor is not None else None
         if per_drive is not None:  # such as m/V, made m/N by the factor in N/V
             drive_kind, text, power = per_drive
@@ -455,10 +440,10 @@ class _Table:
             )
         return cast(Quantity, kind), factor, unit.decibel
 
-    def _part(self, role: str, default: str | None = None) -> tuple[Quantity, FloatArray]:
+    def _part(self, role: str) -> tuple[Quantity, FloatArray]:
         """Return the quantity and the SI values of a gain, or of a real or imaginary part."""
         channel = self.bound.required(role)
-        quantity, factor, decibel = self._factor(role, default)
+        quantity, factor, decibel = self._factor(role)
         values = self.bound.numbers(role, channel)
         if decibel or role == "gain_db":
             self.bound.source.require(np.abs(values) < 1000.0, channel, "a level within 1000 dB")
@@ -482,69 +467,52 @@ class _Table:
 
     def _errors(self, quantity: Quantity, response: ComplexArray) -> dict[str, Any]:
         """Return the constructor's arguments on errors that the table has columns for."""
-        motion = self.bound.motion()
-        amplitude, part = si_unit("displacement", motion), si_unit(quantity, motion)
-        dof = self.bound.channel("dof")
-        form, inherited = self._form(_ERROR_FORMS), self._error_unit("amplitude")
-        out: dict[str, Any] = {
-            "covariance": None if form is None else self._covariance(form, part, response),
+        dof, form = self.bound.channel("dof"), self._form(_ERROR_FORMS)
+        errors: dict[str, Any] = {
+            "covariance": None if form is None else self._covariance(form, quantity, response),
             "dof": None if dof is None else self.bound.source.numbers(dof, infinite=True),
-            "amplitude_std": self._scaled("amplitude_std", amplitude, inherited),
+            "amplitude_std": self._scaled("amplitude_std"),
+            "drive_std": self._scaled("drive_std"),
         }
-        force = si_unit("force", motion)
-        if self.bound.has("drive_std"):
-            out["drive_std"] = self._scaled("drive_std", force, self._error_unit("drive"))
-        for level, of_level in (("amplitude", amplitude), ("drive", force)):
-            cross = [f"covariance_{level}_{one}" for one in ("real", "imag")]
+        for level in ("amplitude", "drive"):
+            cross = [f"covariance_{level}_{part}" for part in ("real", "imag")]
             if all(self.bound.has(role) for role in cross):
-                unit = f"({of_level})*({part})"
-                both = [self._scaled(role, unit) for role in cross]
-                out[f"{level}_covariance"] = np.stack(both, -1)
-        return out
+                both = [self._scaled(role, quantity) for role in cross]
+                errors[f"{level}_covariance"] = np.stack(both, -1)
+        return errors
 
     def _covariance(
-        self, form: tuple[str, ...], unit: str, response: ComplexArray
+        self, form: tuple[str, ...], quantity: Quantity, response: ComplexArray
     ) -> NDArray[np.float64]:
-        zero = np.zeros(response.shape)
+        given = [self._scaled(role, quantity) for role in form]
+        ri = np.zeros(response.shape)
         match form:
             case ("std",):
-                std = self._scaled("std", unit, self._error_unit("gain", "real", "response"))
-                rr = ii = std**2
-                ri = zero
+                rr = ii = given[0] ** 2
             case ("real_std", "imag_std"):
-                default = self._error_unit("real", "response")
-                rr, ii = (self._scaled(role, unit, default) ** 2 for role in form)
-                ri = zero
+                rr, ii = given[0] ** 2, given[1] ** 2
             case ("gain_std", "phase_std"):
-                along = self._scaled("gain_std", unit, self._error_unit("gain")) ** 2
-                across = (np.abs(response) * self._scaled("phase_std", "rad")) ** 2
+                along, across = given[0] ** 2, (np.abs(response) * given[1]) ** 2
                 c, s = np.cos(np.angle(response)), np.sin(np.angle(response))
                 rr, ii = along * c**2 + across * s**2, along * s**2 + across * c**2
                 ri = (along - across) * c * s
             case _:
-                rr, ri, ii = (self._scaled(role, f"({unit})^2") for role in form)
+                rr, ri, ii = given
         return np.stack([np.stack([rr, ri], -1), np.stack([ri, ii], -1)], -2)
 
-    def _error_unit(self, *roles: str) -> str | None:
-        """Return the unit that a standard deviation inherits from the column it belongs to."""
-        for role in roles:
-            channel = self.bound.channel(role)
-            if channel is not None:
-                unit = self.bound.unit(role, channel)
-                return None if unit.decibel else unit.text
-        return None
-
-    def _scaled(self, role: str, si: str, default: str | None = None) -> Any:
-        """Return an error column in the SI unit given, or None where there is none."""
-        channel = self.bound.channel(role)
+    def _scaled(self, role: str, quantity: str = "dynamic_stiffness") -> Any:
+        """Return a column in the SI unit that it is declared with, None where there is none."""
+        bound, column = self.bound, RESPONSE_COLUMNS[role]
+        channel = bound.channel(role)
         if channel is None:
             return None
-        unit = self.bound.unit(role, channel, default)
-        values = self.bound.numbers(role, channel)
-        if not role.startswith("covariance"):
-            self.bound.source.require(values >= 0.0, channel, "a standard deviation >= 0")
-        what = f"{self.bound.source.name}: column {channel.name!r}"
-        return values * factor_to(unit, si, what) * unit.to_peak
+        unit, values = bound.unit(role, channel), bound.numbers(role, channel)
+        if column.least:
+            bound.source.require(values >= 0.0, channel, column.least)
+        what = f"{bound.source.name}: column {channel.name!r}"
+        return (
+            values * factor_to(unit, column.unit_of(bound.motion(), quantity), what) * unit.to_peak
+        )
 
     def _whole_numbers(self, role: str) -> FloatArray | None:
         channel = self.bound.channel(role)
@@ -565,18 +533,15 @@ class _Table:
                 f"({zero.size} such rows); expected a measured value"
             )
 
-    def _level(self) -> Any:
-        channel = self.bound.channel("level")
-        if channel is None:
-            return self.options.drive if self.options.level is None else self.options.level
-        if channel.values.dtype.kind == "U":
-            return np.atleast_1d(channel.values)
-        return self.bound.source.numbers(channel)
+    @property
+    def _stated_level(self) -> str | float | None:
+        return self.options.drive if self.options.level is None else self.options.level
 
-    def _run(self) -> Any:
-        channel = self.bound.channel("run")
+    def _labels(self, role: str, stated: str | float | None) -> Any:
+        """Return the labels in a column, or those stated for the whole table."""
+        channel = self.bound.channel(role)
         if channel is None:
-            return self.options.run
+            return stated
         if channel.values.dtype.kind == "U":
             return np.atleast_1d(channel.values)
         return self.bound.source.numbers(channel)
@@ -584,7 +549,7 @@ class _Table:
     def _controlled(self, force_only: bool) -> Any:
         held = self.bound.map.controlled
         if isinstance(held, Mapping):
-            label = str(self._level())
+            label = str(self._labels("level", self._stated_level))
             found = [w for w in CONTROLLED if fnmatch.fnmatchcase(label, held.get(w, ""))]
             if len(found) != 1:
                 raise DataError(

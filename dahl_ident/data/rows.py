@@ -1,9 +1,10 @@
-"""The bare columns of one table, or of many tables of one shape stacked, for computation."""
+"""Rows of tables: bare columns for computation, of many tables stacked, and names for people."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -11,20 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.columns import COLUMNS
 from dahl_ident.data.frequency_response import FrequencyResponse
 from dahl_ident.errors import DataError
-from dahl_ident.units import Quantity
-
-_OPTIONAL = (
-    "amplitude", "drive", "covariance", "dof", "amplitude_std", "amplitude_covariance",
-    "drive_std", "drive_covariance",
-)  # fmt: skip
-# of one table's column, else 1
-_DIMENSIONS = {
-    "covariance": 3,
-    "amplitude_covariance": 2,
-    "drive_covariance": 2,
-}
+from dahl_ident.units import Quantity, engineering, shown_unit
 
 
 @dataclass(frozen=True)
@@ -67,7 +58,7 @@ class Rows:
             forced=data.controlled == "force",
             omega=data.omega,
             response=data.response,
-            **{name: getattr(data, name) for name in _OPTIONAL},
+            **{name: getattr(data, name) for name in _optional()},
         )
 
     @classmethod
@@ -99,36 +90,37 @@ class Rows:
             forced=columns["controlled"] == "force",
             omega=2.0 * np.pi * frequency,
             response=np.array([table.response for table in tables]),
-            **{name: _optional(tables, name) for name in _OPTIONAL},
+            **{name: _all_or_none(tables, name) for name in _optional()},
         )
 
     def take(self, tables: NDArray[np.intp] | slice) -> Rows:
         """Return some of the stacked tables; columns that all share stay as they are."""
-        columns = {name: getattr(self, name) for name in ("omega", "response", *_OPTIONAL)}
-        stacked = {
-            name: column[tables]
-            for name, column in columns.items()
-            if column is not None and column.ndim > _DIMENSIONS.get(name, 1)
-        }
-        return replace(self, **stacked)
+        return replace(self, **{name: column[tables] for name, column in self._stacked()})
 
     def table(self, index: int) -> Rows:
         """Return one of the stacked tables."""
-        one = self.take(np.array([index]))
-        columns = {name: getattr(one, name) for name in ("omega", "response", *_OPTIONAL)}
-        first = {
-            name: column[0]
-            for name, column in columns.items()
-            if column is not None and column.ndim > _DIMENSIONS.get(name, 1)
-        }
-        return replace(one, **first)
+        return replace(self, **{name: column[index] for name, column in self._stacked()})
+
+    def _stacked(self) -> Iterator[tuple[str, Any]]:
+        """Yield the columns in which the stacked tables differ."""
+        for one in fields(self):
+            column = getattr(self, one.name)
+            row = COLUMNS[one.name].shape if one.name in COLUMNS else ()
+            if isinstance(column, np.ndarray) and column.ndim > 1 + len(row):
+                yield one.name, column
 
     def with_responses(self, responses: ComplexArray) -> Rows:
         """Return these rows with one set of responses for each of many tables."""
         return replace(self, response=responses)
 
 
-def _optional(tables: Sequence[FrequencyResponse], name: str) -> NDArray[Any] | None:
+def _optional() -> list[str]:
+    """Return the names of the columns that a table may lack."""
+    names = [one.name for one in fields(Rows) if one.name in COLUMNS]
+    return [name for name in names if name not in ("response", "harmonic")]
+
+
+def _all_or_none(tables: Sequence[FrequencyResponse], name: str) -> NDArray[Any] | None:
     given = [getattr(table, name) is not None for table in tables]
     if not any(given):
         return None
@@ -148,3 +140,38 @@ def _stacked(tables: Sequence[FrequencyResponse], name: str) -> NDArray[Any]:
         return np.asarray(first)
     stacked = np.array(columns)
     return stacked[0] if (stacked == stacked[0]).all() else stacked
+
+
+def row_names(data: FrequencyResponse, rows: Sequence[int]) -> list[str]:
+    """Return the names of rows, such as "1 Hz, 0.67 mm, harmonic 3".
+
+    Rows of one name have their number behind it.
+
+    Examples
+    --------
+    >>> data = FrequencyResponse([1.0, 1.0, 2.0], [3.0, 2.0, 2.0], [6.7e-4, 6.7e-4, 2e-3])
+    >>> row_names(data, [0, 2])
+    ['1 Hz, 670 µm (row 0)', '2 Hz, 2 mm']
+    """
+    if not len(rows):
+        return []
+    every = [_name(data, row) for row in range(data.n)]
+    count = Counter(every)
+    return [f"{every[r]} (row {r})" if count[every[r]] > 1 else every[r] for r in rows]
+
+
+def _name(data: FrequencyResponse, row: int) -> str:
+    driven = data.drive is not None and data.controlled[row] == "force"
+    size = data.drive if driven or data.amplitude is None else data.amplitude
+    unit = shown_unit("N" if size is data.drive else "m", data.motion)
+    parts = [f"{data.frequency_hz[row]:.4g} Hz"]
+    if size is not None:
+        parts.append(engineering(float(size[row]), unit))
+    harmonic = int(data.harmonic[row])
+    if harmonic != 1:
+        parts.append(f"harmonic {harmonic}" if harmonic else "mean force")
+    if data.level is not None and data.level.dtype.kind == "U":
+        parts.append(f"level {data.level[row]}")
+    if data.run is not None and len(data.runs or ()) > 1:
+        parts.append(f"run {data.run[row]}")
+    return ", ".join(parts)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dahl_ident.data.column_names import split_header
+from dahl_ident.data.raw_columns import split_header
 from dahl_ident.errors import DataError, MissingDependencyError, ValidationError
 
 if TYPE_CHECKING:

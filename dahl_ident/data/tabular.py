@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data.fields import plain_mappings
+from dahl_ident.data.columns import plain_mappings
 
 if TYPE_CHECKING:
     import pandas as pd

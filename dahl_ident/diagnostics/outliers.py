@@ -19,7 +19,7 @@ from scipy import special
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.data.row_names import row_names
+from dahl_ident.data.rows import row_names
 from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.fitting import Optimum
 

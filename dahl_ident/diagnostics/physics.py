@@ -8,7 +8,7 @@ import numpy as np
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.data.row_names import row_names
+from dahl_ident.data.rows import row_names
 from dahl_ident.diagnostics.formatting import percent, with_unit
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.plausible_units import implausible_units

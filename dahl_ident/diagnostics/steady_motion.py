@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from dahl_ident.data.row_names import row_names
+from dahl_ident.data.rows import row_names
 from dahl_ident.diagnostics.formatting import percent
 from dahl_ident.fitting import Optimum
 

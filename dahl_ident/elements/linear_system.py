@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.data.fields import one_of
+from dahl_ident.data.columns import one_of
 from dahl_ident.data.quantities import DEFINITIONS, converted
 from dahl_ident.elements.behaviour import (
     STENCIL,

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from dahl_ident.arrays import non_negative_array, positive_number, whole_number
-from dahl_ident.data.fields import one_of
+from dahl_ident.data.columns import one_of
 from dahl_ident.elements import Element
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.bench_time import LEAST_CYCLES

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.data.fields import one_of
+from dahl_ident.data.columns import one_of
 from dahl_ident.data.rows import Rows
 from dahl_ident.data.tabular import assumes_frequency
 from dahl_ident.elements import Element, Model, Parameter

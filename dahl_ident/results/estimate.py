@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.data import FrequencyResponse, Record
-from dahl_ident.data.row_names import row_names
+from dahl_ident.data.rows import row_names
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import FitError, ValidationError

@@ -20,7 +20,7 @@ from dahl_ident.arrays import (
     non_negative_array,
     positive_array,
 )
-from dahl_ident.data.fields import one_of
+from dahl_ident.data.columns import one_of
 from dahl_ident.elements.element import Element, as_model
 from dahl_ident.errors import MultipleSolutionsWarning, ValidationError
 from dahl_ident.steady_state.exact_response import exact_motions

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from dahl_ident.arrays import positive_array, positive_number, whole_number
-from dahl_ident.data.fields import one_of
+from dahl_ident.data.columns import one_of
 from dahl_ident.errors import ValidationError
 from dahl_ident.synthetic.checks import non_negative_number
 from dahl_ident.synthetic.randomness import Draws

@@ -13,7 +13,7 @@ from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from dahl_ident.data.fields import one_of
+from dahl_ident.data.columns import one_of
 from dahl_ident.data.storage import read_text
 from dahl_ident.elements import Element
 from dahl_ident.elements.description import describe_model, model_from_description

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.column_names import split_header
-from dahl_ident.data.raw_columns import Channel, Source, plain, words
+from dahl_ident.data.raw_columns import Channel, Source, plain, split_header, words
 from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.column_names import split_header
-from dahl_ident.data.raw_columns import Channel, plain
+from dahl_ident.data.raw_columns import Channel, plain, split_header
 from dahl_ident.errors import DataError, UnitError
 from dahl_ident.units import parse_unit
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data.column_map import RECORD_NAMES, RESPONSE_NAMES
+from dahl_ident.data.columns import RECORD_COLUMNS, RESPONSE_COLUMNS
 from dahl_ident.data.raw_columns import Channel, Source, plain
 from dahl_ident.data.record import gaps, is_even, sample_rate
 from dahl_ident.data.record_table import is_stamped
@@ -41,7 +41,9 @@ _INTERVALS = ("ts", "dt", "sampling_interval", "sample_interval")  # s, of singl
 _RATES = ("fs", "sample_rate", "sampling_rate", "sampling_frequency")  # Hz
 _FEW_GAPS = 5  # that are listed; of more, number, longest and first say more
 _NO_UNIT = ("level",)
-_PROPOSED_NAMES = RESPONSE_NAMES | {"frequency": (*RESPONSE_NAMES["frequency"], "f")}
+_RECORD_NAMES = {role: column.names for role, column in RECORD_COLUMNS.items()}
+_RESPONSE_NAMES = {role: column.names for role, column in RESPONSE_COLUMNS.items()}
+_PROPOSED_NAMES = _RESPONSE_NAMES | {"frequency": (*_RESPONSE_NAMES["frequency"], "f")}
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ def _summary(channel: Channel) -> ChannelSummary:
 
 def _sampling(source: Source) -> tuple[str, tuple[str, ...]]:
     """Describe the sampling of the first channel that is time, by its name or its unit."""
-    by_name = [c for c in source.channels if _named(c, "time", RECORD_NAMES)]
+    by_name = [c for c in source.channels if _named(c, "time", _RECORD_NAMES)]
     by_unit = [c for c in source.channels if _of_kind(c, ("time",))]
     for channel in by_name or by_unit:
         if channel.values.dtype.kind not in "fiu" or channel.size < 2:
@@ -163,7 +165,7 @@ def _proposal(source: Source) -> str:
     if any(channel.size > 1 for channel in groups.values()):  # single numbers are settings
         groups = {path: channel for path, channel in groups.items() if channel.size > 1}
     response = _is_response(groups.values())
-    names = _PROPOSED_NAMES if response else RECORD_NAMES
+    names = _PROPOSED_NAMES if response else _RECORD_NAMES
     units = _RESPONSE_UNITS if response else _RECORD_UNITS
     roles: dict[str, str] = {}
     for role in units:
@@ -229,9 +231,9 @@ def _is_response(channels: Collection[Channel]) -> bool:
         kinds = (_RECORD_UNITS | _RESPONSE_UNITS)[role]
         return any(_named(c, role, names) or _of_kind(c, kinds) for c in channels)
 
-    if any_is("frequency", RESPONSE_NAMES):
+    if any_is("frequency", _RESPONSE_NAMES):
         return True
-    sampled = any(any_is(role, RECORD_NAMES) for role in ("time", *MOTION_KINDS))
+    sampled = any(any_is(role, _RECORD_NAMES) for role in ("time", *MOTION_KINDS))
     return not sampled and any_is("frequency", _PROPOSED_NAMES)
 
 

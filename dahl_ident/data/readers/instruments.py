@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.column_names import split_header
-from dahl_ident.data.raw_columns import Channel, Source, Stored, words
+from dahl_ident.data.raw_columns import Channel, Source, Stored, split_header, words
 from dahl_ident.data.readers.file import File, utf8
 from dahl_ident.data.stated_levels import stated_levels
 from dahl_ident.data.storage import library

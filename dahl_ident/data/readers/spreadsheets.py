@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.column_names import split_header
-from dahl_ident.data.raw_columns import Channel, Source, Stored, words
+from dahl_ident.data.raw_columns import Channel, Source, Stored, split_header, words
 from dahl_ident.data.readers import sheet_process
 from dahl_ident.data.readers.file import MOST_CHANNELS, ZIP_ERRORS, File
 from dahl_ident.data.readers.header import best_run, header, named_channels, refuse_second_header
