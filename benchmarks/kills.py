@@ -34,7 +34,7 @@ COMMANDS = {
     "fit": "fit {}/table.csv --save fit.json --report fit.html --overwrite",
     "sample": "sample {}/table.csv --seed 1 --steps 300 --resume chain.h5 --report chain.html "
     "--overwrite",
-    "plan": "plan {}/fit.json --frequency-hz 5 --displacement 1e-4,1e-2 --time 600 "
+    "plan": "plan {}/fit.json --frequency 5Hz --displacement 0.1:10mm --time 600 "
     "--table plan.csv --overwrite",
     "report": "report {}/table.csv -o report.pdf -o report.html -o report.json --overwrite",
     "campaign": "campaign {}/lab.toml --jobs 2 --report campaign.html --overwrite",

@@ -6,6 +6,8 @@ and nothing else. A message says what was found, what was expected and what to d
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import Any
 
 __all__ = [
@@ -224,3 +226,16 @@ class MultipleSolutionsWarning(UserWarning):
     >>> int((found.amplitude > 0.0).sum())
     3
     """
+
+
+def choices(known: Iterable[str], *words: str) -> str:
+    """Return the known names for a message, and those that unknown words may have meant.
+
+    Examples
+    --------
+    >>> choices(["f_max", "sigma"], "fmax")
+    "f_max, sigma; did you mean 'f_max'?"
+    """
+    names = list(known)
+    near = [repr(name) for word in words for name in get_close_matches(word, names, 1)]
+    return ", ".join(names) + (f"; did you mean {', '.join(near)}?" if near else "")

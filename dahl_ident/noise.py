@@ -53,8 +53,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data.columns import one_of
 from dahl_ident.data.rows import Rows
-from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.errors import DataError
 
 Rho = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
 """A loss: z -> rho(z), rho'(z), rho''(z)."""
@@ -377,8 +378,7 @@ def noise_for(rows: Rows, kind: str | None) -> Noise:
     """
     if kind is None:
         kind = "relative" if rows.covariance is None else "measured"
-    if kind not in NOISE_MODELS:
-        raise ValidationError(f"noise is {kind!r}; expected one of {', '.join(NOISE_MODELS)}")
+    one_of(kind, "noise", NOISE_MODELS)
     if kind == "relative":
         return _relative(rows)
     if kind == "absolute":

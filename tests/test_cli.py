@@ -22,7 +22,7 @@ from tests.command_line import Runner
 
 COMMANDS = (
     "demo", "inspect", "extract", "fit", "sample", "plan", "campaign", "report", "export",
-    "simulate", "datasets",
+    "simulate", "datasets", "template",
 )  # fmt: skip
 PROGRAM = Path(sys.executable).with_name("dahl-ident")
 
@@ -47,7 +47,7 @@ def test_command_line_and_python_give_the_same_numbers(run: Runner) -> None:
         assert told[name]["stderr"] == fit.params[name].stderr
         assert whole["budget"]["parameters"][name]["U"] == fit.budget()[name].U
     alpha = whole["assumed"]["alpha"]
-    assert f"(here {alpha['value']:.3f} +- {alpha['stderr']:.3f})" in fit.verdict
+    assert f"(here {alpha['value']:.3f} ± {alpha['stderr']:.3f})" in fit.verdict
 
 
 def test_a_missing_file_is_one_line_and_status_1(run: Runner) -> None:
@@ -68,6 +68,10 @@ def test_a_missing_file_is_one_line_and_status_1(run: Runner) -> None:
             ("simulate", "--f-max", "1", "--sigma", "2", "--levels", "a:b:c"),
             "levels is 'a:b:c'; expected numbers",
         ),
+        (("datasets", "nosy"), "did you mean 'noisy'?"),
+        (("template", "reprot"), "did you mean 'report'?"),
+        (("sample", "-", "--prior", "fmax=1:2"), "did you mean 'f_max'?"),
+        (("fit", "-", "--start", "sgma=1"), "did you mean 'sigma'?"),
         (("datasets", "nosuch"), "there is no data set 'nosuch'; there are"),
         (("datasets", "-o", "x.csv"), "--output needs the name of a data set"),
         (("sample", "-", "--prior", "f_max"), "prior is 'f_max'; expected a name and two bounds"),
@@ -366,12 +370,14 @@ def test_a_chain_goes_on_from_its_file(run: Runner) -> None:
     assert second["summary"]["sigma"]["mean"] == whole["summary"]["sigma"]["mean"]
 
 
-def test_no_color_is_obeyed_on_a_terminal() -> None:
+def test_the_status_is_coloured_on_a_terminal_unless_no_color(tmp_path: Path) -> None:
     pty = pytest.importorskip("pty", reason="terminals are POSIX")
+    table = tmp_path / "noisy.csv"
+    di.load_dataset("noisy").save(table)
     for extra, coloured in (({}, True), ({"NO_COLOR": "1"}, False)):
         ours, theirs = pty.openpty()
         process = subprocess.Popen(
-            [str(PROGRAM), "datasets"], stdout=theirs, stderr=theirs,
+            [str(PROGRAM), "fit", str(table)], stdout=theirs, stderr=theirs,
             env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "100", **extra},
         )  # fmt: skip
         os.close(theirs)
@@ -386,8 +392,9 @@ def test_no_color_is_obeyed_on_a_terminal() -> None:
             out += part
         process.wait(timeout=60)
         os.close(ours)
-        assert (re.search(rb"\x1b\[[0-9;]*3[0-9]", out) is not None) <= coloured
-        assert b"noisy" in out
+        green = re.search(rb"\x1b\[[0-9;]*32m *Trusted\x1b\[0m\.", out) is not None
+        assert green == coloured
+        assert b"f_max" in out
 
 
 def test_a_progress_bar_stays_out_of_the_results(tmp_path: Path) -> None:
@@ -432,13 +439,83 @@ def test_a_bootstrap_from_a_negative_seed_is_refused(run: Runner) -> None:
     assert outcome.err == "error: seed is -2; expected a whole number >= 0\n"
 
 
-def test_completion_knows_the_commands() -> None:
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        ("da", "datasets"),
+        ("datasets noi", "noisy"),
+        ("fit --method ip", "ipopt"),
+        ("export fit.json --to mujoco-", "mujoco-frictionloss"),
+        ("template op", "options"),
+    ],
+)
+def test_the_shell_completes_commands_and_values(words: str, completed: str) -> None:
+    typed = f"dahl-ident {words}"
     environment = {
-        **os.environ, "_DAHL_IDENT_COMPLETE": "complete_bash", "COMP_WORDS": "dahl-ident da",
-        "COMP_CWORD": "1",
+        **os.environ, "_DAHL_IDENT_COMPLETE": "complete_bash", "COMP_WORDS": typed,
+        "COMP_CWORD": str(len(typed.split()) - 1),
     }  # fmt: skip
     done = subprocess.run([str(PROGRAM)], env=environment, capture_output=True, text=True)
-    assert done.stdout.split() == ["datasets"]
+    assert done.stdout.split() == [completed]
+
+
+def test_every_template_is_read_by_its_option(run: Runner) -> None:
+    for name in ("report", "options", "columns", "campaign"):
+        assert run("template", name, "-o", f"{name}.toml").status == 0
+    assert run("template", "report").out == Path("report.toml").read_text(encoding="utf-8")
+    noise = np.random.default_rng(1)
+    table = "f [Hz],x [um],K,phi\n" + "".join(
+        f"1,{1e6 * A},{1e-3 * abs(N)},{np.degrees(np.angle(N))}\n"
+        for A in np.geomspace(1e-3, 3e-2, 12)
+        for N in [complex(di.Dahl(0.1, 30.0).describing_function([A])[0] * noise.normal(1.0, 1e-3))]
+    )
+    Path("data/pivot").mkdir(parents=True)
+    Path("data/pivot/one.csv").write_text(table, encoding="utf-8")
+    read = ("fit", "data/pivot/one.csv", "--columns", "columns.toml", "--json")
+    fitted = json.loads(run(*read, "--metadata", "report.toml").out)["params"]
+    assert fitted["f_max"]["value"] == pytest.approx(0.1, rel=0.01)
+    assert fitted["force_gain"]["stderr"] == pytest.approx(0.0025, rel=0.01)
+    assert fitted["displacement_gain"]["stderr"] == pytest.approx(0.001, rel=0.01)
+    optioned = json.loads(run(*read, "--noise", "relative", "--config", "options.toml").out)
+    assert optioned["params"]["mass"]["value"] == pytest.approx(0.3)
+    listed = run("campaign", "campaign.toml", "--dry-run")
+    assert "to do: pivot" in listed.out, listed.err
+
+
+def test_quantities_take_their_unit(run: Runner) -> None:
+    plant = ("--f-max", "100mN", "--sigma", "0.03N/mm", "--mass", "300g")
+    drive = ("--controlled", "force", "--levels", "50:200mN:9", "--frequency", "1,2Hz")
+    assert run("simulate", *plant, *drive, "-o", "plant.csv").status == 0
+    data = di.read_frequency_response("plant.csv")
+    assert data.drive is not None
+    assert sorted(set(data.frequency_hz)) == [1.0, 2.0]
+    assert data.drive.min() == pytest.approx(0.05)
+    assert data.drive.max() == pytest.approx(0.2)
+    fit = ("fit", "plant.csv", "--json", "--noise", "relative", "--mass", "0.3kg")
+    params = json.loads(run(*fit, "--f-max", "0.1 N").out)["params"]
+    assert (params["mass"]["value"], params["f_max"]["vary"]) == (pytest.approx(0.3), False)
+    assert params["sigma"]["value"] == pytest.approx(30.0, rel=1e-6)
+
+
+def test_quiet_leaves_errors_and_what_goes_to_standard_output(run: Runner) -> None:
+    table = run("datasets", "noisy", "-o", "-", "--quiet").out
+    assert "frequency_hz" in table
+    told = run("fit", "-", "--quiet", "--save", "f.json", "--report", "r.html", stdin=table)
+    assert (told.status, told.out, told.err) == (0, "", "")
+    assert json.loads(run("fit", "-", "-q", "--json", stdin=table).out)["trusted"]
+    assert run("fit", "absent.csv", "-q").err.startswith("error: absent.csv")
+    assert run("fit", "-", stdin=table).out, "the next command prints again"
+
+
+@pytest.mark.parametrize("command", ["datasets", "simulate"])
+def test_lists_keep_to_a_narrow_terminal(
+    run: Runner, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    plant = ("--f-max", "0.1", "--sigma", "30") if command == "simulate" else ()
+    told = run(command, *plant).out
+    assert max(map(len, told.splitlines())) <= 60
+    assert command != "simulate" or Experiment.from_toml(told).truth["sigma"] == 30.0
 
 
 WRITING = {
@@ -548,7 +625,7 @@ def test_sensors_are_fixed_free_or_have_a_prior(run: Runner) -> None:
 def test_priors_come_from_a_calibration_sheet(run: Runner) -> None:
     table = run("datasets", "noisy", "-o", "-").out
     Path("lab.toml").write_text(
-        "[sample]\nsteps = 30\n[sample.prior]\nf_max = [0.01, 1]\n"
+        "[sample]\nsteps = 30\n[sample.prior]\nf_max = ['10mN', '1N']\n"
         'sigma = "lognorm(s=0.1, scale=30)"\n',
         encoding="utf-8",
     )

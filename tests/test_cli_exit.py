@@ -26,8 +26,10 @@ POSIX = pytest.mark.skipif(sys.platform == "win32", reason="signals and pipes ar
     [
         (("fit",), ("Missing argument", "files"), "fit"),
         (("fit", "-", "--nosuch"), ("--nosuch",), "fit"),
-        (("fit", "-", "--frequency-hz", "a,2"), ("--frequency-hz", "'a,2'"), "fit"),
-        (("fit", "-", "--frequency-hz", "1"), ("--frequency-hz", "pair of numbers"), "fit"),
+        (("fit", "-", "--frequency", "soon"), ("--frequency", "'soon'"), "fit"),
+        (("plan", "--time", "5kg"), ("--time", "[kg]", "dimension of s"), "plan"),
+        (("fit", "-", "--loss", "hubr"), ("did you mean 'huber'?",), "fit"),
+        (("ft", "-"), ("did you mean 'fit'?",), ""),
         (("fit", "-", "--method", "lmfit"), ("--method", "'lmfit'", "lm, scipy, ipopt"), "fit"),
         (("sample", "-", "--method", "nuts"), ("--method", "'nuts'", "mcmc, grid"), "sample"),
         (("--no-color", "sample", "-", "--steps"), ("--steps", "argument"), "sample"),

@@ -39,3 +39,10 @@ def test_extract_names_its_own_options(monkeypatch: pytest.MonkeyPatch) -> None:
     assert in_options(message) == "Name it with --force ..., or --force 'friction force'"
     monkeypatch.setattr(console._session, "typed", ["fit", "run.csv"])
     assert "--columns map.toml" in in_options(message)
+
+
+def test_ranges_are_options() -> None:
+    shown = in_options("give ranges={'f_max': (low, high), 'mass': (low, high)} that hold")
+    assert shown == "give --ranges f_max=low:high --ranges mass=low:high that hold"
+    shown = in_options("give limits['frequency_hz'], or target={'f_max': 0.02}")
+    assert shown == "give --frequency, or --target f_max=0.02"

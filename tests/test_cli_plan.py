@@ -11,8 +11,8 @@ import pytest
 import dahl_ident as di
 from tests.command_line import Runner
 
-BENCH = ("--frequency-hz", "5", "--displacement", "3e-4,3e-2", "--noise", "0.02")
-RANGES = ("--ranges", "f_max=0.09,0.11", "--ranges", "sigma=27,33")
+BENCH = ("--frequency", "5Hz", "--displacement", "0.3:30mm", "--noise", "0.02")
+RANGES = ("--ranges", "f_max=90:110mN", "--ranges", "sigma=27:33")
 
 
 def test_a_plan_from_ranges_is_that_of_python(run: Runner) -> None:
@@ -34,7 +34,7 @@ def test_a_saved_fit_is_continued_and_files_are_written(run: Runner) -> None:
     table = run("datasets", "noisy", "-o", "-").out
     assert run("fit", "-", "--alpha", "1", "--save", "fit.json", stdin=table).status == 0
     outcome = run(
-        "plan", "fit.json", "--frequency-hz", "5", "--displacement", "3e-4,3e-2", "--time", "20",
+        "plan", "fit.json", "--frequency", "5", "--displacement", "3e-4:3e-2", "--time", "20",
         "--table", "levels.csv", "--waveform", "exciter.csv", "--sample-rate", "100",
     )  # fmt: skip
     assert outcome.status == 0, outcome.err
@@ -50,7 +50,7 @@ def test_motions_in_time_continue_a_fit_of_records(run: Runner) -> None:
     record = di.Record(time, displacement=x, force=di.Dahl(0.1, 30.0).force(x) + noise)
     di.fit(record, di.Dahl(alpha=1.0)).save("fit.json")
     outcome = run(
-        "plan", "fit.json", "--motion", "trapezoid", "--displacement", "1e-3,2e-2", "--speed",
+        "plan", "fit.json", "--motion", "trapezoid", "--displacement", "1e-3:2e-2", "--speed",
         "0.05", "--acceleration", "1", "--time", "20", "--sample-rate", "100",
         "--waveform", "exciter.csv",
         "--table", "motions.csv",
@@ -73,7 +73,9 @@ def test_a_target_out_of_reach_ends_with_3(run: Runner) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--time", "9"), "nothing is known about f_max, sigma; give --ranges"),
+        ((*RANGES, "--target", "fmax=0.1"), "f_max, sigma, alpha; did you mean 'f_max'?"),
+        ((*RANGES, "--force", "1:2:3"), "force is '1:2:3'; expected a number, or low:high"),
+        (("--time", "9s"), "nothing is known about f_max, sigma; give --ranges f_max=low:high"),
         ((*RANGES, "--target", "f_max=a"), "f_max is 'a'; expected a number"),
         ((*RANGES, "--target", "f_max=1", "--target", "sigma"), "with and without a number"),
         ((*RANGES, "--waveform", "w.csv"), "--waveform and --motion need --sample-rate"),

@@ -288,7 +288,7 @@ def test_the_command_line(tmp_path: Path, run: Runner) -> None:
     assert Path("joint.xml").read_text() == fit.export("mujoco")
     refused = run("export", "fit.json", "--to", "mujoco", "-o", "joint.xml")
     assert (refused.status, "exists already" in refused.err) == (1, True)
-    assert "expected one of" in run("export", "fit.json", "--to", "sdf").err
+    assert "'sdf' is not one of mujoco" in run("export", "fit.json", "--to", "sdf").err
     assert run("export", "fit.json").status == 2
     with pytest.raises(DataError):
         fit.export("c", "joint.xml")

@@ -77,7 +77,7 @@ def test_every_command_knows_it(file: Path, run: Runner) -> None:
     assert json.loads(fitted.out)["params"]["k"]["value"] == pytest.approx(30.0, rel=0.02)
     sampled = run("sample", csv, *laws, "--element", kind, "--method", "grid", "--json")
     assert sampled.status == 0
-    planned = run("plan", saved, *laws, "--frequency-hz", "1", "--displacement", "0.03",
+    planned = run("plan", saved, *laws, "--frequency", "1", "--displacement", "0.03",
                   "--noise", "0.01", "--time", "600", "--target", "f_max")  # fmt: skip
     assert planned.status == 0
     page = folder / "page.md"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import re
 from importlib.resources import files
 from pathlib import Path
@@ -21,7 +22,9 @@ from dahl_ident.diagnostics.formatting import listed
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.reporting.markdown import markdown
 from dahl_ident.reporting.sections import document
+from dahl_ident.results.changes import changes
 from tests.browser import CHROMIUM, Page, chromium
+from tests.command_line import Runner
 
 METADATA: dict[str, Any] = {
     "specimen": "Flex pivot 12",
@@ -148,7 +151,7 @@ def test_the_order_is_answer_assumed_pictures_details(fit: di.FitResult, tmp_pat
         "Sources of uncertainty", "Parameters"
     ]  # fmt: skip
     assumed = text.split("## What was assumed")[1].split("## ")[0]
-    assert "Not given, so that the uncertainty counts it: alpha, here 0.996 +- 0.016." in assumed
+    assert "Not given, so that the uncertainty counts it: alpha, here 0.996 ± 0.016." in assumed
     assert f"Taken as exact: {listed(fit.budget().exact)}." in assumed
     stated = fit.budget()["f_max"]
     combined = text.split("## Expanded uncertainty")[1].split("## ")[0]
@@ -188,46 +191,87 @@ def _result_rows(text: str) -> dict[str, list[str]]:
     return {row[0]: row for row in rows[2:]}
 
 
-def test_two_devices_are_overlaid_and_their_changes_judged(
+def runs(f_max: float, seed: int, scatter: float, count: int) -> di.FitResult:
+    """Return a fit of some runs between which the friction scatters, exactly by its share."""
+    rng = np.random.default_rng(seed)
+    shares = 1.0 + scatter * stats.zscore(rng.standard_normal(count), ddof=1)
+    tables = []
+    for i, share in enumerate(shares):
+        one = measured(f_max * share, 100 * seed + i)
+        run = np.full(one.n, f"day {i + 1}")
+        tables.append(di.FrequencyResponse(one.frequency_hz, one.response, one.amplitude, run=run))
+    return di.fit(di.FrequencyResponse.concatenate(tables), di.Dahl(alpha=1.0))
+
+
+def test_two_devices_are_overlaid_and_their_changes_judged(tmp_path: Path) -> None:
+    fit, later = runs(0.1, 1, 0.01, 4), runs(0.15, 2, 0.01, 4)
+    facts = json.loads(report([fit, later], tmp_path / "r.json").read_text("utf-8"))
+    found = {change["parameter"]: change for change in facts["changes"]}
+    assert found["f_max"]["significant"]
+    assert not found["sigma"]["significant"]
+    for name, change in found.items():
+        one, other = fit.budget()[name], later.budget()[name]
+        u = math.hypot(one.u, other.u)
+        z = (other.value - one.value) / u
+        assert change["u"] == pytest.approx(u)
+        assert change["p"] == pytest.approx(2.0 * (1.0 - stats.norm.cdf(abs(z))), abs=1e-12)
+    text = report([fit, later], tmp_path / "r.md").read_text("utf-8").replace("\\", "")
+    assert re.search(r"f_max from .*: 0.0[45]\d* ± 0.00\d* N .*: significant", text)
+    assert (tmp_path / "r_pictures" / "overlay.png").exists()
+
+
+def test_scatter_between_runs_counts_in_the_change_of_a_single_run(fit: di.FitResult) -> None:
+    """A single day compared with four: its own scatter is that of the four."""
+    several = runs(0.103, 3, 0.02, 4)
+    change = next(c for c in changes({"a": fit, "b": several}) if c.parameter == "f_max")
+    assert change.runs_known
+    assert change.u > 0.02 * 0.1, "one day of a device that scatters by 2 % between days"
+    assert not change.significant
+    single = next(c for c in changes({"a": fit, "b": fit}) if c.parameter == "f_max")
+    assert not single.runs_known
+
+
+def test_two_single_runs_leave_open_whether_the_device_changed(
     fit: di.FitResult, tmp_path: Path
 ) -> None:
     later = di.fit(measured(0.11, 2, file="later.csv"), di.Dahl())
     facts = json.loads(report([fit, later], tmp_path / "r.json").read_text("utf-8"))
-    changes = {change["parameter"]: change for change in facts["changes"]}
-    assert changes["f_max"]["significant"]
-    assert not changes["sigma"]["significant"]
-    for name, change in changes.items():
-        one, other = fit.params[name], later.params[name]
-        assert one.stderr is not None
-        assert other.stderr is not None
-        u = (one.stderr**2 + other.stderr**2) ** 0.5
-        z = (other.value - one.value) / u
-        assert change["u"] == pytest.approx(u)
-        assert change["p"] == pytest.approx(2.0 * (1.0 - stats.norm.cdf(abs(z))), abs=1e-12)
     assert [file["file"] for file in facts["files"]] == ["pivot.csv", "later.csv"]
-    text = report([fit, later], tmp_path / "r.md").read_text("utf-8").replace("\\", "")
-    assert "f_max changes from pivot to later:" in text
-    assert (tmp_path / "r_pictures" / "overlay.png").exists()
+    change = next(c for c in facts["changes"] if c["parameter"] == "f_max")
+    assert (change["p"] < 1e-4, change["significant"]) == (True, False)
+    assert any("scatter between runs" in line for line in facts["verdict"])
 
 
 def test_a_change_of_what_is_not_determined_is_not_judged(
     fit: di.FitResult, microslip: di.FitResult, tmp_path: Path
 ) -> None:
     facts = json.loads(report([fit, microslip], tmp_path / "r.json").read_text("utf-8"))
-    changes = {change["parameter"]: change for change in facts["changes"]}
-    assert (changes["f_max"]["p"], changes["f_max"]["significant"]) == (None, False)
-    assert changes["sigma"]["p"] is not None
+    found = {change["parameter"]: change for change in facts["changes"]}
+    assert (found["f_max"]["p"], found["f_max"]["significant"]) == (None, False)
+    assert found["sigma"]["p"] is not None
+
+
+def test_two_saved_fits_say_what_changed(run: Runner, fit: di.FitResult) -> None:
+    fit.save("monday.json")
+    di.fit(measured(0.11, 2), di.Dahl()).save("friday.json")
+    told = run("fit", "monday.json", "friday.json", "--report", "change.html")
+    assert told.status == 0, told.err
+    assert re.search(r"f_max from monday to friday: 0.0\d+ ± 0.00\d+ N \(\+1\d %, p < 0", told.out)
+    assert "sigma from monday to friday: " in told.out
+    assert "Each fit is of a single run" in told.out
+    assert Path("change.html").exists()
+    assert "give no other options" in run("fit", "monday.json", "friday.json", "--mass", "1").err
+    as_json = json.loads(run("fit", "monday.json", "friday.json", "--json").out)
+    assert {c["parameter"] for c in as_json} == {"f_max", "sigma"}
 
 
 def test_equal_devices_seldom_change_significantly() -> None:
     """At 5 %, 2 parameters of 60 pairs: more than 14 significant ones have probability 0.1 %."""
-    from dahl_ident.reporting.overlay import _changes
-
     fits = [di.fit(measured(0.1, seed), di.Dahl()) for seed in range(120)]
     found = [
-        change["significant"]
+        change.p < 0.05
         for a, b in zip(fits[::2], fits[1::2], strict=True)
-        for change in _changes("a", a, "b", b)
+        for change in changes({"a": a, "b": b})
     ]
     assert len(found) == 120
     assert stats.binom.sf(sum(found) - 1, 120, 0.05) > 1e-3

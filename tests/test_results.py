@@ -277,7 +277,7 @@ class TestReport:
     def test_priors_losses_and_units_are_told(self) -> None:
         sensors = Sensors(force_gain=stats.norm(1.0, 0.005))
         told = fit(table(), Dahl(), sensors=sensors).fit_report()
-        assert "prior of force_gain: 1 +- 0.005" in told
+        assert "prior of force_gain: 1 ± 0.005" in told
         assert "robust loss: huber" in fit(table(), Dahl(), loss="huber").fit_report()
         absolute = fit(table(), Dahl(), noise="absolute").fit_report()
         assert "N/m, estimated with" in absolute
@@ -294,7 +294,7 @@ class TestReport:
 
     def test_repr_is_one_line(self, result: FitResult) -> None:
         assert repr(result) == (
-            "<FitResult: f_max = 0.09957 +- 0.00039 N, sigma = 30.016 +- 0.063 N/m; converged>"
+            "<FitResult: f_max = 0.09957 ± 0.00039 N, sigma = 30.016 ± 0.063 N/m; converged>"
         )
 
     def test_frame(self, result: FitResult) -> None:

@@ -27,6 +27,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.decorrelation import Decorrelation, decorrelation_of
 from dahl_ident.bayes.priors import JointPrior
 from dahl_ident.bayes.row_errors import RowErrors
+from dahl_ident.data.columns import one_of
 from dahl_ident.errors import SamplingError, ValidationError
 from dahl_ident.fitting import solve
 from dahl_ident.problem import Problem, Quadratic
@@ -61,10 +62,7 @@ class Density:
 
     def __post_init__(self) -> None:
         problem = self.problem
-        if self.likelihood not in LIKELIHOODS:
-            raise ValidationError(
-                f"likelihood is {self.likelihood!r}; expected one of {', '.join(LIKELIHOODS)}"
-            )
+        one_of(self.likelihood, "likelihood", LIKELIHOODS)
         if self.likelihood == "student_t" and not problem.gaussian:
             raise ValidationError(
                 "likelihood='student_t' is for Gaussian noise with outliers, but the covariance of "

@@ -29,7 +29,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray, finite_array
 from dahl_ident.elements import Parameter
-from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.errors import ModelError, ValidationError, choices
 from dahl_ident.problem import Problem
 
 _DECADES = 1e5  # beyond the data's sizes, either way: as data far from the knee leave open
@@ -243,7 +243,8 @@ def joint_prior(
     unknown = [name for name in given if name not in problem.names]
     if unknown:
         raise ModelError(
-            f"there is a prior for {', '.join(unknown)}, but free are {', '.join(problem.names)}"
+            f"there is a prior for {', '.join(unknown)}, but free are "
+            f"{choices(problem.names, *unknown)}"
         )
     estimates = np.full(len(problem.names), np.nan) if estimate is None else estimate
     parts = []

@@ -31,7 +31,7 @@ from dahl_ident.bayes.priors import (
     checked_prior,
     default_bounds,
 )
-from dahl_ident.errors import FitError, ModelError, SamplingError
+from dahl_ident.errors import FitError, ModelError, SamplingError, choices
 from dahl_ident.fitting.record_start import in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
@@ -185,7 +185,9 @@ def record_prior(
     names = [p.name for p in problem.free]
     unknown = [name for name in given if name not in names]
     if unknown:
-        raise ModelError(f"there is a prior for {', '.join(unknown)}, but free are {names}")
+        raise ModelError(
+            f"there is a prior for {', '.join(unknown)}, but free are {choices(names, *unknown)}"
+        )
     parts = []
     for parameter, at in zip(problem.free, estimate.tolist(), strict=False):
         if parameter.name in given:

@@ -21,6 +21,7 @@ from dahl_ident.cli.plan import plan
 from dahl_ident.cli.report import report
 from dahl_ident.cli.sample import sample
 from dahl_ident.cli.simulate import simulate
+from dahl_ident.cli.template import template
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.version import __version__
 
@@ -38,6 +39,7 @@ app = typer.Typer(
 )
 commands = (
     demo, inspect, extract, fit, sample, plan, campaign, report, export, simulate, datasets,
+    template,
 )  # fmt: skip
 for command in commands:
     app.command()(command)

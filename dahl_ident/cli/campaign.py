@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import console
-from dahl_ident.cli.options import LawFiles, Laws
+from dahl_ident.cli.option_groups import with_option_groups
+from dahl_ident.cli.options import General, Laws, Writing, quantity
 from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:
@@ -23,9 +24,12 @@ _LINE_EVERY = 60.0
 """Seconds between lines of progress where there is no terminal."""
 
 
+@with_option_groups
 def campaign(
+    general: General,
+    laws: Laws,
+    writing: Writing,
     definition: Annotated[Path, typer.Argument(help="TOML file that defines the campaign.")],
-    laws: LawFiles = None,
     jobs: Annotated[
         int | None, typer.Option(help="Processes; by default as many as processors.")
     ] = None,
@@ -34,13 +38,13 @@ def campaign(
     ] = None,
     timeout: Annotated[
         float | None,
-        typer.Option(help="Most seconds for a device; by default 10 medians, at least 60."),
+        quantity("Longest time for a device; by default 10 medians, at least 60 s.", "s"),
     ] = None,
     memory: Annotated[
         float | None, typer.Option(help="Most memory for a device, GB; by default a fair share.")
     ] = None,
     patience: Annotated[
-        float, typer.Option(help="Most seconds without an answer of the scheduler.")
+        float, quantity("Longest time without an answer of the scheduler.", "s")
     ] = 120.0,
     send_files: Annotated[
         bool, typer.Option("--send-files", help="Send workers the contents of files, not paths.")
@@ -58,10 +62,6 @@ def campaign(
     redo: Annotated[
         bool, typer.Option("--redo", help="Repeat all fits if options have changed.")
     ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an existing report.")
-    ] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Read, extract and fit the files of many devices into one table.
 
@@ -73,9 +73,9 @@ def campaign(
     from dahl_ident.campaigns.population import USABLE
     from dahl_ident.campaigns.run import run
 
-    Laws(laws).run()
+    laws.run()
     read = read_definition(definition)
-    _check_report(report, overwrite, covariate, order, read)
+    _check_report(report, writing.overwrite, covariate, order, read)
     with ExitStack() as stack:
         progress = stack.enter_context(_progress()) if sys.stderr.isatty() else _lines()
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # this command says it itself
@@ -89,10 +89,10 @@ def campaign(
             covariates=covariate,
             order=order,
             title=definition.stem,
-            overwrite=overwrite,
+            overwrite=writing.overwrite,
         )
-        console.write_error(f"report: {place}")
-    if json:
+        console.note(f"report: {place}")
+    if general.json:
         facts = {"finished": list(done.finished), "to_do": list(done.to_do)}
         console.write_json({**facts, "statuses": dict(done.statuses), "folder": str(done.folder)})
     else:
@@ -144,9 +144,7 @@ def _lines() -> Callable[[int, int, Mapping[str, Any]], None]:
             shown = now
             rate = done / (now - began)
             left = (total - done) / rate / 60.0
-            console.write_error(
-                f"{done} of {total} fits, {rate:.3g} a second, {left:.0f} minutes left"
-            )
+            console.note(f"{done} of {total} fits, {rate:.3g} a second, {left:.0f} minutes left")
 
     return update
 

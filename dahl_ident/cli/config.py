@@ -16,7 +16,7 @@ from typing import Any
 
 import typer
 
-from dahl_ident.errors import DataError
+from dahl_ident.errors import DataError, choices
 
 
 def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
@@ -64,7 +64,7 @@ def _refuse_unknown(path: Path, what: str, given: Iterable[str], known: Collecti
     unknown = sorted(set(given) - set(known))
     if unknown:
         raise DataError(
-            f"{path}: {what} {', '.join(unknown)}; there are {', '.join(sorted(known))}"
+            f"{path}: {what} {', '.join(unknown)}; there are {choices(sorted(known), *unknown)}"
         )
 
 

@@ -28,12 +28,15 @@ BAD_INPUT = 1  # exit status, as are the others; the one of any uncaught error
 WRONG_USE = 2  # as click has it for unknown options
 NOT_TRUSTED = 3  # the first that is free
 _NARROWEST = 40  # columns; in narrower windows indented lines would hold a word or two
+_STATUS = re.compile(r"\s*(Trusted|Approximate|Not determined|Not described)(?=\.)")
+_STYLES = {"Trusted": "bold green", "Approximate": "bold yellow"}
 INTERRUPTED = 130  # as shells have it: 128 and the number of SIGINT
 
 
 @dataclass
 class _Session:
     color: bool = True
+    quiet: bool = False
     typed: Sequence[str] = ()
 
 
@@ -44,9 +47,9 @@ def begin(typed: Sequence[str]) -> None:
     """Store the command, and show warnings as plain lines, without file and code."""
 
     def show(message: Warning | str, *_: Any) -> None:
-        write_error(f"warning: {in_options(str(message))}")
+        note(f"warning: {in_options(str(message))}")
 
-    _session.typed = typed
+    _session.typed, _session.quiet = typed, False
     if isinstance(sys.stdout, io.TextIOWrapper):
         # the name of a file, or a unit, may hold what the terminal's encoding does not
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -80,8 +83,14 @@ def in_options(message: str) -> str:
             return f"--{name.replace('_', '-')}"
         return f"--{name.replace('_', '-')}{' ' if value else ''}{value}"
 
+    def assigned(found: re.Match[str]) -> str:
+        pairs = re.findall(r"'([^']+)': (?:\((\w+), (\w+)\)|([^,}]+))", found[2])
+        return " ".join(f"{found[1]} {n}={value or f'{a}:{b}'}" for n, a, b, value in pairs)
+
     message = re.sub(r"columns=(\{(?:[^{}]|\{[^{}]*\})*\})", _column_map, message)
     message = re.sub(r"(?<![\w.(-])([a-z]+(?:_[a-z]+)*)=(True\b|['\"\w]?)", option, message)
+    message = re.sub(r"(--(?:ranges|target|start|suspects)) ?\{([^}]*)\}", assigned, message)
+    message = re.sub(r"limits\['([a-z]+)(?:_hz)?'\]", r"--\1", message)
     return message.replace("di.fit(record, model)", "dahl-ident fit --record")
 
 
@@ -120,6 +129,11 @@ def use_color(color: bool) -> None:
     _session.color = color
 
 
+def be_quiet(quiet: bool) -> None:
+    """Leave out everything but errors, JSON, and files on standard output."""
+    _session.quiet = quiet
+
+
 def _terminal() -> Console:
     """Return the console for results; colour and width follow the terminal."""
     from rich.console import Console
@@ -130,12 +144,23 @@ def _terminal() -> Console:
         highlight=False,
         soft_wrap=True,
         width=None if terminal else 100,
+        quiet=_session.quiet,
     )
 
 
 def write(text: str) -> None:
-    """Print a text unchanged."""
-    sys.stdout.write(f"{text}\n")
+    """Print a text unchanged, the status of a result in colour where there is a terminal."""
+    if _session.quiet:
+        return
+    status = _STATUS.match(text) if sys.stdout.isatty() else None
+    if status is None:
+        sys.stdout.write(f"{text}\n")
+        return
+    from rich.text import Text
+
+    styled = Text(text)
+    styled.stylize(_STYLES.get(status[0].strip(), "bold red"), *status.span())
+    _terminal().print(styled)
 
 
 def write_wrapped(text: str) -> None:
@@ -155,12 +180,19 @@ def write_error(text: str) -> None:
     sys.stderr.write(f"{text}\n")
 
 
+def note(text: str) -> None:
+    """Print one line on standard error that --quiet leaves out."""
+    if not _session.quiet:
+        write_error(text)
+
+
 def write_json(value: Any) -> None:
     """Print one JSON document."""
     from dahl_ident.data.storage import plain_data
 
     known = plain_data(value, not_finite=lambda _: None)
-    write(json.dumps(known, indent=2, ensure_ascii=False, allow_nan=False))
+    text = json.dumps(known, indent=2, ensure_ascii=False, allow_nan=False)
+    sys.stdout.write(f"{text}\n")
 
 
 def table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -9,8 +9,14 @@ import typer
 from dahl_ident.cli import console
 from dahl_ident.cli.files import write_data
 from dahl_ident.cli.option_groups import with_option_groups
-from dahl_ident.cli.options import General, Writing
+from dahl_ident.cli.options import General, Writing, starting
 from dahl_ident.errors import ValidationError
+
+
+def _names(incomplete: str) -> list[str]:
+    from dahl_ident.synthetic.catalogue import DATA_SETS
+
+    return starting(DATA_SETS)(incomplete)
 
 
 @with_option_groups
@@ -18,7 +24,10 @@ def datasets(
     general: General,
     writing: Writing,
     name: Annotated[
-        str | None, typer.Argument(help="Data set to describe or copy; lists all if left out.")
+        str | None,
+        typer.Argument(
+            help="Data set to describe or copy; lists all if left out.", autocompletion=_names
+        ),
     ] = None,
     output: Annotated[
         str | None,
@@ -47,14 +56,11 @@ def datasets(
     if general.json:
         console.write_json([_facts(one.name) for one in DATA_SETS.values()])
         return
-    console.table(
-        "Shipped data sets",
-        ("name", "kind", "what it shows", "determines"),
-        [
-            (one.name, one.kind.replace("_", " "), one.teaches, ", ".join(one.identifiable))
-            for one in DATA_SETS.values()
-        ],
-    )
+    for one in DATA_SETS.values():
+        kind = one.kind.replace("_", " ")
+        console.write_wrapped(
+            f"{one.name} ({kind}): {one.teaches}. Determines {', '.join(one.identifiable)}."
+        )
 
 
 def _facts(name: str) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""Parsing of numbers, bounds and distributions: ``0.3``, ``0.01:1``, ``norm(1, 0.005)``."""
+"""Values as they are typed: ``0.3``, ``50um``, ``0.01:1``, ``1,2,5Hz``, ``norm(1, 0.005)``."""
 
 from __future__ import annotations
 
@@ -14,23 +14,70 @@ if TYPE_CHECKING:
 
 FREE = "free"
 _CALL = re.compile(r"(?:scipy\.)?(?:stats\.)?(\w+)\((.*)\)")
+_QUANTITY = re.compile(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\s\d.,]?.*?)\s*")
 
 
-def number(name: str, text: str) -> float:
-    """Return a parameter's value.
+def number(name: str, text: str, unit: str | None = None) -> float:
+    """Return a number in SI, or one with its unit such as ``50um``.
+
+    Parameters
+    ----------
+    name : str
+        For the message; its last word may be that of a parameter.
+    text : str
+        As typed.
+    unit : str, optional
+        SI unit; by default that of the parameter.
 
     Raises
     ------
     ModelError
         If the text is not a value.
+    UnitError
+        If its unit has another dimension.
     """
     try:
         value = float(text)
     except ValueError:
-        value = math.nan
+        value = _quantity(name, text, unit)
     if not math.isfinite(value):
-        raise ModelError(f"{name} is {text!r}; expected a number in SI units, or '{FREE}'")
+        raise ModelError(
+            f"{name} is {text!r}; expected a number in SI units or with its unit, or '{FREE}'"
+        )
     return value
+
+
+def _quantity(name: str, text: str, unit: str | None) -> float:
+    """Return a number with its unit in SI; NaN for other text."""
+    if _QUANTITY.fullmatch(text) is None:
+        return math.nan
+    from dahl_ident.elements.element import KINDS
+    from dahl_ident.units import SI_UNITS, parse_quantity
+
+    if unit is None:
+        units = {p.name: p.unit for law in KINDS.values() for p in law.parameters}
+        units |= {"displacement_gain": "1", "force_gain": "1", "delay": "s"}
+        parameter = name.split()[-1]
+        unit = next((u for n, u in units.items() if f"_{parameter}".endswith(f"_{n}")), "")
+    kinds = tuple(kind for kind, both in SI_UNITS.items() if unit in both)
+    return parse_quantity(text, kinds, name)[0] if kinds else math.nan
+
+
+def numbers(name: str, text: str, unit: str | None = None, sep: str = ":") -> list[float]:
+    """Return the numbers of ``1:50um``; a unit after the last holds for those without one."""
+    parts = text.split(sep)
+    read = [_QUANTITY.fullmatch(part) for part in parts]
+    last = read[-1][2] if read[-1] else ""
+    parts = [f"{q[1]}{q[2] or last}" if q else part for q, part in zip(read, parts, strict=True)]
+    return [number(name, part, unit) for part in parts]
+
+
+def ends(name: str, text: str, unit: str | None = None) -> float | tuple[float, float]:
+    """Return the two ends of ``low:high``, or one number."""
+    given = numbers(name, text, unit)
+    if len(given) > 2:
+        raise ValidationError(f"{name} is {text!r}; expected a number, or low:high")
+    return given[0] if len(given) == 1 else (given[0], given[1])
 
 
 def number_or_free(name: str, text: str | None) -> float | None:
@@ -53,14 +100,13 @@ def prior(assigned: str) -> tuple[str, PriorLike]:
     name, _, text = assigned.partition("=")
     if "(" in text:
         return name, distribution(name, text)
-    try:
-        low, high = (float(part) for part in text.split(":"))
-    except ValueError as exc:
+    bounds = ends(f"prior of {name}", text) if text else None
+    if not isinstance(bounds, tuple):
         raise ValidationError(
             f"prior is {assigned!r}; expected a name and two bounds or a distribution, such as "
             "f_max=0.01:1 or mass=norm(0.3,0.001)"
-        ) from exc
-    return name, (low, high)
+        )
+    return name, bounds
 
 
 def values(option: str, assigned: Sequence[str]) -> dict[str, float]:

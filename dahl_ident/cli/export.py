@@ -8,10 +8,9 @@ from typing import Annotated
 import typer
 
 from dahl_ident.cli.files import written
-from dahl_ident.cli.fit import finish
+from dahl_ident.cli.fit import finish, saved_fit
 from dahl_ident.cli.option_groups import with_option_groups
-from dahl_ident.cli.options import Files, General, Laws, Seed, Writing
-from dahl_ident.cli.report import saved_fit
+from dahl_ident.cli.options import Files, General, Laws, Seed, Writing, one_of
 from dahl_ident.errors import ValidationError
 
 
@@ -23,9 +22,19 @@ def export(
     writing: Writing,
     to: Annotated[
         str,
-        typer.Option(
-            help="mujoco, mujoco-frictionloss, urdf, modelica, matlab, c, gtc, ufloat, latex or "
-            "draws."
+        one_of(
+            "Format: a simulator, a controller, a paper, or other budgets.",
+            None,
+            "mujoco",
+            "mujoco-frictionloss",
+            "urdf",
+            "modelica",
+            "matlab",
+            "c",
+            "gtc",
+            "ufloat",
+            "latex",
+            "draws",
         ),
     ] = "",
     output: Annotated[

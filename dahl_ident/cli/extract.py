@@ -22,6 +22,9 @@ from dahl_ident.cli.options import (
     General,
     Sheet,
     Writing,
+    controlled_option,
+    one_of,
+    quantity,
 )
 
 if TYPE_CHECKING:
@@ -49,12 +52,11 @@ class Extracting:
     """Measurement of points; the options of ``extract``."""
 
     frequency: Annotated[
-        float | None,
-        typer.Option(help="Excitation frequency if known, Hz.", rich_help_panel=_EXTRACTING),
+        float | None, quantity("Excitation frequency if known.", "Hz", _EXTRACTING)
     ] = None
-    mode: Annotated[
-        str, typer.Option(help="auto, steps or sweep.", rich_help_panel=_EXTRACTING)
-    ] = "auto"
+    mode: Annotated[str, one_of("auto, steps or sweep.", _EXTRACTING, "auto", "steps", "sweep")] = (
+        "auto"
+    )
     num_periods: Annotated[
         int | None,
         typer.Option(help="Last periods of each segment to use.", rich_help_panel=_EXTRACTING),
@@ -71,12 +73,7 @@ class Extracting:
             rich_help_panel=_EXTRACTING,
         ),
     ] = None
-    controlled: Annotated[
-        str,
-        typer.Option(
-            help="Controlled quantity: displacement or force.", rich_help_panel=_EXTRACTING
-        ),
-    ] = "displacement"
+    controlled: Annotated[str, controlled_option(_EXTRACTING)] = "displacement"
     min_share: Annotated[
         float,
         typer.Option(help="Minimum share of the sine in the power.", rich_help_panel=_EXTRACTING),
@@ -157,7 +154,7 @@ def tell_of_sweeps(data: FrequencyResponse, files: list[str], reading: dict[str,
         given = (item for item in reading.items() if item[1] != vars(RecordReading())[item[0]])
         words = [w for name, value in given for w in (f"--{name.replace('_', '-')}", str(value))]
         command = shlex.join(["dahl-ident", "fit", "--record", *files, *words])
-        console.write_error(
+        console.note(
             f"{len(fast)} of {len(verdicts)} points are of a sweep that friction could not follow. "
             f"Its waveforms can be fitted at once, without that error: {command}"
         )
@@ -171,7 +168,7 @@ def good_points(data: FrequencyResponse) -> FrequencyResponse:
     good = data.quality["verdict"] == "good"
     rows = (~good & (data.harmonic == data.harmonic.min())).nonzero()[0].tolist()
     for i, name in zip(rows, row_names(data, rows), strict=True):
-        console.write_error(f"left out: {name}: {data.quality['verdict'][i]}")
+        console.note(f"left out: {name}: {data.quality['verdict'][i]}")
     if not good.any():
         raise ExtractionError("no point is good; without --good-only the table holds them all")
     return data.select(rows=good)

@@ -23,10 +23,11 @@ from dahl_ident.cli.options import (
     Laws,
     Reading,
     Writing,
+    noise_option,
     one_of,
     steady_option,
 )
-from dahl_ident.errors import FitInterrupted, ValidationError
+from dahl_ident.errors import DataError, FitInterrupted, ValidationError
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse, Record
@@ -51,10 +52,12 @@ AsRecords = Annotated[
 ]
 Predicted = Annotated[
     str | None,
-    typer.Option(
-        help="With --record: force or motion is predicted from the other; by default motion where "
+    one_of(
+        "With --record: force or motion is predicted from the other; by default motion where "
         "the model has a mass.",
-        callback=one_of("force", "motion"),
+        None,
+        "force",
+        "motion",
     ),
 ]
 
@@ -65,24 +68,24 @@ class Estimating:
 
     method: Annotated[
         str,
-        typer.Option(
-            help="lm, scipy (least_squares) or ipopt (exact second derivatives).",
-            callback=one_of("lm", "scipy", "ipopt"),
-            rich_help_panel=_ESTIMATING,
+        one_of(
+            "lm, scipy (least_squares) or ipopt (exact second derivatives).",
+            _ESTIMATING,
+            "lm",
+            "scipy",
+            "ipopt",
         ),
     ] = "lm"
-    noise: Annotated[
-        str | None,
-        typer.Option(
-            help="measured, relative or absolute; by default measured if a covariance is known.",
-            rich_help_panel=_ESTIMATING,
-        ),
-    ] = None
+    noise: Annotated[str | None, noise_option(_ESTIMATING)] = None
     loss: Annotated[
         str,
-        typer.Option(
-            help="linear, huber, soft_l1 or student_t; all but the first down-weight outliers.",
-            rich_help_panel=_ESTIMATING,
+        one_of(
+            "linear, huber, soft_l1 or student_t; all but the first down-weight outliers.",
+            _ESTIMATING,
+            "linear",
+            "huber",
+            "soft_l1",
+            "student_t",
         ),
     ] = "linear"
     steady: Annotated[str, steady_option(_ESTIMATING)] = "exact"
@@ -125,6 +128,8 @@ def fit(
 ) -> None:
     """Estimate a model's parameters, and state whether the data determine them.
 
+    Of several saved fits, such as monday.json friday.json, it says what changed.
+
     Example: dahl-ident datasets noisy -o - | dahl-ident fit -
     """
     from dahl_ident.data.storage import place_of
@@ -132,6 +137,13 @@ def fit(
     from dahl_ident.results.result import FORMATS
 
     laws.run()
+    if len(files) > 1 and all(map(is_saved, files)):
+        if (reading, channels, model, estimating) != (
+            Reading(), Channels(), ModelOptions(metadata=model.metadata), Estimating()
+        ) or save is not None:  # fmt: skip
+            raise ValidationError("saved fits are compared as they are; give no other options")
+        _compare_saved(files, general, writing, report, model)
+        return
     writing.check([report, save], files, json=general.json)
     check_reports(report)
     if save is not None:
@@ -175,19 +187,59 @@ def fit(
     finish(result)
 
 
+def _compare_saved(
+    files: list[str], general: General, writing: Writing, report: str | None, model: ModelOptions
+) -> None:
+    """Print what changed from one saved fit to the next."""
+    from dahl_ident.results.changes import changes, headline
+
+    writing.check([report], files, json=general.json)
+    check_reports(report)
+    fits = [saved_fit(file) for file in files]
+    found = changes(dict(zip((Path(file).stem for file in files), fits, strict=True)))
+    if general.json:
+        console.write_json([change.to_dict() for change in found])
+    elif report != STANDARD:
+        told = [f"{change}." for change in found]
+        told += [line for line in headline(found) if line not in told]
+        console.write_wrapped("\n".join(told))
+    if report is not None:
+        write_report_beside(fits, report, writing, model)
+    finish(next((fit for fit in fits if not fit.status.usable), fits[0]))
+
+
+def is_saved(file: str) -> bool:
+    """Return whether a file holds a saved fit."""
+    from dahl_ident.data.storage import read_text
+
+    return file.endswith(".json") and '"schema": "dahl_ident.' in read_text(Path(file))
+
+
+def saved_fit(file: str) -> FitResult | RecordFit:
+    """Return the fit of a table or of records that a file holds."""
+    from dahl_ident.results import FitResult, RecordFit
+    from dahl_ident.results.record_fit import SCHEMA
+
+    try:
+        return FitResult.load(file)
+    except DataError as exc:
+        if repr(SCHEMA) not in str(exc):
+            raise
+        return RecordFit.load(file)
+
+
 def table_or_none(
     files: list[str], reading: Reading, channels: Channels
 ) -> FrequencyResponse | None:
     """Return the table in the files; None, and a line that says so, where they hold waveforms."""
     from dahl_ident.data.response_table import WaveformsError
-    from dahl_ident.errors import DataError
 
     try:
         data = reading.read(files)
     except WaveformsError:
         if STANDARD in files:  # has been read, and cannot be read again
             raise
-        console.write_error("the files hold waveforms: fitted sample by sample, as with --record")
+        console.note("the files hold waveforms: fitted sample by sample, as with --record")
         return None
     except DataError:
         refuse_channels(channels)
@@ -329,7 +381,7 @@ def write_report_beside(
     """Write a report in addition to other output, and print its path."""
     written_to = write_report(results, place, writing, metadata=model.metadata)
     if written_to != STANDARD:
-        console.write_error(f"report: {written_to}")
+        console.note(f"report: {written_to}")
 
 
 def as_json(result: FitResult) -> dict[str, Any]:

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli.distributions import FREE, known, number_or_free
-from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.errors import ModelError, ValidationError, choices
 
 if TYPE_CHECKING:
     from dahl_ident.elements import Element
 
-_MODEL = "Model"
+MODEL = "Model"
 _SENSORS = "Sensors"
 _KINDS = "a number, 'free', '0.5 %' (standard uncertainty), or a prior, 'norm(1, 0.005)'."
 _CALL = re.compile(r"\s*(\w+)\s*(?:\((.*)\))?\s*", re.DOTALL)
@@ -30,7 +30,7 @@ OTHERS = ("mass", "damping", "stiffness")
 
 def model_option(help_text: str) -> Any:
     """Return an option of the model."""
-    return typer.Option(help=help_text, rich_help_panel=_MODEL)
+    return typer.Option(help=help_text, rich_help_panel=MODEL)
 
 
 ELEMENT_HELP = (
@@ -47,20 +47,22 @@ def _sensor(help_text: str) -> Any:
 class ModelOptions:
     """Elements and sensors, with their known and free parameters."""
 
-    f_max: Annotated[str | None, model_option("Friction limit, N; estimated if left out.")] = None
-    sigma: Annotated[str | None, model_option("Contact stiffness, N/m; estimated if left out.")] = (
+    f_max: Annotated[str | None, model_option("Friction limit, 0.1N; estimated if left out.")] = (
         None
     )
+    sigma: Annotated[
+        str | None, model_option("Contact stiffness, 30N/m; estimated if left out.")
+    ] = None
     alpha: Annotated[str | None, model_option("Exponent, or 'free'; 1 is assumed if left out.")] = (
         None
     )
     element: Annotated[list[str] | None, model_option(ELEMENT_HELP)] = None
-    mass: Annotated[str | None, model_option("Add a mass: kg, or 'free'.")] = None
-    damping: Annotated[str | None, model_option("Add a damper: N s/m, or 'free'.")] = None
-    stiffness: Annotated[str | None, model_option("Add a spring: N/m, or 'free'.")] = None
+    mass: Annotated[str | None, model_option("Add a mass: 300g, or 'free'.")] = None
+    damping: Annotated[str | None, model_option("Add a damper: '0.2 N s/m', or 'free'.")] = None
+    stiffness: Annotated[str | None, model_option("Add a spring: 0.3N/m, or 'free'.")] = None
     force_gain: Annotated[str | None, _sensor("Measured over true force")] = None
     displacement_gain: Annotated[str | None, _sensor("Measured over true displacement")] = None
-    delay: Annotated[str | None, _sensor("Lag of the displacement channel, s")] = None
+    delay: Annotated[str | None, _sensor("Lag of the displacement channel")] = None
     metadata: Annotated[
         Path | None,
         typer.Option(
@@ -149,8 +151,8 @@ def _entry(text: str) -> dict[str, Any]:
     cls, inside = class_named(call[1]), call[2] or ""
     if cls is None:
         raise ModelError(
-            f"--element names the kind {call[1]!r}; expected one of {', '.join(KINDS)}, or a law "
-            "from a file given with --laws"
+            f"--element names the kind {call[1]!r}; expected a law from a file given with --laws, "
+            f"or one of {choices(KINDS, call[1])}"
         )
     kind = cls.kind
     entry: dict[str, Any] = {"kind": kind}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli.config import take_options
-from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.errors import DataError, ModelError, UnitError, ValidationError, choices
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
@@ -35,40 +35,57 @@ def _existing(patterns: list[str]) -> list[str]:
     return files
 
 
-def one_of(*choices: str) -> Callable[[str | None], str | None]:
-    """Return a check of an option's value, if it was given; any other value is a usage error."""
+def one_of(help_text: str, panel: str | None, *names: str) -> Any:
+    """Return an option with these values, which the shell completes."""
 
     def check(value: str | None) -> str | None:
-        if value is not None and value not in choices:
-            raise typer.BadParameter(f"{value!r} is not one of {', '.join(choices)}")
+        if value is not None and value not in names:
+            raise typer.BadParameter(f"{value!r} is not one of {choices(names, value)}")
         return value
 
-    return check
+    return typer.Option(
+        help=help_text, callback=check, autocompletion=starting(names), rich_help_panel=panel
+    )
+
+
+def starting(names: Iterable[str]) -> Callable[[str], list[str]]:
+    """Return what completes the beginning of a word."""
+    return lambda incomplete: [name for name in names if name.startswith(incomplete)]
 
 
 def steady_option(panel: str) -> Any:
     """Return the option of how the response to a force that is held is predicted."""
-    return typer.Option(
-        help="Response to a force that is held: exact, or 'describing function' (a sine assumed).",
-        callback=one_of("exact", "describing function"),
-        rich_help_panel=panel,
-    )
+    return one_of(
+        "Response to a force that is held: exact, or 'describing function' (a sine assumed).",
+        panel, "exact", "describing function",
+    )  # fmt: skip
 
 
-def _range(text: str | None) -> tuple[float, float] | None:
-    """Return the two numbers of ``0.2,0.6``."""
-    if text is None:
-        return None
-    try:
-        low, high = (float(part) for part in text.split(","))
-    except ValueError as exc:
-        raise typer.BadParameter(f"{text!r} is not a pair of numbers such as 0.2,0.6") from exc
-    return low, high
+def noise_option(panel: str) -> Any:
+    """Return the option of the noise of the rows."""
+    return one_of(
+        "measured, relative or absolute; by default measured if a covariance is known.",
+        panel, "measured", "relative", "absolute",
+    )  # fmt: skip
 
 
-def _is_range(text: str | None) -> str | None:
-    _range(text)
-    return text
+def controlled_option(panel: str) -> Any:
+    """Return the option of what was held."""
+    return one_of("Controlled quantity: displacement or force.", panel, "displacement", "force")
+
+
+def quantity(help_text: str, unit: str, panel: str | None = None) -> Any:
+    """Return an option for a number in SI, or one with its unit."""
+
+    def parse(text: str) -> float:
+        from dahl_ident.cli.distributions import number
+
+        try:
+            return number("it", str(text), unit)
+        except (ModelError, UnitError) as exc:
+            raise typer.BadParameter(str(exc).removesuffix(", or 'free'")) from exc
+
+    return typer.Option(help=help_text, parser=parse, metavar=f"<{unit}>", rich_help_panel=panel)
 
 
 Files = Annotated[
@@ -93,11 +110,24 @@ Sheet = Annotated[
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
 
 
+def _silence(quiet: bool) -> bool:
+    from dahl_ident.cli import console
+
+    console.be_quiet(quiet)
+    return quiet
+
+
 @dataclass(frozen=True)
 class General:
     """The options of every command."""
 
     json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False
+    quiet: Annotated[
+        bool,
+        typer.Option(
+            "--quiet", "-q", help="Print errors, and what goes to -, alone.", callback=_silence
+        ),
+    ] = False
     config: Annotated[
         Path | None,
         typer.Option(
@@ -109,7 +139,7 @@ class General:
     ] = None
 
 
-LawFiles = Annotated[
+_LawFiles = Annotated[
     list[Path] | None,
     typer.Option(
         help="Python file with laws of your own, which --element then knows by kind or class name. "
@@ -123,7 +153,7 @@ LawFiles = Annotated[
 class Laws:
     """Laws of the user."""
 
-    laws: LawFiles = None
+    laws: _LawFiles = None
 
     def run(self) -> None:
         """Run the files, so that models can name the laws in them."""
@@ -188,11 +218,10 @@ class Channels:
     force: Channel = None
     sample_rate: Annotated[
         float | None,
-        typer.Option(help="Hz, for files without a time column.", rich_help_panel=_READING),
+        quantity("For files without a time column.", "Hz", _READING),
     ] = None
     missing: Annotated[
-        str,
-        typer.Option(help="Treatment of empty samples: error or drop.", rich_help_panel=_READING),
+        str, one_of("Treatment of empty samples: error or drop.", _READING, "error", "drop")
     ] = "error"
 
 
@@ -221,10 +250,7 @@ class Reading:
             rich_help_panel=_READING,
         ),
     ] = None
-    frequency: Annotated[
-        float | None,
-        typer.Option(help="Frequency of all rows, Hz.", rich_help_panel=_READING),
-    ] = None
+    frequency: Annotated[float | None, quantity("Frequency of all rows.", "Hz", _READING)] = None
     sweep: Annotated[
         str | None,
         typer.Option(
@@ -244,20 +270,11 @@ class Reading:
             rich_help_panel=_READING,
         ),
     ] = None
-    controlled: Annotated[
-        str | None,
-        typer.Option(help="Controlled quantity: displacement or force.", rich_help_panel=_READING),
-    ] = None
-    frequency_hz: Annotated[
-        str | None,
-        typer.Option(
-            help="Keep only this range, Hz: 0.2,0.6.", callback=_is_range, rich_help_panel=_READING
-        ),
-    ] = None
+    controlled: Annotated[str | None, controlled_option(_READING)] = None
     where: Annotated[
         str | None,
         typer.Option(
-            help="Keep the rows that meet a condition: 'level > 3 and harmonic == 1'.",
+            help="Keep the rows that meet a condition: '0.2 <= frequency_hz < 5 and level > 3'.",
             rich_help_panel=_READING,
         ),
     ] = None
@@ -285,5 +302,4 @@ class Reading:
 
         given = dict(vars(self))
         where, levels, runs = (given.pop(name) for name in ("where", "levels", "runs"))
-        given["frequency_hz"] = _range(self.frequency_hz)
         return selected(read_frequency_response(files, **given), where, levels, runs)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,15 +9,29 @@ from typing import Annotated, Any
 import typer
 
 from dahl_ident.cli import console
+from dahl_ident.cli.distributions import ends, number
 from dahl_ident.cli.files import write_picture
+from dahl_ident.cli.fit import saved_fit
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.option_groups import with_option_groups
-from dahl_ident.cli.options import General, Laws, Seed, Writing, one_of, steady_option
+from dahl_ident.cli.options import (
+    General,
+    Laws,
+    Seed,
+    Writing,
+    controlled_option,
+    one_of,
+    quantity,
+    steady_option,
+)
 from dahl_ident.errors import ValidationError
 
+_LIMITS = {
+    "frequency": "Hz", "displacement": "m", "force": "N", "speed": "m/s", "acceleration": "m/s^2",
+}  # fmt: skip
 _BENCH = "Bench"
 _AIM = "Aim"
-_RANGE = "the highest value, or lowest,highest"
+_RANGE = "the highest value, or lowest:highest"
 
 
 def _bench(help_text: str) -> Any:
@@ -33,37 +46,31 @@ def _aim(help_text: str) -> Any:
 class Bench:
     """The limits of the bench and the times that it needs."""
 
-    frequency_hz: Annotated[
-        str | None, _bench(f"Frequency, Hz: {_RANGE}; not needed for trapezoids.")
+    frequency: Annotated[
+        str | None, _bench(f"Frequency, 5Hz: {_RANGE}; not needed for trapezoids.")
     ] = None
-    displacement: Annotated[str | None, _bench(f"Displacement amplitude, m: {_RANGE}.")] = None
-    force: Annotated[str | None, _bench(f"Force amplitude, N: {_RANGE}.")] = None
-    speed: Annotated[str | None, _bench("Highest speed, m/s.")] = None
-    acceleration: Annotated[str | None, _bench("Highest acceleration, m/s^2.")] = None
-    time: Annotated[float | None, _bench("Total time, s.")] = None
-    controlled: Annotated[
-        str,
-        typer.Option(
-            help="Controlled quantity: displacement or force.",
-            callback=one_of("displacement", "force"),
-            rich_help_panel=_BENCH,
-        ),
-    ] = "displacement"
+    displacement: Annotated[str | None, _bench(f"Displacement amplitude, 1mm: {_RANGE}.")] = None
+    force: Annotated[str | None, _bench(f"Force amplitude, 0.2N: {_RANGE}.")] = None
+    speed: Annotated[str | None, _bench("Highest speed, 50mm/s.")] = None
+    acceleration: Annotated[str | None, _bench("Highest acceleration, 1m/s^2.")] = None
+    time: Annotated[float | None, quantity("Total time, 10min.", "s", _BENCH)] = None
+    controlled: Annotated[str, controlled_option(_BENCH)] = "displacement"
     steady: Annotated[str | None, steady_option(_BENCH)] = None
     motion: Annotated[
         str | None,
-        typer.Option(
-            help="Plan motions in time, for a fit of records: trapezoid or multisine; without it, "
+        one_of(
+            "Plan motions in time, for a fit of records: trapezoid or multisine; without it, "
             "settled sines.",
-            callback=one_of("trapezoid", "multisine"),
-            rich_help_panel=_BENCH,
+            _BENCH,
+            "trapezoid",
+            "multisine",
         ),
     ] = None
     noise: Annotated[
         str | None,
         _bench(
-            "Noise of one cycle: 0.01, or 'relative=0.01,force=1e-3,displacement=1e-7'; of a force "
-            "sample with --motion: force=1e-3."
+            "Noise of one cycle: 0.01, or 'relative=0.01,force=1mN,displacement=0.1um'; of a force "
+            "sample with --motion: force=1mN."
         ),
     ] = None
     scatter: Annotated[
@@ -71,14 +78,14 @@ class Bench:
         _bench("Scatter of gain and phase between runs, 0.02; by default that of the fit."),
     ] = None
     num_runs: Annotated[int | None, _bench("Number of runs; by default the best one.")] = None
-    change_over: Annotated[float, _bench("Seconds from one level to the next.")] = 1.0
-    between_runs: Annotated[float, _bench("Additional seconds for each run.")] = 0.0
+    change_over: Annotated[float, quantity("Time from one level to the next.", "s", _BENCH)] = 1.0
+    between_runs: Annotated[float, quantity("Additional time for each run.", "s", _BENCH)] = 0.0
 
     def limits(self) -> dict[str, Any]:
         """Return the limits that were given."""
         given: dict[str, Any] = {
-            name: _ends(name, text)
-            for name in ("frequency_hz", "displacement", "force", "speed", "acceleration")
+            "frequency_hz" if name == "frequency" else name: ends(name, text, unit)
+            for name, unit in _LIMITS.items()
             if (text := getattr(self, name)) is not None
         }
         return given if self.time is None else {**given, "time": self.time}
@@ -104,7 +111,7 @@ class Aim:
     ] = None
     ranges: Annotated[
         list[str] | None,
-        _aim("Range of a parameter with 95 % probability, f_max=0.05,0.2; repeatable."),
+        _aim("Range of a parameter with 95 % probability, f_max=0.05:0.2N; repeatable."),
     ] = None
     suspects: Annotated[
         list[str] | None,
@@ -114,8 +121,8 @@ class Aim:
     def keywords(self) -> dict[str, Any]:
         """Return the arguments of ``plan``."""
         wanted = [text.partition("=") for text in self.target or []]
-        numbers = {name: _number(name, value) for name, sign, value in wanted if sign}
-        if numbers and len(numbers) < len(wanted):
+        shares = {name: number(name, value, "1") for name, sign, value in wanted if sign}
+        if shares and len(shares) < len(wanted):
             raise ValidationError(
                 "target has names with and without a number; give every one its uncertainty, or "
                 "none"
@@ -123,9 +130,9 @@ class Aim:
         ranges = dict(_pair("ranges", text) for text in self.ranges or [])
         suspects = dict(_pair("suspects", text) for text in self.suspects or [])
         return {
-            "target": numbers or [name for name, _, _ in wanted] or None,
-            "ranges": {name: _ends(name, text) for name, text in ranges.items()},
-            "suspects": {name: _number(name, text) for name, text in suspects.items()} or None,
+            "target": shares or [name for name, _, _ in wanted] or None,
+            "ranges": {n: ends(f"ranges of {n}", text) for n, text in ranges.items()},
+            "suspects": {n: number(n, text, "1") for n, text in suspects.items()} or None,
         }
 
 
@@ -148,7 +155,7 @@ def plan(
     ] = None,
     sample_rate: Annotated[
         float | None,
-        typer.Option(help="Sample rate of the waveform, and of the records of --motion, Hz."),
+        quantity("Sample rate of the waveform, and of the records of --motion.", "Hz"),
     ] = None,
     picture: Annotated[
         Path | None,
@@ -157,8 +164,8 @@ def plan(
 ) -> None:
     """Plan the next measurement: levels, frequencies and cycles, or motions in time.
 
-    Example: dahl-ident plan --frequency-hz 5 --displacement 1e-4,1e-2 --ranges f_max=0.05,0.2
-    --ranges sigma=15,60 --noise 0.01 --target f_max=0.01 --target sigma=0.01
+    Example: dahl-ident plan --frequency 5Hz --displacement 0.1:10mm --ranges f_max=0.05:0.2N
+    --ranges sigma=15:60 --noise 0.01 --target f_max=0.01 --target sigma=0.01
     """
     from dahl_ident.data.storage import write_whole
     from dahl_ident.planning import plan as make
@@ -192,31 +199,17 @@ def plan(
 def _known(fit: str | None, options: ModelOptions) -> Any:
     """Return the saved fit, or the model of the options."""
     from dahl_ident.elements.element import as_model
-    from dahl_ident.results import FitResult
-    from dahl_ident.results.record_fit import RecordFit
 
     if fit is not None:
         if options != ModelOptions():
             raise ValidationError(
                 "a saved fit has its model and sensors; leave out the options that describe them"
             )
-        return RecordFit.load(fit) if _is_of_records(fit) else FitResult.load(fit)
+        return saved_fit(fit)
     given = options.keywords()
     if not given["sensors"].are_exact:
         raise ValidationError("a plan before any data takes the sensors as exact; leave them out")
     return as_model(given["model"]).with_free(given["free"])
-
-
-def _is_of_records(path: str) -> bool:
-    """Return whether a saved fit is one of records; False where the file is no saved fit."""
-    from dahl_ident.data.storage import read_text
-    from dahl_ident.results.record_fit import SCHEMA
-
-    try:
-        content = json.loads(read_text(path))
-    except ValueError:
-        return False
-    return isinstance(content, dict) and content.get("schema") == SCHEMA
 
 
 def _pair(option: str, text: str) -> tuple[str, str]:
@@ -226,22 +219,8 @@ def _pair(option: str, text: str) -> tuple[str, str]:
     return name.strip(), value
 
 
-def _number(name: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ValidationError(f"{name} is {text!r}; expected a number, SI") from None
-
-
-def _ends(name: str, text: str) -> float | list[float]:
-    ends = [_number(name, part) for part in text.split(",")]
-    return ends[0] if len(ends) == 1 else ends
-
-
 def _noise(text: str | None) -> Any:
     if text is None or "=" not in text:
-        return None if text is None else _number("noise", text)
-    return {
-        name: _number(name, value)
-        for name, value in (_pair("noise", part) for part in text.split(","))
-    }
+        return None if text is None else number("noise", text, "1")
+    given = [_pair("noise", part) for part in text.split(",")]
+    return {name: number(f"noise {name}", value, _LIMITS.get(name, "1")) for name, value in given}

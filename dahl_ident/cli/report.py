@@ -10,11 +10,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dahl_ident.cli import console
-from dahl_ident.cli.fit import Estimating, check_reports, finish, fitted, write_report
+from dahl_ident.cli.fit import (
+    Estimating,
+    check_reports,
+    finish,
+    fitted,
+    is_saved,
+    saved_fit,
+    write_report,
+)
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import STANDARD, Files, General, Laws, Reading, Seed, Writing
-from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:
     from dahl_ident.results import ChainPosterior, FitResult, RecordFit, RecordPosterior
@@ -69,10 +77,10 @@ def report(
         raise ValidationError(
             "--waveforms-columns is given without --waveforms; give both, or neither"
         )
-    saved = all(file.endswith(".json") for file in files)
+    saved = all(map(is_saved, files))
     unset = (Reading(), ModelOptions(metadata=model.metadata), Estimating())
     chosen = (reading, model, estimating) != unset
-    if any(file.endswith(".json") for file in files) and (not saved or chosen):
+    if (saved and chosen) or (not saved and any(map(is_saved, files))):
         raise ValidationError(
             "saved fits are reported unchanged: give no tables together with them, and no options "
             "of reading, model or estimate"
@@ -103,16 +111,3 @@ def report(
     elif STANDARD not in places:
         console.write("\n".join(places))
     finish(next((fit for fit in fits if not fit.status.usable), result))
-
-
-def saved_fit(file: str) -> FitResult | RecordFit:
-    """Return the fit of a table or of records that a file holds."""
-    from dahl_ident.results import FitResult, RecordFit
-    from dahl_ident.results.record_fit import SCHEMA
-
-    try:
-        return FitResult.load(file)
-    except DataError as exc:
-        if repr(SCHEMA) not in str(exc):
-            raise
-        return RecordFit.load(file)

@@ -32,6 +32,7 @@ from dahl_ident.cli.options import (
     Laws,
     Reading,
     Writing,
+    noise_option,
     one_of,
     steady_option,
 )
@@ -50,10 +51,11 @@ class Sampling:
 
     method: Annotated[
         str,
-        typer.Option(
-            help="mcmc, or grid: integration over up to three parameters, without a chain.",
-            callback=one_of("mcmc", "grid"),
-            rich_help_panel=_SAMPLING,
+        one_of(
+            "mcmc, or grid: integration over up to three parameters, without a chain.",
+            _SAMPLING,
+            "mcmc",
+            "grid",
         ),
     ] = "mcmc"
     prior: Annotated[
@@ -64,21 +66,19 @@ class Sampling:
             rich_help_panel=_SAMPLING,
         ),
     ] = None
-    noise: Annotated[
-        str | None,
-        typer.Option(help="measured, relative or absolute.", rich_help_panel=_SAMPLING),
-    ] = None
+    noise: Annotated[str | None, noise_option(_SAMPLING)] = None
     steady: Annotated[str, steady_option(_SAMPLING)] = "exact"
     likelihood: Annotated[
         str,
-        typer.Option(help="gaussian, student_t or none.", rich_help_panel=_SAMPLING),
+        one_of("gaussian, student_t or none.", _SAMPLING, "gaussian", "student_t", "none"),
     ] = "gaussian"
     uncertainty: Annotated[
         str,
-        typer.Option(
-            help="combined: every source of the fit's budget; noise: independent noise alone.",
-            callback=one_of("combined", "noise"),
-            rich_help_panel=_SAMPLING,
+        one_of(
+            "combined: every source of the fit's budget; noise: independent noise alone.",
+            _SAMPLING,
+            "combined",
+            "noise",
         ),
     ] = "combined"
     seed: Annotated[

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import console
+from dahl_ident.cli.distributions import numbers
 from dahl_ident.cli.files import progress_bar, write_data
 from dahl_ident.cli.model import (
     ELEMENT_HELP,
+    MODEL,
     OTHERS,
     elements,
     in_parallel,
@@ -18,8 +20,17 @@ from dahl_ident.cli.model import (
     refuse_beside_elements,
 )
 from dahl_ident.cli.option_groups import with_option_groups
-from dahl_ident.cli.options import General, Laws, Seed, Writing, steady_option
-from dahl_ident.errors import ValidationError
+from dahl_ident.cli.options import (
+    General,
+    Laws,
+    Seed,
+    Writing,
+    controlled_option,
+    one_of,
+    quantity,
+    steady_option,
+)
+from dahl_ident.errors import ModelError, ValidationError
 
 if TYPE_CHECKING:
     from dahl_ident.elements import Element
@@ -27,6 +38,7 @@ if TYPE_CHECKING:
 
 _EXCITATION = "Excitation"
 _ERRORS = "Errors"
+_UNITS = {"displacement": "m", "force": "N"}
 _SPAN = (0.1, 10.0)  # of the characteristic displacement, if no levels are given
 _COUNT = 30  # levels: 15 a decade, as in the shipped data sets
 
@@ -35,13 +47,13 @@ _COUNT = 30  # levels: 15 a decade, as in the shipped data sets
 class Plant:
     """The true plant: friction and the elements in parallel."""
 
-    f_max: Annotated[float | None, model_option("Friction force, N.")] = None
-    sigma: Annotated[float | None, model_option("Contact stiffness, N/m.")] = None
+    f_max: Annotated[float | None, quantity("Friction force.", "N", MODEL)] = None
+    sigma: Annotated[float | None, quantity("Contact stiffness.", "N/m", MODEL)] = None
     alpha: Annotated[float | None, model_option("Exponent; 1 if left out.")] = None
     element: Annotated[list[str] | None, model_option(ELEMENT_HELP)] = None
-    mass: Annotated[float | None, model_option("Add a mass, kg.")] = None
-    damping: Annotated[float | None, model_option("Add a damper, N s/m.")] = None
-    stiffness: Annotated[float | None, model_option("Add a spring, N/m.")] = None
+    mass: Annotated[float | None, quantity("Add a mass.", "kg", MODEL)] = None
+    damping: Annotated[float | None, quantity("Add a damper.", "N s/m", MODEL)] = None
+    stiffness: Annotated[float | None, quantity("Add a spring.", "N/m", MODEL)] = None
 
     def built(self) -> Element:
         """Return the plant."""
@@ -69,22 +81,24 @@ class Excitation:
     levels: Annotated[
         str | None,
         typer.Option(
-            help="Amplitudes, 1e-4,1e-3 or low:high:count; by default 30 around the knee.",
+            help="Amplitudes, 0.1,1mm or low:high:count; by default 30 around the knee.",
             rich_help_panel=_EXCITATION,
         ),
     ] = None
-    frequencies_hz: Annotated[
-        str, typer.Option(help="Frequencies, Hz, in the same form.", rich_help_panel=_EXCITATION)
-    ] = "1"
-    controlled: Annotated[
-        str,
-        typer.Option(
-            help="Controlled quantity: displacement or force.", rich_help_panel=_EXCITATION
-        ),
-    ] = "displacement"
+    frequency: Annotated[
+        str, typer.Option(help="Frequencies, in the same form.", rich_help_panel=_EXCITATION)
+    ] = "1Hz"
+    controlled: Annotated[str, controlled_option(_EXCITATION)] = "displacement"
     order: Annotated[
         str,
-        typer.Option(help="given, ascending, descending or random.", rich_help_panel=_EXCITATION),
+        one_of(
+            "given, ascending, descending or random.",
+            _EXCITATION,
+            "given",
+            "ascending",
+            "descending",
+            "random",
+        ),
     ] = "given"
     settling_periods: Annotated[
         int, typer.Option(help="Before measuring.", rich_help_panel=_EXCITATION)
@@ -178,10 +192,11 @@ def _experiment(plant: Plant, excitation: Excitation, errors: Errors, motion: Mo
     truth = plant.built()
     given: dict[str, Any] = dict(vars(excitation))
     as_record = given.pop("record")
+    controlled = excitation.controlled
     given["levels"] = _numbers(
-        "levels", excitation.levels or _usual_levels(truth, excitation.controlled)
+        "levels", excitation.levels or _usual_levels(truth, controlled), _UNITS[controlled]
     )
-    given["frequencies_hz"] = _numbers("frequencies_hz", excitation.frequencies_hz)
+    given["frequencies_hz"] = _numbers("frequency", given.pop("frequency"), "Hz")
     steps = SteppedSine(**given)
     if not as_record:
         return Experiment(truth, steps, table=Table(**vars(errors), **vars(motion)))
@@ -210,16 +225,17 @@ def _usual_levels(truth: Element, controlled: str) -> str:
     return f"{_SPAN[0] * low}:{_SPAN[1] * high}:{_COUNT}"
 
 
-def _numbers(name: str, text: str) -> list[float]:
-    """Return the numbers of ``1,2,5`` or of ``low:high:count``, evenly spread in logarithm."""
+def _numbers(name: str, text: str, unit: str) -> list[float]:
+    """Return the numbers of ``1,2,5mm`` or of ``low:high:count``, evenly spread in logarithm."""
     import numpy as np
 
     try:
-        if ":" in text:
-            low, high, count = text.split(":")
-            return [float(v) for v in np.geomspace(float(low), float(high), int(count))]
-        return [float(part) for part in text.split(",")]
-    except ValueError as exc:
+        if ":" not in text:
+            return numbers(name, text, unit, sep=",")
+        span, _, count = text.rpartition(":")
+        low, high = numbers(name, span, unit)
+        return [float(v) for v in np.geomspace(low, high, int(count))]
+    except (ModelError, ValueError) as exc:
         raise ValidationError(
-            f"{name} is {text!r}; expected numbers such as 1e-4,1e-3, or low:high:count"
+            f"{name} is {text!r}; expected numbers such as 0.1,1mm, or low:high:count"
         ) from exc

@@ -36,7 +36,7 @@ from dahl_ident.data.columns import CONTROLLED, FILE_COLUMNS, FileColumn, one_of
 from dahl_ident.data.raw_columns import Channel, Source, plain
 from dahl_ident.data.storage import read_text
 from dahl_ident.data.tabular import listed
-from dahl_ident.errors import DataError, DataWarning, UnitError, ValidationError
+from dahl_ident.errors import DataError, DataWarning, UnitError, ValidationError, choices
 from dahl_ident.units import (
     MECHANICAL_KINDS,
     QUANTITIES,
@@ -153,7 +153,8 @@ def _read(entries: Mapping[str, Any]) -> ColumnMap:
             settings[key] = _setting(key, entry)
         else:
             raise ValidationError(
-                f"unknown entry {key!r}; expected one of {', '.join((*FILE_COLUMNS, *_SETTINGS))}"
+                f"unknown entry {key!r}; expected one of "
+                f"{choices((*FILE_COLUMNS, *_SETTINGS), key)}"
             )
     return ColumnMap(roles, **settings)
 

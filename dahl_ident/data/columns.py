@@ -23,7 +23,7 @@ from dahl_ident.arrays import (
     refuse_masked,
 )
 from dahl_ident.data.quantities import polar_std
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import ValidationError, choices
 from dahl_ident.units import Motion, si_unit
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def plain_mappings(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 def one_of(value: str, name: str, allowed: tuple[str, ...]) -> str:
     """Return `value` if it is among `allowed`, else name them."""
     if value not in allowed:
-        raise ValidationError(f"{name} is {value!r}; expected one of {', '.join(allowed)}")
+        raise ValidationError(f"{name} is {value!r}; expected one of {choices(allowed, value)}")
     return value
 
 

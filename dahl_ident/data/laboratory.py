@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from dahl_ident.data.storage import read_text
-from dahl_ident.errors import DahlIdentError, DataError, ValidationError
+from dahl_ident.errors import DahlIdentError, DataError, ValidationError, choices
 from dahl_ident.units import parse_quantity
 
 CHANNELS = {"force": "force_gain", "displacement": "displacement_gain", "delay": "delay"}
@@ -160,7 +160,8 @@ def _checked(given: Mapping[str, Any], where: str) -> Metadata:
     unknown = sorted(set(given) - set(known))
     if unknown:
         raise ValidationError(
-            f"{where}metadata has the field {unknown[0]!r}; expected any of {', '.join(known)}"
+            f"{where}metadata has the field {unknown[0]!r}; expected any of "
+            f"{choices(known, *unknown)}"
         )
     texts = {name: _text(given[name], f"{where}{name}") for name in _TEXTS if name in given}
     return Metadata(
@@ -196,7 +197,7 @@ def _instrument(one: Any, name: str) -> Instrument:
     unknown = sorted(set(one) - set(_INSTRUMENT))
     if unknown:
         raise ValidationError(
-            f"{name} has the field {unknown[0]!r}; expected any of {', '.join(_INSTRUMENT)}"
+            f"{name} has the field {unknown[0]!r}; expected any of {choices(_INSTRUMENT, *unknown)}"
         )
     given = {key: _text(one[key], f"{name}.{key}") for key in _INSTRUMENT if key in one}
     words = {"serial": "serial ", "calibration": "calibrated: ", "uncertainty": "uncertainty "}
@@ -210,7 +211,9 @@ def _standard(given: Mapping[str, str], name: str) -> float:
     """Return the standard uncertainty of an instrument's channel, 0 where none is stated."""
     channel, text = given.get("channel"), given.get("uncertainty")
     if channel is not None and channel not in CHANNELS:
-        raise ValidationError(f"{name}.channel is {channel!r}; expected {', '.join(CHANNELS)}")
+        raise ValidationError(
+            f"{name}.channel is {channel!r}; expected {choices(CHANNELS, channel)}"
+        )
     if channel is None or text is None:
         return 0.0
     if "k" not in given:

@@ -159,7 +159,7 @@ class ModelComparison:
         gain, error = best.density.gain_over(first.density)
         text = (
             f"{best.name} would be better: the log density of tests left out is higher by "
-            f"{gain:.0f} +- {error:.0f}."
+            f"{gain:.0f} ± {error:.0f}."
         )
         absurd = [f"There {warning}." for warning in negative_parameters(best.optimum)]
         return " ".join([text, *absurd])
@@ -191,7 +191,7 @@ class ModelComparison:
             found.append([
                 m.name, m.reason, percent(m.density.misfit), percent(m.density.harmonic_misfit),
                 str(m.optimum.dof), *changes,
-                ("0" if m is first else f"{gain:+.1f} +- {error:.1f}") + mark,
+                ("0" if m is first else f"{gain:+.1f} ± {error:.1f}") + mark,
             ])  # fmt: skip
         return found
 

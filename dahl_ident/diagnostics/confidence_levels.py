@@ -2,7 +2,7 @@
 
 Where the noise's scale is known, an estimate's error is normal and the rise of -2 ln L follows
 chi-square; where the scale was estimated with nu degrees of freedom, they follow Student's t and
-F(1, nu). Both are said here by one number a level: the threshold q, with ``theta_hat +- q stderr``
+F(1, nu). Both are said here by one number a level: the threshold q, with ``theta_hat ± q stderr``
 on one side and a rise of the deviance by q^2 on the other.
 """
 

@@ -64,7 +64,7 @@ def _alike(numbers: Sequence[float], last: int) -> list[str]:
 
 
 def with_unit(value: float, uncertainty: float | None, unit: str) -> str:
-    """Return ``"0.0999 +- 0.0010 N"``.
+    """Return ``"0.0999 ± 0.0010 N"``.
 
     Parameters
     ----------
@@ -81,10 +81,10 @@ def with_unit(value: float, uncertainty: float | None, unit: str) -> str:
     Examples
     --------
     >>> with_unit(0.0999123, 0.00101, "N")
-    '0.0999 +- 0.0010 N'
+    '0.0999 ± 0.0010 N'
     """
     number, error = rounded(value, uncertainty)
-    return f"{number} +- {error} {unit}".rstrip()
+    return f"{number} ± {error} {unit}".rstrip()
 
 
 def percent(share: float) -> str:

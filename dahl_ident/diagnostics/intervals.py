@@ -148,7 +148,7 @@ class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
 
 
 def wald_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> ConfidenceIntervals:
-    """Return theta +- q stderr, transformed to parameter values.
+    """Return theta ± q stderr, transformed to parameter values.
 
     Parameters
     ----------

@@ -229,7 +229,7 @@ def _contradicted_priors(fit: Judged) -> Iterator[str]:
         if apart > _CONTRADICTED:
             yield (
                 f"The data contradict the prior of {name}: {values[name]:.4g} against "
-                f"{mean:g} +- {std:g}, {apart:.1f} standard deviations: check the calibration, or "
+                f"{mean:g} ± {std:g}, {apart:.1f} standard deviations: check the calibration, or "
                 "the model."
             )
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dahl_ident.elements.element import KINDS, Element, Model, as_model, class_named
-from dahl_ident.errors import ModelError
+from dahl_ident.errors import ModelError, choices
 
 
 def describe_model(model: Element) -> list[dict[str, Any]]:
@@ -80,9 +80,9 @@ def _build(entry: Mapping[str, Any]) -> Element:
     cls = class_named(str(kind))
     if cls is None:
         raise ModelError(
-            f"the element {dict(entry)} has the kind {kind!r}; expected one of {', '.join(KINDS)}, "
-            "or a law of your own: import its file first, or give it as laws (on the command line "
-            "--laws)"
+            f"the element {dict(entry)} has the kind {kind!r}; expected a law of your own, "
+            "whose file was imported or given as laws (on the command line --laws), or one of "
+            f"{choices(KINDS, str(kind))}"
         )
     name = rest.pop("name", None)
     return cls.from_description(rest, name)

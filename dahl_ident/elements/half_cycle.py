@@ -1,7 +1,7 @@
 """Places on half a cycle x = A cos(theta), without sines: t = tan(theta/4), from 0 to 1.
 
 Sine and cosine of theta are rational in t, so that integrals over t need no trigonometric function
-at their nodes; its poles, at t = +-j, are far enough for Gauss points.
+at their nodes; its poles, at t = ±j, are far enough for Gauss points.
 """
 
 from __future__ import annotations

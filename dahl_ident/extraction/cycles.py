@@ -2,7 +2,7 @@
 
 A record of unknown frequency is cut at its rising crossings. A crossing counts when the motion
 goes from below ``-h`` to above ``+h``, so noise makes none; ``h`` is a part of the amplitude, and
-where the motion stays within ``+-h`` for long the search goes on there with that part's own
+where the motion stays within ``±h`` for long the search goes on there with that part's own
 amplitude. So levels that differ by any factor are found, each about its own mean. Where the
 frequency is known the record is cut into its periods instead, which works in any noise.
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray, positive_number, whole_number
 from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.data.columns import one_of
 from dahl_ident.errors import ExtractionError, ValidationError
 from dahl_ident.extraction.block_means import Samples
 from dahl_ident.extraction.cycles import Cycles
@@ -44,8 +45,7 @@ def record_response(
     :func:`dahl_ident.extraction.extract`.
     """
     settings = _settings(num_periods, settling_periods, harmonics, controlled, min_share)
-    if mode not in MODES:
-        raise ValidationError(f"mode is {mode!r}; expected one of {', '.join(MODES)}")
+    one_of(mode, "mode", MODES)
     known = None if frequency is None else positive_number(frequency, "frequency")
     points: list[Point] = []
     refused: list[str] = []

@@ -29,7 +29,7 @@ from functools import cached_property
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import ValidationError, choices
 
 KNEE = 1.345  # 95 % efficient for one number with Gaussian noise (Huber)
 TAIL_DOF = 4.0  # the usual choice: tails of outliers, still a finite variance
@@ -128,5 +128,5 @@ def loss_named(name: str) -> Loss | None:
     if name == "linear":
         return None
     if name not in LOSSES:
-        raise ValidationError(f"loss is {name!r}; expected linear, {', '.join(LOSSES)}")
+        raise ValidationError(f"loss is {name!r}; expected {choices(['linear', *LOSSES], name)}")
     return LOSSES[name]

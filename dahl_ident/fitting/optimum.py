@@ -315,8 +315,7 @@ class OptimumBatch(Sequence[Optimum]):
             ]
             parts.append(f"Here: {', '.join(gone)}.")
             left = [
-                f"{c.expression} = {c.value:.4g} +- {c.stderr:.2g}"
-                for c in self.combinations[index]
+                f"{c.expression} = {c.value:.4g} ± {c.stderr:.2g}" for c in self.combinations[index]
             ]
             if left:
                 parts.append(f"The limit depends on {', '.join(left)}.")

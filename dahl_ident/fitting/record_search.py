@@ -9,7 +9,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.behaviour import Behaviour
-from dahl_ident.errors import FitError, FitInterrupted, ModelError
+from dahl_ident.errors import FitError, FitInterrupted, ModelError, choices
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
 from dahl_ident.fitting.record_start import MORE_STARTS, STARTS, record_starts, started_at
 from dahl_ident.problem import Quadratic
@@ -123,7 +123,7 @@ def solve_records(
     unknown = [name for name in start or () if name not in problem.names]
     if unknown:
         raise ModelError(
-            f"start names {', '.join(unknown)}; the unknowns are {', '.join(problem.names)}"
+            f"start names {', '.join(unknown)}; the unknowns are {choices(problem.names, *unknown)}"
         )
     problem.watch = trace = _Trace(tell)
     try:

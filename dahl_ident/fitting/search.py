@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.errors import FitError, ModelError, ValidationError
+from dahl_ident.errors import FitError, ModelError, ValidationError, choices
 from dahl_ident.fitting.asymptotes import (
     Chart,
     Limit,
@@ -203,7 +203,7 @@ def _completed(problem: Problem, start: Mapping[str, float], theta: FloatArray) 
     unknown = [name for name in start if name not in names]
     if unknown:
         raise ModelError(
-            f"start names {', '.join(unknown)}; the free parameters are {', '.join(names)}"
+            f"start names {', '.join(unknown)}; the free parameters are {choices(names, *unknown)}"
         )
     values = problem.to_values(theta)
     return problem.to_search([start.get(n, v) for n, v in zip(names, values, strict=True)])

@@ -18,7 +18,7 @@ from dahl_ident.diagnostics.departures import noise_of_rows, scatter_of_runs
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.element import as_model
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import ValidationError, choices
 from dahl_ident.problem import Problem
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.sensors import Sensors
@@ -328,7 +328,7 @@ def _moments(parameters: Sequence[Parameter], ranges: Ranges) -> tuple[FloatArra
     if unknown:
         raise ValidationError(
             f"ranges names {', '.join(sorted(unknown))}; free are "
-            f"{', '.join(p.name for p in parameters)}"
+            f"{choices((p.name for p in parameters), *unknown)}"
         )
     centre, std = np.zeros(len(parameters)), np.full(len(parameters), np.inf)
     for i, p in enumerate(parameters):

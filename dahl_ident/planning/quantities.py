@@ -10,7 +10,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.budget import coverage_factor
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import ValidationError, choices
 
 RESPONSE = "response"
 _POWER = re.compile(r"(?P<name>[A-Za-z_]\w*)(?:\^(?P<power>-?\d+(?:\.\d+)?))?")
@@ -39,8 +39,8 @@ def direction(expression: str, parameters: Any, values: FloatArray) -> FloatArra
     for name, power in _powers(expression):
         if name not in names:
             raise ValidationError(
-                f"target names {name!r}; free are {', '.join(names)}, alone or in a product of "
-                "powers such as 'f_max/sigma'"
+                f"target names {name!r}; expected a product of powers, such as 'f_max/sigma', of "
+                f"{choices(names, name)}"
             )
         i = names.index(name)
         size = 1.0 if parameters[i].transform == "log" else values[:, i]

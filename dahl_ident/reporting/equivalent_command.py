@@ -66,7 +66,11 @@ def _source(data: FrequencyResponse) -> tuple[list[str], list[str]] | None:
 
 def _options_of(part: Mapping[str, Any]) -> Mapping[str, Any]:
     options = part.get("options")
-    return options if isinstance(options, Mapping) else {}
+    if not isinstance(options, Mapping):
+        return {}
+    kept = options.get("frequency_hz")
+    where = None if kept is None else f"{kept[0]} <= frequency_hz <= {kept[1]}"
+    return {**options, "frequency_hz": None, "where": where}
 
 
 def _extraction_of(part: Mapping[str, Any]) -> dict[str, Any]:

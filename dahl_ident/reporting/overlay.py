@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import special
 
 from dahl_ident import plots
 from dahl_ident.data.laboratory import Metadata
 from dahl_ident.diagnostics.formatting import rounded
-from dahl_ident.diagnostics.verdicts import Verdict
 from dahl_ident.errors import ValidationError
 from dahl_ident.reporting.document import (
     Bullets,
@@ -36,11 +33,10 @@ from dahl_ident.reporting.sections import (
     worst_status,
 )
 from dahl_ident.results import FitResult
+from dahl_ident.results.changes import SIGNIFICANT, Change, changes, headline, is_usable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-SIGNIFICANT = 0.05  # two-sided probability below which a change is called significant
 
 
 def overlay(
@@ -68,34 +64,24 @@ def overlay(
         raise ValidationError(f"the fits measure in different units: {', '.join(sorted(units))}")
     names = _names(fits)
     given = metadata or Metadata()
-    changes = [
-        change
-        for (a, b), (fit, later) in zip(pairwise(names), pairwise(fits), strict=True)
-        for change in _changes(a, fit, b, later)
-    ]
-    found = [c for c in changes if c["significant"]]
-    verdict = [
-        f"{c['parameter']} changes from {c['from']} to {c['to']}: {_words(c)}." for c in found
-    ]
-    if not found:
-        verdict = ["No parameter changes significantly between the measurements."]
-    verdict += [f"{name}: {fit.verdict}" for name, fit in zip(names, fits, strict=True)]
+    found = changes(dict(zip(names, fits, strict=True)))
+    verdicts = tuple(f"{name}: {fit.verdict}" for name, fit in zip(names, fits, strict=True))
     sections = (
         Section("Parameters side by side", (_table(names, fits),)),
-        Section("Changes", (_change_table(changes), Paragraph(_HOW))),
+        changes_section(found),
         Section("Pictures", (_picture(names, fits),)),
-        Section("Verdicts", (Bullets(tuple(verdict[len(found) or 1 :])),), details=True),
+        Section("Verdicts", (Bullets(verdicts),), details=True),
     )
     return Document(
         title=title or given.title or f"Comparison of {', '.join(names)}",
         status=worst_status(fits),
-        verdict=tuple(verdict[: len(found) or 1]),
+        verdict=tuple(headline(found)),
         header=_header(fits, names, given),
         sections=sections,
         facts={
             "fits": [{"name": n} | fit_facts(fit) for n, fit in zip(names, fits, strict=True)],
             "posteriors": [],
-            "changes": changes,
+            "changes": [change.to_dict() for change in found],
             "metadata": given.facts(),
             **origin_facts(fits[0].data),
             "files": [file for fit in fits for file in origin_facts(fit.data)["files"]],
@@ -106,10 +92,10 @@ def overlay(
 
 
 _HOW = (
-    "A change is the difference of two estimates; its standard uncertainty is the root of the sum "
-    "of both variances, so a calibration error that both share does not show in it. p is the "
-    "two-sided probability of a change this large if there is no real change; below "
-    f"{SIGNIFICANT:g} it is called significant."
+    "A change is the difference of two estimates. Its standard uncertainty u combines both "
+    "budgets; for a fit of a single run, the scatter between runs that the other fit shows is "
+    "added. p is the two-sided probability of a change this large if there is no real change; "
+    f"below {SIGNIFICANT:g} it is called significant, unless no fit shows scatter between runs."
 )
 
 
@@ -132,45 +118,6 @@ def _header(
         f"{name}: {'; '.join(one['Data'])}" for name, one in zip(names, own, strict=True)
     )
     return tuple(rows.items())
-
-
-def _changes(a: str, fit: FitResult, b: str, later: FitResult) -> list[dict[str, Any]]:
-    """Return the change of every parameter that both fits estimate."""
-    found = []
-    for name in fit.var_names:
-        if name not in later.var_names:
-            continue
-        one, other = fit.params[name], later.params[name]
-        change = other.value - one.value
-        u = math.hypot(one.stderr or 0.0, other.stderr or 0.0)
-        usable = all(_is_usable(f, name) for f in (fit, later)) and math.isfinite(u) and u > 0.0
-        p = float(2.0 * special.ndtr(-abs(change) / u)) if usable else math.nan
-        found.append(
-            {
-                "parameter": name, "unit": one.unit, "from": a, "to": b, "change": change,
-                "relative": change / one.value if one.value else math.nan, "u": u,
-                "p": p, "significant": bool(p < SIGNIFICANT),
-            }
-        )  # fmt: skip
-    return found
-
-
-def _is_usable(fit: FitResult, name: str) -> bool:
-    """Return whether the uncertainty of a parameter is valid."""
-    judged = fit.identifiability.parameters[name].verdict
-    identified = judged in (Verdict.IDENTIFIED, Verdict.BY_PRIOR)
-    return identified and str(fit.status) != "not described"
-
-
-def _words(change: dict[str, Any]) -> str:
-    value, error = rounded(change["change"], change["u"])
-    unit = f" {change['unit']}" if change["unit"] else ""
-    percents = 100.0 * change["relative"]
-    return f"{value} \u00b1 {error}{unit} ({percents:+.2g} %, {_p(change['p'])})"
-
-
-def _p(p: float) -> str:
-    return "p < 0.0001" if p < 1e-4 else f"p = {p:.1g}"
 
 
 def _table(names: Sequence[str], fits: Sequence[FitResult]) -> Table:
@@ -197,43 +144,31 @@ def _estimate(fit: FitResult, name: str) -> Cell:
     if not math.isfinite(estimate.value):
         return Cell("none finite")
     value, error = rounded(estimate.value, estimate.stderr)
-    return Cell(f"{value} \u00b1 {error}", estimate.value, struck=not _is_usable(fit, name))
+    return Cell(f"{value} \u00b1 {error}", estimate.value, struck=not is_usable(fit, name))
 
 
-def _change_table(changes: Sequence[dict[str, Any]]) -> Table:
+def changes_section(found: Sequence[Change]) -> Section:
+    """Return the table of changes, and how it is made."""
     rows = []
-    for c in changes:
-        value, error = rounded(c["change"], c["u"])
-        usable = math.isfinite(c["p"])
+    for c in found:
+        value, error = rounded(c.change, c.u)
+        usable = math.isfinite(c.p)
         rows.append(
             (
-                Cell(c["parameter"]),
-                Cell(f"{c['from']} to {c['to']}"),
-                Cell(value, c["change"], struck=not usable),
-                Cell(error, c["u"] if math.isfinite(c["u"]) else None, struck=not usable),
-                Cell(c["unit"] or "-"),
-                Cell(_p(c["p"]).removeprefix("p ").removeprefix("= "), c["p"])
-                if usable
-                else Cell("-"),
-                Cell(_significance(c)),
+                Cell(c.parameter),
+                Cell(f"{c.before} to {c.after}"),
+                Cell(value, c.change, struck=not usable),
+                Cell(error, c.u if math.isfinite(c.u) else None, struck=not usable),
+                Cell(c.unit or "-"),
+                Cell(c.p_text.removeprefix("p = ").removeprefix("p "), c.p if usable else None),
+                Cell(c.significance),
             )
         )
     header = (
-        "parameter",
-        "between",
-        "change",
-        "standard uncertainty u",
-        "unit",
-        "p",
-        "significance",
-    )
-    return Table("Changes from each measurement to the next", header, tuple(rows))
-
-
-def _significance(change: dict[str, Any]) -> str:
-    if not math.isfinite(change["p"]):
-        return "cannot be stated: not both estimates can be used"
-    return "significant" if change["significant"] else "not significant"
+        "parameter", "between", "change", "standard uncertainty u", "unit", "p", "significance"
+    )  # fmt: skip
+    table = Table("Changes from each measurement to the next", header, tuple(rows))
+    return Section("Changes", (table, Paragraph(_HOW)))
 
 
 def _picture(names: Sequence[str], fits: Sequence[FitResult]) -> Picture:

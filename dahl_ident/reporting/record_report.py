@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,8 +29,10 @@ from dahl_ident.reporting.document import (
     words,
 )
 from dahl_ident.reporting.figures import budget_picture
+from dahl_ident.reporting.overlay import changes_section
 from dahl_ident.reporting.sections import COVERAGE, RELATES, identity, short
 from dahl_ident.results import RecordFit, RecordPosterior
+from dahl_ident.results.changes import Change, changes, headline
 from dahl_ident.version import __version__
 
 if TYPE_CHECKING:
@@ -52,6 +56,7 @@ def record_document(
     fits = list(dict.fromkeys(r.fit if isinstance(r, RecordPosterior) else r for r in results))
     given = metadata or Metadata()
     several = len(fits) > 1
+    changed = _changes(fits)
     front: list[Section] = []
     details: list[Section] = []
     for number, fit in enumerate(fits):
@@ -105,18 +110,25 @@ def record_document(
     return Document(
         title=title or given.title or f"Friction identified from {name}",
         status=max((str(r.status) for r in (*fits, *drawn)), key=order.index),
-        verdict=tuple(
+        verdict=tuple(headline(changed) if changed else ())
+        + tuple(
             f"{fit.problem.model!r}: {line}" if several and i == 0 else line
             for fit in fits
             for i, line in enumerate(fit.statements)
         )
         + tuple(line for one in drawn for line in posterior_sections.verdict(one)),
         header=tuple(header.items()),
-        sections=(*front, *details, Section("Origin", tuple(origin), details=True)),
+        sections=(
+            *([changes_section(changed)] if changed else []),
+            *front,
+            *details,
+            Section("Origin", tuple(origin), details=True),
+        ),
         facts={
             "fits": [],
             "posteriors": [one.to_dict() for one in drawn],
             "record_fits": [_facts(fit) for fit in fits],
+            "changes": [change.to_dict() for change in changed],
             "files": files,
             "metadata": given.facts(),
             "versions": provenance.versions(),
@@ -126,6 +138,18 @@ def record_document(
         identity=identity(given, [(str(f["file"]), str(f["sha256"])) for f in files]),
         signatory=given.signatory,
     )
+
+
+def _changes(fits: Sequence[RecordFit]) -> list[Change]:
+    """Return the changes between fits to different records; none between models of the same."""
+    firsts = [fit.records[0] for fit in fits]
+    channels = ("time", "displacement", "velocity", "acceleration", "force", "drive")
+    for a, b in pairwise(firsts):
+        if all(np.array_equal(getattr(a, name), getattr(b, name)) for name in channels):
+            return []
+    named = [Path(str((r.provenance or {}).get("file", "measurement"))).stem for r in firsts]
+    names = [n if named.count(n) == 1 else f"{n} ({i})" for i, n in enumerate(named, 1)]
+    return changes(dict(zip(names, fits, strict=True)))
 
 
 def _model(fit: RecordFit) -> Iterator[str]:

@@ -9,7 +9,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, curves
 from dahl_ident.data.quantities import polar_std
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import ValidationError, choices
 from dahl_ident.plots import (
     Axes,
     Curve,
@@ -59,7 +59,7 @@ def draw_residuals(fit: JudgedFit, against: str | None, ax: Axes | None) -> Axes
         ),
     }
     if against not in places:
-        raise ValidationError(f"against is {against!r}; expected one of {', '.join(places)}")
+        raise ValidationError(f"against is {against!r}; expected one of {choices(places, against)}")
     x, label = places[against]
     of_curve = np.stack([curves.curve_of_row(data), data.harmonic])
     first, second = standardized_residuals(fit).T

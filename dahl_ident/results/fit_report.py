@@ -128,7 +128,7 @@ def _noise(fit: JudgedFit) -> list[str]:
     if loss != "linear":
         lines.append(f"robust loss: {loss}")
     for name, prior in fit.problem.priors.items():
-        lines.append(f"prior of {name}: {float(prior.mean()):g} +- {float(prior.std()):g}")
+        lines.append(f"prior of {name}: {float(prior.mean()):g} ± {float(prior.std()):g}")
     return lines
 
 

@@ -12,7 +12,7 @@ from dahl_ident.arrays import FloatArray, array_between, finite_array, positive_
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.noise_scale import ScalePosterior, ln_scale_draws
 from dahl_ident.bayes.quadrature import Grid
-from dahl_ident.errors import ModelError
+from dahl_ident.errors import ModelError, choices
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_base import QUANTILES
 from dahl_ident.results.response_posterior import ResponsePosterior
@@ -135,7 +135,7 @@ class GridPosterior(ResponsePosterior):
 
     def _axis(self, name: str) -> int:
         if name not in self.names:
-            raise ModelError(f"there is no {name!r}; expected one of {', '.join(self.names)}")
+            raise ModelError(f"there is no {name!r}; expected one of {choices(self.names, name)}")
         return self.names.index(name)
 
     @cached_property

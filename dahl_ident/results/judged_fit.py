@@ -37,7 +37,7 @@ from dahl_ident.diagnostics.intervals import (
 from dahl_ident.diagnostics.statements import statements, verdict_status
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
-from dahl_ident.errors import FitError, ValidationError
+from dahl_ident.errors import FitError, ValidationError, choices
 from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.results.fit_numbers import FitNumbers
 from dahl_ident.units import Quantity
@@ -89,7 +89,9 @@ class JudgedFit(FitNumbers):
             If there is no optimum to repeat.
         """
         if method not in METHODS:
-            raise ValidationError(f"method is {method!r}; expected one of {', '.join(METHODS)}")
+            raise ValidationError(
+                f"method is {method!r}; expected one of {choices(METHODS, method)}"
+            )
         levels = tuple(checked_levels(levels).tolist())
         key = (method, levels, replicates, seed)
         if key not in self._intervals:

@@ -18,7 +18,7 @@ from dahl_ident.bayes.priors import PriorLike
 from dahl_ident.data.storage import plain_data
 from dahl_ident.diagnostics.statements import doubted
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import ValidationError, choices
 from dahl_ident.results.prior_influence import PriorInfluence, prior_influences
 from dahl_ident.results.result import Result
 
@@ -208,7 +208,7 @@ class Posterior(Result):
         """
         kind = self._PLOTS[0] if kind is None else kind
         if kind not in self._PLOTS:
-            raise ValidationError(f"kind is {kind!r}; expected one of {', '.join(self._PLOTS)}")
+            raise ValidationError(f"kind is {kind!r}; expected one of {choices(self._PLOTS, kind)}")
         return getattr(self, f"plot_{kind}")(ax=ax)
 
     def plot_corner(self, **options: Any) -> NDArray[Any]:

@@ -119,8 +119,8 @@ class Result(ABC):
     >>> data = di.load_dataset("noisy")
     >>> for result in (di.fit(data, di.Dahl()), di.posterior(data, di.Dahl(), method="grid")):
     ...     print(result.status, result.params["f_max"])
-    trusted f_max = 0.10002 +- 0.00049 N
-    trusted f_max = 0.10002 +- 0.00039 N
+    trusted f_max = 0.10002 ± 0.00049 N
+    trusted f_max = 0.10002 ± 0.00039 N
     """
 
     _called: ClassVar[str] = "a result"

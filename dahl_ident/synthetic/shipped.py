@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dahl_ident.data import FrequencyResponse, Record, read_frequency_response, read_record
-from dahl_ident.errors import DataError
+from dahl_ident.errors import DataError, choices
 
 _PACKAGE = Path(__file__).parents[1]  # the folder dahl_ident
 _PLACES = (_PACKAGE / "datasets" / "synthetic", _PACKAGE.parent / "datasets" / "synthetic")
@@ -45,7 +45,7 @@ def load_dataset(name: str) -> FrequencyResponse | Record:
     place = datasets_directory()
     sidecar_file = place / f"{name}.json"
     if not sidecar_file.is_file():
-        known = ", ".join(sorted(p.stem for p in place.glob("*.json")))
+        known = choices(sorted(p.stem for p in place.glob("*.json")), name)
         raise DataError(f"there is no data set {name!r}; there are {known}")
     sidecar: dict[str, Any] = json.loads(sidecar_file.read_text(encoding="utf-8"))
     file = place / sidecar["file"]

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from collections.abc import Mapping
 from typing import Any
+
+_WIDTH = 50  # columns of a list; a longer one takes several lines
 
 
 def toml_text(data: Mapping[str, Any], prefix: str = "") -> str:
@@ -46,6 +49,7 @@ def toml_text(data: Mapping[str, Any], prefix: str = "") -> str:
 
 def _scalar(value: Any) -> str:
     if isinstance(value, list):
-        return f"[{', '.join(_scalar(v) for v in value)}]"
+        text = f"[{', '.join(_scalar(v) for v in value)}]"
+        return text if len(text) <= _WIDTH else "\n    ".join(textwrap.wrap(text, _WIDTH))
     # JSON writes strings, booleans and finite numbers as TOML does
     return json.dumps(value, ensure_ascii=False, allow_nan=False)

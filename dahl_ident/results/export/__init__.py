@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dahl_ident.data.storage import write_whole
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import ValidationError, choices
 from dahl_ident.results.export import c_header, numbers, simulators
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def export(
             raise ValidationError(f"to is {to!r}, but a posterior is exported as {DRAWS!r} alone")
         content = FORMATS[to][1](result).encode()
     else:
-        raise ValidationError(f"to is {to!r}; expected one of {', '.join([*FORMATS, DRAWS])}")
+        raise ValidationError(f"to is {to!r}; expected one of {choices([*FORMATS, DRAWS], to)}")
     if path is None:
         return content.decode()
     place = Path(path)

@@ -1,0 +1,150 @@
+"""What changed from one fit to the next: differences of parameters with the whole uncertainty."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+from scipy import special
+
+from dahl_ident.diagnostics.error_sources import RUNS
+from dahl_ident.diagnostics.formatting import rounded
+from dahl_ident.diagnostics.verdict_status import VerdictStatus
+from dahl_ident.diagnostics.verdicts import Verdict
+from dahl_ident.errors import FitError
+from dahl_ident.results.fit_result import FitResult
+from dahl_ident.results.record_fit import RecordFit
+
+SIGNIFICANT = 0.05  # two-sided probability below which a change is called significant
+
+
+@dataclass(frozen=True)
+class Change:
+    """The change of one parameter.
+
+    Attributes
+    ----------
+    parameter, unit : str
+    before, after : str
+        Names of the two fits.
+    change, relative : float
+        Difference of the estimates, and its share of the earlier one.
+    u : float
+        Its standard uncertainty: both combined ones, and for a fit of a single run the scatter
+        between runs that the other one shows.
+    runs_known : bool
+        Whether `u` holds the scatter between runs.
+    p : float
+        Two-sided probability of such a difference by chance; NaN where an estimate must not be
+        used.
+    """
+
+    parameter: str
+    unit: str
+    before: str
+    after: str
+    change: float
+    relative: float
+    u: float
+    runs_known: bool
+    p: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether neither noise nor scatter between runs explains it."""
+        return self.runs_known and self.p < SIGNIFICANT
+
+    @property
+    def significance(self) -> str:
+        """The judgement in words."""
+        if not math.isfinite(self.p):
+            return "cannot be stated: not both estimates can be used"
+        if self.p >= SIGNIFICANT:
+            return "not significant"
+        return "significant" if self.runs_known else "beyond noise; scatter between runs unknown"
+
+    @property
+    def p_text(self) -> str:
+        """The probability as text, complete."""
+        if not math.isfinite(self.p):
+            return "-"
+        return "p < 0.0001" if self.p < 1e-4 else f"p = {self.p:.1g}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it for machines."""
+        names = {"before": "from", "after": "to"}
+        facts = {names.get(name, name): value for name, value in vars(self).items()}
+        return facts | {"significant": self.significant}
+
+    def __str__(self) -> str:
+        value, error = rounded(self.change, self.u)
+        numbers = f"{value} ± {error} {self.unit}".rstrip()
+        return (
+            f"{self.parameter} from {self.before} to {self.after}: {numbers} "
+            f"({100.0 * self.relative:+.2g} %, {self.p_text}): {self.significance}"
+        )
+
+
+def changes(fits: Mapping[str, FitResult | RecordFit]) -> list[Change]:
+    """Return the changes of every parameter that a fit and the one before it estimate."""
+    return [
+        _change(name, *earlier, *later)
+        for earlier, later in pairwise(fits.items())
+        for name in earlier[1].var_names
+        if name in later[1].var_names
+    ]
+
+
+def headline(found: list[Change]) -> list[str]:
+    """Return what changed in sentences, and what the comparison leaves open."""
+    told = [f"{c}." for c in found if math.isfinite(c.p) and c.p < SIGNIFICANT]
+    if not told:
+        return ["No parameter changes significantly between the measurements."]
+    if not all(c.runs_known for c in found):
+        told.append(
+            "Each fit is of a single run, so scatter between runs (a new mounting, another day) "
+            "may be the reason: repeat runs, and fit them together."
+        )
+    return told
+
+
+def is_usable(fit: FitResult | RecordFit, name: str) -> bool:
+    """Return whether the uncertainty of a parameter is valid."""
+    if isinstance(fit, FitResult):
+        judged = fit.identifiability.parameters[name].verdict
+        if judged not in (Verdict.IDENTIFIED, Verdict.BY_PRIOR):
+            return False
+    return fit.status is not VerdictStatus.NOT_DESCRIBED
+
+
+def _change(
+    name: str, a: str, fit: FitResult | RecordFit, b: str, later: FitResult | RecordFit
+) -> Change:
+    one, other = fit.params[name], later.params[name]
+    known = [_scatter(each, name) for each in (fit, later)]
+    stated = max((share for share in known if share is not None), default=0.0)
+    missing = [
+        stated * abs(p.value) for p, share in zip((one, other), known, strict=True) if share is None
+    ]
+    u = math.hypot(one.stderr or 0.0, other.stderr or 0.0, *missing)
+    usable = is_usable(fit, name) and is_usable(later, name) and 0.0 < u < math.inf
+    change = other.value - one.value
+    relative = change / one.value if one.value else math.nan
+    p = float(2.0 * special.ndtr(-abs(change) / u)) if usable else math.nan
+    return Change(name, one.unit, a, b, change, relative, u, len(missing) < len(known), p)
+
+
+def _scatter(fit: FitResult | RecordFit, name: str) -> float | None:
+    """Return the relative scatter of a parameter between runs; None where there is one run."""
+    runs = len(set(fit.problem.runs if isinstance(fit, RecordFit) else fit.data.runs or ()))
+    if runs < 2:
+        return None
+    try:
+        stated = fit.budget()[name]
+    except (FitError, KeyError):
+        return None
+    u = next((row.u for row in stated.rows if row.source == RUNS), 0.0)
+    return u * math.sqrt(runs) / abs(stated.value) if stated.value else 0.0
