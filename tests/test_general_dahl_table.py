@@ -11,7 +11,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import joint_prior
 from dahl_ident.elements import general_dahl, linear_dahl
-from dahl_ident.elements.general_dahl_table import describing_function
+from dahl_ident.elements.general_dahl_table import describing_function, describing_function_slope
 from dahl_ident.problem import Problem
 from tests.bayes_cases import friction_table, harmonic_table
 
@@ -47,6 +47,15 @@ def test_holds_the_quadrature(alpha: float) -> None:
 def test_agrees_with_fifty_digit_integration(beta: float, alpha: float) -> None:
     exact = exact_harmonics(beta, alpha, (1,))[0].value / beta
     assert abs(complex(describing_function(at(beta), at(alpha))) - exact) * (1.0 + beta) < 1e-10
+
+
+@pytest.mark.parametrize("alpha", [0.01, 0.5, 0.899, 0.95, 1.0, 1.8, 100.0, 2000.0])
+def test_slope_is_that_of_the_quadrature(alpha: float) -> None:
+    beta = 10.0 ** np.random.default_rng(1).uniform(-6.0, 6.0, 400)
+    h, slope = describing_function_slope(beta, at(alpha))
+    by_quadrature = -general_dahl.describing_function_gradient(beta, at(alpha))[1]
+    assert np.array_equal(h, describing_function(beta, at(alpha)))
+    assert np.max(np.abs(slope - by_quadrature) * (1.0 + beta)) < 1e-8
 
 
 def test_closed_forms_of_one_and_of_one_half() -> None:

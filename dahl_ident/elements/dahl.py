@@ -768,6 +768,19 @@ class TabulatedDahl(Dahl):
             sigma * general_dahl_table.describing_function(sigma * amplitude / f_max, alpha)
         )
 
+    def stiffness_slope(
+        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Return N and dN/dA, unchecked."""
+        f_max, sigma, alpha = values
+        h, by_ln_beta = general_dahl_table.describing_function_slope(
+            sigma * amplitude / f_max, alpha
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slope = sigma * by_ln_beta / amplitude
+        rests = np.broadcast_to(sigma * amplitude / f_max, slope.shape) < _AT_REST
+        return sigma * h, np.where(rests, _slope_at_rest(values, 1, slope.shape), slope)
+
 
 def _is_linear(alpha: FloatArray) -> bool:
     return bool(np.equal(alpha, 1.0).all())

@@ -45,63 +45,116 @@ def describing_function(beta: FloatArray, alpha: FloatArray) -> ComplexArray:
     >>> describing_function(np.array([1e-9, 1.0]), np.array(2.0)).round(6)
     array([1.      +0.j      , 0.544039+0.354193j])
     """
-    if alpha.ndim == 0 or alpha.shape[-1] > 1:
-        return describing_function(beta[..., None], alpha[..., None])[..., 0]
+    return _from_tables(beta, alpha, slope=False)[0]
+
+
+def describing_function_slope(
+    beta: FloatArray, alpha: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return h, and its derivative with respect to ln beta, which errs by 1e-9 of ``1/(1 + beta)``.
+
+    Examples
+    --------
+    >>> h, slope = describing_function_slope(np.array([1.0]), np.array(1.0))
+    >>> slope.round(6)
+    array([-0.38193+0.131416j])
+    """
+    return _from_tables(beta, alpha, slope=True)
+
+
+def _from_tables(
+    beta: FloatArray, alpha: FloatArray, *, slope: bool
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return h, and its derivative with respect to ln beta where it is wanted, else zeros."""
     shape = np.broadcast_shapes(beta.shape, alpha.shape)
-    rows = np.broadcast_to(beta, shape).reshape(-1, shape[-1])
-    exponent = np.broadcast_to(alpha, (*shape[:-1], 1)).ravel()
-    strip = np.searchsorted(_WALLS, exponent, side="right") - 1
-    result = np.empty(rows.shape, dtype=np.complex128)
+    pairs = np.broadcast_to(beta, shape).ravel()
+    exponents, owner = np.unique(alpha, return_inverse=True)
+    owner = np.broadcast_to(owner.reshape(alpha.shape), shape).ravel()
+    strip = (np.searchsorted(_WALLS, exponents, side="right") - 1)[owner]
+    result = np.zeros((2, pairs.size), dtype=np.complex128)
     for index in np.unique(strip):
         chosen = np.flatnonzero(strip == index)
-        step = max(1, _VALUES_PER_BLOCK // shape[-1])
-        for part in (chosen[i : i + step] for i in range(0, chosen.size, step)):
+        for first in range(0, chosen.size, _VALUES_PER_BLOCK):
+            part = chosen[first : first + _VALUES_PER_BLOCK]
+            own, which = np.unique(owner[part], return_inverse=True)
             if 0 <= index < len(_WALLS) - 1:
-                result[part] = _on_strip(int(index), rows[part], exponent[part])
+                found = _on_strip(int(index), pairs[part], exponents[own], which, slope=slope)
+                result[0, part], result[1, part] = found
+            elif slope:
+                direct = general_dahl.describing_function_gradient(
+                    pairs[part], exponents[own[which]]
+                )
+                result[0, part], result[1, part] = direct[0], direct[2] - direct[0]
             else:
-                direct = general_dahl.describing_function(rows[part], exponent[part, None])
-                result[part] = direct
-    return result.reshape(shape)
+                result[0, part] = general_dahl.describing_function(
+                    pairs[part], exponents[own[which]]
+                )
+    return result[0].reshape(shape), result[1].reshape(shape)
 
 
-def _on_strip(strip: int, beta: FloatArray, alpha: FloatArray) -> ComplexArray:
-    """Return h at beta, (S, n), for alpha, (S,), between two walls."""
-    panel, place = _panels(strip, beta, alpha)
+def _on_strip(
+    strip: int, beta: FloatArray, exponents: FloatArray, owner: NDArray[np.intp], *, slope: bool
+) -> tuple[ComplexArray, ComplexArray | float]:
+    """Return h at beta, (N,), for exponents between two walls, and its slope, or 0.
+
+    `owner` are the places in `exponents`, (S,), of each pair's alpha.
+    """
+    panel, place, stretch = _panels(strip, beta, exponents, owner)
     first = panel.min()
-    present = np.flatnonzero(np.bincount((panel - first).ravel()))
+    present = np.flatnonzero(np.bincount(panel - first))
     slot = np.zeros(present[-1] + 1, dtype=np.intp)
     slot[present] = np.arange(present.size)
     low, high = _over_alpha(strip, _WALLS[strip : strip + 2])
-    across = (2.0 * _over_alpha(strip, alpha) - low - high) / (high - low)
+    across = (2.0 * _over_alpha(strip, exponents) - low - high) / (high - low)
     tables = np.stack([_series(strip, int(first + k)) for k in present], axis=2)
     along = chebyshev.chebvander(across, _NODES - 1) @ tables.view(np.float64)
     terms = along.view(np.complex128).reshape(_NODES, -1)
-    which = slot[panel - first] + present.size * np.arange(len(alpha))[:, None]
+    which = slot[panel - first] + present.size * owner
     # the Chebyshev polynomials one after the other, never all of them at once
     before, now = np.ones(place.shape), place
     total = terms[0].take(which)
+    if not slope:
+        for term in terms[1:]:
+            total += now * term.take(which)
+            before, now = now, 2.0 * place * now - before
+        return total / (1.0 + beta), 0.0
+    rise = np.zeros_like(total)
+    rose, rises = np.zeros(place.shape), np.ones(place.shape)
     for term in terms[1:]:
-        total += now * term.take(which)
+        own = term.take(which)
+        total += now * own
+        rise += rises * own
+        rose, rises = rises, 2.0 * (now + place * rises) - rose
         before, now = now, 2.0 * place * now - before
-    return np.asarray(total / (1.0 + beta))
+    h = total / (1.0 + beta)
+    return h, rise * stretch / (1.0 + beta) - h * (beta / (1.0 + beta))
 
 
 def _over_alpha(strip: int, alpha: FloatArray) -> FloatArray:
     return np.asarray(np.log1p(-alpha) if strip < _ONSET_SHOWS else np.log(alpha))
 
 
-def _panels(strip: int, beta: FloatArray, alpha: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
-    """Return the number of each pair's panel and where in it the pair is, from -1 to 1."""
+def _panels(
+    strip: int, beta: FloatArray, exponents: FloatArray, owner: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+    """Return the number of each pair's panel, where in it the pair is, from -1 to 1, and slopes.
+
+    The slopes are those of the place with respect to ln beta.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
-        b = np.fmin(np.fmax(np.log(beta), _LEAST), _MOST)
+        ln_beta = np.log(beta)
+    b = np.fmin(np.fmax(ln_beta, _LEAST), _MOST)
+    stretch = np.where(b == ln_beta, 2.0 / _WIDTH, 0.0)
     start: FloatArray | int = 0
     if strip < _ONSET_SHOWS:
-        b = b - _onset(alpha)[:, None]
+        b = b - _onset(exponents)[owner]
         near, size = np.abs(b) < 1.0, np.maximum(np.abs(b), _NEAREST)
         start = np.where(near, np.where(b < 0.0, _BELOW, _ABOVE), 0)
+        stretch = np.where(near, stretch / np.copysign(size, b), stretch)
         b = np.where(near, np.log(size), b)
     whole = np.floor(b / _WIDTH)
-    return np.asarray(whole + start, dtype=np.intp), 2.0 * (b / _WIDTH - whole) - 1.0
+    place = 2.0 * (b / _WIDTH - whole) - 1.0
+    return np.asarray(whole + start, dtype=np.intp), place, stretch
 
 
 def _onset(alpha: FloatArray) -> FloatArray:
