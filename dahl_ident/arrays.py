@@ -104,15 +104,20 @@ def array_between(value: ArrayLike, name: str, low: float, high: float) -> Float
 
 def positive_number(value: Any, name: str) -> float:
     """Return `value` as one finite float above zero."""
-    array = positive_array(value, name)
-    if array.ndim:
-        raise ValidationError(f"{name}: expected one number, got an array of shape {array.shape}")
-    return float(array)
+    return _one(positive_array(value, name), name)
+
+
+def non_negative_number(value: Any, name: str) -> float:
+    """Return `value` as one finite float of at least zero."""
+    return _one(non_negative_array(value, name), name)
 
 
 def finite_number(value: Any, name: str) -> float:
     """Return `value` as one finite float."""
-    array = finite_array(value, name)
+    return _one(finite_array(value, name), name)
+
+
+def _one(array: FloatArray, name: str) -> float:
     if array.ndim:
         raise ValidationError(f"{name}: expected one number, got an array of shape {array.shape}")
     return float(array)

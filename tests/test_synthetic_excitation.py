@@ -171,7 +171,7 @@ def test_flicker_noise_falls_as_one_over_f(n: int) -> None:
         ({"levels": (1.0,), "controlled": "x"}, "controlled is 'x'; expected one of"),
         ({"levels": (1.0,), "num_periods": 0}, "num_periods is 0; expected a whole number >= 1"),
         ({"levels": (1.0,), "settling_periods": 1.5}, "settling_periods is 1.5"),
-        ({"levels": (1.0,), "ramp_periods": -1.0}, "ramp_periods is -1.0; expected a number >= 0"),
+        ({"levels": (1.0,), "ramp_periods": -1.0}, "ramp_periods is -1.0; expected numbers >= 0"),
         ({"levels": (1.0,), "rest": float("nan")}, "rest is nan"),
     ],
 )

@@ -28,8 +28,7 @@ from dahl_ident.bayes.chain import Chain, RandomState
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.record_density import RecordDensity
-from dahl_ident.data.file_lock import locked
-from dahl_ident.data.storage import library, plain_data, put_in_place
+from dahl_ident.data.storage import library, locked, plain_data, put_in_place
 from dahl_ident.elements.description import describe_model
 from dahl_ident.errors import ModelError, SamplingError
 

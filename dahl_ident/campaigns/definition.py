@@ -39,8 +39,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from dahl_ident.data.columns import one_of
 from dahl_ident.data.storage import regular
-from dahl_ident.errors import DataError
+from dahl_ident.errors import DataError, ValidationError, choices
 
 _TABLES = {"laws", "files", "read", "extract", "fit", "posterior", "model", "output"}
 _FILES = {"pattern", "kind", "covariates"}
@@ -148,63 +149,63 @@ def read_definition(source: str | Path | Mapping[str, Any]) -> Definition:
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as exc:
             raise DataError(f"{path}: cannot be read as a campaign in TOML: {exc}") from exc
         name, folder = str(path), path.resolve().parent
-    _known(name, "tables", content, _TABLES)
-    files = _table(name, content, "files")
-    output = _table(name, content, "output")
-    _known(name, "options in [files]", files, _FILES)
-    _known(name, "options in [output]", output, _OUTPUT)
-    kind = _choice(name, "[files] kind", files.get("kind", "record"), _KINDS)
-    per = _choice(name, "[output] per", output.get("per", "device"), _UNITS)
+    try:
+        return _checked(name, folder, content)
+    except ValidationError as exc:
+        raise DataError(f"{name}: {exc}") from exc
+
+
+def _checked(name: str, folder: Path, content: Mapping[str, Any]) -> Definition:
+    _refuse_unknown("tables", content, _TABLES)
+    files, output = _table(content, "files"), _table(content, "output")
+    _refuse_unknown("options in [files]", files, _FILES)
+    _refuse_unknown("options in [output]", output, _OUTPUT)
+    kind = one_of(files.get("kind", "record"), "[files] kind", _KINDS)
+    per = one_of(output.get("per", "device"), "[output] per", _UNITS)
     place, reports = output.get("folder", "results"), output.get("reports", False)
     if not isinstance(place, str) or not place:
-        raise DataError(f"{name}: [output] folder is {place!r}; expected the path of a folder")
+        raise ValidationError(f"[output] folder is {place!r}; expected the path of a folder")
     if not isinstance(reports, bool):
-        raise DataError(f"{name}: [output] reports is {reports!r}; expected true or false")
-    _run_laws(name, folder, content.get("laws", []))
-    model, parameters, laws = _model(name, content.get("model"))
+        raise ValidationError(f"[output] reports is {reports!r}; expected true or false")
+    _run_laws(folder, content.get("laws", []))
+    model, parameters, laws = _model(content.get("model"))
     options = {
         "kind": kind,
         "per": per,
         "model": model,
-        **{table: _table(name, content, table) for table in ("read", "extract", "fit")},
-        "posterior": _table(name, content, "posterior") if "posterior" in content else None,
+        **{table: _table(content, table) for table in ("read", "extract", "fit")},
+        "posterior": _table(content, "posterior") if "posterior" in content else None,
     }
     if laws:
         options["laws"] = laws
-    _check_options(name, options)
-    tasks = _tasks(name, folder, files, per)
-    _check_names(name, tasks, parameters)
+    _check_options(options)
+    tasks = _tasks(folder, files, per)
+    _check_names(tasks, parameters)
     return Definition(name, options, tasks, folder / place, reports)
 
 
-def _table(name: str, content: Mapping[str, Any], key: str) -> dict[str, Any]:
+def _table(content: Mapping[str, Any], key: str) -> dict[str, Any]:
     table = content.get(key, {})
     if not isinstance(table, Mapping):
-        raise DataError(f"{name}: {key} is {table!r}; expected a table, [{key}]")
+        raise ValidationError(f"{key} is {table!r}; expected a table, [{key}]")
     return dict(table)
 
 
-def _known(name: str, what: str, given: Collection[str], known: Collection[str]) -> None:
+def _refuse_unknown(what: str, given: Collection[str], known: Collection[str]) -> None:
     unknown = sorted(set(given) - set(known))
     if unknown:
-        raise DataError(
-            f"{name}: unknown {what}: {', '.join(unknown)}; expected some of "
-            f"{', '.join(sorted(known))}"
+        raise ValidationError(
+            f"unknown {what}: {', '.join(unknown)}; expected some of "
+            f"{choices(sorted(known), *unknown)}"
         )
 
 
-def _choice(name: str, what: str, given: Any, known: Collection[str]) -> str:
-    if given not in known:
-        raise DataError(f"{name}: {what} is {given!r}; expected {' or '.join(known)}")
-    return str(given)
-
-
-def _run_laws(name: str, folder: Path, given: Any) -> None:
+def _run_laws(folder: Path, given: Any) -> None:
     """Run the files of laws, so that their laws are known by their kinds."""
     files = [given] if isinstance(given, str) else given
     if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
-        raise DataError(
-            f"{name}: laws is {given!r}; expected the path of a Python file, or a list of paths"
+        raise ValidationError(
+            f"laws is {given!r}; expected the path of a Python file, or a list of paths"
         )
     for file in files:
         from dahl_ident.elements.law_files import load_laws
@@ -212,7 +213,7 @@ def _run_laws(name: str, folder: Path, given: Any) -> None:
         load_laws(folder / file)
 
 
-def _model(name: str, entries: Any) -> tuple[list[dict[str, Any]], Collection[str], dict[str, str]]:
+def _model(entries: Any) -> tuple[list[dict[str, Any]], Collection[str], dict[str, str]]:
     """Return the model as plain data, names of its parameters, and digests of files of laws."""
     from dahl_ident.elements.description import describe_model, model_from_description
     from dahl_ident.elements.law_files import file_of, own_laws
@@ -222,14 +223,14 @@ def _model(name: str, entries: Any) -> tuple[list[dict[str, Any]], Collection[st
         or not entries
         or not all(isinstance(entry, Mapping) for entry in entries)
     ):
-        raise DataError(f'{name}: there is no model; give [[model]] tables, such as kind = "dahl"')
+        raise ValidationError('there is no model; give [[model]] tables, such as kind = "dahl"')
     model = model_from_description(entries)
     files = {file for law in own_laws(model.elements) if (file := file_of(law)) is not None}
     digests = {Path(file.path).name: file.digest for file in sorted(files)}
     return describe_model(model), [p.name for p in model.parameters], digests
 
 
-def _check_options(name: str, options: Mapping[str, Any]) -> None:
+def _check_options(options: Mapping[str, Any]) -> None:
     """Refuse options that the functions do not have, before any file is read."""
     import dahl_ident as di
 
@@ -241,60 +242,60 @@ def _check_options(name: str, options: Mapping[str, Any]) -> None:
     if record:
         functions["extract"] = di.extract
     elif options["extract"]:
-        raise DataError(f"{name}: [extract] is given, but tables of responses are not extracted")
+        raise ValidationError("[extract] is given, but tables of responses are not extracted")
     if options["posterior"] is not None:
         functions["posterior"] = di.posterior
     for table, function in functions.items():
         known = set(inspect.signature(function).parameters) - _SET_BY_CAMPAIGN
-        _known(name, f"options in [{table}]", options[table], known)
+        _refuse_unknown(f"options in [{table}]", options[table], known)
     try:
         json.dumps(options)
     except TypeError as exc:
-        raise DataError(
-            f"{name}: a date or time stands where an option has none; expected a number or a text "
+        raise ValidationError(
+            f"a date or time stands where an option has none; expected a number or a text "
             f"in quotes ({exc})"
         ) from exc
 
 
-def _check_names(name: str, tasks: Sequence[Task], parameters: Collection[str]) -> None:
+def _check_names(tasks: Sequence[Task], parameters: Collection[str]) -> None:
     """Refuse covariates that are called as a column of results, and fits of the same name."""
     taken = _COLUMNS | set(parameters)
     for column in {column for task in tasks for column in task.covariates}:
         if column in taken or column.startswith(_PREFIXES):
-            raise DataError(
-                f"{name}: a covariate is called {column!r}, as a column of the results; give it "
+            raise ValidationError(
+                f"a covariate is called {column!r}, as a column of the results; give it "
                 "another name"
             )
     for one, other in pairwise(sorted(tasks, key=lambda task: task.name)):
         if one.name == other.name:
-            raise DataError(
-                f"{name}: device {one.device!r}, run {one.run!r} and device {other.device!r}, run "
+            raise ValidationError(
+                f"device {one.device!r}, run {one.run!r} and device {other.device!r}, run "
                 f"{other.run!r} are both called {one.name}; rename the files of one"
             )
 
 
-def _tasks(name: str, folder: Path, files: Mapping[str, Any], per: str) -> tuple[Task, ...]:
+def _tasks(folder: Path, files: Mapping[str, Any], per: str) -> tuple[Task, ...]:
     pattern = files.get("pattern")
     if not isinstance(pattern, str):
-        raise DataError(f"{name}: [files] has no pattern; give one, such as 'data/{{device}}.csv'")
-    found = _matches(name, folder, pattern)
-    table = _covariates(name, folder, files.get("covariates"))
+        raise ValidationError("[files] has no pattern; give one, such as 'data/{device}.csv'")
+    found = _matches(folder, pattern)
+    table = _covariates(folder, files.get("covariates"))
     groups: dict[tuple[str, str], list[tuple[str, Path, dict[str, float | str]]]] = {}
     seen: dict[tuple[str, str], Path] = {}
     for path, fields in found:
         device = fields.pop("device")
         run = fields.pop("run", path.stem)
         if (device, run) in seen:
-            raise DataError(
-                f"{name}: {seen[device, run]} and {path} are both device {device!r}, run {run!r}; "
+            raise ValidationError(
+                f"{seen[device, run]} and {path} are both device {device!r}, run {run!r}; "
                 "add what distinguishes them to the pattern, as {run}"
             )
         seen[device, run] = path
         values: dict[str, float | str] = {key: _value(text) for key, text in fields.items()}
-        own = _looked_up(name, table, device, run)
+        own = _looked_up(table, device, run)
         if both := values.keys() & own.keys():
-            raise DataError(
-                f"{name}: {', '.join(sorted(both))} stands in the pattern and in the table of "
+            raise ValidationError(
+                f"{', '.join(sorted(both))} stands in the pattern and in the table of "
                 "covariates; leave it out of one"
             )
         values |= own
@@ -311,19 +312,19 @@ def _tasks(name: str, folder: Path, files: Mapping[str, Any], per: str) -> tuple
     )
 
 
-def _matches(name: str, folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
+def _matches(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
     """Return the files of the pattern with the fields that their paths hold."""
     fields = _FIELD.findall(pattern)
     if "device" not in fields:
-        raise DataError(
-            f"{name}: the pattern {pattern!r} has no {{device}}; put it where the path names it"
+        raise ValidationError(
+            f"the pattern {pattern!r} has no {{device}}; put it where the path names it"
         )
     if len(set(fields)) < len(fields):
-        raise DataError(f"{name}: the pattern {pattern!r} names a field twice")
+        raise ValidationError(f"the pattern {pattern!r} names a field twice")
     parts = _FIELD.split(pattern)
     if any(brace in part for part in parts[::2] for brace in "{}"):
-        raise DataError(
-            f"{name}: the pattern {pattern!r} has braces without a name of letters, digits and _ "
+        raise ValidationError(
+            f"the pattern {pattern!r} has braces without a name of letters, digits and _ "
             "between them"
         )
     wild = "".join("*" if i % 2 else glob.escape(part) for i, part in enumerate(parts))
@@ -336,18 +337,18 @@ def _matches(name: str, folder: Path, pattern: str) -> list[tuple[Path, dict[str
         if match is not None:
             found.append((folder / path, match.groupdict()))
     if not found:
-        raise DataError(f"{name}: the pattern {pattern!r} finds no file below {folder}")
+        raise ValidationError(f"the pattern {pattern!r} finds no file below {folder}")
     return found
 
 
 def _covariates(
-    name: str, folder: Path, given: Any
+    folder: Path, given: Any
 ) -> dict[tuple[str, str | None], dict[str, float | str]] | None:
     """Return the rows of the table by device and run, None where there is no table."""
     if given is None:
         return None
     if not isinstance(given, str):
-        raise DataError(f"{name}: [files] covariates is {given!r}; expected the path of a table")
+        raise ValidationError(f"[files] covariates is {given!r}; expected the path of a table")
     path = folder / given
     try:
         with regular(path).open(encoding="utf-8-sig", newline="") as file:
@@ -381,7 +382,6 @@ def _covariates(
 
 
 def _looked_up(
-    name: str,
     table: Mapping[tuple[str, str | None], dict[str, float | str]] | None,
     device: str,
     run: str,
@@ -391,8 +391,8 @@ def _looked_up(
     for key in ((device, run), (device, None)):
         if key in table:
             return table[key]
-    raise DataError(
-        f"{name}: the table of covariates has no row for device {device!r}, run {run!r}; add one"
+    raise ValidationError(
+        f"the table of covariates has no row for device {device!r}, run {run!r}; add one"
     )
 
 

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -27,8 +27,7 @@ from dahl_ident.campaigns.engine import (
 )
 from dahl_ident.campaigns.journal import Journal, finished, write_tables
 from dahl_ident.campaigns.work import Job, Row, digest_of
-from dahl_ident.data.file_lock import locked
-from dahl_ident.data.storage import as_before_inert, read_text, regular, write_whole
+from dahl_ident.data.storage import as_before_inert, locked, read_text, regular, write_whole
 from dahl_ident.errors import DataError, ModelError
 from dahl_ident.version import __version__
 
@@ -134,7 +133,7 @@ class Campaign:
 
 
 def campaign(
-    source: str | Path | Mapping[str, Any],
+    source: str | Path | Mapping[str, Any] | Definition,
     *,
     jobs: int | None = None,
     executor: Executor | None = None,
@@ -155,8 +154,9 @@ def campaign(
 
     Parameters
     ----------
-    source : path or mapping
-        TOML file, or its content; see :mod:`dahl_ident.campaigns.definition`.
+    source : path, mapping or Definition
+        TOML file, its content, or what was read from it; see
+        :mod:`dahl_ident.campaigns.definition`.
     jobs : int, optional
         Processes of this machine, with one numerical thread each; by default as many as there
         are processors. Elsewhere: the number of fits at a time.
@@ -224,34 +224,8 @@ def campaign(
     >>> campaign(definition, jobs=1).table[["device", "sigma"]].round(1).to_dict("list")
     {'device': ['clean', 'noisy'], 'sigma': [30.0, 30.0]}
     """
-    return run(
-        read_definition(source),
-        jobs=jobs,
-        executor=executor,
-        scheduler=scheduler,
-        limits=(timeout, memory),
-        patience=patience,
-        send_files=send_files,
-        dry_run=dry_run,
-        redo=redo,
-        progress=progress,
-    )
-
-
-def run(
-    definition: Definition,
-    *,
-    jobs: int | None,
-    executor: Executor | None,
-    scheduler: str | None,
-    limits: tuple[float | None, float | None],
-    patience: float,
-    send_files: bool,
-    dry_run: bool,
-    redo: bool,
-    progress: Callable[[int, int, Mapping[str, Any]], None] | None,
-) -> Campaign:
-    """Do what :func:`campaign` does, with a definition that was read already."""
+    definition = source if isinstance(source, Definition) else read_definition(source)
+    limits = (timeout, memory)
     for name, limit in zip(("timeout", "memory"), limits, strict=True):
         if limit is not None:
             positive_number(limit, name)
@@ -261,7 +235,7 @@ def run(
         keys = _keys(definition, Limits(*limits))
         agree = _options_agree(definition, redo)
         known = set(finished(folder / _JOURNAL)[0]) if agree else set()
-        return _split(definition, keys, known, {})
+        return _split(definition, keys, known)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as exc:
@@ -271,7 +245,7 @@ def run(
         with closing(Journal(folder / _JOURNAL)) as journal:
             allowed = Limits(*limits, journal.seconds)
             keys = _keys(definition, allowed)
-            outcome = _split(definition, keys, set(journal.places), {})
+            outcome = _split(definition, keys, set(journal.places))
             missing = [(key, task) for key, task in zip(keys, definition.tasks, strict=True)
                        if key not in journal.places]  # fmt: skip
             jobs_of = ((tag, _job(definition, tag, send_files, laws)) for tag in missing)
@@ -306,7 +280,7 @@ def run(
             f"{lost}; {len(there)} of {len(keys)} fits are in {folder / 'results.csv'}, and the "
             "same command does the others"
         ) from lost
-    return Campaign(folder, outcome.finished, outcome.to_do, statuses)
+    return replace(outcome, statuses=statuses)
 
 
 def _place(jobs: int | None, executor: Executor | None, scheduler: str | None) -> Place:
@@ -363,15 +337,13 @@ def _whole(task: Task, row: dict[str, Any]) -> dict[str, Any]:
     return {**own, **task.covariates, **row, "version": __version__}
 
 
-def _split(
-    definition: Definition, keys: list[str], known: set[str], statuses: Mapping[str, int]
-) -> Campaign:
+def _split(definition: Definition, keys: list[str], known: set[str]) -> Campaign:
     named = list(zip(keys, definition.tasks, strict=True))
     return Campaign(
         definition.folder,
         tuple(task.name for key, task in named if key in known),
         tuple(task.name for key, task in named if key not in known),
-        statuses,
+        {},
     )
 
 

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import tempfile
 import time
-from collections.abc import Mapping
-from contextlib import nullcontext
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from dahl_ident.errors import DataError
@@ -151,35 +151,23 @@ def _response(
     return di.extract(records, **options["extract"])
 
 
-def _on_disk(job: Job, digests: list[str]) -> Any:
-    """Return a context that gives the paths of the files, and record their digests."""
-    if all(content is None for _, content in job.files):
-        paths = [Path(name) for name, _ in job.files]
-        digests += [digest_of(path) for path in paths]
-        return nullcontext(paths)
-    return _Unpacked(job, digests)
+@contextmanager
+def _on_disk(job: Job, digests: list[str]) -> Iterator[list[Path]]:
+    """Give the paths of the files while they are read, and record their digests.
 
-
-class _Unpacked:
-    """Files that came with their job, in a folder that lives as long as they are read."""
-
-    def __init__(self, job: Job, digests: list[str]) -> None:
-        self._job, self._digests = job, digests
-
-    def __enter__(self) -> list[Path]:
-        self._folder = tempfile.TemporaryDirectory(prefix="campaign_")
+    Files that came with the job are in a folder that is removed afterwards.
+    """
+    with TemporaryDirectory(prefix="campaign_") as folder:
         paths = []
-        for index, (name, content) in enumerate(self._job.files):
-            assert content is not None
-            self._digests.append(hashlib.sha256(content).hexdigest())
-            path = Path(self._folder.name) / str(index) / Path(name).name
-            path.parent.mkdir()
-            path.write_bytes(content)
+        for index, (name, content) in enumerate(job.files):
+            path = Path(name)
+            if content is not None:
+                path = Path(folder) / str(index) / path.name
+                path.parent.mkdir()
+                path.write_bytes(content)
             paths.append(path)
-        return paths
-
-    def __exit__(self, *_: object) -> None:
-        self._folder.cleanup()
+            digests.append(digest_of(path))
+        yield paths
 
 
 def digest_of(path: Path) -> str:

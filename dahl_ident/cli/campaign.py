@@ -71,7 +71,7 @@ def campaign(
     """
     from dahl_ident.campaigns.definition import read_definition
     from dahl_ident.campaigns.population import USABLE
-    from dahl_ident.campaigns.run import run
+    from dahl_ident.campaigns.run import campaign as run_campaign
 
     laws.run()
     read = read_definition(definition)
@@ -79,8 +79,8 @@ def campaign(
     with ExitStack() as stack:
         progress = stack.enter_context(_progress()) if sys.stderr.isatty() else _lines()
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # this command says it itself
-        done = run(
-            read, jobs=jobs, executor=None, scheduler=scheduler, limits=(timeout, memory),
+        done = run_campaign(
+            read, jobs=jobs, scheduler=scheduler, timeout=timeout, memory=memory,
             patience=patience, send_files=send_files, dry_run=dry_run, redo=redo, progress=progress,
         )  # fmt: skip
     if report is not None and not dry_run:

@@ -23,15 +23,15 @@ from __future__ import annotations
 
 import tomllib
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray, finite_number, non_negative_array, positive_number
+from dahl_ident.arrays import FloatArray, non_negative_number, positive_number
 from dahl_ident.data.columns import CONTROLLED, FILE_COLUMNS, FileColumn, one_of
 from dahl_ident.data.raw_columns import Channel, Source, plain
 from dahl_ident.data.storage import read_text
@@ -103,9 +103,6 @@ class ColumnMap:
     drive_factor_uncertainty: float = 0.0
 
 
-_SETTINGS = tuple(f.name for f in fields(ColumnMap) if f.name != "roles")
-
-
 def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -> ColumnMap:
     """Read a column map.
 
@@ -145,12 +142,11 @@ def _read(entries: Mapping[str, Any]) -> ColumnMap:
     roles: dict[str, Column] = {}
     settings: dict[str, Any] = {}
     for key, entry in entries.items():
-        if key == "controlled" and not _is_column(entry):
-            settings[key] = _controlled(entry)
-        elif key in FILE_COLUMNS:
+        column = key in FILE_COLUMNS
+        if key in _SETTINGS and not (column and isinstance(entry, Mapping) and "column" in entry):
+            settings[key] = _SETTINGS[key](entry, key)
+        elif column:
             roles[key] = _column(entry, key)
-        elif key in _SETTINGS:
-            settings[key] = _setting(key, entry)
         else:
             raise ValidationError(
                 f"unknown entry {key!r}; expected one of "
@@ -164,10 +160,6 @@ def _toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(read_text(path, "the column map"))
     except tomllib.TOMLDecodeError as exc:
         raise DataError(f"{path}: not a TOML file: {exc}") from exc
-
-
-def _is_column(entry: Any) -> bool:
-    return isinstance(entry, Mapping) and "column" in entry
 
 
 def _column(entry: Any, role: str) -> Column:
@@ -193,29 +185,31 @@ def _column(entry: Any, role: str) -> Column:
     return Column(entry.get("column"), entry.get("unit"), int(sign), factor)
 
 
-def _controlled(entry: Any) -> str | dict[str, str]:
+def _controlled(entry: Any, key: str) -> str | dict[str, str]:
     if isinstance(entry, str):
-        return one_of(entry, "controlled", CONTROLLED)
+        return one_of(entry, key, CONTROLLED)
     if isinstance(entry, Mapping) and all(isinstance(v, str) for v in entry.values()):
-        return {one_of(key, "controlled", CONTROLLED): entry[key] for key in entry}
+        return {one_of(held, key, CONTROLLED): entry[held] for held in entry}
     raise ValidationError(
-        f"controlled is {entry!r}; expected 'displacement' or 'force', or a pattern of level "
-        "labels for each of them"
+        f"{key} is {entry!r}; expected 'displacement' or 'force', or a pattern of level labels "
+        "for each of them"
     )
 
 
-def _setting(key: str, entry: Any) -> Any:
-    match key:
-        case "quantity":
-            return one_of(entry, key, QUANTITIES)
-        case "sample_rate":
-            return positive_number(entry, key)
-        case "drive_factor_uncertainty":
-            return finite_number(non_negative_array(entry, key), key)
-        case _:
-            if not isinstance(entry, str):
-                raise ValidationError(f"{key} is {entry!r}; expected text such as '12.5 N/V'")
-            return entry
+def _text(entry: Any, key: str) -> str:
+    if not isinstance(entry, str):
+        raise ValidationError(f"{key} is {entry!r}; expected text such as '12.5 N/V'")
+    return entry
+
+
+_SETTINGS: dict[str, Callable[[Any, str], Any]] = {
+    "quantity": lambda entry, key: one_of(entry, key, QUANTITIES),
+    "controlled": _controlled,
+    "sweep": _text,
+    "sample_rate": positive_number,
+    "drive_factor": _text,
+    "drive_factor_uncertainty": non_negative_number,
+}
 
 
 @dataclass
@@ -377,8 +371,9 @@ class Binding:
         what = " and ".join(given)
         if kind in (None, "force"):
             channel = self.channel("drive")
-            column = "the drive" if channel is None else f"column {channel.header!r}"
-            found = "no column holds the drive" if kind is None else f"{column} is a force already"
+            found = "no column holds the drive"
+            if channel is not None:
+                found = f"the drive ({channel.name}) is a force already"
             raise DataError(
                 f"{self.source.name}: {what} is given, but {found}; expected a drive in V or A: "
                 "leave the factor out, or name the column with columns={'drive': ...}"

@@ -56,7 +56,9 @@ def plain_mappings(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 def one_of(value: str, name: str, allowed: tuple[str, ...]) -> str:
     """Return `value` if it is among `allowed`, else name them."""
     if value not in allowed:
-        raise ValidationError(f"{name} is {value!r}; expected one of {choices(allowed, value)}")
+        raise ValidationError(
+            f"{name} is {value!r}; expected one of {choices(allowed, str(value))}"
+        )
     return value
 
 

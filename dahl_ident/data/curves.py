@@ -8,65 +8,33 @@ exception.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import FloatArray
 from dahl_ident.data.quantities import polar_std
 from dahl_ident.errors import ValidationError
-from dahl_ident.units import Motion, Quantity, engineering, si_unit
+from dahl_ident.units import engineering, si_unit
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from dahl_ident.data.frequency_response import FrequencyResponse
 
 _SAME_FREQUENCY = 5e-3  # relative
 _NOMINAL = 1.5  # factor within which a numeric level is the amplitude that was held
 
 
-class _Points(Protocol):
-    """The attributes of a frequency response that curves need."""
-
-    @property
-    def n(self) -> int: ...
-    @property
-    def frequency_hz(self) -> FloatArray: ...
-    @property
-    def response(self) -> ComplexArray: ...
-    @property
-    def amplitude(self) -> FloatArray | None: ...
-    @property
-    def drive(self) -> FloatArray | None: ...
-    @property
-    def covariance(self) -> FloatArray | None: ...
-    @property
-    def level(self) -> NDArray[Any] | None: ...
-    @property
-    def levels(self) -> list[Any]: ...
-    @property
-    def controlled(self) -> NDArray[np.str_]: ...
-    @property
-    def quantity(self) -> Quantity: ...
-    @property
-    def motion(self) -> Motion: ...
-    @property
-    def unit(self) -> str: ...
-    def select(
-        self, *, level: Any = None, harmonic: int | None = None, rows: ArrayLike | None = None
-    ) -> Self: ...
-
-
-P = TypeVar("P", bound=_Points)
 Stds = tuple[FloatArray | None, FloatArray | None]
 
 
 def draw(
-    data: P,
+    data: FrequencyResponse,
     ax: Any = None,
     *,
-    stds: Callable[[P], Stds] | None = None,
-    fitted: Callable[[P, bool], Any] | None = None,
+    stds: Callable[[FrequencyResponse], Stds] | None = None,
+    fitted: Callable[[FrequencyResponse, bool], Any] | None = None,
 ) -> tuple[Any, Any]:
     """Draw gain and phase of the fundamental, over amplitude or frequency as suits the table.
 
@@ -103,7 +71,7 @@ def draw(
 
 
 def draw_backbone(
-    data: _Points, stds: tuple[FloatArray, FloatArray], ax: Any = None
+    data: FrequencyResponse, stds: tuple[FloatArray, FloatArray], ax: Any = None
 ) -> tuple[Any, Any]:
     """Draw natural frequency and damping ratio over amplitude, with their standard deviations."""
     from dahl_ident.plots import plot_backbone
@@ -133,16 +101,16 @@ def draw_waveforms(time: FloatArray, frame: pd.DataFrame, kind: str, ax: Any = N
     raise ValidationError(f"kind is {kind!r}; expected 'waveforms' or 'loops'")
 
 
-def _stds(data: _Points) -> Stds:
+def _stds(data: FrequencyResponse) -> Stds:
     return (None, None) if data.covariance is None else polar_std(data.response, data.covariance)
 
 
-def is_force_controlled(data: _Points) -> bool:
+def is_force_controlled(data: FrequencyResponse) -> bool:
     """Return whether most rows were driven by force."""
     return bool(np.mean(data.controlled == "force") > 0.5)
 
 
-def held_amplitude(data: _Points) -> FloatArray:
+def held_amplitude(data: FrequencyResponse) -> FloatArray:
     """Return the controlled amplitude, or the other one if that is unknown."""
     held, other = data.amplitude, data.drive
     if is_force_controlled(data):
@@ -152,18 +120,18 @@ def held_amplitude(data: _Points) -> FloatArray:
     return found
 
 
-def held_label(data: _Points) -> str:
+def held_label(data: FrequencyResponse) -> str:
     """Return the axis label of that amplitude."""
     kind = "force" if held_amplitude(data) is data.drive else "displacement"
     return f"{kind} amplitude [{si_unit(kind, data.motion)}]"
 
 
-def gain_label(data: _Points) -> str:
+def gain_label(data: FrequencyResponse) -> str:
     """Return the axis label of the gain."""
     return f"{data.quantity.replace('_', ' ')} [{data.unit}]"
 
 
-def is_over_frequency(data: _Points) -> bool:
+def is_over_frequency(data: FrequencyResponse) -> bool:
     """Return whether curves over frequency suit the table better than curves over amplitude."""
     parts = [data.select(level=label) for label in data.levels] or [data]
     return all(
@@ -171,7 +139,7 @@ def is_over_frequency(data: _Points) -> bool:
     )
 
 
-def curves(data: P) -> list[tuple[str, P]]:
+def curves(data: FrequencyResponse) -> list[tuple[str, FrequencyResponse]]:
     """Return the parts of the table that make one curve each, with their labels.
 
     One a level over frequency, or one a frequency over amplitude.
@@ -183,7 +151,7 @@ def curves(data: P) -> list[tuple[str, P]]:
     return [(f"{f:.4g} Hz", data.select(rows=nominal == f)) for f in np.unique(nominal)]
 
 
-def curve_of_row(data: _Points) -> FloatArray:
+def curve_of_row(data: FrequencyResponse) -> FloatArray:
     """Return for each row the frequency or the level's index that it shares with its curve."""
     if not is_over_frequency(data):
         return _nominal_frequency(data.frequency_hz)
@@ -192,17 +160,17 @@ def curve_of_row(data: _Points) -> FloatArray:
     return np.array([data.levels.index(label) for label in data.level.tolist()], dtype=float)
 
 
-def abscissa(part: _Points, over_frequency: bool) -> FloatArray:
+def abscissa(part: FrequencyResponse, over_frequency: bool) -> FloatArray:
     """Return the places of some rows on the axis."""
     return part.frequency_hz if over_frequency else held_amplitude(part)
 
 
-def abscissa_label(data: _Points) -> str:
+def abscissa_label(data: FrequencyResponse) -> str:
     """Return the label of the axis that suits the table."""
     return "frequency [Hz]" if is_over_frequency(data) else held_label(data)
 
 
-def _level(label: Any, part: _Points) -> str:
+def _level(label: Any, part: FrequencyResponse) -> str:
     """Return a level with a unit if it is the controlled amplitude and not just a name."""
     if not isinstance(label, (int, float)):
         return str(label)

@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from dahl_ident.arrays import (
     ComplexArray,
     FloatArray,
-    finite_number,
     non_negative_array,
+    non_negative_number,
     positive_array,
 )
 from dahl_ident.data.columns import (
@@ -163,9 +163,8 @@ class FrequencyResponse(Tabular):
         values = {name: one.checked(given[name], name, n) for name, one in COLUMNS.items()} | {
             "quantity": one_of(quantity, "quantity", (*QUANTITIES, "backbone")),
             "motion": one_of(motion, "motion", MOTIONS),
-            "drive_factor_uncertainty": finite_number(
-                non_negative_array(drive_factor_uncertainty, "drive_factor_uncertainty"),
-                "drive_factor_uncertainty",
+            "drive_factor_uncertainty": non_negative_number(
+                drive_factor_uncertainty, "drive_factor_uncertainty"
             ),
             "quality": frozen_mapping(
                 {

@@ -8,7 +8,7 @@ from __future__ import annotations
 import datetime
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,25 +25,24 @@ _FIELDS = {
     "customer": "Customer",
     "specimen": "Specimen",
     "method": "Method",
+    "instruments": "Instruments",
+    "traceability": "Traceability",
+    "ambient": "Ambient conditions",
     "received": "Date of receipt",
     "measured": "Date of measurement",
     "place": "Place of measurement",
     "operator": "Operator",
-    "traceability": "Traceability",
     "remarks": "Remarks",
 }
-_TEXTS = ("title", "number", *_FIELDS, "authorised_by", "role")
-_BLANK = ("Specimen", "Instruments", "Ambient conditions", "Date of measurement", "Operator")
-_LAST = (
-    "Instruments",
-    "Traceability",
-    "Ambient conditions",
-    "Date of receipt",
-    "Date of measurement",
-    "Place of measurement",
-    "Operator",
-    "Remarks",
-)
+"""The printed fields in their order."""
+_LISTS = ("ambient", "instruments")
+_TEXTS = (
+    "title", "number", *(key for key in _FIELDS if key not in _LISTS), "authorised_by", "role"
+)  # fmt: skip
+_BLANK = ("specimen", "instruments", "ambient", "measured", "operator")
+_WORDS = {
+    "serial": "serial ", "calibration": "calibrated: ", "uncertainty": "uncertainty ", "k": "k = "
+}  # fmt: skip
 _INSTRUMENT = ("name", "quantity", "model", "serial", "calibration", "channel", "uncertainty", "k")
 
 
@@ -103,19 +102,17 @@ class Metadata:
     def lines(self) -> dict[str, tuple[str, ...]]:
         """The lines of each printed field, by its printed name, in order."""
         printed = {
-            name: tuple(line.strip() for line in self.texts.get(key, "").splitlines())
-            for key, name in _FIELDS.items()
+            key: tuple(line.strip() for line in self.texts.get(key, "").splitlines())
+            for key in _FIELDS
         }
-        printed["Instruments"] = tuple(one.text for one in self.instruments)
-        printed["Ambient conditions"] = self.ambient
-        order = sorted(printed, key=lambda name: _LAST.index(name) if name in _LAST else -1)
-        return {name: printed[name] for name in order if any(printed[name]) or name in _BLANK}
+        printed |= {"instruments": tuple(i.text for i in self.instruments), "ambient": self.ambient}
+        kept = (key for key in _FIELDS if any(printed[key]) or key in _BLANK)
+        return {_FIELDS[key]: printed[key] for key in kept}
 
     def facts(self) -> dict[str, Any]:
         """Return the fields for machines, empty where they are not stated."""
-        texts = {name: self.texts.get(name, "") for name in _TEXTS}
         return {
-            **texts,
+            **{name: self.texts.get(name, "") for name in _TEXTS},
             "ambient": self.ambient,
             "instruments": tuple(one.text for one in self.instruments),
         }
@@ -156,19 +153,21 @@ def metadata_of(given: Mapping[str, Any] | str | Path | None) -> Metadata:
 
 
 def _checked(given: Mapping[str, Any], where: str) -> Metadata:
-    known = (*_TEXTS, "ambient", "instruments")
-    unknown = sorted(set(given) - set(known))
-    if unknown:
-        raise ValidationError(
-            f"{where}metadata has the field {unknown[0]!r}; expected any of "
-            f"{choices(known, *unknown)}"
-        )
+    _refuse_unknown(given, (*_TEXTS, *_LISTS), f"{where}metadata")
     texts = {name: _text(given[name], f"{where}{name}") for name in _TEXTS if name in given}
     return Metadata(
         texts,
         _ambient(given.get("ambient", ()), f"{where}ambient"),
         _instruments(given.get("instruments", ()), f"{where}instruments"),
     )
+
+
+def _refuse_unknown(given: Mapping[str, Any], known: Sequence[str], name: str) -> None:
+    unknown = sorted(set(given) - set(known))
+    if unknown:
+        raise ValidationError(
+            f"{name} has the field {unknown[0]!r}; expected any of {choices(known, *unknown)}"
+        )
 
 
 def _text(value: Any, name: str) -> str:
@@ -194,15 +193,9 @@ def _instrument(one: Any, name: str) -> Instrument:
     """Return an instrument that is given as a text or as a table."""
     if not isinstance(one, Mapping):
         return Instrument(_text(one, name))
-    unknown = sorted(set(one) - set(_INSTRUMENT))
-    if unknown:
-        raise ValidationError(
-            f"{name} has the field {unknown[0]!r}; expected any of {choices(_INSTRUMENT, *unknown)}"
-        )
+    _refuse_unknown(one, _INSTRUMENT, name)
     given = {key: _text(one[key], f"{name}.{key}") for key in _INSTRUMENT if key in one}
-    words = {"serial": "serial ", "calibration": "calibrated: ", "uncertainty": "uncertainty "}
-    words["k"] = "k = "
-    parts = [words.get(key, "") + text for key, text in given.items() if key != "channel"]
+    parts = [_WORDS.get(key, "") + text for key, text in given.items() if key != "channel"]
     parts += [f"{key} not stated" for key in ("calibration", "uncertainty") if key not in given]
     return Instrument(", ".join(parts), given.get("channel", ""), _standard(given, name))
 
@@ -223,9 +216,11 @@ def _standard(given: Mapping[str, str], name: str) -> float:
         )
     try:
         k = float(given["k"])
-        u = _delay(text) if channel == "delay" else float(text.removesuffix("%")) / 100.0
+        if channel == "delay":
+            u = parse_quantity(text, ("time",), "uncertainty")[0]
+        else:
+            u = float(text.removesuffix("%")) / 100.0 if text.endswith("%") else math.nan
         stated = 0.0 < u < math.inf and 0.0 < k < math.inf
-        stated = stated and (channel == "delay" or text.endswith("%"))
     except (ValueError, DahlIdentError):
         stated = False
     if not stated:
@@ -235,7 +230,3 @@ def _standard(given: Mapping[str, str], name: str) -> float:
             "number above zero"
         )
     return u / k
-
-
-def _delay(text: str) -> float:
-    return parse_quantity(text, ("time",), "uncertainty")[0]

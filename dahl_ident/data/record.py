@@ -15,7 +15,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import SMALLEST, FloatArray, finite_array, positive_number
+from dahl_ident.arrays import (
+    SMALLEST,
+    FloatArray,
+    finite_array,
+    non_negative_number,
+    positive_number,
+)
 from dahl_ident.data.columns import column, frozen_copy, frozen_mapping, one_of
 from dahl_ident.data.storage import plain_data
 from dahl_ident.data.tabular import Lines, Tabular, extent, noted
@@ -133,17 +139,14 @@ class Record(Tabular):
             "time": seconds,
             "drive_unit": drive_unit,
             "drive_factor": drive_factor,
-            "drive_factor_uncertainty": float(drive_factor_uncertainty),
+            "drive_factor_uncertainty": non_negative_number(
+                drive_factor_uncertainty, "drive_factor_uncertainty"
+            ),
             "motion": one_of(motion, "motion", MOTIONS),
             "provenance": frozen_mapping(provenance),
         }
         if drive_factor is not None:
             values["drive_factor"] = positive_number(drive_factor, "drive_factor")
-        if not 0.0 <= drive_factor_uncertainty < np.inf:
-            raise ValidationError(
-                f"drive_factor_uncertainty is {drive_factor_uncertainty!r}; expected a relative "
-                "standard uncertainty >= 0"
-            )
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -360,20 +363,7 @@ def _doubted(record: Record, said: str) -> dict[str, Any]:
 
 def cut(record: Record, part: slice) -> Record:
     """Return some of a record's samples."""
-    channels = {
-        name: None if samples is None else samples[part]
-        for name in ("displacement", "velocity", "acceleration", "force", "drive")
-        for samples in (getattr(record, name),)
-    }
-    return Record(
-        record.time[part],
-        **channels,
-        drive_unit=record.drive_unit,
-        drive_factor=record.drive_factor,
-        drive_factor_uncertainty=record.drive_factor_uncertainty,
-        motion=record.motion,
-        provenance=record.provenance,
-    )
+    return replace(record, **{name: getattr(record, name)[part] for name in record._units})
 
 
 def _time(value: ArrayLike) -> FloatArray:

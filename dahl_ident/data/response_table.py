@@ -35,7 +35,6 @@ from dahl_ident.data.tabular import ASSUMED, listed
 from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import (
     DRIVE_KINDS,
-    MECHANICAL_KINDS,
     MOTION_KINDS,
     QUANTITIES,
     Quantity,
@@ -43,6 +42,7 @@ from dahl_ident.units import (
     kind_of,
     parse_quantity,
     parse_unit,
+    si_unit,
 )
 
 _FORMS = (("response",), ("real", "imag"), ("gain", "phase"), ("gain_db", "phase"))
@@ -88,8 +88,6 @@ def response_from(
     """
     source = replace(source, channels=tuple(map(_as_gain, source.channels)))
     source, options = _with_stated(source, columns, options)
-    if columns.sweep is not None:
-        source = _with_frequencies(source, columns.sweep)
     whole = Binding(source, columns, RESPONSE_COLUMNS)
     if source.runs:
         whole.doubt(f"the header is repeated in the file: read as {len(source.runs) + 1} runs")
@@ -99,11 +97,14 @@ def response_from(
             options = replace(options, level=label)
         named = source if label is None else replace(source, name=f"{source.name}, level {label}")
         table = _Table(named, one, options)
-        parts.append(table.response())
-        whole.used |= table.bound.used
-        whole.notes += table.bound.notes
+        try:
+            parts.append(table.response())
+        except ValidationError as exc:
+            raise DataError(f"{named.name}: {exc}") from exc
+        whole.used |= table.used
+        whole.notes += table.notes
         of = "" if label is None else f"level {label}: "
-        whole.doubts += [f"{of}{text}" for text in table.bound.doubts]
+        whole.doubts += [f"{of}{text}" for text in table.doubts]
     data = parts[0] if len(parts) == 1 else FrequencyResponse.concatenate(parts)
     assumed = {"frequency": ASSUMED} if _UNKNOWN_FREQUENCY in whole.notes else {}
     return replace(data, provenance=whole.provenance() | assumed)
@@ -142,56 +143,89 @@ def _with_stated(
     return replace(source, notes=(*source.notes, *notes)), held
 
 
-def _with_frequencies(source: Source, sweep: str) -> Source:
-    """Return a source with the frequencies of a sweep, one for each row."""
+def _swept(sweep: str, rows: int) -> FloatArray:
+    """Return the frequencies of a sweep, one for each row."""
     found = _SWEEP.fullmatch(sweep)
     if found is None:
-        raise DataError(
-            f"{source.name}: sweep is {sweep!r}; expected the first and the last frequency and "
-            "their spacing, such as '1 to 100 Hz, log' or '0 to 800 Hz, linear'"
+        raise ValidationError(
+            f"sweep is {sweep!r}; expected the first and the last frequency and their spacing, "
+            "such as '1 to 100 Hz, log' or '0 to 800 Hz, linear'"
         )
-    names = RESPONSE_COLUMNS["frequency"].names
-    known = [c for c in source.channels if plain(c.short or c.name) in names]
-    if known:
-        raise DataError(
-            f"{source.name}: sweep={sweep!r} is given, and column {known[0].name!r} holds the "
-            "frequency too; leave out one of them"
-        )
-    first, last = (float(text) for text in found.groups()[:2])
-    rows, log = source.channels[0].size, found[3] == "log"
+    first, last, log = float(found[1]), float(found[2]), found[3] == "log"
     if rows < 2 or not (first > 0.0 if log else first >= 0.0) or not first < last < np.inf:
-        raise DataError(
-            f"{source.name}: sweep is {sweep!r} for {rows} rows; expected rising frequencies"
-        )
-    axis = (np.geomspace if log else np.linspace)(first, last, rows)
-    frequency = Channel("frequency", axis, "Hz", "frequency")
-    note = f"frequencies from the sweep stated, {sweep}"
-    return replace(source, channels=(*source.channels, frequency), notes=(*source.notes, note))
+        raise ValidationError(f"sweep is {sweep!r} for {rows} rows; expected rising frequencies")
+    return (np.geomspace if log else np.linspace)(first, last, rows)
 
 
-class _Table:
+class _Table(Binding):
     """One table with one column for each role."""
 
     def __init__(self, source: Source, columns: ColumnMap, options: ResponseOptions) -> None:
+        super().__init__(source, columns, RESPONSE_COLUMNS)
         self.options = options
-        self.bound = Binding(source, columns, RESPONSE_COLUMNS)
+        self.level = options.drive if options.level is None else options.level
         self.factor_uncertainty = 0.0
-        self._within_range()
+
+    def _add_stated(self) -> None:
+        """Add a column for each of frequency, amplitude and drive that is stated for all rows."""
+        options, sweep = self.options, self.map.sweep
+        roles = ("frequency", *(role for form in _FORMS for role in form))
+        rows = next((c.size for role in roles if (c := self.channel(role)) is not None), 0)
+        if sweep is not None:
+            self._add("frequency", _swept(sweep, rows), "Hz", "sweep", sweep)
+            self.notes.append(f"frequencies from the sweep stated, {sweep}")
+        if not self.has("frequency"):
+            self._refuse_waveforms()
+            if options.frequency is None and rows and not self.has("amplitude"):
+                raise ValidationError(
+                    "no column holds the frequency; name it with columns={'frequency': ...}, or "
+                    "say what was swept, such as sweep='1 to 100 Hz, log'"
+                )
+            if not rows:
+                self.required("frequency")
+            if options.frequency is None:
+                self.notes.append(_UNKNOWN_FREQUENCY)
+                self._add("frequency", np.ones(rows), "Hz", "frequency", 1.0)
+        if options.frequency is not None:
+            hertz = positive_number(options.frequency, "frequency")
+            self._add("frequency", np.full(rows, hertz), "Hz", "frequency", hertz)
+        for role, kinds in (("amplitude", MOTION_KINDS), ("drive", DRIVE_KINDS)):
+            text = getattr(options, role)
+            if text is not None:
+                value, kind, motion = parse_quantity(text, kinds, f"{self.source.name}: {role}")
+                if not 0.0 < value < np.inf:
+                    raise ValidationError(f"{role} is {text!r}; expected a value > 0")
+                unit = f"{si_unit(kind, motion)} pk"
+                self._add(role, np.full(rows, value), unit, role, text)
+
+    def _add(self, role: str, values: FloatArray, unit: str, option: str, said: Any) -> None:
+        """Add a column that an option states, unless the table has one."""
+        source, known = self.source, self.channel(role)
+        if known is not None:
+            raise ValidationError(
+                f"{option}={said!r} is given, and column {known.name!r} holds the {role} too; "
+                "leave out one of them"
+            )
+        channels = (*source.channels, Channel(str(said), values, unit, role))
+        self.source = replace(source, channels=channels)
 
     def response(self) -> FrequencyResponse:
-        bound, source = self.bound, self.bound.source
+        options = self.options
+        self._add_stated()
+        self.same_length({r: c for r in RESPONSE_COLUMNS if (c := self.channel(r)) is not None})
+        if options.frequency_hz is not None:
+            self._keep_range(*options.frequency_hz)
         frequency_hz = self._frequency()
         amplitude = self._amplitude(frequency_hz)
-        drive = self._drive(frequency_hz)
+        drive = self._drive()
         if amplitude is None and drive is None:
-            raise DataError(
-                f"{source.name}: neither an amplitude nor a drive is given; friction answers "
-                "every amplitude differently. Name a column with columns={'amplitude': ...} "
-                "(inspect proposes a column map), or give drive='0.2 N' or amplitude='5 um' for "
-                "the whole file"
+            raise ValidationError(
+                "neither an amplitude nor a drive is given; friction answers every amplitude "
+                "differently. Name a column with columns={'amplitude': ...} (inspect proposes a "
+                "column map), or give drive='0.2 N' or amplitude='5 um' for the whole file"
             )
         harmonic = self._whole_numbers("harmonic")
-        if bound.has("damping_ratio"):
+        if self.has("damping_ratio"):
             quantity, response, errors = self._backbone(frequency_hz, amplitude)
         else:
             quantity, response = self._response(frequency_hz, amplitude, drive)
@@ -199,30 +233,27 @@ class _Table:
             errors = self._errors(quantity, response)
             if harmonic is not None:
                 _make_real(response, errors, harmonic == 0)
-        options = self.options
-        try:
-            data = FrequencyResponse(
-                frequency_hz,
-                response,
-                amplitude,
-                drive,
-                level=self._labels("level", self._stated_level),
-                run=self._labels("run", options.run),
-                controlled=self._controlled(drive is not None and amplitude is None),
-                harmonic=1 if harmonic is None else harmonic,
-                quantity=quantity,
-                motion=bound.motion(),
-                drive_factor_uncertainty=self._factor_uncertainty(),
-                quality=self._quality(),
-                **errors,
-            )
-        except ValidationError as exc:
-            raise DataError(f"{source.name}: {exc}") from exc
+        saved = self.source.metadata.get("drive_factor_uncertainty")
+        data = FrequencyResponse(
+            frequency_hz,
+            response,
+            amplitude,
+            drive,
+            level=self._labels("level", self.level),
+            run=self._labels("run", options.run),
+            controlled=self._controlled(drive is not None and amplitude is None),
+            harmonic=1 if harmonic is None else harmonic,
+            quantity=quantity,
+            motion=self.motion(),
+            drive_factor_uncertainty=self.factor_uncertainty or float(saved or 0.0),
+            quality=self._quality(),
+            **errors,
+        )
         if quantity != "backbone":
-            check_drive(data, bound.doubt_rows)
-            check_phase_size(data, bound.doubt_rows)
+            check_drive(data, self.doubt_rows)
+            check_phase_size(data, self.doubt_rows)
             if options.passive:
-                check_energy(source.name, data, bound.doubt_rows)
+                check_energy(self.source.name, data, self.doubt_rows)
         return data
 
     def _backbone(
@@ -232,43 +263,27 @@ class _Table:
         roles = ("damping_ratio", "frequency_std", "damping_ratio_std")
         ratio, frequency_std, ratio_std = (self._scaled(role) for role in roles)
         if amplitude is None or frequency_std is None or ratio_std is None:
-            raise DataError(
-                f"{self.bound.source.name}: a table of damping ratios is a backbone; expected the "
-                "columns amplitude, frequency_std and damping_ratio_std in addition to frequency "
-                "and damping_ratio"
+            raise ValidationError(
+                "a table of damping ratios is a backbone; expected the columns amplitude, "
+                "frequency_std and damping_ratio_std in addition to frequency and damping_ratio"
             )
-        try:
-            data = FrequencyResponse.backbone(
-                amplitude, frequency_hz, ratio,
-                frequency_std=frequency_std, damping_ratio_std=ratio_std,
-            )  # fmt: skip
-        except ValidationError as exc:
-            raise DataError(f"{self.bound.source.name}: {exc}") from exc
+        data = FrequencyResponse.backbone(
+            amplitude, frequency_hz, ratio, frequency_std=frequency_std, damping_ratio_std=ratio_std
+        )
         errors = self._errors("backbone", data.response) | {"covariance": data.covariance}
         return "backbone", data.response, errors
 
-    def _within_range(self) -> None:
+    def _keep_range(self, low: float, high: float) -> None:
         """Leave out the frequencies that the user does not want, before anything is judged."""
-        self._refuse_waveforms()
-        lengths = {c: self.bound.channel(c) for c in RESPONSE_COLUMNS}
-        self.bound.same_length({r: c for r, c in lengths.items() if c is not None})
-        if self.options.frequency_hz is None:
-            return
-        low, high = self.options.frequency_hz
-        channel = self.bound.required("frequency")
-        frequency_hz = self._hertz(self.bound.numbers("frequency", channel))
+        frequency_hz = self._hertz(self.numbers("frequency", self.required("frequency")))
         keep = (frequency_hz >= low) & (frequency_hz <= high)
         if not keep.any():
-            raise DataError(
-                f"{self.bound.source.name}: no frequency lies from {low:g} to {high:g} Hz"
-            )
-        self.bound.source = self.bound.source.rows(keep)
+            raise ValidationError(f"no frequency lies from {low:g} to {high:g} Hz")
+        self.source = self.source.rows(keep)
 
     def _refuse_waveforms(self) -> None:
         """Say so where samples in time were given for responses."""
-        source = self.bound.source
-        if self.bound.has("frequency"):
-            return
+        source = self.source
         held = {plain(c.short or c.name) for c in source.channels}
         motion_or_force = {n for r in (*MOTION_KINDS, "force") for n in RECORD_COLUMNS[r].names}
         if held & set(RECORD_COLUMNS["time"].names) and held & motion_or_force:
@@ -280,99 +295,49 @@ class _Table:
             )
 
     def _hertz(self, values: FloatArray) -> FloatArray:
-        channel = self.bound.required("frequency")
-        unit = self.bound.unit("frequency", channel)
-        kind, factor = self.bound.kind("frequency", unit, ("frequency", "angular_frequency"))
+        channel = self.required("frequency")
+        unit = self.unit("frequency", channel)
+        kind, factor = self.kind("frequency", unit, ("frequency", "angular_frequency"))
         return values * factor / (2.0 * np.pi if kind == "angular_frequency" else 1.0)
 
     def _frequency(self) -> FloatArray:
-        bound, stated = self.bound, self.options.frequency
-        channel = bound.channel("frequency")
-        if channel is None:
-            rows = next((c for f in _FORMS for r in f if (c := bound.channel(r)) is not None), None)
-            if rows is not None and stated is None and not bound.has("amplitude"):
-                raise DataError(
-                    f"{bound.source.name}: no column holds the frequency; name it with "
-                    "columns={'frequency': ...}, or say what was swept, such as sweep='1 to 100 "
-                    "Hz, log'"
-                )
-            if rows is None:
-                bound.required("frequency")
-            assert rows is not None  # else an error was raised
-            if stated is None:
-                bound.notes.append(_UNKNOWN_FREQUENCY)
-            return np.full(
-                rows.size, 1.0 if stated is None else positive_number(stated, "frequency")
-            )
-        if stated is not None:
-            raise DataError(
-                f"{bound.source.name}: frequency={stated!r} is given, and column {channel.name!r} "
-                "holds the frequency too; leave out one of them"
-            )
-        values = bound.numbers("frequency", channel)
-        self.bound.source.require(
+        channel = self.required("frequency")
+        values = self.numbers("frequency", channel)
+        self.source.require(
             values >= SMALLEST, channel, "a frequency > 0; frequency_hz=(low, high) leaves rows out"
         )
         return self._hertz(values)
 
     def _amplitude(self, frequency_hz: FloatArray) -> FloatArray | None:
-        found = self._peaks("amplitude", MOTION_KINDS, frequency_hz.shape)
-        return None if found is None else per_frequency(found[1], frequency_hz, found[0])
+        kind, values = self._peaks("amplitude", MOTION_KINDS)
+        return None if values is None else per_frequency(values, frequency_hz, kind)
 
-    def _drive(self, frequency_hz: FloatArray) -> FloatArray | None:
-        found = self._peaks("drive", DRIVE_KINDS, frequency_hz.shape)
+    def _drive(self) -> FloatArray | None:
+        kind, values = self._peaks("drive", DRIVE_KINDS)
         if not self._gain_per_drive():
-            self.bound.refuse_idle_factor(None if found is None else found[0])
-        return None if found is None else found[1] * self._force_per(found[0])
+            self.refuse_idle_factor(None if values is None else kind)
+        if values is None:
+            return None
+        factor, self.factor_uncertainty = self.force_per(kind)
+        return values * factor
 
-    def _peaks(
-        self, role: str, kinds: tuple[str, ...], shape: tuple[int, ...]
-    ) -> tuple[str, FloatArray] | None:
-        """Return kind and zero-to-peak values of a column, or of the one value for the file."""
-        bound, text = self.bound, getattr(self.options, role)
-        channel = bound.channel(role)
+    def _peaks(self, role: str, kinds: tuple[str, ...]) -> tuple[str, FloatArray | None]:
+        """Return kind and zero-to-peak values of a column."""
+        channel = self.channel(role)
         if channel is None:
-            return None if text is None else self._constant(role, text, kinds, shape)
-        if text is not None:
-            raise DataError(
-                f"{bound.source.name}: {role}={text!r} is given, and column {channel.name!r} holds "
-                f"the {role} too; leave out one of them"
-            )
-        values = bound.numbers(role, channel)
-        bound.source.require(values >= SMALLEST, channel, "a value > 0")
-        unit = bound.unit(role, channel)
-        kind, factor = bound.kind(role, unit, kinds)
-        bound.note_peak(role, unit)
+            return "", None
+        values = self.numbers(role, channel)
+        self.source.require(values >= SMALLEST, channel, "a value > 0")
+        unit = self.unit(role, channel)
+        kind, factor = self.kind(role, unit, kinds)
+        self.note_peak(role, unit)
         return kind, values * factor * unit.to_peak
-
-    def _constant(
-        self, role: str, text: str, kinds: tuple[str, ...], shape: tuple[int, ...]
-    ) -> tuple[str, FloatArray]:
-        """Return one amplitude or drive that holds for the whole file."""
-        value, kind, motion = parse_quantity(text, kinds, f"{self.bound.source.name}: {role}")
-        if not 0.0 < value < np.inf:
-            raise DataError(f"{self.bound.source.name}: {role} is {text!r}; expected a value > 0")
-        if kind in MECHANICAL_KINDS:
-            self.bound.motions[role] = motion
-        return kind, np.full(shape, value)
 
     def _gain_per_drive(self) -> bool:
         """Return whether the response is one for a drive in V or A, such as m/V."""
-        for role in ("gain", "gain_db", "real", "response"):
-            channel = self.bound.channel(role)
-            if channel is not None and _per_drive(self.bound.unit(role, channel).text) is not None:
-                return True
-        return False
-
-    def _force_per(self, kind: str) -> float:
-        """Return the force for one SI unit of the drive."""
-        factor, self.factor_uncertainty = self.bound.force_per(kind)
-        return factor
-
-    def _factor_uncertainty(self) -> float:
-        """Return the uncertainty of the factor that was used, or that an earlier save states."""
-        saved = self.bound.source.metadata.get("drive_factor_uncertainty")
-        return self.factor_uncertainty or float(saved or 0.0)
+        found = [(role, self.channel(role)) for role in ("gain", "gain_db", "real", "response")]
+        units = (self.unit(role, channel).text for role, channel in found if channel is not None)
+        return any(_per_drive(unit) is not None for unit in units)
 
     def _response(
         self, frequency_hz: FloatArray, amplitude: FloatArray | None, drive: FloatArray | None
@@ -380,103 +345,98 @@ class _Table:
         form = self._form(_FORMS)
         match form:
             case ("response",):
-                return self._complex()
+                quantity, factor, _ = self._factor("response")
+                channel = self.required("response")
+                return quantity, factor * self.source.complex_numbers(channel)
             case ("real", "imag"):
                 quantity, real = self._part("real")
                 other, imag = self._part("imag")
                 if other != quantity:
                     raise UnitError(
-                        f"{self.bound.source.name}: units disagree: real is {quantity}, imag "
-                        f"{other}"
+                        f"{self.source.name}: units disagree: real is {quantity}, imag {other}"
                     )
                 return quantity, real + 1j * imag
             case (role, "phase"):
                 quantity, gain = self._part(role)
                 return quantity, gain * np.exp(1j * self._phase())
-        quantity_named = self.bound.map.quantity
-        if amplitude is None or drive is None or not self.bound.has("phase"):
-            raise DataError(
-                f"{self.bound.source.name}: no response; expected real and imag, gain (or "
-                "gain_db) and phase, complex numbers, or a phase beside amplitude and drive"
+        wanted = self.map.quantity
+        if amplitude is None or drive is None or not self.has("phase"):
+            raise ValidationError(
+                "no response; expected real and imag, gain (or gain_db) and phase, complex "
+                "numbers, or a phase together with amplitude and drive"
             )
-        if quantity_named is None:
-            raise DataError(
-                f"{self.bound.source.name}: the phase stands without a gain; say which quantity's "
-                "it is with quantity='receptance' or another"
+        if wanted is None:
+            raise ValidationError(
+                "the phase stands without a gain; say which quantity's it is with "
+                "quantity='receptance' or another"
             )
         receptance = FrequencyResponse(
             frequency_hz, amplitude / drive, amplitude, quantity="receptance"
         )
-        return quantity_named, receptance.to(quantity_named).gain * np.exp(1j * self._phase())
+        return wanted, receptance.to(wanted).gain * np.exp(1j * self._phase())
 
     def _form(self, forms: tuple[tuple[str, ...], ...]) -> tuple[str, ...] | None:
         """Return the one form whose columns are all there; the map decides between several."""
-        mapped = [f for f in forms if self.bound.map.roles.keys() >= {*f}]
-        found = [f for f in mapped or forms if all(self.bound.has(role) for role in f)]
-        named = [f for f in found if f[0] in self.bound.map.roles]
+        mapped = [f for f in forms if self.map.roles.keys() >= {*f}]
+        found = [f for f in mapped or forms if all(self.has(role) for role in f)]
+        named = [f for f in found if f[0] in self.map.roles]
         found = named or found
         if len(found) > 1:
-            raise DataError(
-                f"{self.bound.source.name}: both {' and '.join(found[0])} and "
-                f"{' and '.join(found[1])} are there; name one of them in columns="
+            raise ValidationError(
+                f"both {' and '.join(found[0])} and {' and '.join(found[1])} are there; name one "
+                "of them in columns="
             )
         return found[0] if found else None
 
     def _factor(self, role: str) -> tuple[Quantity, float, bool]:
         """Return which quantity a column's unit makes it, its factor, and whether it is in dB."""
-        bound = self.bound
-        unit = bound.unit(role, bound.required(role))
-        per_drive = _per_drive(unit.text) if bound.map.drive_factor is not None else None
+        unit = self.unit(role, self.required(role))
+        per_drive = _per_drive(unit.text) if self.map.drive_factor is not None else None
         if per_drive is not None:  # such as m/V, made m/N by the factor in N/V
             drive_kind, text, power = per_drive
-            kind, factor = bound.kind(role, parse_unit(text), QUANTITIES)
-            value, self.factor_uncertainty = bound.force_per(drive_kind)
+            kind, factor = self.kind(role, parse_unit(text), QUANTITIES)
+            value, self.factor_uncertainty = self.force_per(drive_kind)
             return cast(Quantity, kind), factor * value**power, unit.decibel
-        kind, factor = bound.kind(role, unit, QUANTITIES)
-        wanted = bound.map.quantity
+        kind, factor = self.kind(role, unit, QUANTITIES)
+        wanted = self.map.quantity
         if wanted is not None and kind != wanted:
             raise UnitError(
-                f"{bound.source.name}: the {role} in [{unit.text}] is {kind}, not {wanted}"
+                f"{self.source.name}: the {role} in [{unit.text}] is {kind}, not {wanted}"
             )
         return cast(Quantity, kind), factor, unit.decibel
 
     def _part(self, role: str) -> tuple[Quantity, FloatArray]:
         """Return the quantity and the SI values of a gain, or of a real or imaginary part."""
-        channel = self.bound.required(role)
+        channel = self.required(role)
         quantity, factor, decibel = self._factor(role)
-        values = self.bound.numbers(role, channel)
+        values = self.numbers(role, channel)
         if decibel or role == "gain_db":
-            self.bound.source.require(np.abs(values) < 1000.0, channel, "a level within 1000 dB")
+            self.source.require(np.abs(values) < 1000.0, channel, "a level within 1000 dB")
             return quantity, factor * 10.0 ** (values / 20.0)
         if role == "gain":
-            self.bound.source.require(values >= 0.0, channel, "a gain >= 0")
+            self.source.require(values >= 0.0, channel, "a gain >= 0")
         return quantity, factor * values
 
-    def _complex(self) -> tuple[Quantity, ComplexArray]:
-        channel = self.bound.required("response")
-        quantity, factor, _ = self._factor("response")
-        return quantity, factor * self.bound.source.complex_numbers(channel)
-
     def _phase(self) -> FloatArray:
-        channel = self.bound.required("phase")
-        values = self.bound.numbers("phase", channel)
-        unit = self.bound.unit("phase", channel)
-        _, factor = self.bound.kind("phase", unit, ("angle",))
-        check_phase_unit(values, factor != 1.0, channel.name, self.bound.doubt_rows)
+        channel = self.required("phase")
+        values = self.numbers("phase", channel)
+        unit = self.unit("phase", channel)
+        _, factor = self.kind("phase", unit, ("angle",))
+        check_phase_unit(values, factor != 1.0, channel.name, self.doubt_rows)
         return values * factor
 
     def _errors(self, quantity: Quantity, response: ComplexArray) -> dict[str, Any]:
         """Return the constructor's arguments on errors that the table has columns for."""
-        dof, form = self.bound.channel("dof"), self._form(_ERROR_FORMS)
+        dof, form = self.channel("dof"), self._form(_ERROR_FORMS)
         errors: dict[str, Any] = {
             "covariance": None if form is None else self._covariance(form, quantity, response),
-            "dof": None if dof is None else self.bound.source.numbers(dof, infinite=True),
+            "dof": None if dof is None else self.source.numbers(dof, infinite=True),
             "amplitude_std": self._scaled("amplitude_std"),
             "drive_std": self._scaled("drive_std"),
         }
         for level in ("amplitude", "drive"):
             cross = [f"covariance_{level}_{part}" for part in ("real", "imag")]
-            if all(self.bound.has(role) for role in cross):
+            if all(self.has(role) for role in cross):
                 both = [self._scaled(role, quantity) for role in cross]
                 errors[f"{level}_covariance"] = np.stack(both, -1)
         return errors
@@ -502,77 +462,71 @@ class _Table:
 
     def _scaled(self, role: str, quantity: str = "dynamic_stiffness") -> Any:
         """Return a column in the SI unit that it is declared with, None where there is none."""
-        bound, column = self.bound, RESPONSE_COLUMNS[role]
-        channel = bound.channel(role)
+        column = RESPONSE_COLUMNS[role]
+        channel = self.channel(role)
         if channel is None:
             return None
-        unit, values = bound.unit(role, channel), bound.numbers(role, channel)
+        unit, values = self.unit(role, channel), self.numbers(role, channel)
         if column.least:
-            bound.source.require(values >= 0.0, channel, column.least)
-        what = f"{bound.source.name}: column {channel.name!r}"
-        return (
-            values * factor_to(unit, column.unit_of(bound.motion(), quantity), what) * unit.to_peak
-        )
+            self.source.require(values >= 0.0, channel, column.least)
+        si, what = column.unit_of(self.motion(), quantity), f"column {channel.name!r}"
+        return values * factor_to(unit, si, f"{self.source.name}: {what}") * unit.to_peak
 
     def _whole_numbers(self, role: str) -> FloatArray | None:
-        channel = self.bound.channel(role)
+        channel = self.channel(role)
         if channel is None:
             return None
-        values = self.bound.numbers(role, channel)
+        values = self.numbers(role, channel)
         good = (values >= 0.0) & (values == np.round(values))
-        self.bound.source.require(good, channel, "a whole number >= 0")
+        self.source.require(good, channel, "a whole number >= 0")
         return values
 
     def _refuse_zero(self, response: ComplexArray, harmonic: FloatArray | None) -> None:
         fundamental = np.ones(response.shape, bool) if harmonic is None else harmonic == 1
         zero = np.flatnonzero((np.abs(response) < SMALLEST) & fundamental)
         if zero.size:
-            source = self.bound.source
+            source = self.source
             raise DataError(
                 f"{source.name}, {source.row_name(int(zero[0]))}: the response is 0 "
                 f"({zero.size} such rows); expected a measured value"
             )
 
-    @property
-    def _stated_level(self) -> str | float | None:
-        return self.options.drive if self.options.level is None else self.options.level
-
     def _labels(self, role: str, stated: str | float | None) -> Any:
         """Return the labels in a column, or those stated for the whole table."""
-        channel = self.bound.channel(role)
+        channel = self.channel(role)
         if channel is None:
             return stated
         if channel.values.dtype.kind == "U":
             return np.atleast_1d(channel.values)
-        return self.bound.source.numbers(channel)
+        return self.source.numbers(channel)
 
     def _controlled(self, force_only: bool) -> Any:
-        held = self.bound.map.controlled
+        held = self.map.controlled
         if isinstance(held, Mapping):
-            label = str(self._labels("level", self._stated_level))
+            label = str(self._labels("level", self.level))
             found = [w for w in CONTROLLED if fnmatch.fnmatchcase(label, held.get(w, ""))]
             if len(found) != 1:
-                raise DataError(
-                    f"{self.bound.source.name}: level {label!r} matches "
-                    f"{'both patterns' if found else 'no pattern'} of controlled: {dict(held)}"
+                raise ValidationError(
+                    f"level {label!r} matches {'both patterns' if found else 'no pattern'} of "
+                    f"controlled: {dict(held)}"
                 )
             return found[0]
         if held is not None:
             return held
-        channel = self.bound.channel("controlled")
+        channel = self.channel("controlled")
         if channel is not None:
             words = np.char.strip(np.atleast_1d(channel.values).astype(str))
-            self.bound.source.require(np.isin(words, CONTROLLED), channel, "displacement or force")
+            self.source.require(np.isin(words, CONTROLLED), channel, "displacement or force")
             return words
         word = "force" if force_only else "displacement"
-        self.bound.notes.append(f"controlled: {word}, as the table does not say")
+        self.notes.append(f"controlled: {word}, as the table does not say")
         return word
 
     def _quality(self) -> dict[str, NDArray[Any]]:
         """Return the verdicts that an earlier save listed, in the types they had."""
-        kinds = self.bound.source.metadata.get("quality", {})
-        found = {name: self.bound.source.find(name) for name in kinds}
-        self.bound.used |= {channel.name for channel in found.values()}
+        kinds = self.source.metadata.get("quality", {})
+        found = {name: self.source.find(name) for name in kinds}
+        self.used |= {channel.name for channel in found.values()}
         return {name: _typed(found[name].values, kind) for name, kind in kinds.items()}
 
 

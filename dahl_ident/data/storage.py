@@ -15,15 +15,17 @@ import json
 import math
 import os
 import stat
+import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from dahl_ident.data.raw_columns import split_header
-from dahl_ident.errors import DataError, MissingDependencyError, ValidationError
+from dahl_ident.errors import DahlIdentError, DataError, MissingDependencyError, ValidationError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -180,6 +182,47 @@ def _move_to_new(part: Path, path: Path) -> None:
         part.unlink()
 
 
+@contextlib.contextmanager
+def locked(file: Path, error: type[DahlIdentError]) -> Iterator[None]:
+    """Hold the lock ``<file>.lock``; raise `error` where another process holds it.
+
+    It is released when the process ends, whichever way. On Windows there is no such lock.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    path = file.with_name(file.name + ".lock")
+    while True:
+        try:
+            opened = path.open("w")
+        except OSError as exc:
+            raise error(f"{file} cannot be written: {exc.strerror or exc}") from exc
+        with opened as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise error(
+                    f"another run is writing {file}; wait for its end, or give another file"
+                ) from None
+            if not _is_still(path, lock):  # its last owner has removed it meanwhile
+                continue
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+            return
+
+
+def _is_still(path: Path, file: IO[str]) -> bool:
+    """Return whether an open file is the one that the path names."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False
+
+
 def inert(frame: pd.DataFrame) -> pd.DataFrame:
     """Return a table whose texts no spreadsheet takes for formulas: those get an apostrophe.
 
@@ -325,14 +368,6 @@ def _text(frame: pd.DataFrame, separator: str) -> bytes:
     return f"# {METADATA_MARK} {metadata}\n{table}".encode()
 
 
-def _csv(frame: pd.DataFrame) -> bytes:
-    return _text(frame, ",")
-
-
-def _tsv(frame: pd.DataFrame) -> bytes:
-    return _text(frame, "\t")
-
-
 def _parquet(frame: pd.DataFrame) -> bytes:
     library("pyarrow", "parquet")
     buffer = io.BytesIO()
@@ -358,8 +393,8 @@ def _hdf5(frame: pd.DataFrame) -> bytes:
 
 
 _WRITERS: dict[str, Callable[[pd.DataFrame], bytes]] = {
-    ".csv": _csv,
-    ".tsv": _tsv,
+    ".csv": partial(_text, separator=","),
+    ".tsv": partial(_text, separator="\t"),
     ".parquet": _parquet,
     ".h5": _hdf5,
     ".hdf5": _hdf5,

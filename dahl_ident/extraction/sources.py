@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import whole_number
 from dahl_ident.data import FrequencyResponse, Record
-from dahl_ident.data.level_files import labelled
+from dahl_ident.data.levels import labelled
 from dahl_ident.data.readers import record_pieces, refuse_repeated, run_names
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.extraction.from_record import record_response

@@ -16,9 +16,14 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
-from dahl_ident.arrays import ComplexArray, FloatArray, finite_number, positive_number
+from dahl_ident.arrays import (
+    ComplexArray,
+    FloatArray,
+    finite_number,
+    non_negative_number,
+    positive_number,
+)
 from dahl_ident.errors import ValidationError
-from dahl_ident.synthetic.checks import non_negative_number
 from dahl_ident.synthetic.mechanism import Signal
 from dahl_ident.synthetic.randomness import Draws
 

@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from dahl_ident.arrays import positive_array, positive_number, whole_number
+from dahl_ident.arrays import non_negative_number, positive_array, positive_number, whole_number
 from dahl_ident.data.columns import one_of
 from dahl_ident.errors import ValidationError
-from dahl_ident.synthetic.checks import non_negative_number
 from dahl_ident.synthetic.randomness import Draws
 from dahl_ident.synthetic.waveform import Waveform, WaveformBuilder
 

@@ -14,12 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray, whole_number
+from dahl_ident.arrays import ComplexArray, FloatArray, non_negative_number, whole_number
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.columns import one_of
 from dahl_ident.errors import ValidationError
 from dahl_ident.steady_state import STEADY, Steady
-from dahl_ident.synthetic.checks import non_negative_number
 from dahl_ident.synthetic.randomness import Draws
 
 

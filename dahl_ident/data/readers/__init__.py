@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from dahl_ident.data.column_map import column_map
 from dahl_ident.data.frequency_response import FrequencyResponse
-from dahl_ident.data.level_files import labelled
+from dahl_ident.data.levels import labelled
 from dahl_ident.data.raw_columns import Source
 from dahl_ident.data.readers.file import File, open_file
 from dahl_ident.data.readers.inspection import FileContents, contents
@@ -156,14 +156,14 @@ def read_frequency_response(
     if not paths:
         raise DataError("no file to read; expected at least one path")
     refuse_repeated(paths)
-    mapped = column_map(
-        columns,
-        quantity=quantity,
-        sweep=sweep,
-        drive_factor=drive_factor,
-        drive_factor_uncertainty=drive_factor_uncertainty,
-        controlled=controlled,
-    )
+    entries = {
+        "quantity": quantity,
+        "sweep": sweep,
+        "drive_factor": drive_factor,
+        "drive_factor_uncertainty": drive_factor_uncertainty,
+        "controlled": controlled,
+    }
+    mapped = column_map(columns, **entries)
     parts = []
     for one in paths:
         groups = groups_in_name(one, level_from_name)
@@ -176,18 +176,14 @@ def read_frequency_response(
             frequency_hz=frequency_hz,
             passive=passive,
         )
-        given = _given(columns=columns, quantity=quantity, sweep=sweep, drive_factor=drive_factor,
-                       drive_factor_uncertainty=drive_factor_uncertainty, controlled=controlled,
-                       sheet=sheet, **vars(options))  # fmt: skip
+        given = _given(columns=columns, **entries, sheet=sheet, **vars(options))
         part = response_from(open_source(one, sheet, given), mapped, options)
-        if level is not None and part.level is not None and any(v != level for v in part.level):
-            raise DataError(
-                f"{one}: level={level!r} is given, but the table has its own levels; leave it out"
-            )
-        if run is not None and part.run is not None and any(v != options.run for v in part.run):
-            raise DataError(
-                f"{one}: run={run!r} is given, but the table has its own runs; leave it out"
-            )
+        for name, label, labels in (("level", level, part.level), ("run", options.run, part.run)):
+            if label is not None and labels is not None and any(v != label for v in labels):
+                raise DataError(
+                    f"{one}: {name}={label!r} is given, but the table has its own {name}s; leave "
+                    "it out"
+                )
         parts.append(part)
     if len(parts) == 1:
         return _as_saved(parts[0]) if _is_frame(paths[0]) else parts[0]

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dahl_ident.data.levels import stated_levels
 from dahl_ident.data.raw_columns import Channel, Source, Stored, split_header, words
 from dahl_ident.data.readers.file import File, utf8
-from dahl_ident.data.stated_levels import stated_levels
 from dahl_ident.data.storage import library
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError

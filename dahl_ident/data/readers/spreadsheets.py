@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dahl_ident.data.levels import stated_levels
 from dahl_ident.data.raw_columns import Channel, Source, Stored, split_header, words
 from dahl_ident.data.readers import sheet_process
 from dahl_ident.data.readers.file import MOST_CHANNELS, ZIP_ERRORS, File
 from dahl_ident.data.readers.header import best_run, header, named_channels, refuse_second_header
-from dahl_ident.data.stated_levels import stated_levels
 from dahl_ident.data.storage import library, read_metadata
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dahl_ident.data.levels import stated_levels
 from dahl_ident.data.raw_columns import Channel, Source, plain, split_header, words
 from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
 from dahl_ident.data.readers.header import (
@@ -31,7 +32,6 @@ from dahl_ident.data.readers.header import (
     named_channels,
     refuse_second_header,
 )
-from dahl_ident.data.stated_levels import stated_levels
 from dahl_ident.data.storage import METADATA_MARK, as_before_inert, read_metadata
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError

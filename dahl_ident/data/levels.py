@@ -1,0 +1,108 @@
+"""Levels of tests: one in each of several files, or one that a header states."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data.frequency_response import FrequencyResponse
+from dahl_ident.errors import UnitError, ValidationError
+from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS, parse_quantity
+
+_SAME = 1.1  # ratio up to which drives or amplitudes are one level
+_NUMBER = r"(?P<value>[0-9]+(?:[.,][0-9]+)?(?:e[-+]?[0-9]+)?)"
+_UNIT = r"[^\W\d_][^;,\t\])\"']{0,20}"
+_LINE = re.compile(
+    rf"[\W_]*(?P<key>[a-z][a-z _.-]{{2,40}}?)\s*(?:[\[(](?P<own>{_UNIT})[\])]\s*)?[\"']?\s*"
+    rf"(?:[:=;,\t]\s*|\s)[\"']?{_NUMBER}(?:[\"']?\s*[;,\t]?\s*[\[(\"']?(?P<unit>{_UNIT}))?",
+    re.IGNORECASE,
+)
+_SUBJECTS = {
+    "drive", "driving", "excitation", "source", "force", "control", "target", "reference", "test",
+    "shaker", "input", "sine", "load", "torque", "displacement", "velocity", "acceleration",
+    "response", "nominal",
+}  # fmt: skip
+_SIZES = {"level", "amplitude"}
+
+
+def labelled(parts: Sequence[FrequencyResponse], names: Sequence[str]) -> list[FrequencyResponse]:
+    """Return the tables of several files with their names as levels, or else as runs.
+
+    A level that was measured in a file of its own is not a run of its own: how such files differ
+    is what the levels are for, and scatter between runs cannot be told from it.
+    """
+    if any(part.run is not None for part in parts) or not _one_level_each(parts):
+        return [
+            part if part.run is not None else replace(part, run=np.full(part.n, name))
+            for part, name in zip(parts, names, strict=True)
+        ]
+    return [
+        part if part.level is not None else replace(part, level=np.full(part.n, name))
+        for part, name in zip(parts, names, strict=True)
+    ]
+
+
+def _one_level_each(parts: Sequence[FrequencyResponse]) -> bool:
+    """Return whether each table holds one level, and no two the same."""
+    if all(part.level is not None for part in parts):
+        labels = [set(np.asarray(part.level).tolist()) for part in parts]
+        return max(map(len, labels)) == 1 and len(set.union(*labels)) == len(parts)
+    if any(part.level is not None for part in parts):
+        return False
+    held = [_held(part) for part in parts]
+    for sizes in zip(*held, strict=True):
+        known = [size for size in sizes if size is not None]
+        if len(known) < len(parts):
+            continue
+        middle = np.sort([np.median(size) for size in known])
+        one_each = all(size.max() < _SAME * size.min() for size in known)
+        if one_each and np.all(middle[1:] > _SAME * middle[:-1]):
+            return True
+    return False
+
+
+def _held(part: FrequencyResponse) -> tuple[FloatArray | None, FloatArray | None]:
+    """Return the sizes of force and displacement of all points."""
+    first = part.select(rows=part.harmonic == 1) if (part.harmonic == 1).any() else part
+    gain = first.to("dynamic_stiffness").gain
+    drive, amplitude = first.drive, first.amplitude
+    if drive is None and amplitude is not None:
+        drive = amplitude * gain
+    if amplitude is None and drive is not None:
+        amplitude = drive / gain
+    return drive, amplitude
+
+
+def stated_levels(lines: Iterable[str]) -> dict[str, str]:
+    """Return the drive and the amplitude that lines of a header state, if each states one only.
+
+    Such a line is ``Excitation level: 0.2 N rms``, ``Control amplitude;5;um`` or ``DRIVE = 1 V``.
+
+    Examples
+    --------
+    >>> stated_levels(["Date: 2024-01-01", "Excitation level: 0.2 N rms"])
+    {'drive': '0.2 N rms'}
+    >>> stated_levels(["Control amplitude (um),5"])
+    {'amplitude': '5 um'}
+    """
+    found: dict[str, set[str]] = {}
+    for line in lines:
+        match = _LINE.match(line[:200])
+        if match is None:
+            continue
+        words = set(re.split(r"[\s_.-]+", match["key"].casefold())) - {""}
+        if not words <= _SUBJECTS | _SIZES or not (words & _SIZES or words == {"drive"}):
+            continue
+        unit = match["own"] or match["unit"] or ""
+        text = f"{match['value'].replace(',', '.')} {unit.strip()}"
+        try:
+            _, kind, _ = parse_quantity(text, (*DRIVE_KINDS, *MOTION_KINDS), "level")
+        except (UnitError, ValidationError):
+            continue
+        role = "drive" if kind in DRIVE_KINDS else "amplitude"
+        found.setdefault(role, set()).add(text)
+    return {role: texts.pop() for role, texts in found.items() if len(texts) == 1}
