@@ -76,19 +76,6 @@ def test_response_beside_it(p: float) -> None:
             )
 
 
-def test_casadi_says_the_same() -> None:
-    ca = pytest.importorskip("casadi")
-    law = PowerDamper(2.0, 0.5)
-    p, A, w = ca.SX.sym("p"), ca.SX.sym("A"), ca.SX.sym("w")
-    for k in (1, 3, 5):
-        real, imag = law.casadi_stiffness([ca.SX(2.0), p, ca.SX(1.0)], A, w, k)
-        function = ca.Function("N", [p, A, w], [real, imag])
-        for exponent in (0.2, 0.5, 1.7, 3.0):
-            expected = exactly(2.0, exponent, 0.3, 7.0, k)
-            size = abs(exactly(2.0, exponent, 0.3, 7.0, 1))
-            assert abs(float(function(exponent, 0.3, 7.0)[1]) - expected.imag) < 1e-11 * size
-
-
 def test_force_description_and_refusals() -> None:
     law = PowerDamper(2.0, 0.5, name="oil")
     assert law.force([0.0, 0.0], velocity=[0.25, -4.0]).tolist() == [1.0, -4.0]

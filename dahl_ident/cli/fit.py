@@ -69,7 +69,7 @@ class Estimating:
     method: Annotated[
         str,
         one_of(
-            "lm, scipy (least_squares) or ipopt (exact second derivatives).",
+            "lm, scipy (least_squares) or ipopt (interior point).",
             _ESTIMATING,
             "lm",
             "scipy",

@@ -9,7 +9,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,6 @@ from dahl_ident.arrays import (
 )
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError
-
-if TYPE_CHECKING:
-    import casadi as ca
-
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -401,14 +397,6 @@ class Behaviour(ABC):
     ) -> FloatArray:
         """Return the factor by which a deviation from the steady loop shrinks in one cycle."""
         return np.zeros(np.broadcast_shapes(np.shape(amplitude), np.shape(omega)))
-
-    def casadi_stiffness(
-        self, values: Sequence[ca.SX], amplitude: ca.SX, omega: ca.SX, harmonic: int = 1
-    ) -> tuple[ca.SX, ca.SX]:
-        """Return real and imaginary part of F_k/X_1 as casadi expressions."""
-        raise ModelError(
-            f"{self!r} cannot be written as a casadi expression; use a method other than ipopt"
-        )
 
     def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
         """Return the limits at infinity that this law declares, for amplitudes low to high, m."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,9 +49,6 @@ from dahl_ident.elements.lugre import LuGre
 from dahl_ident.elements.maxwell_slip import MaxwellSlip
 from dahl_ident.elements.parameter import Assumed, Parameter
 from dahl_ident.errors import ValidationError
-
-if TYPE_CHECKING:
-    import casadi as ca
 
 _EXPONENTS = (1e-9, 1e3)  # beyond them the loop is that of the limit, to rounding
 _ALPHA = Assumed(1.0)  # linear Dahl, the law of the closed forms; a user may give another
@@ -302,21 +299,6 @@ class Dahl(Friction):
         f_max, sigma, alpha = values
         beta = np.asarray(sigma * amplitude / f_max)
         return hysteresis.transient_decay(beta, alpha) + 0.0 * omega
-
-    def casadi_stiffness(
-        self, values: Sequence[ca.SX], amplitude: ca.SX, omega: ca.SX, harmonic: int = 1
-    ) -> tuple[ca.SX, ca.SX]:
-        """Return real and imaginary part of F_k/X_1; alpha fixed at 1 is in closed form."""
-        from dahl_ident.elements import casadi_dahl
-
-        f_max, sigma, alpha = values
-        beta = sigma * amplitude / f_max
-        exponent = self.parameters[2]
-        if harmonic == 1 and not exponent.free and exponent.value == 1.0:
-            h = casadi_dahl.linear_describing_function(beta)
-        else:
-            h = casadi_dahl.general_describing_function(beta, alpha, harmonic)
-        return sigma * h.real, sigma * h.imag
 
     def combinations(self) -> tuple[Combination, ...]:
         """Return what microslip and the knee determine."""
@@ -727,7 +709,6 @@ class _AsymmetricDahl(Dahl):
     force_bounds = Friction.force_bounds
     knee = Friction.knee
     transient_decay = Friction.transient_decay
-    casadi_stiffness = Friction.casadi_stiffness
     _check_start = Friction._check_start
     _step = Friction._step
     branch = Friction.branch

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,10 +25,6 @@ from dahl_ident.elements.behaviour import Behaviour, StiffnessGradient
 from dahl_ident.elements.law_files import file_of, restored, source_path
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError, ValidationError
-
-if TYPE_CHECKING:
-    import casadi as ca
-
 
 Value = TypeVar("Value")
 
@@ -477,16 +473,6 @@ class Model(Element):
         for element, s in zip(self._elements, self._slices, strict=True):
             slowest = np.maximum(slowest, element.transient_decay(values[s], amplitude, omega))
         return slowest
-
-    def casadi_stiffness(
-        self, values: Sequence[ca.SX], amplitude: ca.SX, omega: ca.SX, harmonic: int = 1
-    ) -> tuple[ca.SX, ca.SX]:
-        """Return real and imaginary part of the sum as casadi expressions."""
-        real, imag = 0.0 * amplitude, 0.0 * amplitude
-        for element, s in zip(self._elements, self._slices, strict=True):
-            own = element.casadi_stiffness(values[s], amplitude, omega, harmonic)
-            real, imag = real + own[0], imag + own[1]
-        return real, imag
 
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return the objections of all elements to their values."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -12,9 +12,6 @@ from dahl_ident.data.quantities import power_of_s
 from dahl_ident.elements.behaviour import HistoryGradient, Mechanics, StiffnessGradient
 from dahl_ident.elements.element import Element, motion
 from dahl_ident.elements.parameter import Parameter
-
-if TYPE_CHECKING:
-    import casadi as ca
 
 
 class Lumped(Element):
@@ -107,16 +104,6 @@ class Lumped(Element):
         """Return p s^n over 1."""
         (value,) = self.known_values()
         return np.append(value, np.zeros(self.order)), np.ones(1)
-
-    def casadi_stiffness(
-        self, values: Sequence[ca.SX], amplitude: ca.SX, omega: ca.SX, harmonic: int = 1
-    ) -> tuple[ca.SX, ca.SX]:
-        """Return real and imaginary part of p (j omega)^n."""
-        if harmonic != 1:
-            return 0.0 * values[0], 0.0 * values[0]
-        size = values[0] * omega**self.order
-        real, imag = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0))[self.order]
-        return real * size, imag * size
 
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return an objection to a negative value."""

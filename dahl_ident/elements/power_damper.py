@@ -14,7 +14,7 @@ force becomes Coulomb's, 4 c/pi of fundamental.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.special import gamma, rgamma
@@ -29,16 +29,7 @@ from dahl_ident.elements.behaviour import (
 from dahl_ident.elements.element import Element, motion
 from dahl_ident.elements.parameter import Parameter
 
-if TYPE_CHECKING:
-    import casadi as ca
-
 _AT_REST = 1e-12  # square of the speed, over the reference speed, that counts as rest
-_LANCZOS = (
-    0.99999999999980993, 676.5203681218851, -1259.1392167224028, 771.32342877765313,
-    -176.61502916214059, 12.507343278686905, -0.13857109526572012, 9.9843695780195716e-6,
-    1.5056327351493116e-7,
-)  # fmt: skip
-"""Of Lanczos' approximation of the gamma function with g = 7, to 1e-15."""
 
 
 class PowerDamper(Element):
@@ -199,25 +190,6 @@ class PowerDamper(Element):
         ratio = velocity / speed
         return Mechanics(0.0, c * ratio * (ratio * ratio + _AT_REST) ** (0.5 * (p - 1.0)))
 
-    def casadi_stiffness(
-        self, values: Sequence[ca.SX], amplitude: ca.SX, omega: ca.SX, harmonic: int = 1
-    ) -> tuple[ca.SX, ca.SX]:
-        """Return real and imaginary part of F_k/X_1 as casadi expressions."""
-        import casadi as ca
-
-        c, p, speed = values
-        nothing = 0.0 * amplitude
-        if harmonic % 2 == 0:
-            return nothing, nothing
-        shift = (harmonic - 1) // 2
-        product = ca.SX(1.0)
-        for i in range(shift):
-            product *= (p - harmonic) / 2.0 + 1.0 + i
-        logarithm = _log_gamma(p + 1.0) - _log_gamma((p + harmonic) / 2.0 + 1.0)
-        logarithm -= _log_gamma((p - harmonic) / 2.0 + 1.0 + shift) + p * float(np.log(2.0))
-        share = 2.0 * (-1) ** shift * ca.exp(logarithm) * product
-        return nothing, c / amplitude * (amplitude * omega / speed) ** p * share
-
 
 def _share(p: FloatArray, k: int) -> FloatArray:
     """Return 2 I_k(p)/pi, the harmonic of sin^p over its height."""
@@ -227,15 +199,3 @@ def _share(p: FloatArray, k: int) -> FloatArray:
     sign = (-1.0) ** ((k - 1) // 2)
     upper, lower = rgamma((p + k) / 2.0 + 1.0), rgamma((p - k) / 2.0 + 1.0)
     return np.asarray(2.0 * sign * gamma(p + 1.0) * 2.0**-p * upper * lower)
-
-
-def _log_gamma(x: ca.SX) -> ca.SX:
-    """Return ln Gamma(x) for x > 1/2."""
-    import casadi as ca
-
-    y = x - 1.0
-    series = ca.SX(_LANCZOS[0])
-    for i, term in enumerate(_LANCZOS[1:], start=1):
-        series += term / (y + i)
-    t = y + 7.5
-    return 0.5 * float(np.log(2.0 * np.pi)) + (y + 0.5) * ca.log(t) - t + ca.log(series)

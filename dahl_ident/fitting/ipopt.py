@@ -1,16 +1,12 @@
 r"""Least squares by IPOPT: constraints between parameters, and noise in the drive as well.
 
-The problem is that of :mod:`dahl_ident.fitting.search`, written as casadi expressions, so
-IPOPT has the exact Hessian. From the least-squares optimum it takes a step or two.
+The problem is that of :mod:`dahl_ident.fitting.search`, for any law and for exact steady motions:
+the cost and its exact gradient J' r are those of the problem's own residuals. The Hessian is the
+difference of gradients: far from the optimum Gauss and Newton's leads IPOPT astray. From the
+least-squares optimum it takes a few steps.
 
-**Form.** Rows with controlled displacement enter in reduced form: the response is an explicit
-function of the parameters. Rows with controlled force enter in full space: each displacement
-phasor is a pair of unknowns tied to the drive by the balance of forces Z(A, omega) X = u_0
-(Eqn. 53). No root is searched for; the balance holds when IPOPT has converged. Errors of a
-measured amplitude or drive are unknowns as well, see :mod:`dahl_ident.fitting.casadi_rows`.
-
-**Constraints** are comparisons of casadi expressions, see
-:mod:`dahl_ident.fitting.casadi_constraints`. An equality takes one parameter's worth of freedom
+**Constraints** are comparisons of casadi expressions, see :mod:`dahl_ident.fitting.constraints`;
+casadi differentiates them twice. An equality takes one parameter's worth of freedom
 away: the covariance is that of the estimate on the constraint. An inequality that holds with
 equality acts as a bound does; the covariance is that without it.
 
@@ -20,9 +16,10 @@ residuals by their own size, so that nothing depends on physical units.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,9 +27,7 @@ from scipy.linalg import null_space
 
 from dahl_ident.arrays import FloatArray, finite_array, non_negative_array
 from dahl_ident.errors import FitError, ValidationError
-from dahl_ident.fitting.casadi_constraints import Constraints, Relations
-from dahl_ident.fitting.casadi_nlp import RowwiseProblem, SharedTerms
-from dahl_ident.fitting.casadi_rows import Target, parameter_values, row_blocks
+from dahl_ident.fitting.constraints import Constraints, Relations
 from dahl_ident.fitting.convergence import Ends, optima
 from dahl_ident.fitting.global_start import starts
 from dahl_ident.fitting.levenberg_marquardt import Minima
@@ -47,19 +42,16 @@ from dahl_ident.fitting.optimum import (
 )
 from dahl_ident.fitting.search import solve
 from dahl_ident.fitting.status import Status
-from dahl_ident.problem import Problem
-
-if TYPE_CHECKING:
-    import casadi as ca
+from dahl_ident.problem import Problem, Quadratic
 
 _TOLERANCE = 1e-11  # of the scaled gradient: well below the smallest step that a report shows
 _ITERATIONS = 300  # a limit for searches that do not end
 _LEAST_RESIDUAL = 1e-4  # of the largest change that a parameter's own size makes
 _ACTIVE = 1e-6  # an inequality nearer to its limit than this holds there
+_STEP = 1e-4  # of ln p, between gradients whose difference is the Hessian
 _MOST_STARTS = 6  # the lowest minima of the global grid, and what the user gave
 _RESCALINGS = 30  # of the noise's scale; a handful is the rule
 _SAME_SCALE = 1e-10  # change of ln scale that ends them
-_SAME_COST = 1e-6  # of the cost unit: two ends this near are one optimum
 _WORDS = {
     "Maximum_Iterations_Exceeded": "it reached the maximum number of iterations",
     "Restoration_Failed": "it could not return to a point that satisfies the constraints",
@@ -85,7 +77,7 @@ def solve_ipopt(
     Parameters
     ----------
     problem : Problem
-        One table; models of Dahl, Mass, Damper, Spring, and LinearSystem without free parameters.
+        One table.
     constraints : callable, optional
         Takes a mapping of every parameter's name to its casadi symbol, returns comparisons with
         ``<=``, ``>=`` or ``==``.
@@ -109,12 +101,12 @@ def solve_ipopt(
     Raises
     ------
     FitError
-        If no parameters satisfy the constraints, or the model cannot be written as expressions.
+        If no parameters satisfy the constraints.
     ModelError
         If a constraint or `start` names an unknown parameter.
     ValidationError
-        If a constraint is no comparison, the drive's errors are given where they mean nothing, or
-        rows are to be predicted by the exact steady motion.
+        If a constraint is not a comparison, or the drive's errors are given where they mean
+        nothing.
 
     Examples
     --------
@@ -131,17 +123,14 @@ def solve_ipopt(
     >>> print(f"{tied.values[1] / tied.values[0]:.6f}")
     250.000000
     """
-    if problem.is_exact:
-        raise ValidationError(
-            "method='ipopt' has no expressions for the exact steady motion of rows whose force was "
-            "held; say steady='describing function', or take method='lm'"
-        )
     given, problem = problem, _with_drive_error(problem, loss, drive_std, drive_covariance)
     relations = Relations.of(problem, constraints)
     # a start takes no noise of the drive, which takes many times as long; a cost does
     begin = solve(problem if relations.texts else given, loss=loss, start=start)
     if begin.status.at_infinity and not relations.texts and problem is given:
         return replace(begin, method="ipopt")
+    if begin.problem.steady != problem.steady:  # no steady motion to begin from
+        problem = problem.with_steady(begin.problem.steady)
     adapts = not problem.scale_known and bool(loss != "linear" or problem.priors)
     target = Target(problem, begin.scale if adapts else 1.0, loss)
     found = _search(target, begin, relations)
@@ -156,6 +145,29 @@ def solve_ipopt(
 
 
 @dataclass(frozen=True)
+class Target:
+    """What is minimised: a problem, and how its residuals count.
+
+    Attributes
+    ----------
+    problem : Problem
+        One table.
+    scale : float
+        What the data's residuals are divided by.
+    loss : str
+        "linear" or a robust loss, see :mod:`dahl_ident.fitting.losses`.
+    """
+
+    problem: Problem
+    scale: float = 1.0
+    loss: str = "linear"
+
+    def at(self, theta: FloatArray) -> Quadratic:
+        """Return the cost, half the sum of losses, with its derivatives; theta (P,) or (S, P)."""
+        return self.problem.quadratic(theta, self.scale, loss_named(self.loss))
+
+
+@dataclass(frozen=True)
 class _Found:
     """Where IPOPT ended, in search coordinates."""
 
@@ -166,8 +178,6 @@ class _Found:
     slopes: FloatArray
     """Of the relations' differences by theta, (C, P)."""
     active: tuple[bool, ...]
-    cost_unit: float
-    """A cost whose residuals are all of the size that the coordinates were scaled by."""
 
     @property
     def failure(self) -> str:
@@ -184,19 +194,23 @@ def _search(target: Target, begin: Optimum, relations: Relations) -> _Found:
     the minimum on a constraint may lie elsewhere.
     """
     problem, found = target.problem, []
-    if begin.success:
+    if np.isfinite(target.at(begin.theta).cost):
         found.append(_descend(target, begin.theta, relations))
-        if not found[0].failure and not relations.freedom_lost and not any(found[0].active):
+        held = relations.freedom_lost or any(found[0].active)
+        if begin.success and not found[0].failure and not held:
             return found[0]
     low, high = problem.bounds()
-    for theta in np.clip(starts(problem)[:_MOST_STARTS], low, high):
-        try:
-            found.append(_descend(target, theta, relations))
-        except FitError:  # no steady amplitude there
-            continue
+    found += [
+        _descend(target, theta, relations)
+        for theta in np.clip(starts(problem)[:_MOST_STARTS], low, high)
+        if np.isfinite(target.at(theta).cost)
+    ]
     if not found:
-        raise FitError("no start has a steady amplitude in every row; give another start")
+        raise FitError("no start has a steady response in every row; give another start")
     best = min(found, key=lambda end: (bool(end.failure), end.cost))
+    if not best.failure:  # again, in the units of the optimum
+        found.append(_descend(target, best.theta, relations))
+        best = best if found[-1].failure else found[-1]
     return replace(best, evaluations=sum(end.evaluations for end in found))
 
 
@@ -207,86 +221,133 @@ def _descend(
     import casadi as ca
 
     problem = target.problem
-    unit, weight = _units(target, start)
+    unit, weight, tolerance, step = _units(target, start)
+
+    def value(xi: FloatArray) -> list[FloatArray]:
+        at = target.at(start + unit * xi)
+        return [2.0 * weight * at.cost, 2.0 * weight * unit * at.gradient]
+
+    def hessian(xi: FloatArray) -> list[FloatArray]:
+        at = target.at(start + unit * (xi + np.vstack([np.zeros(xi.size), np.diag(step)])))
+        exact = (at.gradient[1:] - at.gradient[0]) / step[:, None] * unit
+        found = (
+            exact + exact.T
+            if np.isfinite(exact).all()
+            else 2.0 * at.hessian[0] * np.outer(unit, unit)
+        )
+        return [weight * found]
+
     xi = ca.SX.sym("xi", start.size)
-    theta = ca.DM(start) + ca.DM(unit) * xi
-    values = parameter_values(problem, theta)
-    differences = relations.at(values)
+    differences = relations.at(problem, ca.DM(start) + ca.DM(unit) * xi)
     slopes = ca.Function("slopes", [xi], [ca.jacobian(differences, xi)])
     size = np.linalg.norm(np.asarray(slopes(0.0)), axis=1)
     size[~np.isfinite(size) | (size == 0.0)] = 1.0
-    priors = [((values[name] - p.mean()) / p.std()) ** 2 for name, p in problem.priors.items()]
-    shared = SharedTerms(xi, weight * ca.sum1(ca.vertcat(0.0, *priors)), differences / ca.DM(size))
-    nlp = RowwiseProblem(shared, row_blocks(target, theta, start), weight)
-    solution, stats = _run(nlp, problem, start, unit, relations)
-    x, g = (np.asarray(solution[key]).ravel() for key in ("x", "g"))
-    inequalities = zip(g[nlp.n_balances :], relations.equal, strict=True)
-    return _Found(
-        theta=start + unit * x[: start.size],
-        cost=0.5 * float(solution["f"]) / weight,
-        return_status=str(stats["return_status"]),
-        evaluations=evaluations + int(stats["n_call_nlp_f"]),
-        slopes=np.asarray(slopes(x[: start.size])) / unit,
-        active=tuple(not equal and c > -_ACTIVE for c, equal in inequalities),
-        cost_unit=0.5 / weight,
-    )
-
-
-def _units(target: Target, start: FloatArray) -> tuple[FloatArray, float]:
-    """Return the unit of each coordinate, and the factor from the sum of losses to f."""
-    problem = target.problem
-    at = problem.quadratic(start, target.scale, loss_named(target.loss))
-    m = problem.n_residuals + len(problem.priors)
-    reach = np.sqrt(np.diagonal(at.hessian) / m)  # rms change of the residuals per unit
-    reach = np.where((reach > 0.0) & np.isfinite(reach), reach, 1.0)
-    logarithmic = np.array([p.transform == "log" for p in problem.parameters])
-    whole = np.max(reach * np.where(logarithmic, 1.0, np.abs(start)))
-    residual = max(float(np.sqrt(2.0 * at.cost / m)), _LEAST_RESIDUAL * float(whole))
-    return residual / reach, 0.5 / (m * residual**2)
-
-
-def _run(
-    nlp: RowwiseProblem,
-    problem: Problem,
-    start: FloatArray,
-    unit: FloatArray,
-    relations: Relations,
-) -> tuple[dict[str, ca.DM], dict[str, Any]]:
-    import casadi as ca
-
+    differences = differences / ca.DM(size)
+    multipliers = ca.SX.sym("lam_g", size.size)
+    curvature, _ = ca.hessian(ca.dot(multipliers, differences), xi)
+    related = ca.Function("related", [xi], [differences, ca.jacobian(differences, xi)])
+    curved = ca.Function("curved", [xi, multipliers], [ca.densify(curvature)])
+    x, p = ca.MX.sym("x", start.size), ca.MX.sym("p", 0)
+    lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", size.size)
+    P = start.size
+    computed = [_callback()(value, P, [(1, 1), (P, 1)]), _callback()(hessian, P, [(P, P)])]
+    (f, gradient), (curvature,) = (function.call([x]) for function in computed)
+    g, jacobian = related.call([x])
+    curvature = ca.triu(lam_f * curvature + curved(x, lam_g))
     low, high = ((bound - start) / unit for bound in problem.bounds())
-    own = np.full(nlp.n_variables - start.size, np.inf)
-    balanced = np.zeros(nlp.n_balances)
-    least = np.where(relations.equal, 0.0, -np.inf)
     bounded = not all(relations.equal) or bool(np.isfinite([low, high]).any())
     solver = ca.nlpsol(
         "ipopt",
         "ipopt",
-        nlp.values(),
+        ca.Function("nlp", [x, p], [f, g], ["x", "p"], ["f", "g"]),
         {
-            "grad_f": nlp.gradient(),
-            "jac_g": nlp.jacobian(),
-            "hess_lag": nlp.hessian(),
-            "no_nlp_grad": True,  # what numpy computes has none but those given
+            "grad_f": ca.Function("grad_f", [x, p], [f, gradient], ["x", "p"], ["f", "grad_f_x"]),
+            "jac_g": ca.Function("jac_g", [x, p], [g, jacobian], ["x", "p"], ["g", "jac_g_x"]),
+            "hess_lag": ca.Function(
+                "hess_lag", [x, p, lam_f, lam_g], [curvature], ["x", "p", "lam_f", "lam_g"],
+                ["triu_hess_gamma_x_x"],
+            ),
+            "no_nlp_grad": True,
             "print_time": False,
             "show_eval_warnings": False,
             "ipopt.print_level": 0,
             "ipopt.sb": "yes",
-            "ipopt.tol": _TOLERANCE,
+            "ipopt.tol": tolerance,
             "ipopt.max_iter": _ITERATIONS,
             "ipopt.nlp_scaling_method": "none",
             "ipopt.bound_relax_factor": 0.0,
-            "ipopt.mu_init": 1e-3 if bounded else _TOLERANCE,
+            "ipopt.mu_init": 1e-3 if bounded else tolerance,
         },
+    )  # fmt: skip
+    least = np.where(relations.equal, 0.0, -np.inf)
+    solution = solver(x0=0.0, lbx=low, ubx=high, lbg=least, ubg=0.0)
+    stats = solver.stats()
+    end, held = (np.asarray(solution[key]).ravel() for key in ("x", "g"))
+    return _Found(
+        theta=start + unit * end,
+        cost=0.5 * float(solution["f"]) / weight,
+        return_status=str(stats["return_status"]),
+        evaluations=evaluations + int(stats["n_call_nlp_f"]),
+        slopes=np.asarray(slopes(end)) / unit,
+        active=tuple(
+            not equal and bool(c > -_ACTIVE) for c, equal in zip(held, relations.equal, strict=True)
+        ),
     )
-    solution = solver(
-        x0=0.0,
-        lbx=np.concatenate((low, -own)),
-        ubx=np.concatenate((high, own)),
-        lbg=np.concatenate((balanced, least)),
-        ubg=0.0,
-    )
-    return solution, solver.stats()
+
+
+def _units(target: Target, start: FloatArray) -> tuple[FloatArray, float, float, FloatArray]:
+    """Return what IPOPT's coordinates xi and function f are measured in.
+
+    The unit of each coordinate, the factor from the sum of losses to f, the tolerance of the
+    gradient, and steps of xi for differences of the gradient.
+    """
+    problem, at = target.problem, target.at(start)
+    m = problem.n_residuals + len(problem.priors)
+    reach = np.sqrt(np.maximum(np.diagonal(at.hessian), 0.0) / m)  # rms change of the residuals
+    reach = np.where((reach > 0.0) & np.isfinite(reach), reach, 1.0)
+    logarithmic = np.array([p.transform == "log" for p in problem.parameters])
+    whole = np.max(reach * np.where(logarithmic, 1.0, np.abs(start)))
+    residual = max(float(np.sqrt(2.0 * at.cost / m)), _LEAST_RESIDUAL * float(whole))
+    unit = residual / reach
+    rounding = float(problem.rounding) / target.scale / residual
+    step = _STEP * np.where(logarithmic, 1.0, whole / reach) / unit
+    return unit, 0.5 / (m * residual**2), max(_TOLERANCE, rounding), step
+
+
+@cache
+def _callback() -> Any:
+    import casadi as ca
+
+    class Computed(ca.Callback):
+        """A casadi function of a vector that numpy computes."""
+
+        def __init__(
+            self,
+            work: Callable[[FloatArray], list[FloatArray]],
+            size: int,
+            shapes: list[tuple[int, int]],
+        ) -> None:
+            ca.Callback.__init__(self)
+            self._work, self._size, self._shapes = work, size, shapes
+            self._last: tuple[bytes, list[Any]] = (b"", [])
+            self.construct("computed", {})
+
+        def get_n_out(self) -> int:
+            return len(self._shapes)
+
+        def get_sparsity_in(self, _: int) -> Any:
+            return ca.Sparsity.dense(self._size)
+
+        def get_sparsity_out(self, which: int) -> Any:
+            return ca.Sparsity.dense(*self._shapes[which])
+
+        def eval(self, arguments: Any) -> Any:
+            at = np.asarray(arguments[0]).ravel()
+            if self._last[0] != at.tobytes():
+                self._last = at.tobytes(), [ca.DM(np.asarray(v)) for v in self._work(at)]
+            return self._last[1]
+
+    return Computed
 
 
 def _with_drive_error(
@@ -333,15 +394,11 @@ def _ended(target: Target, found: _Found, relations: Relations, begin: Optimum) 
             f"no parameters satisfy the constraints {'; '.join(relations.texts)} within the "
             "bounds; IPOPT found the least violation elsewhere: relax one of them"
         )
-    at = problem.quadratic(found.theta, target.scale, loss)
     words = found.failure
-    elsewhere = abs(float(at.cost) - found.cost) > _SAME_COST * found.cost_unit
-    if not words and elsewhere:
-        words = "it ended at another of the plant's several amplitudes than the one measured"
     minima = Minima(
         found.theta[None],
         np.array([found.cost]),
-        at.hessian[None],
+        target.at(found.theta).hessian[None],
         np.array([not words]),
         np.array([begin.nfev + found.evaluations]),
     )

@@ -83,7 +83,9 @@ class SteadyRows:
         if alone.size:
             last = self._orbits.get(self._shooting.system.order)
             starts = None if last is None else last[alone % n]
-            X[alone], found = self._solve(p[alone], w[alone], u[alone], chosen, starts, False)
+            X[alone], found = self._solve(
+                p[alone], w[alone], u[alone], chosen, starts, stable=False
+            )
             first = found[:n]
             if last is not None:
                 first = np.where(np.isfinite(first), first, last)
@@ -142,10 +144,14 @@ class SteadyRows:
         drive: FloatArray,
         chosen: list[int],
         starts: FloatArray | None,
-        stable: bool,
+        *,
+        again: bool = True,
+        stable: bool = True,
     ) -> tuple[ComplexArray, FloatArray]:
         """Return X, its derivatives with respect to drive and parameters, and the orbits."""
-        found = self._shooting(values, omega, drive, chosen=chosen, starts=starts, stable=stable)
+        found = self._shooting(
+            values, omega, drive, chosen=chosen, starts=starts, again=again, stable=stable
+        )
         X = [found.harmonics, found.by_drive, found.by_parameter[:, 0]]
         return np.concatenate(X, axis=1), found.starts
 
@@ -164,9 +170,7 @@ class SteadyRows:
         for place in range(max(map(len, self._order))):
             sweeps = [i for i, sweep in enumerate(self._order) if place < len(sweep)]
             rows = np.array([self._order[i][place] for i in sweeps])
-            X, own = self._solve(
-                values[rows], omega[rows], drive[rows], chosen, orbits[sweeps], True
-            )
+            X, own = self._solve(values[rows], omega[rows], drive[rows], chosen, orbits[sweeps])
             apart = np.abs(X[:, 0] - measured[rows])
             far = np.flatnonzero(~(apart < _ELSEWHERE * np.abs(measured[rows])))
             if far.size:  # the row may have been measured on another branch
@@ -175,7 +179,7 @@ class SteadyRows:
                 begin[:, 0], begin[:, 1] = at.real, -omega[rows[far]] * at.imag
                 there = rows[far]
                 other, orbit = self._solve(
-                    values[there], omega[there], drive[there], chosen, begin, True
+                    values[there], omega[there], drive[there], chosen, begin, again=False
                 )
                 nearer = ~(apart[far] <= np.abs(other[:, 0] - at)) & np.isfinite(other[:, 0])
                 X[far[nearer]], own[far[nearer]] = other[nearer], orbit[nearer]

@@ -23,7 +23,7 @@ from dahl_ident.steady_state import Steady
 
 if TYPE_CHECKING:
     from dahl_ident.elements.equations import Excitation
-    from dahl_ident.fitting.casadi_constraints import Constraints
+    from dahl_ident.fitting.constraints import Constraints
     from dahl_ident.problem.record_problem import Output
 
 
@@ -90,8 +90,8 @@ def fit(
     method : {"lm", "scipy", "ipopt"}, default "lm"
         "lm" is Levenberg and Marquardt's method from a global start. "scipy" is
         `scipy.optimize.least_squares` on the same residuals and Jacobian from the same starts.
-        "ipopt" goes on from the optimum with exact second derivatives, and alone takes
-        `constraints` and noise in the drive. All three find the same optimum; "lm" is the fastest.
+        "ipopt" goes on from the optimum by IPOPT, and alone takes `constraints` and noise in the
+        drive. All three find the same optimum; "lm" is the fastest.
     free : iterable of str, optional
         Names of parameters that have values but are to be estimated, starting from these values.
     fixed : mapping of str to float, optional

@@ -125,6 +125,7 @@ class Shooting:
         harmonics: Sequence[int] = (1,),
         starts: FloatArray | None = None,
         cycles: int | None = None,
+        again: bool = True,
         stable: bool = True,
     ) -> SteadyMotion:
         """Return the steady motions of many rows.
@@ -140,25 +141,26 @@ class Shooting:
         harmonics : sequence of int
             k of those wanted.
         starts : ndarray, shape (rows, order), optional
-            States at t = 0 to start from; NaN stands for rest. A row that leads nowhere from them
-            is started from rest, then by many cycles.
+            States at t = 0 to start from; NaN stands for rest.
         cycles : int, optional
             That the motion goes through from these states before it is solved for.
+        again : bool, default True
+            Whether a row that leads nowhere from its start is started from rest.
         stable : bool, default True
             Whether a motion that is not stable counts as none.
         """
         ask = _Ask(values, omega, drive, tuple(chosen), tuple(harmonics), stable)
         result = _empty(omega.size, len(harmonics), len(chosen), self.system.order)
         possible = np.isfinite(values).all(axis=1) & np.isfinite(omega) & np.isfinite(drive)
-        known = np.zeros(omega.size, dtype=np.bool_)
         if starts is not None:
             known = possible & np.isfinite(starts).all(axis=1)
             self._solve(result, known, ask, starts, cycles)
-        attempts: list[tuple[int | None, float]] = [(None, 1.0), (None, _FINER), (_LONG, _FINER)]
-        if not stable:  # a search passes many values at which nothing settles
-            attempts = attempts[: 1 + bool(np.all(values == values[0]))]
-        for cycles, finer in attempts:
-            self._solve(result, possible & ~result.found, ask, cycles=cycles, finer=finer)
+            possible &= again | ~known
+        self._solve(result, possible & ~result.found, ask)
+        unstable = np.isfinite(result.multiplier)
+        if stable or np.all(values == values[0]):  # a search passes values at which nothing settles
+            self._solve(result, possible & ~result.found & ~unstable, ask, finer=_FINER)
+        self._solve(result, possible & ~result.found & unstable, ask, cycles=_LONG)
         return result
 
     def _solve(

@@ -77,13 +77,21 @@ class Relations:
         function = ca.Function("differences", list(symbols.values()), [ca.vertcat(*differences)])
         return cls(tuple(texts), tuple(equal), function)
 
-    def at(self, values: Mapping[str, ca.SX]) -> ca.SX:
-        """Return lhs - rhs as expressions of what the parameters' values are."""
+    def at(self, problem: Problem, theta: ca.SX) -> ca.SX:
+        """Return lhs - rhs as expressions of the search coordinates theta."""
         import casadi as ca
 
         if self.differences is None:
             return ca.SX(0, 1)
-        return self.differences.call(list(values.values()))[0]
+        place = {p.name: (i, p.transform) for i, p in enumerate(problem.parameters)}
+        values = []
+        for parameter in (*problem.model.parameters, *problem.sensors.parameters):
+            if parameter.name not in place:
+                values.append(ca.SX(float(parameter.value or 0.0)))
+                continue
+            index, transform = place[parameter.name]
+            values.append(ca.exp(theta[index]) if transform == "log" else theta[index])
+        return self.differences.call(values)[0]
 
 
 class _Symbols(dict[str, "ca.SX"]):
