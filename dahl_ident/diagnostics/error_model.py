@@ -227,12 +227,31 @@ class ErrorModel:
             return np.inf
         return max(1.0, 2.0 * sum(parts.values()) ** 2 / spread)
 
-    @property
-    def runs_about_optimum(self) -> RunDeviations | None:
-        """How runs deviate from the optimum, in its parameters."""
-        columns = [self.names.index(name) for name in self.optimum.names]
-        moved = self.optimum.theta - self.theta[columns]
-        return None if self.runs is None else self.runs.about(moved, columns)
+    @cached_property
+    def at_estimate(self) -> Optimum:
+        """The estimate as an optimum: its residuals have the stated weights."""
+        problem, theta, optimum = self.problem, self.theta, self.optimum
+        known = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
+        values = [
+            known[name] if not np.isfinite(1.0 / known.get(name, 1.0)) else self.values[name]
+            for name in self.names
+        ]
+        C = self.covariance.copy()
+        open_ = [i for i, name in enumerate(self.names) if not self.holds(name)]
+        C[open_] = C[:, open_] = 0.0
+        C[open_, open_] = np.inf
+        y, _ = problem.residuals_and_jacobian(theta)
+        m = problem.n_residuals
+        data, priors = float(y[:m] @ y[:m]), float(y[m:] @ y[m:])
+        scale = 1.0
+        if not problem.scale_known:
+            free = max(optimum.dof - priors, 1.0)
+            scale = max(float(np.sqrt(data / free)), float(problem.rounding))
+        cost = 0.5 * (data + scale**2 * priors)
+        return replace(
+            optimum, problem=problem, theta=theta, values=np.array(values), covariance=C,
+            scale=scale, cost=cost,
+        )  # fmt: skip
 
     @cached_property
     def beside_the_law(self) -> ComplexArray:
@@ -312,43 +331,28 @@ def with_assumed(given: Problem) -> tuple[Problem, dict[str, Assumption]]:
         assumed[gain.name] = Assumption(DRIVE, float(u))
     if not assumed:
         return given, {}
-    free = Problem(
-        given.data,
-        given.model,
-        noise=given.noise,
-        sensors=given.sensors,
-        free=assumed,
-        steady=given.steady,
-    )
-    return free, assumed
+    return given.assuming({name: one.std for name, one in assumed.items()}), assumed
 
 
 class _Rows:
     """Residuals and Jacobian at a point, counted as the optimum counts them."""
 
-    def __init__(
-        self, optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumption]
-    ) -> None:
+    def __init__(self, optimum: Optimum, problem: Problem) -> None:
         self._problem = problem
-        names, known = problem.names, dict(zip(optimum.names, optimum.theta, strict=True))
+        known = dict(zip(optimum.names, optimum.theta, strict=True))
         self.start = np.array(
             [known.get(p.name, np.log(p.value or 1.0)) for p in problem.parameters]
         )
         self.m = problem.n_residuals
-        columns = [names.index(name) for name in assumed]
-        self._select = np.eye(len(names))[columns]
-        self._std = np.array([one.std for one in assumed.values()])
 
     def at(self, theta: FloatArray, near: Linearization) -> tuple[FloatArray, FloatArray]:
-        """Return residuals and Jacobian: data, priors of sensors, ranges of exponents."""
+        """Return residuals and Jacobian: data, then priors."""
         y, J = near.y, near.J
-        if self._problem.priors:
+        if self._problem.n_priors:
             own, by = self._problem.residuals_and_jacobian(theta, tails=False)
             y, J = np.concatenate([y, own[self.m :]]), np.vstack([J, by[self.m :]])
         weight = np.concatenate([row_weights(self._problem), np.ones(len(y) - self.m)])
-        select = self._select / self._std[:, None]
-        y = np.concatenate([y * weight, select @ (theta - self.start)])
-        return y, np.vstack([J * weight[:, None], select])
+        return y * weight, J * weight[:, None]
 
 
 def row_weights(problem: Problem) -> FloatArray:
@@ -363,7 +367,7 @@ def row_weights(problem: Problem) -> FloatArray:
 def _estimated(
     optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumption], determined: bool
 ) -> ErrorModel:
-    rows = _Rows(optimum, problem, assumed)
+    rows = _Rows(optimum, problem)
     m = rows.m
     basis = None
     if not determined:
@@ -371,12 +375,11 @@ def _estimated(
         first = rows.at(rows.start, linearization(problem, rows.start))
         basis = Basis.of(first[1], rows.start, chart)
     dof = problem.n_numbers - len(problem.names)
-    extra = len(problem.priors) + len(assumed)
     estimate = weighted_estimate(
         problem,
         lambda theta: rows.at(theta, linearization(problem, theta)),
         rows.start,
-        dof + extra * problem.scale_known,
+        dof + problem.n_priors * problem.scale_known,
         basis,
     )
     theta = estimate.theta

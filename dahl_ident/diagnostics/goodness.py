@@ -3,8 +3,9 @@
 Every test that applies is made: chi-square where the noise is known, trends and runs of the
 residuals over amplitude, frequency and drive, a stiffness that rises with amplitude, the
 exponent's score (departure from the universal curve h(beta)), the third harmonic against the
-model's. Their joint false-alarm rate is 1 %: the
-level of each is a hundredth over their number.
+model's. Their joint false-alarm rate is 1 %: the level of each is a hundredth over the number of
+those that do not object more strongly (Holm, Scandinavian Journal of Statistics 6 (1979) 65).
+Trends are judged beyond the misfit of the estimate, which is noise to them.
 
 Where the data are not described, the sign of the response and the suspicious rows are tried as
 the cause (:mod:`dahl_ident.diagnostics.misfit_explanations`); a cause found leads the verdict.
@@ -23,7 +24,7 @@ import numpy as np
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray
-from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.formatting import p_text, percent, with_unit
 from dahl_ident.diagnostics.misfit_explanations import (
@@ -202,8 +203,13 @@ class Goodness:
 
     @cached_property
     def level(self) -> float:
-        """p-value below which one test counts."""
-        return _FALSE_ALARM / max(len(self._tests), 1)
+        """p-value below which one test counts, by Holm's procedure."""
+        left = len(self._tests)
+        for p in sorted(test.p_value for test in self._tests):
+            if left == 1 or not p < _FALSE_ALARM / left:
+                break
+            left -= 1
+        return _FALSE_ALARM / max(left, 1)
 
     @property
     def _tests(
@@ -350,20 +356,26 @@ class Goodness:
 
 
 def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
-    """Return every test of an optimum's residuals, physical warnings, and what explains both.
+    """Return every test of an estimate's residuals, physical warnings, and what explains both.
 
-    With `errors`, a scatter between runs that exceeds the noise is taken out first.
+    The estimate is that of `errors`, if known; a scatter between runs that exceeds the noise is
+    taken out first.
     """
-    found = _tested(optimum)
+    found = _tested(optimum, errors)
     if errors is not None and found.objections:
-        found = _within_runs(optimum, errors) or found
+        found = _within_runs(errors) or found
     if optimum.method == "ipopt" or (optimum.success and not found.objections):
         return found  # another solver may have had constraints, which no trial would keep
-    sign = sign_convention(optimum, lambda turned: not _tested(turned).objections)
+    sign = sign_convention(optimum, found.rms_misfit, _tested_estimate)
     if sign:
         return replace(found, sign=sign, warnings=(*found.warnings, sign))
     found = _without_suspicious(optimum, found)
     return replace(found, bound=_bound(optimum, found.rms_misfit)) if found.objections else found
+
+
+def _tested_estimate(optimum: Optimum) -> Goodness:
+    """Return the tests of the estimate that belongs to an optimum."""
+    return _tested(optimum, error_model(optimum, of_combinations=True))
 
 
 def _bound(optimum: Optimum, misfit: float) -> str:
@@ -384,7 +396,7 @@ def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
     """Return `found` with the objections that remain without the suspicious rows."""
     rows = [point.row for point in found.suspicious]
     other = set_aside(optimum, rows) if rows and found.objections else None
-    rest = None if other is None else _tested(other)
+    rest = None if other is None else _tested_estimate(other)
     if rest is None or rest.objections or rest.hints or rest.untested or not rest.judged:
         return found
     if not rest.rms_misfit * EXPLAINS < found.rms_misfit or at_an_end(optimum, rows):
@@ -406,13 +418,13 @@ def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
     )
 
 
-def _within_runs(optimum: Optimum, errors: ErrorModel) -> Goodness | None:
+def _within_runs(errors: ErrorModel) -> Goodness | None:
     """Return the tests of the residuals within runs; None where the runs do not differ.
 
     Where differences between runs take half of the degrees of freedom, as with one point a run,
     they are not told from a wrong model, which the plain residuals test.
     """
-    runs = errors.runs_about_optimum
+    runs, optimum = errors.runs, errors.at_estimate
     if runs is None:
         return None
     every, within = ResidualSpace(optimum), ResidualSpace(optimum, runs)
@@ -420,7 +432,7 @@ def _within_runs(optimum: Optimum, errors: ErrorModel) -> Goodness | None:
         return None
     explained = float(every.residuals @ every.residuals - within.residuals @ within.residuals)
     p = every.tail(explained, every.dof - within.dof)
-    found = _tested(optimum, within)
+    found = _tested(optimum, errors, within)
     if not p < found.level:
         return None
     scatter = {
@@ -432,9 +444,19 @@ def _within_runs(optimum: Optimum, errors: ErrorModel) -> Goodness | None:
     return replace(found, warnings=warnings, runs_differ=RunsDiffer(scatter, p))
 
 
-def _tested(optimum: Optimum, space: ResidualSpace | None = None) -> Goodness:
-    """Return every test of an optimum's residuals, and physical warnings."""
-    space, problem = space or ResidualSpace(optimum), optimum.problem
+def _tested(
+    optimum: Optimum, errors: ErrorModel | None, within: ResidualSpace | None = None
+) -> Goodness:
+    """Return every test of the residuals at the estimate, and physical warnings.
+
+    Trends are those beyond the estimate's misfit, which is noise to them.
+    """
+    if errors is not None:
+        optimum = errors.at_estimate
+    space, problem = within or ResidualSpace(optimum), optimum.problem
+    weighted = space
+    if errors is not None and errors.estimate.misfit > 0.0:
+        weighted = ResidualSpace(optimum, None if within is None else errors.runs, errors.estimate)
     chi_square = _chi_square(optimum, space)
     return Goodness(
         rms_misfit(problem, optimum.theta),
@@ -442,7 +464,7 @@ def _tested(optimum: Optimum, space: ResidualSpace | None = None) -> Goodness:
         _noise_share(optimum),
         optimum.dof,
         stiffening(optimum),
-        tuple(trends(optimum, space)),
+        tuple(trends(optimum, weighted)),
         tuple(runs(optimum, space)),
         _exponent(optimum, space, chi_square),
         _third_harmonic(optimum, space),
@@ -533,15 +555,7 @@ def _is_exponent(parameter: Parameter) -> bool:
 
 def _by_alpha(optimum: Optimum, name: str) -> ComplexArray:
     """Return the relative change of the response with ln alpha, sensors and drive included."""
-    given = optimum.problem
-    freed = Problem(
-        given.data,
-        given.model,
-        noise=given.noise,
-        sensors=given.sensors,
-        free=[name],
-        steady=given.steady,
-    )
+    freed = optimum.problem.freeing([name])
     theta = np.zeros(len(freed.names))
     known = dict(zip(optimum.names, optimum.theta, strict=True))
     for i, parameter in enumerate(freed.parameters):

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import comb
+from typing import Protocol
 
 import numpy as np
 
@@ -72,13 +73,24 @@ def rms_misfit_of(problem: Problem, fitted: ComplexArray) -> float:
     return float(np.sqrt(np.mean(_misfit(problem, fitted) ** 2)))
 
 
-def sign_convention(optimum: Optimum, described: Callable[[Optimum], bool]) -> str:
+class Tested(Protocol):
+    """Tests of a fit's residuals."""
+
+    @property
+    def rms_misfit(self) -> float:
+        """Of the fundamentals."""
+
+    @property
+    def objections(self) -> tuple[str, ...]:
+        """What speaks against the model."""
+
+
+def sign_convention(optimum: Optimum, before: float, tested: Callable[[Optimum], Tested]) -> str:
     """Return which sign of the response explains data that the fit does not; "" where none.
 
-    `described` says whether a fit's residuals look like noise: a missing mass or spring is met
-    better with a turned sign as well, but not to the noise.
+    `before` is the misfit of the estimate, and `tested` tests that of another optimum: a missing
+    mass or spring is met better with a turned sign as well, but not to the noise.
     """
-    before = rms_misfit(optimum.problem, optimum.theta)
     fitted = optimum.problem.predict(optimum.theta)
     middle = float(np.median(_misfit(optimum.problem, fitted)))
     found = []
@@ -94,13 +106,12 @@ def sign_convention(optimum: Optimum, described: Callable[[Optimum], bool]) -> s
     if not found:
         return ""
     _, turn, problem = min(found, key=lambda each: each[0])
-    turned = solve(problem, loss=optimum.loss)
-    after = rms_misfit(problem, turned.theta)
-    if not after * EXPLAINS < before or not described(turned):
+    turned = tested(solve(problem, loss=optimum.loss))
+    if turned.objections or not turned.rms_misfit * EXPLAINS < before:
         return ""
     return (
         f"With the response {turn.name} the misfit falls from {percent(before)} to "
-        f"{percent(after)} rms: {turn.check}"
+        f"{percent(turned.rms_misfit)} rms: {turn.check}"
     )
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.diagnostics.misfit_share import WeightedEstimate
 from dahl_ident.diagnostics.run_deviations import Linearization, RunDeviations, linearization
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import loss_named
@@ -95,6 +96,7 @@ class RelativeSpace(_Space):
         with np.errstate(divide="ignore", invalid="ignore"):
             y = np.log(problem.data.response / predicted)[self._rows]
             J = (problem.prediction_jacobian(theta) / predicted[:, None])[self._rows]
+        J = J[:, [name not in problem.ranges for name in problem.names]]  # assumed ones stay
         self.basis = _orthonormal(np.concatenate([J.real, J.imag]))
         r = np.concatenate([y.real, y.imag])
         self.residuals = r - self.basis @ (self.basis.T @ r)
@@ -115,18 +117,34 @@ class ResidualSpace(_Space):
 
     scale = 1.0
 
-    def __init__(self, optimum: Optimum, runs: RunDeviations | None = None) -> None:
+    def __init__(
+        self,
+        optimum: Optimum,
+        runs: RunDeviations | None = None,
+        weights: WeightedEstimate | None = None,
+    ) -> None:
+        """Take residuals with the stated weights, or with those of an estimate.
+
+        The size of the latter's misfit is itself an estimate, as an unknown scale is.
+        """
         self._optimum, self._problem = optimum, optimum.problem
+        self._estimate = weights if weights is not None and weights.misfit > 0.0 else None
+        self._scale_known = optimum.scale_known and self._estimate is None
         self.dof = optimum.dof
         m = optimum.problem.n_residuals
         scale = optimum.scale
         self._scale = scale if np.isfinite(scale) and scale > 0.0 else 1.0
         y, J = self._problem.residuals_and_jacobian(optimum.theta, self._scale, tails=False)
+        if self._estimate is not None:
+            y, J = self._estimate.weighted(y), self._estimate.weighted(J)
         own = np.zeros((m, 0))
         if runs is not None:
             near = linearization(self._problem, optimum.theta, runs)
             y[:m], J[:m] = near.residuals / self._scale, near.J / self._scale
             own = _columns_of_runs(near, runs, self._problem.data.harmonic) / self._scale
+            if self._estimate is not None:
+                y, J = self._estimate.weighted(y), self._estimate.weighted(J)
+                own = self._estimate.weighted(own)
             self.dof -= _orthonormal(np.hstack([J[:m], own])).shape[1]
             self.dof += _orthonormal(J[:m]).shape[1]
         self._column_weight, residual_weight = self._weights(y[:m])
@@ -156,6 +174,8 @@ class ResidualSpace(_Space):
         theta = self._optimum.theta
         predicted = self._problem.predict(theta)
         columns = -self._problem.residual_change(theta, changes * predicted) / self._scale
+        if self._estimate is not None:
+            columns = self._estimate.weighted(columns.T).T
         return np.asarray(columns * self._column_weight)
 
     def p_value(self, changes: ComplexArray) -> float:
@@ -173,7 +193,7 @@ class ResidualSpace(_Space):
 
     def tail_of(self, explained: float, k: int, total: float, dof: int) -> float:
         """Return the same where only `total`, with `dof` degrees of freedom, is left of them."""
-        if self._optimum.scale_known:
+        if self._scale_known:
             return float(special.chdtrc(k, explained))
         if dof <= k or total <= explained:
             return np.nan

@@ -181,7 +181,7 @@ class Optimum:
 
     @property
     def _counted(self) -> int:
-        determined = self.problem.n_numbers + len(self.problem.priors) - self.dof
+        determined = self.problem.n_numbers + self.problem.n_priors - self.dof
         return determined + (not self.scale_known)
 
     @property

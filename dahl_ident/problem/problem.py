@@ -84,6 +84,8 @@ class Problem:
         Their names.
     priors : dict of str to Prior
         The priors of sensor parameters that are free.
+    ranges : dict of str to (float, float)
+        Mean and standard deviation of the search coordinates of assumed parameters.
     scale_known : bool
         Whether the residuals have unit variance as they are.
     gaussian : bool
@@ -163,6 +165,7 @@ class Problem:
         self._orbits = {}
         self._alike = Interchangeable(model, self.names)
         self.priors: dict[str, Prior] = sensors.priors
+        self.ranges: dict[str, tuple[float, float]] = {}
 
     def _set_rows(self, rows: Rows, noise: str | None) -> None:
         self._rows = rows
@@ -248,6 +251,35 @@ class Problem:
         return Predictor(
             self.model, self.sensors, self._coordinates, self._rows, shooting, self._orbits
         )
+
+    def freeing(self, names: Iterable[str]) -> Problem:
+        """Return the problem with given parameters free as well."""
+        return Problem(
+            self.data,
+            self.model,
+            noise=self.noise,
+            sensors=self.sensors,
+            free=names,
+            steady=self.steady,
+        )
+
+    def assuming(self, spread: Mapping[str, float]) -> Problem:
+        """Return the problem with given parameters free, each with its value as a prior.
+
+        Parameters
+        ----------
+        spread : mapping of str to float
+            Standard deviation of the logarithm of each.
+        """
+        other = self.freeing(spread)
+        values = {p.name: p.value or 1.0 for p in other.parameters}
+        other.ranges = {n: (float(np.log(values[n])), std) for n, std in spread.items()}
+        return other
+
+    @property
+    def n_priors(self) -> int:
+        """The number of priors, those of assumed parameters included."""
+        return len(self.priors) + len(self.ranges)
 
     # Tables
 
@@ -562,7 +594,7 @@ class Problem:
         self, theta: FloatArray, y: ComplexArray, changes: list[ComplexArray], scale: ArrayLike
     ) -> FloatArray:
         """Return residuals and, below them, their derivatives: (..., 1 + P, m), priors last."""
-        lead, m, extra = self._shape(theta)[:-1], self.n_residuals, len(self.priors)
+        lead, m, extra = self._shape(theta)[:-1], self.n_residuals, self.n_priors
         pairs = np.empty((*lead, len(changes) + 1, m // 2), dtype=np.complex128)
         pairs[..., 0, :] = y
         for index, change in enumerate(changes, start=1):
@@ -580,6 +612,11 @@ class Problem:
                 rows[..., 0, place] = (values[..., index] - mean) / std
                 if changes:
                     rows[..., 1 + index, place] = slopes[..., index] / std
+            for place, (name, (mean, std)) in enumerate(self.ranges.items(), m + len(self.priors)):
+                index = self.names.index(name)
+                rows[..., 0, place] = (theta[..., index] - mean) / std
+                if changes:
+                    rows[..., 1 + index, place] = 1.0 / std
         return rows
 
     # Likelihood

@@ -145,7 +145,7 @@ def _residuals(fit: FitResult) -> Picture:
 def _universal(fit: FitResult, curve: UniversalCurve) -> Picture:
     sigma = curve.stiffness
     normalised = fit.data.select(harmonic=1).to("dynamic_stiffness").response / sigma
-    off = float(np.max(np.abs(normalised - fit.problem.predict(fit.optimum.theta) / sigma)))
+    off = float(np.max(np.abs(normalised - fit.best_fit[fit.data.harmonic == 1] / sigma)))
 
     def draw() -> Figure:
         marks = [(b, complex(curve.response(np.array([b]))[0])) for b in _MARKED_BETA]

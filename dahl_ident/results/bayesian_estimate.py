@@ -315,7 +315,8 @@ def _case(
         return _Case(
             Density(problem, joint_prior(problem, given, values), likelihood), optimum, fit
         )
-    wider, assumed = with_assumed(problem)
+    _, assumed = with_assumed(problem)
+    wider = problem.freeing(assumed) if assumed else problem
     errors = fit.errors or error_model(optimum, of_combinations=True)
     known = dict(zip(optimum.names, optimum.theta.tolist(), strict=True))
     theta = np.array([known.get(p.name, np.log(p.value or 1.0)) for p in wider.parameters])

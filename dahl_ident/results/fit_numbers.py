@@ -139,10 +139,16 @@ class FitNumbers(Result):
             for i, a in enumerate(names)
         }
 
+    @cached_property
+    def _estimate(self) -> Optimum:
+        """The estimate, as an optimum; the search's where nothing else is estimated."""
+        errors = self.errors_of_combinations
+        return self._optimum if errors is None else errors.at_estimate
+
     @property
     def residual(self) -> FloatArray:
-        """Whitened residuals."""
-        return self._optimum.residuals
+        """Whitened residuals at the estimate."""
+        return self._estimate.residuals
 
     @property
     def chisqr(self) -> float:
@@ -157,7 +163,7 @@ class FitNumbers(Result):
     @property
     def scale(self) -> float:
         """Standard deviation of the residuals: 1 where known beforehand."""
-        return self._optimum.scale
+        return self._estimate.scale
 
     @property
     def scale_known(self) -> bool:
@@ -208,9 +214,7 @@ class FitNumbers(Result):
     @cached_property
     def best_fit(self) -> ComplexArray:
         """Predicted response at the estimate, shape (n,)."""
-        if self.errors is None:
-            return self.problem.predict(self._optimum.theta)
-        return self.errors.problem.predict(self.errors.theta)
+        return self._estimate.problem.predict(self._estimate.theta)
 
     @cached_property
     def model(self) -> Model:

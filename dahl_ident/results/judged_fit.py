@@ -171,7 +171,7 @@ class JudgedFit(FitNumbers):
     @cached_property
     def goodness(self) -> Goodness:
         """Whether the residuals are noise, and the estimates physically possible."""
-        return goodness(self._optimum, self.errors)
+        return goodness(self._optimum, self.errors_of_combinations)
 
     @cached_property
     def cross_validation(self) -> CrossValidation | None:
