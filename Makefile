@@ -56,7 +56,8 @@ test-lowest: install  ## what depends on versions, on the lowest declared ones
 examples: install  ## renew the outputs printed in README and manual
 	$(BIN)/python -m tests.examples
 
-docs: install  ## the manual into docs/_build/html; any warning fails
+docs: install  ## the manual with its examples and notebooks run; any warning fails
+	$(BIN)/pytest -q -n $(JOBS) --dist worksteal -m manual tests/test_docs.py
 	$(BIN)/python -m sphinx -q -W --keep-going -b html -j $(JOBS) docs docs/_build/html
 
 bench: install  ## timings side by side with the peers, written into the manual

@@ -20,13 +20,15 @@ def run(*arguments: str) -> int:
     return code if isinstance(code, int) else 0
 
 
-def test_demo_recovers_the_plant(
+def test_demo_recovers_the_plant_and_tells_machines_its_steps_on_standard_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    status = run("demo")
-    out = capsys.readouterr().out
-    assert status == 0, out
+    Path("lab.toml").write_text("json = true\noutput = 'here'\n", encoding="utf-8")
+    status = run("demo", "--config", "lab.toml")
+    printed = capsys.readouterr()
+    said, told = printed.err, json.loads(printed.out)
+    assert status == 0, said
     steps = [
         "1. inspect",
         "2. extract",
@@ -35,31 +37,18 @@ def test_demo_recovers_the_plant(
         "5. posterior",
         "6. report",
     ]
-    places = [out.index(step) for step in steps]
+    places = [said.index(step) for step in steps]
     assert places == sorted(places)
-    lines = out[out.index("Compared with the truth") : out.index("4. identifiability")].splitlines()
+    lines = said[said.index("Compared with the truth") : places[3]].splitlines()
     off = [float(line.split()[-1]) for line in lines if line.strip().startswith(("f_max", "sigma"))]
     assert len(off) == 2
     assert all(abs(number) < 4.0 for number in off)
-    page = Path(out.rstrip().rsplit("report: ", 1)[1])
-    assert page == tmp_path / "out" / "report.html"
-    assert '<p class="mark">Trusted</p>' in page.read_text(encoding="utf-8")
-
-
-def test_demo_for_machines_tells_its_steps_on_standard_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("lab.toml").write_text("json = true\noutput = 'here'\n", encoding="utf-8")
-    assert run("demo", "--config", "lab.toml") == 0
-    printed = capsys.readouterr()
-    told = json.loads(printed.out)
-    assert "6. report" in printed.err
     for name, truth in told["truth"].items():
         assert told["fit"]["params"][name]["value"] == pytest.approx(truth, rel=0.3)
     assert told["posterior"]["converged"]
-    assert Path(told["report"]) == tmp_path / "here" / "report.html"
-    assert Path(told["report"]).is_file()
+    page = Path(said.rstrip().rsplit("report: ", 1)[1])
+    assert page == Path(told["report"]) == tmp_path / "here" / "report.html"
+    assert '<p class="mark">Trusted</p>' in page.read_text(encoding="utf-8")
 
 
 def test_demo_says_where_no_folder_can_be(

@@ -46,6 +46,7 @@ def test_every_class_and_function_of_the_reference_has_an_example() -> None:
     assert [name for name in names if not _has_example(attrgetter(name)(di))] == []
 
 
+@pytest.mark.manual
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
 def test_examples_print_what_the_page_says(page: Path, tmp_path: Path) -> None:
     assert renewed(page, tmp_path) == page.read_text("utf-8")
