@@ -100,7 +100,7 @@ class Density:
     @property
     def decorrelation(self) -> Decorrelation | None:
         """Coordinates in which ridges between linear elements and friction are straight."""
-        return decorrelation_of(self.problem)
+        return decorrelation_of(self.tabulated)
 
     def to_values(self, x: FloatArray) -> FloatArray:
         """Return values at points of shape (..., D), or (..., P) without the scale."""
