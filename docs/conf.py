@@ -44,6 +44,8 @@ html_math_renderer = "mathml"
 html_theme = "pydata_sphinx_theme"
 html_title = "dahl_ident"
 html_show_sourcelink = False
+html_theme_options = {"header_links_before_dropdown": 9}
+smartquotes_action = "qe"  # two hyphens begin an option
 html_static_path = ["_static"]
 html_css_files = ["manual.css"]
 # pages without others below them have nothing to list on the left
@@ -56,6 +58,7 @@ html_sidebars = {
         "contributing",
         "install",
         "quick_start",
+        "cheat_sheet",
         "command_line",
         "gallery",
         "glossary",

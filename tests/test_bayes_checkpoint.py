@@ -196,5 +196,5 @@ def test_a_lock_left_by_a_killed_run_or_removed_by_another_does_not_matter(
 def test_a_missing_folder_and_a_folder_are_said(tmp_path: Path) -> None:
     with pytest.raises(SamplingError, match="is a folder; give the path of a file in it"):
         sampled(tmp_path, steps=50)
-    with pytest.raises(SamplingError, match="nowhere is no folder; make it"):
+    with pytest.raises(SamplingError, match="nowhere is not a folder; make it"):
         sampled(tmp_path / "nowhere" / "chain.h5", steps=50)

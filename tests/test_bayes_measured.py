@@ -48,7 +48,7 @@ def test_the_bolted_joint_leaves_f_max_to_its_prior(tmp_path: Path) -> None:
     assert posterior.converged, posterior.message
     f_max = next(rule for rule in posterior.prior_influences if rule.name == "f_max")
     assert f_max.at_upper_end
-    assert "f_max is set by its prior: posterior width 0." in str(posterior)
+    assert "f_max is known from its prior: posterior width 0." in str(posterior)
     # all the same, the microslip loss and the small-amplitude stiffness are well known
     loss = posterior.function(lambda f_max, sigma, **_: sigma**2 / f_max)
     assert loss["84%"] < 1.4 * loss["16%"]

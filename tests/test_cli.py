@@ -319,7 +319,7 @@ def test_every_help_has_an_example_that_runs(run: Runner, command: str) -> None:
         return  # run by make demo and by the test of the chain
     if command == "campaign":
         run("datasets", "noisy", "-o", "device.csv")
-        Path("lab.toml").write_text(
+        Path("campaign.toml").write_text(
             '[files]\npattern = "{device}.csv"\nkind = "response"\n[[model]]\nkind = "dahl"\n'
         )
     if command == "export":
@@ -646,3 +646,11 @@ def test_a_comparison_is_printed_once(run: Runner) -> None:
     table = run("datasets", "alpha_2", "-o", "-").out
     told = run("fit", "-", "-v", "--compare", stdin=table).out
     assert told.count("model              reason") == 1
+
+
+def test_warnings_are_in_the_short_output(run: Runner) -> None:
+    table = run("datasets", "fig_7_plant", "-o", "-").out
+    plant = ("--mass", "0.3", "--damping", "free", "--stiffness", "free")
+    told = run("fit", "-", *plant, "--steady", "describing function", stdin=table).out
+    assert re.search(r"Warning: the describing function, .* fit with --steady 'exact'\.", told)
+    assert "Warning" not in run("fit", "-", *plant, stdin=table).out

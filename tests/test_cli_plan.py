@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +67,7 @@ def test_motions_in_time_continue_a_fit_of_records(run: Runner) -> None:
 def test_a_target_out_of_reach_ends_with_3(run: Runner) -> None:
     outcome = run("plan", *BENCH, *RANGES, "--target", "f_max=1e-5", "--time", "20")
     assert outcome.status == 3
-    assert "does NOT reach what is wanted" in outcome.out
+    assert "does NOT meet the target" in outcome.out
     assert "the limit of time prevents it" in outcome.err
 
 
@@ -88,3 +89,18 @@ def test_bad_input_says_what_was_expected(
     outcome = run("plan", *BENCH, *options)
     assert outcome.status == 1
     assert message in outcome.err
+
+
+def test_time_to_spare_is_for_repeats(run: Runner) -> None:
+    outcome = run("plan", *BENCH, *RANGES, "--alpha", "1", "--target", "f_max=0.01", "--time", "1h")
+    first = outcome.out.splitlines()[0]
+    seconds = float(first.split()[3])
+    assert "meets the target" in first
+    left = re.search(r"(\d+) s are left; the whole time would give f_max (\S+) %", outcome.out)
+    assert left is not None
+    assert float(left[1]) == pytest.approx(3600.0 - seconds, rel=1e-3)
+    assert float(left[2]) < 0.2, "an hour instead of seconds"
+    assert "Repeat the plan in 5 runs, each a new mounting" in outcome.out
+    short = run("plan", *BENCH, *RANGES, "--alpha", "1", "--target", "f_max=0.01", "--time",
+                f"{1.2 * seconds}s")  # fmt: skip
+    assert "are left" not in short.out

@@ -155,7 +155,7 @@ def test_equivalent_plant_around_python_control_systems() -> None:
     ours = equivalent_plant(friction + named, 1e-3, 0.7)
     assert ours.poles().size == 2
     frd = LinearSystem(control.frd([1.0, 2.0], [1.0, 2.0]), quantity="receptance")
-    with pytest.raises(ModelError, match="is no rational function of s"):
+    with pytest.raises(ModelError, match="is not a rational function of s"):
         equivalent_plant(friction + frd, 1e-3, 0.2)
     with pytest.raises(ValidationError, match=r"amplitude is 0\.0; expected numbers > 0"):
         equivalent_plant(FIG_7, 0.0, 1.0)

@@ -95,3 +95,20 @@ def test_formulas_of_the_manual_are_mathml() -> None:
     for text in blocks:
         assert offline.mathml(text, "block").startswith("<math ")
         assert "\\" not in re.sub("<[^>]*>", "", offline.mathml(text, "block")), text
+
+
+def test_the_messages_of_troubleshooting_are_those_of_the_package() -> None:
+    source = "".join(p.read_text("utf-8") for p in Path(di.__file__).parent.rglob("*.py"))
+    flat = re.sub(r"\"\s*f?\"", "", source)  # texts over several lines
+    page = (DOCS / "how_to" / "troubleshooting.md").read_text("utf-8")
+    messages = re.findall(r"^\| `([^`]+)` \|", page, re.MULTILINE)
+    assert len(messages) > 10
+    assert [text for text in messages if text not in flat] == []
+
+
+def test_every_field_of_the_metadata_is_explained() -> None:
+    page = (DOCS / "how_to" / "reports.md").read_text("utf-8")
+    template = Path(di.__file__).parent / "cli" / "templates" / "report.toml"
+    fields = re.findall(r"^(?:\[\[)?([a-z_]+)(?:\]\])?(?: =|$)", template.read_text("utf-8"), re.M)
+    assert set(fields) >= {"number", "role", "instruments", "ambient", "k"}
+    assert [name for name in fields if f"`{name}`" not in page and f"[{name}]" not in page] == []

@@ -167,8 +167,8 @@ FRD = control.frd(WHOLE, np.geomspace(1.0, 1e3, 20))
 @pytest.mark.parametrize(
     ("system", "quantity", "text"),
     [
-        (FRD, "receptance", "no rational function of s"),
-        (control.c2d(WHOLE, 1e-3), "receptance", "no rational function of s"),
+        (FRD, "receptance", "not a rational function of s"),
+        (control.c2d(WHOLE, 1e-3), "receptance", "not a rational function of s"),
         (WHOLE * 100.0 / (S + 100.0), "receptance", r"grows as s\^3; an equation of motion"),
     ],
 )

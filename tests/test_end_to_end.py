@@ -92,7 +92,7 @@ def test_an_exponent_of_2_is_not_taken_for_linear_dahl() -> None:
     fit = di.fit(table("alpha_2"), di.Dahl(alpha=1.0))
     assert not fit.trusted
     assert "these data are not linear Dahl" in fit.verdict
-    assert "the data favour alpha near 2.0" in str(fit.goodness)
+    assert "alpha near 2.0" in str(fit.goodness)
     estimated = di.fit(table("alpha_2"), di.Dahl()).params["alpha"]
     assert estimated.stderr is not None
     assert abs(estimated.value - 2.0) < 3.0 * estimated.stderr

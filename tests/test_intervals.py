@@ -334,7 +334,7 @@ class TestTable:
         frame = found.to_frame()
         assert frame.shape == (6, 6)
         assert frame["upper"].iloc[-1] == found.upper[-1, 1]
-        with pytest.raises(KeyError, match="mass is no free parameter"):
+        with pytest.raises(KeyError, match="mass is not a free parameter"):
             found["mass"]
 
     @pytest.mark.parametrize("levels", [[0.0], [1.0], [], [2.0], [np.nan]])

@@ -281,3 +281,14 @@ def test_bad_arguments_are_named() -> None:
     with pytest.raises(ModelError, match="has no frequency of its own; give frequency_range_hz"):
         limit_cycles(Spring(-1.0), GRIP)
     assert LimitCycle(1.0, 0.5, -1.0).omega == pytest.approx(np.pi)
+
+
+def test_an_empty_result_says_why() -> None:
+    calm = limit_cycles(Mass(1.0) + Damper(1.0) + Spring(1.0), GRIP)
+    assert calm == ()
+    assert "at no amplitude" in repr(calm)
+
+
+def test_a_loop_of_the_wrong_sign_is_refused() -> None:
+    with pytest.raises(ModelError, match="loop has a negative mass, so its sign is wrong"):
+        limit_cycles(-HUNTING, Dahl(f_max=1.0, sigma=1e4))

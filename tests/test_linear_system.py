@@ -210,5 +210,5 @@ def test_linear_system_beside_friction_replaces_the_lumped_part() -> None:
 
 def test_measured_response_has_no_force_over_time() -> None:
     element = LinearSystem(control.frd(1.0 / STIFFNESS, OMEGA), quantity="receptance")
-    with pytest.raises(ModelError, match=r"receptance of F.*no rational function of s"):
+    with pytest.raises(ModelError, match=r"receptance of F.*not a rational function of s"):
         element.force([0.0, 1.0])

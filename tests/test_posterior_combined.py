@@ -123,7 +123,7 @@ def test_a_parameter_that_a_default_prior_sets_is_not_determined() -> None:
     for uncertainty in ("noise", "combined"):
         open_ = di.posterior(microslip, LINEAR, method="grid", uncertainty=uncertainty)
         assert str(open_.status) == "not determined"
-        assert "f_max is set by its prior" in open_.verdict
+        assert "f_max is known from its prior" in open_.verdict
     known = di.posterior(microslip, LINEAR, method="grid", priors={"f_max": (0.5, 2.0)})
     assert known.status.usable
 

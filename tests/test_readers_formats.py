@@ -629,7 +629,7 @@ class TestLvmStrictly:
 
     @pytest.mark.parametrize("count", ["6_4", "\u00b2", "1" * 30])
     def test_what_is_no_number_of_samples(self, tmp_path: Path, count: str) -> None:
-        with pytest.raises(DataError, match="is no number of samples"):
+        with pytest.raises(DataError, match="is not a number of samples"):
             self.read(tmp_path, self.text(self.rows()).replace("\t64\t64", f"\t{count}\t64"))
 
     @pytest.mark.parametrize("odd", ["1_000", "0x10", "1,5", "--"])

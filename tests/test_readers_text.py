@@ -253,7 +253,9 @@ class TestUnusualTables:
 
     def test_time_stamps_that_are_none(self, tmp_path: Path) -> None:
         text = "time,x [mm],F [N]\n12:00:01,1,1\n12:00:61,1,1\n"
-        with pytest.raises(DataError, match="line 3, column 'time': '12:00:61' is no time stamp"):
+        with pytest.raises(
+            DataError, match="line 3, column 'time': '12:00:61' is not a time stamp"
+        ):
             read_record(written(tmp_path, text))
         zones = (
             "timestamp,x [mm],F [N]\n2024-03-31T01:59:59+01:00,1,1\n2024-03-31T03:00:00+02:00,2,2\n"

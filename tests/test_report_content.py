@@ -416,3 +416,15 @@ def test_number_title_hash_and_page_stand_on_every_page(tmp_path: Path) -> None:
         assert f"Page {i} of {len(pages)}" in text
     assert "Authorised by, B. Sample, head of laboratory" in " ".join("".join(pages[:2]).split())
     assert "The results relate only to the item that was measured." in pages[0]
+
+
+def test_the_energy_of_a_cycle_has_the_uncertainty_of_the_budget(fit: di.FitResult) -> None:
+    """The loop of Dahl's law from its differential equation, integrated over its displacement."""
+    found = re.search(
+        r"A cycle loses \S+ ± \S+ J at \S+ m and (\S+) ± (\S+) J at (\S+) m", text_of(fit)
+    )
+    assert found is not None
+    lost, u, A = map(float, found.groups())
+    truth = di.Dahl(0.1, 30.0, alpha=1.0).loop(A, 20001)
+    assert abs(lost - abs(float(np.trapezoid(truth[1], truth[0])))) < 3.0 * u
+    assert u > 0.5 * lost * fit.budget()["f_max"].u / fit.budget()["f_max"].value

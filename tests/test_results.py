@@ -23,8 +23,10 @@ from dahl_ident import (
     Mass,
     Sensors,
     Spring,
+    compare_models,
     fit,
     fit_many,
+    load_dataset,
     posterior,
 )
 from dahl_ident.arrays import FloatArray
@@ -426,7 +428,9 @@ class TestStorage:
         with pytest.raises(DataError, match=r"lost\.json: the file cannot be read: No such file"):
             FitResult.load(tmp_path / "lost.json")
         (tmp_path / "image.json").write_bytes(b"\x89PNG")
-        with pytest.raises(DataError, match=r"image\.json: the file cannot be read: it is no text"):
+        with pytest.raises(
+            DataError, match=r"image\.json: the file cannot be read: it is not text"
+        ):
             FitResult.load(tmp_path / "image.json")
 
     @pytest.mark.parametrize(
@@ -522,3 +526,19 @@ class TestPictures:
         segments = top.collections[-1].get_segments()  # type: ignore[attr-defined]  # error bars
         heights = [np.ptp(s[:, 1]) for s in segments]
         np.testing.assert_allclose(heights, 0.04 * data.gain, rtol=1e-6)
+
+
+def test_a_pandas_table_is_fitted_as_it_is_read() -> None:
+    data = load_dataset("noisy")
+    frame = data.to_frame()
+    assert fit(frame, Dahl()).params["f_max"].value == pytest.approx(
+        fit(data, Dahl()).params["f_max"].value, rel=1e-12
+    )
+
+
+def test_a_list_of_fits_is_sent_to_the_report() -> None:
+    found = fit(load_dataset("noisy"), Dahl())
+    with pytest.raises(
+        ValidationError, match=r"got several fits; .* di\.report\(\[fit, \.\.\.\]\)"
+    ):
+        compare_models([found, found])  # type: ignore[arg-type]

@@ -197,8 +197,8 @@ def test_a_robust_fit_that_moves_an_estimate_is_said_without_suspicious_rows() -
 def test_what_only_a_prior_determines_is_not_called_identified() -> None:
     tight = fit(_scattered(3), Dahl(), sensors=Sensors(force_gain=stats.norm(1.0, 0.01)))
     known = tight.identifiability
-    assert known.headline == "f_max and sigma are identified; force_gain is set by its prior."
-    assert known.parameters["force_gain"].text.endswith("set by its prior")
+    assert known.headline == "f_max and sigma are identified; force_gain is known from its prior."
+    assert known.parameters["force_gain"].text.endswith("known from its prior")
     assert known.named(Verdict.IDENTIFIED) == ["f_max", "sigma"]
     assert tight.trusted
     # with friction known, the data say far more of the gain than a wide prior

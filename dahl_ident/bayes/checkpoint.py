@@ -156,7 +156,7 @@ def open_chain(path: str | os.PathLike[str], identity: Identity) -> Iterator[Cha
     if file.is_dir():
         raise SamplingError(f"{file} is a folder; give the path of a file in it")
     if not file.parent.is_dir():
-        raise SamplingError(f"{file.parent} is no folder; make it, or give another path")
+        raise SamplingError(f"{file.parent} is not a folder; make it, or give another path")
     with locked(file, SamplingError):
         chain_file = ChainFile(file, identity)
         try:

@@ -67,7 +67,7 @@ def campaign(
 
     An interrupted campaign continues where it stopped; a changed file is fitted again.
 
-    Example: dahl-ident campaign lab.toml --jobs 4 --report campaign.html
+    Example: dahl-ident campaign campaign.toml --jobs 4 --report campaign.html
     """
     from dahl_ident.campaigns.definition import read_definition
     from dahl_ident.campaigns.population import USABLE

@@ -79,12 +79,28 @@ class LimitCycle:
         return self.growth_rate < 0.0
 
 
+class LimitCycles(tuple[LimitCycle, ...]):
+    """Limit cycles by rising amplitude; where there is none, `reason` says why.
+
+    Examples
+    --------
+    >>> from dahl_ident import Dahl, Damper, Mass, Spring
+    >>> limit_cycles(Mass(1.0) + Damper(1.0) + Spring(1.0), Dahl(f_max=1.0, sigma=1e4))
+    no limit cycle: from ... Hz, -1/H meets friction's N(A) at no amplitude
+    """
+
+    reason: str = ""
+
+    def __repr__(self) -> str:
+        return super().__repr__() if self else f"no limit cycle: {self.reason}"
+
+
 def limit_cycles(
     loop: Any,
     friction: Element,
     *,
     frequency_range_hz: tuple[float, float] | None = None,
-) -> tuple[LimitCycle, ...]:
+) -> LimitCycles:
     """Return every solution of 1 + H(j omega) N(A) = 0 with its stability.
 
     Parameters
@@ -101,14 +117,14 @@ def limit_cycles(
 
     Returns
     -------
-    tuple of LimitCycle
-        By rising amplitude; empty where none exists.
+    LimitCycles
+        A tuple of LimitCycle, by rising amplitude; empty where none exists, with the reason.
 
     Raises
     ------
     ModelError
-        If `friction` is not rate-independent friction alone, `loop` is not linear, or a
-        parameter has no value.
+        If `friction` is not rate-independent friction alone, `loop` is not linear or has the
+        wrong sign, or a parameter has no value.
     ValidationError
         If `loop` is not a system, or the range is not two rising frequencies.
 
@@ -153,7 +169,11 @@ def limit_cycles(
         cycle = _refine(linear, as_model(friction), A[j], omega[i])
         if cycle is not None and omega[0] <= cycle.omega <= omega[-1]:
             found.append(cycle)
-    return _distinct(found)
+    cycles = LimitCycles(_distinct(found))
+    if not cycles:
+        ends = " to ".join(f"{w / (2.0 * np.pi):.3g}" for w in (omega[0], omega[-1]))
+        cycles.reason = f"from {ends} Hz, -1/H meets friction's N(A) at no amplitude"
+    return cycles
 
 
 def as_linear(loop: Any) -> Model:
@@ -196,6 +216,11 @@ def _frequencies(linear: Model, contact: float, asked_hz: tuple[float, float] | 
     roots = np.zeros(0, dtype=np.complex128)
     if has_polynomials(linear):
         numerator, denominator = coefficients(transfer_stiffness(linear))
+        if numerator.size - denominator.size == 2 and numerator[0] * denominator[0] < 0.0:
+            raise ModelError(
+                "loop has a negative mass, so its sign is wrong; expected displacement over the "
+                "force that acts where the friction acts"
+            )
         stuck = np.polyadd(numerator, contact * denominator)
         roots = np.concatenate([np.roots(p) for p in (numerator, denominator, stuck)])
         roots = roots[np.abs(roots) > 0.0]

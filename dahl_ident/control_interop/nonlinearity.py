@@ -119,7 +119,7 @@ def friction_elements(friction: Element) -> tuple[Element, ...]:
             )
         if not element.rate_independent:
             raise ModelError(
-                f"{element!r} depends on the rate, so its describing function is no function of "
+                f"{element!r} depends on the rate, so its describing function is not a function of "
                 "the amplitude alone; expected rate-independent friction, such as Dahl"
             )
     friction.known_values()

@@ -171,7 +171,7 @@ def _seconds(bound: Binding, channel: Channel) -> FloatArray:
             moment = np.datetime64(stamp.replace(" ", "T").replace(",", "."), "ns")
         if found is None or np.isnat(moment):
             raise DataError(
-                f"{bound.source.where(channel, i)}: {str(cell)[:40]!r} is no time stamp such as "
+                f"{bound.source.where(channel, i)}: {str(cell)[:40]!r} is not a time stamp such as "
                 "2024-03-31T12:00:00.5 or 12:00:00.5"
             )
         nanoseconds[i] = moment.astype(np.int64)

@@ -108,7 +108,7 @@ def read_text(path: str | Path, what: str = "the file") -> str:
     try:
         return regular(path, what).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as exc:
-        why = exc.strerror if isinstance(exc, OSError) else "it is no text"
+        why = exc.strerror if isinstance(exc, OSError) else "it is not text"
         raise DataError(f"{path}: {what} cannot be read: {why}") from exc
 
 

@@ -39,7 +39,7 @@ def advice(optimum: Optimum, name: str, limits: Interval, lost: frozenset[str]) 
             return _of_spring(optimum, lost)
     return (
         "because its effect on these data is below their noise or like that of another parameter: "
-        "fix it, or measure where it matters"
+        "fix it, or measure where its effect is larger"
     )
 
 
@@ -153,7 +153,7 @@ def _of_spring(optimum: Optimum, lost: frozenset[str]) -> str:
             f"because friction's stiffness {stiff[0]} can take its place: measure the spring "
             "without friction, or drive far into slip"
         )
-    return "because its force is below the noise of the response: drive where it matters"
+    return "because its force is below the noise of the response: measure where it is larger"
 
 
 def _hiding_spring(optimum: Optimum, lost: frozenset[str]) -> str:

@@ -32,6 +32,7 @@ from dahl_ident.problem import Problem
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.units import shown_unit
 
+ENERGY = "energy lost in a cycle"  # name of a derived quantity
 _STEP = 1e-5  # relative, of parameters, for the slope of a knee; of frequencies, for a stiffness
 _RESONANT = 1e-12  # relative: a natural frequency is found
 _PASSES = 50  # at most; one is enough unless the stiffness depends on the frequency
@@ -282,7 +283,7 @@ def derived(
     band = describing_function_band(optimum, A, errors)
     N, loss = band.response, np.pi * A**2
     rows = [
-        ("energy lost in a cycle", "J", loss * N.imag, loss * band.imag_std),
+        (ENERGY, "J", loss * N.imag, loss * band.imag_std),
         ("equivalent stiffness", shown_unit("N/m", motion), N.real, band.real_std),
     ]
     if frequency_hz is not None:

@@ -13,7 +13,7 @@ not either, and one of negative damping is no mechanism's.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -295,6 +295,11 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
     >>> compare_models(result).best.name
     'exponent free'
     """
+    if isinstance(fit, Sequence):
+        raise ValidationError(
+            "compare_models got several fits; it takes one, and a mapping of names to other models "
+            "of its data. What changed between fits of different data is in di.report([fit, ...])"
+        )
     if not isinstance(fit.optimum, Optimum):
         raise ValidationError(
             "compare_models got a fit of records; it takes a fit of a table. Compare models of "

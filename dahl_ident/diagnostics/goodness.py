@@ -97,7 +97,7 @@ class Exponent:
         value = with_unit(self.wanted, self.stderr, "")
         wide = f" (error widened {self.widened:.2g} times because of the misfit)"
         widening = wide if self.widened > 1.0 else ""
-        return f"the data favour {self.name} near {value}{widening} over {self.fixed:g}"
+        return f"{self.name} near {value}{widening} describes the data better than {self.fixed:g}"
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,7 @@ class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
 
     def __getitem__(self, name: str) -> tuple[Interval, ...]:
         if name not in self.names:
-            raise KeyError(f"{name} is no free parameter; there are {', '.join(self.names)}")
+            raise KeyError(f"{name} is not a free parameter; there are {', '.join(self.names)}")
         i = self.names.index(name)
         rows = zip(self.levels, self.lower[:, i], self.upper[:, i], strict=True)
         return tuple(Interval(float(c), float(a), float(b)) for c, a, b in rows)

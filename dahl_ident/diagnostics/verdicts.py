@@ -57,7 +57,7 @@ class Verdict(Enum):
     """How well a parameter is determined."""
 
     IDENTIFIED = "identified"
-    BY_PRIOR = "set by its prior"
+    BY_PRIOR = "known from its prior"
     WEAK = "weakly identified"
     NOT_IDENTIFIED = "not identified"
 
@@ -178,7 +178,7 @@ class Identifiability:
         if not lost and not weak and given:
             others = self.named(Verdict.IDENTIFIED)
             rest = f"{listed(others)} {'is' if len(others) == 1 else 'are'} identified; "
-            set_by = "is set by its prior" if len(given) == 1 else "are set by their priors"
+            set_by = "is known from its prior" if len(given) == 1 else "are known from their priors"
             return f"{rest if others else ''}{listed(given)} {set_by}."
         if not lost and not weak:
             return "Every parameter is identified."

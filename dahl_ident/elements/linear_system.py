@@ -412,7 +412,7 @@ class LinearSystem(Element):
         system = self.system_at([float(v) for v in self.known_values()])
         if isinstance(system, control.FRD) or not system.isctime():
             raise ModelError(
-                f"{self!r} is no rational function of s, and so has no equation of motion in "
+                f"{self!r} is not a rational function of s, and so has no equation of motion in "
                 "continuous time; give a continuous TransferFunction or StateSpace"
             )
         transfer = control.tf(system)

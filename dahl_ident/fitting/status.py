@@ -46,7 +46,7 @@ class Status(Enum):
     )
     RUNS_AWAY = (
         "No finite optimum: the fit improves as a parameter goes to a limit. The amplitudes do not "
-        "reach what it describes: measure where it matters, or fix it."
+        "reach what it describes: measure where its effect is larger, or fix it."
     )
     NOT_CONVERGED = (
         "Not converged: the search stopped before it found a minimum. The numbers are not an "

@@ -355,8 +355,26 @@ class Plan:
                      if any(name.startswith("U(") for name in self.expected)
                      else "Relative standard uncertainties.")  # fmt: skip
         lines += [f"{text}." for text in self.undetermined]
+        lines += self._spare()
         lines.append(f"Assumed: {'; '.join(self.assumptions)}.")
         return "\n".join(lines)
+
+    def _spare(self) -> list[str]:
+        """Return what the time that is left would buy, and what to use it for."""
+        time = self.planner.question.limits.time
+        if not (self.reached and self.seconds < 0.5 * time < np.inf):
+            return []
+        found = self.planner.search.solve(time)
+        chosen = found.selection
+        told = self.planner.forecast.expected(chosen.levels, chosen.cycles, found.runs)
+        bought = ", ".join(f"{name} {_percent(told[name].after)}" for name in self.target)
+        lines = [f"{time - self.seconds:.4g} s are left; the whole time would give {bought}."]
+        if self.runs == 1:
+            lines.append(
+                f"Repeat the plan in {min(5, int(time // self.seconds))} runs, each a new "
+                "mounting: only runs show the scatter between them; longer ones do not reduce it."
+            )
+        return lines
 
     def _levels(self) -> list[str]:
         heading = (
@@ -412,7 +430,7 @@ def _headline(plan: Plan) -> str:
     runs = f"{plan.runs} runs of {levels}" if plan.runs > 1 else levels
     end = ""
     if plan.target:
-        end = "; reaches what is wanted" if plan.reached else "; does NOT reach what is wanted"
+        end = "; meets the target" if plan.reached else "; does NOT meet the target"
     return f"{runs} in {plan.seconds:.4g} s{end}."
 
 

@@ -110,7 +110,7 @@ class RecordProblem:
             if not isinstance(record, Record):
                 raise ValidationError(
                     f"data holds a {type(record).__name__}; expected a FrequencyResponse, a Record "
-                    "or several records"
+                    "or several records (read_frequency_response and read_record read files)"
                 )
         self.model = as_model(model)
         self.excitation = excitation

@@ -167,7 +167,7 @@ def _universal(fit: FitResult, curve: UniversalCurve) -> Picture:
 
 def _profiles(fit: FitResult) -> Picture:
     """Return the profile of every free parameter, two panels a row."""
-    best = (f"{name} is {fit.params[name].value:.4g}" for name in fit.var_names)
+    best = [f"{name} is {v:.4g}" for name, v in zip(fit.var_names, fit.optimum.values, strict=True)]
 
     def draw() -> Figure:
         rows = -(-fit.nvarys // 2)
@@ -181,8 +181,9 @@ def _profiles(fit: FitResult) -> Picture:
 
     return Picture(
         "profiles",
-        "Profile likelihood of each parameter: where the curve meets a dashed line is the limit at "
-        "that confidence.",
+        "Profile likelihood of each parameter, from noise alone: where the curve meets a dashed "
+        "line is the limit at that confidence. Stated estimates weigh every source of error, and "
+        "may differ from its minimum.",
         f"One curve for each parameter; at the minima {', '.join(best)}.",
         draw,
     )
@@ -197,7 +198,7 @@ def _draw_profile(fit: FitResult, index: int, axis: plots.Axes) -> None:
     plots.plot_profile(
         np.exp(coordinate) if logarithmic else coordinate,
         profiler.curve(index, coordinate),
-        best=fit.params[name].value,
+        best=float(fit.optimum.values[index]),
         limits={percent(c): float(t**2) for c, t in zip(LEVELS, q, strict=True)},
         label=_with_unit(name, parameter.unit),
         log=bool(logarithmic and np.ptp(coordinate) > _STRAIGHT),

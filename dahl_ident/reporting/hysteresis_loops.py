@@ -9,6 +9,8 @@ import numpy as np
 
 from dahl_ident import plots
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.diagnostics.bands import ENERGY
+from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.elements import Friction
 from dahl_ident.reporting.document import Picture, figure_of
 from dahl_ident.units import engineering, si_unit
@@ -26,8 +28,7 @@ def loops(fit: FitResult, friction: Friction) -> Picture:
     """Return the picture of the loops at the smallest, a middle and the largest amplitude."""
     sizes, measured = _chosen(fit, friction)
     unit, force_unit = (si_unit(kind, fit.data.motion) for kind in ("displacement", "force"))
-    omega = 2.0 * np.pi * float(np.median(fit.data.frequency_hz))
-    energy = np.pi * sizes**2 * friction.dynamic_stiffness(sizes, omega).imag
+    losses = [q for q in fit.derived(sizes.tolist()) if q.name == ENERGY]
     drawn = [friction.loop(float(A), 6 * (_POINTS - 1) + 1) for A in sizes]
     over_amplitude = bool(sizes[-1] > _WIDE * sizes[0])
 
@@ -55,8 +56,9 @@ def loops(fit: FitResult, friction: Friction) -> Picture:
         else "The data hold no higher harmonics of the force, so there is no measured loop."
     )
     finding = (
-        f"A cycle loses {energy[0]:.3g} J at {sizes[0]:.3g} {unit} and {energy[-1]:.3g} J at "
-        f"{sizes[-1]:.3g} {unit}."
+        f"A cycle loses {with_unit(losses[0].value, losses[0].stderr, 'J')} at {sizes[0]:.3g} "
+        f"{unit} and {with_unit(losses[-1].value, losses[-1].stderr, 'J')} at {sizes[-1]:.3g} "
+        f"{unit} (standard uncertainties)."
     )
     if measured:
         finding += f" {_distance(drawn, measured)}"
@@ -80,7 +82,8 @@ def _chosen(
     fundamental = data.harmonic == 1
     if (data.harmonic != 1).any() and fit.problem.sensors.are_exact:
         assert data.amplitude is not None  # harmonics belong to a displacement
-        points = np.stack([data.frequency_hz, data.amplitude])
+        run = np.zeros(data.n) if data.run is None else np.unique(data.run, return_inverse=True)[1]
+        points = np.stack([data.frequency_hz, data.amplitude, run])
         own = [np.flatnonzero((points[:, i] == points.T).all(axis=1)) for i in range(data.n)]
         full = [i for i in np.flatnonzero(fundamental) if own[i].size > 1]
         rank = [full[i] for i in np.argsort(data.amplitude[full])]

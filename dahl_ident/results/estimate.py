@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.data import FrequencyResponse, Record, read_frequency_response
 from dahl_ident.data.rows import row_names
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
@@ -22,6 +22,8 @@ from dahl_ident.sensors import Sensors
 from dahl_ident.steady_state import Steady
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from dahl_ident.elements.equations import Excitation
     from dahl_ident.fitting.constraints import Constraints
     from dahl_ident.problem.record_problem import Output
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
 
 @overload
 def fit(
-    data: FrequencyResponse,
+    data: FrequencyResponse | pd.DataFrame,
     model: Element,
     *,
     method: str = ...,
@@ -59,7 +61,7 @@ def fit(
     progress: bool = ...,
 ) -> RecordFit: ...
 def fit(
-    data: FrequencyResponse | Record | Sequence[Record],
+    data: FrequencyResponse | pd.DataFrame | Record | Sequence[Record],
     model: Element,
     *,
     method: str = "lm",
@@ -82,8 +84,9 @@ def fit(
 
     Parameters
     ----------
-    data : FrequencyResponse, Record or sequence of Record
-        What was measured. Displacement-controlled rows need an amplitude, force-controlled rows
+    data : FrequencyResponse, DataFrame, Record or sequence of Record
+        What was measured; a pandas table is read by `read_frequency_response`.
+        Displacement-controlled rows need an amplitude, force-controlled rows
         a drive. Records of any motion are fitted sample by sample, several as runs of one device.
     model : Element
         One element or a sum, such as ``Dahl() + Mass(0.3)``. Numbers are fixed, the rest free.
@@ -154,6 +157,8 @@ def fit(
     >>> result.params["f_max"].value.__round__(9), result.success
     (0.1, True)
     """
+    if hasattr(data, "iloc"):  # a table in memory, without the import of pandas
+        data = read_frequency_response(cast("pd.DataFrame", data))
     if not isinstance(data, FrequencyResponse):
         taken = {
             "noise": noise, "sensors": sensors, "constraints": constraints,

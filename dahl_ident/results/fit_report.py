@@ -60,7 +60,9 @@ def as_html(fit: JudgedFit, intervals: ConfidenceIntervals) -> str:
 
 
 def _all(fit: JudgedFit, intervals: ConfidenceIntervals) -> Iterator[Section]:
-    yield Section("Verdict", list(fit.statements))
+    first, *others = fit.statements
+    warnings = [f"Warning: {text}." for text in fit.goodness.warnings]
+    yield Section("Verdict", [first, *warnings, *others])
     yield Section("Parameters", _parameters(fit, intervals))
     combined = [str(c) for c in fit.identifiability.combinations]
     if combined:

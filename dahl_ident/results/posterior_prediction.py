@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
-from dahl_ident.diagnostics.bands import DerivedQuantity
+from dahl_ident.diagnostics.bands import ENERGY, DerivedQuantity
 from dahl_ident.diagnostics.confidence_levels import checked_levels
 from dahl_ident.elements import Element
 from dahl_ident.problem import Problem
@@ -89,7 +89,7 @@ def derived_at_draws(
     for A in positive_array(amplitudes, "amplitudes").ravel().tolist():
         at = np.full(len(theta), A), np.full(len(theta), omega)
         N = np.sum([e.stiffness(own, *at) for e, own in zip(friction, values, strict=True)], axis=0)
-        yield _quantity("energy lost in a cycle", "J", A, np.pi * A**2 * N.imag)
+        yield _quantity(ENERGY, "J", A, np.pi * A**2 * N.imag)
         yield _quantity("equivalent stiffness", shown_unit("N/m", motion), A, N.real)
         if frequency_hz is not None:
             yield _quantity("equivalent damping", shown_unit("N s/m", motion), A, N.imag / omega)

@@ -45,7 +45,7 @@ class PriorInfluence:
             )
         reach = f", and it reaches the prior's {' and '.join(ends)} end" if ends else ""
         return (
-            f"{self.name} is set by its prior: posterior width {self.width:.2f} of the "
+            f"{self.name} is known from its prior: posterior width {self.width:.2f} of the "
             f"prior's{reach}."
         )
 

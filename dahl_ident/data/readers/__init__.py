@@ -370,7 +370,7 @@ def open_source(
         return replace(dictionary_source(path), options=options or {})
     file = open_file(path)
     if sheet is not None and file.format not in ("excel", "ods"):
-        raise DataError(f"{file.name}: sheet={sheet!r} is given, but the file is no workbook")
+        raise DataError(f"{file.name}: sheet={sheet!r} is given, but the file is not a workbook")
     try:
         source = _parsed(file, sheet)
     except MemoryError as exc:
@@ -437,7 +437,9 @@ def groups_in_name(path: PathLike | pd.DataFrame, expression: str | None) -> dic
     try:
         pattern = re.compile(expression)
     except re.error as exc:
-        raise DataError(f"level_from_name {expression!r} is no regular expression: {exc}") from exc
+        raise DataError(
+            f"level_from_name {expression!r} is not a regular expression: {exc}"
+        ) from exc
     found = pattern.search(name)
     if found is None or not pattern.groups:
         raise DataError(

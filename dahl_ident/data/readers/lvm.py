@@ -143,7 +143,7 @@ def _check_samples(file: File, segment: dict[str, Any], rows: int, single: bool)
     unread = [value for value in stated if not re.fullmatch("[0-9]{1,18}", value)]
     if unread:
         raise DataError(
-            f"{file.name}: the LVM file is damaged: {unread[0][:40]!r} is no number of samples"
+            f"{file.name}: the LVM file is damaged: {unread[0][:40]!r} is not a number of samples"
         )
     most = max(map(int, stated), default=rows)
     timed = "X_Value" in segment["labels"]

@@ -79,7 +79,7 @@ class _Level5:
             if kind == _COMPRESSED:
                 kind, content, _ = self.element(self.inflated(content), 0)
             if kind != _MATRIX:
-                raise _DamagedError(f"element type {kind} at byte {at} is no matrix")
+                raise _DamagedError(f"element type {kind} at byte {at} is not a matrix")
             if at != subsystem:  # what MATLAB keeps of objects for itself
                 yield from self.matrix(content, None, 0)
             at = following

@@ -95,7 +95,7 @@ class _Sdf:
         found, size = struct.unpack_from(">hi", self.data, at) if at >= 0 else (None, 0)
         if found != kind or not 6 <= size <= len(self.data) - at:
             raise _DamagedError(
-                f"at byte {at} is no whole record of type {kind}; is the file cut off?"
+                f"at byte {at} is not a whole record of type {kind}; is the file cut off?"
             )
         return self.data[at : at + size]
 
