@@ -134,7 +134,7 @@ def test_one_free_friction_parameter_can_run_away(
     ],
 )
 def test_limits_hold_for_driven_plants(friction: ComplexArray, status: Status) -> None:
-    f = np.geomspace(0.05, 5.0, n)[RNG.permutation(n)]
+    f = np.geomspace(0.05, 5.0, n)[np.random.default_rng(0).permutation(n)]
     omega = 2.0 * np.pi * f
     Z = friction + 7.0 - 0.3 * omega**2 + 0.24j * omega
     data = FrequencyResponse(
@@ -143,7 +143,7 @@ def test_limits_hold_for_driven_plants(friction: ComplexArray, status: Status) -
     plant = Dahl() + Mass() + Damper() + Spring()
     found = solve(Problem(data, plant, steady="describing function"))  # which made the data
     assert found.status is status
-    np.testing.assert_allclose(found.values[2:4], [0.3, 0.24], rtol=0.07)
+    np.testing.assert_allclose(found.values[2:4], [0.3, 0.24], rtol=0.05)
     assert np.isfinite(list(found.stderr.values())[2:4]).all()
 
 
