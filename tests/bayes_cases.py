@@ -1,8 +1,6 @@
-"""Small problems for the tests of sampling and quadrature."""
+"""Small problems for the tests of sampling and integration."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -62,34 +60,3 @@ def harmonic_table(amplitude_error: float) -> di.FrequencyResponse:
         covariance=(0.02 * np.abs(exact))[:, None, None] ** 2 * np.eye(2),
         amplitude_std=amplitude_error * amplitude if amplitude_error else None,
     )
-
-
-@dataclass
-class GaussianSlices:
-    """Slices of a normal density of any covariance, shape (D, D)."""
-
-    outer: int
-    centre: FloatArray
-    covariance: FloatArray
-
-    followers = 0
-
-    @property
-    def inner(self) -> tuple[int, ...]:
-        """The other axes."""
-        return tuple(i for i in range(len(self.centre)) if i != self.outer)
-
-    def charts(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return conditional means, and the conditional spread."""
-        a, b = self.outer, list(self.inner)
-        C = self.covariance
-        offset = values - self.centre[a]
-        modes = np.repeat(self.centre[None], len(values), axis=0)
-        modes[:, a] = values
-        modes[:, b] += offset[:, None] * C[b, a] / C[a, a]
-        rest = C[np.ix_(b, b)] - np.outer(C[b, a], C[b, a]) / C[a, a]
-        return modes, np.repeat(np.linalg.cholesky(rest)[None], len(values), axis=0)
-
-    def follow(self, theta: FloatArray) -> FloatArray:
-        """Return nothing; nothing follows."""
-        return theta[:, :0]

@@ -1,4 +1,4 @@
-"""The posterior that users hold: against quadrature, and in every form it takes."""
+"""The posterior that users hold: against importance points, and in every form it takes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def scenarios() -> dict[str, tuple[di.FrequencyResponse, Any, dict[str, Any]]]:
 
 
 @pytest.mark.parametrize("name", scenarios())
-def test_sampling_agrees_with_quadrature(name: str) -> None:
+def test_sampling_agrees_with_integration(name: str) -> None:
     data, model, options = scenarios()[name]
     drawn = di.posterior(data, model, seed=3, ess=3000.0, **options, uncertainty="noise")
     grid = di.posterior(data, model, **options, method="grid", uncertainty="noise")

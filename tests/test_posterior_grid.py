@@ -1,4 +1,4 @@
-"""Quadrature against closed forms, scipy's integration, and its own limits."""
+"""Importance points against closed forms, scipy's integration, product rules, and their limits."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from scipy.integrate import trapezoid
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.importance import WeightedPoints, integrate
 from dahl_ident.bayes.noise_scale import ScalePosterior
-from dahl_ident.bayes.priors import joint_prior
-from dahl_ident.bayes.quadrature import Grid, integrate, rule
+from dahl_ident.bayes.priors import JointPrior, ParameterPrior, joint_prior
+from dahl_ident.elements import Parameter
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
 from dahl_ident.problem import Problem
 from dahl_ident.results import GridPosterior
 from tests.bayes_cases import (
     FRICTION,
     X_C,
-    GaussianSlices,
     friction_table,
     spring_table,
     with_covariance,
@@ -33,30 +33,21 @@ TIGHT = with_covariance(friction_table(30, 0.1, 10.0, 0.01), 0.01)  # f_max to 0
 LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
 
 
-def gaussian_grid(mean: FloatArray, covariance: FloatArray, low: float, high: float) -> Grid:
+def box(dims: int, low: float, high: float) -> JointPrior:
+    parameters = [Parameter(f"p{i}", "", "a number") for i in range(dims)]
+    return JointPrior(tuple(ParameterPrior(p, (low, high)) for p in parameters))
+
+
+def gaussian_grid(mean: FloatArray, covariance: FloatArray, prior: JointPrior) -> WeightedPoints:
     density = stats.multivariate_normal(mean, covariance)
-    D = len(mean)
-    box = np.full(D, low), np.full(D, high)
+    low, high = prior.limits
 
     def log_density(theta: FloatArray) -> FloatArray:
         inside = ((theta >= low) & (theta <= high)).all(axis=1)
         return np.where(inside, np.atleast_1d(density.logpdf(theta)), -np.inf)
 
-    std = np.sqrt(np.diagonal(covariance))
-    centre = mean + 0.3 * std
-    slices = [GaussianSlices(axis, centre, 1.3 * covariance) for axis in range(D)]
-    return integrate(log_density, box, slices, centre, 1.3 * std)
-
-
-def test_the_rule_is_exact_for_polynomials() -> None:
-    x = rule().nodes
-    for power in range(9):
-        exact = (1.0 - (-1.0) ** (power + 1)) / (power + 1)
-        assert rule().weights @ x**power == pytest.approx(exact, abs=1e-14)
-    assert np.all(rule().weights > 0.0)
-    # x^8 = (T_8 + 8 T_6 + 28 T_4 + 56 T_2 + 35)/128
-    series = np.array([35.0, 0.0, 56.0, 0.0, 28.0, 0.0, 8.0, 0.0, 1.0]) / 128.0
-    np.testing.assert_allclose(rule().series @ x**8, series, atol=1e-14)
+    centre = mean + 0.3 * np.sqrt(np.diagonal(covariance))
+    return integrate(log_density, prior, centre, 1.3**2 * covariance)
 
 
 @pytest.mark.parametrize("dims", [1, 2, 3])
@@ -65,19 +56,19 @@ def test_a_gaussian_in_a_wide_box(dims: int, correlation: float) -> None:
     std = np.array([0.5, 0.002, 0.05])[:dims]
     matrix = np.full((dims, dims), correlation) + (1.0 - correlation) * np.eye(dims)
     mean = np.array([1.0, -2.0, 0.3])[:dims]
-    grid = gaussian_grid(mean, matrix * np.outer(std, std), -10.0, 10.0)
-    assert grid.error < 1e-4
-    assert abs(grid.log_evidence) < 1e-4
+    grid = gaussian_grid(mean, matrix * np.outer(std, std), box(dims, -10.0, 10.0))
+    assert grid.error < 1e-3
+    assert abs(grid.log_evidence) < 1e-3
     assert grid.weights.sum() == pytest.approx(1.0, abs=1e-12)
     for axis in range(dims):
         found = (grid.quantiles(axis, LEVELS) - mean[axis]) / std[axis]
-        assert stats.norm.cdf(found) == pytest.approx(LEVELS, abs=1e-4)
+        assert stats.norm.cdf(found) == pytest.approx(LEVELS, abs=1e-3)
 
 
 def test_a_wall_cuts_the_density() -> None:
-    grid = gaussian_grid(np.array([0.2, 0.0]), np.diag([1.0, 0.01]), 0.0, 10.0)
+    grid = gaussian_grid(np.array([0.2, 0.0]), np.diag([1.0, 0.01]), box(2, 0.0, 10.0))
     inside = stats.norm.sf(-0.2) * 0.5
-    assert grid.log_evidence == pytest.approx(np.log(inside), abs=1e-4)
+    assert grid.log_evidence == pytest.approx(np.log(inside), abs=1e-3)
 
 
 def test_the_noise_scale_follows_its_closed_form() -> None:
@@ -110,32 +101,10 @@ def test_one_parameter_against_scipy() -> None:
         scipy_integrate.quad(partial(density, moment=k), *ends, epsrel=1e-10, limit=400)[0]
         for k in range(3)
     ]
-    assert grid.log_evidence == pytest.approx(np.log(moments[0]), abs=1e-4)
+    assert grid.log_evidence == pytest.approx(np.log(moments[0]), abs=1e-3)
     mean = moments[1] / moments[0]
-    assert grid.mean()[0] == pytest.approx(mean, rel=1e-4)
+    assert grid.mean()[0] == pytest.approx(mean, rel=1e-3)
     assert grid.std()[0] == pytest.approx(np.sqrt(moments[2] / moments[0] - mean**2), rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("rows", "low", "high", "noise"),
-    [
-        (30, 0.3, 3.0, 0.01),
-        (3, 0.3, 3.0, 0.5),
-        (10, 0.003, 0.03, 0.01),
-        (10, 0.0003, 0.003, 0.05),
-        (10, 30.0, 300.0, 0.01),
-    ],
-)
-def test_the_stated_error_holds(rows: int, low: float, high: float, noise: float) -> None:
-    data = friction_table(rows, low, high, noise)
-    grid = di.posterior(data, di.Dahl(), method="grid", uncertainty="noise")
-    exact = di.posterior(data, di.Dahl(), tolerance=1e-6, method="grid", uncertainty="noise")
-    assert grid.converged
-    assert grid.error < 1e-4
-    assert abs(grid.log_evidence - exact.log_evidence) < grid.error
-    for name in grid.names:
-        below = exact.quantile(name, LEVELS)
-        assert grid.quantile(name, LEVELS) == pytest.approx(below, rel=3e-3)
 
 
 def gauss(low: float, high: float, panels: int) -> tuple[FloatArray, FloatArray]:
@@ -167,7 +136,7 @@ def test_few_points_and_much_noise_stay_inside_the_stated_error(seed: int) -> No
     data = friction_table(int(random.integers(2, 6)), low, 30.0 * low, noise, seed)
     priors = {"f_max": (1e-3, 10.0), "sigma": (0.3, 3e3)}
     grid = di.posterior(data, di.Dahl(), priors=priors, method="grid", uncertainty="noise")
-    assert grid.error < 1e-4
+    assert grid.error < 1e-3
     _, mass = brute_force(grid, priors, 90)
     assert abs(mass.sum() - 1.0) < grid.error
 
@@ -175,12 +144,19 @@ def test_few_points_and_much_noise_stay_inside_the_stated_error(seed: int) -> No
 @pytest.mark.parametrize(
     ("data", "model", "priors", "panels"),
     [
-        (friction_table(3, noise=0.3), di.Dahl(), {"f_max": (1e-3, 1e2), "sigma": (0.1, 1e4)}, 40),
+        (friction_table(30, noise=0.01), di.Dahl(), {"f_max": (0.09, 0.11), "sigma": (25, 35)}, 40),
+        (friction_table(3, noise=0.5), di.Dahl(), {"f_max": (1e-5, 1e3), "sigma": (1e-3, 1e5)}, 60),
+        (
+            friction_table(10, 0.0003, 0.003, 0.05),
+            di.Dahl(),
+            {"f_max": (1e-4, 1e5), "sigma": (20.0, 50.0)},
+            50,
+        ),
         (
             friction_table(10, 0.003, 0.03, 0.02),
             di.Dahl(),
             {"f_max": (1e-3, 1e2), "sigma": (20.0, 50.0)},
-            100,
+            50,
         ),
         (
             spring_table(0.3),
@@ -189,41 +165,38 @@ def test_few_points_and_much_noise_stay_inside_the_stated_error(seed: int) -> No
             6,
         ),
     ],
-    ids=["heavy tails", "microslip", "spring cut by walls"],
+    ids=["peak", "heavy tails", "open to the wall", "microslip", "spring cut by walls"],
 )
 def test_the_stated_error_holds_against_brute_force(
     data: di.FrequencyResponse, model: Any, priors: dict[str, Any], panels: int
 ) -> None:
     grid = di.posterior(data, model, priors=priors, method="grid", uncertainty="noise")
-    assert grid.error < 1e-4
+    assert grid.error < 1e-3
     nodes, mass = brute_force(grid, priors, panels)
     assert abs(mass.sum() - 1.0) < grid.error
+    logarithmic = [name != "stiffness" for name in grid.problem.names]
+    low, high = joint_prior(grid.problem, priors).limits
+    weights, theta = grid.points
     for axis, name in enumerate(grid.problem.names):
-        values = np.exp(nodes[..., axis]) if name != "stiffness" else nodes[..., axis]
-        for moment in (1, 2):
-            exact = np.sum(mass * values**moment) / mass.sum()
-            found = grid.function(lambda _n=name, _m=moment, **by_name: by_name[_n] ** _m)["mean"]
-            assert found == pytest.approx(exact, rel=3e-4)
         # the mass below a wall between panels has no error of its own
-        low, high = (limit[axis] for limit in joint_prior(grid.problem, priors).limits)
-        wall = low + (high - low) * (panels // 2) / panels
-        below = float(np.sum(mass * (nodes[..., axis] < wall)))
-        middle = np.exp(wall) if name != "stiffness" else wall
-        if 1e-3 < below < 1.0 - 1e-3:
-            assert float(grid.quantile(name, below)) == pytest.approx(middle, rel=2e-3)
+        for panel in range(1, panels):
+            wall = low[axis] + (high[axis] - low[axis]) * panel / panels
+            below = float(np.sum(mass * (nodes[..., axis] < wall)) / mass.sum())
+            assert weights @ (theta[:, axis] < wall) == pytest.approx(below, abs=1e-3)
+            if 0.02 < below < 0.98:
+                value = float(grid.quantile(name, below))
+                place = np.log(value) if logarithmic[axis] else value
+                share = weights @ (theta[:, axis] < place)
+                assert share == pytest.approx(below, abs=1e-4)
 
 
-def test_disagreement_between_the_parameters_is_error() -> None:
-    # along the diagonal lies a second mode that the slices of one axis lead past
+def test_a_second_mode_is_found_from_the_prior() -> None:
     def log_density(theta: FloatArray) -> FloatArray:
-        first, second = (-0.5 * np.sum((theta - m) ** 2, axis=1) for m in ([0, 0], [6.0, 0.0]))
+        first, second = (-0.5 * np.sum((theta - m) ** 2, axis=1) for m in ([0, 0], [12.0, 9.0]))
         return np.asarray(np.logaddexp(first, second))
 
-    box = np.full(2, -20.0), np.full(2, 20.0)
-    slices = [GaussianSlices(axis, np.zeros(2), 0.01 * np.eye(2)) for axis in (0, 1)]
-    grid = integrate(log_density, box, slices, np.zeros(2), np.ones(2))
-    missing = abs(np.expm1(grid.log_evidence - np.log(4.0 * np.pi)))
-    assert grid.error >= missing
+    grid = integrate(log_density, box(2, -20.0, 20.0), np.zeros(2), np.eye(2))
+    assert grid.log_evidence == pytest.approx(np.log(4.0 * np.pi), abs=1e-3)
 
 
 def test_a_bolted_ridge_keeps_its_time() -> None:
@@ -236,14 +209,33 @@ def test_a_bolted_ridge_keeps_its_time() -> None:
     assert (rule_.name, rule_.at_upper_end) == ("f_max", True)
 
 
-def test_what_contradicts_itself_is_told_before_it_is_refined() -> None:
-    # sigma alone shows; beside a free spring friction may as well be none, at either end
+def test_friction_that_may_be_none_at_either_end() -> None:
+    # sigma alone shows; beside a free spring friction may as well be none
     data = di.load_dataset("microslip")
     assert isinstance(data, di.FrequencyResponse)
     grid = di.posterior(data, di.Dahl() + di.Spring(), method="grid", uncertainty="noise")
+    assert grid.converged
+    # the product of Gauss's rule, 240 nodes in ln f_max and in ln sigma, with the trapezoidal rule
+    # along the spring around its conditional mode
+    assert abs(grid.log_evidence + 23.52020) < grid.error
+
+
+def test_an_accuracy_that_is_not_reached_is_said() -> None:
+    grid = di.posterior(
+        friction_table(), di.Dahl(), method="grid", uncertainty="noise", tolerance=1e-6
+    )
+    assert not grid.converged
     assert grid.message.startswith("NOT CONVERGED: error")
-    assert grid.error > 0.1
-    assert grid.evaluations < 200_000  # 675,000 with every lattice refined
+    assert grid.evaluations < 300_000
+
+
+def test_the_same_answer_at_every_call() -> None:
+    first, second = (
+        di.posterior(TIGHT, di.Dahl(), method="grid", uncertainty="noise", tolerance=1e-2)
+        for _ in range(2)
+    )
+    assert first.log_evidence == second.log_evidence
+    np.testing.assert_array_equal(first.points[1], second.points[1])
 
 
 def test_evidence_of_a_free_exponent_is_lower_where_the_exponent_is_one() -> None:
@@ -263,9 +255,9 @@ def test_evidence_of_a_free_exponent_is_lower_where_the_exponent_is_one() -> Non
 
 def test_scale_free_and_scale_known_agree_for_many_rows() -> None:
     table = friction_table(rows=200, noise=0.02)
-    free = di.posterior(table, di.Dahl(), method="grid", uncertainty="noise")
-    known = di.posterior(
-        with_covariance(table, 0.02), di.Dahl(), method="grid", uncertainty="noise"
+    free, known = (
+        di.posterior(data, di.Dahl(), method="grid", uncertainty="noise", tolerance=5e-3)
+        for data in (table, with_covariance(table, 0.02))
     )
     assert known.names == ("f_max", "sigma")
     # the scale is known to 5 % from 400 residuals
@@ -285,7 +277,13 @@ def test_a_microslip_posterior_names_the_prior() -> None:
 
 
 @pytest.mark.parametrize(
-    "prior", [stats.norm(1.0, 0.1), stats.norm(0.105, 0.0005), stats.lognorm(0.1, scale=1.0)]
+    "prior",
+    [
+        stats.norm(1.0, 0.1),
+        stats.norm(1.0, 0.01),
+        stats.norm(0.105, 0.0005),
+        stats.lognorm(0.1, scale=1.0),
+    ],
 )
 def test_data_outweigh_the_tail_of_a_prior(prior: Any) -> None:
     grid = di.posterior(
@@ -316,19 +314,13 @@ def test_a_prior_that_keeps_the_data_out_is_told_with_its_misfit() -> None:
     assert free.findings[0].startswith("Noise alone is counted; with every source")
 
 
-def test_a_lattice_laid_amiss_is_no_silent_answer() -> None:
-    priors = {"f_max": stats.norm(1.0, 0.01)}  # ninety deviations from what the data say
-    grid = di.posterior(TIGHT, di.Dahl(), priors=priors, method="grid", uncertainty="noise")
-    assert grid.converged or str(grid).startswith("NOT CONVERGED: error")
-
-
 def test_marginals_are_densities_with_the_right_quantiles() -> None:
     grid = di.posterior(friction_table(), di.Dahl(), method="grid", uncertainty="noise")
     for name in grid.names:
         ends = grid.quantile(name, np.array([1e-5, 0.3, 1.0 - 1e-5]))
         x = np.linspace(ends[0], ends[2], 4001)
         density = grid.marginal(name, x)
-        assert trapezoid(density, x) == pytest.approx(1.0, abs=1e-4)
+        assert trapezoid(density, x) == pytest.approx(1.0, abs=1e-3)
         below = x <= ends[1]
         assert trapezoid(density[below], x[below]) == pytest.approx(0.3, abs=2e-3)
     low, high = np.exp(joint_prior(grid.problem).limits)

@@ -204,7 +204,10 @@ class JointPrior:
 
     def draw(self, random: np.random.Generator, size: int) -> FloatArray:
         """Return independent draws of theta, shape (size, P)."""
-        q = random.uniform(size=(size, len(self.priors)))
+        return self.quantiles(random.uniform(size=(size, len(self.priors))))
+
+    def quantiles(self, q: FloatArray) -> FloatArray:
+        """Return the quantile of each theta at probabilities of shape (S, P)."""
         return np.stack([p.quantile(q[:, i]) for i, p in enumerate(self.priors)], axis=-1)
 
     def __str__(self) -> str:

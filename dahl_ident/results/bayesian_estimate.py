@@ -1,4 +1,4 @@
-"""Bayesian estimation: the posterior by Markov chain, or by quadrature for few parameters."""
+"""Bayesian estimation: the posterior by Markov chain, or by integration for few parameters."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ import numpy as np
 from dahl_ident.arrays import FloatArray, positive_number, whole_number
 from dahl_ident.bayes.chain import Chain, LogDensity, Pool, Settings, run
 from dahl_ident.bayes.checkpoint import Stored, identity, open_chain
-from dahl_ident.bayes.conditional_modes import ConditionalModes
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.importance import integrate
 from dahl_ident.bayes.priors import PriorLike, joint_prior
-from dahl_ident.bayes.quadrature import integrate
 from dahl_ident.bayes.record_density import RecordDensity, record_prior
 from dahl_ident.bayes.walker_start import (
     centre_and_covariance,
@@ -111,7 +110,7 @@ def posterior(
     uncertainty: str = "combined",
     seed: int | None = None,
     progress: bool = False,
-    tolerance: float = 1e-4,
+    tolerance: float = 1e-3,
 ) -> GridPosterior: ...
 
 
@@ -137,9 +136,9 @@ def posterior(
     resume: str | os.PathLike[str] | None = None,
     pool: Pool | None = None,
     progress: bool = False,
-    tolerance: float = 1e-4,
+    tolerance: float = 1e-3,
 ) -> ChainPosterior | GridPosterior | RecordPosterior:
-    """Return the posterior of a model's parameters, by Markov chain or by quadrature.
+    """Return the posterior of a model's parameters, by Markov chain or by integration.
 
     Parameters
     ----------
@@ -149,9 +148,9 @@ def posterior(
     model : Element, optional
         One element or a sum, such as ``Dahl() + Mass(0.3)``; left out with a fit.
     method : {"mcmc", "grid"}, default "mcmc"
-        "mcmc" samples with emcee. "grid" integrates over up to three free parameters: no chain,
-        no Monte Carlo error, and the evidence. An unknown noise scale is integrated analytically
-        there and does not count among the three.
+        "mcmc" samples with emcee. "grid" integrates over up to three free parameters with
+        importance points: no chain, the same answer at every call, and the evidence. An unknown
+        noise scale is integrated analytically there and does not count among the three.
     priors : mapping of str to distribution or (low, high), optional
         By parameter: a frozen distribution of scipy.stats over the value, or bounds, between
         which positive parameters are log-uniform and the others uniform. Parameters left out
@@ -190,8 +189,8 @@ def posterior(
         once, which is faster unless a single likelihood takes milliseconds.
     progress : bool, default False
         Show a bar on the terminal, with the time that is left.
-    tolerance : float, default 1e-4
-        With "grid": error of the total probability to be reached.
+    tolerance : float, default 1e-3
+        With "grid": relative error of the evidence and error of probabilities to be reached.
 
     Returns
     -------
@@ -234,7 +233,7 @@ def posterior(
             "method": method != "mcmc", "noise": noise is not None, "sensors": sensors is not None,
             "likelihood": likelihood != "gaussian", "pool": pool is not None,
             "uncertainty": uncertainty != "combined",
-            "tolerance": tolerance != 1e-4,
+            "tolerance": tolerance != 1e-3,
         }  # fmt: skip
         given = [name for name, is_given in refused.items() if is_given]
         if given:
@@ -258,7 +257,7 @@ def posterior(
         "walkers": walkers is not None, "ensembles": ensembles != 4, "resume": resume is not None,
         "pool": pool is not None,
     }  # fmt: skip
-    _refuse_other_methods(method, for_chain, {"tolerance": tolerance != 1e-4})
+    _refuse_other_methods(method, for_chain, {"tolerance": tolerance != 1e-3})
     if pool is not None and not callable(getattr(pool, "map", None)):
         raise ValidationError(f"pool is {pool!r}; expected an object with map, such as a Pool")
     if uncertainty not in UNCERTAINTIES:
@@ -346,13 +345,12 @@ def _grid(case: _Case, tolerance: float) -> GridPosterior:
         )
     tolerance = positive_number(tolerance, "tolerance")
     centre, covariance = centre_and_covariance(density, case.optimum, np.random.default_rng(0))
-    slicers = [ConditionalModes(density, axis, centre) for axis in range(len(centre))]
     grid = integrate(
         density.marginal,
-        density.prior.limits,
-        slicers,
+        density.prior,
         centre,
-        np.sqrt(np.diagonal(covariance)),
+        covariance,
+        density.decorrelation,
         tolerance=tolerance,
     )
     return GridPosterior(density, grid, tolerance, case.fit, case.uncertainty)

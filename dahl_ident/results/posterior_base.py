@@ -1,4 +1,4 @@
-"""The common base of posteriors by chain and by quadrature."""
+"""The common base of posteriors by chain and by importance points."""
 
 from __future__ import annotations
 

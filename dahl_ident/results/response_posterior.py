@@ -1,4 +1,4 @@
-"""What posteriors of settled sines by chain and by quadrature have in common."""
+"""What posteriors of settled sines by chain and by importance points have in common."""
 
 from __future__ import annotations
 

@@ -1,0 +1,289 @@
+r"""Posteriors of up to three parameters by importance points: no chain, and the evidence.
+
+Points are drawn from a mixture q of heavy-tailed distributions that resembles the density p, and
+weighted by p/q; the mean of the weights is the evidence (Owen, Monte Carlo theory, methods and
+examples, 2013, chapters 9 and 17). The mixture is fitted in rounds. All points so far, weighted by
+the mean of the mixtures that they were drawn from (Cornuet et al., Scandinavian Journal of
+Statistics 39, 2012), are split again and again where they spread most, and each part becomes one
+component, so that curved ridges are followed. One component is the prior: it finds modes apart from
+the centre, and bounds the weights where the data leave a parameter open.
+
+The result rests on independent randomizations of one Sobol sequence, with the mixture held. Their
+scatter is the error: of the evidence, and of the probabilities below the limits of intervals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+from scipy.special import gammaln, logsumexp, ndtr, stdtrit
+from scipy.stats import qmc
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.bayes.decorrelation import Decorrelation
+from dahl_ident.bayes.priors import JointPrior
+
+LogDensity = Callable[[FloatArray], FloatArray]
+Rows = NDArray[np.intp]
+
+_DOF = 4.0  # of Student's t: tails heavier than those of a posterior, yet few wasted points
+_WIDER = 1.5  # times the covariance of a part, so that parts overlap
+_PARTS, _LEAST = 16, 40  # parts at most, and effective points in each at least
+_ROUND, _ROUNDS = 1024, 12  # points in a round, and rounds at most
+_ALIKE = 0.5  # effective points for each point of the last round, at which the mixture is good
+_REPEATS = 6  # independent randomizations: the fewer, the more each gains from Sobol's evenness
+_FIRST = 128  # points of each component, before their number is doubled
+_COVERAGE = 2.6  # standard errors that are stated: 95 % of Student's t with 5 dof
+_LIMITS = ndtr(np.linspace(-2.0, 2.0, 9))  # probabilities whose error is estimated
+_BLOCK = 256  # points in one call of the density: its arrays then stay in the processor's cache
+_KNOTS = ndtr(np.linspace(-4.5, 4.5, 46))  # of the distribution function behind a density
+
+
+@dataclass(frozen=True)
+class WeightedPoints:
+    """A posterior as points theta, (N, D), and their probabilities, (N,), which sum to 1.
+
+    `log_evidence` has the relative error `error`, and so has every probability; `evaluations`
+    counts the points at which the density was computed.
+    """
+
+    theta: FloatArray
+    weights: FloatArray
+    log_evidence: float
+    error: float
+    evaluations: int
+
+    def quantiles(self, axis: int, probabilities: FloatArray) -> FloatArray:
+        """Return quantiles of one theta."""
+        theta, below = self._distribution[axis]
+        return np.interp(probabilities, below, theta)
+
+    def density(self, axis: int, theta: FloatArray) -> FloatArray:
+        """Return the density of one theta at given values, smoothed as far as the points allow."""
+        ends = self._distribution[axis][0][[0, -1]]
+        knots = np.array([ends[0], *self.quantiles(axis, _KNOTS), ends[1]])
+        solid = np.append(True, np.diff(knots) > 0.0)
+        below = np.array([0.0, *_KNOTS, 1.0])[solid]
+        slope = PchipInterpolator(knots[solid], below, extrapolate=False).derivative()
+        return np.nan_to_num(slope(theta))
+
+    @cached_property
+    def _distribution(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Of every axis: theta in order, and the probability below."""
+        orders = np.argsort(self.theta, axis=0).T
+        return [
+            (x[order], np.cumsum(self.weights[order]) - 0.5 * self.weights[order])
+            for x, order in zip(self.theta.T, orders, strict=True)
+        ]
+
+
+def integrate(
+    log_density: LogDensity,
+    prior: JointPrior,
+    centre: FloatArray,
+    covariance: FloatArray,
+    decorrelation: Decorrelation | None = None,
+    *,
+    tolerance: float = 1e-3,
+    most: int = 2**18,
+) -> WeightedPoints:
+    """Return a density as weighted points, with its integral.
+
+    Parameters
+    ----------
+    log_density : callable
+        theta (S, D) -> (S,); -inf outside the prior.
+    prior : JointPrior
+        Of theta.
+    centre, covariance : ndarray, shapes (D,) and (D, D)
+        Where the density is large, and about its covariance.
+    decorrelation : Decorrelation, optional
+        Coordinates in which ridges are straight.
+    tolerance : float
+        Relative error to be reached.
+    most : int
+        Number of points at which refinement ends in any case.
+    """
+    target = _Target(log_density, prior, decorrelation)
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        mixture = _fitted(target, centre, covariance)
+        return _repeated(target, mixture, tolerance, most)
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Points phi, (S, D), with theta, the log-density, and that of the prior."""
+
+    phi: FloatArray
+    theta: FloatArray
+    log_density: FloatArray
+    log_prior: FloatArray
+
+    def __add__(self, other: _Batch) -> _Batch:
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return _Batch(*(np.concatenate(pair) for pair in pairs))
+
+
+@dataclass
+class _Target:
+    """The density over phi, in which volumes are those of theta."""
+
+    log_density: LogDensity
+    prior: JointPrior
+    decorrelation: Decorrelation | None
+    evaluations: int = 0
+
+    def decorrelated(self, theta: FloatArray) -> FloatArray:
+        return theta if self.decorrelation is None else self.decorrelation.decorrelated(theta)
+
+    def at(self, phi: FloatArray) -> _Batch:
+        self.evaluations += len(phi)
+        theta = phi if self.decorrelation is None else self.decorrelation.original(phi)
+        blocks = range(0, len(theta), _BLOCK)
+        log_density = np.concatenate([self.log_density(theta[i : i + _BLOCK]) for i in blocks])
+        return _Batch(
+            phi,
+            theta,
+            np.where(np.isnan(log_density), -np.inf, log_density),
+            self.prior.log_density(theta),
+        )
+
+
+@dataclass(frozen=True)
+class _Mixture:
+    """Components of equal shares: with means (K, D) and roots (K, D, D), and the prior.
+
+    A component's coordinates along the columns of its root are independent Student's t.
+    """
+
+    means: FloatArray
+    roots: FloatArray
+
+    def sequences(self, seed: int) -> list[qmc.Sobol]:
+        """Return a randomized sequence for each component."""
+        count, D = self.means.shape
+        return [qmc.Sobol(D, seed=np.random.default_rng([seed, k])) for k in range(count + 1)]
+
+    def draw(self, target: _Target, sequences: list[qmc.Sobol], size: int) -> _Batch:
+        """Return `size` more points of each component."""
+        *uniform, of_prior = (sequence.random(size) for sequence in sequences)
+        t = stdtrit(_DOF, np.array(uniform))
+        phi = self.means[:, None] + t @ self.roots.swapaxes(1, 2)
+        prior = target.decorrelated(target.prior.quantiles(of_prior))
+        return target.at(np.concatenate([*phi, prior]))
+
+    def log_density(self, batch: _Batch) -> FloatArray:
+        """Return that of the mixture, (S,)."""
+        count, D = self.means.shape
+        half = 0.5 * (_DOF + 1.0)
+        constant = D * (gammaln(half) - gammaln(0.5 * _DOF) - 0.5 * np.log(_DOF * np.pi))
+        total = batch.log_prior
+        for mean, root in zip(self.means, self.roots, strict=True):
+            t = np.linalg.solve(root, (batch.phi - mean).T)
+            log_t = constant - half * np.log1p(t**2 / _DOF).sum(axis=0)
+            total = np.logaddexp(total, log_t - np.linalg.slogdet(root)[1])
+        return np.asarray(total - np.log(count + 1))
+
+
+def _fitted(target: _Target, centre: FloatArray, covariance: FloatArray) -> _Mixture:
+    """Return a mixture that resembles the density."""
+    std = np.sqrt(np.diagonal(covariance))
+    root = std[:, None] * np.linalg.cholesky(covariance / np.outer(std, std))
+    step = 1e-3 * root.T  # small, so that a straight line in theta is one in phi
+    ahead, behind = (target.decorrelated(centre + s) for s in (step, -step))
+    phi = target.decorrelated(centre[None])
+    mixtures = [_Mixture(phi, (ahead - behind).T[None] / 2e-3)]
+    seen: _Batch | None = None
+    for number in range(_ROUNDS):
+        mixture = mixtures[-1]
+        size = _ROUND // len(mixture.means)
+        new = mixture.draw(target, mixture.sequences(number), size)
+        seen = new if seen is None else seen + new
+        drawn = logsumexp([m.log_density(seen) for m in mixtures], axis=0)
+        mixtures.append(_split(seen.phi, _normalised(seen.log_density - drawn)))
+        weights = _normalised(new.log_density - mixture.log_density(new))
+        if number > 1 and _effective(weights) > _ALIKE * len(weights):
+            break
+    return mixtures[-1]
+
+
+def _split(phi: FloatArray, weights: FloatArray) -> _Mixture:
+    """Return components of weighted points, halved along their longest axes."""
+    root = _root(phi, weights)
+    x = np.linalg.solve(root, phi.T).T.astype(np.float64)  # so that axes can be compared
+    parts = [np.flatnonzero(weights)]
+    while 2 * len(parts) * _LEAST <= _effective(weights) and len(parts) < _PARTS:
+        parts = [half for part in parts for half in _halves(part, x, weights)]
+    means = np.array([np.average(x[part], axis=0, weights=weights[part]) for part in parts])
+    roots = [np.sqrt(_WIDER) * _root(x[part], weights[part]) for part in parts]
+    return _Mixture(means @ root.T, root @ np.array(roots))
+
+
+def _halves(part: Rows, x: FloatArray, weights: FloatArray) -> tuple[Rows, Rows]:
+    """Return the points on both sides of the median along the longest axis."""
+    own = weights[part]
+    covariance = np.atleast_2d(np.cov(x[part], rowvar=False, aweights=own, ddof=0))
+    order = part[np.argsort(x[part] @ np.linalg.eigh(covariance)[1][:, -1])]
+    below = np.cumsum(weights[order])
+    middle = int(np.clip(np.searchsorted(below, 0.5 * below[-1]), 1, len(part) - 1))
+    return order[:middle], order[middle:]
+
+
+def _root(x: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return a root of the covariance of weighted points."""
+    covariance = np.atleast_2d(np.cov(x, rowvar=False, aweights=weights, ddof=0))
+    std = np.sqrt(np.diagonal(covariance)) + 1e-9
+    correlation = covariance / np.outer(std, std)
+    return np.asarray(std[:, None] * np.linalg.cholesky(correlation + 1e-9 * np.eye(len(std))))
+
+
+def _repeated(target: _Target, mixture: _Mixture, tolerance: float, most: int) -> WeightedPoints:
+    """Return points from one mixture, doubled in number until their error is small enough."""
+    D = mixture.means.shape[1]
+    sequences = [mixture.sequences(_ROUNDS + number) for number in range(_REPEATS)]
+    theta, log_weights = np.empty((_REPEATS, 0, D)), np.empty((_REPEATS, 0))
+    size = _FIRST
+    while True:
+        new = [mixture.draw(target, sequence, size) for sequence in sequences]
+        theta = np.concatenate([theta, [b.theta for b in new]], axis=1)
+        latest = [b.log_density - mixture.log_density(b) for b in new]
+        log_weights = np.concatenate([log_weights, latest], axis=1)
+        weights = _normalised(log_weights)
+        points = WeightedPoints(
+            theta.reshape(-1, D),
+            weights.ravel(),
+            float(logsumexp(log_weights) - np.log(log_weights.size)),
+            _error(theta, weights),
+            target.evaluations,
+        )
+        if points.error <= tolerance or target.evaluations + log_weights.size > most:
+            return points
+        size = theta.shape[1] // len(sequences[0])
+
+
+def _error(theta: FloatArray, weights: FloatArray) -> float:
+    """Return the error of evidence and probabilities from repeats, (R, N, D) and (R, N)."""
+    R = len(theta)
+    evidence = R * weights.sum(axis=1)
+    errors = [evidence.var(ddof=1)]
+    pooled = WeightedPoints(theta.reshape(-1, theta.shape[-1]), weights.ravel(), 0.0, 0.0, 0)
+    for axis in range(theta.shape[-1]):
+        limits = pooled.quantiles(axis, _LIMITS)
+        below = theta[..., axis] < limits[:, None, None]
+        shares = R * np.sum(below * weights, axis=-1) - _LIMITS[:, None] * evidence
+        errors.append(shares.var(axis=1, ddof=1).mean())
+    return _COVERAGE * float(np.sqrt(np.max(errors) / R))
+
+
+def _normalised(log_weights: FloatArray) -> FloatArray:
+    return np.asarray(np.exp(log_weights - logsumexp(log_weights)))
+
+
+def _effective(weights: FloatArray) -> float:
+    """Return the number of equal weights that are worth as much."""
+    return float(weights.sum() ** 2 / (weights @ weights))
