@@ -350,6 +350,20 @@ def test_help_loads_nothing_heavy() -> None:
     assert not loaded & {"numpy", "scipy", "matplotlib", "pandas", "casadi", "emcee", "pint"}
 
 
+def test_a_fit_of_a_small_table_loads_nothing_that_takes_long(tmp_path: Path) -> None:
+    table = tmp_path / "noisy.csv"
+    di.load_dataset("noisy").save(table)
+    code = (
+        "import sys\nfrom dahl_ident.cli import main\n"
+        f"try:\n    main(['fit', {str(table)!r}, '-q'])\nexcept SystemExit:\n    pass\n"
+        "print('loaded', *sys.modules)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    loaded = set(out.stdout.split())
+    heavy = {"matplotlib", "pandas", "casadi", "emcee", "pint", "scipy.stats", "control", "h5py"}
+    assert loaded & heavy == set()
+
+
 def test_a_saved_fit_is_reported_with_its_posterior(run: Runner) -> None:
     table = run("datasets", "noisy", "-o", "-").out
     assert run("fit", "-", "--save", "fit.json", stdin=table).status == 0

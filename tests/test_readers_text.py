@@ -495,3 +495,26 @@ class TestReadsAgain:
         back = read_frequency_response(data.save(tmp_path / "t.csv"))
         assert back.quality["note"].tolist() == ["007", "1e5"]
         assert back.levels == ["", "nan"]
+
+
+def test_small_and_large_tables_are_read_alike(tmp_path: Path) -> None:
+    """Small ones are parsed without pandas, to the last digit and with the same kinds."""
+    rng = np.random.default_rng(1)
+    rows = [
+        f"{f},{A!r},{g!r},{p:.3e},{c}\n"
+        for f, A, g, p, c in zip(
+            rng.integers(1, 9, 20), np.exp(rng.normal(-7, 3, 20)).tolist(),
+            rng.lognormal(3, 1, 20).tolist(), rng.uniform(5, 80, 20),
+            ["force", "displacement"] * 10, strict=True,
+        )
+    ]  # fmt: skip
+    head = "frequency_hz,amplitude [m],gain [N/m],phase_deg,controlled\n"
+    small, large = tmp_path / "small.csv", tmp_path / "large.csv"
+    small.write_text(head + "".join(rows))
+    large.write_text(head + "".join(rows * 60))
+    assert small.stat().st_size < 1 << 16 < large.stat().st_size
+    a, b = read_frequency_response(small), read_frequency_response(large)
+    np.testing.assert_array_equal(a.response, b.response[:20])
+    np.testing.assert_array_equal(a.amplitude, b.amplitude[:20])
+    np.testing.assert_array_equal(a.frequency_hz, b.frequency_hz[:20])
+    np.testing.assert_array_equal(a.controlled, b.controlled[:20])

@@ -17,16 +17,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 from scipy.special import gammaln, logsumexp, ndtr, stdtrit
-from scipy.stats import qmc
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.decorrelation import Decorrelation
 from dahl_ident.bayes.priors import JointPrior
+
+if TYPE_CHECKING:
+    from scipy.stats import qmc
 
 LogDensity = Callable[[FloatArray], FloatArray]
 Rows = NDArray[np.intp]
@@ -65,6 +67,8 @@ class WeightedPoints:
 
     def density(self, axis: int, theta: FloatArray) -> FloatArray:
         """Return the density of one theta at given values, smoothed as far as the points allow."""
+        from scipy.interpolate import PchipInterpolator
+
         ends = self._distribution[axis][0][[0, -1]]
         knots = np.array([ends[0], *self.quantiles(axis, _KNOTS), ends[1]])
         solid = np.append(True, np.diff(knots) > 0.0)
@@ -166,6 +170,8 @@ class _Mixture:
 
     def sequences(self, seed: int) -> list[qmc.Sobol]:
         """Return a randomized sequence for each component."""
+        from scipy.stats import qmc
+
         count, D = self.means.shape
         return [qmc.Sobol(D, seed=np.random.default_rng([seed, k])) for k in range(count + 1)]
 

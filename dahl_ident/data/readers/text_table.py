@@ -58,6 +58,10 @@ _TRACE = re.compile(
 )
 _FOOTER = re.compile(r"\s*[\"']?[^\W\d_]{2}|\s*(?:\*\*|==|--)", re.UNICODE)
 _SUMMARIES = ("min", "max", "mean", "average", "avg", "std", "rms", "sum", "total", "median")
+_SMALL = 1 << 16  # bytes
+_INTEGER = re.compile(r"-?\d{1,18}")
+_FLOAT = re.compile(r"-?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|-?inf")
+_WORD = re.compile(r"(?!(?i:true|false|nan|na|null|none|inf|infinity)$)[A-Za-z][A-Za-z_]*")
 _MISSING = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "n/a", "#N/A", "null", "1.#QNAN"]
 _DIALECTS = (
     ("\t", "."), (";", "."), (",", "."), ("|", "."),
@@ -458,19 +462,46 @@ def _counts(line: bytes) -> bool:
     return bool(line.strip()) and not _COMMENT_LINE.match(line)
 
 
+def _small(body: bytes, layout: _Layout, texts: set[str]) -> list[NDArray[Any]] | None:
+    """Return the columns of a small table of plain numbers and words, None for any other.
+
+    The import of pandas takes longer than all else that such a table needs.
+    """
+    if len(body) > _SMALL or layout.mark != "." or b'"' in body or not body.isascii():
+        return None
+    rows = [line.decode().split(layout.delimiter) for line in _LINE_END.split(body) if line.strip()]
+    if any(len(row) != layout.width for row in rows):
+        return None
+    columns: list[NDArray[Any]] = []
+    for i, column in enumerate(zip(*rows, strict=True)):
+        cells = [cell.strip() for cell in column]
+        if str(i) not in texts and all(map(_INTEGER.fullmatch, cells)):
+            columns.append(np.array([int(cell) for cell in cells]))
+        elif str(i) not in texts and all(map(_FLOAT.fullmatch, cells)):
+            columns.append(np.array([float(cell) for cell in cells]))
+        elif cells == list(column) and all(map(_WORD.fullmatch, cells)):
+            columns.append(words(cells))
+        else:
+            return None
+    return columns
+
+
 def _parse(
     body: bytes, layout: _Layout, metadata: Mapping[str, Any], name: str
 ) -> list[NDArray[Any]]:
-    import pandas as pd
-
-    # pandas 3.1 reads to the last digit by default, earlier ones have to be asked
-    exact = tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1)
-    precision: dict[str, Any] = {} if exact else {"float_precision": "round_trip"}
     keys = [str(i) for i in range(layout.width)]
     known = metadata.get("text", [])
     if layout.mark[1:]:  # read strictly when they are used: 12,34 is not 1234
         known = list(layout.header.names)
     texts = {key for key, n in zip(keys, layout.header.names, strict=False) if n in known}
+    small = _small(body, layout, texts)
+    if small is not None:
+        return small
+    import pandas as pd
+
+    # pandas 3.1 reads to the last digit by default, earlier ones have to be asked
+    exact = tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1)
+    precision: dict[str, Any] = {} if exact else {"float_precision": "round_trip"}
 
     def read(in_parts: bool) -> pd.DataFrame:
         frame: pd.DataFrame = pd.read_csv(
