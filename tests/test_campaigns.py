@@ -785,10 +785,10 @@ def test_population_matches_a_direct_likelihood() -> None:
     A, b = X.T @ W @ X, X.T @ W @ y
     rest = y @ W @ y - b @ np.linalg.solve(A, b)
     direct = -0.5 * (np.linalg.slogdet(V)[1] + np.linalg.slogdet(A)[1] + rest)
-    found = _Sums(y, u2, X, device, 4).weighted(tau, omega)
-    np.testing.assert_allclose(found[0], A, rtol=1e-12)
-    np.testing.assert_allclose(found[1], b, rtol=1e-12)
-    assert found[2] == pytest.approx(direct, rel=1e-12)
+    found = _Sums(y, u2, X, device, 4).at(tau, omega)
+    np.testing.assert_allclose(found.C @ A, np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(A @ found.b, b, rtol=1e-12)
+    assert found.log_likelihood == pytest.approx(direct, rel=1e-12)
 
 
 def test_wrong_tables_are_named() -> None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,18 +59,52 @@ class _Sums:
         number = self.device[keep] - (self.device[keep] > device)
         return _Sums(self.y[keep], self.u2[keep], self.X[keep], number, self.devices - 1)
 
-    def weighted(self, tau: float, omega: float) -> tuple[FloatArray, FloatArray, float]:
-        """Return X' V^-1 X, X' V^-1 y and the restricted log-likelihood of (tau, omega)."""
+    def likelihood(self, tau: float, omega: float) -> float:
+        """Return the restricted log-likelihood of (tau, omega)."""
+        return self.at(tau, omega).log_likelihood
+
+    def at(self, tau: float, omega: float) -> _Solution:
+        """Return the generalised least squares solution at given scatters."""
         w = 1.0 / (omega**2 + self.u2)
-        total = np.bincount(self.device, w, self.devices)
+        total = self.of_devices(w)
         shrink = tau**2 / (1.0 + tau**2 * total)
         columns = np.column_stack([self.X, self.y])
-        sums = np.stack([np.bincount(self.device, w * c, self.devices) for c in columns.T], axis=-1)
+        sums = np.stack([self.of_devices(w * c) for c in columns.T], axis=-1)
         G = columns.T @ (w[:, None] * columns) - sums.T @ (shrink[:, None] * sums)
-        A, b, yy = G[:-1, :-1], G[:-1, -1], G[-1, -1]
+        C = np.linalg.inv(G[:-1, :-1])
+        b = C @ G[:-1, -1]
         log_det = -np.log(w).sum() + np.log1p(tau**2 * total).sum()
-        rest = yy - b @ np.linalg.solve(A, b)
-        return A, b, float(-0.5 * (log_det + np.linalg.slogdet(A)[1] + rest))
+        squares = G[-1, -1] - G[:-1, -1] @ b
+        log_likelihood = -0.5 * (log_det - np.linalg.slogdet(C)[1] + squares)
+        away = self.of_devices(w * (self.y - self.X @ b)) / total
+        return _Solution(tau, b, C, float(log_likelihood), away, 1.0 / total)
+
+    def of_devices(self, values: FloatArray) -> FloatArray:
+        """Return the sum of values of each device's fits."""
+        return np.bincount(self.device, values, self.devices)
+
+
+class _Solution(NamedTuple):
+    """Coefficients b with their covariance C, and the mean residual of each device."""
+
+    tau: float
+    b: FloatArray
+    C: FloatArray
+    log_likelihood: float
+    away: FloatArray
+    variance: FloatArray
+    """Of the mean residuals, scatter between devices not included."""
+
+    def shrunken(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return estimates of the devices, of mean covariates x, and their variances."""
+        pull = self.tau**2 / (self.tau**2 + self.variance)
+        rest = (1.0 - pull)[:, None] * x
+        variance = pull * self.variance + np.einsum("ij,jk,ik->i", rest, self.C, rest)
+        return x @ self.b + pull * self.away, variance
+
+    def distances(self) -> FloatArray:
+        """Return each device's distance from the population in its standard deviations."""
+        return np.asarray(self.away / np.sqrt(self.tau**2 + self.variance))
 
 
 @dataclass(frozen=True)
@@ -295,12 +329,13 @@ def _one(table: pd.DataFrame, name: str, covariates: list[str]) -> PopulationPar
         )
     data = _Sums(y, u**2, X, device, len(labels))
     repeated = len(y) > len(labels)
-    grid = _grid(data, repeated)
-    b, cov = grid.coefficients
+    nodes, weights = _grid(data, repeated)
+    b, cov, shrunken, variance = _averaged(data, nodes, weights)
     coefficients = {
         key: (float(b[i]), float(np.sqrt(cov[i, i]))) for i, key in enumerate(["mean", *covariates])
     }
-    devices = pd.DataFrame({"own": grid.own, **grid.devices}, index=labels)
+    own = data.of_devices(y / u**2) / data.of_devices(u**-2)
+    devices = pd.DataFrame({"own": own, "shrunken": shrunken, "u": np.sqrt(variance)}, index=labels)
     devices["p"], devices["outlying"] = _outlying(data, repeated)
     if logarithmic:
         devices["u"] *= np.exp(devices["shrunken"])
@@ -310,8 +345,8 @@ def _one(table: pd.DataFrame, name: str, covariates: list[str]) -> PopulationPar
         str(table[f"unit_{name}"].iloc[0]) if f"unit_{name}" in table else "",
         logarithmic,
         coefficients,
-        grid.quantiles(0),
-        grid.quantiles(1) if repeated else (0.0, 0.0, 0.0),
+        _quantiles(nodes[0], weights.sum(axis=1)),
+        _quantiles(nodes[1], weights.sum(axis=0)) if repeated else (0.0, 0.0, 0.0),
         devices,
         _charts(table, y - centred.T @ b[1:]),
     )
@@ -330,79 +365,40 @@ def _numbers(table: pd.DataFrame, column: str) -> FloatArray:
     return np.asarray(values, dtype=np.float64)
 
 
-@dataclass(frozen=True)
-class _Grid:
-    """The posterior of (tau, omega) on a grid, and what follows from it."""
-
-    data: _Sums
-    nodes: tuple[FloatArray, FloatArray]
-    weights: FloatArray  # (tau, omega), sum 1
-
-    @cached_property
-    def coefficients(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance of b, averaged over the grid."""
-        means, second = [], np.zeros((self.data.X.shape[1],) * 2)
-        flat = self.weights.ravel()
-        for tau, omega in self._points():
-            A, b, _ = self.data.weighted(tau, omega)
-            C = np.linalg.inv(A)
-            means.append(C @ b)
-            second = second + flat[len(means) - 1] * C
-        m = np.array(means)
-        mean = flat @ m
-        return mean, second + (flat[:, None] * (m - mean)).T @ (m - mean)
-
-    @cached_property
-    def own(self) -> FloatArray:
-        """Each device's own mean, weighted by the uncertainties of its fits."""
-        w = 1.0 / self.data.u2
-        n = self.data.devices
-        return np.asarray(
-            np.bincount(self.data.device, w * self.data.y, n) / np.bincount(self.data.device, w, n)
-        )
-
-    @cached_property
-    def devices(self) -> dict[str, FloatArray]:
-        """Each device's estimate shrunk towards the population, and its uncertainty."""
-        d = self.data
-        mean, second = np.zeros(d.devices), np.zeros(d.devices)
-        first = np.zeros((d.devices, d.X.shape[1]))
-        np.add.at(first, d.device, d.X)
-        x = first / np.bincount(d.device, minlength=d.devices)[:, None]
-        for weight, (tau, omega) in zip(self.weights.ravel(), self._points(), strict=True):
-            w = 1.0 / (omega**2 + d.u2)
-            total = np.bincount(d.device, w, d.devices)
-            A, b, _ = d.weighted(tau, omega)
-            C = np.linalg.inv(A)
-            beta = C @ b
-            rest = np.bincount(d.device, w * (d.y - d.X @ beta), d.devices) / total
-            pull = tau**2 * total / (1.0 + tau**2 * total)
-            value = x @ beta + pull * rest
-            away = (1.0 - pull)[:, None] * x
-            variance = pull / total + np.einsum("ij,jk,ik->i", away, C, away)
-            mean += weight * value
-            second += weight * (variance + value**2)
-        return {"shrunken": mean, "u": np.sqrt(np.maximum(second - mean**2, 0.0))}
-
-    def quantiles(self, axis: int) -> tuple[float, float, float]:
-        """Return median and 95.45 % limits of tau (0) or omega (1)."""
-        marginal = self.weights.sum(axis=1 - axis)
-        cumulative = np.cumsum(marginal) - 0.5 * marginal
-        low, middle, high = np.interp([0.02275, 0.5, 0.97725], cumulative, self.nodes[axis])
-        return float(middle), float(low), float(high)
-
-    def _points(self) -> list[tuple[float, float]]:
-        return [(float(t), float(o)) for t in self.nodes[0] for o in self.nodes[1]]
+_Nodes = tuple[FloatArray, FloatArray]
 
 
-def _grid(data: _Sums, repeated: bool) -> _Grid:
-    """Return the posterior of the scatters under flat priors, on a grid around its bulk."""
+def _grid(data: _Sums, repeated: bool) -> tuple[_Nodes, FloatArray]:
+    """Return nodes of tau and of omega, and their posterior under flat priors, of sum 1."""
     mode = _reml(data, repeated)
     nodes = (_nodes(data, mode, 0), _nodes(data, mode, 1) if repeated else np.zeros(1))
-    values = np.array([[data.weighted(float(t), float(o))[2] for o in nodes[1]] for t in nodes[0]])
+    values = np.array([[data.likelihood(t, o) for o in nodes[1]] for t in nodes[0]])
     widths = [np.gradient(n) if n.size > 1 else np.ones(1) for n in nodes]
     weights = np.exp(values - values.max()) * widths[0][:, None] * widths[1]
-    return _Grid(data, nodes, weights / weights.sum())
+    return nodes, weights / weights.sum()
+
+
+def _averaged(
+    data: _Sums, nodes: _Nodes, weights: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return mean and covariance of b, and mean and variance of each device, over the grid."""
+    x = np.stack([data.of_devices(c) for c in data.X.T], axis=-1)
+    x /= data.of_devices(np.ones(len(data.y)))[:, None]
+    solutions = [data.at(tau, omega) for tau in nodes[0] for omega in nodes[1]]
+    estimates = [solution.shrunken(x) for solution in solutions]
+    b, C = (np.array([getattr(solution, name) for solution in solutions]) for name in ("b", "C"))
+    values, variances = (np.array(part) for part in zip(*estimates, strict=True))
+    w = weights.ravel()
+    mean, device = w @ b, w @ values
+    covariance = np.tensordot(w, C, 1) + (w[:, None] * (b - mean)).T @ (b - mean)
+    return mean, covariance, device, w @ (variances + (values - device) ** 2)
+
+
+def _quantiles(nodes: FloatArray, weights: FloatArray) -> tuple[float, float, float]:
+    """Return median and 95.45 % limits."""
+    cumulative = np.cumsum(weights) - 0.5 * weights
+    low, middle, high = np.interp([0.02275, 0.5, 0.97725], cumulative, nodes)
+    return float(middle), float(low), float(high)
 
 
 def _reml(data: _Sums, repeated: bool) -> tuple[float, float]:
@@ -411,7 +407,7 @@ def _reml(data: _Sums, repeated: bool) -> tuple[float, float]:
 
     def objective(x: FloatArray) -> float:
         tau, omega = np.abs(x) * spread  # even in both, so that zero is an ordinary point
-        return -data.weighted(float(tau), float(omega) if repeated else 0.0)[2]
+        return -data.likelihood(tau, omega if repeated else 0.0)
 
     if not repeated:
         best = optimize.minimize_scalar(
@@ -427,9 +423,9 @@ def _reml(data: _Sums, repeated: bool) -> tuple[float, float]:
 def _nodes(data: _Sums, mode: tuple[float, float], axis: int) -> FloatArray:
     """Return nodes from zero to where the likelihood is negligible, finer near zero."""
     point = list(mode)
-    top = data.weighted(*point)[2]
+    top = data.likelihood(*point)
     step = 0.1 * float(np.sqrt(np.median(data.u2)))
-    while top - data.weighted(*point)[2] < _GONE:
+    while top - data.likelihood(*point) < _GONE:
         point[axis] = 1.3 * point[axis] + step
     return np.asarray(point[axis] * np.linspace(0.0, 1.0, _NODES) ** 1.5)
 
@@ -443,20 +439,18 @@ def _outlying(data: _Sums, repeated: bool) -> tuple[FloatArray, NDArray[np.bool_
     p, outlying = np.ones(data.devices), np.zeros(data.devices, dtype=bool)
     kept, numbers = data, np.arange(data.devices)
     for _ in range(data.devices // 2):
-        z = _standardised(kept, repeated)
-        worst = int(np.argmax(np.abs(z)))
+        worst = int(np.argmax(np.abs(kept.at(*_reml(kept, repeated)).distances())))
         own = kept.device == worst
         others = kept.without(worst)
         freedom = others.devices - others.X.shape[1]
         if freedom < 1 or np.linalg.matrix_rank(others.X) < others.X.shape[1]:
             break
         tau, omega = _reml(others, repeated)
-        A, b, _ = others.weighted(tau, omega)
-        C = np.linalg.inv(A)
+        solution = others.at(tau, omega)
         w = 1.0 / (omega**2 + kept.u2[own])
         x = (w[:, None] * kept.X[own]).sum(axis=0) / w.sum()
-        rest = float((w * kept.y[own]).sum() / w.sum() - x @ C @ b)
-        distance = rest / np.sqrt(tau**2 + 1.0 / w.sum() + x @ C @ x)
+        rest = float((w * kept.y[own]).sum() / w.sum() - x @ solution.b)
+        distance = rest / np.sqrt(tau**2 + 1.0 / w.sum() + x @ solution.C @ x)
         # the most distant of all: Sidak's correction for the number of devices
         alone = 2.0 * stats.t.sf(abs(distance), freedom)
         p[numbers[worst]] = -np.expm1(kept.devices * np.log1p(-min(alone, 1.0 - 1e-16)))
@@ -465,17 +459,6 @@ def _outlying(data: _Sums, repeated: bool) -> tuple[FloatArray, NDArray[np.bool_
         outlying[numbers[worst]] = True
         kept, numbers = others, np.delete(numbers, worst)
     return p, outlying
-
-
-def _standardised(data: _Sums, repeated: bool) -> FloatArray:
-    """Return each device's distance from the population in its standard deviations."""
-    tau, omega = _reml(data, repeated)
-    A, b, _ = data.weighted(tau, omega)
-    w = 1.0 / (omega**2 + data.u2)
-    total = np.bincount(data.device, w, data.devices)
-    rest = w * (data.y - data.X @ np.linalg.solve(A, b))
-    mean = np.bincount(data.device, rest, data.devices) / total
-    return np.asarray(mean / np.sqrt(tau**2 + 1.0 / total))
 
 
 def _charts(table: pd.DataFrame, y: FloatArray) -> pd.DataFrame:
