@@ -7,6 +7,7 @@ with a seed it determines every number of the data.
 from __future__ import annotations
 
 import json
+import textwrap
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields
@@ -27,10 +28,10 @@ from dahl_ident.synthetic.excitation import (
     SteppedSine,
 )
 from dahl_ident.synthetic.table_errors import Table
-from dahl_ident.synthetic.toml_text import toml_text
 from dahl_ident.units import Motion
 
 _T = TypeVar("_T")
+_WIDTH, _INDENT = 50, "\n    "  # columns of a list in TOML; a longer one takes several lines
 _EXCITATIONS: dict[str, type[Excitation]] = {
     "stepped_sine": SteppedSine,
     "frequency_sweep": FrequencySweep,
@@ -158,7 +159,7 @@ class Experiment:
 
     def to_toml(self) -> str:
         """Return the description as TOML."""
-        return toml_text(self.to_dict())
+        return _toml(self.to_dict())
 
     @classmethod
     def from_toml(cls, text: str) -> Experiment:
@@ -248,3 +249,20 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_plain(v) for v in value]
     return value
+
+
+def _toml(data: Mapping[str, Any], prefix: str = "") -> str:
+    """Return nested plain data without None as TOML, which the standard library only reads."""
+    lines, tables = [], []
+    for key, value in data.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            tables.append(f"\n[{name}]\n{_toml(value, f'{name}.')}")
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            tables += [f"\n[[{name}]]\n{_toml(entry, f'{name}.')}" for entry in value]
+        else:  # JSON writes strings, booleans, finite numbers and lists of them as TOML does
+            text = json.dumps(value, ensure_ascii=False, allow_nan=False)
+            wide = isinstance(value, list) and len(text) > _WIDTH
+            rows = textwrap.wrap(text, _WIDTH) if wide else [text]
+            lines.append(f"{key} = {_INDENT.join(rows)}\n")
+    return "".join(lines + tables)
