@@ -23,7 +23,7 @@ from dahl_ident.data.column_map import column_map
 from dahl_ident.data.frequency_response import FrequencyResponse
 from dahl_ident.data.levels import labelled
 from dahl_ident.data.raw_columns import Source
-from dahl_ident.data.readers.file import File, open_file
+from dahl_ident.data.readers.file import FORMATS, File, open_file
 from dahl_ident.data.readers.inspection import FileContents, contents
 from dahl_ident.data.record import Record
 from dahl_ident.data.record_table import record_from, record_size
@@ -40,21 +40,6 @@ __all__ = ["FileContents", "inspect", "read_frequency_response", "read_record"]
 
 PathLike = str | Path
 Columns = Mapping[str, Any] | str | Path
-_READERS = {
-    "excel": "spreadsheets.read_workbook",
-    "ods": "spreadsheets.read_workbook",
-    "parquet": "spreadsheets.read_parquet",
-    "matlab": "matlab.read_matlab",
-    "hdf5": "hdf5.read_hdf5",
-    "json": "dictionaries.read_json",
-    "npz": "array_trees.read_npz",
-    "npy": "array_trees.read_npy",
-    "lvm": "lvm.read_lvm",
-    "uff": "instruments.read_uff",
-    "tdms": "instruments.read_tdms",
-    "sdf": "sdf.read_sdf",
-    "text": "text_table.read_text_table",
-}
 
 
 def read_frequency_response(
@@ -394,7 +379,7 @@ def _given(**options: Any) -> dict[str, Any]:
 
 def _parsed(file: File, sheet: str | None) -> Source:
     """Pass a file to its reader; readers are imported when first used."""
-    room, _, name = _READERS[file.format].partition(".")
+    room, _, name = FORMATS[file.format].reader.partition(".")
     read = getattr(import_module(f"{__name__}.{room}"), name)
     source: Source = read(file, sheet) if name == "read_workbook" else read(file)
     return source

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from dahl_ident.data.storage import regular
 from dahl_ident.errors import DataError
@@ -37,49 +37,34 @@ _UNPACKED_BYTES = 1 << 27  # 134 MB: more than most tables; read, they take ten 
 _OBJECT_BYTES = 40  # at least, of each line or list of a text that is split into them
 _UNPACKED_RATIO = 8  # text and samples of a converter rarely pack better
 
-_TEXT = ("text", "uff", "lvm", "json")
-# Formats that may stand behind an extension; any, where it is not listed.
-_EXTENSIONS: dict[str, tuple[str, ...]] = {
-    ".csv": ("text",),
-    ".tsv": ("text",),
-    ".txt": _TEXT,
-    ".dat": (*_TEXT, "sdf"),
-    ".sdf": ("sdf",),
-    ".asc": _TEXT,
-    ".prn": ("text",),
-    ".json": ("json",),
-    ".xlsx": ("excel",),
-    ".xlsm": ("excel",),
-    ".ods": ("ods",),
-    ".npz": ("npz",),
-    ".npy": ("npy",),
-    ".parquet": ("parquet",),
-    ".pq": ("parquet",),
-    ".mat": ("matlab", "hdf5"),
-    ".h5": ("hdf5",),
-    ".hdf5": ("hdf5",),
-    ".uff": ("uff",),
-    ".unv": ("uff",),
-    ".bunv": ("uff",),
-    ".tdms": ("tdms",),
-    ".lvm": ("lvm",),
-}
-_NAMES = {
-    "text": "a text table",
-    "json": "JSON",
-    "excel": "an Excel workbook",
-    "old excel": "an Excel 97 workbook",
-    "ods": "an Open Document sheet",
-    "zip": "a ZIP archive",
-    "npz": "NumPy's .npz",
-    "npy": "NumPy's .npy",
-    "parquet": "Parquet",
-    "matlab": "MATLAB v5 or v7",
-    "hdf5": "HDF5 or MATLAB v7.3",
-    "uff": "a universal file",
-    "tdms": "NI TDMS",
-    "lvm": "LabVIEW LVM",
-    "sdf": "an analyser's SDF",
+
+class Format(NamedTuple):
+    """A format: its name for messages, extensions that it may have, and module.function to read it.
+
+    A file of another extension may have any format.
+    """
+
+    name: str
+    extensions: str = ""
+    reader: str = ""
+
+
+FORMATS = {
+    "text": Format("a text table", ".csv .tsv .txt .dat .asc .prn", "text_table.read_text_table"),
+    "json": Format("JSON", ".json .txt .dat .asc", "dictionaries.read_json"),
+    "excel": Format("an Excel workbook", ".xlsx .xlsm", "spreadsheets.read_workbook"),
+    "old excel": Format("an Excel 97 workbook"),
+    "ods": Format("an Open Document sheet", ".ods", "spreadsheets.read_workbook"),
+    "zip": Format("a ZIP archive"),
+    "npz": Format("NumPy's .npz", ".npz", "array_trees.read_npz"),
+    "npy": Format("NumPy's .npy", ".npy", "array_trees.read_npy"),
+    "parquet": Format("Parquet", ".parquet .pq", "spreadsheets.read_parquet"),
+    "matlab": Format("MATLAB v5 or v7", ".mat", "matlab.read_matlab"),
+    "hdf5": Format("HDF5 or MATLAB v7.3", ".mat .h5 .hdf5", "hdf5.read_hdf5"),
+    "uff": Format("a universal file", ".uff .unv .bunv .txt .dat .asc", "instruments.read_uff"),
+    "tdms": Format("NI TDMS", ".tdms", "instruments.read_tdms"),
+    "lvm": Format("LabVIEW LVM", ".lvm .txt .dat .asc", "lvm.read_lvm"),
+    "sdf": Format("an analyser's SDF", ".sdf .dat", "sdf.read_sdf"),
 }
 _UFF = re.compile(rb"-1[ \t]*[\r\n]\s*\d")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -212,14 +197,15 @@ def _checked(file: File, head: bytes) -> File:
     if not head or (head.isspace() and plain.data.isspace()):
         raise DataError(f"{file.name}: the file is empty")
     found = _format(plain, head, suffix)
-    allowed = _EXTENSIONS.get(suffix, (found,))
-    if found not in allowed:
+    is_format = FORMATS[found]
+    allowed = [one for one in FORMATS.values() if suffix and suffix in one.extensions.split()]
+    if allowed and is_format not in allowed:
         raise DataError(
-            f"{file.name}: the extension {suffix} says {_NAMES[allowed[0]]}, the content is "
-            f"{_NAMES[found]}; rename the file to what it is"
+            f"{file.name}: the extension {suffix} says {allowed[0].name}, the content is "
+            f"{is_format.name}; rename the file to what it is"
         )
-    if found in ("old excel", "zip"):
-        raise DataError(f"{file.name}: {_NAMES[found]} is not read; save it as .xlsx or .csv")
+    if not is_format.reader:
+        raise DataError(f"{file.name}: {is_format.name} is not read; save it as .xlsx or .csv")
     return File(path, file.name, file.size, file.sha256, found, content)
 
 
