@@ -175,7 +175,7 @@ def digest_of(path: Path) -> str:
     from dahl_ident.data.storage import regular
 
     try:
-        path.stat()  # what is not there may be elsewhere; what is no file is one nowhere
+        path.stat()  # what is not there may be elsewhere; what is not a file is not one anywhere
         with regular(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as exc:

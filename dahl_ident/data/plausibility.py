@@ -173,8 +173,8 @@ def _stuck(held: FloatArray, other: FloatArray, *, smooth: bool = False) -> NDAr
 
     Dry friction and a coarse converter keep a value as well, but leave it by no more than their
     usual steps. A converter that sticks jumps afterwards, or before where it gives 0; or it keeps
-    a value within the range of a signal that else hardly ever repeats one, because of its noise.
-    A motion is smooth: it does not stop at once.
+    a value within the range of a signal that otherwise hardly ever repeats one, because of its
+    noise. A motion is smooth: it does not stop at once.
     """
     steps = np.abs(np.diff(held))
     starts, stops = _runs(np.concatenate([[False], steps == 0.0]))

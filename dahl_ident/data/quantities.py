@@ -50,7 +50,7 @@ def power_of_s(omega: FloatArray, power: int) -> ComplexArray:
 def converted(
     response: ComplexArray, omega: FloatArray, source: Quantity, target: Quantity
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Return the response as `target`, and its complex derivative by the response.
+    """Return the response as `target`, and its complex derivative with respect to the source.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """Tables to files and nothing lost: CSV, TSV, Parquet and HDF5.
 
-Files are written beside their place under another name and moved there when complete, so that
+Files are written in their folder under another name and moved there when complete, so that
 an interrupted run leaves no half table. What was there before is replaced on request only.
 """
 
@@ -103,7 +103,7 @@ def read_text(path: str | Path, what: str = "the file") -> str:
     Raises
     ------
     DataError
-        If it cannot be read, or is no text.
+        If it cannot be read, or is not text.
     """
     try:
         return regular(path, what).read_text(encoding="utf-8")
@@ -148,7 +148,7 @@ def write_whole(path: Path, content: bytes, *, overwrite: bool = False) -> None:
 
 
 def put_in_place(path: Path, write: Callable[[Path], object], *, overwrite: bool = True) -> None:
-    """Write a file beside its place, flush it to the disk, and move it there when complete.
+    """Write a file under another name, flush it to the disk, and rename it when complete.
 
     `write` gets the path to write to. Whatever it raises is passed on, and leaves `path` alone.
     Of several writers without `overwrite`, all but the first get a FileExistsError.
@@ -297,7 +297,7 @@ def digest(value: Any) -> str:
 
 
 def read_metadata(text: Any) -> dict[str, Any]:
-    """Return what an earlier save of this package wrote beside a table.
+    """Return what an earlier save of this package wrote together with a table.
 
     Raises
     ------
@@ -310,7 +310,7 @@ def read_metadata(text: Any) -> dict[str, Any]:
             _KNOWN_METADATA.get(key, lambda _: False)(value) for key, value in content.items()
         )
     except (RecursionError, TypeError) as exc:
-        raise ValueError("the comment of this package is no JSON text") from exc
+        raise ValueError("the comment of this package is not JSON") from exc
     if not known:
         raise ValueError("the comment of this package holds something else than it wrote")
     return dict(content)

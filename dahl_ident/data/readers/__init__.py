@@ -1,7 +1,7 @@
 """Readers, which turn the usual laboratory files into frequency responses or records.
 
-Formats are recognised by their content: text tables (CSV, TSV and kin, also packed with gzip, bzip2
-or xz), Excel, Parquet, MATLAB, HDF5, universal files 58 and 58b, NI TDMS, LabVIEW LVM and HP's SDF.
+Formats are recognised by their content: text tables (CSV, TSV and the like, also packed with gzip,
+bzip2 or xz), Excel, Parquet, MATLAB, HDF5, universal files 58 and 58b, NI TDMS, LabVIEW LVM, SDF.
 Information that the file does not contain, such as a unit or which column is the force, comes from
 a column map (:mod:`dahl_ident.data.column_map`) or from keywords; missing information is an error.
 Every remaining assumption, such as amplitudes being zero to peak, is noted in the result.
@@ -86,7 +86,7 @@ def read_frequency_response(
     drive_factor : str, optional
         Force for one unit of a drive in V or A, such as ``"12.5 N/V"``.
     drive_factor_uncertainty : float, optional
-        Its relative standard uncertainty; all rows share it, so the table carries it beside
+        Its relative standard uncertainty; all rows share it, so the table carries it in addition to
         the covariance.
     level : str or float, optional
         Label for all rows.

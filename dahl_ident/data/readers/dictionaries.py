@@ -5,7 +5,7 @@ JSON may hold an object of columns, ``{"time [s]": [...], "x [mm]": [...]}``, or
 "x [mm]": 1.0}, ...]`` or ``[["time [s]", "x [mm]"], [0.0, 1.0], ...]``; ``{"columns": [...],
 "data": [[...], ...]}`` and ``{"x [mm]": {"0": 1.0, ...}}`` as pandas writes them; or a list of
 channels with ``name``, ``data``, ``unit_str`` and either ``fs`` or ``time``, as SDyPy has them.
-Units may stand in the names, in each column, or beside them all under ``"units"`` or
+Units may stand in the names, in each column, or for all of them under ``"units"`` or
 ``"displacement units"``. Rows without names have columns ``column 1``, ``column 2``, ...
 """
 
@@ -36,7 +36,7 @@ def read_json(file: File) -> Source:
     Raises
     ------
     DataError
-        If it is no JSON, or holds neither columns nor rows nor channels.
+        If it is not JSON, or holds neither columns nor rows nor channels.
     """
     try:
         text = utf8(file.lines(b"[{")).decode("utf-8", "replace")
@@ -128,8 +128,8 @@ def _upright(labels: Any, rows: list[Any], name: str) -> dict[str, Any]:
 
 def _tables(content: dict[str, Any], name: str, units: Any) -> Iterator[Channel]:
     """Yield the columns of an object, or of the table in it."""
-    beside = {m[1]: unit for key, unit in content.items() if (m := _UNIT_OF.fullmatch(key))}
-    units = content.get("units", units or beside)
+    common = {m[1]: unit for key, unit in content.items() if (m := _UNIT_OF.fullmatch(key))}
+    units = content.get("units", units or common)
     rows = next(
         (content[key] for key in ("data", "rows") if _is_list_of(list, content.get(key))), None
     )

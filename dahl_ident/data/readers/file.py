@@ -170,7 +170,7 @@ def open_file(path: str | Path) -> File:
         digest = hashlib.sha256(data).hexdigest()
         return _checked(File(None, "standard input", len(data), digest, "", data), data[:300])
     place = regular(path)
-    # names of files are bytes, and what is no UTF-8 in them could not be written into a report
+    # names of files are bytes, and what is not UTF-8 in them could not be written into a report
     name = str(place).encode(errors="backslashreplace").decode()
     try:
         with place.open("rb") as stream:

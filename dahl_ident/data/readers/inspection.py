@@ -225,7 +225,7 @@ def _has_name(channel: Channel, roles: Iterable[str], names: Mapping[str, tuple[
 
 
 def _is_response(channels: Collection[Channel]) -> bool:
-    """Return whether channels are a table of response: f is force beside time or motion only."""
+    """Return whether channels are a table of response; f is force only with time or motion."""
 
     def any_is(role: str, names: Mapping[str, tuple[str, ...]]) -> bool:
         kinds = (_RECORD_UNITS | _RESPONSE_UNITS)[role]

@@ -47,7 +47,7 @@ _BEFORE_BRACKET = re.compile(r"(?<=[^\s\])])[ \t]+(?=[\[(])")  # "time [s]" is o
 _BLANK_SEPARATED = re.compile(r"(?:\[[^\]]{0,60}\]|\([^)]{0,60}\)|\S)+")
 _HEAD_BYTES = 1 << 15  # from the first numbers on: hundreds of lines show the format
 _HEAD_LINES = 4  # of numbers, however wide
-_LONGEST_LINE = 1 << 18  # bytes: 10,000 columns and more; beyond, it is no text table
+_LONGEST_LINE = 1 << 18  # bytes: 10,000 columns and more; beyond, it is not a text table
 _MOST_COMMENTS = 20_000  # lines, before the first numbers or among them: a limit on time
 _MANY_LINES = 50  # from which decimals of one length are a format, not chance
 _FOOTER_LINES = 20  # that are left out at most; more text after the numbers is an error
@@ -96,7 +96,7 @@ def read_text_table(file: File) -> Source:
     Raises
     ------
     DataError
-        If the bytes are no text, or no table of numbers is found, or lines differ in width.
+        If the bytes are not text, or no table of numbers is found, or lines differ in width.
     """
     data, name = utf8(file.data), file.name
     if b"\0" in data:
