@@ -191,8 +191,8 @@ def _table(content: Mapping[str, Any], key: str) -> dict[str, Any]:
     return dict(table)
 
 
-def _refuse_unknown(what: str, given: Collection[str], known: Collection[str]) -> None:
-    unknown = sorted(set(given) - set(known))
+def _refuse_unknown(what: str, names: Collection[str], known: Collection[str]) -> None:
+    unknown = sorted(set(names) - set(known))
     if unknown:
         raise ValidationError(
             f"unknown {what}: {', '.join(unknown)}; expected some of "
@@ -200,12 +200,12 @@ def _refuse_unknown(what: str, given: Collection[str], known: Collection[str]) -
         )
 
 
-def _run_laws(folder: Path, given: Any) -> None:
+def _run_laws(folder: Path, laws: Any) -> None:
     """Run the files of laws, so that their laws are known by their kinds."""
-    files = [given] if isinstance(given, str) else given
+    files = [laws] if isinstance(laws, str) else laws
     if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
         raise ValidationError(
-            f"laws is {given!r}; expected the path of a Python file, or a list of paths"
+            f"laws is {laws!r}; expected the path of a Python file, or a list of paths"
         )
     for file in files:
         from dahl_ident.elements.law_files import load_laws
@@ -278,11 +278,11 @@ def _tasks(folder: Path, files: Mapping[str, Any], per: str) -> tuple[Task, ...]
     pattern = files.get("pattern")
     if not isinstance(pattern, str):
         raise ValidationError("[files] has no pattern; give one, such as 'data/{device}.csv'")
-    found = _matches(folder, pattern)
+    paths = _matches(folder, pattern)
     table = _covariates(folder, files.get("covariates"))
     groups: dict[tuple[str, str], list[tuple[str, Path, dict[str, float | str]]]] = {}
     seen: dict[tuple[str, str], Path] = {}
-    for path, fields in found:
+    for path, fields in paths:
         device = fields.pop("device")
         run = fields.pop("run", path.stem)
         if (device, run) in seen:
@@ -292,13 +292,13 @@ def _tasks(folder: Path, files: Mapping[str, Any], per: str) -> tuple[Task, ...]
             )
         seen[device, run] = path
         values: dict[str, float | str] = {key: _value(text) for key, text in fields.items()}
-        own = _looked_up(table, device, run)
-        if both := values.keys() & own.keys():
+        row = _looked_up(table, device, run)
+        if both := values.keys() & row.keys():
             raise ValidationError(
                 f"{', '.join(sorted(both))} stands in the pattern and in the table of "
                 "covariates; leave it out of one"
             )
-        values |= own
+        values |= row
         groups.setdefault((device, run if per == "run" else ""), []).append((run, path, values))
     return tuple(
         Task(
@@ -331,14 +331,14 @@ def _matches(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
     expression = re.compile(
         "".join(f"(?P<{part}>[^/]+?)" if i % 2 else re.escape(part) for i, part in enumerate(parts))
     )
-    found = []
+    paths = []
     for path in sorted(glob.glob(wild, root_dir=folder)):  # noqa: PTH207  # absolute patterns too
         match = expression.fullmatch(Path(path).as_posix())
         if match is not None:
-            found.append((folder / path, match.groupdict()))
-    if not found:
+            paths.append((folder / path, match.groupdict()))
+    if not paths:
         raise ValidationError(f"the pattern {pattern!r} finds no file below {folder}")
-    return found
+    return paths
 
 
 def _covariates(

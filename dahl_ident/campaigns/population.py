@@ -319,8 +319,8 @@ def _one(table: pd.DataFrame, name: str, covariates: list[str]) -> PopulationPar
     logarithmic = bool((value > 0.0).all())
     y, u = (np.log(value), u / value) if logarithmic else (value, u)
     labels, device = np.unique(table["device"].to_numpy(dtype=str), return_inverse=True)
-    given = np.array([_numbers(table, c) for c in covariates]).reshape(len(covariates), len(y))
-    centred = given - given.mean(axis=1, keepdims=True)
+    measured = np.array([_numbers(table, c) for c in covariates]).reshape(len(covariates), len(y))
+    centred = measured - measured.mean(axis=1, keepdims=True)
     X = np.column_stack([np.ones(len(y)), *centred])
     if np.linalg.matrix_rank(X / np.maximum(np.abs(X).max(axis=0), 1e-300)) < X.shape[1]:
         raise ValidationError(
@@ -415,8 +415,8 @@ def _reml(data: _Sums, repeated: bool) -> tuple[float, float]:
         )
         return float(best.x) * spread, 0.0
     starts = [np.array([a, b]) for a in (0.7, 0.05) for b in (0.7, 0.05)]
-    found = [optimize.minimize(objective, s, method="Nelder-Mead") for s in starts]
-    tau, omega = np.abs(min(found, key=lambda r: float(r.fun)).x) * spread
+    optima = [optimize.minimize(objective, s, method="Nelder-Mead") for s in starts]
+    tau, omega = np.abs(min(optima, key=lambda r: float(r.fun)).x) * spread
     return float(tau), float(omega)
 
 
@@ -440,16 +440,16 @@ def _outlying(data: _Sums, repeated: bool) -> tuple[FloatArray, NDArray[np.bool_
     kept, numbers = data, np.arange(data.devices)
     for _ in range(data.devices // 2):
         worst = int(np.argmax(np.abs(kept.at(*_reml(kept, repeated)).distances())))
-        own = kept.device == worst
+        fits = kept.device == worst
         others = kept.without(worst)
         freedom = others.devices - others.X.shape[1]
         if freedom < 1 or np.linalg.matrix_rank(others.X) < others.X.shape[1]:
             break
         tau, omega = _reml(others, repeated)
         solution = others.at(tau, omega)
-        w = 1.0 / (omega**2 + kept.u2[own])
-        x = (w[:, None] * kept.X[own]).sum(axis=0) / w.sum()
-        rest = float((w * kept.y[own]).sum() / w.sum() - x @ solution.b)
+        w = 1.0 / (omega**2 + kept.u2[fits])
+        x = (w[:, None] * kept.X[fits]).sum(axis=0) / w.sum()
+        rest = float((w * kept.y[fits]).sum() / w.sum() - x @ solution.b)
         distance = rest / np.sqrt(tau**2 + 1.0 / w.sum() + x @ solution.C @ x)
         # the most distant of all: Sidak's correction for the number of devices
         alone = 2.0 * stats.t.sf(abs(distance), freedom)

@@ -296,7 +296,7 @@ def _laws(definition: Definition) -> tuple[str | LawFile, ...]:
     from dahl_ident.elements.description import model_from_description
     from dahl_ident.elements.law_files import LawFile, file_of, own_laws, source_path
 
-    found: dict[str | LawFile, None] = {}
+    sources: dict[str | LawFile, None] = {}
     for law in own_laws(model_from_description(definition.options["model"]).elements):
         file, path = file_of(law), source_path(law)
         if path is None:
@@ -306,8 +306,8 @@ def _laws(definition: Definition) -> tuple[str | LawFile, ...]:
             )
         if law.__module__ == "__main__":
             file = LawFile(path, read_text(path))
-        found[file or law.__module__] = None
-    return tuple(found)
+        sources[file or law.__module__] = None
+    return tuple(sources)
 
 
 def _unless_refused(
@@ -333,8 +333,8 @@ def _unless_refused(
 def _whole(task: Task, row: dict[str, Any]) -> dict[str, Any]:
     del row["key"]
     row.pop("retry", None)
-    own = {"device": task.device, **({"run": task.run} if task.run else {})}
-    return {**own, **task.covariates, **row, "version": __version__}
+    labels = {"device": task.device, **({"run": task.run} if task.run else {})}
+    return {**labels, **task.covariates, **row, "version": __version__}
 
 
 def _split(definition: Definition, keys: list[str], known: set[str]) -> Campaign:
@@ -404,7 +404,7 @@ def _keys(definition: Definition, limits: Limits) -> list[str]:
     digests: dict[str, list[Any]] = {}
     keys = []
     for task in definition.tasks:
-        own = []
+        of_files = []
         for path in task.files:
             try:
                 state = path.stat()
@@ -414,8 +414,8 @@ def _keys(definition: Definition, limits: Limits) -> list[str]:
                 digests[str(path)] = known
             except (OSError, DataError):
                 known = [0, 0, "unreadable"]  # a row that says so, until it can be read
-            own.append(known[2])
-        keys.append(definition.key([task.name, *task.runs, *own], __version__))
+            of_files.append(known[2])
+        keys.append(definition.key([task.name, *task.runs, *of_files], __version__))
     if definition.folder.is_dir() and digests != cache:
         write_whole(cache_path, json.dumps(digests).encode(), overwrite=True)
     return keys
@@ -423,19 +423,19 @@ def _keys(definition: Definition, limits: Limits) -> list[str]:
 
 def _digest(path: Path, seconds: float) -> str:
     """Return the digest of a file whose medium may hang."""
-    found: list[str | DataError] = []
+    outcome: list[str | DataError] = []
 
     def read() -> None:
         try:
-            found.append(digest_of(path))
+            outcome.append(digest_of(path))
         except DataError as exc:
-            found.append(exc)
+            outcome.append(exc)
 
     thread = threading.Thread(target=read, daemon=True)
     thread.start()
     thread.join(seconds)
-    if not found:
+    if not outcome:
         raise DataError(f"{path}: cannot be read within {seconds:.3g} s")
-    if isinstance(found[0], DataError):
-        raise found[0]
-    return found[0]
+    if isinstance(outcome[0], DataError):
+        raise outcome[0]
+    return outcome[0]

@@ -261,28 +261,28 @@ class Binding:
         spec = self.map.roles.get(role, Column())
         if spec.column is not None:
             return self.source.find(spec.column)
-        found, names = self.named(role), self.columns[role].names
+        matches, names = self.named(role), self.columns[role].names
         if role not in self.map.roles:  # a column that the map gives another role has no second one
             named = [c.column for c in self.map.roles.values() if c.column and "*" not in c.column]
             taken = [self.source.find(column).content for column in named]
-            found = [c for c in found if not any(c.content is other for other in taken)]
+            matches = [c for c in matches if not any(c.content is other for other in taken)]
         if role == "run":  # a table may have file, day and test; the first name is used
-            found.sort(key=lambda c: names.index(plain(c.short or c.name)))
-            found = found[:1]
-        if len(found) > 1:
-            distinct = len({c.name for c in found}) == len(found)
-            way = f"say which one with columns={{{role!r}: {found[0].name!r}}}"
+            matches.sort(key=lambda c: names.index(plain(c.short or c.name)))
+            matches = matches[:1]
+        if len(matches) > 1:
+            distinct = len({c.name for c in matches}) == len(matches)
+            way = f"say which one with columns={{{role!r}: {matches[0].name!r}}}"
             raise DataError(
-                f"{self.source.name}: {len(found)} columns may be the {role}: "
-                f"{listed([c.header for c in found])}; "
+                f"{self.source.name}: {len(matches)} columns may be the {role}: "
+                f"{listed([c.header for c in matches])}; "
                 + (way if distinct else "rename them in the file")
             )
-        if not found and role in self.map.roles:
+        if not matches and role in self.map.roles:
             raise DataError(
                 f"{self.source.name}: no column is called {' or '.join(names)}; name "
                 f"the column of the {role} too"
             )
-        return found[0] if found else None
+        return matches[0] if matches else None
 
     def has(self, role: str) -> bool:
         """Return whether a role is present."""
@@ -371,11 +371,11 @@ class Binding:
         what = " and ".join(given)
         if kind in (None, "force"):
             channel = self.channel("drive")
-            found = "no column holds the drive"
+            why = "no column holds the drive"
             if channel is not None:
-                found = f"the drive ({channel.name}) is a force already"
+                why = f"the drive ({channel.name}) is a force already"
             raise DataError(
-                f"{self.source.name}: {what} is given, but {found}; expected a drive in V or A: "
+                f"{self.source.name}: {what} is given, but {why}; expected a drive in V or A: "
                 "leave the factor out, or name the column with columns={'drive': ...}"
             )
         if self.map.drive_factor is None and "drive_factor" not in self.source.metadata:
@@ -397,7 +397,7 @@ class Binding:
         notes = list(dict.fromkeys([*self.source.notes, *self.notes]))
         if unused:
             notes.append(f"columns not used: {listed(unused, 5)}")
-        found = {
+        facts = {
             "file": self.source.name,
             "format": self.source.format,
             "sha256": self.source.sha256,
@@ -406,7 +406,7 @@ class Binding:
             "warnings": list(dict.fromkeys([*self.source.doubts, *self.doubts])),
             "origin": self.source.metadata.get("provenance"),
         }
-        return {key: value for key, value in found.items() if value}
+        return {key: value for key, value in facts.items() if value}
 
     def doubt(self, message: str) -> None:
         """Warn, and keep the warning with the data: verdict and report repeat it."""
@@ -415,10 +415,10 @@ class Binding:
 
     def doubt_rows(self, rows: NDArray[np.bool_], message: str) -> None:
         """Warn of the rows that are marked, if there are any."""
-        found = np.flatnonzero(rows)
-        if found.size:
-            names = ", ".join(self.source.row_name(int(i)) for i in found[:_SHOWN])
-            more = f" and {found.size - _SHOWN} more" if found.size > _SHOWN else ""
+        marked = np.flatnonzero(rows)
+        if marked.size:
+            names = ", ".join(self.source.row_name(int(i)) for i in marked[:_SHOWN])
+            more = f" and {marked.size - _SHOWN} more" if marked.size > _SHOWN else ""
             self.doubt(f"{message}: {names}{more}")
 
     def note_peak(self, role: str, unit: Unit) -> None:
@@ -452,11 +452,11 @@ def by_level(source: Source, columns: ColumnMap) -> dict[str | None, ColumnMap]:
     starred = {r: c for r, c in columns.roles.items() if c.column and "*" in c.column}
     if not starred:
         return {None: columns}
-    found = {role: source.matching(str(spec.column)) for role, spec in starred.items()}
-    first = next(iter(found))
-    for role, matches in found.items():
-        if matches.keys() != found[first].keys():
-            odd = sorted(matches.keys() ^ found[first].keys())
+    levels = {role: source.matching(str(spec.column)) for role, spec in starred.items()}
+    first = next(iter(levels))
+    for role, matches in levels.items():
+        if matches.keys() != levels[first].keys():
+            odd = sorted(matches.keys() ^ levels[first].keys())
             raise DataError(
                 f"{source.name}: {starred[first].column!r} and {starred[role].column!r} do not "
                 f"match the same levels; only one of them has {listed(odd)}"
@@ -466,10 +466,10 @@ def by_level(source: Source, columns: ColumnMap) -> dict[str | None, ColumnMap]:
             columns,
             roles={
                 **columns.roles,
-                **{r: replace(starred[r], column=found[r][label].name) for r in starred},
+                **{r: replace(starred[r], column=levels[r][label].name) for r in starred},
             },
         )
-        for label in found[first]
+        for label in levels[first]
     }
 
 

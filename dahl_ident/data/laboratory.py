@@ -152,18 +152,18 @@ def metadata_of(given: Mapping[str, Any] | str | Path | None) -> Metadata:
     return _checked(read, f"{given}: ")
 
 
-def _checked(given: Mapping[str, Any], where: str) -> Metadata:
-    _refuse_unknown(given, (*_TEXTS, *_LISTS), f"{where}metadata")
-    texts = {name: _text(given[name], f"{where}{name}") for name in _TEXTS if name in given}
+def _checked(entries: Mapping[str, Any], where: str) -> Metadata:
+    _refuse_unknown(entries, (*_TEXTS, *_LISTS), f"{where}metadata")
+    texts = {name: _text(entries[name], f"{where}{name}") for name in _TEXTS if name in entries}
     return Metadata(
         texts,
-        _ambient(given.get("ambient", ()), f"{where}ambient"),
-        _instruments(given.get("instruments", ()), f"{where}instruments"),
+        _ambient(entries.get("ambient", ()), f"{where}ambient"),
+        _instruments(entries.get("instruments", ()), f"{where}instruments"),
     )
 
 
-def _refuse_unknown(given: Mapping[str, Any], known: Sequence[str], name: str) -> None:
-    unknown = sorted(set(given) - set(known))
+def _refuse_unknown(entries: Mapping[str, Any], known: Sequence[str], name: str) -> None:
+    unknown = sorted(set(entries) - set(known))
     if unknown:
         raise ValidationError(
             f"{name} has the field {unknown[0]!r}; expected any of {choices(known, *unknown)}"
@@ -194,28 +194,28 @@ def _instrument(one: Any, name: str) -> Instrument:
     if not isinstance(one, Mapping):
         return Instrument(_text(one, name))
     _refuse_unknown(one, _INSTRUMENT, name)
-    given = {key: _text(one[key], f"{name}.{key}") for key in _INSTRUMENT if key in one}
-    parts = [_WORDS.get(key, "") + text for key, text in given.items() if key != "channel"]
-    parts += [f"{key} not stated" for key in ("calibration", "uncertainty") if key not in given]
-    return Instrument(", ".join(parts), given.get("channel", ""), _standard(given, name))
+    texts = {key: _text(one[key], f"{name}.{key}") for key in _INSTRUMENT if key in one}
+    parts = [_WORDS.get(key, "") + text for key, text in texts.items() if key != "channel"]
+    parts += [f"{key} not stated" for key in ("calibration", "uncertainty") if key not in texts]
+    return Instrument(", ".join(parts), texts.get("channel", ""), _standard(texts, name))
 
 
-def _standard(given: Mapping[str, str], name: str) -> float:
+def _standard(texts: Mapping[str, str], name: str) -> float:
     """Return the standard uncertainty of an instrument's channel, 0 where none is stated."""
-    channel, text = given.get("channel"), given.get("uncertainty")
+    channel, text = texts.get("channel"), texts.get("uncertainty")
     if channel is not None and channel not in CHANNELS:
         raise ValidationError(
             f"{name}.channel is {channel!r}; expected {choices(CHANNELS, channel)}"
         )
     if channel is None or text is None:
         return 0.0
-    if "k" not in given:
+    if "k" not in texts:
         raise ValidationError(
             f"{name} has an uncertainty for the channel {channel}, but no k; expected the coverage "
             "factor of the certificate, k = 2, or k = 1 for a standard uncertainty"
         )
     try:
-        k = float(given["k"])
+        k = float(texts["k"])
         if channel == "delay":
             u = parse_quantity(text, ("time",), "uncertainty")[0]
         else:
@@ -226,7 +226,7 @@ def _standard(given: Mapping[str, str], name: str) -> float:
     if not stated:
         expected = '"20 us"' if channel == "delay" else 'a share of the reading, "0.5 %"'
         raise ValidationError(
-            f"{name} has uncertainty {text!r} and k {given['k']!r}; expected {expected}, and a "
+            f"{name} has uncertainty {text!r} and k {texts['k']!r}; expected {expected}, and a "
             "number above zero"
         )
     return u / k

@@ -89,7 +89,7 @@ def stated_levels(lines: Iterable[str]) -> dict[str, str]:
     >>> stated_levels(["Control amplitude (um),5"])
     {'amplitude': '5 um'}
     """
-    found: dict[str, set[str]] = {}
+    stated: dict[str, set[str]] = {}
     for line in lines:
         match = _LINE.match(line[:200])
         if match is None:
@@ -104,5 +104,5 @@ def stated_levels(lines: Iterable[str]) -> dict[str, str]:
         except (UnitError, ValidationError):
             continue
         role = "drive" if kind in DRIVE_KINDS else "amplitude"
-        found.setdefault(role, set()).add(text)
-    return {role: texts.pop() for role, texts in found.items() if len(texts) == 1}
+        stated.setdefault(role, set()).add(text)
+    return {role: texts.pop() for role, texts in stated.items() if len(texts) == 1}

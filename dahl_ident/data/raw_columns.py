@@ -191,13 +191,13 @@ class Source:
         parts = (pattern[: start.start()], pattern[start.start() : end.end()], pattern[end.end() :])
         before, varying, after = (re.escape(part).replace(r"\*", r"[^.\[\]/]*") for part in parts)
         expression = re.compile(f"{before}({varying}){after}")
-        found = {m[1]: c for c in self.channels if (m := expression.fullmatch(c.name))}
-        if not found:
+        channels = {m[1]: c for c in self.channels if (m := expression.fullmatch(c.name))}
+        if not channels:
             raise DataError(
                 f"{self.name}: nothing matches {pattern!r}; there are "
                 f"{listed([c.name for c in self.channels], 20)}"
             )
-        return found
+        return channels
 
     def numbers(self, channel: Channel, *, infinite: bool = False) -> FloatArray:
         """Return a channel's numbers, finite unless said, or name the cell that holds another.
@@ -348,11 +348,11 @@ def split_header(text: str) -> tuple[str, str | None]:
         unit = square[3].strip()
         if not _INDEX.fullmatch(unit) or (unit == "1" and square[2]):
             return square[1], unit
-    for found in filter(None, (p.fullmatch(text) for p in (_CURVED, _UNBRACKETED))):
-        if found[2].strip() == "dB":
-            return found[1], "dB"  # of what, whoever needs the gain will ask
+    for match in filter(None, (p.fullmatch(text) for p in (_CURVED, _UNBRACKETED))):
+        if match[2].strip() == "dB":
+            return match[1], "dB"  # of what, whoever needs the gain will ask
         try:
-            return found[1], parse_unit(found[2]).text
+            return match[1], parse_unit(match[2]).text
         except UnitError:
             continue
     return text.strip(), None

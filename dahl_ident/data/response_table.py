@@ -145,13 +145,13 @@ def _with_stated(
 
 def _swept(sweep: str, rows: int) -> FloatArray:
     """Return the frequencies of a sweep, one for each row."""
-    found = _SWEEP.fullmatch(sweep)
-    if found is None:
+    match = _SWEEP.fullmatch(sweep)
+    if match is None:
         raise ValidationError(
             f"sweep is {sweep!r}; expected the first and the last frequency and their spacing, "
             "such as '1 to 100 Hz, log' or '0 to 800 Hz, linear'"
         )
-    first, last, log = float(found[1]), float(found[2]), found[3] == "log"
+    first, last, log = float(match[1]), float(match[2]), match[3] == "log"
     if rows < 2 or not (first > 0.0 if log else first >= 0.0) or not first < last < np.inf:
         raise ValidationError(f"sweep is {sweep!r} for {rows} rows; expected rising frequencies")
     return (np.geomspace if log else np.linspace)(first, last, rows)
@@ -335,8 +335,8 @@ class _Table(Binding):
 
     def _gain_per_drive(self) -> bool:
         """Return whether the response is one for a drive in V or A, such as m/V."""
-        found = [(role, self.channel(role)) for role in ("gain", "gain_db", "real", "response")]
-        units = (self.unit(role, channel).text for role, channel in found if channel is not None)
+        columns = [(role, self.channel(role)) for role in ("gain", "gain_db", "real", "response")]
+        units = (self.unit(role, channel).text for role, channel in columns if channel is not None)
         return any(_per_drive(unit) is not None for unit in units)
 
     def _response(
@@ -378,15 +378,15 @@ class _Table(Binding):
     def _form(self, forms: tuple[tuple[str, ...], ...]) -> tuple[str, ...] | None:
         """Return the one form whose columns are all there; the map decides between several."""
         mapped = [f for f in forms if self.map.roles.keys() >= {*f}]
-        found = [f for f in mapped or forms if all(self.has(role) for role in f)]
-        named = [f for f in found if f[0] in self.map.roles]
-        found = named or found
-        if len(found) > 1:
+        complete = [f for f in mapped or forms if all(self.has(role) for role in f)]
+        named = [f for f in complete if f[0] in self.map.roles]
+        complete = named or complete
+        if len(complete) > 1:
             raise ValidationError(
-                f"both {' and '.join(found[0])} and {' and '.join(found[1])} are there; name one "
-                "of them in columns="
+                f"both {' and '.join(complete[0])} and {' and '.join(complete[1])} are there; "
+                "name one of them in columns="
             )
-        return found[0] if found else None
+        return complete[0] if complete else None
 
     def _factor(self, role: str) -> tuple[Quantity, float, bool]:
         """Return which quantity a column's unit makes it, its factor, and whether it is in dB."""
@@ -444,20 +444,20 @@ class _Table(Binding):
     def _covariance(
         self, form: tuple[str, ...], quantity: Quantity, response: ComplexArray
     ) -> NDArray[np.float64]:
-        given = [self._scaled(role, quantity) for role in form]
+        columns = [self._scaled(role, quantity) for role in form]
         ri = np.zeros(response.shape)
         match form:
             case ("std",):
-                rr = ii = given[0] ** 2
+                rr = ii = columns[0] ** 2
             case ("real_std", "imag_std"):
-                rr, ii = given[0] ** 2, given[1] ** 2
+                rr, ii = columns[0] ** 2, columns[1] ** 2
             case ("gain_std", "phase_std"):
-                along, across = given[0] ** 2, (np.abs(response) * given[1]) ** 2
+                along, across = columns[0] ** 2, (np.abs(response) * columns[1]) ** 2
                 c, s = np.cos(np.angle(response)), np.sin(np.angle(response))
                 rr, ii = along * c**2 + across * s**2, along * s**2 + across * c**2
                 ri = (along - across) * c * s
             case _:
-                rr, ri, ii = given
+                rr, ri, ii = columns
         return np.stack([np.stack([rr, ri], -1), np.stack([ri, ii], -1)], -2)
 
     def _scaled(self, role: str, quantity: str = "dynamic_stiffness") -> Any:
@@ -504,13 +504,13 @@ class _Table(Binding):
         held = self.map.controlled
         if isinstance(held, Mapping):
             label = str(self._labels("level", self.level))
-            found = [w for w in CONTROLLED if fnmatch.fnmatchcase(label, held.get(w, ""))]
-            if len(found) != 1:
+            matches = [w for w in CONTROLLED if fnmatch.fnmatchcase(label, held.get(w, ""))]
+            if len(matches) != 1:
                 raise ValidationError(
-                    f"level {label!r} matches {'both patterns' if found else 'no pattern'} of "
+                    f"level {label!r} matches {'both patterns' if matches else 'no pattern'} of "
                     f"controlled: {dict(held)}"
                 )
-            return found[0]
+            return matches[0]
         if held is not None:
             return held
         channel = self.channel("controlled")
@@ -525,9 +525,9 @@ class _Table(Binding):
     def _quality(self) -> dict[str, NDArray[Any]]:
         """Return the verdicts that an earlier save listed, in the types they had."""
         kinds = self.source.metadata.get("quality", {})
-        found = {name: self.source.find(name) for name in kinds}
-        self.used |= {channel.name for channel in found.values()}
-        return {name: _typed(found[name].values, kind) for name, kind in kinds.items()}
+        channels = {name: self.source.find(name) for name in kinds}
+        self.used |= {channel.name for channel in channels.values()}
+        return {name: _typed(channels[name].values, kind) for name, kind in kinds.items()}
 
 
 def _per_drive(text: str) -> tuple[str, str, int] | None:

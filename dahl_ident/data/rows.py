@@ -121,12 +121,12 @@ def _optional() -> list[str]:
 
 
 def _all_or_none(tables: Sequence[FrequencyResponse], name: str) -> NDArray[Any] | None:
-    given = [getattr(table, name) is not None for table in tables]
-    if not any(given):
+    present = [getattr(table, name) is not None for table in tables]
+    if not any(present):
         return None
-    if not all(given):
+    if not all(present):
         raise DataError(
-            f"table {given.index(False)} has no {name}, table {given.index(True)} has; "
+            f"table {present.index(False)} has no {name}, table {present.index(True)} has; "
             "tables estimated together must agree in what they hold"
         )
     return _stacked(tables, name)

@@ -75,11 +75,11 @@ def noted(provenance: Mapping[str, Any] | None) -> list[tuple[str, str]]:
 
 def doubts(provenance: Mapping[str, Any] | None) -> list[str]:
     """Return the warnings that were shown on reading data, and what they were made from."""
-    found: list[str] = []
+    warnings: list[str] = []
     for part in _origins(provenance):
         file = f"{part['file']}: " if "file" in part else ""
-        found += [f"{file}{text}" for text in part.get("warnings", ())]
-    return list(dict.fromkeys(found))
+        warnings += [f"{file}{text}" for text in part.get("warnings", ())]
+    return list(dict.fromkeys(warnings))
 
 
 def assumes_frequency(provenance: Mapping[str, Any] | None) -> bool:
