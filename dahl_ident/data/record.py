@@ -22,7 +22,7 @@ from dahl_ident.arrays import (
     non_negative_number,
     positive_number,
 )
-from dahl_ident.data.columns import column, frozen_copy, frozen_mapping, one_of
+from dahl_ident.data.columns import RECORD_COLUMNS, column, frozen_copy, frozen_mapping, one_of
 from dahl_ident.data.storage import plain_data
 from dahl_ident.data.tabular import Lines, Tabular, extent, noted
 from dahl_ident.errors import DataWarning, ValidationError
@@ -106,17 +106,10 @@ class Record(Tabular):
         motion: Motion = "translation",
         provenance: Mapping[str, Any] | None = None,
     ) -> None:
-        seconds = _time(time)
-        n = seconds.size
-        channels: dict[str, ArrayLike | None] = {
-            "displacement": displacement,
-            "velocity": velocity,
-            "acceleration": acceleration,
-            "force": force,
-            "drive": drive,
-        }
+        given = {name: value for name, value in locals().items() if name in RECORD_COLUMNS}
+        seconds = _time(given.pop("time"))
         values: dict[str, Any] = {
-            name: column(value, name, n, finite_array) for name, value in channels.items()
+            name: column(value, name, seconds.size, finite_array) for name, value in given.items()
         }
         for name, samples in values.items():
             size = 0.0 if samples is None else float(np.abs(samples).max())
@@ -125,10 +118,10 @@ class Record(Tabular):
                     f"no sample of {name} is above {size:.3g} in size; expected at least "
                     f"{_SMALLEST:g}: check the unit"
                 )
-        given = [name for name in MOTION_KINDS if values[name] is not None]
-        if len(given) != 1:
+        motions = [name for name in MOTION_KINDS if values[name] is not None]
+        if len(motions) != 1:
             raise ValidationError(
-                f"expected exactly one of {', '.join(MOTION_KINDS)}, got {given or 'none'}"
+                f"expected exactly one of {', '.join(MOTION_KINDS)}, got {motions or 'none'}"
             )
         if force is None and drive is None:
             raise ValidationError("neither force nor drive is given; a record needs one of them")
