@@ -101,6 +101,19 @@ def test_read_from_a_file_and_stored(tmp_path: Path) -> None:
     assert "damping ratio" in str(read)
 
 
+def test_a_saved_backbone_keeps_every_column(tmp_path: Path) -> None:
+    data = di.FrequencyResponse.backbone(
+        [1e-4, 1e-3], [21.0, 20.0], [0.02, 0.03], frequency_std=0.01, damping_ratio_std=1e-3,
+        drive=[0.1, 0.2], dof=7.0, amplitude_std=[1e-6, 1e-6], level=["a", "b"],
+        quality={"settled": [True, False]},
+    )  # fmt: skip
+    read = di.read_frequency_response(data.save(tmp_path / "backbone.csv"))
+    for name in ("response", "drive", "dof", "amplitude_std", "covariance"):
+        np.testing.assert_allclose(getattr(read, name), getattr(data, name))
+    assert read.levels == ["a", "b"]
+    assert read.quality["settled"].tolist() == [True, False]
+
+
 def test_what_cannot_be_done_is_refused() -> None:
     data = measured()
     with pytest.raises(ModelError, match="up to the mass"):
