@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.data import file_lock
+from dahl_ident.data import storage
 from dahl_ident.data.storage import library
 from dahl_ident.errors import SamplingError
 from dahl_ident.problem import Problem
@@ -179,7 +179,7 @@ def test_a_lock_left_by_a_killed_run_or_removed_by_another_does_not_matter(
     lock = tmp_path / "chain.h5.lock"
     lock.touch()
     seen: list[bool] = []
-    is_still = file_lock._is_still
+    is_still = storage._is_still
 
     def removed_once(path: Path, file: Any) -> bool:
         if not seen:
@@ -187,7 +187,7 @@ def test_a_lock_left_by_a_killed_run_or_removed_by_another_does_not_matter(
         seen.append(is_still(path, file))
         return seen[-1]
 
-    monkeypatch.setattr(file_lock, "_is_still", removed_once)
+    monkeypatch.setattr(storage, "_is_still", removed_once)
     assert sampled(path, seed=9, steps=60).steps == 60
     assert seen == [False, True]
     assert not lock.exists()

@@ -71,7 +71,7 @@ class _Sums:
         columns = np.column_stack([self.X, self.y])
         sums = np.stack([self.of_devices(w * c) for c in columns.T], axis=-1)
         G = columns.T @ (w[:, None] * columns) - sums.T @ (shrink[:, None] * sums)
-        C = np.linalg.inv(G[:-1, :-1])
+        C = np.asarray(np.linalg.inv(G[:-1, :-1]), dtype=np.float64)
         b = C @ G[:-1, -1]
         log_det = -np.log(w).sum() + np.log1p(tau**2 * total).sum()
         squares = G[-1, -1] - G[:-1, -1] @ b
@@ -81,7 +81,7 @@ class _Sums:
 
     def of_devices(self, values: FloatArray) -> FloatArray:
         """Return the sum of values of each device's fits."""
-        return np.bincount(self.device, values, self.devices)
+        return np.bincount(self.device, values, self.devices).astype(np.float64)
 
 
 class _Solution(NamedTuple):
