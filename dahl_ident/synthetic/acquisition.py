@@ -13,8 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.signal import lfilter
 
 from dahl_ident.arrays import (
     ComplexArray,
@@ -125,6 +123,9 @@ class Channel:
 
         The filter is exact for a signal that is linear between 16 points per sample.
         """
+        from scipy.interpolate import CubicSpline
+        from scipy.signal import lfilter
+
         if self.antialias_hz is None:
             return signal
         early = start - abs(self.delay) - step

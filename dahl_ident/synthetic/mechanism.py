@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, Model
@@ -85,6 +84,8 @@ class Mechanism:
 
     def _integrated(self, force: Waveform) -> Signal:
         """Return x(t) from even samples, between which it is interpolated by its derivatives."""
+        from scipy.interpolate import CubicHermiteSpline
+
         steps = int(np.ceil(force.duration * force.highest_frequency_hz * _PER_PERIOD))
         time, length = np.linspace(0.0, force.duration, steps + 1, retstep=True)
         place = 0.5 - 0.5 * np.cos(np.pi * (np.arange(8) + 0.5) / 8)

@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from scipy.optimize import brentq
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element
@@ -223,6 +222,8 @@ class _Run:
     def _first_turn(self, x: FloatArray) -> float:
         """Return the position in [0, 1] of the reversal; 0 if at the start, 1 if there is none."""
         speed = self._friction.direction * (FINE_DERIVATIVE @ x)
+        from scipy.optimize import brentq
+
         noise = _NOISE * max(self._peak, float(np.max(np.abs(x))))
         backwards = speed < -noise
         if not backwards.any():
