@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import dahl_ident as di
 from dahl_ident.cli.app import main
 from dahl_ident.errors import DataError
+from tests.command_line import Runner
 from tests.test_record_fit import DAHL, recorded
 
 MAP = """
@@ -147,3 +149,29 @@ def test_a_waveform_of_a_plan_is_no_record(tmp_path: Path) -> None:
     place = plan.write_waveform(tmp_path / "wave.csv", 1000.0)
     with pytest.raises(DataError, match="holds no measured force"):
         di.read_record(place)
+
+
+def test_two_days_of_waveforms_are_compared(run: Runner) -> None:
+    """Parameters of the device change, not the first force, offset and drift of a record."""
+    time = np.arange(600) / 100.0
+    x = 5e-3 * np.sin(2.0 * time) * (0.2 + 0.8 * np.sin(0.6 * time) ** 2)
+    for day, f_max in (("monday", 0.10), ("friday", 0.12)):
+        noise = 5e-4 * np.random.default_rng(int(1000 * f_max)).standard_normal(600)
+        force = np.zeros(600)
+        for i, dx in enumerate(np.diff(x), 1):  # the exact solution of Dahl's equation
+            end = f_max * np.sign(dx)
+            force[i] = end + (force[i - 1] - end) * np.exp(-30.0 / f_max * abs(dx))
+        table = np.c_[time, x, force + noise]
+        np.savetxt(f"{day}.csv", table, delimiter=",", comments="",
+                   header="time [s],displacement [m],force [N]")  # fmt: skip
+        run("fit", f"{day}.csv", "--record", "--alpha", "1", "--save", f"{day}.json")
+    told = run("fit", "monday.json", "friday.json", "--report", "r.html")
+    assert told.status in (0, 3), told.err
+    changes = {
+        line.split()[0]: line for line in told.out.splitlines() if " from monday to " in line
+    }
+    assert set(changes) == {"f_max", "sigma"}
+    found = re.search(r": (\S+) ± (\S+) N ", changes["f_max"])
+    assert found is not None
+    assert abs(float(found[1]) - 0.02) < 4.0 * float(found[2])
+    assert "Changes from each measurement" in Path("r.html").read_text(encoding="utf-8")

@@ -176,7 +176,13 @@ def test_what_must_not_be_used_is_crossed_out_with_its_reason(
     bent = di.FrequencyResponse(
         np.ones(20), not_dahl.response * (1 + 2 * (np.arange(20) % 2)), not_dahl.amplitude
     )
-    rows = _result_rows(text_of(di.fit(bent, di.Dahl(), throw=False)))
+    text = text_of(di.fit(bent, di.Dahl(), throw=False))
+    assert "Derived: " not in text
+    for table, columns in (("## Parameters", slice(1, 3)), ("## Stiffness and d", slice(1, None))):
+        lines = text.split(table)[1].split("\n## ")[0].splitlines()
+        cells = [line.strip("| ").split(" | ") for line in lines if line.startswith("|")][2:]
+        assert [row for row in cells if row[0] != "alpha" and "~~" not in row[columns][0]] == []
+    rows = _result_rows(text)
     for cells in rows.values():
         assert all(cell.startswith("~~") for cell in cells[1:4])
     assert "does not describe the data" in rows["sigma"][-1]

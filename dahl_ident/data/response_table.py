@@ -178,8 +178,9 @@ class _Table(Binding):
             self._refuse_waveforms()
             if options.frequency is None and rows and not self.has("amplitude"):
                 raise ValidationError(
-                    "no column holds the frequency; name it with columns={'frequency': ...}, or "
-                    "say what was swept, such as sweep='1 to 100 Hz, log'"
+                    "no column holds the frequency (inspect proposes a column map); name it with "
+                    "columns={'frequency': ...}, or say what was swept, such as "
+                    "sweep='1 to 100 Hz, log'"
                 )
             if not rows:
                 self.required("frequency")

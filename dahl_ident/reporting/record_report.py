@@ -78,7 +78,8 @@ def record_document(
             )
         front.append(Section(f"What was assumed{of}", (Bullets(tuple(_assumed(fit, given))),)))
         front.append(Section(f"Pictures{of}", tuple(_pictures(fit, number))))
-        lines = (*fit.goodness.lines, *(f"Derived: {quantity}" for quantity in fit.derived()))
+        derived = fit.derived() if fit.status is not VerdictStatus.NOT_DESCRIBED else ()
+        lines = (*fit.goodness.lines, *(f"Derived: {quantity}" for quantity in derived))
         details.append(Section(f"Goodness of fit{of}", (Bullets(lines),), details=True))
     for one in drawn:
         front.append(Section("Posterior", tuple(posterior_sections.answer(one))))

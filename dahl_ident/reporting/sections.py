@@ -292,7 +292,8 @@ def _parameters(fit: FitResult, drawn: Sequence[ChainPosterior]) -> Iterator[Blo
     for found in intervals:
         by_note.setdefault(found.note, []).append(tables.method_name(found))
     notes = [f"Intervals by {listed(names)}: {note}" for note, names in by_note.items()]
-    yield Bullets((*notes, *(f"Derived: {quantity}" for quantity in fit.derived())))
+    derived = fit.derived() if fit.status is not VerdictStatus.NOT_DESCRIBED else ()
+    yield Bullets((*notes, *(f"Derived: {quantity}" for quantity in derived)))
 
 
 def _goodness(fit: FitResult) -> Iterator[Block]:

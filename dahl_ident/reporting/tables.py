@@ -12,6 +12,7 @@ from dahl_ident.diagnostics.formatting import interval, rounded
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Verdict
 from dahl_ident.reporting.document import Cell, Table, number, words
+from dahl_ident.results.changes import is_usable
 from dahl_ident.units import si_unit
 
 if TYPE_CHECKING:
@@ -141,15 +142,20 @@ def parameters(
     rows = []
     for name, estimate in fit.params.items():
         value, error = rounded(estimate.value, estimate.stderr)
+        bad = name in fit.var_names and not is_usable(fit, name)
+        lost = fit.status is VerdictStatus.NOT_DESCRIBED  # then no interval holds either
         row = [
             Cell(name),
-            Cell(value, estimate.value) if np.isfinite(estimate.value) else Cell("none finite"),
-            Cell(error if estimate.vary else "fixed", _finite(estimate.stderr)),
+            Cell(value, estimate.value, bad)
+            if np.isfinite(estimate.value)
+            else Cell("none finite"),
+            Cell(error if estimate.vary else "fixed", _finite(estimate.stderr), bad),
             Cell(estimate.unit or "-"),
         ]
         for found in at:
             limits = found.get(name)
-            row.append(Cell(interval(limits.lower, limits.upper, "") if limits else "-"))
+            shown = interval(limits.lower, limits.upper, "") if limits else "-"
+            row.append(Cell(shown, struck=bool(limits) and lost))
         row += [Cell(credible_interval(posterior, name)) for posterior in drawn]
         rows.append((*row, Cell(estimate.description)))
     methods = [*(method_name(one) for one in intervals), *("posterior" for _ in drawn)]
@@ -187,7 +193,8 @@ def linearization(fit: FitResult) -> Table | None:
     for found in fit.derived(sizes.tolist(), f):
         if found.amplitude is not None:
             value, error = rounded(found.value, found.stderr)
-            cell = Cell(f"{value} \u00b1 {error}", found.value)
+            lost = fit.status is VerdictStatus.NOT_DESCRIBED
+            cell = Cell(f"{value} \u00b1 {error}", found.value, lost)
             columns.setdefault(f"{found.name} [{found.unit}]", []).append(cell)
     rows = tuple(zip(*columns.values(), strict=True))
     caption = f"Friction as an equivalent spring and damper (damping at {f:.4g} Hz)"

@@ -93,8 +93,8 @@ def changes(fits: Mapping[str, FitResult | RecordFit]) -> list[Change]:
     return [
         _change(name, *earlier, *later)
         for earlier, later in pairwise(fits.items())
-        for name in earlier[1].var_names
-        if name in later[1].var_names
+        for name in (p.name for p in earlier[1].model.parameters)
+        if name in earlier[1].var_names and name in later[1].var_names
     ]
 
 
