@@ -129,7 +129,9 @@ def test_a_parameter_that_a_default_prior_sets_is_not_determined() -> None:
 
 
 def test_refusals() -> None:
-    with pytest.raises(ValidationError, match="uncertainty is 'all'; expected combined or noise"):
+    with pytest.raises(
+        ValidationError, match="uncertainty is 'all'; expected one of combined, noise"
+    ):
         di.posterior(friction_table(), LINEAR, method="grid", uncertainty="all")
     tied = di.fit(
         friction_table(),

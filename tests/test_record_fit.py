@@ -521,7 +521,7 @@ def test_report(tmp_path: Path, ending: str) -> None:
 
 def test_what_records_cannot_do_is_refused_by_name() -> None:
     fit = di.fit(recorded(DAHL, "random", 500, 1e-3), di.Dahl())
-    with pytest.raises(ValidationError, match="method given; a posterior of records takes none"):
+    with pytest.raises(ValidationError, match="method given with a posterior of records"):
         di.posterior(fit.records[0], di.Dahl(), method="grid")  # type: ignore[call-overload]
     with pytest.raises(ValidationError, match="beside a RecordFit"):
         di.posterior(fit, di.Dahl())

@@ -15,9 +15,8 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.convergence import Convergence, judge
-from dahl_ident.bayes.decorrelation import Decorrelation
+from dahl_ident.bayes.density import LogDensity
 from dahl_ident.bayes.moves import moves_for
-from dahl_ident.bayes.priors import JointPrior
 
 _FIRST_CHECK = 200  # steps: three times WARM_UP and LENGTH at an autocorrelation time of 1
 _GROWTH = 1.25  # from check to check: at most a quarter more steps than are needed
@@ -27,40 +26,6 @@ _PIECES = 20  # one piece adds at most this fraction of the chain
 
 RandomState = tuple[Any, ...]
 """As numpy.random.RandomState.get_state returns it."""
-
-
-class LogDensity(Protocol):
-    """A log-posterior over search coordinates, (S, D) -> (S,)."""
-
-    @property
-    def prior(self) -> JointPrior:
-        """Of the model's coordinates."""
-
-    @property
-    def likelihood(self) -> str:
-        """How the data count; "none" for the prior alone."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the coordinates' values."""
-
-    @property
-    def logarithmic(self) -> tuple[bool, ...]:
-        """Which coordinates are logarithms."""
-
-    @property
-    def priors(self) -> dict[str, str]:
-        """Every prior in words."""
-
-    @property
-    def decorrelation(self) -> Decorrelation | None:
-        """Coordinates in which ridges are straight, where there are some."""
-
-    def to_values(self, x: FloatArray) -> FloatArray:
-        """Return values at points."""
-
-    def __call__(self, x: FloatArray) -> FloatArray:
-        """Return the log-density; -inf outside the prior's support."""
 
 
 class Pool(Protocol):

@@ -17,6 +17,7 @@ For outliers a row may count as Student's t in two dimensions with nu = 4 instea
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -30,7 +31,7 @@ from dahl_ident.bayes.row_errors import RowErrors
 from dahl_ident.data.columns import one_of
 from dahl_ident.errors import SamplingError, ValidationError
 from dahl_ident.fitting import solve
-from dahl_ident.problem import Problem, Quadratic
+from dahl_ident.problem import Problem
 
 LIKELIHOODS = ("gaussian", "student_t", "none")
 SCALE = "noise_scale"
@@ -38,8 +39,50 @@ TAIL_DOF = 4.0  # of Student's t: heavy tails for outliers, yet a finite varianc
 _FARTHEST = 300.0  # of ln s
 
 
+class LogDensity(ABC):
+    """A log-posterior over search coordinates; call it with points of shape (S, D)."""
+
+    prior: JointPrior
+    likelihood: str
+
+    @abstractmethod
+    def __call__(self, x: FloatArray) -> FloatArray:
+        """Return the log-density, (S, D) -> (S,); -inf outside the prior's support."""
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether ln s is the last coordinate."""
+        return False
+
+    @property
+    def decorrelation(self) -> Decorrelation | None:
+        """Coordinates in which ridges are straight, where there are some."""
+        return None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coordinates' values, D of them."""
+        return (*(part.parameter.name for part in self.prior.priors), *[SCALE] * self.has_scale)
+
+    @property
+    def logarithmic(self) -> tuple[bool, ...]:
+        """Which coordinates are logarithms."""
+        return (*(part.logarithmic for part in self.prior.priors), *[True] * self.has_scale)
+
+    @property
+    def priors(self) -> dict[str, str]:
+        """Every prior in words."""
+        texts = {part.parameter.name: str(part) for part in self.prior.priors}
+        return texts | ({SCALE: "1/s"} if self.has_scale else {})
+
+    def to_values(self, x: FloatArray) -> FloatArray:
+        """Return values at points of shape (..., D), or (..., P) without the scale."""
+        logarithmic = self.logarithmic[: x.shape[-1]]
+        return np.where(logarithmic, np.exp(np.where(logarithmic, x, 0.0)), x)
+
+
 @dataclass(frozen=True)
-class Density:
+class Density(LogDensity):
     """Log-posterior of a problem; call it with points of shape (S, D).
 
     Attributes
@@ -81,31 +124,9 @@ class Density:
         return not self.problem.scale_known and self.likelihood != "none"
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the coordinates' values, D of them."""
-        return (*self.problem.names, *((SCALE,) if self.has_scale else ()))
-
-    @property
-    def logarithmic(self) -> tuple[bool, ...]:
-        """Which coordinates are logarithms."""
-        own = tuple(p.transform == "log" for p in self.problem.parameters)
-        return (*own, *((True,) if self.has_scale else ()))
-
-    @property
-    def priors(self) -> dict[str, str]:
-        """Every prior in words."""
-        texts = {part.parameter.name: str(part) for part in self.prior.priors}
-        return texts | ({SCALE: "1/s"} if self.has_scale else {})
-
-    @property
     def decorrelation(self) -> Decorrelation | None:
         """Coordinates in which ridges between linear elements and friction are straight."""
         return decorrelation_of(self.tabulated)
-
-    def to_values(self, x: FloatArray) -> FloatArray:
-        """Return values at points of shape (..., D), or (..., P) without the scale."""
-        logarithmic = self.logarithmic[: x.shape[-1]]
-        return np.where(logarithmic, np.exp(np.where(logarithmic, x, 0.0)), x)
 
     def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return theta, (S, P), and s, (S,), which is 1 where it is known."""
@@ -201,22 +222,17 @@ class Density:
         each = each + self.errors.log_weights
         return np.asarray(np.exp(each - logsumexp(each, axis=1, keepdims=True)))
 
-    def quadratic(self, theta: FloatArray, problem: Problem, chart: FloatArray) -> Quadratic:
-        """Return half the sum of squares, at estimated sizes, as `Problem.quadratic` does."""
-        if self.errors is None:
-            return problem.quadratic(theta, chart=chart)
-        errors, m = self.errors, problem.n_residuals
-        y, by = problem.residuals_and_jacobian(errors.held(theta), tails=False)
-        y = y[..., :m] + errors.moved(theta)
+    def curvature(self, theta: FloatArray) -> tuple[float, FloatArray]:
+        """Return half the sum of squares at theta, (P,), and its Hessian, at estimated sizes."""
+        errors, m = self.errors, self.problem.n_residuals
+        assert errors is not None
+        at = theta[None]
+        y, by = self.problem.residuals_and_jacobian(errors.held(at), tails=False)
+        y = y[..., :m] + errors.moved(at)
         by = np.where(np.isnan(errors.centre), by[..., :m, :], errors.slopes)
         with np.errstate(invalid="ignore", over="ignore"):
             y, by = errors.independent(y, by)
-            by = by @ chart
-            cost = 0.5 * np.sum(y**2, axis=-1)
-            gradient = np.einsum("smp,sm->sp", by, y)
-            return Quadratic(
-                np.where(cost < np.inf, cost, np.inf), gradient, by.swapaxes(-1, -2) @ by
-            )
+            return float(0.5 * np.sum(y**2)), by[0].T @ by[0]
 
     def _combined(self, theta: FloatArray) -> FloatArray:
         """Return the log-posterior with shared errors, an unknown scale integrated out."""

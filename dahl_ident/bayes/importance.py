@@ -30,7 +30,7 @@ from dahl_ident.bayes.priors import JointPrior
 if TYPE_CHECKING:
     from scipy.stats import qmc
 
-LogDensity = Callable[[FloatArray], FloatArray]
+Function = Callable[[FloatArray], FloatArray]
 Rows = NDArray[np.intp]
 
 _DOF = 4.0  # of Student's t: tails heavier than those of a posterior, yet few wasted points
@@ -87,7 +87,7 @@ class WeightedPoints:
 
 
 def integrate(
-    log_density: LogDensity,
+    log_density: Function,
     prior: JointPrior,
     centre: FloatArray,
     covariance: FloatArray,
@@ -137,7 +137,7 @@ class _Batch:
 class _Target:
     """The density over phi, in which volumes are those of theta."""
 
-    log_density: LogDensity
+    log_density: Function
     prior: JointPrior
     decorrelation: Decorrelation | None
     evaluations: int = 0

@@ -242,33 +242,57 @@ def joint_prior(
         If a prior is neither a distribution nor two bounds in order, or a parameter has no
         default.
     """
-    given = dict(priors or {})
-    unknown = [name for name in given if name not in problem.names]
+    return prior_of(
+        problem.parameters,
+        np.full(len(problem.names), np.nan) if estimate is None else estimate,
+        {"given": priors or {}, "assumed": assumed or {}, "sensors": problem.priors},
+        lambda parameter, at: _default(problem, parameter, at),
+    )
+
+
+def prior_of(
+    parameters: Sequence[Parameter],
+    estimate: FloatArray,
+    sources: Mapping[str, Mapping[str, Any]],
+    default: Callable[[Parameter, float], tuple[float, float]],
+) -> JointPrior:
+    """Return the prior of every parameter from the first source that has one, or else bounds.
+
+    Parameters
+    ----------
+    parameters : sequence of Parameter
+    estimate : ndarray, shape (P,)
+        Least-squares values, not finite where unknown.
+    sources : mapping of str to mapping of str to distribution or (low, high)
+        Priors by source and name, those that were given under "given".
+    default : callable
+        Returns the bounds of a parameter with an estimate.
+
+    Raises
+    ------
+    ModelError
+        If a prior was given for another name.
+    ValidationError
+        If a prior is neither a distribution nor two bounds in order.
+    """
+    names = [p.name for p in parameters]
+    unknown = [name for name in sources.get("given", {}) if name not in names]
     if unknown:
         raise ModelError(
-            f"there is a prior for {', '.join(unknown)}, but free are "
-            f"{choices(problem.names, *unknown)}"
+            f"there is a prior for {', '.join(unknown)}, but free are {choices(names, *unknown)}"
         )
-    estimates = np.full(len(problem.names), np.nan) if estimate is None else estimate
     parts = []
-    for parameter, at in zip(problem.parameters, estimates, strict=True):
-        name = parameter.name
-        if name in given:
-            prior = checked_prior(parameter, given[name])
-            parts.append(ParameterPrior(parameter, prior, "given", float(at)))
-        elif assumed and name in assumed:
-            prior = checked_prior(parameter, assumed[name])
-            parts.append(ParameterPrior(parameter, prior, "assumed", float(at)))
-        elif name in problem.priors:
-            prior = checked_prior(parameter, problem.priors[name])
-            parts.append(ParameterPrior(parameter, prior, "sensors", float(at)))
+    for parameter, at in zip(parameters, estimate.tolist(), strict=True):
+        source = next((s for s, priors in sources.items() if parameter.name in priors), None)
+        if source is None:
+            parts.append(ParameterPrior(parameter, default(parameter, at), "default"))
         else:
-            bounds = _default(problem, parameter, float(at))
-            parts.append(ParameterPrior(parameter, bounds, "default"))
+            prior = _checked_prior(parameter, sources[source][parameter.name])
+            parts.append(ParameterPrior(parameter, prior, source, at))
     return JointPrior(tuple(parts))
 
 
-def checked_prior(parameter: Parameter, given: Any) -> PriorLike:
+def _checked_prior(parameter: Parameter, given: Any) -> PriorLike:
     """Return a prior as it was given, or raise where it is none for the parameter."""
     frozen = not hasattr(given, "freeze")  # as those of scipy.stats without parameters have
     if frozen and all(hasattr(given, name) for name in ("logpdf", "cdf", "ppf")):

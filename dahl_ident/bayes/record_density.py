@@ -23,21 +23,15 @@ from functools import cached_property
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.bayes.decorrelation import Decorrelation
-from dahl_ident.bayes.priors import (
-    JointPrior,
-    ParameterPrior,
-    PriorLike,
-    checked_prior,
-    default_bounds,
-)
-from dahl_ident.errors import FitError, ModelError, SamplingError, choices
+from dahl_ident.bayes.density import LogDensity
+from dahl_ident.bayes.priors import JointPrior, PriorLike, default_bounds, prior_of
+from dahl_ident.errors import FitError, SamplingError
 from dahl_ident.fitting.record_start import in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
 
 @dataclass(frozen=True)
-class RecordDensity:
+class RecordDensity(LogDensity):
     """Log-posterior of the model's free parameters; call it with points of shape (S, P).
 
     Attributes
@@ -58,26 +52,6 @@ class RecordDensity:
     dof: float
     prior: JointPrior
     likelihood = "gaussian"
-    decorrelation: Decorrelation | None = None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the model's free parameters."""
-        return tuple(p.name for p in self.problem.free)
-
-    @property
-    def logarithmic(self) -> tuple[bool, ...]:
-        """Which coordinates are logarithms."""
-        return tuple(p.transform == "log" for p in self.problem.free)
-
-    @property
-    def priors(self) -> dict[str, str]:
-        """Every prior in words."""
-        return {part.parameter.name: str(part) for part in self.prior.priors}
-
-    def to_values(self, x: FloatArray) -> FloatArray:
-        """Return values at points of shape (..., P)."""
-        return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, x, 0.0)), x)
 
     @property
     def centre(self) -> FloatArray:
@@ -169,38 +143,15 @@ def record_prior(
         By parameter name; the rest gets wide bounds from the size of force and motion.
     estimate : ndarray
         Least-squares values, the model's first.
-
-    Returns
-    -------
-    JointPrior
-
-    Raises
-    ------
-    ModelError
-        If a name is not that of a free parameter of the model.
-    ValidationError
-        If a prior is neither a distribution nor two bounds in order.
     """
-    given = dict(priors or {})
-    names = [p.name for p in problem.free]
-    unknown = [name for name in given if name not in names]
-    if unknown:
-        raise ModelError(
-            f"there is a prior for {', '.join(unknown)}, but free are {choices(names, *unknown)}"
-        )
-    parts = []
-    for parameter, at in zip(problem.free, estimate.tolist(), strict=False):
-        if parameter.name in given:
-            prior = checked_prior(parameter, given[parameter.name])
-            parts.append(ParameterPrior(parameter, prior, "given", at))
-        else:
-            declared = parameter.dimension
-
-            def sizes(powers: tuple[int, int, int] = declared) -> FloatArray:
-                return _sizes(problem, powers)
-
-            parts.append(ParameterPrior(parameter, default_bounds(parameter, at, sizes), "default"))
-    return JointPrior(tuple(parts))
+    return prior_of(
+        problem.free,
+        estimate[: len(problem.free)],
+        {"given": priors or {}},
+        lambda parameter, at: default_bounds(
+            parameter, at, lambda: _sizes(problem, parameter.dimension)
+        ),
+    )
 
 
 def _sizes(problem: RecordProblem, powers: tuple[int, int, int]) -> FloatArray:

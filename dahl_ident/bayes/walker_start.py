@@ -13,11 +13,10 @@ from functools import partial
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.bayes.chain import LogDensity
-from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.density import Density, LogDensity
 from dahl_ident.errors import FitError, SamplingError
 from dahl_ident.fitting import Optimum, solve
-from dahl_ident.problem import Problem, Quadratic
+from dahl_ident.problem import Problem
 from dahl_ident.sensors import Sensors
 
 _WIDER = 2.0  # times the posterior's spread: R-hat needs starts wider than the posterior
@@ -119,7 +118,7 @@ def centre_and_covariance(
         if density.errors is None:
             known = _with_normal_priors(problem).information(theta, scale)
         else:
-            known = _by_data(density, theta).hessian[0] / scale**2
+            known = density.curvature(theta)[1] / scale**2
         precision = precision + known
     size = 1.0 / np.sqrt(np.diagonal(precision))
     return theta, np.linalg.inv(precision * np.outer(size, size)) * np.outer(size, size)
@@ -206,7 +205,7 @@ def _scale(density: Density, theta: FloatArray) -> float:
     if density.errors is None:
         squares = float(density.squares(theta[None]).sum())
     else:
-        squares = 2.0 * float(_by_data(density, theta).cost[0])
+        squares = 2.0 * density.curvature(theta)[0]
     scale = float(np.sqrt(squares / density.problem.n_residuals))
     if not scale > _EXACT:
         raise SamplingError(
@@ -214,7 +213,3 @@ def _scale(density: Density, theta: FloatArray) -> float:
             "scale could be estimated; data without noise need a covariance for sampling"
         )
     return scale
-
-
-def _by_data(density: Density, theta: FloatArray) -> Quadratic:
-    return density.quadratic(theta[None], density.problem, np.eye(len(theta)))

@@ -7,15 +7,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from typing import Literal, NamedTuple, overload
+from inspect import signature
+from typing import Any, Literal, NamedTuple, overload
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray, positive_number, whole_number
-from dahl_ident.bayes.chain import Chain, LogDensity, Pool, Settings, run
+from dahl_ident.bayes.chain import Chain, Pool, Settings, run
 from dahl_ident.bayes.checkpoint import Stored, identity, open_chain
 from dahl_ident.bayes.convergence import Convergence
-from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.density import Density, LogDensity
 from dahl_ident.bayes.importance import integrate
 from dahl_ident.bayes.priors import PriorLike, joint_prior
 from dahl_ident.bayes.record_density import RecordDensity, record_prior
@@ -26,6 +27,7 @@ from dahl_ident.bayes.walker_start import (
     starting_points,
 )
 from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.data.columns import one_of
 from dahl_ident.diagnostics.error_model import EXPONENT, error_model, with_assumed
 from dahl_ident.diagnostics.shared_errors import row_errors
 from dahl_ident.elements import Element
@@ -226,67 +228,80 @@ def posterior(
     >>> grid.converged, round(float(grid.quantile("f_max", 0.5)), 2)
     (True, 0.1)
     """
-    if method not in METHODS:
-        raise ValidationError(f"method is {method!r}; expected {' or '.join(METHODS)}")
-    if not isinstance(data, FrequencyResponse | FitResult):
-        refused = {
-            "method": method != "mcmc", "noise": noise is not None, "sensors": sensors is not None,
-            "likelihood": likelihood != "gaussian", "pool": pool is not None,
-            "uncertainty": uncertainty != "combined",
-            "tolerance": tolerance != 1e-3,
-        }  # fmt: skip
-        given = [name for name, is_given in refused.items() if is_given]
-        if given:
-            raise ValidationError(f"{', '.join(given)} given; a posterior of records takes none")
-        recorded = _record_fit(data, model, free, fixed)
-        record_density = RecordDensity(
-            recorded.problem,
-            recorded.optimum.values,
-            recorded.covar[: len(recorded.problem.free), : len(recorded.problem.free)],
-            recorded.errors.dof,
-            record_prior(recorded.problem, priors, recorded.optimum.values),
-        )
-        settings = _settings(record_density, seed, steps, max_steps, ess, walkers, ensembles)
-        start = partial(scattered, record_density, record_density.centre, record_density.root)
-        chain, verdict, settings = _chain(
-            record_density, start, settings, seed, resume, None, progress
-        )
-        return refuse_unusable(RecordPosterior(recorded, record_density, chain, verdict, settings))
-    for_chain = {
-        "steps": steps is not None, "max_steps": max_steps != 20000, "ess": ess != 2000.0,
-        "walkers": walkers is not None, "ensembles": ensembles != 4, "resume": resume is not None,
-        "pool": pool is not None,
-    }  # fmt: skip
-    _refuse_other_methods(method, for_chain, {"tolerance": tolerance != 1e-3})
+    options = {**locals()}
+    one_of(method, "method", METHODS)
+    of_records = not isinstance(data, FrequencyResponse | FitResult)
+    _refuse_options("a posterior of records" if of_records else f"method={method!r}", options)
     if pool is not None and not callable(getattr(pool, "map", None)):
         raise ValidationError(f"pool is {pool!r}; expected an object with map, such as a Pool")
-    if uncertainty not in UNCERTAINTIES:
-        raise ValidationError(
-            f"uncertainty is {uncertainty!r}; expected {' or '.join(UNCERTAINTIES)}"
+    one_of(uncertainty, "uncertainty", UNCERTAINTIES)
+    _refuse_beside_a_fit(data, options)
+    made: Callable[[Chain, Convergence, Settings], ChainPosterior | RecordPosterior]
+    density: LogDensity
+    if isinstance(data, FrequencyResponse | FitResult):
+        problem, fit = _fit(data, model, noise, sensors, free, fixed, steady)
+        case = _case(problem, fit, priors, likelihood, uncertainty)
+        if method == "grid":
+            return _grid(case, tolerance)
+        density, start = case.density, partial(starting_points, case.density, case.optimum)
+        made = partial(ChainPosterior, case.density, fit=case.fit, uncertainty=case.uncertainty)
+    else:
+        recorded = (
+            data
+            if isinstance(data, RecordFit)
+            else fit_any(data, _checked(model), free=free, fixed=fixed, throw=False)
         )
-    problem, fit = _fit(data, model, noise, sensors, free, fixed, steady)
-    case = _case(problem, fit, priors, likelihood, uncertainty)
-    if method == "grid":
-        return _grid(case, tolerance)
-    settings = _settings(case.density, seed, steps, max_steps, ess, walkers, ensembles)
-    start = partial(starting_points, case.density, case.optimum)
-    chain, verdict, settings = _chain(case.density, start, settings, seed, resume, pool, progress)
-    return refuse_unusable(
-        ChainPosterior(case.density, chain, verdict, settings, case.fit, case.uncertainty)
-    )
+        density = _record_density(recorded, priors)
+        start = partial(scattered, density, density.centre, density.root)
+        made = partial(RecordPosterior, recorded, density)
+    settings = _settings(density, seed, steps, max_steps, ess, walkers, ensembles)
+    return refuse_unusable(made(*_chain(density, start, settings, seed, resume, pool, progress)))
 
 
-def _refuse_other_methods(
-    method: str, for_chain: Mapping[str, bool], for_grid: Mapping[str, bool]
-) -> None:
-    """Refuse options that belong only to the other method."""
-    other = for_grid if method == "mcmc" else for_chain
-    given = [name for name, is_given in other.items() if is_given]
+_CHAIN_ONLY = ("steps", "max_steps", "ess", "walkers", "ensembles", "resume", "pool")
+_TABLES_ONLY = ("method", "noise", "sensors", "steady", "likelihood", "uncertainty")
+_REFUSED = {
+    "a posterior of records": (*_TABLES_ONLY, "pool", "tolerance"),
+    "method='mcmc'": ("tolerance",),
+    "method='grid'": _CHAIN_ONLY,
+}
+
+
+def _refuse_options(kind: str, options: Mapping[str, Any]) -> None:
+    """Refuse options that a kind of posterior does not have, unless they are left as they are."""
+    defaults = signature(posterior).parameters
+    given = [name for name in _REFUSED[kind] if options[name] != defaults[name].default]
     if given:
         raise ValidationError(
-            f"{', '.join(given)} given with method={method!r}, which has no such option; leave "
-            f"it out, or use method={next(m for m in METHODS if m != method)!r}"
+            f"{', '.join(given)} given with {kind}, which has no such option; leave it out"
         )
+
+
+def _refuse_beside_a_fit(data: object, options: Mapping[str, Any]) -> None:
+    """Refuse what a fit has already."""
+    if not isinstance(data, FitResult | RecordFit):
+        return
+    names = ("model", "noise", "sensors", "fixed", "steady")
+    given = [name for name in names if options[name] is not None]
+    given += ["free"] if tuple(options["free"]) else []
+    if given:
+        raise ValidationError(
+            f"{', '.join(given)} is given beside a {type(data).__name__}, which has its own; pass "
+            "the data instead"
+        )
+
+
+def _checked(model: Element | None) -> Element:
+    if model is None:
+        raise ModelError("there is no model; give one, such as Dahl(), or pass a fit")
+    return model
+
+
+def _record_density(fit: RecordFit, priors: Mapping[str, PriorLike] | None) -> RecordDensity:
+    values, count = fit.optimum.values, len(fit.problem.free)
+    prior = record_prior(fit.problem, priors, values)
+    covariance = fit.covar[:count, :count]
+    return RecordDensity(fit.problem, values, covariance, fit.errors.dof, prior)
 
 
 class _Case(NamedTuple):
@@ -356,24 +371,6 @@ def _grid(case: _Case, tolerance: float) -> GridPosterior:
     return GridPosterior(density, grid, tolerance, case.fit, case.uncertainty)
 
 
-def _record_fit(
-    data: Record | Sequence[Record] | RecordFit,
-    model: Element | None,
-    free: Iterable[str],
-    fixed: Mapping[str, float] | None,
-) -> RecordFit:
-    if isinstance(data, RecordFit):
-        if model is not None or fixed is not None or tuple(free):
-            raise ValidationError(
-                "model, free or fixed is given beside a RecordFit, which has its own; pass the "
-                "records instead"
-            )
-        return data
-    if model is None:
-        raise ModelError("there is no model; give one, such as Dahl(), or pass a RecordFit")
-    return fit_any(data, model, free=free, fixed=fixed, throw=False)
-
-
 def _chain(
     density: Density | RecordDensity,
     start_with: Callable[[int, np.random.Generator], FloatArray],
@@ -433,26 +430,12 @@ def _fit(
 ) -> tuple[Problem, FitResult | None]:
     """Return the problem, and its least-squares fit; None where there are too few data for one."""
     if isinstance(data, FitResult):
-        given = {
-            "model": model,
-            "noise": noise,
-            "sensors": sensors,
-            "fixed": fixed,
-            "steady": steady,
-        }
-        extra = [name for name, value in given.items() if value is not None]
-        if extra or tuple(free):
-            raise ValidationError(
-                f"{', '.join([*extra, *(['free'] if tuple(free) else [])])} is given beside a "
-                "FitResult, which has its own; pass the data instead"
-            )
         if data.first_order:
             raise ValidationError(
                 "the fit had constraints, which a posterior does not take; pass the data instead"
             )
         return data.problem, data
-    if model is None:
-        raise ModelError("there is no model; give one, such as Dahl(), or pass a FitResult")
+    model = _checked(model)
     problem = Problem(
         data, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady or "exact"
     )

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray, whole_number
-from dahl_ident.bayes.chain import LogDensity
+from dahl_ident.bayes.density import LogDensity
 from dahl_ident.bayes.priors import PriorLike
 from dahl_ident.data.storage import plain_data
 from dahl_ident.diagnostics.statements import doubted
