@@ -133,7 +133,7 @@ class Campaign:
 
 
 def campaign(
-    source: str | Path | Mapping[str, Any] | Definition,
+    source: str | Path | Mapping[str, Any],
     *,
     jobs: int | None = None,
     executor: Executor | None = None,
@@ -154,9 +154,8 @@ def campaign(
 
     Parameters
     ----------
-    source : path, mapping or Definition
-        TOML file, its content, or what was read from it; see
-        :mod:`dahl_ident.campaigns.definition`.
+    source : path or mapping
+        TOML file, or its content; see :mod:`dahl_ident.campaigns.definition`.
     jobs : int, optional
         Processes of this machine, with one numerical thread each; by default as many as there
         are processors. Elsewhere: the number of fits at a time.
@@ -224,7 +223,7 @@ def campaign(
     >>> campaign(definition, jobs=1).table[["device", "sigma"]].round(1).to_dict("list")
     {'device': ['clean', 'noisy'], 'sigma': [30.0, 30.0]}
     """
-    definition = source if isinstance(source, Definition) else read_definition(source)
+    definition = read_definition(source)
     limits = (timeout, memory)
     for name, limit in zip(("timeout", "memory"), limits, strict=True):
         if limit is not None:

@@ -80,7 +80,7 @@ def campaign(
         progress = stack.enter_context(_progress()) if sys.stderr.isatty() else _lines()
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # this command says it itself
         done = run_campaign(
-            read, jobs=jobs, scheduler=scheduler, timeout=timeout, memory=memory,
+            definition, jobs=jobs, scheduler=scheduler, timeout=timeout, memory=memory,
             patience=patience, send_files=send_files, dry_run=dry_run, redo=redo, progress=progress,
         )  # fmt: skip
     if report is not None and not dry_run:
