@@ -180,8 +180,8 @@ def test_what_must_not_be_used_is_crossed_out_with_its_reason(
     assert "Derived: " not in text
     for table, columns in (("## Parameters", slice(1, 3)), ("## Stiffness and d", slice(1, None))):
         lines = text.split(table)[1].split("\n## ")[0].splitlines()
-        cells = [line.strip("| ").split(" | ") for line in lines if line.startswith("|")][2:]
-        assert [row for row in cells if row[0] != "alpha" and "~~" not in row[columns][0]] == []
+        struck = [line.strip("| ").split(" | ") for line in lines if line.startswith("|")][2:]
+        assert [row for row in struck if row[0] != "alpha" and "~~" not in row[columns][0]] == []
     rows = _result_rows(text)
     for cells in rows.values():
         assert all(cell.startswith("~~") for cell in cells[1:4])

@@ -25,16 +25,7 @@ def export(
         one_of(
             "Format: a simulator, a controller, a paper, or other budgets.",
             None,
-            "mujoco",
-            "mujoco-frictionloss",
-            "urdf",
-            "modelica",
-            "matlab",
-            "c",
-            "gtc",
-            "ufloat",
-            "latex",
-            "draws",
+            "mujoco|mujoco-frictionloss|urdf|modelica|matlab|c|gtc|ufloat|latex|draws",
         ),
     ] = "",
     output: Annotated[

@@ -23,24 +23,24 @@ from dahl_ident.cli.options import (
     Sheet,
     Writing,
     controlled_option,
+    in_panel,
     one_of,
     quantity,
+    reading,
 )
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
 
-_READING = "Reading"
 _EXTRACTING = "Extracting"
+_extracting = in_panel(_EXTRACTING)
 
 
 @dataclass(frozen=True)
 class RecordReading(Channels):
     """Reading of records; the options of ``read_record``."""
 
-    columns: Annotated[
-        Path | None, typer.Option(help="Column map, a TOML file.", rich_help_panel=_READING)
-    ] = None
+    columns: Annotated[Path | None, reading("Column map, a TOML file.")] = None
     drive: Channel = None
     drive_factor: DriveFactor = None
     drive_factor_uncertainty: DriveFactorUncertainty = None
@@ -54,30 +54,20 @@ class Extracting:
     frequency: Annotated[
         float | None, quantity("Excitation frequency if known.", "Hz", _EXTRACTING)
     ] = None
-    mode: Annotated[str, one_of("auto, steps or sweep.", _EXTRACTING, "auto", "steps", "sweep")] = (
-        "auto"
-    )
-    num_periods: Annotated[
-        int | None,
-        typer.Option(help="Last periods of each segment to use.", rich_help_panel=_EXTRACTING),
-    ] = None
+    mode: Annotated[str, one_of("auto, steps or sweep.", _EXTRACTING, "auto|steps|sweep")] = "auto"
+    num_periods: Annotated[int | None, _extracting("Last periods of each segment to use.")] = None
     settling_periods: Annotated[
-        int | None,
-        typer.Option(help="Leading periods of each segment to omit.", rich_help_panel=_EXTRACTING),
+        int | None, _extracting("Leading periods of each segment to omit.")
     ] = None
     harmonics: Annotated[
         str | None,
-        typer.Option(
-            help="Harmonics to extract, 0 to 9: by default the odd ones, and the even ones of an "
-            "asymmetric force; if force is controlled, only 1.",
-            rich_help_panel=_EXTRACTING,
+        _extracting(
+            "Harmonics to extract, 0 to 9: by default the odd ones, and the even ones of an "
+            "asymmetric force; if force is controlled, only 1."
         ),
     ] = None
     controlled: Annotated[str, controlled_option(_EXTRACTING)] = "displacement"
-    min_share: Annotated[
-        float,
-        typer.Option(help="Minimum share of the sine in the power.", rich_help_panel=_EXTRACTING),
-    ] = 0.6
+    min_share: Annotated[float, _extracting("Minimum share of the sine in the power.")] = 0.6
 
     def keywords(self) -> dict[str, Any]:
         """Return the arguments of ``extract``."""
@@ -107,8 +97,7 @@ def extract(
     ] = None,
     plot: Annotated[str | None, typer.Option(help="Plot to write, such as points.png.")] = None,
     level_from_name: Annotated[
-        str | None,
-        typer.Option(help="Regular expression for file names; its group is the level."),
+        str | None, typer.Option(help="Regular expression for file names; its group is the level.")
     ] = None,
     jobs: Annotated[int, typer.Option(help="Number of processes for several files.")] = 1,
     good_only: Annotated[

@@ -23,6 +23,7 @@ from dahl_ident.cli.options import (
     Laws,
     Reading,
     Writing,
+    in_panel,
     noise_option,
     one_of,
     steady_option,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from dahl_ident.results.result import Result
 
 _ESTIMATING = "Estimating"
+_estimating = in_panel(_ESTIMATING)
 TAKEN = ("model", "free", "fixed", "start")  # by a fit of records
 _OF_RECORDS = ("columns", "drive", "drive_factor", "drive_factor_uncertainty", "sheet")
 ReportPlace = Annotated[
@@ -56,8 +58,7 @@ Predicted = Annotated[
         "With --record: force or motion is predicted from the other; by default motion where "
         "the model has a mass.",
         None,
-        "force",
-        "motion",
+        "force|motion",
     ),
 ]
 
@@ -69,11 +70,7 @@ class Estimating:
     method: Annotated[
         str,
         one_of(
-            "lm, scipy (least_squares) or ipopt (interior point).",
-            _ESTIMATING,
-            "lm",
-            "scipy",
-            "ipopt",
+            "lm, scipy (least_squares) or ipopt (interior point).", _ESTIMATING, "lm|scipy|ipopt"
         ),
     ] = "lm"
     noise: Annotated[str | None, noise_option(_ESTIMATING)] = None
@@ -82,19 +79,13 @@ class Estimating:
         one_of(
             "linear, huber, soft_l1 or student_t; all but the first down-weight outliers.",
             _ESTIMATING,
-            "linear",
-            "huber",
-            "soft_l1",
-            "student_t",
+            "linear|huber|soft_l1|student_t",
         ),
     ] = "linear"
     steady: Annotated[str, steady_option(_ESTIMATING)] = "exact"
     start: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Additional initial value for the search, f_max=0.1; once for each parameter.",
-            rich_help_panel=_ESTIMATING,
-        ),
+        _estimating("Additional initial value for the search, f_max=0.1; once for each parameter."),
     ] = None
 
     def keywords(self) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli.distributions import FREE, known, number_or_free
+from dahl_ident.cli.options import in_panel
 from dahl_ident.errors import ModelError, ValidationError, choices
 
 if TYPE_CHECKING:
@@ -28,11 +29,7 @@ _CHANNELS = ("force_gain", "displacement_gain", "delay")
 OTHERS = ("mass", "damping", "stiffness")
 
 
-def model_option(help_text: str) -> Any:
-    """Return an option of the model."""
-    return typer.Option(help=help_text, rich_help_panel=MODEL)
-
-
+model_option = in_panel(MODEL)
 ELEMENT_HELP = (
     "An element instead of Dahl friction, by its kind and known values: 'bouc_wen', "
     "'dahl(f_max=0.1, alpha=free)', 'mass(0.3)'; once for each."

@@ -20,6 +20,14 @@ STANDARD = "-"
 _READING = "Reading"
 
 
+def in_panel(panel: str) -> Callable[[str], Any]:
+    """Return what makes options of one panel of the help from their texts."""
+    return lambda help_text: typer.Option(help=help_text, rich_help_panel=panel)
+
+
+reading = in_panel(_READING)
+
+
 def _existing(patterns: list[str]) -> list[str]:
     """Return the files of all patterns; refuse absent ones before heavy libraries are loaded."""
     files: list[str] = []
@@ -35,8 +43,9 @@ def _existing(patterns: list[str]) -> list[str]:
     return files
 
 
-def one_of(help_text: str, panel: str | None, *names: str) -> Any:
-    """Return an option with these values, which the shell completes."""
+def one_of(help_text: str, panel: str | None, values: str) -> Any:
+    """Return an option with values such as ``"lm|scipy"``, which the shell completes."""
+    names = values.split("|")
 
     def check(value: str | None) -> str | None:
         if value is not None and value not in names:
@@ -57,21 +66,23 @@ def steady_option(panel: str) -> Any:
     """Return the option of how the response to a force that is held is predicted."""
     return one_of(
         "Response to a force that is held: exact, or 'describing function' (a sine assumed).",
-        panel, "exact", "describing function",
-    )  # fmt: skip
+        panel,
+        "exact|describing function",
+    )
 
 
 def noise_option(panel: str) -> Any:
     """Return the option of the noise of the rows."""
     return one_of(
         "measured, relative or absolute; by default measured if a covariance is known.",
-        panel, "measured", "relative", "absolute",
-    )  # fmt: skip
+        panel,
+        "measured|relative|absolute",
+    )
 
 
 def controlled_option(panel: str) -> Any:
     """Return the option of what was held."""
-    return one_of("Controlled quantity: displacement or force.", panel, "displacement", "force")
+    return one_of("Controlled quantity: displacement or force.", panel, "displacement|force")
 
 
 def quantity(help_text: str, unit: str, panel: str | None = None) -> Any:
@@ -94,19 +105,17 @@ Files = Annotated[
 ]
 Channel = Annotated[
     str | None,
-    typer.Option(help='Its column, with unit if needed: "x \\[mm]".', rich_help_panel=_READING),
+    reading('Its column, with unit if needed: "x \\[mm]".'),
 ]
 DriveFactor = Annotated[
     str | None,
-    typer.Option(help='Force for one unit of drive, "12.5 N/V".', rich_help_panel=_READING),
+    reading('Force for one unit of drive, "12.5 N/V".'),
 ]
 DriveFactorUncertainty = Annotated[
     float | None,
-    typer.Option(help="Its relative standard uncertainty.", rich_help_panel=_READING),
+    reading("Its relative standard uncertainty."),
 ]
-Sheet = Annotated[
-    str | None, typer.Option(help="Sheet of an Excel workbook.", rich_help_panel=_READING)
-]
+Sheet = Annotated[str | None, reading("Sheet of an Excel workbook.")]
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
 
 
@@ -217,11 +226,10 @@ class Channels:
     acceleration: Channel = None
     force: Channel = None
     sample_rate: Annotated[
-        float | None,
-        quantity("For files without a time column.", "Hz", _READING),
+        float | None, quantity("For files without a time column.", "Hz", _READING)
     ] = None
     missing: Annotated[
-        str, one_of("Treatment of empty samples: error or drop.", _READING, "error", "drop")
+        str, one_of("Treatment of empty samples: error or drop.", _READING, "error|drop")
     ] = "error"
 
 
@@ -229,71 +237,41 @@ class Channels:
 class Reading:
     """Reading of tables; the options of ``read_frequency_response``."""
 
-    columns: Annotated[
-        Path | None, typer.Option(help="Column map, a TOML file.", rich_help_panel=_READING)
-    ] = None
+    columns: Annotated[Path | None, reading("Column map, a TOML file.")] = None
     quantity: Annotated[
         str | None,
-        typer.Option(
-            help="Response quantity, such as receptance; by default it follows from the unit.",
-            rich_help_panel=_READING,
-        ),
+        reading("Response quantity, such as receptance; by default it follows from the unit."),
     ] = None
-    amplitude: Annotated[
-        str | None,
-        typer.Option(help='Displacement amplitude, "5 um rms".', rich_help_panel=_READING),
-    ] = None
+    amplitude: Annotated[str | None, reading('Displacement amplitude, "5 um rms".')] = None
     drive: Annotated[
-        str | None,
-        typer.Option(
-            help='Force amplitude, "0.2 N" or "{level} N"; of a record its column.',
-            rich_help_panel=_READING,
-        ),
+        str | None, reading('Force amplitude, "0.2 N" or "{level} N"; of a record its column.')
     ] = None
     frequency: Annotated[float | None, quantity("Frequency of all rows.", "Hz", _READING)] = None
     sweep: Annotated[
         str | None,
-        typer.Option(
-            help='Frequencies of all rows where no column holds them: "1 to 100 Hz, log".',
-            rich_help_panel=_READING,
-        ),
+        reading('Frequencies of all rows where no column holds them: "1 to 100 Hz, log".'),
     ] = None
     drive_factor: DriveFactor = None
     drive_factor_uncertainty: DriveFactorUncertainty = None
-    level: Annotated[
-        str | None, typer.Option(help="Label for all rows.", rich_help_panel=_READING)
-    ] = None
+    level: Annotated[str | None, reading("Label for all rows.")] = None
     level_from_name: Annotated[
-        str | None,
-        typer.Option(
-            help="Regular expression for file names; its group is the level.",
-            rich_help_panel=_READING,
-        ),
+        str | None, reading("Regular expression for file names; its group is the level.")
     ] = None
     controlled: Annotated[str | None, controlled_option(_READING)] = None
     where: Annotated[
         str | None,
-        typer.Option(
-            help="Keep the rows that meet a condition: '0.2 <= frequency_hz < 5 and level > 3'.",
-            rich_help_panel=_READING,
-        ),
+        reading("Keep the rows that meet a condition: '0.2 <= frequency_hz < 5 and level > 3'."),
     ] = None
-    levels: Annotated[
-        str | None, typer.Option(help="Keep only these levels: 1,2,5.", rich_help_panel=_READING)
-    ] = None
+    levels: Annotated[str | None, reading("Keep only these levels: 1,2,5.")] = None
     runs: Annotated[
         str | None,
-        typer.Option(
-            help="Keep only these runs: day1,day2. Each of several files is a run, or a level if "
-            "it holds one of its own.",
-            rich_help_panel=_READING,
+        reading(
+            "Keep only these runs: day1,day2. Each of several files is a run, or a level if "
+            "it holds one of its own."
         ),
     ] = None
     sheet: Sheet = None
-    passive: Annotated[
-        bool,
-        typer.Option(help="Refuse a table with a net gain of energy.", rich_help_panel=_READING),
-    ] = True
+    passive: Annotated[bool, reading("Refuse a table with a net gain of energy.")] = True
 
     def read(self, files: list[str]) -> FrequencyResponse:
         """Read the files into one table."""

@@ -20,6 +20,7 @@ from dahl_ident.cli.options import (
     Seed,
     Writing,
     controlled_option,
+    in_panel,
     one_of,
     quantity,
     steady_option,
@@ -30,16 +31,10 @@ _LIMITS = {
     "frequency": "Hz", "displacement": "m", "force": "N", "speed": "m/s", "acceleration": "m/s^2",
 }  # fmt: skip
 _BENCH = "Bench"
-_AIM = "Aim"
 _RANGE = "the highest value, or lowest:highest"
 
 
-def _bench(help_text: str) -> Any:
-    return typer.Option(help=help_text, rich_help_panel=_BENCH)
-
-
-def _aim(help_text: str) -> Any:
-    return typer.Option(help=help_text, rich_help_panel=_AIM)
+_bench, _aim = in_panel(_BENCH), in_panel("Aim")
 
 
 @dataclass(frozen=True)
@@ -62,8 +57,7 @@ class Bench:
             "Plan motions in time, for a fit of records: trapezoid or multisine; without it, "
             "settled sines.",
             _BENCH,
-            "trapezoid",
-            "multisine",
+            "trapezoid|multisine",
         ),
     ] = None
     noise: Annotated[
@@ -154,8 +148,7 @@ def plan(
         Path | None, typer.Option(help="File for the waveform of one run for the exciter, .csv.")
     ] = None,
     sample_rate: Annotated[
-        float | None,
-        quantity("Sample rate of the waveform, and of the records of --motion.", "Hz"),
+        float | None, quantity("Sample rate of the waveform, and of the records of --motion.", "Hz")
     ] = None,
     picture: Annotated[
         Path | None,

@@ -46,8 +46,7 @@ def report(
         ),
     ] = ["report.html"],  # noqa: B006 - typer takes lists as lists
     waveforms: Annotated[
-        Path | None,
-        typer.Option(help="Waveforms of the table; the report shows how they settled."),
+        Path | None, typer.Option(help="Waveforms of the table; the report shows how they settled.")
     ] = None,
     waveforms_columns: Annotated[
         Path | None, typer.Option(help="Column map of these waveforms, a TOML file.")

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from dahl_ident.cli import console
 from dahl_ident.cli.distributions import prior
 from dahl_ident.cli.fit import (
@@ -32,6 +30,7 @@ from dahl_ident.cli.options import (
     Laws,
     Reading,
     Writing,
+    in_panel,
     noise_option,
     one_of,
     steady_option,
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
     pass
 
 _SAMPLING = "Sampling"
+_sampling = in_panel(_SAMPLING)
 _CHAIN = ("seed", "steps", "max_steps", "ess", "walkers", "ensembles", "resume")
 
 
@@ -54,63 +54,40 @@ class Sampling:
         one_of(
             "mcmc, or grid: integration over up to three parameters, without a chain.",
             _SAMPLING,
-            "mcmc",
-            "grid",
+            "mcmc|grid",
         ),
     ] = "mcmc"
     prior: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Bounds of a parameter, f_max=0.01:1, or a distribution of scipy.stats, "
-            "'mass=norm(0.3, 0.001)'; once for each.",
-            rich_help_panel=_SAMPLING,
+        _sampling(
+            "Bounds of a parameter, f_max=0.01:1, or a distribution of scipy.stats, "
+            "'mass=norm(0.3, 0.001)'; once for each."
         ),
     ] = None
     noise: Annotated[str | None, noise_option(_SAMPLING)] = None
     steady: Annotated[str, steady_option(_SAMPLING)] = "exact"
     likelihood: Annotated[
-        str,
-        one_of("gaussian, student_t or none.", _SAMPLING, "gaussian", "student_t", "none"),
+        str, one_of("gaussian, student_t or none.", _SAMPLING, "gaussian|student_t|none")
     ] = "gaussian"
     uncertainty: Annotated[
         str,
         one_of(
             "combined: every source of the fit's budget; noise: independent noise alone.",
             _SAMPLING,
-            "combined",
-            "noise",
+            "combined|noise",
         ),
     ] = "combined"
     seed: Annotated[
         int | None,
-        typer.Option(
-            help="Seed of the random numbers; by default that of the chain in --resume, or 1.",
-            rich_help_panel=_SAMPLING,
-        ),
+        _sampling("Seed of the random numbers; by default that of the chain in --resume, or 1."),
     ] = None
-    steps: Annotated[
-        int | None,
-        typer.Option(help="Total steps; by default until converged.", rich_help_panel=_SAMPLING),
-    ] = None
-    max_steps: Annotated[
-        int, typer.Option(help="Maximum steps, converged or not.", rich_help_panel=_SAMPLING)
-    ] = 20000
-    ess: Annotated[
-        float, typer.Option(help="Effective draws wanted.", rich_help_panel=_SAMPLING)
-    ] = 2000.0
-    walkers: Annotated[
-        int | None,
-        typer.Option(help="Walkers in all ensembles together.", rich_help_panel=_SAMPLING),
-    ] = None
-    ensembles: Annotated[
-        int, typer.Option(help="Independent groups of walkers.", rich_help_panel=_SAMPLING)
-    ] = 4
+    steps: Annotated[int | None, _sampling("Total steps; by default until converged.")] = None
+    max_steps: Annotated[int, _sampling("Maximum steps, converged or not.")] = 20000
+    ess: Annotated[float, _sampling("Effective draws wanted.")] = 2000.0
+    walkers: Annotated[int | None, _sampling("Walkers in all ensembles together.")] = None
+    ensembles: Annotated[int, _sampling("Independent groups of walkers.")] = 4
     resume: Annotated[
-        Path | None,
-        typer.Option(
-            help="HDF5 file that keeps the chain; a stopped run continues from it.",
-            rich_help_panel=_SAMPLING,
-        ),
+        Path | None, _sampling("HDF5 file that keeps the chain; a stopped run continues from it.")
     ] = None
 
     def keywords(self) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from dahl_ident.cli.options import (
     Seed,
     Writing,
     controlled_option,
+    in_panel,
     one_of,
     quantity,
     steady_option,
@@ -37,7 +38,9 @@ if TYPE_CHECKING:
     from dahl_ident.synthetic import Experiment
 
 _EXCITATION = "Excitation"
+_excitation = in_panel(_EXCITATION)
 _ERRORS = "Errors"
+_errors = in_panel(_ERRORS)
 _UNITS = {"displacement": "m", "force": "N"}
 _SPAN = (0.1, 10.0)  # of the characteristic displacement, if no levels are given
 _COUNT = 30  # levels: 15 a decade, as in the shipped data sets
@@ -80,30 +83,20 @@ class Excitation:
 
     levels: Annotated[
         str | None,
-        typer.Option(
-            help="Amplitudes, 0.1,1mm or low:high:count; by default 30 around the knee.",
-            rich_help_panel=_EXCITATION,
-        ),
+        _excitation("Amplitudes, 0.1,1mm or low:high:count; by default 30 around the knee."),
     ] = None
-    frequency: Annotated[
-        str, typer.Option(help="Frequencies, in the same form.", rich_help_panel=_EXCITATION)
-    ] = "1Hz"
+    frequency: Annotated[str, _excitation("Frequencies, in the same form.")] = "1Hz"
     controlled: Annotated[str, controlled_option(_EXCITATION)] = "displacement"
     order: Annotated[
         str,
         one_of(
             "given, ascending, descending or random.",
             _EXCITATION,
-            "given",
-            "ascending",
-            "descending",
-            "random",
+            "given|ascending|descending|random",
         ),
     ] = "given"
-    settling_periods: Annotated[
-        int, typer.Option(help="Before measuring.", rich_help_panel=_EXCITATION)
-    ] = 10
-    num_periods: Annotated[int, typer.Option(help="Measured.", rich_help_panel=_EXCITATION)] = 5
+    settling_periods: Annotated[int, _excitation("Before measuring.")] = 10
+    num_periods: Annotated[int, _excitation("Measured.")] = 5
     record: Annotated[
         bool, typer.Option("--record", help="Waveforms, not a table.", rich_help_panel=_EXCITATION)
     ] = False
@@ -114,17 +107,9 @@ class Errors:
     """Noise: relative in a table, absolute in a record."""
 
     displacement_std: Annotated[
-        float,
-        typer.Option(
-            help="Displacement noise: of a table, relative; of samples, m.", rich_help_panel=_ERRORS
-        ),
+        float, _errors("Displacement noise: of a table, relative; of samples, m.")
     ] = 0.0
-    force_std: Annotated[
-        float,
-        typer.Option(
-            help="Force noise: of a table, relative; of samples, N.", rich_help_panel=_ERRORS
-        ),
-    ] = 0.0
+    force_std: Annotated[float, _errors("Force noise: of a table, relative; of samples, N.")] = 0.0
 
 
 @dataclass(frozen=True)
