@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -111,9 +113,15 @@ def write_tables(rows: Callable[[], Iterator[dict[str, Any]]], folder: Path) -> 
                 columns[name] = str if columns.get(name, type(value)) is str else type(value)
     rest = [c for c in columns if c not in _FIRST]
     order = [*(c for c in _FIRST if c in columns), *sorted(rest)]
-    _written(folder / "results.csv", rows, order, columns, _csv)
-    if _has_pyarrow():
-        _written(folder / "results.parquet", rows, order, columns, _parquet)
+    writers = {"results.csv": _csv}
+    if find_spec("pyarrow") is not None:
+        writers["results.parquet"] = _parquet
+    for name, write in writers.items():
+        path, frames = folder / name, _frames(rows, order, columns)
+        try:
+            put_in_place(path, partial(write, frames))
+        except OSError as exc:
+            raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
     return statuses
 
 
@@ -151,26 +159,13 @@ def _frames(
     yield frame(block)
 
 
-def _written(
-    path: Path,
-    rows: Callable[[], Iterator[dict[str, Any]]],
-    order: Sequence[str],
-    columns: Mapping[str, type],
-    write: Callable[[Path, Iterator[pd.DataFrame]], None],
-) -> None:
-    try:
-        put_in_place(path, lambda part: write(part, _frames(rows, order, columns)))
-    except OSError as exc:
-        raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
-
-
-def _csv(path: Path, frames: Iterator[pd.DataFrame]) -> None:
+def _csv(frames: Iterator[pd.DataFrame], path: Path) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         for number, frame in enumerate(frames):
             inert(frame).to_csv(file, index=False, header=number == 0, lineterminator="\n")
 
 
-def _parquet(path: Path, frames: Iterator[pd.DataFrame]) -> None:
+def _parquet(frames: Iterator[pd.DataFrame], path: Path) -> None:
     pyarrow, parquet = library("pyarrow"), library("pyarrow.parquet")
     writer = None
     for frame in frames:
@@ -179,9 +174,3 @@ def _parquet(path: Path, frames: Iterator[pd.DataFrame]) -> None:
         writer.write_table(table)
     if writer is not None:
         writer.close()
-
-
-def _has_pyarrow() -> bool:
-    from importlib.util import find_spec
-
-    return find_spec("pyarrow") is not None

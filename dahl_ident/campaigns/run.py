@@ -245,8 +245,8 @@ def campaign(
             allowed = Limits(*limits, journal.seconds)
             keys = _keys(definition, allowed)
             outcome = _split(definition, keys, set(journal.places))
-            missing = [(key, task) for key, task in zip(keys, definition.tasks, strict=True)
-                       if key not in journal.places]  # fmt: skip
+            tagged = list(zip(keys, definition.tasks, strict=True))
+            missing = [tag for tag in tagged if tag[0] not in journal.places]
             jobs_of = ((tag, _job(definition, tag, send_files, laws)) for tag in missing)
             lost: LostError | None = None
             with _place(jobs, executor, scheduler) as place:
@@ -265,8 +265,7 @@ def campaign(
                             progress(number, len(missing), row)
                 except LostError as exc:
                     lost = exc
-            there = [(key, task) for key, task in zip(keys, definition.tasks, strict=True)
-                     if key in journal.places]  # fmt: skip
+            there = [tag for tag in tagged if tag[0] in journal.places]
 
             def rows() -> Iterator[dict[str, Any]]:
                 found = journal.rows(key for key, _ in there)

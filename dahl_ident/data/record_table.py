@@ -190,7 +190,8 @@ def _without_rounding(bound: Binding, time: FloatArray) -> FloatArray:
     if time.size < _FEWEST_STAMPS or is_even(time):
         return time
     step = (time[-1] - time[0]) / (time.size - 1)
-    digits = (d for d in range(12) if _are_whole(time, 10.0**-d))
+    ratios = (time * 10.0**d for d in range(12))
+    digits = (d for d, r in enumerate(ratios) if np.abs(r - np.round(r)).max() < 1e-3)
     resolution = 10.0 ** -next(digits, 12)
     middle = np.arange(time.size) - 0.5 * (time.size - 1)
     grid = time.mean() + middle * float(middle @ time / (middle @ middle))
@@ -198,11 +199,6 @@ def _without_rounding(bound: Binding, time: FloatArray) -> FloatArray:
         return time  # of coarser stamps, one that is missing would not be seen
     bound.notes.append(f"times are rounded to {resolution:g}, and taken as even")
     return np.asarray(grid)
-
-
-def _are_whole(time: FloatArray, unit: float) -> bool:
-    ratio = time / unit
-    return bool(np.abs(ratio - np.round(ratio)).max() < 1e-3)
 
 
 def _drive(bound: Binding, channel: Channel) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -126,7 +127,7 @@ class Tabular(ABC):
 
     def __reduce__(self) -> tuple[Any, ...]:
         arguments = plain_mappings((f.name, getattr(self, f.name)) for f in fields(self))
-        return _rebuild, (type(self), arguments)
+        return partial(type(self), **arguments), ()
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write a file that the package reads again, with nothing lost.
@@ -164,7 +165,3 @@ class Tabular(ABC):
         from dahl_ident.data.storage import save_frame
 
         return save_frame(self.to_frame(), path, overwrite=overwrite)
-
-
-def _rebuild(kind: type[Tabular], arguments: dict[str, Any]) -> Tabular:
-    return kind(**arguments)

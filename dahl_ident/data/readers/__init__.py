@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -281,16 +281,12 @@ def record_pieces(
     edges = [i * n // pieces for i in range(pieces + 1)]
     for start, stop in pairwise(edges):
         channels = (c.part(slice(start, stop)) if c.size == n else c for c in source.channels)
-        row_name = partial(_row_after, source.row_name, start)
-        part = replace(source, channels=tuple(channels), row_name=row_name)
+        named = partial(lambda first, row: source.row_name(first + row), start)
+        part = replace(source, channels=tuple(channels), row_name=named)
         record = record_from(part, bound, missing)
         if bound.sample_rate is not None:
             record = replace(record, time=record.time + start / bound.sample_rate)
         yield record
-
-
-def _row_after(row_name: Callable[[int], str], start: int, row: int) -> str:
-    return row_name(start + row)
 
 
 def _as_saved(data: FrequencyResponse) -> FrequencyResponse:
@@ -379,8 +375,8 @@ def _given(**options: Any) -> dict[str, Any]:
 
 def _parsed(file: File, sheet: str | None) -> Source:
     """Pass a file to its reader; readers are imported when first used."""
-    room, _, name = FORMATS[file.format].reader.partition(".")
-    read = getattr(import_module(f"{__name__}.{room}"), name)
+    module, _, name = FORMATS[file.format].reader.partition(".")
+    read = getattr(import_module(f"{__name__}.{module}"), name)
     source: Source = read(file, sheet) if name == "read_workbook" else read(file)
     return source
 

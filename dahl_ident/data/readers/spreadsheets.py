@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -242,15 +242,11 @@ def frame_source(
         frame = frame.reset_index()
     if not len(frame) or not len(frame.columns):
         raise DataError(f"{name}: the table is empty")
+    headers = [split_header(str(label)) for label in frame.columns]
     channels = tuple(
-        Channel(*_named(label, _plain(frame.iloc[:, i]))) for i, label in enumerate(frame.columns)
+        Channel(header, _plain(frame.iloc[:, i]), unit) for i, (header, unit) in enumerate(headers)
     )
     return Source(name, kind, channels, sha256, metadata=metadata)
-
-
-def _named(label: Hashable, values: NDArray[Any]) -> tuple[str, NDArray[Any], str | None]:
-    name, unit = split_header(str(label))
-    return name, values, unit
 
 
 def _plain(series: pd.Series[Any]) -> NDArray[Any]:
