@@ -14,10 +14,7 @@ from dahl_ident.diagnostics import ErrorModel, budget, error_model
 from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.error_sources import repeated_levels
 from dahl_ident.diagnostics.variance_components import (
-    Columns,
-    Contrasts,
     LinearModel,
-    likelihood,
     variance_components,
 )
 from dahl_ident.errors import FitError
@@ -61,22 +58,6 @@ class TestVariances:
         best = optimize.minimize(minus_log_density, np.zeros(2), method="Nelder-Mead")
         found = variance_components(model, np.array([1.0, 0.0]))
         np.testing.assert_allclose(found.variances, np.exp(best.x), rtol=0.02)
-
-    @pytest.mark.parametrize("variances", [(1.0, 0.5, 2.0), (1.0, 0.0, 2.0), (0.1, 0.3, 0.0)])
-    def test_columns_give_what_dense_matrices_give(self, variances: tuple[float, ...]) -> None:
-        """Pairs of residuals with a column of their own beside columns of all, and a prior."""
-        rng = np.random.default_rng(5)
-        own = np.zeros((30, 2, 30))
-        own[np.arange(30), :, np.arange(30)] = rng.standard_normal((30, 2))
-        Z = [np.repeat(rng.uniform(1.0, 2.0, 30), 2), own.reshape(60, 30)]
-        Z = [np.append(z, np.zeros((1, *z.shape[1:])), axis=0) for z in Z]
-        J, last = rng.standard_normal((61, 3)), np.append(np.zeros(60), 1.0)
-        Z.append(rng.standard_normal((61, 4)) * (1.0 - last)[:, None])
-        model = LinearModel(rng.standard_normal(61), J, last, Z)
-        assert isinstance(likelihood(model), Columns)
-        one, other = (of(model).at(np.array(variances)) for of in (Contrasts, Columns))
-        for a, b in zip(one, other, strict=True):
-            np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=1e-9, atol=1e-9)
 
     def test_variances_many_decades_apart_keep_their_own_errors(self) -> None:
         """Two days apart by much more than the noise: one degree of freedom, 2 s^4 its variance."""

@@ -85,11 +85,11 @@ def departures(
         found = {_SMOOTH: noise_of_rows(errors) ** 2}
     if not any(found.values()):
         return None
-    where, apart = places(amplitude, omega), any(source.part for source in errors.sources)
+    where = places(amplitude, omega)
     every_source = StructuredSources(problem, errors.theta, where)
     sources = [
         source
-        for source in every_source.at(errors.theta, errors.near, apart=apart)
+        for source in every_source.at(errors.theta, errors.near)
         if source.name == MODEL_ERROR and found.get(_kind(source))
     ]
     size = [np.sqrt(found[_kind(source)]) for source in sources]
@@ -107,12 +107,12 @@ def departures(
     return Departures(there @ turned, _information(errors, missed @ turned), assumed)
 
 
-_SMOOTH = (False, "", "")
+_SMOOTH = (False, "")
 
 
-def _kind(source: Source) -> tuple[bool, str, str]:
+def _kind(source: Source) -> tuple[bool, str]:
     parallel = source.shapes is not None and source.shapes.parallel
-    return parallel, "" if source.rate_of is None else source.rate_of[0], source.part
+    return parallel, "" if source.rate_of is None else source.rate_of[0]
 
 
 def _information(errors: ErrorModel, columns: FloatArray) -> FloatArray:

@@ -28,7 +28,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -42,11 +41,8 @@ from dahl_ident.diagnostics.error_sources import (
     TESTS,
     Source,
     StructuredSources,
-    additive,
-    gain_and_phase,
-    of_one_scale,
+    noise_of,
     own_errors,
-    relative_scatter,
     rows_of_tests,
     run_deviations,
 )
@@ -61,14 +57,12 @@ from dahl_ident.diagnostics.run_deviations import (
     linearization,
 )
 from dahl_ident.diagnostics.variance_components import (
-    CLOSE,
     Likelihood,
     LinearModel,
     Projection,
     RowProjection,
     VarianceComponents,
     block_diagonal,
-    likelihood,
     variance_components,
 )
 from dahl_ident.fitting import Optimum
@@ -82,9 +76,6 @@ _FEWEST_TESTS = 5  # of which each is left out in turn
 _TESTS_THAT_LIMIT = 8  # fewer may agree by chance although the model errs
 _BY_CHANCE = 2.0  # standard deviations
 _SHARED_BY = 4.0  # tests at most that a smooth model error moves alike, of its length
-_ASKED_FOR = {MODEL_ERROR: 0.3, NOISE: 0.5}  # rise of the log-likelihood that a source takes
-_RATE = 0.1  # the same for a force limit that changes with speed
-_SUPPORTED = 4.0  # the same for another kind of noise: 0.5 % of the tables, by chance
 _LEAST_DOF = 4  # residuals beyond the parameters, below which there is noise alone
 _FEW_ROWS = 100  # with more, rows are compressed to directions that the sources affect
 _CALIBRATIONS = {
@@ -233,8 +224,8 @@ class ErrorModel:
         problem, theta, optimum = self.problem, self.theta, self.optimum
         known = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
         values = [
-            known[name] if not np.isfinite(1.0 / known.get(name, 1.0)) else self.values[name]
-            for name in self.names
+            value if self.holds(name) else known.get(name, value)
+            for name, value in self.values.items()
         ]
         C = self.covariance.copy()
         open_ = [i for i, name in enumerate(self.names) if not self.holds(name)]
@@ -385,43 +376,23 @@ def _estimated(
     theta = estimate.theta
     if basis is not None:
         basis = basis.at(theta)
-    noise: tuple[Source, ...] | None = None
-    apart = False  # whether gain and phase have errors of their own size
     shared = StructuredSources(problem, theta) if _tells(problem, assumed) else None
-    starts: dict[tuple[int, ...] | None, FloatArray] = {}
+    apart = own_errors(problem, _standing_apart(optimum))
     runs: RunDeviations | None = None
+    start: FloatArray | None = None
     for _ in range(_STEPS):
         near = linearization(problem, theta, runs)
         y, whole = rows.at(theta, near)
         if not np.isfinite(y).all():
             raise np.linalg.LinAlgError("a drive beyond the force limit has no steady response")
-        level = float(y[:m] @ y[:m]) / max(dof, 1)
-        rest = () if shared is None else shared.at(theta, near, apart=apart)
         J = whole if basis is None else whole @ basis.matrix
-        lever = estimate.lever(J)
-        plain = of_one_scale(problem)
-        if rest and m <= 2 * _FEW_ROWS:
-            scatter = relative_scatter(problem, theta)
-            plain = (*of_one_scale(problem, beside=bool(scatter)), *scatter)
-        sources, linear, found = _supported(
-            problem, y, J, lever, noise or plain, rest, level, starts
-        )
-        if noise is None:
-            noise = plain
-            if rest and m <= 2 * _FEW_ROWS:
-                scales = of_one_scale(problem, beside=True)
-                kinds = (
-                    (*scales, *relative_scatter(problem, theta, apart=True))
-                    if problem.scale_known
-                    else gain_and_phase(problem),
-                    () if problem.scale_known else additive(problem),
-                    _noise_and_own_errors(optimum, plain),
-                )
-                noise, sources, linear, found = _kind_of_noise(
-                    problem, y, J, lever, (sources, linear, found), level, (plain, *kinds)
-                )
-                apart = noise is kinds[0]
-                starts = starts if noise is plain else {}
+        noise = noise_of(problem, theta, few=m <= 2 * _FEW_ROWS and shared is not None)
+        sources = noise if shared is None else (*noise, *apart, *shared.at(theta, near))
+        linear, contrasts = linear_model(problem, y, J, sources, estimate.lever(J))
+        level = 0.0 if problem.scale_known else float(y[:m] @ y[:m]) / max(dof, 1)
+        floor = np.array([level * (s.columns.ndim == 1) for s in sources])
+        found = _asked_for(contrasts, sources, floor if start is None else start, floor)
+        start = found.variances
         projection = Projection(linear, found.variances)
         before, runs = runs, run_deviations(problem, sources, projection.effects())
         if runs is not None:  # these are about the estimate that V weighs
@@ -430,6 +401,12 @@ def _estimated(
             runs = runs.about(move, range(len(theta)))
         if alike(before, runs):
             break
+    always = [s.name == NOISE and not s.price for s in sources]
+    kept = np.flatnonzero((found.variances > 0.0) | always).tolist()
+    sources = tuple(sources[k] for k in kept)
+    linear = replace(linear, Z=[linear.Z[k] for k in kept])
+    found = found.only(kept)
+    projection = Projection(linear, found.variances)
     assert linear.lever is not None
     G = given = linear.lever if basis is None else basis.matrix @ linear.lever
     contributions = _by_source(problem, assumed, sources, linear, found, G)
@@ -509,22 +486,44 @@ def _at_least(contributions: dict[str, FloatArray], least: FloatArray) -> dict[s
     return {**contributions, TESTS: _positive(C * np.outer(wider, wider) - C)}
 
 
-def _noise_and_own_errors(optimum: Optimum, noise: tuple[Source, ...]) -> tuple[Source, ...]:
-    """Return noise and an error of each row that stands apart; empty where none does.
+def _standing_apart(optimum: Optimum) -> list[int]:
+    """Return the rows that stand apart.
 
     Neighbours, or a row at an end of the table, may be where the model fails.
     """
     rows = sorted(p.row for p in suspicious_points(optimum, ResidualSpace(optimum)))
-    if not rows or at_an_end(optimum, rows) or neighbourhood(optimum, rows):
-        return ()
-    return (*noise, *own_errors(optimum.problem, rows))
+    return [] if at_an_end(optimum, rows) or neighbourhood(optimum, rows) else rows
 
 
 def _tells(problem: Problem, assumed: Collection[str]) -> bool:
     return problem.n_numbers - len(problem.names) + len(assumed) >= _LEAST_DOF
 
 
-_Found = tuple[tuple[Source, ...], LinearModel, VarianceComponents]
+def _asked_for(
+    contrasts: Likelihood, sources: Sequence[Source], start: FloatArray, floor: FloatArray
+) -> VarianceComponents:
+    """Return the variances; sources that raise the likelihood too little have none.
+
+    A source that has none beside all others is never missed; of the rest, that which costs the
+    likelihood least leaves first. `floor` has variances at which the covariance is not singular.
+    """
+    most = np.array([s.largest for s in sources])
+    price = np.array([s.price for s in sources])
+    found = variance_components(contrasts, np.minimum(start, most), most)
+    while True:
+        most = np.where((price > 0.0) & (found.variances == 0.0), 0.0, most)
+        best, best_loss = found, 0.0
+        for k in np.flatnonzero((price > 0.0) & (most > 0.0)).tolist():
+            fewer = most.copy()
+            fewer[k] = 0.0
+            begin = np.where(found.variances > 0.0, found.variances, floor)
+            trial = variance_components(contrasts, np.minimum(begin, fewer), fewer)
+            loss = found.log_likelihood - trial.log_likelihood - price[k]
+            if loss < best_loss:
+                best, best_loss = trial, loss
+        if best is found:
+            return found
+        found = best
 
 
 def linear_model(
@@ -547,95 +546,7 @@ def linear_model(
     Z = [np.concatenate([z, np.zeros((extra, *z.shape[1:]))]) for z in Z]
     linear = LinearModel(y, J, known, Z, lever)
     fewer = linear.compressed(m) if m > 2 * _FEW_ROWS else linear
-    return fewer, likelihood(linear if any(s.columns.ndim == 3 for s in sources) else fewer)
-
-
-def _supported(
-    problem: Problem,
-    y: FloatArray,
-    J: FloatArray,
-    lever: FloatArray,
-    noise: tuple[Source, ...],
-    rest: tuple[Source, ...],
-    level: float,
-    starts: dict[tuple[int, ...] | None, FloatArray],
-) -> _Found:
-    """Return the sources; model errors and noise of the amplitudes where the data ask for them.
-
-    `starts` has the variances with all sources (None) and with those of each subset that were
-    estimated last; these ones take their place.
-    """
-    every = (*noise, *rest)
-    linear, contrasts = linear_model(problem, y, J, every, lever)
-    upper = np.array([s.largest for s in every])
-    scales = np.array([s.columns.ndim == 1 and not problem.scale_known for s in every])
-    floor = np.where(scales, level, 0.0)
-    whole = variance_components(contrasts, np.minimum(starts.get(None, floor), upper), upper)
-    starts[None] = whole.variances
-    optional = np.array([i >= len(noise) and s.name in _ASKED_FOR for i, s in enumerate(every)])
-    # what has no variance beside all others has none beside fewer that explain as much
-    asked = np.flatnonzero(optional & (whole.variances > 0.0)).tolist()
-    best, best_value = None, -np.inf
-    for k in range(len(asked) + 1):
-        for subset in combinations(asked, k):
-            price = sum(_asked_for(every[i]) for i in subset)
-            # fewer sources explain no more than all of them do
-            if best is not None and whole.log_likelihood + CLOSE - price < best_value:
-                continue
-            kept = ~optional
-            kept[list(subset)] = True
-            most = np.where(kept, upper, 0.0)
-            begin = np.where(whole.variances > 0.0, whole.variances, floor)
-            begin = np.minimum(starts.get(subset, begin), most)
-            trial = variance_components(contrasts, begin, most)
-            starts[subset] = trial.variances
-            value = trial.log_likelihood - price
-            if value > best_value:
-                best, best_value = trial, value
-    assert best is not None
-    kept = np.flatnonzero(~optional | (best.variances > 0.0))
-    return (
-        tuple(every[i] for i in kept.tolist()),
-        replace(linear, Z=[linear.Z[i] for i in kept.tolist()]),
-        replace(
-            best,
-            variances=best.variances[kept],
-            largest=best.largest[kept],
-            information=best.information[np.ix_(kept, kept)],
-        ),
-    )
-
-
-def _asked_for(source: Source) -> float:
-    return _RATE if source.rate_of is not None else _ASKED_FOR[source.name]
-
-
-def _kind_of_noise(
-    problem: Problem,
-    y: FloatArray,
-    J: FloatArray,
-    lever: FloatArray,
-    found: _Found,
-    level: float,
-    kinds: Sequence[tuple[Source, ...]],
-) -> tuple[tuple[Source, ...], tuple[Source, ...], LinearModel, VarianceComponents]:
-    """Return the kind of noise that the residuals support, and the sources with it.
-
-    `found` has the first of the `kinds`.
-    """
-    best, kind = found, kinds[0]
-    rest = tuple(s for s in found[0] if not any(s is k for k in kind))
-    for trial in kinds[1:]:
-        if not trial:
-            continue
-        sources = (*trial, *rest)
-        linear, contrasts = linear_model(problem, y, J, sources, lever)
-        own = np.array([s.columns.ndim == 1 for s in sources])
-        upper = np.array([s.largest for s in sources])
-        other = variance_components(contrasts, np.where(own, level, 0.0), upper)
-        if other.log_likelihood > best[2].log_likelihood + _SUPPORTED:
-            best, kind = (sources, linear, other), trial
-    return (kind, *best)
+    return fewer, Likelihood(fewer)
 
 
 def _by_source(

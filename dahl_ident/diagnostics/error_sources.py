@@ -14,7 +14,7 @@ or spring missing from the model; the part that the model's linear elements can 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +33,12 @@ APART = "suspicious points"
 TESTS = "jackknife over tests"
 HARMONICS = "model error of harmonics"
 
+_PRICE = 0.4  # rise of the log-likelihood that a model error, or noise of levels, takes
+_PRICE_OF_RATE = 0.1  # the same for a force limit that changes with speed
+_PRICE_OF_A_ROW = 2.0  # the same for an error of one row, which some row seems to have by chance
 _LENGTH = 1.0  # of the model error, in ln A and ln omega
-_MOST_PLACES = 200  # rows beyond which a column for each costs seconds, cubic in their number
+_MOST_PLACES = 200  # of shapes, chosen evenly where rows are more
+_MOST_NOISY = 100  # levels with a noise of their own: the cost is cubic in their number
 _SMOOTH = 1e-3  # eigenvalue of the correlation, over the largest, that is negligible
 _MOST_SHAPES = 24  # of its eigenvectors; a decade of both amplitude and frequency takes 15
 _SAME_LEVEL = 0.02  # of ln A and ln f, beyond which the response is another
@@ -74,8 +78,6 @@ class Source:
     rate_of : (str, float) or None
         Parameter that changes as a power of the peak speed, and ln of the speed where it is its
         estimate.
-    part : str
-        "gain" or "phase" of a smooth departure, where these have a variance each; else empty.
     """
 
     name: str
@@ -86,7 +88,7 @@ class Source:
     largest: float = np.inf
     absorbed: FloatArray | None = None
     rate_of: tuple[str, float] | None = None
-    part: str = ""
+    price: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -139,56 +141,26 @@ def places(amplitude: FloatArray, omega: FloatArray) -> FloatArray:
     return np.asarray(np.log(np.column_stack(np.broadcast_arrays(amplitude, omega))))
 
 
-def of_one_scale(problem: Problem, *, beside: bool = False) -> tuple[Source, ...]:
-    """Return noise of one scale: unknown, or beyond that of the data's covariance.
+def noise_of(problem: Problem, theta: FloatArray, *, few: bool) -> tuple[Source, ...]:
+    """Return the noise that each row has of its own.
 
-    `beside` a scatter of all rows alike, a stated covariance may be too small by a moderate factor
-    only. Far more than was stated is another error, and no larger where a covariance is.
+    Of unknown size, or beyond that of the data's covariance: far more than was stated is another
+    error, and no larger where a covariance is. Then, of `few` rows, gain and phase have a scatter
+    too. Harmonics have their own: what a model misses of them is no error of the fundamental.
     """
-    most = _MOST_UNDERSTATED**2 - 1.0 if beside else np.inf
-    return (Source(NOISE, np.ones(problem.n_residuals), unit_noise(problem), largest=most),)
-
-
-def gain_and_phase(problem: Problem) -> tuple[Source, ...]:
-    """Return noise with separate scales for gain and phase; empty where residuals mix them."""
-    if problem.noise != "relative":
-        return ()
-    n = problem.n_residuals // 2
-    return tuple(Source(NOISE, np.tile(part, n), 0.5) for part in ([1.0, 0.0], [0.0, 1.0]))
-
-
-def additive(problem: Problem) -> tuple[Source, ...]:
-    """Return noise of constant size in the response, beside that in proportion to it."""
-    if problem.noise != "relative":
-        return ()
-    size = np.exp(np.log(np.abs(problem.data.response)).mean()) / np.abs(problem.data.response)
-    floor = Source(NOISE, np.repeat(size, 2), float(np.mean(size**2)))
-    return (*of_one_scale(problem), floor)
-
-
-def relative_scatter(
-    problem: Problem, theta: FloatArray, *, apart: bool = False
-) -> tuple[Source, ...]:
-    """Return scatter of ln gain and phase alike, beside a stated covariance.
-
-    Harmonics have a scatter of their own: what a model misses of them is no error of the
-    fundamental. With `apart` gain and phase of the fundamentals have one each.
-    """
-    if not problem.scale_known:
-        return ()
-    n, predicted = problem.n_residuals // 2, problem.predict(theta)
+    n, unit = problem.n_residuals // 2, unit_noise(problem)
+    if not (few and problem.scale_known):
+        return (Source(NOISE, np.ones(2 * n), unit),)
+    predicted, first = problem.predict(theta), problem.data.harmonic == 1
     parts = [-problem.residual_change(theta, f * predicted).reshape(n, 2) for f in (1.0, 1j)]
-    first = problem.data.harmonic == 1
-    both = np.stack(parts, axis=-1)
-    groups = [(first, both[..., :1]), (first, both[..., 1:])] if apart else [(first, both)]
+    blocks = np.zeros((n, 2, n, 2))
+    blocks[np.arange(n), :, np.arange(n), :] = np.stack(parts, axis=-1)
     found = []
-    for own, changes in (*groups, (~first, both)):
+    for own in (first, ~first):
         if own.any():
-            blocks = np.zeros((n, 2, n, changes.shape[-1]))
-            blocks[np.arange(n), :, np.arange(n), :] = changes
-            columns = blocks[:, :, own].reshape(2 * n, -1)
-            square = 0.5 * changes.shape[-1] * float(own.mean())
-            found.append(Source(NOISE, columns, square))
+            share, most = float(own.mean()), _MOST_UNDERSTATED**2 - 1.0
+            found.append(Source(NOISE, np.repeat(1.0 * own, 2), share * unit, largest=most))
+            found.append(Source(NOISE, blocks[:, :, own].reshape(2 * n, -1), share))
     return tuple(found)
 
 
@@ -198,7 +170,8 @@ def own_errors(problem: Problem, rows: Sequence[int]) -> tuple[Source, ...]:
     for row in rows:
         columns = np.zeros((problem.n_residuals, 2))
         columns[2 * row : 2 * row + 2] = np.eye(2)
-        found.append(Source(APART, columns, unit_noise(problem) / problem.data.n))
+        share = unit_noise(problem) / problem.data.n
+        found.append(Source(APART, columns, share, price=_PRICE_OF_A_ROW))
     return tuple(found)
 
 
@@ -232,13 +205,8 @@ class StructuredSources:
         self._rates = bool(np.ptp(self._places[:, 1]) > _LEAST_RATE_RANGE)
         self._levels = _scattering_levels(problem)
 
-    def at(
-        self, theta: FloatArray, near: Linearization, *, apart: bool = False
-    ) -> tuple[Source, ...]:
-        """Return the sources at theta, their columns linearised where `near` is.
-
-        With `apart`, a smooth departure has one variance in gain, and another in phase.
-        """
+    def at(self, theta: FloatArray, near: Linearization) -> tuple[Source, ...]:
+        """Return the sources at theta, their columns linearised where `near` is."""
         problem, predicted, J = self._problem, near.predicted, near.J
         size = _sizes(problem, predicted)
 
@@ -248,32 +216,20 @@ class StructuredSources:
 
         own = self._fundamental & (size != 0.0)  # a gap that is not crossed has no response
         missed = problem.data.response[own] / size[own] - 1.0
-        gain, phase = (
-            _MOST_DEPARTURE**2 * float(np.mean(part**2)) if own.any() else 0.0
-            for part in (missed.real, missed.imag)
-        )
+        left = float(np.mean(np.abs(missed) ** 2)) if own.any() else 0.0
         found = []
         for shape, changes in zip(self._shapes, self._changes, strict=True):
             square, made, absorbed = _mean_square(changes), columns(changes), None
             if shape.parallel:
                 absorbed = _absorbed(problem, J, made)
                 made = made + J @ absorbed
-            whole = Source(
-                MODEL_ERROR, made, square, shape,
-                largest=0.5 * (gain + phase) / square, absorbed=absorbed,
+            most = 0.5 * _MOST_DEPARTURE**2 * left / square
+            found.append(
+                Source(
+                    MODEL_ERROR, made, square, shape,
+                    largest=most, absorbed=absorbed, price=_PRICE,
+                )
             )  # fmt: skip
-            if shape.parallel or not apart:
-                found.append(whole)
-                continue
-            for part, most, half in zip(
-                ("gain", "phase"), (gain, phase), np.split(made, 2, axis=1), strict=True
-            ):
-                found.append(
-                    replace(
-                        whole, columns=half, mean_square=0.5 * square,
-                        largest=most / square, part=part,
-                    )
-                )  # fmt: skip
         centre = float(self._speed[self._fundamental].mean()) if self._fundamental.any() else 0.0
         change = np.repeat(self._speed - centre, 2)[:, None]
         found += [
@@ -282,6 +238,7 @@ class StructuredSources:
                 J[:, i : i + 1] * change,
                 float(np.mean((J[:, i] * change[:, 0]) ** 2)) * unit_noise(problem),
                 rate_of=(problem.names[i], centre),
+                price=_PRICE_OF_RATE,
             )
             for i in _scattering_parameters(problem)
             if self._rates
@@ -319,7 +276,7 @@ class StructuredSources:
             columns = -self._problem.residual_change(theta, change).reshape(-1, 2, 1)
             share = np.divide(change, predicted, out=np.zeros_like(change), where=predicted != 0.0)
             square = 0.5 * float(np.mean(np.abs(share) ** 2))
-            yield Source(NOISE, columns, square, largest=most**2)
+            yield Source(NOISE, columns, square, largest=most**2, price=_PRICE)
 
 
 def run_deviations(
@@ -342,7 +299,7 @@ def _scattering_levels(problem: Problem) -> bool:
     """Return whether levels may be noisy; not where noise is known or rows are many."""
     data = problem.data
     stated = problem.scale_known or problem.noise != "relative"
-    return data.n <= _MOST_PLACES and not (stated and (data.controlled != "force").all())
+    return data.n <= _MOST_NOISY and not (stated and (data.controlled != "force").all())
 
 
 def _sizes(problem: Problem, predicted: ComplexArray) -> ComplexArray:

@@ -132,9 +132,6 @@ def changes_there(
         return None
     ratio = np.ones(n, dtype=np.complex128) if stiffness is None else stiffness
     changes = _parts(shapes.changes(where, ratio).T)
-    if source.part:
-        gain, phase = np.split(changes, 2, axis=-1)
-        return gain if source.part == "gain" else phase
     return changes if source.absorbed is None else changes - _parts(slopes) @ source.absorbed
 
 

@@ -15,9 +15,9 @@ Source: Patterson and Thompson, Biometrika 58 (1971) 545; Searle, Casella and Mc
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,6 @@ from scipy import linalg
 from dahl_ident.arrays import TINY, FloatArray
 
 _STEPS = 40  # at most; the likelihood rises in each, so the last is the best
-_FEW = 3  # residuals over columns of sources beyond which columns are quicker
-_DENSE = 60  # residuals up to which dense matrices are quicker in any case
 _LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.02)  # of a scoring step, until the likelihood rises
 CLOSE = 1e-3  # rise of the log-likelihood that no longer matters
 _SETTLED = 1e-5  # twice the rise that a step promises, below which it is not made
@@ -136,6 +134,16 @@ class VarianceComponents:
     information: FloatArray
     log_likelihood: float
     largest: FloatArray
+
+    def only(self, kept: Sequence[int]) -> VarianceComponents:
+        """Return those of some sources, of which the others have none."""
+        part = np.array(kept)
+        return replace(
+            self,
+            variances=self.variances[part],
+            information=self.information[np.ix_(part, part)],
+            largest=self.largest[part],
+        )
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -246,142 +254,8 @@ class State(NamedTuple):
     information: FloatArray
 
 
-class Likelihood(Protocol):
-    """The restricted likelihood of a linear model."""
-
-    def at(self, variances: FloatArray) -> State:
-        """Return likelihood, gradient and expected information.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            If the covariance is singular.
-        """
-
-
-def likelihood(model: LinearModel) -> Likelihood:
-    """Return what computes a model's likelihood: in few columns, where most sources have few."""
-    if len(model.y) <= _DENSE:
-        return Contrasts(model)
-    columns = model.J.shape[1] + sum(z.shape[1] for z in model.Z if not _within_pairs(z))
-    return Columns(model) if _FEW * columns < len(model.y) else Contrasts(model)
-
-
-class Columns:
-    """The likelihood by the columns of sources, U, beside those of single rows, D.
-
-    D is made of blocks of two residuals; whitened with their factors, D is 1. Without the columns
-    the projection is P_0 = 1 - Q Q', Q orthonormal columns of J; with them
-
-        P = P_0 - P_0 U S (1 + T S)^-1 U' P_0,    T = U' P_0 U,
-
-    S their variances. The cost is linear in the number of residuals.
-    """
-
-    def __init__(self, model: LinearModel) -> None:
-        local = [k for k, z in enumerate(model.Z) if _within_pairs(z)]
-        parts = {k: z for k, z in enumerate(model.Z) if k not in local}
-        # an odd residual has another beside it that is none, of a variance of one
-        self._known = _blocks(np.append(np.sqrt(model.known), np.ones(len(model.y) % 2)))
-        self._local = {k: _blocks(_even(model.Z[k])) for k in local}
-        whole = _even(np.column_stack([model.y, model.J, *parts.values()]))
-        self._whole = whole.reshape(len(self._known), 2, -1)
-        self._parameters = model.J.shape[1]
-        self._owner = np.repeat(list(parts), [z.shape[1] for z in parts.values()]).astype(np.intp)
-        self._size = 0.5 * np.linalg.slogdet(model.J.T @ model.J)[1]
-
-    def at(self, variances: FloatArray) -> State:
-        """Return likelihood, gradient and expected information."""
-        K, owner = len(variances), self._owner
-        whitening, volume = _whitening(
-            self._known + sum(variances[k] * block for k, block in self._local.items())
-        )
-        whole = (whitening @ self._whole).reshape(2 * len(whitening), -1)
-        y, J, U = np.split(whole, [1, 1 + self._parameters], axis=1)
-        Q, R = np.linalg.qr(J)
-        E, u = (part - Q @ (Q.T @ part) for part in (U, y[:, 0]))
-        T, S = U.T @ E, variances[owner]
-        back = np.linalg.inv(np.eye(len(S)) + T * S)
-        t = U.T @ u
-        h, H = back @ t, back @ T
-        C = S[:, None] * back
-        likelihood = -(
-            volume
-            + np.log(np.abs(np.diagonal(R))).sum()
-            - self._size
-            - 0.5 * np.linalg.slogdet(back)[1]
-            + 0.5 * (float(u @ u) - float(t @ (S * h)))
-        )
-        own = (np.arange(K)[:, None] == owner).astype(np.float64)
-        gradient = 0.5 * (own @ (h**2) - own @ np.diagonal(H))
-        information = 0.5 * own @ (H**2) @ own.T
-        pairs = (len(whitening), 2, -1)
-        weighted = (u - E @ (S * h)).reshape(pairs)
-        turned = (E @ back.T).reshape(pairs)
-        F, N = np.column_stack([Q, E]), np.eye(Q.shape[1] + len(S))
-        N[Q.shape[1] :, Q.shape[1] :] = C
-        within = (F @ N).reshape(pairs) @ F.reshape(pairs).swapaxes(1, 2)
-        blocks = {
-            k: whitening @ block @ whitening.swapaxes(1, 2) for k, block in self._local.items()
-        }
-        grams = {}
-        for k, block in blocks.items():
-            grams[k] = N @ (F.T @ (block @ F.reshape(pairs)).reshape(F.shape))
-            explained = float(np.sum(weighted * (block @ weighted)))
-            left = np.trace(block, axis1=1, axis2=2).sum() - np.sum(within * block)
-            gradient[k] = 0.5 * (explained - float(left))
-            across = 0.5 * own @ np.sum(turned * (block @ turned), axis=(0, 1))
-            information[k] += across
-            information[:, k] += across
-        for k, one in blocks.items():
-            for other, two in blocks.items():
-                both = one @ two
-                information[k, other] = 0.5 * (
-                    np.trace(both, axis1=1, axis2=2).sum()
-                    - 2.0 * np.sum(both * within.swapaxes(1, 2))
-                    + np.sum(grams[k] * grams[other].T)
-                )
-        return State(float(likelihood), gradient, information)
-
-
-def _within_pairs(part: FloatArray) -> bool:
-    """Return whether each column of a source lies within one pair of residuals."""
-    if part.ndim == 1:
-        return True
-    seen = (_even(part) != 0.0).reshape(-1, 2, part.shape[1]).any(axis=1)
-    return bool((seen.sum(axis=0) <= 1).all())
-
-
-def _even(part: FloatArray) -> FloatArray:
-    return np.concatenate([part, np.zeros((len(part) % 2, *part.shape[1:]))])
-
-
-def _blocks(columns: FloatArray) -> FloatArray:
-    """Return the covariance of each pair of residuals, (n, 2, 2), by columns within pairs."""
-    if columns.ndim == 1:
-        return np.asarray(columns.reshape(-1, 2, 1) ** 2 * np.eye(2))
-    pairs = columns.reshape(-1, 2, columns.shape[1])
-    return np.asarray(pairs @ pairs.swapaxes(1, 2))
-
-
-def _whitening(blocks: FloatArray) -> tuple[FloatArray, float]:
-    """Return inverse Cholesky factors of blocks (n, 2, 2), and minus the log of their volume."""
-    first, across, second = blocks[:, 0, 0], blocks[:, 1, 0], blocks[:, 1, 1]
-    if not first.min() > 0.0:
-        raise np.linalg.LinAlgError("the covariance of the residuals is singular")
-    lower = across / first
-    rest = second - lower * across
-    if not rest.min() > 0.0:
-        raise np.linalg.LinAlgError("the covariance of the residuals is singular")
-    found = np.zeros(blocks.shape)
-    found[:, 0, 0] = 1.0 / np.sqrt(first)
-    found[:, 1, 1] = 1.0 / np.sqrt(rest)
-    found[:, 1, 0] = -lower * found[:, 1, 1]
-    return found, float(0.5 * np.log(first * rest).sum())
-
-
-class Contrasts:
-    """Residuals that no parameter can change, and the covariance that each source makes there."""
+class Likelihood:
+    """The restricted likelihood: of residuals that no parameter can change."""
 
     def __init__(self, model: LinearModel) -> None:
         n = model.J.shape[1]
@@ -453,7 +327,7 @@ def variance_components(
     [1.0, 2.8]
     """
     s = np.array(start, dtype=np.float64)
-    contrasts = likelihood(model) if isinstance(model, LinearModel) else model
+    contrasts = Likelihood(model) if isinstance(model, LinearModel) else model
     state = contrasts.at(s)
     for _ in range(_STEPS):
         step = _projected(s, state.gradient, state.information, s >= upper)
