@@ -15,7 +15,6 @@ import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.importance import WeightedPoints, integrate
-from dahl_ident.bayes.noise_scale import ScalePosterior
 from dahl_ident.bayes.priors import JointPrior, ParameterPrior, joint_prior
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
@@ -69,16 +68,6 @@ def test_a_wall_cuts_the_density() -> None:
     grid = gaussian_grid(np.array([0.2, 0.0]), np.diag([1.0, 0.01]), box(2, 0.0, 10.0))
     inside = stats.norm.sf(-0.2) * 0.5
     assert grid.log_evidence == pytest.approx(np.log(inside), abs=1e-3)
-
-
-def test_the_noise_scale_follows_its_closed_form() -> None:
-    # one point: s^2 is inverse gamma
-    scale = ScalePosterior(np.array([0.8]), np.array([1.0]), 6)
-    exact = stats.invgamma(6, scale=0.4)
-    assert scale.quantiles(LEVELS) == pytest.approx(np.sqrt(exact.ppf(LEVELS)), rel=1e-9)
-    mean = exact.expect(np.sqrt)
-    assert scale.mean() == pytest.approx(mean, rel=1e-7)
-    assert scale.std() == pytest.approx(np.sqrt(exact.mean() - mean**2), rel=1e-6)
 
 
 def test_one_parameter_against_scipy() -> None:
@@ -139,6 +128,21 @@ def test_few_points_and_much_noise_stay_inside_the_stated_error(seed: int) -> No
     assert grid.error < 1e-3
     _, mass = brute_force(grid, priors, 90)
     assert abs(mass.sum() - 1.0) < grid.error
+
+
+@pytest.mark.parametrize("rows", [2, 5, 30])
+def test_the_noise_scale_is_a_mixture_of_inverse_gammas(rows: int) -> None:
+    priors = {"f_max": (0.01, 1.0), "sigma": (3.0, 300.0)}
+    data = friction_table(rows, noise=0.1)
+    grid = di.posterior(data, di.Dahl(), priors=priors, method="grid", uncertainty="noise")
+    nodes, mass = brute_force(grid, priors, 40)
+    theta, mass = nodes.reshape(-1, 2), mass.ravel() / mass.sum()
+    y = np.log(data.response / Problem(data, di.Dahl()).predict(theta))
+    squares = np.sum(np.abs(y) ** 2, axis=1)
+    for level in LEVELS:
+        s = float(grid.quantile("noise_scale", level))
+        below = stats.invgamma(rows, scale=0.5 * squares).cdf(s**2)
+        assert mass @ below == pytest.approx(level, abs=1e-3)
 
 
 @pytest.mark.parametrize(

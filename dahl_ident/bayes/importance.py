@@ -119,6 +119,11 @@ def integrate(
         return _repeated(target, mixture, tolerance, most)
 
 
+def in_blocks(function: Function, theta: FloatArray) -> FloatArray:
+    """Return a function of many points, (S, D), that is faster for few at once."""
+    return np.concatenate([function(theta[i : i + _BLOCK]) for i in range(0, len(theta), _BLOCK)])
+
+
 @dataclass(frozen=True)
 class _Batch:
     """Points phi, (S, D), with theta, the log-density, and that of the prior."""
@@ -148,8 +153,7 @@ class _Target:
     def at(self, phi: FloatArray) -> _Batch:
         self.evaluations += len(phi)
         theta = phi if self.decorrelation is None else self.decorrelation.original(phi)
-        blocks = range(0, len(theta), _BLOCK)
-        log_density = np.concatenate([self.log_density(theta[i : i + _BLOCK]) for i in blocks])
+        log_density = in_blocks(self.log_density, theta)
         return _Batch(
             phi,
             theta,
@@ -261,8 +265,8 @@ def _repeated(target: _Target, mixture: _Mixture, tolerance: float, most: int) -
         log_weights = np.concatenate([log_weights, latest], axis=1)
         weights = _normalised(log_weights)
         points = WeightedPoints(
-            theta.reshape(-1, D),
-            weights.ravel(),
+            theta[weights > 0.0],
+            weights[weights > 0.0],
             float(logsumexp(log_weights) - np.log(log_weights.size)),
             _error(theta, weights),
             target.evaluations,

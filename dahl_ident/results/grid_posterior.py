@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike
 from dahl_ident.arrays import FloatArray, array_between, finite_array, positive_array
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.importance import WeightedPoints
-from dahl_ident.bayes.noise_scale import ScalePosterior, ln_scale_draws
+from dahl_ident.bayes.noise_scale import with_scale
 from dahl_ident.errors import ModelError, choices
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_base import QUANTILES
@@ -103,11 +104,8 @@ class GridPosterior(ResponsePosterior):
         """
         axis = self._axis(name)
         q = np.atleast_1d(array_between(probabilities, "probabilities", _END, 1.0 - _END))
-        if axis == len(self.problem.names):
-            found = self._scale.quantiles(q)
-        else:
-            found = self._grid.quantiles(axis, q)
-            found = np.exp(found) if self._density.logarithmic[axis] else found
+        found = self._points.quantiles(axis, q)
+        found = np.exp(found) if self._density.logarithmic[axis] else found
         return found.reshape(np.shape(probabilities))
 
     def marginal(self, name: str, values: ArrayLike) -> FloatArray:
@@ -128,10 +126,8 @@ class GridPosterior(ResponsePosterior):
         axis = self._axis(name)
         logarithmic = self._density.logarithmic[axis]
         x = (positive_array if logarithmic else finite_array)(values, name)
-        if axis == len(self.problem.names):
-            return self._scale.density(x)
         theta = np.log(x) if logarithmic else x
-        return self._grid.density(axis, theta) / (x if logarithmic else 1.0)
+        return self._points.density(axis, theta) / (x if logarithmic else 1.0)
 
     def _axis(self, name: str) -> int:
         if name not in self.names:
@@ -139,36 +135,31 @@ class GridPosterior(ResponsePosterior):
         return self.names.index(name)
 
     @cached_property
-    def _values(self) -> FloatArray:
-        """Values of the points, (N, P), the scale not included."""
-        theta = self._grid.theta
-        return self.problem.to_values(theta)
+    def _points(self) -> WeightedPoints:
+        """The points, an unknown noise scale included."""
+        if not self._density.has_scale:
+            return self._grid
+        return replace(self._grid, theta=with_scale(self._density, self._grid))
 
     @cached_property
-    def _scale(self) -> ScalePosterior:
-        likely = self._grid.weights > 0.0
-        sums = self._density.sums(self._grid.theta[likely])
-        weights = self._grid.weights[likely, None] * self._density.probabilities(sums)
-        return ScalePosterior(sums.ravel(), weights.ravel(), self.problem.n_residuals // 2)
+    def _values(self) -> FloatArray:
+        return self._density.to_values(self._points.theta)
 
     @property
     def points(self) -> tuple[FloatArray, FloatArray]:
-        """Weights, shape (N,), which sum to 1, and search coordinates, (N, P), of all points."""
-        return self._grid.weights, self._grid.theta
+        """Weights, shape (N,), which sum to 1, and search coordinates, (N, D), of all points."""
+        return self._points.weights, self._points.theta
 
     def mean(self) -> FloatArray:
         """Return the means of the parameters, in the order of `names`."""
-        own = self._grid.weights @ self._values
-        return np.append(own, self._scale.mean()) if self._density.has_scale else own
+        return np.asarray(self._points.weights @ self._values)
 
     def std(self) -> FloatArray:
         """Return the standard deviations of the parameters, in the order of `names`."""
-        centred = self._values - self._grid.weights @ self._values
-        own = np.sqrt(self._grid.weights @ centred**2)
-        return np.append(own, self._scale.std()) if self._density.has_scale else own
+        return np.asarray(np.sqrt(self._points.weights @ (self._values - self.mean()) ** 2))
 
     def _weighted(self) -> tuple[FloatArray, FloatArray]:
-        return self._values, self._grid.weights
+        return self._values[:, : len(self.problem.names)], self._points.weights
 
     def summary(self) -> pd.DataFrame:
         """Return one row a parameter: ``mean, std, 2.5%, 16%, median, 84%, 97.5%, unit``."""
@@ -183,15 +174,7 @@ class GridPosterior(ResponsePosterior):
 
     def _draws(self, size: int, seed: int) -> FloatArray:
         random = np.random.default_rng(seed)
-        theta = random.choice(self._grid.theta, size=size, p=self._grid.weights)
-        if not self._density.has_scale:
-            return theta
-        sums = self._density.sums(theta)
-        below = np.cumsum(self._density.probabilities(sums), axis=1)
-        chosen = (random.random((size, 1)) * below[:, -1:] > below).sum(axis=1, keepdims=True)
-        squares = np.take_along_axis(sums, chosen, axis=1)[:, 0]
-        rows = self.problem.n_residuals // 2
-        return np.column_stack([theta, ln_scale_draws(squares, rows, random)])
+        return random.choice(self._points.theta, size=size, p=self._points.weights)
 
     @property
     def findings(self) -> tuple[str, ...]:
