@@ -269,7 +269,7 @@ def test_sample_integrates_at_once_where_asked(run: Runner) -> None:
     options = ("sample", "-", "--prior", "f_max=0.01:1")
     told = json.loads(run(*options, "--method", "grid", "--json", stdin=table).out)
     assert told["converged"]
-    assert told["error"] < 1e-4
+    assert told["error"] < 1e-3
     chain = json.loads(run(*options, "--json", stdin=table).out)
     for name in ("f_max", "sigma"):
         exact, drawn = told["summary"][name], chain["summary"][name]
