@@ -14,7 +14,7 @@ from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.formatting import rounded
 from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Verdict
-from dahl_ident.errors import FitError
+from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.record_fit import RecordFit
 
@@ -124,6 +124,8 @@ def _change(
     name: str, a: str, fit: FitResult | RecordFit, b: str, later: FitResult | RecordFit
 ) -> Change:
     one, other = fit.params[name], later.params[name]
+    if one.unit != other.unit:
+        raise ValidationError(f"{name} is in {one.unit} of {a} and in {other.unit} of {b}")
     known = [_scatter(each, name) for each in (fit, later)]
     stated = max((share for share in known if share is not None), default=0.0)
     missing = [
