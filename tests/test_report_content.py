@@ -151,10 +151,14 @@ def test_the_order_is_answer_assumed_pictures_details(fit: di.FitResult, tmp_pat
         "Sources of uncertainty", "Parameters"
     ]  # fmt: skip
     assumed = text.split("## What was assumed")[1].split("## ")[0]
-    assert "Not given, so that the uncertainty counts it: alpha, here 0.996 ± 0.016." in assumed
+    assert fit.errors is not None
+    alpha = f"{fit.errors.values['alpha']:.3f} ± {fit.errors.stderr['alpha']:.3f}"
+    assert f"Not given, so that the uncertainty counts it: alpha, here {alpha}." in assumed
     assert f"Taken as exact: {listed(fit.budget().exact)}." in assumed
     stated = fit.budget()["f_max"]
     combined = text.split("## Expanded uncertainty")[1].split("## ")[0]
+    shown = _result_rows(text)["f_max"][2]
+    assert f"| f_max | {shown} |" in combined, "one notation of u in both tables"
     assert f"| {stated.k:.2f} |" in combined
     assert f"{stated.rows[0].source} {100.0 * stated.rows[0].share:.0f} %" in combined
     budget = text.split("## Sources of uncertainty")[1].split("## ")[0]

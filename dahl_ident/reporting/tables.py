@@ -73,8 +73,8 @@ def uncertainty(found: Budget) -> Table:
         sources = [f"{source} {share:.0f} %" for source, share in shares if share >= 0.5]
         rows.append(
             (
-                Cell(p.name), _two_digits(p.u), _dof(p.dof), Cell(f"{p.k:.2f}", p.k),
-                _two_digits(p.U), Cell(p.unit or "-"), Cell(", ".join(sources) or "-"),
+                Cell(p.name), _rounded(p.value, p.u), _dof(p.dof), Cell(f"{p.k:.2f}", p.k),
+                _rounded(p.value, p.U), Cell(p.unit or "-"), Cell(", ".join(sources) or "-"),
             )
         )  # fmt: skip
     header = (
@@ -93,8 +93,8 @@ def budget(found: Budget) -> Table:
         unit = p.unit or "-"
         rows.append(
             (
-                Cell(p.name), Cell("combined"), Cell("-"), _two_digits(p.u), Cell(unit),
-                _dof(p.dof), Cell("100 %", 1.0), Cell(f"{p.k:.2f}", p.k), _two_digits(p.U),
+                Cell(p.name), Cell("combined"), Cell("-"), _rounded(p.value, p.u), Cell(unit),
+                _dof(p.dof), Cell("100 %", 1.0), Cell(f"{p.k:.2f}", p.k), _rounded(p.value, p.U),
             )
         )  # fmt: skip
         rows += [
@@ -113,8 +113,9 @@ def budget(found: Budget) -> Table:
     )
 
 
-def _two_digits(u: float) -> Cell:
-    return Cell(rounded(u, u)[1], u)
+def _rounded(value: float, u: float) -> Cell:
+    """Return an uncertainty to two digits, written as beside its estimate."""
+    return Cell(rounded(value, u)[1], u)
 
 
 def _dof(dof: float) -> Cell:
