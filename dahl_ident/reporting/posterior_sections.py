@@ -19,7 +19,7 @@ from dahl_ident.reporting.document import (
     Table,
     number,
 )
-from dahl_ident.results.chain_draws import ChainDraws
+from dahl_ident.results.chain_posterior import ChainDraws
 from dahl_ident.results.posterior_base import QUANTILES
 
 if TYPE_CHECKING:

@@ -34,8 +34,7 @@ from dahl_ident.elements import Element
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
-from dahl_ident.results.chain_draws import refuse_unusable
-from dahl_ident.results.chain_posterior import ChainPosterior
+from dahl_ident.results.chain_posterior import ChainPosterior, refuse_unusable
 from dahl_ident.results.estimate import fit as fit_any
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.grid_posterior import GridPosterior

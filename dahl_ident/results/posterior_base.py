@@ -25,6 +25,9 @@ from dahl_ident.results.result import Result
 if TYPE_CHECKING:
     import pandas as pd
 
+    from dahl_ident.results.fit_result import FitResult
+    from dahl_ident.results.record_fit import RecordFit
+
 
 SCHEMA = "dahl_ident.posterior"
 
@@ -100,12 +103,21 @@ class Posterior(Result):
         """Whether the numbers can be used.
 
         Not determined where it has not converged, or a prior that nobody gave sets a parameter;
-        not described where data or prior object.
+        not described where data or prior object; approximate where the fit's numbers are.
         """
         against = any(rule.contradicted for rule in self.prior_influences)
         if self.converged and (against or self._misfits):
             return VerdictStatus.NOT_DESCRIBED
-        return VerdictStatus.NOT_DETERMINED if self._objections else VerdictStatus.TRUSTED
+        if self._objections:
+            return VerdictStatus.NOT_DETERMINED
+        fit = self._counted_fit
+        approximate = fit is not None and fit.status is VerdictStatus.APPROXIMATE
+        return VerdictStatus.APPROXIMATE if approximate else VerdictStatus.TRUSTED
+
+    @property
+    @abstractmethod
+    def _counted_fit(self) -> FitResult | RecordFit | None:
+        """The fit whose sources of error are counted; None where noise alone is."""
 
     @property
     def _objections(self) -> tuple[str, ...]:
@@ -131,9 +143,13 @@ class Posterior(Result):
         return (*map(str, self.prior_influences), *self._misfits, *self._notes)
 
     @property
-    @abstractmethod
     def _misfits(self) -> tuple[str, ...]:
-        """Where the data contradict the model, in words."""
+        """Where the data contradict the model, in words; by default those of the fit."""
+        fit = self._counted_fit
+        if fit is None or fit.status is not VerdictStatus.NOT_DESCRIBED:
+            return ()
+        first, *others = fit.statements
+        return (first.removeprefix(f"{fit.status.capitalize()}. "), *others)
 
     def draws(self, size: int, seed: int = 0) -> FloatArray:
         """Return values drawn from the posterior, shape (size, number of parameters)."""

@@ -16,8 +16,7 @@ from dahl_ident.data import Record
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.record_errors import record_assumptions, record_derived
-from dahl_ident.diagnostics.verdict_status import VerdictStatus
-from dahl_ident.results.chain_draws import ChainDraws
+from dahl_ident.results.chain_posterior import ChainDraws
 from dahl_ident.results.record_fit import RecordBand, RecordFit
 from dahl_ident.results.result import Estimate, Parameters
 
@@ -84,18 +83,12 @@ class RecordPosterior(ChainDraws):
         return tuple(record.provenance for record in self.fit.records)
 
     @property
-    def _misfits(self) -> tuple[str, ...]:
-        if self.fit.status is not VerdictStatus.NOT_DESCRIBED:
-            return ()
-        first, *others = self.fit.statements[:2]
-        return (first.removeprefix(f"{self.fit.status.capitalize()}. "), *others)
+    def _counted_fit(self) -> RecordFit:
+        return self.fit
 
     @property
-    def status(self) -> VerdictStatus:
-        """Whether the numbers can be used; approximate where the fit's are."""
-        own = super().status
-        approximate = self.fit.status is VerdictStatus.APPROXIMATE
-        return self.fit.status if own is VerdictStatus.TRUSTED and approximate else own
+    def _misfits(self) -> tuple[str, ...]:
+        return super()._misfits[:2]
 
     @property
     def _notes(self) -> tuple[str, ...]:

@@ -60,7 +60,7 @@ class ResponsePosterior(Posterior):
 
         None where the prior was sampled, or where rows share errors; the fit's tests count there.
         """
-        if self.likelihood == "none" or self._combined is not None:
+        if self.likelihood == "none" or self._counted_fit is not None:
             return ()
         draws = self._draws(_CHECK_DRAWS, 0)
         return predictive_checks(self._density, draws, np.random.default_rng(0))
@@ -71,14 +71,12 @@ class ResponsePosterior(Posterior):
 
     @property
     def _misfits(self) -> tuple[str, ...]:
-        fit = self._combined
+        fit = self._counted_fit
         if fit is None:
             return tuple(str(check) for check in self.checks if not check.passed)
-        if fit.status is VerdictStatus.NOT_DESCRIBED:
-            first, *others = fit.statements
-            return (first.removeprefix(f"{fit.status.capitalize()}. "), *others)
-        undetermined = fit.status is VerdictStatus.NOT_DETERMINED
-        return fit.goodness.statements if undetermined and fit.goodness.objections else ()
+        if fit.status is VerdictStatus.NOT_DETERMINED and fit.goodness.objections:
+            return fit.goodness.statements
+        return super()._misfits
 
     @property
     def uncertainty(self) -> str:
@@ -86,24 +84,15 @@ class ResponsePosterior(Posterior):
         return self._uncertainty
 
     @property
-    def _combined(self) -> FitResult | None:
-        """The fit whose sources of error are counted; None where noise alone is."""
+    def _counted_fit(self) -> FitResult | None:
         return self._fit if self._uncertainty == "combined" else None
-
-    @property
-    def status(self) -> VerdictStatus:
-        """Whether the numbers can be used; approximate where the fit's are."""
-        own, fit = super().status, self._combined
-        if own is VerdictStatus.TRUSTED and fit is not None:
-            return fit.status if fit.status is VerdictStatus.APPROXIMATE else own
-        return own
 
     @property
     def _notes(self) -> tuple[str, ...]:
         fit = self._fit
         if fit is None or self.likelihood == "none":
             return ()
-        if self._combined is not None:
+        if self._counted_fit is not None:
             shared = self._density.errors
             names = ["noise"] if shared is None else list(shared.counted)
             free = [n for n in self.problem.names if n not in fit.problem.names]
