@@ -178,6 +178,18 @@ def shared_by_level(rng: np.random.Generator) -> Table:
     return FrequencyResponse(np.ones(32), N, A), (F_MAX, SIGMA)
 
 
+def levels_gain(size: float, *, level_too: bool) -> Draw:
+    """Return tables of ten levels at three frequencies, each level with a gain of its own."""
+
+    def draw(rng: np.random.Generator) -> Table:
+        A = np.repeat(_amplitudes(0.1, 10.0, 10), 3)
+        gain = np.repeat(np.exp(size * rng.standard_normal(10)), 3)
+        N = _friction(A * gain if level_too else A) * gain * _noise(rng, len(A), NOISE, NOISE)
+        return _of(N, A, np.tile([0.5, 1.0, 2.0], 10))
+
+    return draw
+
+
 def altered(change: Callable[[np.random.Generator, FloatArray, ComplexArray], Table]) -> Draw:
     """Return tables over two decades that `change` makes from exact ones."""
     A = _amplitudes(0.1, 10.0)
@@ -331,6 +343,11 @@ def cells() -> list[Cell]:
     ]
     found += [
         Cell("8 levels x 4, errors in common", shared_by_level),
+        *(
+            Cell(f"ten levels, {what} off by {100 * s:.0f} % each", levels_gain(s, level_too=too))
+            for what, too in (("gain", False), ("gain and amplitude", True))
+            for s in (0.02, 0.05)
+        ),
         Cell("noise along the rows, 0.4", autocorrelated(0.4)),
         Cell("noise along the rows, 0.7", autocorrelated(0.7)),
         Cell("gain noise ten times phase noise", uneven(0.03, 0.003)),

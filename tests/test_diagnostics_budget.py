@@ -279,6 +279,26 @@ class TestEstimate:
         own = float(test.log_gain_std[0] ** 2 - device.log_gain_std[0] ** 2)
         assert own == pytest.approx(noise, rel=1e-6)
 
+    @pytest.mark.parametrize("level_too", [False, True])
+    def test_levels_whose_gain_is_wrong(self, level_too: bool) -> None:
+        """An amplifier's range at each of ten levels of three frequencies, not given as runs."""
+        size, inside = 0.05, []
+        for seed in range(12):
+            rng = np.random.default_rng([3, seed])
+            gain = np.repeat(np.exp(size * rng.standard_normal(10)), 3)
+            A = np.repeat(np.geomspace(0.1, 10.0, 10), 3) * X_C
+            N = FRICTION.describing_function(A * (gain if level_too else 1.0)) * gain
+            data = FrequencyResponse(
+                np.tile([0.5, 1.0, 2.0], 10), N * relative_noise(30, 0.01, seed), A
+            )
+            found = modelled(data)
+            assert "scatter between repeated levels" in found.contributions
+            inside += [
+                abs(found.values[name] - truth) < 2.5 * found.stderr[name]
+                for name, truth in (("f_max", 0.1), ("sigma", 30.0))
+            ]
+        assert sum(inside) >= 21  # of 24
+
     def test_the_misfit_makes_chi_square_its_degrees_of_freedom(self) -> None:
         """Against a general minimiser and root finder on residuals made here."""
         A = np.geomspace(0.1, 10.0, 12) * X_C

@@ -35,6 +35,7 @@ HARMONICS = "model error of harmonics"
 
 _PRICE = 0.4  # rise of the log-likelihood that a model error, or noise of levels, takes
 _PRICE_OF_RATE = 0.1  # the same for a force limit that changes with speed
+_PRICE_OF_LEVELS = 3.0  # the same for what a level has in common: 1 % of the tables, by chance
 _PRICE_OF_A_ROW = 2.0  # the same for an error of one row, which some row seems to have by chance
 _LENGTH = 1.0  # of the model error, in ln A and ln omega
 _MOST_PLACES = 200  # of shapes, chosen evenly where rows are more
@@ -186,6 +187,8 @@ class StructuredSources:
         self, problem: Problem, theta: FloatArray, beside: FloatArray | None = None
     ) -> None:
         self._problem = problem
+        compliance = problem.data.quantity in COMPLIANCES
+        self._divided = np.where((problem.data.controlled == "force") == compliance, 1.0, -1.0)
         view, data = problem.predicted_stiffness(theta), problem.data
         self._places = places(view.amplitude, view.omega)
         self._fundamental = view.harmonic == 1
@@ -204,6 +207,7 @@ class StructuredSources:
         self._speed = self._places.sum(axis=1)
         self._rates = bool(np.ptp(self._places[:, 1]) > _LEAST_RATE_RANGE)
         self._levels = _scattering_levels(problem)
+        self._in_common = _rows_of_levels(data)
 
     def at(self, theta: FloatArray, near: Linearization) -> tuple[Source, ...]:
         """Return the sources at theta, their columns linearised where `near` is."""
@@ -255,10 +259,22 @@ class StructuredSources:
             ]
         if self._levels:
             found += self._noise_of_levels(theta)
+        if len(self._in_common) >= _FEWEST_TESTS:
+            found += self._errors_of_levels(theta, near)
         if len(self._repeats) >= _FEWEST:
             shared = np.concatenate([self._repeats, 1j * self._repeats])
             found.append(Source(LEVELS, columns(shared), 1.0, own="both"))
         return tuple(found)
+
+    def _errors_of_levels(self, theta: FloatArray, near: Linearization) -> Iterator[Source]:
+        """Yield what all rows of one level share: a gain, and an error of the level itself.
+
+        An amplifier's gain makes both where the responses were divided by the level.
+        """
+        by_level = self._problem.level_slope(theta)
+        for change in (near.predicted, by_level, by_level + self._divided * near.predicted):
+            columns = near.change(self._in_common * change).T
+            yield Source(LEVELS, columns, 0.5, own="gain", price=_PRICE_OF_LEVELS)
 
     def _noise_of_levels(self, theta: FloatArray) -> Iterator[Source]:
         """Yield noise of the amplitudes, or drives, at which responses were measured.
@@ -269,9 +285,7 @@ class StructuredSources:
         """
         predicted = self._problem.predict(theta)
         by_level = self._problem.level_slope(theta)
-        data = self._problem.data
-        divided = (data.controlled == "force") == (data.quantity in COMPLIANCES)
-        by_both = by_level + np.where(divided, predicted, -predicted)
+        by_both = by_level + self._divided * predicted
         for change, most in ((by_level, np.inf), (by_both, _MOST_LEVEL_NOISE)):
             columns = -self._problem.residual_change(theta, change).reshape(-1, 2, 1)
             share = np.divide(change, predicted, out=np.zeros_like(change), where=predicted != 0.0)
@@ -343,6 +357,25 @@ def _scattering_parameters(problem: Problem) -> list[int]:
     return found
 
 
+def _rows_of_levels(data: FrequencyResponse) -> FloatArray:
+    """Return which rows belong to each drive or amplitude held at several frequencies, (L, n)."""
+    held = _agreeing(np.log(_held(data)), (data.controlled == "force").astype(np.intp))
+    rows = held == np.arange(held.max() + 1)[:, None]
+    count = rows.sum(axis=1)
+    if len(rows) > _MOST_LEVELS or not (count > 1).all():
+        return np.empty((0, data.n))
+    return np.asarray(rows, dtype=np.float64)
+
+
+def _held(data: FrequencyResponse) -> FloatArray:
+    """Return the drive or amplitude that was held in each row, (n,)."""
+    driven, held = data.controlled == "force", np.ones(data.n)
+    for rows, column in ((driven, data.drive), (~driven, data.amplitude)):
+        if column is not None:
+            held[rows] = column[rows]
+    return held
+
+
 def _repeats(level: NDArray[np.intp], fundamental: NDArray[np.bool_]) -> FloatArray:
     """Return which rows belong to each level that was measured more than once, (levels, n).
 
@@ -362,12 +395,8 @@ def repeated_levels(data: FrequencyResponse) -> NDArray[np.intp]:
     closely as repeats do; not where a sweep is dense.
     """
     driven = data.controlled == "force"
-    held = np.ones(data.n)
-    for rows, column in ((driven, data.drive), (~driven, data.amplitude)):
-        if column is not None:
-            held[rows] = column[rows]
     frequency = _agreeing(np.log(data.frequency_hz), np.zeros(data.n, dtype=np.intp))
-    return _agreeing(np.log(held), 2 * frequency + driven)
+    return _agreeing(np.log(_held(data)), 2 * frequency + driven)
 
 
 def rows_of_tests(data: FrequencyResponse) -> list[NDArray[np.intp]]:
