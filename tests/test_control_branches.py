@@ -39,32 +39,34 @@ def staircase(plant: Element, drives: FloatArray, frequency_hz: float, hold: int
 
 
 def test_sweeps_up_and_down_land_on_the_two_stable_branches() -> None:
-    """The third harmonic, near the held mass's resonance, shifts the upper branch by a tenth."""
+    """At drives far apart, between which branches begin and end."""
     up = np.array([0.05, 0.065, 0.0675, 0.0725])
     seen = staircase(ACTIVE, np.concatenate([up, up[::-1][1:]]), FREQUENCY, 60)
     rising, falling = seen[: up.size], seen[up.size - 1 :][::-1]
     branches = response_branches(ACTIVE, FREQUENCY, up)
     A, stable = branches.steady.amplitude, branches.stable
     assert stable.tolist() == [
-        [True, False, False], [True, False, True], [True, False, True], [True, False, False],
+        [True, False, False], [True, False, False], [True, False, True], [True, False, False],
     ]  # fmt: skip
-    lowest, highest = A[:, 0], np.nanmax(A, axis=1)
-    assert rising[:3] == pytest.approx(lowest[:3], rel=0.08)
-    assert falling[3] == pytest.approx(highest[3], rel=0.15)
-    assert falling[0] == pytest.approx(rising[0], rel=1e-3)
-    middle = A[1:3, 1]
-    assert np.all(rising[1:3] < 0.6 * middle)
-    assert np.all(falling[1:3] > 1.3 * middle)
-    for amplitude, drive, tolerance in ((rising[:3], up[:3], 0.03), (falling[1:], up[1:], 0.13)):
-        force = amplitude * np.abs(ACTIVE.dynamic_stiffness(amplitude, 2.0 * np.pi * FREQUENCY))
-        assert force == pytest.approx(drive, rel=tolerance)
+    assert rising == pytest.approx(A[:, 0], rel=1e-4)
+    assert falling[[0, 2, 3]] == pytest.approx([A[0, 0], A[2, 2], A[3, 0]], rel=1e-4)
+
+
+def test_the_describing_function_places_branches_roughly() -> None:
+    """The third harmonic, near the held mass's resonance, shifts the upper branch by a tenth."""
+    exact, sine = (
+        response_branches(ACTIVE, FREQUENCY, 0.0675, steady=steady).steady.amplitude
+        for steady in ("exact", "describing function")
+    )
+    assert sine == pytest.approx(exact, rel=0.25)
+    assert sine != pytest.approx(exact, rel=0.05)
 
 
 def test_passive_plants_have_one_stable_branch() -> None:
     plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
-    frequency, drive = np.geomspace(0.05, 5.0, 40)[:, None], np.geomspace(1e-4, 10.0, 40)
+    frequency, drive = np.geomspace(0.05, 5.0, 16)[:, None], np.geomspace(1e-4, 10.0, 16)
     branches = response_branches(plant, frequency, drive)
-    assert branches.stable.shape == (40, 40, 1)
+    assert branches.stable.shape == (16, 16, 1)
     assert branches.stable.all()
 
 
@@ -80,7 +82,8 @@ def test_without_friction_the_rate_is_that_of_the_pole() -> None:
 def test_falling_branches_are_unstable() -> None:
     """Where A |Z| falls with A, at least one disturbance grows."""
     u = np.geomspace(0.03, 0.2, 60)
-    branches = response_branches(ACTIVE, np.linspace(0.5, 0.9, 15)[:, None], u)
+    f = np.linspace(0.5, 0.9, 15)[:, None]
+    branches = response_branches(ACTIVE, f, u, steady="describing function")
     A = branches.steady.amplitude[branches.steady.found]
     omega = 2.0 * np.pi * branches.steady.frequency_hz[branches.steady.found]
     size = [step * A * np.abs(ACTIVE.dynamic_stiffness(step * A, omega)) for step in (0.999, 1.001)]

@@ -61,7 +61,7 @@ def response_branches(
     frequency_hz: ArrayLike,
     drive: ArrayLike,
     *,
-    steady: Steady = "describing function",
+    steady: Steady = "exact",
 ) -> Branches:
     """Return every steady response, and whether each is stable.
 
@@ -73,9 +73,9 @@ def response_branches(
         Hz, > 0.
     drive : array_like
         Zero-to-peak force u_0 > 0, N; broadcast with `frequency_hz`.
-    steady : {"exact", "describing function"}, default "describing function"
-        See :func:`dahl_ident.response`. Exact branches start from those of the describing function,
-        and one that lies far from its estimate may be missed.
+    steady : {"exact", "describing function"}, default "exact"
+        See :func:`dahl_ident.response`. Exact branches start from those of the describing function
+        and are followed from point to point, in the order of the points.
 
     Returns
     -------
@@ -104,7 +104,7 @@ def response_branches(
     >>> plant = Dahl(f_max=0.1, sigma=30) + Mass(0.3) + Damper(-0.03) + Spring(3.0)
     >>> branches = response_branches(plant, 0.525, 0.114)
     >>> branches.steady.amplitude.round(3).tolist()
-    [0.011, 0.088, 0.29]
+    [0.009, 0.114, 0.258]
     >>> branches.stable.tolist()
     [True, False, True]
     """

@@ -158,7 +158,9 @@ def response(
 
     Notes
     -----
-    Exact motions are known to 1e-8. For the describing function
+    Exact motions are known to 1e-8. They start from those of the describing function, and each is
+    followed through the neighbouring points, in their order, as far as it goes: give the points of
+    a sweep in the order of the sweep. For the describing function
 
     ``A |Z| = u_0`` holds within 1e-12 max(1, kappa/4), kappa = (abs(L) + abs(N))/abs(Z): near a
     sharp resonance L and N nearly cancel. Two of several amplitudes may be missed where A abs(Z)
@@ -196,6 +198,10 @@ def response(
         omega, u = (np.broadcast_to(v, shape).ravel()[exact] for v in (2.0 * np.pi * f, u0))
         unique = points.friction.unique & (points.linear.imag[exact] >= 0.0)
         motions = exact_motions(plant, omega, u, X[exact], unique, every=all_roots)
+        more = ((0, 0), (0, motions.displacement.shape[1] - X.shape[1]))
+        X, share, multiplier = (
+            np.pad(v, more, constant_values=np.nan) for v in (X, share, multiplier)
+        )
         X[exact], share[exact], multiplier[exact] = motions
         amplitude = np.abs(X)
     found = ~np.isnan(amplitude)
