@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp, trapezoid
 
-from dahl_ident import Dahl, Friction, Parameter
+from dahl_ident import Backlash, Dahl, Friction, Parameter
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ModelError
@@ -59,7 +59,7 @@ class Asymmetric(Friction):
 
     def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
         up, down, sigma = values
-        return sigma * (1.0 - direction * force / np.where(np.asarray(direction) > 0.0, up, down))
+        return sigma * (1.0 - direction * force / np.where(direction > 0.0, up, down))
 
 
 def jenkins(k: float, slip: float, A: FloatArray) -> ComplexArray:
@@ -267,3 +267,27 @@ def test_derivatives_of_a_law_whose_units_do_not_agree() -> None:
     by_f_max = exact.by_parameter[0] + 0.5 * exact.by_parameter[1]
     np.testing.assert_allclose(ours.by_parameter[0], by_f_max, rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(ours.by_parameter[1], exact.by_parameter[1], rtol=1e-7, atol=1e-9)
+
+
+def test_derivatives_of_the_force_over_time_are_those_of_the_closed_form() -> None:
+    t = np.linspace(0.0, 10.0, 1500)
+    x = 3.0 * (np.sin(3.0 * t) + 0.6 * np.sin(7.3 * t))
+    exact = Dahl().force_history_gradient([1.0, 2.0, 1.0], x, state=0.3)
+    ours = SlopeOfDahl(alpha=1.0).force_history_gradient([1.0, 2.0, 1.0], x, state=0.3)
+    assert np.max(np.abs(ours.value - exact.value)) < 1e-9
+    assert np.max(np.abs(ours.by_state - exact.by_state)) < 1e-8
+    for one, other in zip(ours.by_parameter[:2], exact.by_parameter[:2], strict=True):
+        assert np.max(np.abs(one - other)) < 1e-7 * np.max(np.abs(other))
+
+
+@pytest.mark.parametrize("gap", [1e-7, 1e-9, 1e-11])
+def test_a_narrow_gap_hardly_changes_the_force_over_time(gap: float) -> None:
+    x = 0.5 * np.sin(np.linspace(0.0, 40.0, 900))
+    behind = Backlash(Dahl(1.0, 3.0, 2.0), gap).force(x)
+    assert np.max(np.abs(behind - Dahl(1.0, 3.0, 2.0).force(x))) < 4.0 * gap + 2e-9
+
+
+def test_scales_of_the_force_follow_from_units_that_agree_with_the_law() -> None:
+    assert SlopeOfDahl().scale_parameters == ("f_max", "sigma")
+    assert Jenkins().scale_parameters == ("stiffness",)
+    assert SlopeOfLuGre(1.0, 3.0, 1.5, 0.7).scale_parameters == ()

@@ -14,13 +14,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements import force_curve
 from dahl_ident.elements.behaviour import (
     Asymptote,
     Combination,
@@ -36,6 +34,7 @@ from dahl_ident.elements.steady_loop import Branch, Loop, Rows
 from dahl_ident.errors import ModelError
 
 _CLOSED = 1e-9  # gap over the smallest amplitude that counts as none
+_NARROWEST = 1e-9  # of the path: crossings of a narrower gap cannot be told apart in time
 
 
 class Backlash(Friction):
@@ -219,11 +218,13 @@ class Backlash(Friction):
         )
         if known is not None:
             return known.value
-        at = [np.asarray(v, dtype=np.float64) for v in values]
-        rising, falling = partial(self._rising, at), partial(self._falling, at)
-        return force_curve.force_history(
-            rising, falling, displacement, float(state), gap=float(values[-1])
-        )
+        if self._is_narrow(values, displacement):
+            return self._element.force_history(values[:-1], displacement, velocity, state)
+        return super().force_history(values, displacement, velocity, state)
+
+    def states_at(self, values: Sequence[float], force: float) -> Sequence[float]:
+        """Return the force, and the place in the gap: in contact, or in the middle."""
+        return force, 0.5 * float(values[-1]) * float(np.sign(force))
 
     def force_history_gradient(
         self,
@@ -234,13 +235,20 @@ class Backlash(Friction):
         *,
         acceleration: FloatArray | None = None,
     ) -> HistoryGradient:
-        """Return the force at every sample with its derivatives, exactly for linear Dahl."""
+        """Return the force at every sample with its derivatives."""
         known = self.element.history_behind_gap(
             values[:-1], float(values[-1]), displacement, float(state)
         )
-        return known or super().force_history_gradient(
-            values, displacement, velocity, state, acceleration=acceleration
-        )
+        if known is not None:
+            return known
+        if self._is_narrow(values, displacement):
+            found = self.element.force_history_gradient(values[:-1], displacement, velocity, state)
+            return found._replace(by_parameter=(*found.by_parameter, np.zeros(displacement.shape)))
+        return super().force_history_gradient(values, displacement, velocity, state)
+
+    def _is_narrow(self, values: Sequence[FloatArray | float], displacement: FloatArray) -> bool:
+        """Return whether the gap is too narrow beside the path to matter."""
+        return float(values[-1]) < _NARROWEST * float(np.abs(np.diff(displacement)).sum())
 
     def steady_force(
         self, values: Sequence[FloatArray], path: FloatArray, cycles: int

@@ -36,6 +36,7 @@ from dahl_ident.elements import (
 from dahl_ident.elements.backlash import Backlash
 from dahl_ident.elements.behaviour import (
     Asymptote,
+    Behaviour,
     Combination,
     HistoryGradient,
     StiffnessGradient,
@@ -245,9 +246,7 @@ class Dahl(Friction):
         """
         f_max, sigma, alpha = (float(v) for v in values)
         if alpha != 1.0 or self.parameters[2].free:
-            return super().force_history_gradient(
-                values, displacement, velocity, state, acceleration=acceleration
-            )
+            return Behaviour.force_history_gradient(self, values, displacement, velocity, state)
         force, by_state, by = hysteresis.linear_history_gradient(displacement, f_max, sigma, state)
         return HistoryGradient(force, by_state, (*by.T, np.zeros(force.shape)))
 

@@ -21,7 +21,7 @@ from dahl_ident.arrays import (
     positive_number,
     whole_number,
 )
-from dahl_ident.elements.law_checks import check_declarations, check_slope
+from dahl_ident.elements.law_checks import check_declarations, check_slope, scaling_the_force
 from dahl_ident.elements.slope_law import SlopeLaw
 from dahl_ident.errors import ModelError
 
@@ -77,6 +77,8 @@ class Friction(SlopeLaw):
             )
         self._bind(given | named, name)
         check_slope(self)
+        if not self.scale_parameters:
+            self.scale_parameters = scaling_the_force(self)
 
     def _check_rate(self, method: str) -> None:
         if not self.rate_independent:

@@ -37,9 +37,11 @@ _TO_SLIP = 0.98  # of the force of full slip: the largest loop
 _SOFT = 3.0  # times the scale: that of a law without full slip
 _CREATED = 0.01  # of the work of both directions: energy that the steps of an integral may create
 _AGREE = 1e-8  # relative: symbols and numbers
+_FORCE_UNIT = 32.0  # N, a unit in which a law has the same form; a power of 2 changes no digit
 _RESERVED = ("name", "kind", "element")  # keys of an element in files
 
 _CHECKED: WeakKeyDictionary[type, set[tuple[Parameter, ...]]] = WeakKeyDictionary()
+_SCALING: WeakKeyDictionary[type, tuple[str, ...]] = WeakKeyDictionary()
 
 
 def is_of_package(law: type) -> bool:
@@ -119,6 +121,34 @@ def check_slope(law: SlopeLaw) -> None:
         if all(reasons):
             raise ModelError(f"{type(law).__name__}.slope {reasons[0]}")
     done.add(declared)
+
+
+def scaling_the_force(law: SlopeLaw) -> tuple[str, ...]:
+    """Return the labels of parameters that scale the force together: those with a unit of force.
+
+    None where their units do not agree with the law.
+    """
+    if type(law) not in _SCALING:
+        labels = tuple(v for v, p in zip(law.labels, law.parameters, strict=True) if p.dimension[0])
+        _SCALING[type(law)] = labels if _agrees_with_units(law) else ()
+    return _SCALING[type(law)]
+
+
+def _agrees_with_units(law: SlopeLaw) -> bool:
+    """Return whether the slope is in proportion to a unit of force, and to parameters with it."""
+    powers = [p.dimension[0] for p in law.parameters]
+    if not set(powers) <= {0, 1}:
+        return False
+    rng = np.random.default_rng(2)
+    values = [_tried(p, rng, _TRIALS) for p in law.parameters]
+    force = rng.uniform(-1.0, 1.0, _TRIALS) * 10.0 ** rng.uniform(-3.0, 3.0, _TRIALS)
+    direction = np.resize([1.0, -1.0], _TRIALS)
+    speed = None if law.rate_independent else direction * rng.uniform(0.1, 1.0, _TRIALS)
+    scaled = [v * _FORCE_UNIT**power for v, power in zip(values, powers, strict=True)]
+    with np.errstate(all="ignore"):
+        slope = np.asarray(law.slope(force, direction, speed, values))
+        other = np.asarray(law.slope(_FORCE_UNIT * force, direction, speed, scaled))
+    return bool(np.allclose(other, _FORCE_UNIT * slope, rtol=1e-12, atol=0.0, equal_nan=True))
 
 
 class _Trial:

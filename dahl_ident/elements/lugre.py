@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.behaviour import Asymptote, Mechanics
+from dahl_ident.elements.behaviour import Asymptote
 from dahl_ident.elements.element import motion
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
@@ -95,19 +95,6 @@ class LuGre(Friction):
         """Return the whole force from that of the bristles and its slope."""
         _, sigma, *_, micro_damping, viscous = values
         return force + (micro_damping / sigma * slope + viscous) * velocity
-
-    def mechanics(
-        self,
-        values: Sequence[Any],
-        displacement: Any,
-        velocity: Any,
-        direction: Any,
-        states: Sequence[Any],
-    ) -> Mechanics:
-        """Return the whole force, and the change over time of the bristles' force."""
-        (force,) = states
-        slope = self.slope(force, direction, velocity, values)
-        return Mechanics(0.0, self.output(force, slope, velocity, values), (slope * velocity,))
 
     def force_history(
         self,

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.behaviour import Mechanics, clipped
+from dahl_ident.elements.behaviour import Behaviour, Mechanics, clipped
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.recursion import stretches
 from dahl_ident.errors import ModelError
@@ -38,6 +38,7 @@ class Masing(Friction):
     """Parallel Jenkins elements, defined by the force of a first loading; see the module."""
 
     one_state = False
+    force_history_gradient = Behaviour.force_history_gradient
     unique_response = True
 
     @abstractmethod

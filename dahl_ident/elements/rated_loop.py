@@ -31,7 +31,7 @@ _NEWTON_STEPS = 60  # at most; a loop that has not settled by then has no number
 _CONVERGED = 1e-12  # of the largest force: what the next step would change is below rounding
 _STALLS, _ROUNDED = 9, 1e-9  # after so many steps, a change that may be rounding alone
 _SAME = 1e-13  # relative difference of slopes that is rounding
-FORCE_STEP = 1e-6  # of the force, for the derivative of the slope
+_FORCE_STEP = 1e-6  # of the force, for the derivative of the slope
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def _settled(
     """
     for iteration in range(_NEWTON_STEPS):
         s = along(force)
-        h = FORCE_STEP * np.maximum(size, np.abs(force).max(axis=1)[:, None])
+        h = _FORCE_STEP * np.maximum(size, np.abs(force).max(axis=1)[:, None])
         by_force = (along(force + h) - along(force - h)) / (2.0 * h)
         right = travel * (s - by_force * force)
         found, decay = _linear(-travel * by_force, right[:, None], width, matrix, 1.0)

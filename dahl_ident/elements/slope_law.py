@@ -1,7 +1,7 @@
 """What follows from the slope dF/dx of a law: loops, harmonics, derivatives, force, limits.
 
-By quadrature (:mod:`dahl_ident.elements.steady_loop`) and from tables
-(:mod:`dahl_ident.elements.force_curve`).
+Settled loops by quadrature (:mod:`dahl_ident.elements.steady_loop`), forces along histories by the
+engine (:mod:`dahl_ident.elements.held_motion`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dahl_ident.arrays import (
     ComplexArray,
     FloatArray,
 )
-from dahl_ident.elements import force_curve
+from dahl_ident.elements import held_motion
 from dahl_ident.elements.behaviour import (
     SOFTENED,
     STENCIL,
@@ -31,7 +31,7 @@ from dahl_ident.elements.behaviour import (
     central_differences,
 )
 from dahl_ident.elements.element import Element, motion
-from dahl_ident.elements.rated_loop import FORCE_STEP, RatedLoop, rated_loop
+from dahl_ident.elements.rated_loop import RatedLoop, rated_loop
 from dahl_ident.elements.steady_loop import Loop, Rows, closed_loop, force_limit
 from dahl_ident.errors import ModelError, ValidationError
 
@@ -39,7 +39,6 @@ _BLOCK = 200  # loops computed together: their scratch arrays stay in the proces
 _AT_REST = 1e-150  # smaller amplitudes are rest
 _SMALLEST = 1e-30  # m; the same for a velocity-dependent law
 _RATED_BLOCK = 64  # velocity-dependent loops computed together: each solves a small linear system
-_SUBSTEPS = 4  # of a step between samples: the error of second order falls by 16
 _FARTHEST = 1e9  # m; a law that has not slipped fully there never does
 _START = 60  # steps from rest to the start of a path: as fine as a cycle of 240
 _FORCE_UNIT, _LENGTH_UNIT = 32.0, 2.0**-7  # units in which a law should have the same form
@@ -111,7 +110,7 @@ class SlopeLaw(Element):
         """Return the present force, and its change over time: slope times velocity."""
         (force,) = states
         slope = self.slope(force, direction, velocity, values)
-        return Mechanics(0.0, force, (slope * velocity,))
+        return Mechanics(0.0, self.output(force, slope, velocity, values), (slope * velocity,))
 
     def stiffness(
         self,
@@ -318,37 +317,29 @@ class SlopeLaw(Element):
     ) -> FloatArray:
         """Return the force at every sample, unchecked.
 
-        From the curves of both directions; for a velocity-dependent law by exponential steps,
-        exact between samples where its slope is linear in the force and the speed constant.
+        A law that depends on the rate moves at the mean of two samples' velocities between them.
         """
-        if not self.rate_independent:
-            v = motion(velocity, "velocity", displacement, self)
-            return self._rated_history(values, displacement, v, float(state))
-        at = [np.asarray(v, dtype=np.float64) for v in values]
-        return force_curve.force_history(
-            partial(self._rising, at), partial(self._falling, at), displacement, float(state)
-        )
+        v = velocity if self.rate_independent else motion(velocity, "velocity", displacement, self)
+        return held_motion.force_along(self, values, displacement, v, state).value
 
-    def _rated_history(
-        self, values: Sequence[Any], x: FloatArray, v: FloatArray, state: float
-    ) -> FloatArray:
-        forces = np.full(x.shape, state)
-        force = state
-        for i, (step, speed) in enumerate(
-            zip(np.diff(x).tolist(), (0.5 * (v[1:] + v[:-1])).tolist(), strict=True), start=1
-        ):
-            heading = -1.0 if step < 0.0 else 1.0
-            for _ in range(_SUBSTEPS):
-                h = FORCE_STEP * max(abs(force), abs(step))
-                low, s, high = (
-                    float(self.slope(force + d, heading, speed, values)) for d in (-h, 0.0, h)
-                )
-                y = step / _SUBSTEPS * (high - low) / (2.0 * h) if h else 0.0
-                growth = float(np.expm1(y)) / y if y else 1.0
-                force += step / _SUBSTEPS * s * growth
-            forces[i] = force
-        slope = self.slope(forces, np.where(v < 0.0, -1.0, 1.0), v, values)
-        return np.asarray(self.output(forces, slope, v, values)) + 0.0 * forces
+    def force_history_gradient(
+        self,
+        values: Sequence[FloatArray | float],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
+        *,
+        acceleration: FloatArray | None = None,
+    ) -> HistoryGradient:
+        """Return the force at every sample with its derivatives; 0 by parameters that are fixed."""
+        if not self.rate_independent:
+            return super().force_history_gradient(values, displacement, velocity, state)
+        free = [i for i, p in enumerate(self.parameters) if p.free]
+        return held_motion.force_along(self, values, displacement, velocity, state, free)
+
+    def states_at(self, values: Sequence[float], force: float) -> Sequence[float]:
+        """Return the states from which a held motion starts with a force."""
+        return (force,)
 
     def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Return the forces of full slip in both directions, N; inf if there is none."""

@@ -222,13 +222,15 @@ def pass_event(f, signal, t, e, y, S, first, chosen, w, at):
     w[at.sides + e] *= -1.0
     if e == 0:
         choose_sides(f, signal, t, y, w, at)
-    elif (  # both branches lead here, and not because nothing moves
-        slope_at(f, signal, t, y, e, w, at) * w[at.sides + e] <= 0.0
-        and abs(w[2]) > NEAR * w[at.scale + 1]
-    ):
-        side, w[at.sides + e] = w[at.sides + e], 0.0
-        if slope_at(f, signal, t, y, e, w, at) != 0.0:
-            w[at.sides + e] = side
+    else:
+        rate, row = slope_at(f, signal, t, y, e, w, at), at.scale + n + e
+        if rate == 0.0:  # it stays as rounding left it, and counts as zero
+            w[row] = max(w[row], 2.0 * abs(w[o + n + e]) / NEAR)
+        # both branches lead here, and not because nothing moves
+        if rate * w[at.sides + e] <= 0.0 and abs(w[2]) > NEAR * w[at.scale + 1]:
+            side, w[at.sides + e] = w[at.sides + e], 0.0
+            if slope_at(f, signal, t, y, e, w, at) != 0.0:
+                w[at.sides + e] = side
     if moves:
         put(y, w)
         evaluate(f, signal, t, 0.0, w, at)

@@ -525,7 +525,7 @@ def _table(
     """Return F_k/X_1 over unit scale at ln(A/length) = -32, -31.99, ..., 32."""
     element = d.element
     values = _unit_values(d, length, numbers)
-    plain = set(vars(element)) <= {"_name", "parameters"}
+    plain = set(vars(element)) <= {"_name", "parameters", "scale_parameters"}
     key = (type(element), element.labels, tuple(float(v) for v in values), harmonic)
     if not plain or key not in _TABLES:
         table = _computed_table(element, values, harmonic)
