@@ -28,7 +28,7 @@ from dahl_ident.steady_state import Shooting, Steady
 
 DESTINATION = Path("docs/validation/driven_plants.md")
 SEED = 31
-TABLES = 8  # of each plant, each with noise of its own
+TABLES = 4  # of each plant, each with noise of its own
 LEVELS, FREQUENCIES = 5, 12
 solve_ivp: Any = integrate.solve_ivp
 SAMPLES = 512  # of a cycle, for its fundamental
