@@ -72,6 +72,7 @@ EXPONENT = "exponent"
 DRIVE = "drive factor"
 _GAIN = "force_gain"
 _STEPS = 6  # expansions about the runs at most; the last counts, settled or not
+_TRIED = 2  # sources of which one may leave, at a time
 _FEWEST_TESTS = 5  # of which each is left out in turn
 _TESTS_THAT_LIMIT = 8  # fewer may agree by chance although the model errs
 _BY_CHANCE = 2.0  # standard deviations
@@ -379,7 +380,7 @@ def _estimated(
     shared = StructuredSources(problem, theta) if _tells(problem, assumed) else None
     apart = own_errors(problem, _standing_apart(optimum))
     runs: RunDeviations | None = None
-    start: FloatArray | None = None
+    found: VarianceComponents | None = None
     for _ in range(_STEPS):
         near = linearization(problem, theta, runs)
         y, whole = rows.at(theta, near)
@@ -391,8 +392,10 @@ def _estimated(
         linear, contrasts = linear_model(problem, y, J, sources, estimate.lever(J))
         level = 0.0 if problem.scale_known else float(y[:m] @ y[:m]) / max(dof, 1)
         floor = np.array([level * (s.columns.ndim == 1) for s in sources])
-        found = _asked_for(contrasts, sources, floor if start is None else start, floor)
-        start = found.variances
+        if found is None:
+            found = _asked_for(contrasts, sources, floor)
+        else:  # about other runs: what was not asked for before is not asked for again
+            found = variance_components(contrasts, found.variances, found.largest)
         projection = Projection(linear, found.variances)
         before, runs = runs, run_deviations(problem, sources, projection.effects())
         if runs is not None:  # these are about the estimate that V weighs
@@ -401,6 +404,7 @@ def _estimated(
             runs = runs.about(move, range(len(theta)))
         if alike(before, runs):
             break
+    assert found is not None
     always = [s.name == NOISE and not s.price for s in sources]
     kept = np.flatnonzero((found.variances > 0.0) | always).tolist()
     sources = tuple(sources[k] for k in kept)
@@ -500,30 +504,31 @@ def _tells(problem: Problem, assumed: Collection[str]) -> bool:
 
 
 def _asked_for(
-    contrasts: Likelihood, sources: Sequence[Source], start: FloatArray, floor: FloatArray
+    contrasts: Likelihood, sources: Sequence[Source], floor: FloatArray
 ) -> VarianceComponents:
-    """Return the variances; sources that raise the likelihood too little have none.
+    """Return the variances; sources that raise the likelihood by less than their price have none.
 
     A source that has none beside all others is never missed; of the rest, that which costs the
-    likelihood least leaves first. `floor` has variances at which the covariance is not singular.
+    likelihood least leaves first, of a few that cost least by the information on their variances.
+    `floor` has variances at which the covariance is not singular.
     """
     most = np.array([s.largest for s in sources])
     price = np.array([s.price for s in sources])
-    found = variance_components(contrasts, np.minimum(start, most), most)
+    found = variance_components(contrasts, np.minimum(floor, most), most)
     while True:
         most = np.where((price > 0.0) & (found.variances == 0.0), 0.0, most)
-        best, best_loss = found, 0.0
-        for k in np.flatnonzero((price > 0.0) & (most > 0.0)).tolist():
+        open_ = np.flatnonzero((price > 0.0) & (most > 0.0))
+        about = 0.5 * found.variances[open_] ** 2 / np.diagonal(found.covariance)[open_]
+        for k in open_[np.argsort(about - price[open_])[:_TRIED]].tolist():
             fewer = most.copy()
             fewer[k] = 0.0
             begin = np.where(found.variances > 0.0, found.variances, floor)
             trial = variance_components(contrasts, np.minimum(begin, fewer), fewer)
-            loss = found.log_likelihood - trial.log_likelihood - price[k]
-            if loss < best_loss:
-                best, best_loss = trial, loss
-        if best is found:
+            if found.log_likelihood - trial.log_likelihood < price[k]:
+                found = trial
+                break
+        else:
             return found
-        found = best
 
 
 def linear_model(

@@ -15,6 +15,7 @@ Source: Patterson and Thompson, Biometrika 58 (1971) 545; Searle, Casella and Mc
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -263,13 +264,29 @@ class Likelihood:
         self._y = K @ model.y
         self._known = (K * model.known) @ K.T
         parts = [K * part if part.ndim == 1 else K @ part for part in model.Z]
-        self._sources = np.stack([part @ part.T for part in parts])
+        self._parts, self._covariances = parts, np.stack([part @ part.T for part in parts])
         self._model = model
+
+    def only(self, kept: NDArray[np.intp]) -> Likelihood:
+        """Return the likelihood of some of the sources, the first among them."""
+        other = copy(self)
+        other._parts = [self._parts[k] for k in kept]
+        other._covariances = self._covariances[kept]
+        return other
+
+    @cached_property
+    def _by_columns(self) -> tuple[NDArray[np.bool_], FloatArray, NDArray[np.intp]]:
+        """Which sources have few columns, all these columns, and where each source's begin."""
+        sizes = np.array([part.shape[1] for part in self._parts])
+        few = 2 * sizes < len(self._y)
+        chosen = [part for part, is_few in zip(self._parts, few, strict=True) if is_few]
+        columns = np.column_stack([np.zeros((len(self._y), 0)), *chosen])
+        return few, columns, np.concatenate([[0], np.cumsum(sizes[few])[:-1]]).astype(np.intp)
 
     def at(self, variances: FloatArray) -> State:
         """Return likelihood, gradient and expected information."""
         K, r = len(variances), len(self._y)
-        W = self._known + (variances @ self._sources.reshape(K, -1)).reshape(r, r)
+        W = self._known + (variances @ self._covariances.reshape(K, -1)).reshape(r, r)
         L, singular = linalg.lapack.dpotrf(W, lower=1)
         if singular:
             raise np.linalg.LinAlgError("the covariance of the residuals is singular")
@@ -278,11 +295,22 @@ class Likelihood:
         inverse[np.diag_indices(r)] *= 0.5
         weighted = inverse @ self._y
         likelihood = -np.log(np.diagonal(L)).sum() - 0.5 * self._y @ weighted
-        products = inverse @ self._sources
-        across = products.swapaxes(1, 2).reshape(K, -1)
-        traces = products.reshape(K, -1)[:, :: r + 1].sum(axis=1)
-        gradient = 0.5 * (weighted @ self._sources @ weighted - traces)
-        information = 0.5 * products.reshape(K, -1) @ across.T
+        few, columns, starts = self._by_columns
+        many = ~few
+        traces, information = np.empty(K), np.empty((K, K))
+        products = inverse @ self._covariances[many]
+        flat = products.reshape(len(products), r * r)
+        traces[many] = flat[:, :: r + 1].sum(axis=1)
+        information[np.ix_(many, many)] = 0.5 * flat @ products.swapaxes(1, 2).reshape(flat.shape).T
+        if few.any():
+            moved = inverse @ columns
+            traces[few] = np.add.reduceat((columns * moved).sum(axis=0), starts)
+            both = np.add.reduceat((columns.T @ moved) ** 2, starts, axis=0)
+            information[np.ix_(few, few)] = 0.5 * np.add.reduceat(both, starts, axis=1)
+            mixed = (columns * (products @ moved)).sum(axis=1).reshape(len(products), -1)
+            mixed = 0.5 * np.add.reduceat(mixed, starts, axis=1)
+            information[np.ix_(many, few)], information[np.ix_(few, many)] = mixed, mixed.T
+        gradient = 0.5 * (weighted @ self._covariances @ weighted - traces)
         rest, count = self._model.outside
         if count:
             variance = self._model.outside_variance(variances)
@@ -326,8 +354,11 @@ def variance_components(
     >>> (variance_components(model, np.array([1.0, 0.0])).variances ** 0.5).round(1).tolist()
     [1.0, 2.8]
     """
-    s = np.array(start, dtype=np.float64)
-    contrasts = Likelihood(model) if isinstance(model, LinearModel) else model
+    whole = Likelihood(model) if isinstance(model, LinearModel) else model
+    bounds = np.broadcast_to(np.asarray(upper, dtype=np.float64), np.shape(start))
+    kept = np.flatnonzero((bounds > 0.0) | (np.arange(bounds.size) == 0))
+    contrasts, upper = whole.only(kept), bounds[kept]
+    s = np.array(start, dtype=np.float64)[kept]
     state = contrasts.at(s)
     for _ in range(_STEPS):
         step = _projected(s, state.gradient, state.information, s >= upper)
@@ -340,8 +371,9 @@ def variance_components(
         s, state = found
         if rise < CLOSE:
             break
-    bounds = np.broadcast_to(np.asarray(upper, dtype=np.float64), s.shape)
-    return VarianceComponents(s, state.information, state.log_likelihood, bounds)
+    variances, information = np.zeros(bounds.size), np.zeros((bounds.size, bounds.size))
+    variances[kept], information[np.ix_(kept, kept)] = s, state.information
+    return VarianceComponents(variances, information, state.log_likelihood, bounds)
 
 
 def _projected(
@@ -383,7 +415,7 @@ def _along(
     state: State,
     s: FloatArray,
     step: FloatArray,
-    upper: FloatArray | float,
+    upper: FloatArray,
 ) -> tuple[FloatArray, State] | None:
     """Return the first point along the step at which the likelihood is higher."""
     for length in _LENGTHS:
