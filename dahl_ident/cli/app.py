@@ -76,6 +76,8 @@ def main(arguments: list[str] | None = None) -> None:
         As typed after ``dahl-ident``; by default those of the process.
     """
     typed = sys.argv[1:] if arguments is None else arguments
+    # the matrices are small: numerical threads would wait for each other longer than they work
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if not console.open_streams():
         console.write_error("error: standard output is closed; send it to a file, or /dev/null")
         sys.exit(console.BAD_INPUT)
