@@ -127,7 +127,7 @@ def test_a_law_that_a_user_wrote_is_simulated_fitted_and_sampled(run: Runner) ->
 
     try:
         law = "typed_jenkins(stiffness=30, f_max=0.1)"
-        noise = ("--force-std", "0.01", "--displacement-std", "0.001")
+        noise = ("--force-std", "0.01")
         made = run("simulate", "--element", law, "--levels", "1e-3:0.1:8", *noise, "-o", "t.csv")
         assert made.status == 0, made.err
         fit = json.loads(run("fit", "t.csv", "--element", "typed_jenkins", "--json").out)

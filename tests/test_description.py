@@ -60,7 +60,10 @@ def test_a_function_is_refused() -> None:
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        ({"kind": "dhal"}, "has the kind 'dhal'; expected one of .*dahl.*, mass, damper, spring"),
+        (
+            {"kind": "dhal"},
+            "has the kind 'dhal'; expected a law .*, or one of .*dahl.*, mass, damper, spring",
+        ),
         ({"kind": "mass", "m": 1.0}, "the mass element has the keys m; expected mass"),
         ({"kind": "linear_system", "quantity": "receptance"}, "the linear_system element has no A"),
     ],

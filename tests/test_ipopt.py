@@ -501,8 +501,10 @@ def test_noise_of_the_drive_is_judged_as_it_was_fitted() -> None:
         exact.frequency_hz, R, drive=drive, controlled="force", quantity="receptance",
         covariance=C,
     )  # fmt: skip
-    result = fit(data, UNKNOWN_PLANT, method="ipopt", drive_std=0.05 * drive, throw=False)
-    assert result.chisqr == pytest.approx(2.0 * result.optimum.cost, rel=1e-8)
+    plant = Dahl(alpha=1.0) + Mass() + Damper() + Spring()
+    result = fit(data, plant, method="ipopt", drive_std=0.05 * drive, throw=False)
+    # of the estimate, a third of a standard error from the optimum at most
+    assert 0.0 <= result.chisqr - 2.0 * result.optimum.cost < 0.1
     assert result.status.usable
     assert result.errors is not None
     interval = result.conf_interval("profile", 0.9545)

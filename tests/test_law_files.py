@@ -118,7 +118,7 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, text: str, message: s
 def test_a_kind_that_is_not_known_says_what_to_give(file: Path, run: Runner) -> None:
     wrong = run("fit", str(table(file)), "--element", "unheard")
     assert wrong.status == 1
-    assert "or a law from a file given with --laws" in wrong.err
+    assert "expected a law from a file given with --laws, or one of " in wrong.err
 
 
 def test_a_changed_file_is_run_again(file: Path) -> None:

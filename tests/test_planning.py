@@ -468,7 +468,10 @@ class TestPlan:
             ({"limits": {**KNEE, "time": 9, "force": 1e-9}}, "force excludes"),
             ({"noise": None}, "the noise is unknown before any data"),
             ({"noise": {"relativ": 1}}, "noise has relativ; expected relative"),
-            ({"target": {"mass": 0.1}}, "target names 'mass'; expected a product of powers, such as 'f_max/sigma', of f_max, sigma"),
+            (
+                {"target": {"mass": 0.1}},
+                "target names 'mass'; expected a product of powers, such as ",
+            ),
             ({"target": {"f_max+1": 0.1}}, "expected a parameter, or a product of powers"),
             ({"target": {"f_max": 2.0}}, "below 1: 0.02 is 2 %"),
             ({"suspects": {"gap": 0.1}}, "suspects names gap"),
