@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.integrate import trapezoid
 
 import dahl_ident as di
 from dahl_ident import report
@@ -436,5 +437,5 @@ def test_the_energy_of_a_cycle_has_the_uncertainty_of_the_budget(fit: di.FitResu
     assert found is not None
     lost, u, A = map(float, found.groups())
     truth = di.Dahl(0.1, 30.0, alpha=1.0).loop(A, 20001)
-    assert abs(lost - abs(float(np.trapezoid(truth[1], truth[0])))) < 3.0 * u
+    assert abs(lost - abs(float(trapezoid(truth[1], truth[0])))) < 3.0 * u
     assert u > 0.5 * lost * fit.budget()["f_max"].u / fit.budget()["f_max"].value
