@@ -291,9 +291,10 @@ class TestDoubts:
         columns[rows, 30:45] = 0.0
         self.named(tmp_path, columns, message)
 
-    def test_a_motion_that_sticks(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("places", [slice(30, 45), slice(None)])
+    def test_a_motion_that_sticks(self, places: slice, tmp_path: Path) -> None:
         columns = COLUMNS.copy()
-        columns[1, 30:45] = columns[1, 30]
+        columns[1, places] = columns[1, 30]
         self.named(tmp_path, columns, "the motion repeats one value while the force goes on")
 
     @pytest.mark.parametrize("row", [0, 1, 2])

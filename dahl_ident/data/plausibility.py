@@ -174,7 +174,7 @@ def _stuck(held: FloatArray, other: FloatArray, *, smooth: bool = False) -> NDAr
     Dry friction and a coarse converter keep a value as well, but leave it by no more than their
     usual steps. A converter that sticks jumps afterwards, or before where it gives 0; or it keeps
     a value within the range of a signal that otherwise hardly ever repeats one, because of its
-    noise. A motion is smooth: it does not stop at once.
+    noise. A motion is smooth: it does not stop at once, and it does not rest throughout.
     """
     steps = np.abs(np.diff(held))
     starts, stops = _runs(np.concatenate([[False], steps == 0.0]))
@@ -182,8 +182,8 @@ def _stuck(held: FloatArray, other: FloatArray, *, smooth: bool = False) -> NDAr
     travel = np.abs(other[[(starts + stops) // 2, stops]] - other[starts]).max(axis=0)
     moved = travel > _STUCK_TRAVEL * np.ptp(other)
     starts, stops = starts[moved], stops[moved]
-    if not starts.size or not steps.any():
-        return np.zeros(0, dtype=np.intp)
+    if not starts.size or not steps.any():  # a force of 0 throughout is a free decay
+        return np.asarray(starts[:1] if smooth else starts[:0])
     usual, count = _usual(steps), np.sum(steps == 0.0)
     jumps = np.append(steps, 0.0)[stops] > 5.0 * usual
     jumps |= (held[starts] == 0.0) & (_edges(held, starts, stops) > 3.0 * usual)
