@@ -262,23 +262,10 @@ class Density(LogDensity):
         problem = self.problem
         model = problem.model.tabulated()
         if model is not problem.model:
-            problem = Problem(
-                problem.data,
-                model,
-                noise=problem.noise,
-                sensors=problem.sensors,
-                steady=problem.steady,
-            )
+            problem = problem.like(model=model)
         if not problem.is_exact:
             return problem
-        sensors = problem.sensors.with_free(list(problem.priors))
-        alone = Problem(
-            problem.data,
-            self.problem.model,
-            noise=problem.noise,
-            sensors=sensors,
-            steady=problem.steady,
-        )
+        alone = self.problem.like(sensors=problem.sensors.with_free(list(problem.priors)))
         return problem.near(solve(alone).theta)
 
     @cached_property

@@ -44,9 +44,7 @@ def _with_normal_priors(problem: Problem) -> Problem:
     if not normal:
         return problem
     sensors = Sensors(**{**given, **normal})
-    return Problem(
-        problem.data, problem.model, noise=problem.noise, sensors=sensors, steady=problem.steady
-    )
+    return problem.like(sensors=sensors)
 
 
 def starting_points(
@@ -174,7 +172,7 @@ def _moved_inside(density: Density, optimum: Optimum) -> FloatArray:
         candidate = nearest.copy()
         candidate[first] = position
         value = float(problem.to_values(candidate)[first])
-        reduced = optimum_of(_holding(problem, {problem.names[first]: value}))
+        reduced = optimum_of(problem.like(fixed={problem.names[first]: value}))
         if reduced is not None:
             candidate[[problem.names.index(name) for name in reduced.names]] = reduced.theta
             candidates.append(np.clip(candidate, low, high))
@@ -185,17 +183,6 @@ def _moved_inside(density: Density, optimum: Optimum) -> FloatArray:
 def _narrowed(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
     margin = _INSIDE * (high - low)
     return low + margin, high - margin
-
-
-def _holding(problem: Problem, held: dict[str, float]) -> Problem:
-    return Problem(
-        problem.data,
-        problem.model,
-        noise=problem.noise,
-        sensors=problem.sensors,
-        fixed=held,
-        steady=problem.steady,
-    )
 
 
 def _scale(density: Density, theta: FloatArray) -> float:

@@ -183,9 +183,7 @@ def _estimate(optimum: Optimum, errors: ErrorModel | None) -> tuple[Problem, Flo
 def _measured(there: Problem, R: ComplexArray, known: NDArray[np.bool_]) -> StiffnessData:
     """Return amplitude and stiffness of predicted responses, as if they had been measured."""
     data = replace(there.data.select(rows=known), response=R[known])
-    return Problem(
-        data, there.model, noise="absolute", sensors=there.sensors, steady=there.steady
-    ).stiffness_data
+    return there.like(data=data, noise="absolute").stiffness_data
 
 
 def problem_at(
@@ -218,9 +216,7 @@ def problem_at(
         quantity=problem.data.quantity if quantity is None else quantity,
         motion=problem.data.motion,
     )
-    return Problem(
-        grid, problem.model, noise="absolute", sensors=problem.sensors, steady=problem.steady
-    )
+    return problem.like(data=grid, noise="absolute")
 
 
 def describing_function_band(

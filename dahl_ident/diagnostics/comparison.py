@@ -331,11 +331,7 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
 
 def _solved(optimum: Optimum, model: Element, *, own: bool) -> Optimum:
     """Return a candidate's optimum; limits at infinity are those of simpler candidates."""
-    problem = optimum.problem
-    other = Problem(
-        problem.data, model, noise=problem.noise, sensors=problem.sensors, steady=problem.steady
-    )
-    return solve(other, loss=optimum.loss, limits=own)
+    return solve(optimum.problem.like(model=model), loss=optimum.loss, limits=own)
 
 
 def _candidates(

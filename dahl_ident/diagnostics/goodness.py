@@ -44,7 +44,6 @@ from dahl_ident.diagnostics.trends import LEAST_RANGE, Runs, Trend, runs, trends
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.fitting import Optimum
-from dahl_ident.problem import Problem
 
 _FALSE_ALARM = 0.01  # of all tests together: one sound data set in a hundred is doubted
 _HINT = 0.05  # the same of hints, which doubt nothing
@@ -513,14 +512,7 @@ def _scatter(optimum: Optimum) -> Scatter | None:
     problem = optimum.problem
     if problem.noise == "measured" or problem.data.covariance is None or optimum.dof <= 0:
         return None
-    known = Problem(
-        problem.data,
-        problem.model,
-        noise="measured",
-        sensors=problem.sensors,
-        steady=problem.steady,
-    )
-    y, _ = known.residuals_and_jacobian(optimum.theta, tails=False)
+    y, _ = problem.like(noise="measured").residuals_and_jacobian(optimum.theta, tails=False)
     return Scatter(float(np.sqrt(y @ y / optimum.dof)))
 
 
@@ -555,7 +547,7 @@ def _is_exponent(parameter: Parameter) -> bool:
 
 def _by_alpha(optimum: Optimum, name: str) -> ComplexArray:
     """Return the relative change of the response with ln alpha, sensors and drive included."""
-    freed = optimum.problem.freeing([name])
+    freed = optimum.problem.like(free=[name])
     theta = np.zeros(len(freed.names))
     known = dict(zip(optimum.names, optimum.theta, strict=True))
     for i, parameter in enumerate(freed.parameters):

@@ -96,7 +96,7 @@ def sign_convention(optimum: Optimum, before: float, tested: Callable[[Optimum],
     found = []
     for turn in TURNS:
         try:
-            problem = _alike(optimum.problem, turn(optimum.problem.data))
+            problem = optimum.problem.like(data=turn(optimum.problem.data))
             # single rows near a resonance may miss at a start: the median is not bent by them
             first = float(np.median(_misfit(problem, problem.predict(starts(problem)[0]))))
         except DahlIdentError:
@@ -121,7 +121,7 @@ def set_aside(optimum: Optimum, rows: Sequence[int]) -> Optimum | None:
     kept = np.ones(data.n, dtype=np.bool_)
     kept[list(rows)] = False
     try:
-        other = solve(_alike(optimum.problem, data.select(rows=kept)), loss=optimum.loss)
+        other = solve(optimum.problem.like(data=data.select(rows=kept)), loss=optimum.loss)
     except DahlIdentError:
         return None
     return None if other.status is Status.NOT_CONVERGED else other
@@ -157,9 +157,3 @@ def _misfit(problem: Problem, fitted: ComplexArray) -> FloatArray:
     crossed = rows & (fitted != 0.0)  # within a gap there is nothing that a share could be of
     rows = crossed if crossed.any() else rows
     return np.asarray(np.abs(1.0 - fitted[rows] / response[rows]))
-
-
-def _alike(problem: Problem, data: FrequencyResponse) -> Problem:
-    return Problem(
-        data, problem.model, noise=problem.noise, sensors=problem.sensors, steady=problem.steady
-    )

@@ -118,9 +118,7 @@ def linearization(
         own = problem.data.select(rows=rows)
         deviation = gain + 1j * phase * own.harmonic
         own = replace(own, response=own.response * np.exp(-deviation))
-        part = Problem(
-            own, problem.model, noise=problem.noise, sensors=problem.sensors, steady=problem.steady
-        )
+        part = problem.like(data=own)
         there, both = theta + shift, np.repeat(rows, 2)
         at, by = part.residuals_and_jacobian(there, tails=False)
         at, by = at[: 2 * own.n], by[: 2 * own.n]

@@ -375,9 +375,7 @@ def _with_drive_error(
         together = finite_array(covariance, "drive_covariance")
         cross = _for_rows(together, "drive_covariance", (data.n, 2))
     noisy = replace(data, drive_std=spread, drive_covariance=cross)
-    return Problem(
-        noisy, problem.model, noise=problem.noise, sensors=problem.sensors, steady=problem.steady
-    )
+    return problem.like(data=noisy)
 
 
 def _for_rows(value: FloatArray, name: str, shape: tuple[int, ...]) -> FloatArray:

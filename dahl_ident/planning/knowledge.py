@@ -272,11 +272,7 @@ def _with_data(
 ) -> Knowledge:
     """Return draws with the information of their data, at each draw or at one of them."""
     model, assumed = _with_assumed(given.model)
-    problem = given
-    if assumed:
-        problem = Problem(
-            given.data, model, noise=given.noise, sensors=given.sensors, steady=given.steady
-        )
+    problem = given.like(model=model) if assumed else given
     own = [problem.names.index(name) for name in given.names]
     theta = np.array([np.log(p.value or 1.0) for p in problem.parameters]) * np.ones(
         (len(drawn), 1)

@@ -15,7 +15,6 @@ from dahl_ident.planning.forecast import Forecast, typical
 from dahl_ident.planning.optimal_design import Exchange, Selection, continuous_design
 from dahl_ident.planning.quantities import sizes
 from dahl_ident.planning.question import Question
-from dahl_ident.problem import Problem
 
 _POOL = 80  # candidates: the time of the search grows with their number
 _MOST_RUNS = 8  # against scatter between runs: a ninth would gain 6 %
@@ -61,9 +60,7 @@ class LevelSearch:
         own = q.knowledge.problem
         known = np.zeros((S, P, P))
         if own is not None:
-            before = Problem(
-                own.data, q.larger, noise=own.noise, sensors=q.knowledge.sensors, steady=own.steady
-            )
+            before = own.like(model=q.larger, sensors=q.knowledge.sensors)
             scale = 1.0 if own.scale_known else float(q.knowledge.row_noise or 1.0)
             known = known + before.information(theta, scale) * np.outer(size, size)
         self._suspects_before = known + _NOTHING * np.eye(P)

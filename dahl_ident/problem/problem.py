@@ -252,14 +252,24 @@ class Problem:
             self.model, self.sensors, self._coordinates, self._rows, shooting, self._orbits
         )
 
-    def freeing(self, names: Iterable[str]) -> Problem:
-        """Return the problem with given parameters free as well."""
+    def like(
+        self,
+        *,
+        data: FrequencyResponse | None = None,
+        model: Element | None = None,
+        noise: str | None = None,
+        sensors: Sensors | None = None,
+        free: Iterable[str] = (),
+        fixed: Mapping[str, float] | None = None,
+    ) -> Problem:
+        """Return this problem with what is given in place of its own."""
         return Problem(
-            self.data,
-            self.model,
-            noise=self.noise,
-            sensors=self.sensors,
-            free=names,
+            self.data if data is None else data,
+            self.model if model is None else model,
+            noise=self.noise if noise is None else noise,
+            sensors=self.sensors if sensors is None else sensors,
+            free=free,
+            fixed=fixed,
             steady=self.steady,
         )
 
@@ -271,7 +281,7 @@ class Problem:
         spread : mapping of str to float
             Standard deviation of the logarithm of each.
         """
-        other = self.freeing(spread)
+        other = self.like(free=spread)
         values = {p.name: p.value or 1.0 for p in other.parameters}
         other.ranges = {n: (float(np.log(values[n])), std) for n, std in spread.items()}
         return other

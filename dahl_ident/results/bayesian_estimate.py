@@ -329,7 +329,7 @@ def _case(
             Density(problem, joint_prior(problem, given, values), likelihood), optimum, fit
         )
     _, assumed = with_assumed(problem)
-    wider = problem.freeing(assumed) if assumed else problem
+    wider = problem.like(free=assumed) if assumed else problem
     errors = fit.errors or error_model(optimum, of_combinations=True)
     known = dict(zip(optimum.names, optimum.theta.tolist(), strict=True))
     theta = np.array([known.get(p.name, np.log(p.value or 1.0)) for p in wider.parameters])
