@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from dahl_ident.cli import console
 from dahl_ident.cli.distributions import prior
@@ -36,9 +36,6 @@ from dahl_ident.cli.options import (
     steady_option,
 )
 from dahl_ident.errors import ValidationError
-
-if TYPE_CHECKING:
-    pass
 
 _SAMPLING = "Sampling"
 _sampling = in_panel(_SAMPLING)

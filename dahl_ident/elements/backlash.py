@@ -130,21 +130,6 @@ class Backlash(Friction):
         play = clipped(start, half)
         return self.slope(0.0, 1.0, 0.0, values) * (start - play), play
 
-    def state_histories(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray,
-        acceleration: FloatArray,
-    ) -> Sequence[FloatArray]:
-        """Return force and place in the gap along a displacement, from the middle."""
-        force = self.force_history(values, displacement)
-        half, place, places = 0.5 * float(values[-1]), 0.0, [0.0]
-        for step, f in zip(np.diff(displacement).tolist(), force[1:].tolist(), strict=True):
-            place = half * np.sign(f) if f else min(max(place + step, -half), half)
-            places.append(place)
-        return force, np.array(places)
-
     def stiffness(
         self,
         values: Sequence[FloatArray],

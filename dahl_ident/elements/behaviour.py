@@ -303,11 +303,6 @@ class Behaviour(ABC):
         """Whether a force determines the motion of the element."""
         return any(p.is_mass for p in self.parameters)
 
-    @property
-    def fastest_rate(self) -> float:
-        """Largest modulus of the poles of a linear element's states, rad/s."""
-        return 0.0
-
     def sampled(self, interval: float) -> Self:
         """Return this element for histories of one sampling interval, s."""
         return self
@@ -322,18 +317,6 @@ class Behaviour(ABC):
         The states of an element without memory are unknowns themselves.
         """
         return (start,) * self.n_states
-
-    def state_histories(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray,
-        acceleration: FloatArray,
-    ) -> Sequence[FloatArray]:
-        """Return the states along a displacement, unchecked, from zero force."""
-        if not self.n_states:
-            return ()
-        return (self.force_history(values, displacement, velocity, acceleration=acceleration),)
 
     def steady_force(
         self, values: Sequence[FloatArray], path: FloatArray, cycles: int

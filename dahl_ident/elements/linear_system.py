@@ -192,11 +192,6 @@ class LinearSystem(Element):
         """Whether Z(s) grows as s^2."""
         return self._over_time[0][2] != 0.0
 
-    @property
-    def fastest_rate(self) -> float:
-        """Largest modulus of the poles of Z(s), rad/s."""
-        return float(np.max(np.abs(np.linalg.eigvals(self._over_time[1].A)), initial=0.0))
-
     def mechanics(
         self,
         values: Sequence[Any],

@@ -89,19 +89,6 @@ class Masing(Friction):
             reached, sticking = d, sticking - k
         return [k * clipped(place, d) for k, d in zip(stiffnesses, slips, strict=True)]
 
-    def state_histories(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray,
-        acceleration: FloatArray,
-    ) -> Sequence[FloatArray]:
-        """Return the springs' forces along a displacement, unchecked, loaded from rest."""
-        return [
-            jenkins_history(float(k), float(d), displacement)
-            for k, d in zip(*self.sliders(values), strict=True)
-        ]
-
     def force_history(
         self,
         values: Sequence[FloatArray | float],
@@ -253,21 +240,6 @@ class _Paths:
         return np.asarray(
             np.asarray(forces)[path_of] + beyond(np.concatenate(self._places), path_of)
         )
-
-
-def jenkins_history(stiffness: float, slip: float, displacement: FloatArray) -> FloatArray:
-    """Return the force of one Jenkins element along a displacement, from zero.
-
-    Examples
-    --------
-    >>> jenkins_history(2.0, 1.0, np.array([0.0, 1.5, 1.0, -2.0])).tolist()
-    [0.0, 2.0, 1.0, -2.0]
-    """
-    limit, force, forces = stiffness * slip, 0.0, [0.0]
-    for step in (stiffness * np.diff(displacement)).tolist():
-        force = min(max(force + step, -limit), limit)
-        forces.append(force)
-    return np.array(forces)
 
 
 def jenkins(ratio: FloatArray, harmonic: int) -> tuple[ComplexArray, ComplexArray]:

@@ -162,9 +162,6 @@ class Groups(NamedTuple):
     of: Rows
 
 
-ONE = Groups(np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp))  # a row that is its own group
-
-
 def _same(rising: Slope, falling: Slope, top: FloatArray, rows: Rows) -> bool:
     """Return whether the law is odd, judged at nine forces."""
     force = top[rows, None] * np.linspace(-0.93, 0.97, 9)
