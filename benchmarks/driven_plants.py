@@ -108,7 +108,7 @@ def _two_cycles(plant: Plant, u: float, omega: float, start: FloatArray) -> list
     def turn(_t: float, y: FloatArray, _side: float) -> float:
         return float(y[1])
 
-    turn.terminal = True  # type: ignore[attr-defined]
+    turn.terminal = True  # type: ignore[attr-defined]  # solve_ivp reads it
     period = 2.0 * np.pi / omega
     sizes = np.array([abs(start[0]), abs(start[1]), plant.f_max]) + 1e-3 * np.array(
         [u / plant.stiffness, omega * u / plant.stiffness, 0.0]
@@ -118,7 +118,7 @@ def _two_cycles(plant: Plant, u: float, omega: float, start: FloatArray) -> list
     sampled = (np.arange(2 * SAMPLES) + 0.5) / SAMPLES * period
     x = np.empty(sampled.size)
     while t < 2.0 * period:
-        turn.direction = -side  # type: ignore[attr-defined]
+        turn.direction = -side  # type: ignore[attr-defined]  # solve_ivp reads it
         run = solve_ivp(
             rates, (t, 2.0 * period), y, "DOP853", events=turn, dense_output=True, args=(side,),
             rtol=1e-9, atol=1e-11 * sizes,

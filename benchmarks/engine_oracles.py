@@ -339,8 +339,8 @@ to turning point instead, in {times} times as many cases. Units of force and len
 the friction limit, at 0.2 to 3 times the natural frequency. Errors of settled motions are those of
 harmonics 0 to 5, over the largest; those of others are over the largest value of the motion.
 
-Refused: the friction is too stiff for the explicit reference, which tells nothing about the engine;
-those are not among the cases. An error of inf is a motion that the engine did not find. Iwan's
+Refused: the friction is too stiff for the explicit reference; such cases are left out, because they
+do not test the engine. An error of inf is a motion that the engine did not find. Iwan's
 thirty elements are compared along force histories alone: each settled motion takes the reference
 half a minute. `make validation` renews this page; the tests run a part of it.
 

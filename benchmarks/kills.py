@@ -135,7 +135,7 @@ def _ended(name: str, inputs: Path, place: Path, *, clear: bool = True) -> dict[
 
 
 def _contents(name: str, inputs: Path, place: Path) -> dict[str, bytes]:
-    """Return the files that a command has written, without what tells the time."""
+    """Return the files that a command has written, without the times noted in them."""
     found = {}
     for folder in (place, *([inputs / "results"] if name == "campaign" else [])):
         for path in sorted(folder.rglob("*")):

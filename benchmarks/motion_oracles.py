@@ -329,7 +329,7 @@ def integrated(
             shift = 1e-14 * (largest[e] or 1.0) * sides[e]  # what stays at zero is no event
             return float(oracle.functions(t, w[:n], sides[0])[e] + shift)
 
-        event.terminal = True  # type: ignore[attr-defined]
+        event.terminal = True  # type: ignore[attr-defined]  # solve_ivp reads it
         return event
 
     parts = 60 if omega else 20 * (len(kinks) + 1) if kinks else 2000
@@ -341,7 +341,7 @@ def integrated(
     for _ in range(4000):
         events = [event_of(e) for e in range(count)]
         for e, event in enumerate(events):
-            event.direction = -sides[e]  # type: ignore[attr-defined]
+            event.direction = -sides[e]  # type: ignore[attr-defined]  # as above
         found = solve_ivp(
             rates, (t, stops[0]), whole, method="DOP853", rtol=RTOL, atol=1e-14 * scale,
             events=events, dense_output=samples is not None, max_step=longest,

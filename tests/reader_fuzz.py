@@ -137,7 +137,7 @@ def _text(rows: list[list[Any]], separator: str, mark: str) -> bytes:
 
 
 def _kept_open(buffer: io.BytesIO) -> io.BytesIO:
-    buffer.close = lambda: None  # type: ignore[method-assign]
+    buffer.close = lambda: None  # type: ignore[method-assign]  # writers close it
     return buffer
 
 

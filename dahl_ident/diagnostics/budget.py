@@ -247,7 +247,7 @@ class Budget(Mapping[str, ParameterBudget]):
         """
         values = [p.value for p in self.parameters]
         if library == "uncertainties":
-            from uncertainties import correlated_values  # type: ignore[import-untyped]
+            from uncertainties import correlated_values  # type: ignore[import-untyped]  # no types
 
             return dict(zip(self, correlated_values(values, self.covariance), strict=True))
         if library != "GTC":

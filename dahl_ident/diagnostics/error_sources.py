@@ -147,7 +147,7 @@ def noise_of(problem: Problem, theta: FloatArray, *, few: bool) -> tuple[Source,
 
     Of unknown size, or beyond that of the data's covariance: far more than was stated is another
     error, and no larger where a covariance is. Then, of `few` rows, gain and phase have a scatter
-    too. Harmonics have their own: what a model misses of them is no error of the fundamental.
+    too. Harmonics have noise of their own: a misfit in them is not an error of the fundamental.
     """
     n, unit = problem.n_residuals // 2, unit_noise(problem)
     if not (few and problem.scale_known):

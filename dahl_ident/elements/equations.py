@@ -154,7 +154,7 @@ class FirstState:
     def __call__(
         self, starts: FloatArray, values: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the first state, and its derivatives by the starts and by the parameters.
+        """Return the first state and its derivatives with respect to starts and parameters.
 
         Parameters
         ----------

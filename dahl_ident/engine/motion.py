@@ -192,7 +192,7 @@ def kernels(name: str) -> ModuleType:
     if not writable:
         folder = Path(tempfile.mkdtemp(prefix="dahl_ident-"))
     if not any(folder.rglob(f"{name}.*.nbi")):
-        print("compiling the engine, once (half a minute) ...", file=sys.stderr)  # noqa: T201
+        print("compiling the engine, once (half a minute) ...", file=sys.stderr)  # noqa: T201 - users wait
     before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
     try:
         return import_module(f"dahl_ident.engine.{name}")

@@ -97,7 +97,7 @@ def layout(sizes, columns, degree):
     solved_slopes = drive_slopes + s * m * (1 + P)  # solved rates by solved states, (s, n, n)
     coupling = solved_slopes + s * n * n  # and by the displacement, followers included, (s, n)
     follow = coupling + s * n  # change of followers by displacement, (n)
-    follow_slopes = follow + n  # its derivatives by drive and parameters, (n, 1 + P)
+    follow_slopes = follow + n  # derivatives with respect to drive and parameters
     stages = follow_slopes + n * (1 + P)  # changes of the states to the stages, (s, n)
     last = stages + s * n  # those of the last step, (s, n)
     changes = last + s * n  # changes of the sensitivities to the stages, (s, n, columns)

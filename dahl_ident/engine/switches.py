@@ -97,7 +97,7 @@ def on_one_branch(
                 work[target[0]] = ca.SX.unary(code, a[0])
             else:
                 work[target[0]] = ca.SX.binary(code, a[0], a[1])
-    known = 1 if motion else 0  # the velocity is no switch of the law
+    known = 1 if motion else 0  # the velocity, which is not a switch of the law
     return _effective(ca.vertcat(*held), functions[known:], sides[known:])
 
 

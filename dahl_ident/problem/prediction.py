@@ -54,8 +54,8 @@ class Nearby:
     """The prediction near a point: that of the describing function, corrected to the exact one.
 
     The logarithm of the ratio of both is taken as linear in the search coordinates and in the
-    logarithm of the drive. What is left is of second order in the distance, and small there: it is
-    the change of a correction. It costs what the describing function costs.
+    logarithm of the drive. The error is of second order in the distance, and small, because
+    only the correction is linearized. It costs as much as the describing function.
     """
 
     def __init__(self, exact: Predictor, approximate: Predictor, theta: FloatArray) -> None:

@@ -29,7 +29,7 @@ class Commands(SphinxDirective):
 
 def described() -> Iterator[str]:
     """Yield the reference in reStructuredText, line by line."""
-    for name, command in get_command(program).commands.items():  # type: ignore[attr-defined]
+    for name, command in get_command(program).commands.items():  # type: ignore[attr-defined]  # a group
         title = f"dahl-ident {name}"
         yield from (title, "-" * len(title), "")
         for paragraph in (command.help or "").split("\n\n"):
