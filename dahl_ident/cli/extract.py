@@ -129,11 +129,13 @@ def extract(
         console.write_json(_rows(data))
     elif output != STANDARD:
         show(data)
-    tell_of_sweeps(data, files, vars(reading))
+    tell_of_sweeps(data, files, vars(reading), extracting.controlled)
     judge(data)
 
 
-def tell_of_sweeps(data: FrequencyResponse, files: list[str], reading: dict[str, Any]) -> None:
+def tell_of_sweeps(
+    data: FrequencyResponse, files: list[str], reading: dict[str, Any], controlled: str
+) -> None:
     """Say how to fit waveforms that were swept too fast for a table."""
     from dahl_ident.extraction.point import TOO_FAST
 
@@ -142,6 +144,8 @@ def tell_of_sweeps(data: FrequencyResponse, files: list[str], reading: dict[str,
     if fast:
         given = (item for item in reading.items() if item[1] != vars(RecordReading())[item[0]])
         words = [w for name, value in given for w in (f"--{name.replace('_', '-')}", str(value))]
+        if controlled == "force":  # which moves a mass
+            words += ["--mass", "free", "--damping", "free", "--stiffness", "free"]
         command = shlex.join(["dahl-ident", "fit", "--record", *files, *words])
         console.note(
             f"{len(fast)} of {len(verdicts)} points are of a sweep that friction could not follow. "

@@ -48,8 +48,8 @@ AsRecords = Annotated[
     bool,
     typer.Option(
         "--record",
-        help="The files are records of any motion; each is a run. Files that plainly hold "
-        "waveforms need no --record.",
+        help="The files are records of any motion; each is a run, or a level if each holds a sweep "
+        "at one level that no other holds. Files that plainly hold waveforms need no --record.",
     ),
 ]
 Predicted = Annotated[

@@ -10,10 +10,12 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.frequency_response import FrequencyResponse
+from dahl_ident.data.record import Record
 from dahl_ident.errors import UnitError, ValidationError
 from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS, parse_quantity
 
 _SAME = 1.1  # ratio up to which drives or amplitudes are one level
+_NEARLY_ALL = 0.99  # of a wave's samples: noise and spikes lie beyond
 _NUMBER = r"(?P<value>[0-9]+(?:[.,][0-9]+)?(?:e[-+]?[0-9]+)?)"
 _UNIT = r"[^\W\d_][^;,\t\])\"']{0,20}"
 _LINE = re.compile(
@@ -61,6 +63,23 @@ def _one_level_each(parts: Sequence[FrequencyResponse]) -> bool:
         middle = np.sort([np.median(size) for size in known])
         one_each = all(size.max() < _SAME * size.min() for size in known)
         if one_each and np.all(middle[1:] > _SAME * middle[:-1]):
+            return True
+    return False
+
+
+def one_run(records: Sequence[Record]) -> bool:
+    """Return whether each record is a sine or a sweep at one level, and no two levels are alike.
+
+    A sine that keeps its amplitude has a largest value of the square root of two times its root
+    mean square. Such records of several levels are one run, as such tables are.
+    """
+    for channel in ("force_samples", "motion_samples"):
+        waves = [getattr(record, channel) - getattr(record, channel).mean() for record in records]
+        largest = np.array([np.quantile(np.abs(wave), _NEARLY_ALL) for wave in waves])
+        sizes = np.array([np.sqrt(2.0 * np.mean(wave**2)) for wave in waves])
+        keep = (sizes < _SAME * largest) & (largest < _SAME * sizes)
+        sizes.sort()
+        if keep.all() and np.all(sizes[1:] > _SAME * sizes[:-1]):
             return True
     return False
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
+from dahl_ident.data.levels import one_run
 from dahl_ident.data.record import at_even_times, cut, unbroken
 from dahl_ident.elements import Element, Parameter
 from dahl_ident.elements.behaviour import Behaviour, HistoryGradient
@@ -67,9 +68,9 @@ class RecordProblem:
     Parameters
     ----------
     records : sequence of Record
-        Each a run. Where anything is integrated, is differentiated or remembers, a record is cut
-        at its gaps into parts with a first state each; where anything is integrated or
-        differentiated, unevenly sampled parts are resampled. Both with a warning.
+        Each a run, or each a level of one run. Where anything is integrated, is differentiated
+        or remembers, a record is cut at its gaps into parts with a first state each; where anything
+        is integrated or differentiated, unevenly sampled parts are resampled. Both with a warning.
     model : Element
         One element or a sum.
     output : {"force", "motion"}, optional
@@ -124,11 +125,12 @@ class RecordProblem:
         if len({record.motion for record in self.records}) > 1:
             raise DataError("some records are of translation and some of rotation; fit them apart")
         integrated = self.output == "motion" or not self.model.rate_independent
-        self.runs: tuple[int, ...] = tuple(range(len(self.records)))
-        """Which of the given records each one is a part of."""
+        runs = [0] * len(self.records) if one_run(self.records) else range(len(self.records))
+        self.runs: tuple[int, ...] = tuple(runs)
+        """The run of each record; sweeps of one level each, all different, are one run."""
         if integrated or self.with_memory:
             parts = [unbroken(record, _SHORTEST) for record in self.records]
-            self.runs = tuple(i for i, some in enumerate(parts) for _ in some)
+            self.runs = tuple(i for i, some in zip(runs, parts, strict=True) for _ in some)
             self.records = tuple(record for some in parts for record in some)
         if integrated:
             self.records = tuple(at_even_times(record) for record in self.records)

@@ -8,7 +8,7 @@ import numpy as np
 
 from dahl_ident.elements import Backlash, Dahl, Damper, Mass, Spring
 from dahl_ident.synthetic.acquisition import Acquisition, Channel
-from dahl_ident.synthetic.excitation import SteppedSine
+from dahl_ident.synthetic.excitation import FrequencySweep, SteppedSine
 from dahl_ident.synthetic.experiment import Experiment
 from dahl_ident.synthetic.table_errors import Table
 
@@ -267,6 +267,22 @@ DATA_SETS: dict[str, DataSet] = {
             seed=11,
             teaches="what a laboratory stores: fifteen steps of a plant with noise, hum, offset",
             identifiable=_ALL_OF_PLANT,
+        ),
+        DataSet(
+            "sweep_plant",
+            Experiment(
+                _PLANT,
+                FrequencySweep((0.05, 0.2, 1.0), 0.4, 5.0, 90.0),
+                Acquisition(
+                    sample_rate_hz=32.0,
+                    displacement=Channel(noise_std=1e-4),
+                    force=Channel(noise_std=5e-5),
+                ),
+            ),
+            seed=15,
+            teaches="continuous sweeps at three drive levels, fitted as waveforms",
+            identifiable=_ALL_OF_PLANT,
+            caution="swept too fast for a table: fit the waveforms",
         ),
     )
 }

@@ -67,10 +67,7 @@ class SteppedSine:
 
     def __post_init__(self) -> None:
         for name in ("levels", "frequencies_hz"):
-            values = positive_array(getattr(self, name), name)
-            if values.ndim != 1 or values.size == 0:
-                raise ValidationError(f"{name}: expected some numbers, got shape {values.shape}")
-            object.__setattr__(self, name, tuple(values.tolist()))
+            object.__setattr__(self, name, _numbers(getattr(self, name), name))
         one_of(self.controlled, "controlled", get_args(Controlled))
         one_of(self.order, "order", get_args(Order))
         whole_number(self.settling_periods, "settling_periods", 0)
@@ -106,12 +103,12 @@ class SteppedSine:
 
 @dataclass(frozen=True)
 class FrequencySweep:
-    """One level, with a frequency that moves steadily from start to stop.
+    """A frequency that moves steadily from start to stop, at one level or several in turn.
 
     Parameters
     ----------
-    level : float
-        Zero-to-peak amplitude, m (rad) or N (N m).
+    level : float or sequence of float
+        Zero-to-peak amplitude, m (rad) or N (N m); several are swept one after the other.
     start_hz, stop_hz : float
         Hz, in either direction.
     duration : float
@@ -121,7 +118,7 @@ class FrequencySweep:
     controlled : {"displacement", "force"}
         What the level is an amplitude of.
     ramp_periods : float, default 2
-        Periods at the first frequency in which the level is reached.
+        Periods of the first frequency in which level and frequency are reached.
 
     Raises
     ------
@@ -134,7 +131,7 @@ class FrequencySweep:
     62.0
     """
 
-    level: float
+    level: float | Sequence[float]
     start_hz: float
     stop_hz: float
     duration: float
@@ -143,13 +140,18 @@ class FrequencySweep:
     ramp_periods: float = 2.0
 
     def __post_init__(self) -> None:
-        _check_passage(self, "level", "start_hz", "stop_hz", "duration")
+        if isinstance(self.level, Sequence):
+            object.__setattr__(self, "level", _numbers(self.level, "level"))
+            _check_passage(self, "start_hz", "stop_hz", "duration")
+        else:
+            _check_passage(self, "level", "start_hz", "stop_hz", "duration")
 
     def waveform(self, seed: int) -> Waveform:
-        """Return the ramp and the sweep."""
+        """Return a ramp and the sweep, for each level."""
         run = WaveformBuilder(self.start_hz)
-        run.go_to(self.level, self.start_hz, self.ramp_periods / self.start_hz)
-        run.go_to(self.level, self.stop_hz, self.duration, self.spacing)
+        for level in self.level if isinstance(self.level, Sequence) else (self.level,):
+            run.go_to(level, self.start_hz, self.ramp_periods / self.start_hz)
+            run.go_to(level, self.stop_hz, self.duration, self.spacing)
         return run.finish()
 
 
@@ -201,6 +203,14 @@ class AmplitudeRamp:
         run.go_to(self.start_level, self.frequency_hz, self.ramp_periods / self.frequency_hz)
         run.go_to(self.stop_level, self.frequency_hz, self.duration, self.spacing)
         return run.finish()
+
+
+def _numbers(given: Sequence[float], name: str) -> tuple[float, ...]:
+    """Return one or more positive numbers as a tuple."""
+    values = positive_array(given, name)
+    if values.ndim != 1 or values.size == 0:
+        raise ValidationError(f"{name}: expected some numbers, got shape {values.shape}")
+    return tuple(values.tolist())
 
 
 def _check_passage(passage: FrequencySweep | AmplitudeRamp, *positive: str) -> None:

@@ -23,7 +23,7 @@ def load_dataset(name: str) -> FrequencyResponse | Record:
     name : str
         Tables: "clean", "noisy", "microslip", "gross_slip", "alpha_2", "fig_7_plant",
         "fig_7_describing_function", "frf_levels", "outliers", "delayed". Records: "unsettled",
-        "quantised", "plant_recording", "play_and_two_limits".
+        "quantised", "plant_recording", "play_and_two_limits", "sweep_plant".
 
     Returns
     -------

@@ -1,0 +1,99 @@
+"""Sweeps and stepped sines of a driven plant as waveforms: fitted at once, levels as one run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dahl_ident as di
+from dahl_ident.cli.app import main
+from dahl_ident.data.levels import one_run
+from dahl_ident.synthetic import Acquisition, Channel, Experiment, FrequencySweep, SteppedSine
+
+PLANT = di.Dahl(0.1, 30.0) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
+MODEL = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
+SENSORS = Acquisition(32.0, displacement=Channel(noise_std=1e-4), force=Channel(noise_std=5e-5))
+
+
+def sweep(level: float, seed: int) -> di.Record:
+    data = di.simulate(Experiment(PLANT, FrequencySweep(level, 0.4, 5.0, 60.0), SENSORS), seed=seed)
+    assert isinstance(data, di.Record)
+    return data
+
+
+def assert_true(fit: di.FitResult | di.RecordFit) -> None:
+    truth = {"f_max": 0.1, "sigma": 30.0, "mass": 0.3, "damping": 0.24, "stiffness": 0.3}
+    assert fit.trusted, fit.verdict
+    for name, value in truth.items():
+        found = fit.params[name]
+        assert found.stderr is not None
+        assert abs(found.value - value) < 4.0 * found.stderr, fit
+
+
+def test_the_shipped_sweeps_are_fitted_as_waveforms() -> None:
+    assert_true(di.fit(di.load_dataset("sweep_plant"), MODEL))
+
+
+def test_a_sweep_says_how_far_its_points_are_from_settled() -> None:
+    data = di.load_dataset("sweep_plant")
+    assert isinstance(data, di.Record)
+    points = di.extract(data, controlled="force")
+    assert np.mean(["swept too fast" in v for v in points.quality["verdict"]]) > 0.8
+    assert points.drive is not None
+    settled = points.drive / di.response(PLANT, points.frequency_hz, points.drive).displacement
+    error = np.abs(points.response - settled)
+    bias = np.hypot(points.quality["bias_real"], points.quality["bias_imag"])
+    assert points.covariance is not None
+    noise = np.sqrt(np.trace(points.covariance, axis1=1, axis2=2))
+    assert np.mean(error < bias + 2.0 * noise) > 0.9
+    assert np.median(bias / error) < 5.0  # a bound that says something
+
+
+def test_sweeps_of_one_level_each_are_one_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sweeps = [sweep(level, seed) for seed, level in enumerate((0.05, 0.2, 1.0))]
+    assert one_run(sweeps)
+    assert not one_run([*sweeps, sweep(0.2, 9)])  # measured again: on another day
+    for record, level in zip(sweeps, (50, 200, 1000), strict=True):
+        record.save(tmp_path / f"sweep{level}mN.csv")
+    words = ["fit", str(tmp_path / "sweep*.csv"), "--mass", "free", "--damping", "free"]
+    monkeypatch.setattr("sys.argv", ["dahl-ident", *words, "--stiffness", "free"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    told = " ".join(capsys.readouterr().out.split())
+    assert end.value.code in (0, None)
+    assert "Trusted." in told
+    assert "a single run" in told
+    assert "runs differ" not in told
+
+
+def test_motions_that_are_no_sines_are_runs() -> None:
+    t = np.arange(4000) / 100.0
+    rng = np.random.default_rng(1)
+    days = []
+    for size in (1.0, 1.5):
+        x = size * sum(np.sin(2.0 * np.pi * (f * t + rng.random())) for f in (0.3, 0.7, 1.1))
+        days.append(di.Record(t, displacement=x, force=di.Dahl(1.0, 10.0).force(np.asarray(x))))
+    assert not one_run(days)
+
+
+def test_a_table_of_stepped_sines_and_their_waveforms_agree() -> None:
+    steps = SteppedSine(
+        (0.08, 0.3, 1.0), (1.2, 2.0, 3.5), controlled="force", settling_periods=12,
+        num_periods=12, ramp_periods=8.0,
+    )  # fmt: skip
+    record = di.simulate(Experiment(PLANT, steps, SENSORS), seed=3)
+    assert isinstance(record, di.Record)
+    points = di.extract(record, controlled="force")
+    table = di.fit(points, MODEL)
+    waves = di.fit(record, MODEL)
+    assert_true(waves)
+    assert table.trusted, table.verdict
+    for name in ("f_max", "sigma", "mass", "damping", "stiffness"):
+        one, other = table.params[name], waves.params[name]
+        assert one.stderr is not None
+        assert other.stderr is not None
+        assert abs(one.value - other.value) < 3.0 * np.hypot(one.stderr, other.stderr), name
