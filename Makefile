@@ -53,7 +53,7 @@ test-lowest: install  ## what depends on versions, on the lowest declared ones
 	.venv-lowest/bin/pytest -n $(JOBS) --dist worksteal \
 		$(wildcard $(LOWEST:%=tests/test_%.py))
 
-examples: install  ## renew the outputs printed in README and manual
+examples: install  ## renew the outputs in README, manual and notebooks
 	$(BIN)/python -m tests.examples
 
 docs: install  ## the manual with its examples and notebooks run; any warning fails

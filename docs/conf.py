@@ -1,6 +1,7 @@
 """Sphinx: how the manual is built. ``make docs`` fails on any warning.
 
-The notebooks, which `docs/notebooks` links to, are stored without outputs and run at each build.
+The notebooks, which `docs/notebooks` links to, are stored with their outputs: `make examples`
+renews them, and the tests of `make docs` run them. The gallery is run at each build.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ nitpick_ignore_regex = [
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 2
 nb_execution_mode = "force"
+nb_execution_excludepatterns = ["*.ipynb"]
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_execution_timeout = 120

@@ -1,22 +1,27 @@
-"""Run the examples in Markdown pages and put what they print below them.
+"""Run the examples in Markdown pages and the notebooks, and keep what they print and draw.
 
-``python -m tests.examples`` renews the printed outputs of the README and the how-to pages; the
-tests compare them. A ``python`` block goes on where the one before it on its page ended; a
-``bash`` block runs in the same folder, with this environment's programs first.
+``python -m tests.examples`` renews the outputs of the README, the how-to pages and the notebooks,
+or of the files that are named; the tests compare them. A ``python`` block goes on where the one
+before it on its page ended; a ``bash`` block runs in the same folder, with this environment's
+programs first. Of a notebook what is printed is compared; pictures are not.
 """
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import io
+import json
 import os
 import re
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
+_COLOURS = 256  # of a stored picture
 BLOCK = re.compile(r"^```(python|bash)\n(.*?)^```\n(?:\n```output\n.*?^```\n)?", re.DOTALL | re.M)
 
 
@@ -24,6 +29,69 @@ def pages() -> list[Path]:
     """Return the pages that hold examples."""
     candidates = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     return [page for page in candidates if BLOCK.search(page.read_text("utf-8"))]
+
+
+def notebooks() -> list[Path]:
+    """Return the notebooks in reading order."""
+    return sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+def executed(notebook: Path, folder: Path) -> dict[str, Any]:
+    """Return a notebook with the outputs that its cells have now.
+
+    Parameters
+    ----------
+    notebook : Path
+        The file.
+    folder : Path
+        Where it runs and leaves its files.
+    """
+    import nbformat
+    from nbclient import NotebookClient
+
+    content = nbformat.read(notebook, as_version=4)  # type: ignore[no-untyped-call]  # has none
+    where = {"metadata": {"path": str(folder)}}
+    NotebookClient(content, timeout=300, record_timing=False, resources=where).execute()
+    content.metadata.pop("language_info")  # the version of Python
+    content.metadata["language_info"] = {"name": "python"}
+    for cell in content.cells:
+        if cell.cell_type == "code":
+            cell.outputs = [_smaller(one) for one in cell.outputs if not _compiles(one)]
+    text = nbformat.writes(content)  # type: ignore[no-untyped-call]  # has none
+    return dict(json.loads(text))
+
+
+def _compiles(output: dict[str, Any]) -> bool:
+    """Return whether an output says that the engine is compiled; refuse others on stderr."""
+    if output.get("name") != "stderr":
+        return False
+    assert output["text"].startswith("compiling the engine"), output["text"]
+    return True
+
+
+def _smaller(output: dict[str, Any]) -> dict[str, Any]:
+    """Return an output with its picture in 256 colours: half the size."""
+    from PIL import Image
+
+    data = output.get("data", {})
+    if "image/png" in data:
+        few = io.BytesIO()
+        with Image.open(io.BytesIO(base64.b64decode(data["image/png"]))) as picture:
+            picture.convert("RGB").quantize(_COLOURS).save(few, "png", optimize=True)
+        data["image/png"] = base64.b64encode(few.getvalue()).decode("ascii")
+    return output
+
+
+def printed(notebook: dict[str, Any]) -> list[str]:
+    """Return what each cell prints, without the words that stand for its pictures."""
+    return [
+        "".join(
+            "".join(one.get("text", one.get("data", {}).get("text/plain", "")))
+            for one in cell.get("outputs", [])
+            if "image/png" not in one.get("data", {})
+        )
+        for cell in notebook["cells"]
+    ]
 
 
 def renewed(page: Path, folder: Path) -> str:
@@ -71,7 +139,17 @@ def _run_bash(code: str) -> str:
     return done.stdout
 
 
-if __name__ == "__main__":
-    for each in pages():
+def main(names: list[str]) -> None:
+    """Renew the files that are named, or all."""
+    chosen = [Path(name).resolve() for name in names] or [*pages(), *notebooks()]
+    for each in chosen:
         with tempfile.TemporaryDirectory() as scratch:
-            each.write_text(renewed(each, Path(scratch)), encoding="utf-8")
+            if each.suffix == ".ipynb":
+                text = json.dumps(executed(each, Path(scratch)), indent=1, ensure_ascii=False)
+                each.write_text(text + "\n", encoding="utf-8")
+            else:
+                each.write_text(renewed(each, Path(scratch)), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import doctest
 import importlib.util
 import inspect
+import json
 import re
 from operator import attrgetter
 from pathlib import Path
@@ -13,7 +14,7 @@ from types import ModuleType
 import pytest
 
 import dahl_ident as di
-from tests.examples import pages, renewed
+from tests.examples import executed, notebooks, pages, printed, renewed
 
 DOCS = Path(__file__).parents[1] / "docs"
 REFERENCE = "".join(page.read_text("utf-8") for page in (DOCS / "reference").glob("*.md"))
@@ -50,6 +51,13 @@ def test_every_class_and_function_of_the_reference_has_an_example() -> None:
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
 def test_examples_print_what_the_page_says(page: Path, tmp_path: Path) -> None:
     assert renewed(page, tmp_path) == page.read_text("utf-8")
+
+
+@pytest.mark.manual
+@pytest.mark.parametrize("notebook", notebooks(), ids=lambda notebook: notebook.stem)
+def test_a_notebook_prints_what_is_stored(notebook: Path, tmp_path: Path) -> None:
+    stored = json.loads(notebook.read_text("utf-8"))
+    assert printed(executed(notebook, tmp_path)) == printed(stored)
 
 
 def test_files_that_the_manual_names_exist() -> None:
