@@ -24,6 +24,7 @@ extensions = [
     "numpydoc",
     "offline",
     "commands",
+    "thumbnails",
 ]
 exclude_patterns = ["_build", "extensions"]
 nitpicky = True
@@ -46,7 +47,7 @@ html_math_renderer = "mathml"
 html_theme = "pydata_sphinx_theme"
 html_title = "dahl_ident"
 html_show_sourcelink = False
-html_theme_options = {"header_links_before_dropdown": 9}
+html_theme_options = {"header_links_before_dropdown": 7}
 smartquotes_action = "qe"  # two hyphens begin an option
 html_static_path = ["_static"]
 html_css_files = ["manual.css"]

@@ -93,6 +93,16 @@ def test_what_a_page_of_the_manual_fetches_is_found(page: str, fetches: list[str
     assert _offline().fetched(page) == fetches
 
 
+def test_the_search_quotes_the_sections_of_an_article_alone() -> None:
+    pytest.importorskip("latex2mathml")
+    page = (
+        "<nav>All</nav><article><section id='a'><h1>A &lt; B<a class='headerlink'>#</a></h1>"
+        "<p>Two  <a href='x'>words</a></p><script>no</script></section></article><nav>Next</nav>"
+    )
+    text = '<main role="main"><section id="a">A &lt; BTwo words</section></main>'
+    assert _offline().article(page) == text
+
+
 def test_formulas_of_the_manual_are_mathml() -> None:
     pytest.importorskip("latex2mathml")
     offline = _offline()
