@@ -312,10 +312,10 @@ def test_a_prior_that_keeps_the_data_out_is_told_with_its_misfit() -> None:
     )
     assert "at the lower end; check the prior, its unit" in str(walled)
     assert "MISFIT: the residuals are larger than the noise that the data state" in str(walled)
-    assert [text[:12] for text in walled.statements[:2]] == ["Not describe", "MISFIT: the "]
+    assert [f.code for f in walled.findings[:2]] == ["prior_influence", "predictive_check"]
     free = di.posterior(TIGHT, di.Dahl(), method="grid", uncertainty="noise")
     assert free.trusted
-    assert free.findings[0].startswith("Noise alone is counted; with every source")
+    assert "Noise alone is counted; with every source" in free.verdict
 
 
 def test_marginals_are_densities_with_the_right_quantiles() -> None:

@@ -18,7 +18,7 @@ from dahl_ident import (
     fit,
     load_dataset,
 )
-from dahl_ident.diagnostics.statements import _robust_values
+from dahl_ident.diagnostics.checks import robust_values
 from dahl_ident.diagnostics.stiffening import Stiffening, stiffening
 from dahl_ident.diagnostics.verdicts import Verdict
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
@@ -143,8 +143,8 @@ class TestWords:
 
     def test_parameters_without_any_limit_give_way_to_those_with_one(self) -> None:
         known = self.unlimited().identifiability
-        assert len(known.reasons) < len(known.parameters)
-        assert all("anything" not in reason for reason in known.reasons)
+        assert len(known.open) < len(known.parameters)
+        assert all("anything" not in parameter.reason for parameter in known.open)
 
     def test_one_chi_square(self) -> None:
         data = table(n=12)
@@ -223,13 +223,13 @@ def test_a_free_delay_states_the_gain_that_it_assumes() -> None:
     assert "force_gain = 1 exactly" in delayed.verdict
 
 
-def test_the_robust_values_are_those_of_a_robust_fit() -> None:
+def test_therobust_values_are_those_of_a_robust_fit() -> None:
     data = table(noise=0.01, seed=5)
     off = data.response.copy()
     off[[3, 8]] *= 1.15
     fitted = fit(replace(data, response=off), Dahl(alpha=1.0))
     assert fitted.errors is not None
-    found, _ = _robust_values(fitted.errors, fitted.scale)
+    found, _ = robust_values(fitted.errors, fitted.scale)
     robust = fit(fitted.data, Dahl(alpha=1.0), loss="huber")
     for name, value in zip(robust.var_names, robust.optimum.values.tolist(), strict=True):
         stderr = fitted.errors.stderr[name]

@@ -385,6 +385,7 @@ def as_json(result: FitResult) -> dict[str, Any]:
         "status": str(result.status),
         "trusted": result.trusted,
         "verdict": result.verdict,
+        "findings": [finding.to_dict() for finding in result.findings],
         "success": result.success,
         "message": result.message,
         "params": {
@@ -409,4 +410,4 @@ def as_json(result: FitResult) -> dict[str, Any]:
 
 def finish(result: Result) -> None:
     """End with status 3 if the result cannot be used."""
-    console.finish(result.status.usable, result.statements[0].partition(". ")[2])
+    console.finish(result.status.usable, str(result.findings[0]))

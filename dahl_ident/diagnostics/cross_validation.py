@@ -12,6 +12,7 @@ import numpy as np
 
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.held_out import band_factor, held_out
+from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 
 _CONFIDENCE = 0.95  # of the bands: one value in twenty is outside by chance
 
@@ -42,13 +43,19 @@ class CrossValidation:
     misfit: float
     available: int
 
+    def finding(self, severity: VerdictStatus) -> Finding:
+        """Return the check as a finding."""
+        values = {
+            "tests": self.tests,
+            "available": self.available,
+            "inside": self.inside,
+            "count": self.count,
+            "width": self.width,
+        }
+        return Finding(Question.DESCRIBED, severity, "held_out", values)
+
     def __str__(self) -> str:
-        of = "" if self.tests == self.available else f" of {self.available}"
-        return (
-            f"leaving out each of {self.tests}{of} tests in turn, {self.inside} of {self.count} "
-            f"held-out gains and phases are inside their 95 % bands (half width "
-            f"{100.0 * self.width:.2g} %)"
-        )
+        return str(self.finding(VerdictStatus.TRUSTED))
 
 
 def cross_validation(errors: ErrorModel) -> CrossValidation | None:

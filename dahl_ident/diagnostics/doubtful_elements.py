@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from dahl_ident.diagnostics.formatting import percent, with_unit
+from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.elements import Element, Parameter
 from dahl_ident.units import Motion, shown_unit
 
@@ -34,8 +34,8 @@ def below_zero(
     values: Mapping[str, float],
     stderr: Mapping[str, float],
     motion: Motion = "translation",
-) -> Iterator[str]:
-    """Yield a sentence on every estimate clearly below zero, with what to do.
+) -> Iterator[Finding]:
+    """Yield a finding for every estimate clearly below zero, with what to do.
 
     Parameters
     ----------
@@ -46,22 +46,25 @@ def below_zero(
 
     Yields
     ------
-    str
+    Finding
     """
     for parameter in parameters:
         value, error = values[parameter.name], stderr.get(parameter.name, 0.0)
         if parameter.free and np.isfinite(value) and value < -_CLEARLY * error:
-            shown = with_unit(value, error or None, shown_unit(parameter.unit, motion))
-            yield (
-                f"{parameter.name} is negative ({shown}), as of no device: it stands for what the "
-                f"model lacks, and is not {_INSTEAD[parameter.dimension]}."
-            )
+            given = {
+                "name": parameter.name,
+                "value": value,
+                "stderr": error,
+                "unit": shown_unit(parameter.unit, motion),
+                "instead": _INSTEAD[parameter.dimension],
+            }
+            yield Finding(Question.DESCRIBED, VerdictStatus.APPROXIMATE, "negative", given)
 
 
 def slight(
     parameter: Parameter, value: float, error: float, share: float, misfit: float
-) -> Iterator[str]:
-    """Yield a sentence where an element carries less force than the model misses.
+) -> Iterator[Finding]:
+    """Yield a finding where an element carries less force than the model misses.
 
     Parameters
     ----------
@@ -74,12 +77,15 @@ def slight(
 
     Yields
     ------
-    str
+    Finding
     """
     if parameter.free and share < misfit and value >= -_CLEARLY * error:
-        yield (
-            f"{parameter.name} = {with_unit(value, error, parameter.unit)} rests on "
-            f"{percent(share)} rms of the force, less than the model misses "
-            f"({percent(misfit)}), and may stand for that: give it if it is known, or leave "
-            "it out."
-        )
+        values = {
+            "name": parameter.name,
+            "value": value,
+            "stderr": error,
+            "unit": parameter.unit,
+            "share": share,
+            "misfit": misfit,
+        }
+        yield Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "slight", values)

@@ -16,9 +16,10 @@ A fit can be statistically perfect and physically impossible; this gives a warni
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -27,6 +28,7 @@ from dahl_ident.arrays import ComplexArray
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.formatting import p_text, percent, with_unit
+from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.misfit_explanations import (
     EXPLAINS,
     at_an_end,
@@ -38,7 +40,7 @@ from dahl_ident.diagnostics.misfit_explanations import (
 from dahl_ident.diagnostics.outliers import SuspiciousPoint, flagged_rows, suspicious_points
 from dahl_ident.diagnostics.physics import physical_warnings
 from dahl_ident.diagnostics.residual_space import ResidualSpace
-from dahl_ident.diagnostics.slip_density import bound_statement, least_misfit
+from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
 from dahl_ident.diagnostics.stiffening import LEAST_DOF, Stiffening, stiffening
 from dahl_ident.diagnostics.trends import LEAST_RANGE, Runs, Trend, runs, trends
 from dahl_ident.elements import Parameter
@@ -50,7 +52,6 @@ _HINT = 0.05  # the same of hints, which doubt nothing
 _FAR_MORE = 2.0  # scatter over what was measured
 _NO_SENSOR = 0.3  # noise over the response
 _WORTH_NAMING = 0.1  # of the largest scatter: less is not mentioned
-_MOST_DEPARTURES = 3  # in the verdict; the details list all
 
 
 @dataclass(frozen=True)
@@ -160,12 +161,15 @@ class Goodness:
         within runs.
     sign : str
         The sign convention that explains data which the fit does not; empty where none does.
-    apart : str
+    apart : tuple of str
         The suspicious rows, where they alone contradict the model.
+    without_them : str
+        How the model describes the data without those rows.
     neighbours : str
         Where the suspicious rows lie, if they alone depart from the model, but side by side.
-    bound : str
-        Where the model does not describe the data: what parallel Jenkins elements would leave.
+    bound : float or None
+        Where it helps with data that are not described: the least misfit of parallel Jenkins
+        elements.
     untested : bool
         Whether the amplitudes give no more numbers than friction has free parameters, which then
         meet them whatever the mechanism is.
@@ -196,9 +200,11 @@ class Goodness:
     untested: bool
     runs_differ: RunsDiffer | None = None
     sign: str = ""
-    apart: str = ""
+    apart: tuple[str, ...] = ()
+    without_them: str = ""
     neighbours: str = ""
-    bound: str = ""
+    bound: float | None = None
+    rows: int = 0
 
     @cached_property
     def level(self) -> float:
@@ -250,7 +256,7 @@ class Goodness:
             yield str(self.runs_differ)
         found = [trend for trend in self.trends if trend.p_value < level]
         rate = [trend for trend in found if trend.covariate == "frequency"]
-        if self.noise_share is not None and self.noise_share > _NO_SENSOR:
+        if self.beyond_any_sensor and self.noise_share is not None:
             yield (
                 f"the scatter is {percent(self.noise_share)} of the response, "
                 "more than any sensor's noise"
@@ -270,75 +276,69 @@ class Goodness:
             yield from (f"{r}" for r in self.runs if r.p_value < level)
 
     @property
-    def cause(self) -> str:
-        """What explains why the data are not described; empty where nothing does."""
-        return f"{self.sign}. Do not use the numbers of this fit." if self.sign else self.apart
+    def beyond_any_sensor(self) -> bool:
+        """Whether the scatter exceeds that of any sensor."""
+        return self.noise_share is not None and self.noise_share > _NO_SENSOR
+
+    def findings(
+        self, severity: VerdictStatus = VerdictStatus.NOT_DESCRIBED, *, counted: bool = False
+    ) -> Iterator[Finding]:
+        """Yield whether the model describes the data.
+
+        Parameters
+        ----------
+        severity : VerdictStatus, default NOT_DESCRIBED
+            Of a misfit that exceeds the noise.
+        counted : bool, default False
+            Whether the stated uncertainties include that misfit.
+
+        Yields
+        ------
+        Finding
+        """
+        described, note = Question.DESCRIBED, VerdictStatus.TRUSTED
+        misfit: dict[str, Any] = {"rms": self.rms_misfit}
+        values: dict[str, Any]
+        if self.sign:
+            worst = VerdictStatus.NOT_DESCRIBED
+            yield Finding(described, worst, "sign", {"convention": self.sign})
+        elif self.apart:
+            values = {"names": self.apart, "rows": self.rows, "remaining": self.without_them}
+            yield Finding(described, severity, "rows_apart", misfit | values)
+        elif self.objections:
+            values = {"objections": self.objections, "counted": counted}
+            yield Finding(described, severity, "misfit", misfit | values)
+        if not self._enough_points:
+            few = VerdictStatus.NOT_DETERMINED
+            yield Finding(described, few, "too_few_points", misfit | {"dof": self.dof})
+        elif self.untested:
+            yield Finding(described, VerdictStatus.NOT_DETERMINED, "one_amplitude", misfit)
+        elif not self.objections:
+            far = self.scatter is not None and self.scatter.ratio > _FAR_MORE
+            values = {"hints": self.hints, "scatter": str(self.scatter) if far else ""}
+            yield Finding(described, note, "noise", misfit | values)
+        if self.flagged:
+            yield Finding(described, VerdictStatus.APPROXIMATE, "flagged", {"points": self.flagged})
+        if self.sign or self.apart:
+            return
+        if self.suspicious:
+            names = tuple(point.name for point in self.suspicious)
+            values = {"names": names, "neighbours": self.neighbours}
+            yield Finding(described, note, "suspicious", values)
+        if self.bound is not None:
+            values = {"least": self.bound, "law": self.bound < FAR_LESS * self.rms_misfit}
+            yield Finding(described, note, "jenkins_bound", values)
 
     @property
-    def statements(self) -> tuple[str, ...]:
-        """The verdict in its parts, most serious first."""
-        if self.cause:
-            return tuple(filter(None, (self.cause, self._flaws)))
-        first = (self._flaws, self.described)
-        if self.objections or not self.judged:
-            first = (self.described, self._flaws)
-        return tuple(filter(None, (*first, self._apart, self.bound)))
+    def cause(self) -> str:
+        """What explains why the data are not described, in words; empty where nothing does."""
+        causes = (f for f in self.findings() if f.code in ("sign", "rows_apart"))
+        return next(map(str, causes), "")
 
     @property
     def headline(self) -> str:
-        """The verdict in a few sentences."""
-        return " ".join(self.statements)
-
-    @property
-    def departures(self) -> str:
-        """The most serious objections, and how many more there are."""
-        reasons = "; ".join(self.objections[:_MOST_DEPARTURES])
-        more = len(self.objections) - _MOST_DEPARTURES
-        tests = f"; {more} more test{'s' if more > 1 else ''} failed" if more > 0 else ""
-        return f"{reasons}{tests}"
-
-    @property
-    def described(self) -> str:
-        """Whether the model describes the data."""
-        misfit = f"{percent(self.rms_misfit)} rms misfit"
-        if self.objections:
-            return f"The model does not describe these data ({misfit}): {self.departures}."
-        if not self._enough_points:
-            return (
-                f"With {self.dof} degrees of freedom a wrong model cannot be distinguished from "
-                f"noise ({misfit}): "
-                "measure more points, or repeat them so that their covariance is known."
-            )
-        if self.untested:
-            return (
-                "One amplitude gives no more numbers than friction has parameters, so any "
-                f"model fits ({misfit}): measure at other amplitudes as well."
-            )
-        hint = f", with a hint that {_joined(self.hints)}" if self.hints else ""
-        if self.scatter is not None and self.scatter.ratio > _FAR_MORE:
-            hint += f", but {self.scatter}"
-        return f"The residuals are consistent with noise ({misfit}){hint}."
-
-    @property
-    def _flaws(self) -> str:
-        if not self.flagged:
-            return ""
-        return (
-            f"The extraction flagged {len(self.flagged)} of the points fitted "
-            f"({_joined(self.flagged, 3)}): measure them again, or select the good ones."
-        )
-
-    @property
-    def _apart(self) -> str:
-        if not self.suspicious:
-            return ""
-        rows = _joined([point.name for point in self.suspicious], 5)
-        if self.neighbours:
-            return (
-                f"Suspicious rows: {rows}; without them the model describes the data, but they are "
-                f"neighbours, {self.neighbours}: check them, or the model is wrong there."
-            )
-        return f"Suspicious rows: {rows}; check them (a robust loss down-weights these rows)."
+        """Whether the model describes the data, in a few sentences."""
+        return " ".join(str(finding) for finding in self.findings())
 
     @property
     def details(self) -> list[str]:
@@ -377,18 +377,19 @@ def _tested_estimate(optimum: Optimum) -> Goodness:
     return _tested(optimum, error_model(optimum, of_combinations=True))
 
 
-def _bound(optimum: Optimum, misfit: float) -> str:
-    """Return the least misfit of parallel Jenkins elements in words; "" where it says nothing."""
+def _bound(optimum: Optimum, misfit: float) -> float | None:
+    """Return the least misfit of parallel Jenkins elements; None where it says nothing."""
     problem = optimum.problem
     few = (problem.data.harmonic == 1).sum() < LEAST_DOF
     if few or any(p.free for p in problem.sensors.parameters):
-        return ""
+        return None
     if all(e.is_linear for e in problem.model.elements) or problem.is_exact:
-        return ""  # the bound is that of displacements that are sines
+        return None  # the bound is that of displacements that are sines
     try:
-        return bound_statement(least_misfit(problem.data, problem.model), misfit)
+        least = least_misfit(problem.data, problem.model)
     except DahlIdentError:
-        return ""
+        return None
+    return least if least <= misfit else None
 
 
 def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
@@ -403,18 +404,9 @@ def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
     where = neighbourhood(optimum, rows)
     if where:
         return replace(found, neighbours=where)
-    names = _joined([point.name for point in found.suspicious], 10)
-    n = optimum.problem.data.n
-    them, named = "them", f"Only {len(rows)} of {n} rows ({names}) contradict"
-    if len(rows) == 1:
-        them, named = "it", f"Only the row at {names} contradicts"
-    left = rest.described[0].lower() + rest.described[1:].rstrip(".")
-    return replace(
-        found,
-        apart=f"{named} the model ({percent(found.rms_misfit)} rms misfit): without "
-        f"{them} {left}. The fit includes every row: check {them}, or fit with a robust loss "
-        f'that down-weights {them} (loss="huber").',
-    )
+    (remaining,) = (str(f) for f in rest.findings() if f.code == "noise")
+    names = tuple(point.name for point in found.suspicious)
+    return replace(found, apart=names, without_them=remaining, rows=optimum.problem.data.n)
 
 
 def _within_runs(errors: ErrorModel) -> Goodness | None:
@@ -564,9 +556,3 @@ def _third_harmonic(optimum: Optimum, space: ResidualSpace) -> ThirdHarmonic | N
     own = rows.astype(np.complex128)
     ratio, error = space.coefficient(own)
     return ThirdHarmonic(1.0 + ratio, error, space.p_value(np.array([own, 1j * own])))
-
-
-def _joined(parts: Sequence[str], most: int = 100, separator: str = "; ") -> str:
-    """Return parts as one text, no more than so many of them."""
-    more = ["..."] if len(parts) > most else []
-    return separator.join([*parts[:most], *more])

@@ -15,6 +15,7 @@ from dahl_ident.diagnostics.correlated_residuals import sandwich
 from dahl_ident.diagnostics.error_model import EXPONENT
 from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.formatting import listed
+from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.record_sources import (
     BLOCKS,
     AssumedExponent,
@@ -259,8 +260,8 @@ def variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.where((slopes[:, endless] != 0.0).any(axis=1), np.inf, found)
 
 
-def record_assumptions(problem: RecordProblem, errors: RecordErrors) -> str:
-    """Return one sentence with what the estimate rests on and the records cannot test."""
+def record_assumptions(problem: RecordProblem, errors: RecordErrors) -> Finding:
+    """Return what the estimate rests on and the records cannot test."""
     parts = [str(one) for one in errors.exponents]
     known = {one.name for one in errors.exponents}
     parts += [
@@ -272,7 +273,9 @@ def record_assumptions(problem: RecordProblem, errors: RecordErrors) -> str:
         parts.append(f"{listed(errors.exact)} exact")
     if errors.runs < 2:
         parts.append("a single run")
-    return f"Assumed: {'; '.join(parts)}."
+    return Finding(
+        Question.ASSUMED, VerdictStatus.TRUSTED, "records_assumed", {"parts": tuple(parts)}
+    )
 
 
 def record_derived(

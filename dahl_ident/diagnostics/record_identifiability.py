@@ -11,6 +11,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 from dahl_ident.diagnostics.error_model import EXPONENT
 from dahl_ident.diagnostics.error_sources import RUNS
+from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.record_errors import MODEL
 from dahl_ident.elements import Model
 from dahl_ident.elements.recursion import stretches
@@ -33,8 +34,8 @@ def undetermined(
     covariance: FloatArray,
     names: Sequence[str],
     mostly: Mapping[str, str] = MappingProxyType({}),
-) -> tuple[str, ...]:
-    """Return one sentence for each parameter that the records do not determine.
+) -> tuple[Finding, ...]:
+    """Return one finding for each parameter that the records do not determine.
 
     Parameters
     ----------
@@ -52,7 +53,7 @@ def undetermined(
 
     Returns
     -------
-    tuple of str
+    tuple of Finding
     """
     found = []
     paths = [stretches(r.displacement) for r in records if r.displacement is not None]
@@ -71,29 +72,33 @@ def undetermined(
             size = limit if np.isfinite(limit) else 0.0
             if error is None or error <= _UNCERTAIN * max(size, abs(float(parameter.value or 0.0))):
                 continue
-            start = f"{parameter.name} is not determined (standard uncertainty {error:.2g} "
-            start += f"{parameter.unit})".replace(" )", ")")
-            if np.isinf(error):
-                start = f"{parameter.name} is not determined at all"
             if farthest == 0.0:
-                found.append(f"{start}: the displacement is constant; move.")
+                why = ": the displacement is constant; move"
             elif element.has_memory and farthest < 2.0 * low:
                 # an estimate within its own uncertainty of zero says nothing of where slip begins
                 known = error < abs(float(parameter.value or 0.0))
                 needs = f"{2.0 * high:.2g} {unit}" if known else "more"
-                found.append(
-                    f"{start}: the motion moves no farther than {farthest:.2g} {unit} after a "
-                    f"reversal, and slip needs {needs}; move farther."
+                why = (
+                    f": the motion moves no farther than {farthest:.2g} {unit} after a reversal, "
+                    f"and slip needs {needs}; move farther"
                 )
             elif element.has_memory and near < _LONG_ENOUGH:
-                found.append(
-                    f"{start}: the motion never stays below x_c = {low:.2g} {unit} long enough; "
-                    "add reversals and small motions of that size, sampled closely."
+                why = (
+                    f": the motion never stays below x_c = {low:.2g} {unit} long enough; add "
+                    "reversals and small motions of that size, sampled closely"
                 )
             elif mostly.get(parameter.name) in _BECAUSE:
-                found.append(f"{start} because {_BECAUSE[mostly[parameter.name]]}.")
+                why = f" because {_BECAUSE[mostly[parameter.name]]}"
             else:
-                found.append(f"{start}{_alike(parameter.name, covariance, names)}.")
+                why = _alike(parameter.name, covariance, names)
+            values_of = {
+                "name": parameter.name, "stderr": error, "unit": parameter.unit, "why": why
+            }  # fmt: skip
+            found.append(
+                Finding(
+                    Question.DETERMINED, VerdictStatus.NOT_DETERMINED, "record_parameter", values_of
+                )
+            )
     return tuple(found)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.diagnostics.formatting import percent
+from dahl_ident.diagnostics.text import sentence
 from dahl_ident.elements import Element, MaxwellSlip, Model
 from dahl_ident.elements.element import as_model
 from dahl_ident.elements.masing import jenkins
@@ -66,7 +66,7 @@ class SlipDensity:
     @property
     def statement(self) -> str:
         """The least misfit in words."""
-        return bound_statement(self.least_misfit, self.least_misfit)
+        return sentence("jenkins_bound", {"least": self.least_misfit, "law": False})
 
     def law(self) -> MaxwellSlip:
         """Return the density as an element: its Jenkins elements and the spring, as fixed values.
@@ -153,21 +153,6 @@ def least_misfit(data: FrequencyResponse, model: Element) -> float:
     0.16
     """
     return _solved(_system(data, [e for e in as_model(model).elements if e.is_linear]), 0.0)[1]
-
-
-def bound_statement(least: float, misfit: float) -> str:
-    """Return the least misfit of parallel Jenkins elements in words, beside a model's misfit."""
-    share = f"{percent(least)} (rms of the fundamental)"
-    if least < FAR_LESS * misfit:
-        return (
-            "The best symmetric rate-independent law of parallel Jenkins elements (MaxwellSlip, "
-            f"Iwan) leaves {share}."
-        )
-    rest = ": the rest is noise, rate, asymmetry, a gap, or a loop of another shape"
-    return (
-        "No symmetric rate-independent law of parallel Jenkins elements leaves less than "
-        f"{share}{rest if least <= misfit else ', more than this model'}."
-    )
 
 
 class _System(NamedTuple):

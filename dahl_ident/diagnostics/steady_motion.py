@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from dahl_ident.data.rows import row_names
-from dahl_ident.diagnostics.formatting import percent
+from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.fitting import Optimum
 
 _SEEN = 1e-3  # relative difference that is worth a place
@@ -32,30 +32,23 @@ def steady_difference(optimum: Optimum) -> tuple[int, float] | None:
     return row, float(apart[row])
 
 
-def steady_statements(optimum: Optimum) -> Iterator[str]:
+def steady_findings(optimum: Optimum) -> Iterator[Finding]:
     """Yield how driven rows were predicted, and what the other way would have been."""
     problem = optimum.problem
     forced = problem.data.controlled == "force"
     if not forced.any():
         return
+    described, note = Question.DESCRIBED, VerdictStatus.TRUSTED
+    if problem.is_exact:
+        worst = steady_difference(optimum)
+        values = {"difference": 0.0, "row": ""}
+        if worst is not None and worst[1] >= _SEEN:
+            (row,) = row_names(problem.data, [worst[0]])
+            values = {"difference": worst[1], "row": row}
+        yield Finding(described, note, "steady", values)
+        return
     why = problem.obstacle_to_exact
-    if not problem.is_exact:
-        if not why and not problem.takes_energy(optimum.theta):
-            yield (
-                "The force was held, but the describing function predicts the motion: the plant "
-                "would drive itself, and no steady motion is there."
-            )
-        if (
-            why
-            and problem.steady == "exact"
-            and any(not e.is_linear for e in problem.model.elements)
-        ):
-            yield f"The force was held, but the describing function predicts the motion: {why}."
-        return
-    found = steady_difference(optimum)
-    begin = "The force was held, and the exact steady motion fitted"
-    if found is None or found[1] < _SEEN:
-        yield f"{begin}; the describing function would be the same."
-        return
-    (name,) = row_names(problem.data, [found[0]])
-    yield f"{begin}; the describing function would be up to {percent(found[1])} off, at {name}."
+    if not why and not problem.takes_energy(optimum.theta):
+        yield Finding(described, note, "no_steady_motion")
+    if why and problem.steady == "exact" and any(not e.is_linear for e in problem.model.elements):
+        yield Finding(described, note, "describing_function", {"why": why})

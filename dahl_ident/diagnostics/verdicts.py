@@ -32,9 +32,10 @@ from dahl_ident.diagnostics.confidence_levels import LEVELS, percent, thresholds
 from dahl_ident.diagnostics.error_model import EXPONENT, ErrorModel
 from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.formatting import interval as interval_text
-from dahl_ident.diagnostics.formatting import listed, with_unit
+from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import Information, shares
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval
+from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.fitting import Optimum, Status
 
 IDENTIFIED_BELOW = 0.25  # u of a logarithm: 95 % within a factor of 1.6
@@ -95,8 +96,8 @@ class ParameterVerdict:
         Standard deviation of its logarithm, first order and by its profile; infinite where open.
     interval : Interval
         The 95.45 % interval: the profile's, or the combined one where a fit states it.
-    text : str
-        All of it in words, with the reason and what to do where it is not identified.
+    reason : str
+        Interval and verdict in words, with the reason and what to do where it is not identified.
     """
 
     name: str
@@ -105,7 +106,12 @@ class ParameterVerdict:
     fisher_std: float
     profile_std: float
     interval: Interval
-    text: str
+    reason: str
+
+    @property
+    def text(self) -> str:
+        """Name and verdict in words."""
+        return f"{self.name}: {self.reason}"
 
 
 @dataclass(frozen=True)
@@ -171,35 +177,34 @@ class Identifiability:
         )
 
     @property
-    def headline(self) -> str:
-        """The verdict in one sentence."""
-        lost, weak = self.named(Verdict.NOT_IDENTIFIED), self.named(Verdict.WEAK)
-        given = self.named(Verdict.BY_PRIOR)
-        if not lost and not weak and given:
-            others = self.named(Verdict.IDENTIFIED)
-            rest = f"{listed(others)} {'is' if len(others) == 1 else 'are'} identified; "
-            set_by = "is known from its prior" if len(given) == 1 else "are known from their priors"
-            return f"{rest if others else ''}{listed(given)} {set_by}."
-        if not lost and not weak:
-            return "Every parameter is identified."
-        if not lost:
-            return f"Every parameter is determined, but {listed(weak)} only weakly."
-        known = self.determined
-        only = "Nothing is determined"
-        if known:
-            only = f"Only {listed(known)} {'is' if len(known) == 1 else 'are'} determined"
-        weakly = f", {listed(weak)} weakly" if weak else ""
-        return f"{only}{weakly}; not {listed(lost)}."
+    def finding(self) -> Finding:
+        """Which parameters or combinations are determined."""
+        weak = tuple(self.named(Verdict.WEAK))
+        if self.complete:
+            values = {
+                "identified": tuple(self.named(Verdict.IDENTIFIED)),
+                "weak": weak,
+                "by_prior": tuple(self.named(Verdict.BY_PRIOR)),
+            }
+            return Finding(Question.DETERMINED, VerdictStatus.TRUSTED, "identified", values)
+        lost = tuple(self.named(Verdict.NOT_IDENTIFIED))
+        values = {"determined": self.determined, "weak": weak, "lost": lost}
+        return Finding(Question.DETERMINED, VerdictStatus.NOT_DETERMINED, "undetermined", values)
 
     @property
-    def reasons(self) -> tuple[str, ...]:
-        """What is known of each parameter that is not identified, and why no more.
+    def headline(self) -> str:
+        """The verdict in one sentence."""
+        return str(self.finding)
+
+    @property
+    def open(self) -> tuple[ParameterVerdict, ...]:
+        """The parameters that are not identified, with what is known of each.
 
         Those without any limit are left out where another one has some.
         """
         lost = [p for p in self.parameters.values() if p.verdict is Verdict.NOT_IDENTIFIED]
         limited = [p for p in lost if p.interval.lower > 0.0 or np.isfinite(p.interval.upper)]
-        return tuple(f"{p.text}." for p in limited or lost)
+        return tuple(limited or lost)
 
     def __str__(self) -> str:
         lines = [self.headline, *(f"- {p.text}" for p in self.parameters.values())]
@@ -282,14 +287,14 @@ def judged(
     for i, (name, parameter) in enumerate(zip(problem.names, problem.parameters, strict=True)):
         unit = parameter.unit
         limits = _shown((stated or intervals)[name], verdicts[name])
-        text = _text(optimum, name, unit, verdicts[name], limits, lost)
+        reason = _reason(optimum, name, unit, verdicts[name], limits, lost)
         if name in beyond and errors is not None:
             shown = with_unit(errors.values[name], errors.stderr[name], unit)
-            text = f"{name}: {shown}, not determined, {beyond[name]}"
+            reason = f"{shown}, not determined, {beyond[name]}"
         if name in blind:
-            text = f"{name}: {blind[name]}"
+            reason = blind[name]
         parameters[name] = ParameterVerdict(
-            name, unit, verdicts[name], float(fisher[i]), float(profile[i]), limits, text
+            name, unit, verdicts[name], float(fisher[i]), float(profile[i]), limits, reason
         )
     direction = {}
     if lost - blind.keys() and not found:
@@ -508,7 +513,7 @@ def _split(candidate: Candidate) -> FloatArray:
     return np.diag(candidate.direction)[members]
 
 
-def _text(
+def _reason(
     optimum: Optimum,
     name: str,
     unit: str,
@@ -519,5 +524,5 @@ def _text(
     lower = -np.inf if limits.lower == 0.0 else limits.lower
     within = f"{interval_text(lower, limits.upper, unit)} ({percent(limits.level)})"
     if verdict is not Verdict.NOT_IDENTIFIED:
-        return f"{name}: {within}, {verdict.value}"
-    return f"{name}: {within}, not determined, {advice(optimum, name, limits, lost)}"
+        return f"{within}, {verdict.value}"
+    return f"{within}, not determined, {advice(optimum, name, limits, lost)}"

@@ -35,7 +35,7 @@ def sections(posterior: ChainDraws) -> Iterator[Section]:
 
 def verdict(posterior: ChainDraws) -> list[str]:
     """Return whether it can be used, which parameters the prior determines, and misfits."""
-    return [f"Posterior: {posterior.message}", *posterior.findings]
+    return [f"Posterior: {posterior.findings[0]}", *map(str, posterior.findings[1:])]
 
 
 def answer(posterior: ChainDraws) -> Iterator[Block]:
@@ -64,8 +64,7 @@ def _numbers(posterior: ChainDraws) -> Iterator[Block]:
     )
     yield Paragraph(f"Priors (likelihood: {posterior.likelihood.replace('_', ' ')}):")
     yield Bullets(tuple(f"{name}: {text}" for name, text in posterior.priors.items()))
-    if posterior.findings:
-        yield Bullets(posterior.findings)
+    yield Bullets(tuple(map(str, posterior.findings)))
     yield Paragraph(f"Seed {posterior.seed}; the same seed gives the same chain.")
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from dahl_ident.data.laboratory import Metadata
 from dahl_ident.diagnostics.formatting import interval, percent, rounded
-from dahl_ident.diagnostics.verdict_status import VerdictStatus
+from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.reporting import posterior_sections, provenance, tables
 from dahl_ident.reporting.document import (
     MARKS,
@@ -115,7 +115,7 @@ def record_document(
         + tuple(
             f"{fit.problem.model!r}: {line}" if several and i == 0 else line
             for fit in fits
-            for i, line in enumerate(fit.statements)
+            for i, line in enumerate(fit.statements if several else map(str, fit.judgement.told))
         )
         + tuple(line for one in drawn for line in posterior_sections.verdict(one)),
         header=tuple(header.items()),
@@ -240,6 +240,7 @@ def _facts(fit: RecordFit) -> dict[str, Any]:
         "status": str(fit.status),
         "trusted": fit.trusted,
         "verdict": fit.verdict,
+        "findings": [finding.to_dict() for finding in fit.findings],
         "records": len(fit.records),
         "samples": fit.problem.n_residuals,
         "share_of_variance_left": fit.goodness.share_left,

@@ -12,7 +12,7 @@ from dahl_ident.diagnostics.budget import taken_as_exact
 from dahl_ident.diagnostics.comparison import compare_models
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, percent
 from dahl_ident.diagnostics.formatting import listed, with_unit
-from dahl_ident.diagnostics.verdict_status import VerdictStatus
+from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.reporting import posterior_sections, provenance, tables
 from dahl_ident.reporting.document import (
     MARKS,
@@ -196,12 +196,10 @@ def _model(result: Result) -> Iterator[str]:
 def _verdict(fit: FitResult, several: bool) -> list[str]:
     """Return a fit's statements; if there are several fits, model and status come first."""
     warnings = [f"Warning: {text}" for text in fit.goodness.warnings]
+    if not several:
+        return [*map(str, fit.judgement.told), *warnings]
     first, *others = fit.statements
-    if several:
-        first = f"{fit.problem.model!r}: {first}"
-    else:
-        first = first.removeprefix(f"{fit.status.capitalize()}. ")
-    return [first, *others, *warnings]
+    return [f"{fit.problem.model!r}: {first}", *others, *warnings]
 
 
 def _answer(fit: FitResult, of: str) -> Iterator[Section]:
@@ -368,6 +366,7 @@ def fit_facts(fit: FitResult) -> dict[str, Any]:
         "status": str(fit.status),
         "trusted": fit.trusted,
         "verdict": fit.verdict,
+        "findings": [finding.to_dict() for finding in fit.findings],
         "search": fit.optimum.status.name.lower().replace("_", " "),
         "noise": fit.noise,
         "scale": fit.scale,

@@ -9,7 +9,7 @@ import numpy as np
 
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, percent
 from dahl_ident.diagnostics.formatting import interval, rounded
-from dahl_ident.diagnostics.verdict_status import VerdictStatus
+from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Verdict
 from dahl_ident.reporting.document import Cell, Table, number, words
 from dahl_ident.results.changes import is_usable
@@ -38,7 +38,7 @@ def answer(fit: FitResult, *, described: bool) -> Table:
         struck = lost or not described
         found = limits[name]
         closed = lost and bool(np.isfinite([found.lower, found.upper]).all())  # a bound holds
-        reason = judged.text.removeprefix(f"{name}: ") if lost else judged.verdict.value
+        reason = judged.reason if lost else judged.verdict.value
         if not described and not lost:
             reason = "the model does not describe the data: the interval is not valid"
         if fit.status == VerdictStatus.APPROXIMATE and not lost:

@@ -12,7 +12,7 @@ from scipy import special
 
 from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.formatting import rounded
-from dahl_ident.diagnostics.verdict_status import VerdictStatus
+from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Verdict
 from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.results.fit_result import FitResult

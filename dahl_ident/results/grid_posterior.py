@@ -13,6 +13,7 @@ from dahl_ident.arrays import FloatArray, array_between, finite_array, positive_
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.importance import WeightedPoints
 from dahl_ident.bayes.noise_scale import with_scale
+from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.errors import ModelError, choices
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_base import QUANTILES
@@ -177,9 +178,10 @@ class GridPosterior(ResponsePosterior):
         return random.choice(self._points.theta, size=size, p=self._points.weights)
 
     @property
-    def findings(self) -> tuple[str, ...]:
-        """What to know besides the numbers, the evidence among it."""
-        return (*super().findings, f"ln evidence: {self.log_evidence:.4f}")
+    def _notes(self) -> tuple[Finding, ...]:
+        values = {"ln": self.log_evidence}
+        evidence = Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "evidence", values)
+        return (*super()._notes, evidence)
 
     def __repr__(self) -> str:
         return f"<GridPosterior: {', '.join(self.names)}; error {self.error:.1g}>"

@@ -21,6 +21,7 @@ from dahl_ident.diagnostics.bands import (
 )
 from dahl_ident.diagnostics.bootstrap import REPLICATES, bootstrap_intervals
 from dahl_ident.diagnostics.budget import Budget, ParameterBudget, budget
+from dahl_ident.diagnostics.checks import judgement
 from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
 from dahl_ident.diagnostics.cross_validation import CrossValidation, cross_validation
 from dahl_ident.diagnostics.goodness import Goodness, goodness
@@ -34,8 +35,7 @@ from dahl_ident.diagnostics.intervals import (
     profile_intervals,
     wald_intervals,
 )
-from dahl_ident.diagnostics.statements import statements, verdict_status
-from dahl_ident.diagnostics.verdict_status import VerdictStatus
+from dahl_ident.diagnostics.judgement import Judgement
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
 from dahl_ident.errors import FitError, ValidationError, choices
 from dahl_ident.fitting.optimum import Optimum
@@ -180,9 +180,9 @@ class JudgedFit(FitNumbers):
         return None if errors is None else cross_validation(errors)
 
     @cached_property
-    def status(self) -> VerdictStatus:
-        """Whether the numbers can be used."""
-        return verdict_status(self)
+    def judgement(self) -> Judgement:
+        """Every finding about the fit, and the status that follows from them."""
+        return judgement(self)
 
     @cached_property
     def _budget(self) -> Budget:
@@ -211,16 +211,6 @@ class JudgedFit(FitNumbers):
             return self._budget
         except FitError:
             return None
-
-    @property
-    def findings(self) -> tuple[str, ...]:
-        """What the tests of residuals and values remark."""
-        return tuple(self.goodness.warnings)
-
-    @cached_property
-    def statements(self) -> tuple[str, ...]:
-        """The verdict sentence by sentence: the first says whether to trust, the others why."""
-        return statements(self)
 
     # What follows from the estimate
 

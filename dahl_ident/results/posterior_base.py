@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -16,8 +17,8 @@ from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.bayes.density import LogDensity
 from dahl_ident.bayes.priors import PriorLike
 from dahl_ident.data.storage import plain_data
-from dahl_ident.diagnostics.statements import doubted
-from dahl_ident.diagnostics.verdict_status import VerdictStatus
+from dahl_ident.diagnostics.checks import doubted
+from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
 from dahl_ident.errors import ValidationError, choices
 from dahl_ident.results.prior_influence import PriorInfluence, prior_influences
 from dahl_ident.results.result import Result
@@ -86,12 +87,31 @@ class Posterior(Result):
             return ()
         return prior_influences(self._density.prior, self._draws(RULE_DRAWS, 0))
 
+    @cached_property
+    def judgement(self) -> Judgement:
+        """Every finding about the posterior, and the status that follows from them.
+
+        Not determined where it has not converged, or a prior that nobody gave sets a parameter;
+        not described where data or prior object; approximate where the fit's numbers are.
+        """
+        return Judgement((*self._objections, *self._notes, *doubted(*self._provenances)))
+
     @property
-    def statements(self) -> tuple[str, ...]:
-        """The verdict sentence by sentence: the first says whether to trust, the others why."""
-        first, *others = self._objections or (self.message,)
-        said = (*self._notes, *doubted(*self._provenances))
-        return (f"{self.status.capitalize()}. {first}", *others, *said)
+    def _objections(self) -> Iterator[Finding]:
+        """Yield what speaks against the numbers."""
+        code = "sampled" if self.converged else "not_converged"
+        severity = VerdictStatus.TRUSTED if self.converged else VerdictStatus.NOT_DETERMINED
+        yield Finding(Question.DETERMINED, severity, code, {"message": self.message})
+        lost = VerdictStatus.NOT_DESCRIBED if self.converged else VerdictStatus.NOT_DETERMINED
+        default = {p.parameter.name for p in self._density.prior.priors if p.source == "default"}
+        for rule in self.prior_influences:
+            left_open = VerdictStatus.NOT_DETERMINED if rule.name in default else None
+            severity = lost if rule.contradicted else left_open or VerdictStatus.TRUSTED
+            yield rule.finding(severity)
+        yield from (replace(finding, severity=lost) for finding in self._misfits)
+        fit = self._counted_fit
+        if fit is not None and fit.status is not VerdictStatus.NOT_DESCRIBED:
+            yield from (f for f in fit.findings if f.severity is VerdictStatus.APPROXIMATE)
 
     @property
     @abstractmethod
@@ -99,57 +119,22 @@ class Posterior(Result):
         """Where the data come from."""
 
     @property
-    def status(self) -> VerdictStatus:
-        """Whether the numbers can be used.
-
-        Not determined where it has not converged, or a prior that nobody gave sets a parameter;
-        not described where data or prior object; approximate where the fit's numbers are.
-        """
-        against = any(rule.contradicted for rule in self.prior_influences)
-        if self.converged and (against or self._misfits):
-            return VerdictStatus.NOT_DESCRIBED
-        if self._objections:
-            return VerdictStatus.NOT_DETERMINED
-        fit = self._counted_fit
-        approximate = fit is not None and fit.status is VerdictStatus.APPROXIMATE
-        return VerdictStatus.APPROXIMATE if approximate else VerdictStatus.TRUSTED
-
-    @property
     @abstractmethod
     def _counted_fit(self) -> FitResult | RecordFit | None:
         """The fit whose sources of error are counted; None where noise alone is."""
 
     @property
-    def _objections(self) -> tuple[str, ...]:
-        unfinished = () if self.converged else (self.message,)
-        against = (str(rule) for rule in self.prior_influences if rule.contradicted)
-        return (*unfinished, *against, *self._misfits, *map(str, self._left_open))
-
-    @property
-    def _left_open(self) -> tuple[PriorInfluence, ...]:
-        """Parameters that are set by a default prior, which is knowledge of nobody."""
-        default = {p.parameter.name for p in self._density.prior.priors if p.source == "default"}
-        rules = self.prior_influences
-        return tuple(r for r in rules if r.name in default and not r.contradicted)
-
-    @property
-    def _notes(self) -> tuple[str, ...]:
-        """What the numbers count and assume, sentence by sentence."""
+    def _notes(self) -> tuple[Finding, ...]:
+        """What the numbers count and assume."""
         return ()
 
     @property
-    def findings(self) -> tuple[str, ...]:
-        """What the prior determines, and what does not fit."""
-        return (*map(str, self.prior_influences), *self._misfits, *self._notes)
-
-    @property
-    def _misfits(self) -> tuple[str, ...]:
-        """Where the data contradict the model, in words; by default those of the fit."""
+    def _misfits(self) -> tuple[Finding, ...]:
+        """Where the data contradict the model; by default what the fit's status rests on."""
         fit = self._counted_fit
         if fit is None or fit.status is not VerdictStatus.NOT_DESCRIBED:
             return ()
-        first, *others = fit.statements
-        return (first.removeprefix(f"{fit.status.capitalize()}. "), *others)
+        return tuple(f for f in fit.findings if f.severity is not VerdictStatus.TRUSTED)
 
     def draws(self, size: int, seed: int = 0) -> FloatArray:
         """Return values drawn from the posterior, shape (size, number of parameters)."""
@@ -253,7 +238,7 @@ class Posterior(Result):
             "likelihood": self.likelihood,
             "priors": dict(self.priors),
             "set_by_prior": [rule.name for rule in self.prior_influences],
-            "findings": list(self.findings),
+            "findings": [finding.to_dict() for finding in self.findings],
             "summary": self.summary().to_dict(orient="index"),
         }
         return found | {name: getattr(self, name) for name in _HOW if hasattr(self, name)}
@@ -269,6 +254,5 @@ class Posterior(Result):
     def __str__(self) -> str:
         table = self.summary().to_string(float_format=lambda v: f"{v:.5g}")
         priors = [f"  {name}: {text}" for name, text in self.priors.items()]
-        serious = [text for text in self._objections if text != self.message]
-        others = [text for text in self.findings if text not in serious]
-        return "\n".join([self.message, *serious, "", table, *others, "", "Priors:", *priors])
+        said = [str(f) for f in self.findings if f.code not in ("sampled", "not_converged")]
+        return "\n".join([self.message, *said, "", table, "", "Priors:", *priors])

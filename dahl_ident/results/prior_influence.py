@@ -14,6 +14,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.priors import JointPrior, ParameterPrior
+from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 
 _NEARLY_AS_WIDE = 0.5  # of the width: the data have not even halved it
 _END = 0.01  # of the prior's probability that counts as its end
@@ -32,22 +33,19 @@ class PriorInfluence:
     at_upper_end: bool
     contradicted: bool = False
 
+    def finding(self, severity: VerdictStatus) -> Finding:
+        """Return the influence as a finding."""
+        reached = {"lower": self.at_lower_end, "upper": self.at_upper_end}
+        values = {
+            "name": self.name,
+            "width": self.width,
+            "ends": tuple(end for end, there in reached.items() if there),
+            "contradicted": self.contradicted,
+        }
+        return Finding(Question.DETERMINED, severity, "prior_influence", values)
+
     def __str__(self) -> str:
-        ends = [
-            end
-            for end, reached in (("lower", self.at_lower_end), ("upper", self.at_upper_end))
-            if reached
-        ]
-        if self.contradicted:
-            return (
-                f"PRIOR AGAINST DATA: {self.name} lies beyond 99 % of its prior's probability, at "
-                f"the {ends[0]} end; check the prior, its unit, and the data."
-            )
-        reach = f", and it reaches the prior's {' and '.join(ends)} end" if ends else ""
-        return (
-            f"{self.name} is known from its prior: posterior width {self.width:.2f} of the "
-            f"prior's{reach}."
-        )
+        return str(self.finding(VerdictStatus.TRUSTED))
 
 
 def prior_influences(prior: JointPrior, points: FloatArray) -> tuple[PriorInfluence, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,8 +21,10 @@ from dahl_ident.data.record import cut
 from dahl_ident.data.storage import read_text
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget
+from dahl_ident.diagnostics.checks import doubted
 from dahl_ident.diagnostics.doubtful_elements import below_zero, is_single, slight
-from dahl_ident.diagnostics.formatting import percent, rounded, table
+from dahl_ident.diagnostics.formatting import rounded, table
+from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
 from dahl_ident.diagnostics.record_errors import (
     MODEL,
     NOISE,
@@ -35,8 +37,6 @@ from dahl_ident.diagnostics.record_errors import (
 )
 from dahl_ident.diagnostics.record_goodness import RecordGoodness, record_goodness
 from dahl_ident.diagnostics.record_identifiability import undetermined
-from dahl_ident.diagnostics.statements import doubted
-from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.elements import Element, Model
 from dahl_ident.elements.description import describe_model, model_from_description
 from dahl_ident.elements.law_files import describe_laws, require_laws
@@ -247,8 +247,30 @@ class RecordFit(Result):
         return share_in_band(drives, self.problem.measured, self.residuals)
 
     @cached_property
-    def findings(self) -> tuple[str, ...]:
-        """The undetermined parameters with the reasons, in words; empty if there are none."""
+    def judgement(self) -> Judgement:
+        """Every finding about the fit, and the status that follows from them."""
+        return Judgement(
+            (*self._described, *self._undetermined, *self._doubts, *self._slight, *self._notes)
+        )
+
+    @property
+    def _described(self) -> Iterator[Finding]:
+        """Yield whether the model describes the records."""
+        question, lost = Question.DESCRIBED, VerdictStatus.NOT_DESCRIBED
+        far = self._share_left > _FAIRLY
+        if far:
+            yield Finding(question, lost, "records_not_described")
+        if not self.success:
+            yield Finding(question, lost, "no_optimum", {"message": self.message})
+        displaced = all(record.displacement is not None for record in self.records)
+        if self.problem.output == "motion" and (far or not self.success) and displaced:
+            yield Finding(question, lost, "motion_may_be_imposed")
+        if self.misses and not far:
+            yield Finding(question, VerdictStatus.APPROXIMATE, "records_misfit")
+
+    @property
+    def _undetermined(self) -> tuple[Finding, ...]:
+        """Which parameters are not determined, with the reasons."""
         stderr = {p.name: self.params[p.name].stderr or 0.0 for p in self.problem.free}
         mostly = {
             p.name: source
@@ -258,40 +280,33 @@ class RecordFit(Result):
         }
         return undetermined(self.model, self.records, stderr, self.covar, self.var_names, mostly)
 
-    @cached_property
-    def _doubts(self) -> tuple[str, ...]:
-        """What speaks against the estimates physically, a sentence each with what to do."""
+    @property
+    def _doubts(self) -> Iterator[Finding]:
+        """Yield what speaks against the estimates physically, or against an assumption."""
+        question, doubtful = Question.DESCRIBED, VerdictStatus.APPROXIMATE
         values = dict(zip(self.var_names, self._optimum.values.tolist(), strict=True))
         stderr = {p.name: self.params[p.name].stderr or 0.0 for p in self.problem.free}
         single = [e for e in self.problem.model.elements if is_single(e) and e.parameters[0].free]
-        found = list(below_zero([e.parameters[0] for e in single], values, stderr))
-        found += [
-            f"Physically doubtful: {objection}."
-            for element in self.model.elements
-            if not is_single(element)
-            for objection in element.physics([p.value or 0.0 for p in element.parameters])
-        ]
+        yield from below_zero([e.parameters[0] for e in single], values, stderr)
+        for element in self.model.elements:
+            if not is_single(element):
+                for text in element.physics([p.value or 0.0 for p in element.parameters]):
+                    yield Finding(question, doubtful, "unphysical", {"objection": text})
         for one in self.errors.exponents:
             if one.contradicted:
-                found.append(
-                    f"The records ask for {one.name} = {one.found} instead of the assumed "
-                    f"{one.parameter.value:g}: estimate it ({one.name}=None; "
-                    f"{one.name}=free on the command line)."
-                )
-        return tuple(found)
+                asked = {
+                    "name": one.name, "wanted": str(one.found), "assumed": one.parameter.value
+                }  # fmt: skip
+                yield Finding(question, doubtful, "exponent", asked)
 
-    @cached_property
-    def _slight(self) -> tuple[str, ...]:
-        """What may stand for a part of the misfit, because it carries less force than that."""
+    @property
+    def _slight(self) -> Iterator[Finding]:
+        """Yield what carries less force than the misfit, and may stand for a part of it."""
         if self.problem.output == "motion" or not self.misses:
-            return ()
+            return
         size = np.concatenate([y - y.mean() for y in self.problem.measured]).std()
-        found: list[str] = []
         for element in self.model.elements:
-            (parameter, *_), values = (
-                element.parameters,
-                [p.value or 0.0 for p in element.parameters],
-            )
+            parameter, values = element.parameters[0], [p.value or 0.0 for p in element.parameters]
             if parameter.name in self.var_names and is_single(element):
                 force = [
                     element.force_history(values, x, v, 0.0, acceleration=a)
@@ -299,94 +314,40 @@ class RecordFit(Result):
                 ]
                 share = float(np.concatenate([f - f.mean() for f in force]).std() / size)
                 p = self.params[parameter.name]
-                found += slight(
+                yield from slight(
                     self.problem.free[self.var_names.index(p.name)], p.value, p.stderr or 0.0,
                     share, float(np.sqrt(self._share_left)),
                 )  # fmt: skip
-        return tuple(found)
+
+    @property
+    def _notes(self) -> Iterator[Finding]:
+        """Yield the size of the residuals, and what the estimate rests on."""
+        question, note, goodness = Question.DESCRIBED, VerdictStatus.TRUSTED, self.goodness
+        size = {
+            "rms": goodness.share_left**0.5, "output": self.problem.output,
+            "worst": goodness.worst_text,
+        }  # fmt: skip
+        yield Finding(question, note, "record_residuals", size)
+        if self.weighted:
+            within = {"rms": self._share_left**0.5}
+            yield Finding(question, note, "slow_residuals", within)
+        if self.problem.displacement_noise:
+            noise = {
+                "noise": self.problem.displacement_noise,
+                "unit": si_unit("displacement", self.records[0].motion),
+                "travel": self.problem.noise_travel,
+            }
+            yield Finding(question, note, "displacement_noise", noise)
+        yield from doubted(*(record.provenance for record in self.records))
+        samples = {"effective": self.effective_samples, "samples": self.problem.n_residuals}
+        yield Finding(question, note, "effective_samples", samples)
+        yield record_assumptions(self.problem, self.errors)
 
     @property
     def misses(self) -> bool:
         """Whether the model misses more than noise."""
         structured = self.goodness.correlation > _STRUCTURED and self._share_left > _WELL
         return structured or MODEL in self.errors.contributions
-
-    @property
-    def status(self) -> VerdictStatus:
-        """Trusted, approximate, not determined or not described."""
-        if not self.success or self._share_left > _FAIRLY:
-            return VerdictStatus.NOT_DESCRIBED
-        if self.findings:
-            return VerdictStatus.NOT_DETERMINED
-        approximate = self.misses or self._doubts
-        return VerdictStatus.APPROXIMATE if approximate else VerdictStatus.TRUSTED
-
-    @cached_property
-    def statements(self) -> tuple[str, ...]:
-        """The verdict in its parts, most serious first."""
-        left, within = (
-            percent(share**0.5) for share in (self.goodness.share_left, self._share_left)
-        )
-        first = {
-            VerdictStatus.TRUSTED: "Trusted.",
-            VerdictStatus.APPROXIMATE: "Approximate. The misfit exceeds the noise."
-            if self.misses
-            else "Approximate. The estimates are those of no device, or of a wrong assumption.",
-            VerdictStatus.NOT_DETERMINED: "Not determined. Not every parameter is determined.",
-            VerdictStatus.NOT_DESCRIBED: "Not described. The model does not describe the records."
-            if self._share_left > _FAIRLY
-            else "Not described. The search found no optimum.",
-        }[self.status]
-        described = f"The residuals are {left} rms of the measured {self.problem.output}"
-        return (
-            first,
-            *(() if self.success else (self.message,)),
-            *self._imposed,
-            *self._doubts,
-            *self.findings,
-            f"{described}; {self.goodness.worst_text}.",
-            *self._slight,
-            *(
-                (
-                    f"Most of this varies slowly, as noise in the drive causes it: {within} "
-                    "rms remains at the drive's frequencies, and the residuals are weighted by "
-                    "their spectrum.",
-                )
-                if self.weighted
-                else ()
-            ),
-            *self._not_counted,
-            *doubted(*(record.provenance for record in self.records)),
-            f"Error bars take the residuals' correlation into account: {self.effective_samples:.0f}"
-            f" effective of {self.problem.n_residuals} samples.",
-            record_assumptions(self.problem, self.errors),
-        )
-
-    @property
-    def _imposed(self) -> tuple[str, ...]:
-        """What to do where a motion is not described that the exciter may have imposed."""
-        if self.problem.output != "motion" or self.status is not VerdictStatus.NOT_DESCRIBED:
-            return ()
-        if any(record.displacement is None for record in self.records):
-            return ()
-        return (
-            "If the exciter imposed the motion, fit the force instead (output='force'): what it "
-            "moves hardly depends on the force, and the model cannot follow it.",
-        )
-
-    @property
-    def _not_counted(self) -> tuple[str, ...]:
-        """What of the displacement is taken as noise, in words."""
-        noise = self.problem.displacement_noise
-        if not noise:
-            return ()
-        unit = si_unit("displacement", self.records[0].motion)
-        added = 100.0 * self.problem.noise_travel
-        return (
-            f"The displacement's noise of {noise:.2g} {unit} (standard deviation) is not counted "
-            f"as travel, of which it would add {added:.2g} %; the residuals are smaller without "
-            "it. A quieter displacement would determine more.",
-        )
 
     @cached_property
     def coverage_factor(self) -> float:

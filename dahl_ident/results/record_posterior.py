@@ -15,6 +15,7 @@ from dahl_ident.bayes.record_density import RecordDensity
 from dahl_ident.data import Record
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget
+from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.record_errors import record_assumptions, record_derived
 from dahl_ident.results.chain_posterior import ChainDraws
 from dahl_ident.results.record_fit import RecordBand, RecordFit
@@ -87,16 +88,11 @@ class RecordPosterior(ChainDraws):
         return self.fit
 
     @property
-    def _misfits(self) -> tuple[str, ...]:
-        return super()._misfits[:2]
-
-    @property
-    def _notes(self) -> tuple[str, ...]:
-        errors = self.fit.errors
-        counted = [name for name, part in errors.contributions.items() if part.any()]
-        missed = ("The misfit exceeds the noise.",) if self.fit.misses and not self._misfits else ()
-        said = (f"Counted: {'; '.join(counted)}.", record_assumptions(self.fit.problem, errors))
-        return (*missed, *said)
+    def _notes(self) -> tuple[Finding, ...]:
+        errors, note = self.fit.errors, (Question.ASSUMED, VerdictStatus.TRUSTED)
+        sources = tuple(name for name, part in errors.contributions.items() if part.any())
+        counted = Finding(*note, "counted", {"sources": sources})
+        return (counted, record_assumptions(self.fit.problem, errors))
 
     def budget(self) -> Budget:
         """Return the uncertainty budget of the least-squares fit."""

@@ -14,9 +14,8 @@ from dahl_ident.bayes.density import Density
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.bands import DerivedQuantity, problem_at
 from dahl_ident.diagnostics.budget import Budget
-from dahl_ident.diagnostics.formatting import listed
-from dahl_ident.diagnostics.statements import assumptions
-from dahl_ident.diagnostics.verdict_status import VerdictStatus
+from dahl_ident.diagnostics.checks import assumptions
+from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
@@ -70,12 +69,14 @@ class ResponsePosterior(Posterior):
         return (self.data.provenance,)
 
     @property
-    def _misfits(self) -> tuple[str, ...]:
+    def _misfits(self) -> tuple[Finding, ...]:
         fit = self._counted_fit
         if fit is None:
-            return tuple(str(check) for check in self.checks if not check.passed)
+            lost = Question.DESCRIBED, VerdictStatus.NOT_DESCRIBED
+            failed = (check for check in self.checks if not check.passed)
+            return tuple(Finding(*lost, "predictive_check", {"text": str(c)}) for c in failed)
         if fit.status is VerdictStatus.NOT_DETERMINED and fit.goodness.objections:
-            return fit.goodness.statements
+            return tuple(fit.goodness.findings())
         return super()._misfits
 
     @property
@@ -88,8 +89,8 @@ class ResponsePosterior(Posterior):
         return self._fit if self._uncertainty == "combined" else None
 
     @property
-    def _notes(self) -> tuple[str, ...]:
-        fit = self._fit
+    def _notes(self) -> tuple[Finding, ...]:
+        fit, note = self._fit, (Question.ASSUMED, VerdictStatus.TRUSTED)
         if fit is None or self.likelihood == "none":
             return ()
         if self._counted_fit is not None:
@@ -97,20 +98,14 @@ class ResponsePosterior(Posterior):
             names = ["noise"] if shared is None else list(shared.counted)
             free = [n for n in self.problem.names if n not in fit.problem.names]
             ranges = (f"{name} as a parameter, which was not given" for name in free)
-            counted = f"Counted: {'; '.join([*names, *ranges])}."
-            approximate = fit.statements[:1] if self.status is VerdictStatus.APPROXIMATE else ()
-            return (*approximate, counted, *assumptions(fit.optimum, fit.errors))
-        return (*self._beside, *assumptions(fit.optimum, None))
-
-    @property
-    def _beside(self) -> tuple[str, ...]:
-        """What every source together would make of the uncertainties, where noise alone counts."""
-        fit = self._fit
-        if fit is None or fit.errors is None:
-            return ()
-        own = dict(zip(self.names, self.std().tolist(), strict=True))
-        u = [f"{fit.params[n].stderr:.2g} instead of {own[n]:.2g} for {n}" for n in fit.var_names]
-        return (f"Noise alone is counted; with every source of the budget, u is {listed(u)}.",)
+            counted = Finding(*note, "counted", {"sources": (*names, *ranges)})
+            return (counted, *assumptions(fit.optimum, fit.errors))
+        if fit.errors is None:
+            return tuple(assumptions(fit.optimum, None))
+        std = dict(zip(self.names, self.std().tolist(), strict=True))
+        u = [f"{fit.params[n].stderr:.2g} instead of {std[n]:.2g} for {n}" for n in fit.var_names]
+        compared = Finding(*note, "noise_alone", {"compared": tuple(u)})
+        return (compared, *assumptions(fit.optimum, None))
 
     @cached_property
     def params(self) -> Parameters:

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from dahl_ident.data.storage import place_of, write_whole
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.formatting import rounded, with_unit
+from dahl_ident.diagnostics.judgement import Finding, Judgement, VerdictStatus
 from dahl_ident.diagnostics.markup import html_table, pair, symbol, tabular, unit
-from dahl_ident.diagnostics.verdict_status import VerdictStatus
 from dahl_ident.units import Quantity
 
 if TYPE_CHECKING:
@@ -136,8 +136,13 @@ class Result(ABC):
 
     @property
     @abstractmethod
+    def judgement(self) -> Judgement:
+        """Every finding about the numbers, and the status that follows from them."""
+
+    @property
     def status(self) -> VerdictStatus:
         """Trusted, approximate, not determined, or not described."""
+        return self.judgement.status
 
     @property
     def trusted(self) -> bool:
@@ -145,19 +150,19 @@ class Result(ABC):
         return self.status is VerdictStatus.TRUSTED
 
     @property
-    @abstractmethod
+    def findings(self) -> tuple[Finding, ...]:
+        """What was found about data, model and assumptions, the most serious first."""
+        return self.judgement.findings
+
+    @property
     def statements(self) -> tuple[str, ...]:
-        """The verdict sentence by sentence: the first says whether to trust, the others why."""
+        """The findings in words: the first says whether to trust, the others why."""
+        return self.judgement.statements
 
     @property
     def verdict(self) -> str:
         """Whether to trust the numbers, in words, and what speaks against it."""
         return " ".join(self.statements)
-
-    @property
-    @abstractmethod
-    def findings(self) -> tuple[str, ...]:
-        """Further statements on data, model and assumptions."""
 
     @property
     @abstractmethod

@@ -1,0 +1,368 @@
+"""The checks of a fit: each yields findings, of which the worst is the status.
+
+Determined: every parameter, or which combinations. Described: size and kind of the misfit. Assumed:
+what the result depends on and the data cannot test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data.tabular import doubts
+from dahl_ident.diagnostics.budget import taken_as_exact
+from dahl_ident.diagnostics.cross_validation import CrossValidation
+from dahl_ident.diagnostics.doubtful_elements import below_zero, is_single, slight
+from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.goodness import Goodness
+from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
+from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
+from dahl_ident.diagnostics.parameters import parameter_values
+from dahl_ident.diagnostics.steady_motion import steady_findings
+from dahl_ident.diagnostics.verdicts import Identifiability
+from dahl_ident.fitting import Optimum
+from dahl_ident.fitting.losses import LOSSES
+
+_TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
+_FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
+_NARROWEST = 0.7  # half width of 95 % bands over the rms misfit, which for noise is 1.4
+_ENOUGH_HELD_OUT = 16  # values, of which 80 % in bands of 95 % happen once in 100 times
+_DOUBTS_SHOWN = 5  # more would hide the verdict
+_CHANCE = 0.0027  # that data contradict a right constraint as much, as for a prior
+_CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chance
+_PASSES, _SETTLED = 100, 1e-3  # of a robust fit: far below the one uncertainty that matters
+
+_DETERMINED, _DESCRIBED, _ASSUMED = Question
+_TRUSTED, _APPROXIMATE, _NOT_DETERMINED, _NOT_DESCRIBED = VerdictStatus
+
+
+class Judged(Protocol):
+    """The input of a verdict."""
+
+    @property
+    def optimum(self) -> Optimum:
+        """The solver's result."""
+
+    @property
+    def goodness(self) -> Goodness:
+        """Tests of the residuals."""
+
+    @property
+    def identifiability(self) -> Identifiability:
+        """What the data determine."""
+
+    @property
+    def errors(self) -> ErrorModel | None:
+        """The sources of error."""
+
+    @property
+    def cross_validation(self) -> CrossValidation | None:
+        """The check of the bands."""
+
+
+def judgement(fit: Judged) -> Judgement:
+    """Return the findings of every check, and with them the status."""
+    return Judgement(finding for check in CHECKS for finding in check(fit))
+
+
+# Determined?
+
+
+def _parameters(fit: Judged) -> Iterator[Finding]:
+    """Yield which parameters or combinations are determined."""
+    optimum, known = fit.optimum, fit.identifiability
+    if fit.goodness.sign:
+        return  # what the numbers leave undetermined says nothing of the mechanism
+    can_tell = optimum.scale_known or optimum.dof > 0
+    if can_tell or known.complete:
+        yield known.finding
+    if can_tell and not known.complete and known.combinations:
+        values: dict[str, Any] = {"combinations": tuple(map(str, known.combinations))}
+        yield Finding(_DETERMINED, _NOT_DETERMINED, "combinations", values)
+    if not optimum.success:
+        message = optimum.status.value if optimum.status.at_infinity else optimum.message
+        yield Finding(_DETERMINED, _NOT_DETERMINED, "solver", {"message": message})
+    if optimum.dof <= 0:
+        values = {
+            "numbers": optimum.problem.n_residuals,
+            "parameters": len(optimum.names),
+            "scale_known": optimum.scale_known,
+        }
+        yield Finding(_DETERMINED, _NOT_DETERMINED, "no_degrees_of_freedom", values)
+    if can_tell:
+        for parameter in known.open:
+            values = {"name": parameter.name, "reason": parameter.reason}
+            yield Finding(_DETERMINED, _NOT_DETERMINED, "undetermined_parameter", values)
+
+
+# Described?
+
+
+def _is_determined(fit: Judged) -> bool:
+    optimum = fit.optimum
+    determined = optimum.success and optimum.dof > 0 and fit.goodness.judged
+    return determined and fit.identifiability.complete
+
+
+def _residuals(fit: Judged) -> Iterator[Finding]:
+    """Yield the size and kind of the misfit."""
+    goodness = fit.goodness
+    lost = (
+        (fit.errors is None and _is_determined(fit))
+        or _stated_exponent_is_wrong(fit)
+        or goodness.beyond_any_sensor
+        or any(finding.severity is _NOT_DESCRIBED for finding in _bands(fit))
+    )
+    large = goodness.rms_misfit > _TOO_LARGE
+    severity = _NOT_DESCRIBED if lost or large else _APPROXIMATE
+    yield from goodness.findings(severity, counted=_is_determined(fit) and severity is _APPROXIMATE)
+    if large and not goodness.objections:
+        yield Finding(_DESCRIBED, severity, "large_misfit", {"rms": goodness.rms_misfit})
+
+
+def _stated_exponent_is_wrong(fit: Judged) -> bool:
+    """Return whether the data contradict an exponent that the user gave."""
+    exponent = fit.goodness.exponent
+    if exponent is None or exponent.p_value > fit.goodness.level:
+        return False
+    given = {p.name: p for p in fit.optimum.problem.model.parameters}
+    return not given[exponent.name].assumed
+
+
+def _bands(fit: Judged) -> Iterator[Finding]:
+    """Yield whether the bands hold for what was held out, where anything speaks against the fit."""
+    goodness = fit.goodness
+    speaks_against = (goodness.objections, goodness.flagged, *_reservations(fit))
+    if goodness.sign or not any(speaks_against):
+        return
+    check, errors = fit.cross_validation, fit.errors
+    if check is None:
+        return
+    enough = check.count >= _ENOUGH_HELD_OUT
+    if enough and errors is not None:
+        misfit = _misfit_within_runs(errors)
+        if check.width < _NARROWEST * misfit:
+            values = {"width": check.width, "misfit": misfit}
+            yield Finding(_DESCRIBED, _NOT_DESCRIBED, "narrow_bands", values)
+    outside = enough and check.inside < _FEWEST_INSIDE * check.count
+    yield check.finding(_NOT_DESCRIBED if outside else _TRUSTED)
+
+
+def _misfit_within_runs(errors: ErrorModel) -> float:
+    """Return the misfit that bands have to cover.
+
+    It is that within runs: a row that was held out leaves other rows of its run. A force in
+    addition to the model and a change with speed do not count, as bands are centred on them.
+    A smooth departure from the law does: parameters of another law have no uncertainty.
+    """
+    fitted = (errors.near.fitted, errors.beside_the_law)
+    return min(rms_misfit_of(errors.problem, each) for each in fitted)
+
+
+def _reservations(fit: Judged) -> Iterator[Finding]:
+    """Yield what keeps a fit from being trusted although its residuals may look like noise."""
+    yield from _below_zero(fit)
+    yield from _contradicted_priors(fit)
+    yield from _moved_by_outliers(fit)
+
+
+def _estimates(fit: Judged) -> tuple[dict[str, float], Mapping[str, float]]:
+    """Return the values of all parameters, and standard uncertainties of those estimated."""
+    optimum, errors = fit.optimum, fit.errors
+    values = parameter_values(optimum)
+    values |= dict(zip(optimum.names, optimum.values.tolist(), strict=True))
+    return (
+        (values, optimum.stderr)
+        if errors is None
+        else (values | dict(errors.values), errors.stderr)
+    )
+
+
+def _below_zero(fit: Judged) -> Iterator[Finding]:
+    """Yield a finding for every mass, damping or stiffness clearly below zero."""
+    values, stderr = _estimates(fit)
+    problem = fit.optimum.problem
+    single = [e.parameters[0] for e in problem.model.elements if is_single(e)]
+    yield from below_zero(single, values, stderr, problem.data.motion)
+
+
+def _slight(fit: Judged) -> Iterator[Finding]:
+    """Yield a finding for every mass, damper or spring of less force than the model misses."""
+    if not (fit.goodness.objections and _is_determined(fit)):
+        return
+    values, stderr = _estimates(fit)
+    misfit, errors = fit.goodness.rms_misfit, fit.errors
+    if errors is not None:  # what an exponent explains is not missed
+        misfit = rms_misfit_of(errors.problem, errors.near.fitted)
+    view = fit.optimum.problem.stiffness_data
+    rows = view.harmonic == 1
+    for element in fit.optimum.problem.model.elements:
+        if is_single(element) and rows.any():
+            (parameter,) = element.parameters
+            value = values[parameter.name]
+            part = view.of(element, [np.asarray(value)])[rows] / view.stiffness[rows]
+            share = float(np.sqrt(np.mean(np.abs(part) ** 2)))
+            error = float(stderr.get(parameter.name, 0.0))
+            yield from slight(parameter, value, error, share, misfit)
+
+
+def _constraints(fit: Judged) -> Iterator[Finding]:
+    """Yield the constraints that the data contradict."""
+    cost = fit.optimum.constraint_cost
+    if cost is not None and cost.p_value <= _CHANCE:
+        values = {
+            "texts": tuple(cost.texts),
+            "rise": cost.rise,
+            "noise_known": bool(np.isinf(cost.dof)),
+            "p_value": cost.p_value,
+        }
+        yield Finding(_DESCRIBED, _NOT_DESCRIBED, "constraint", values)
+
+
+def _contradicted_priors(fit: Judged) -> Iterator[Finding]:
+    """Yield every prior that the data contradict."""
+    optimum = fit.optimum
+    estimates = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
+    for name, prior in optimum.problem.priors.items():
+        values = {
+            "name": name,
+            "value": estimates[name],
+            "mean": float(prior.mean()),
+            "std": float(prior.std()),
+        }
+        if abs(values["value"] - values["mean"]) > _CONTRADICTED * values["std"]:
+            yield Finding(_DESCRIBED, _APPROXIMATE, "prior", values)
+
+
+def _moved_by_outliers(fit: Judged) -> Iterator[Finding]:
+    """Yield which parameters a robust fit moves by more than one uncertainty."""
+    optimum, errors = fit.optimum, fit.errors
+    if optimum.loss != "linear" or errors is None:
+        return
+    robust, by_noise = robust_values(errors, optimum.scale)
+    moved = tuple(
+        name for name in optimum.names if abs(robust[name] - errors.values[name]) > by_noise[name]
+    )
+    if moved:
+        rows = tuple(point.name for point in fit.goodness.suspicious)
+        yield Finding(_DESCRIBED, _APPROXIMATE, "moved", {"names": moved, "rows": rows})
+
+
+def robust_values(
+    errors: ErrorModel, scale: float
+) -> tuple[Mapping[str, float], Mapping[str, float]]:
+    """Return a robust fit's values about the estimate, by iterated weights of a linear model.
+
+    Also the standard errors of the estimate by its weights. Assumed exponents stay where they are.
+    The noise's scale, where it is not stated, is the robust one of
+    :mod:`dahl_ident.fitting.losses`, from `scale` on.
+    """
+    problem, loss = errors.problem, LOSSES["huber"]
+    y, J = problem.residuals_and_jacobian(errors.theta, tails=False)
+    if problem.scale_known:
+        y, J = errors.estimate.weighted(y), errors.estimate.weighted(J)
+    free = [i for i, name in enumerate(problem.names) if name not in errors.assumed]
+    J, rows = J[:, free], problem.n_residuals // 2
+    variance = 1.0 if problem.scale_known else scale**2
+    weight = np.ones(len(y))
+    weight[2 * rows :] = variance  # priors have their own
+    known = np.linalg.pinv(J.T @ (weight[:, None] * J) / variance)
+    move: FloatArray = np.zeros(len(free))
+    for _ in range(_PASSES):
+        square = np.sum((y + J @ move)[: 2 * rows].reshape(rows, 2) ** 2, axis=1)
+        if not problem.scale_known:
+            variance *= loss.rescaled(square / variance, 2 * rows - len(free))
+        weight[: 2 * rows] = np.repeat(loss.slope(square / variance), 2)
+        weight[2 * rows :] = variance
+        root = np.sqrt(weight)
+        last, found = move, np.linalg.lstsq(root[:, None] * J, -root * y, rcond=1e-10)
+        move = np.asarray(found[0])
+        if np.linalg.norm(J @ (move - last)) < _SETTLED * np.sqrt(variance):
+            break
+    theta, std = errors.theta.copy(), np.zeros(len(errors.theta))
+    theta[free] += move
+    std[free] = np.sqrt(np.diagonal(known))
+    std *= np.abs(problem.value_slopes(errors.theta))
+    values = problem.to_values(theta)
+    names = problem.names
+    return (
+        dict(zip(names, values.tolist(), strict=True)),
+        dict(zip(names, std.tolist(), strict=True)),
+    )
+
+
+def _steady(fit: Judged) -> Iterator[Finding]:
+    """Yield how rows of held force were predicted."""
+    yield from steady_findings(fit.optimum)
+
+
+# Assumed?
+
+
+def _warnings(fit: Judged) -> Iterator[Finding]:
+    """Yield the warnings on reading the data."""
+    yield from doubted(fit.optimum.problem.data.provenance)
+
+
+def doubted(*provenances: Mapping[str, Any] | None) -> Iterator[Finding]:
+    """Yield the warnings that were shown when the data were read."""
+    texts = list(dict.fromkeys(text for one in provenances for text in doubts(one)))
+    for text in texts[:_DOUBTS_SHOWN]:
+        yield Finding(_DESCRIBED, _TRUSTED, "warning", {"text": text})
+    if len(texts) > _DOUBTS_SHOWN:
+        values = {"count": len(texts) - _DOUBTS_SHOWN}
+        yield Finding(_DESCRIBED, _TRUSTED, "more_warnings", values)
+
+
+def _assumed(fit: Judged) -> Iterator[Finding]:
+    """Yield the assumptions of a fit."""
+    yield from assumptions(fit.optimum, fit.errors)
+
+
+def assumptions(optimum: Optimum, errors: ErrorModel | None) -> Iterator[Finding]:
+    """Yield one finding with the assumptions that these data cannot test."""
+    ranges, stated = [], {}
+    for parameter in optimum.problem.model.parameters:
+        name = parameter.name
+        if parameter.prior is None or parameter.free:
+            continue
+        if parameter.assumed and errors is not None and name in errors.assumed:
+            low, high = parameter.prior
+            ranges.append(
+                {
+                    "name": name, "low": low, "high": high, "value": errors.values[name],
+                    "stderr": errors.stderr[name], "unit": parameter.unit,
+                }
+            )  # fmt: skip
+        elif parameter.value is not None:
+            stated[name] = parameter.value
+    sensors = {p.name for p in optimum.problem.sensors.parameters if p.free}
+    if "delay" in sensors and "force_gain" not in sensors:
+        stated["force_gain"] = 1.0
+    cost = optimum.constraint_cost
+    values = {
+        "ranges": tuple(ranges),
+        "stated": stated,
+        "constraints": () if cost is None else tuple(cost.texts),
+        "exact": tuple(taken_as_exact(optimum)),
+        "single_run": len(optimum.problem.data.runs or ()) < 2,
+        "noise_alone": errors is None,
+    }
+    if any(values.values()):
+        yield Finding(_ASSUMED, _TRUSTED, "assumed", values)
+
+
+CHECKS: tuple[Callable[[Judged], Iterator[Finding]], ...] = (
+    _constraints,
+    _parameters,
+    _residuals,
+    _bands,
+    _reservations,
+    _slight,
+    _steady,
+    _warnings,
+    _assumed,
+)

@@ -1,0 +1,117 @@
+"""A judgement is a list of findings: data first, its status the worst severity, words last."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from dahl_ident.diagnostics.text import sentence
+
+
+class VerdictStatus(StrEnum):
+    """The judgement of a result, from good to bad; its value is what users read."""
+
+    TRUSTED = "trusted"
+    """Every parameter is determined and the model describes the data."""
+    APPROXIMATE = "approximate"
+    """The misfit exceeds the noise, and the stated uncertainty includes it."""
+    NOT_DETERMINED = "not determined"
+    """The data do not determine a parameter, or the computation has not converged."""
+    NOT_DESCRIBED = "not described"
+    """The misfit is so large that no uncertainty can be stated."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether the numbers can be used with their stated uncertainty."""
+        return self in (VerdictStatus.TRUSTED, VerdictStatus.APPROXIMATE)
+
+    @property
+    def rank(self) -> int:
+        """Place in the order from good to bad."""
+        return list(VerdictStatus).index(self)
+
+
+class Question(StrEnum):
+    """What a finding answers."""
+
+    DETERMINED = "determined"
+    """Which parameters or combinations do the data determine?"""
+    DESCRIBED = "described"
+    """Does the model describe the data, and how far not?"""
+    ASSUMED = "assumed"
+    """What does the result depend on that the data cannot test?"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One finding about a result.
+
+    Attributes
+    ----------
+    question : Question
+        Which of the three questions it answers.
+    severity : VerdictStatus
+        The best status that a result with this finding can have.
+    code : str
+        Its kind, such as "misfit" or "negative"; it does not change with the wording.
+    values : mapping of str to object
+        Its numbers and names. Printed, a finding is one sentence or two.
+    """
+
+    question: Question
+    severity: VerdictStatus
+    code: str
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return sentence(self.code, self.values)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the finding as plain data, with its text."""
+        return {
+            "question": str(self.question),
+            "severity": str(self.severity),
+            "code": self.code,
+            "values": dict(self.values),
+            "text": str(self),
+        }
+
+
+class Judgement:
+    """What was found about a result, the most serious first.
+
+    Parameters
+    ----------
+    findings : iterable of Finding
+        In the order in which they are to be told where they are equally serious.
+
+    Attributes
+    ----------
+    status : VerdictStatus
+        The worst severity; trusted where nothing was found.
+    findings : tuple of Finding
+        All of them.
+    told : tuple of Finding
+        Those of the verdict: of an unusable result without what only a usable one needs, which is
+        what is identified or assumed.
+    """
+
+    def __init__(self, findings: Iterable[Finding]) -> None:
+        every = sorted(findings, key=lambda finding: -finding.severity.rank)
+        self.status = every[0].severity if every else VerdictStatus.TRUSTED
+        self.findings = tuple(every)
+        self.told = tuple(
+            finding
+            for finding in every
+            if self.status.usable
+            or finding.severity is not VerdictStatus.TRUSTED
+            or finding.question is Question.DESCRIBED
+        )
+
+    @property
+    def statements(self) -> tuple[str, ...]:
+        """The verdict in words; the first sentence begins with the status."""
+        texts = [str(finding) for finding in self.told]
+        return (" ".join([f"{self.status.capitalize()}.", *texts[:1]]), *texts[1:])

@@ -1,0 +1,330 @@
+"""The words of every finding, by its code."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from dahl_ident.diagnostics.formatting import listed, p_text, percent, with_unit
+
+_MOST_DEPARTURES = 3  # in the verdict; the details list all
+
+
+def sentence(code: str, values: Mapping[str, Any]) -> str:
+    """Return a finding in words.
+
+    Examples
+    --------
+    >>> sentence("no_degrees_of_freedom", {"numbers": 2, "parameters": 2, "scale_known": True})
+    '2 numbers and 2 parameters leave no degree of freedom to judge the model: measure more points.'
+    """
+    return _TEXT[code](**values)
+
+
+def joined(parts: Sequence[str], most: int = 100) -> str:
+    """Return parts as one text, no more than so many of them."""
+    return "; ".join([*parts[:most], *(["..."] if len(parts) > most else [])])
+
+
+def departures(objections: Sequence[str]) -> str:
+    """Return the most serious objections, and how many more there are."""
+    more = len(objections) - _MOST_DEPARTURES
+    tests = f"; {more} more test{'s' if more > 1 else ''} failed" if more > 0 else ""
+    return f"{'; '.join(objections[:_MOST_DEPARTURES])}{tests}"
+
+
+def _are(names: Sequence[str]) -> str:
+    return f"{listed(names)} {'is' if len(names) == 1 else 'are'}"
+
+
+# Determined?
+
+
+def _identified(identified: Sequence[str], weak: Sequence[str], by_prior: Sequence[str]) -> str:
+    if weak:
+        return f"Every parameter is determined, but {listed(weak)} only weakly."
+    if not by_prior:
+        return "Every parameter is identified."
+    others = f"{_are(identified)} identified; " if identified else ""
+    priors = "its prior" if len(by_prior) == 1 else "their priors"
+    return f"{others}{_are(by_prior)} known from {priors}."
+
+
+def _undetermined(determined: Sequence[str], weak: Sequence[str], lost: Sequence[str]) -> str:
+    only = f"Only {_are(determined)} determined" if determined else "Nothing is determined"
+    weakly = f", {listed(weak)} weakly" if weak else ""
+    return f"{only}{weakly}; not {listed(lost)}."
+
+
+def _no_degrees_of_freedom(numbers: int, parameters: int, scale_known: bool) -> str:
+    judged = "the model" if scale_known else "noise and model"
+    return (
+        f"{numbers} numbers and {parameters} parameters leave no degree of freedom to judge "
+        f"{judged}: measure more points."
+    )
+
+
+def _record_parameter(name: str, stderr: float, unit: str, why: str) -> str:
+    if math.isinf(stderr):
+        return f"{name} is not determined at all{why}."
+    size = " ".join(filter(None, [f"{stderr:.2g}", unit]))
+    return f"{name} is not determined (standard uncertainty {size}){why}."
+
+
+# Described?
+
+
+def _misfit(rms: float, objections: Sequence[str], counted: bool) -> str:
+    if counted:
+        return (
+            f"The stated uncertainties include a misfit of {percent(rms)} rms: "
+            f"{departures(objections)}."
+        )
+    return (
+        f"The model does not describe these data ({percent(rms)} rms misfit): "
+        f"{departures(objections)}."
+    )
+
+
+def _too_few_points(dof: int, rms: float) -> str:
+    return (
+        f"With {dof} degrees of freedom a wrong model cannot be distinguished from noise "
+        f"({percent(rms)} rms misfit): measure more points, or repeat them so that their "
+        "covariance is known."
+    )
+
+
+def _one_amplitude(rms: float) -> str:
+    return (
+        "One amplitude gives no more numbers than friction has parameters, so any model fits "
+        f"({percent(rms)} rms misfit): measure at other amplitudes as well."
+    )
+
+
+def _noise(rms: float, hints: Sequence[str], scatter: str) -> str:
+    hint = f", with a hint that {joined(hints)}" if hints else ""
+    but = f", but {scatter}" if scatter else ""
+    return f"The residuals are consistent with noise ({percent(rms)} rms misfit){hint}{but}."
+
+
+def _rows_apart(names: Sequence[str], rows: int, rms: float, remaining: str) -> str:
+    them, named = "them", f"Only {len(names)} of {rows} rows ({joined(names, 10)}) contradict"
+    if len(names) == 1:
+        them, named = "it", f"Only the row at {names[0]} contradicts"
+    left = remaining[0].lower() + remaining[1:].rstrip(".")
+    return (
+        f"{named} the model ({percent(rms)} rms misfit): without {them} {left}. The fit includes "
+        f"every row: check {them}, or fit with a robust loss that down-weights {them} "
+        '(loss="huber").'
+    )
+
+
+def _suspicious(names: Sequence[str], neighbours: str) -> str:
+    rows = joined(names, 5)
+    if neighbours:
+        return (
+            f"Suspicious rows: {rows}; without them the model describes the data, but they are "
+            f"neighbours, {neighbours}: check them, or the model is wrong there."
+        )
+    return f"Suspicious rows: {rows}; check them (a robust loss down-weights these rows)."
+
+
+def _flagged(points: Sequence[str]) -> str:
+    return (
+        f"The extraction flagged {len(points)} of the points fitted ({joined(points, 3)}): measure "
+        "them again, or select the good ones."
+    )
+
+
+def _held_out(tests: int, available: int, inside: int, count: int, width: float) -> str:
+    of = "" if tests == available else f" of {available}"
+    return (
+        f"Leaving out each of {tests}{of} tests in turn, {inside} of {count} held-out gains and "
+        f"phases are inside their 95 % bands (half width {100.0 * width:.2g} %)."
+    )
+
+
+def _narrow_bands(width: float, misfit: float) -> str:
+    return (
+        f"The 95 % bands (half width {percent(width)}) do not cover the misfit "
+        f"({percent(misfit)} rms): no uncertainty can be stated."
+    )
+
+
+def _constraint(texts: Sequence[str], rise: float, noise_known: bool, p_value: float) -> str:
+    against = "known noise" if noise_known else "the noise of the fit without them"
+    return (
+        f"The data contradict the constraint {listed(texts)}: the sum of squares rises by "
+        f"{rise:.3g} times the variance of {against} ({p_text(p_value)}): check the constraint, "
+        "or the model."
+    )
+
+
+def _prior(name: str, value: float, mean: float, std: float) -> str:
+    return (
+        f"The data contradict the prior of {name}: {value:.4g} against {mean:g} ± {std:g}, "
+        f"{abs(value - mean) / std:.1f} standard deviations: check the calibration, or the model."
+    )
+
+
+def _moved(names: Sequence[str], rows: Sequence[str]) -> str:
+    named = "; ".join(rows[:5]) or "the rows with the largest residuals"
+    return (
+        f"A robust fit moves {listed(names)} by more than one standard uncertainty: look at "
+        f'{named}, or fit with loss="huber".'
+    )
+
+
+def _negative(name: str, value: float, stderr: float, unit: str, instead: str) -> str:
+    return (
+        f"{name} is negative ({with_unit(value, stderr or None, unit)}), as of no device: it "
+        f"stands for what the model lacks, and is not {instead}."
+    )
+
+
+def _slight(name: str, value: float, stderr: float, unit: str, share: float, misfit: float) -> str:
+    return (
+        f"{name} = {with_unit(value, stderr, unit)} rests on {percent(share)} rms of the force, "
+        f"less than the model misses ({percent(misfit)}), and may stand for that: give it if it "
+        "is known, or leave it out."
+    )
+
+
+def _steady(difference: float, row: str) -> str:
+    begin = "The force was held, and the exact steady motion fitted"
+    if not row:
+        return f"{begin}; the describing function would be the same."
+    return f"{begin}; the describing function would be up to {percent(difference)} off, at {row}."
+
+
+def _jenkins_bound(least: float, law: bool) -> str:
+    share = f"{percent(least)} (rms of the fundamental)"
+    if law:
+        return (
+            "The best symmetric rate-independent law of parallel Jenkins elements (MaxwellSlip, "
+            f"Iwan) leaves {share}."
+        )
+    return (
+        "No symmetric rate-independent law of parallel Jenkins elements leaves less than "
+        f"{share}: the rest is noise, rate, asymmetry, a gap, or a loop of another shape."
+    )
+
+
+def _displacement_noise(noise: float, unit: str, travel: float) -> str:
+    return (
+        f"The displacement's noise of {noise:.2g} {unit} (standard deviation) is not counted as "
+        f"travel, of which it would add {100.0 * travel:.2g} %; the residuals are smaller without "
+        "it. A quieter displacement would determine more."
+    )
+
+
+def _prior_influence(name: str, width: float, ends: Sequence[str], contradicted: bool) -> str:
+    if contradicted:
+        return (
+            f"PRIOR AGAINST DATA: {name} lies beyond 99 % of its prior's probability, at the "
+            f"{ends[0]} end; check the prior, its unit, and the data."
+        )
+    reach = f", and it reaches the prior's {' and '.join(ends)} end" if ends else ""
+    return f"{name} is known from its prior: posterior width {width:.2f} of the prior's{reach}."
+
+
+# Assumed?
+
+
+def _assumed(
+    ranges: Sequence[Mapping[str, Any]],
+    stated: Mapping[str, float],
+    constraints: Sequence[str],
+    exact: Sequence[str],
+    single_run: bool,
+    noise_alone: bool,
+) -> str:
+    parts = [
+        f"{r['name']} between {r['low']:g} and {r['high']:g} "
+        f"(here {with_unit(r['value'], r['stderr'], r['unit'])})"
+        for r in ranges
+    ]
+    parts += [f"{name} = {value:g} exactly" for name, value in stated.items()]
+    parts += [f"the constraint {listed(constraints)}"] if constraints else []
+    parts += [f"{listed(exact)} exact"] if exact else []
+    parts += ["a single run"] if single_run else []
+    if noise_alone:
+        parts.append("no error but noise (stated uncertainties are from noise alone)")
+    return f"Assumed: {'; '.join(parts)}."
+
+
+_TEXT: Mapping[str, Callable[..., str]] = {
+    "identified": _identified,
+    "undetermined": _undetermined,
+    "combinations": lambda combinations: f"Determined: {'; '.join(combinations)}.",
+    "undetermined_parameter": lambda name, reason: f"{name}: {reason}.",
+    "solver": lambda message: message,
+    "no_degrees_of_freedom": _no_degrees_of_freedom,
+    "sign": lambda convention: f"{convention}. Do not use the numbers of this fit.",
+    "rows_apart": _rows_apart,
+    "misfit": _misfit,
+    "large_misfit": lambda rms: (
+        f"The misfit is {percent(rms)} rms, more than half of the response: no uncertainty can "
+        "be stated."
+    ),
+    "too_few_points": _too_few_points,
+    "one_amplitude": _one_amplitude,
+    "noise": _noise,
+    "suspicious": _suspicious,
+    "jenkins_bound": _jenkins_bound,
+    "flagged": _flagged,
+    "held_out": _held_out,
+    "narrow_bands": _narrow_bands,
+    "constraint": _constraint,
+    "prior": _prior,
+    "moved": _moved,
+    "negative": _negative,
+    "slight": _slight,
+    "steady": _steady,
+    "no_steady_motion": lambda: (
+        "The force was held, but the describing function predicts the motion: the plant would "
+        "drive itself, and no steady motion is there."
+    ),
+    "describing_function": lambda why: (
+        f"The force was held, but the describing function predicts the motion: {why}."
+    ),
+    "records_not_described": lambda: "The model does not describe the records.",
+    "no_optimum": lambda message: f"The search found no optimum. {message}",
+    "motion_may_be_imposed": lambda: (
+        "If the exciter imposed the motion, fit the force instead (output='force'): what it moves "
+        "hardly depends on the force, and the model cannot follow it."
+    ),
+    "records_misfit": lambda: "The misfit exceeds the noise.",
+    "record_parameter": _record_parameter,
+    "unphysical": lambda objection: f"Physically doubtful: {objection}.",
+    "exponent": lambda name, wanted, assumed: (
+        f"The records ask for {name} = {wanted} instead of the assumed {assumed:g}: estimate it "
+        f"({name}=None; {name}=free on the command line)."
+    ),
+    "record_residuals": lambda rms, output, worst: (
+        f"The residuals are {percent(rms)} rms of the measured {output}; {worst}."
+    ),
+    "slow_residuals": lambda rms: (
+        f"Most of this varies slowly, as noise in the drive causes it: {percent(rms)} rms remains "
+        "at the drive's frequencies, and the residuals are weighted by their spectrum."
+    ),
+    "displacement_noise": _displacement_noise,
+    "effective_samples": lambda effective, samples: (
+        f"Error bars take the residuals' correlation into account: {effective:.0f} effective of "
+        f"{samples} samples."
+    ),
+    "not_converged": lambda message: message,
+    "sampled": lambda message: message,
+    "prior_influence": _prior_influence,
+    "predictive_check": lambda text: text,
+    "counted": lambda sources: f"Counted: {'; '.join(sources)}.",
+    "noise_alone": lambda compared: (
+        f"Noise alone is counted; with every source of the budget, u is {listed(compared)}."
+    ),
+    "evidence": lambda ln: f"ln evidence: {ln:.4f}",
+    "records_assumed": lambda parts: f"Assumed: {'; '.join(parts)}.",
+    "warning": lambda text: f"Warning on reading: {text}.",
+    "more_warnings": lambda count: f"{count} more warnings on reading.",
+    "assumed": _assumed,
+}
