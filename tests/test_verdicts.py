@@ -235,3 +235,28 @@ def test_therobust_values_are_those_of_a_robust_fit() -> None:
         stderr = fitted.errors.stderr[name]
         assert found[name] == pytest.approx(value, abs=0.02 * stderr)
         assert abs(fitted.optimum.values[fitted.var_names.index(name)] - value) > 0.1 * stderr
+
+
+class TestFindings:
+    def test_the_status_is_the_worst_severity(self) -> None:
+        for data in (table(), table(n=2, noise=0.03), stiffened(0.2), table(beta=(1e-3, 1e-2))):
+            result = fit(data, Dahl(), throw=False)
+            assert result.status == max(
+                (finding.severity for finding in result.findings), key=lambda status: status.rank
+            )
+
+    def test_they_are_data_and_their_text_is_the_verdict(self) -> None:
+        wrong = fit(load_dataset("alpha_2"), Dahl(alpha=1.0), throw=False)
+        (misfit,) = (finding for finding in wrong.findings if finding.code == "misfit")
+        assert misfit.question.value == "described"
+        assert misfit.values["rms"] == pytest.approx(0.11, abs=0.005)
+        assert str(misfit) in wrong.verdict
+        record = misfit.to_dict()
+        assert record["severity"] == "not described"
+        assert record["text"] == str(misfit)
+
+    def test_an_unusable_result_does_not_list_what_is_assumed(self) -> None:
+        wrong = fit(load_dataset("alpha_2"), Dahl(alpha=1.0), throw=False)
+        assert any(finding.code == "assumed" for finding in wrong.findings)
+        assert "Assumed:" not in wrong.verdict
+        assert "Assumed:" in fit(table(), Dahl()).verdict

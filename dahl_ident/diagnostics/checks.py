@@ -147,6 +147,7 @@ def _bands(fit: Judged) -> Iterator[Finding]:
         if check.width < _NARROWEST * misfit:
             values = {"width": check.width, "misfit": misfit}
             yield Finding(_DESCRIBED, _NOT_DESCRIBED, "narrow_bands", values)
+            return
     outside = enough and check.inside < _FEWEST_INSIDE * check.count
     yield check.finding(_NOT_DESCRIBED if outside else _TRUSTED)
 
