@@ -30,7 +30,7 @@ PACKAGES = ("numpy", "scipy", "casadi", "emcee", "control", "lmfit")
 
 def main() -> None:
     """Print all tables, and write them to a file where asked."""
-    parser = argparse.ArgumentParser(description="time this package beside its peers")
+    parser = argparse.ArgumentParser(description="time this package and its peers")
     parser.add_argument("topics", nargs="*", default=TOPICS, help=f"of {', '.join(TOPICS)}")
     parser.add_argument("--write", type=Path, help="write the tables to this Markdown file")
     arguments = parser.parse_args()

@@ -43,8 +43,8 @@ def table(rows: int = 30, noise: float = 0.01) -> di.FrequencyResponse:
     return di.FrequencyResponse(np.ones(rows), exact * np.exp(error), amplitude)
 
 
-def beside_spring() -> di.FrequencyResponse:
-    """Return the same data with a spring of 30 N/m beside the friction."""
+def with_spring() -> di.FrequencyResponse:
+    """Return the same data with a spring of 30 N/m in parallel with the friction."""
     data = table()
     return replace(data, response=data.response + 30.0)
 
@@ -113,7 +113,7 @@ def run() -> list[Row]:
     problems: tuple[tuple[di.FrequencyResponse, di.Element], ...] = (
         (data, di.Dahl()),
         (heavy, di.Dahl()),
-        (beside_spring(), di.Dahl() + di.Spring()),
+        (with_spring(), di.Dahl() + di.Spring()),
         (data, di.Dahl(alpha=None)),
     )
     grids = []

@@ -8,7 +8,7 @@ Computing 32, 2022): with the probability stated, an exact sampler stays inside 
 for every parameter.
 
 Run with ``python -m benchmarks.calibration``; it writes docs/validation/calibration.md and the
-rank plot beside it. The tests run the same on fewer tables.
+rank plot next to it. The tests run the same on fewer tables.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def band(tables: int, gamma: float) -> tuple[FloatArray, FloatArray]:
 
 
 def report(results: dict[str, tuple[FloatArray, int]], folder: Path) -> str:
-    """Return the table as Markdown, and draw the ranks beside it."""
+    """Return the table as Markdown, and draw the ranks next to it."""
     lines = [
         "# Calibration of posteriors",
         "",

@@ -1,4 +1,4 @@
-"""Campaigns at size: a thousand devices of ten records, and what it costs beside the work itself.
+"""Campaigns at size: a thousand devices of ten records, and what they cost beyond the work itself.
 
 ``python -m benchmarks.campaigns`` makes the records with the synthetic laboratory, runs the
 campaign, disturbs it with SIGKILLs, runs it on a Dask cluster over TCP, pools the devices, and
@@ -197,7 +197,7 @@ def _driver(folder: Path, devices: int, records: int) -> str:
         for name in ("journal.jsonl", "results.csv", "results.parquet")
     }
     rows: list[Row] = [
-        ("driver beside the computation, processor time", "5 ms a device",
+        ("driver in addition to the computation, processor time", "5 ms a device",
          f"{overhead[0]:.2f} ms", bool(overhead[0] <= 5.0)),
         ("the same, wall time", "", f"{overhead[1]:.2f} ms", None),
         ("share of elapsed time in which two processes compute", "85 %", f"{busy:.0%}",

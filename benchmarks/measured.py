@@ -116,7 +116,7 @@ def damper() -> None:
 
 
 def beam() -> None:
-    """Print what laws beside a mode leave of the bolted beam, and the least of any Masing law."""
+    """Print the misfit of laws with a mode to the bolted beam, and the least of any Masing law."""
     with tempfile.TemporaryDirectory() as folder:
         columns = Path(folder) / "columns.toml"
         columns.write_text(BEAM)

@@ -401,7 +401,7 @@ def damper(folder: Path) -> Iterator[Choices]:
     """Yield what plans choose of the measured levels of a damper on a crank, series by series.
 
     From a fit to two levels, the next one is planned, twice; a fit to the four predicts the
-    others, beside four evenly spaced levels and all choices of four.
+    others, next to four evenly spaced levels and all choices of four.
     """
     model = LINEAR + di.Damper()
     for series, files in SERIES.items():

@@ -123,7 +123,7 @@ def main() -> None:
         "own motion and noise; every record counts. Coverage of 95 % intervals in percent; values",
         f"outside {100 * LOWEST:.0f} to {100 * HIGHEST:.0f} are marked (!).",
         "",
-        "The displacement moves 10 mm to either side, and the force's noise is 1e-3 N; beside a",
+        "The displacement moves 10 mm to either side, and the force's noise is 1e-3 N; with a",
         "contact stiffness of 30 N/m, noise in the displacement of 3e-5 m is as large. If it is",
         "correlated, as the error of an encoder between its lines, fourth differences show little",
         "of it. Friction goes on from where the motion turned, so errors there last for some x_c",

@@ -78,7 +78,7 @@ def every_point(solve: Callable[[float, float], float]) -> Callable[[], object]:
 
 
 def memory() -> Row:
-    """Return the peak memory of one solution beside that of its input and output."""
+    """Return the peak memory of one solution next to that of its input and output."""
     result = response(PLANT, FREQUENCY_HZ, DRIVE[:, None])
     arrays = (result.amplitude, result.displacement, result.found, result.number_of_solutions)
     held = sum(a.nbytes for a in (*arrays, FREQUENCY_HZ, DRIVE))

@@ -33,7 +33,7 @@ _TRUTH = {
 
 
 def run() -> list[Row]:
-    """Return the seconds of whole fits beside those of peers."""
+    """Return the seconds of whole fits and of those of peers."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         print("no C compiler (cc or gcc) is installed: the compiled simulator is left out")

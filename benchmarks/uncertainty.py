@@ -53,11 +53,11 @@ TRUSTED = 0.95
 DESTINATION = Path("docs/validation/uncertainty.md")
 REASONS = {
     "the model is right, three frequencies": (
-        "the tables show whether f_max changes with speed, or a part beside friction is missing, "
-        "only as well as these sources are counted where the likelihood rises with them; in about "
-        "half of the tables one does by chance, and the median lies where intervals go from 1.4 "
-        "to 2 times those of noise alone. Without them the cells with a missing mass, damper or "
-        "rate would not hold."
+        "the tables show whether f_max changes with speed, or a part in parallel with "
+        "friction is missing, only as well as these sources are counted where the likelihood "
+        "rises with them; in about half of the tables one does by chance, and the median lies "
+        "where intervals go from 1.4 to 2 times those of noise alone. Without them the cells with "
+        "a missing mass, damper or rate would not hold."
     ),
     "noise along the rows, 0.7": (
         "twelve rows are worth about two that are independent. In 7 % of the tables the residuals "

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -278,7 +279,7 @@ def factor_to(unit: Unit, si: str, what: str) -> float:
 
 
 def si_unit(kind: str, motion: Motion = "translation") -> str:
-    """Return the SI unit of a kind, as printed beside its numbers.
+    """Return the SI unit of a kind, as printed after its numbers.
 
     Examples
     --------
@@ -286,6 +287,9 @@ def si_unit(kind: str, motion: Motion = "translation") -> str:
     'N m/rad'
     """
     return SI_UNITS[kind][motion == "rotation"]
+
+
+_PREFIXES = {-9: "n", -6: "\u00b5", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 
 
 def engineering(value: float, unit: str) -> str:
@@ -300,11 +304,27 @@ def engineering(value: float, unit: str) -> str:
     """
     if value == 0.0 or not math.isfinite(value):
         return f"{value:g} {unit}".strip()
-    prefixes = {-9: "n", -6: "\u00b5", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
-    exponent = 3 * math.floor(math.log10(abs(value)) / 3.0)
-    if unit not in ("N", "m", "s", "Hz", "J", "rad") or exponent not in prefixes:
-        return f"{value:.3g} {unit}".strip()
-    return f"{value / 10.0**exponent:.3g} {prefixes[exponent]}{unit}"
+    power, unit = prefix([value], unit)
+    return f"{value / power:.3g} {unit}".strip()
+
+
+def prefix(values: Iterable[float], unit: str) -> tuple[float, str]:
+    """Return the power of ten of a prefix that suits most of some numbers, and the unit with it.
+
+    Examples
+    --------
+    >>> prefix([2e-5, 3e-4, 5e-3], "m")
+    (1e-06, '\u00b5m')
+    >>> prefix([2e-5], "N/m")
+    (1.0, 'N/m')
+    """
+    sizes = sorted(abs(v) for v in values if v != 0.0 and math.isfinite(v))
+    if not sizes or unit not in ("N", "m", "s", "Hz", "J", "rad"):
+        return 1.0, unit
+    exponent = 3 * math.floor(math.log10(sizes[len(sizes) // 2]) / 3.0)
+    if exponent not in _PREFIXES:
+        return 1.0, unit
+    return 10.0**exponent, f"{_PREFIXES[exponent]}{unit}"
 
 
 def shown_unit(unit: str, motion: Motion) -> str:

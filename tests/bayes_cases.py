@@ -21,7 +21,7 @@ def friction_table(
 def spring_table(
     noise: float, rows: int = 8, low: float = 0.3, high: float = 10.0
 ) -> di.FrequencyResponse:
-    """Return the same for friction beside a spring as stiff as it is at small amplitudes."""
+    """Return the same for friction with a spring as stiff as it is at small amplitudes."""
     return _table(30.0, np.geomspace(low, high, rows) * X_C, noise, 1)
 
 

@@ -196,7 +196,7 @@ def test_a_fit_is_taken_over() -> None:
     data = friction_table()
     fit = di.fit(data, di.Dahl())
     assert di.posterior(fit, seed=1, steps=50, uncertainty="noise").problem is fit.problem
-    with pytest.raises(ValidationError, match="noise, free is given beside a FitResult"):
+    with pytest.raises(ValidationError, match="noise, free is given together with a FitResult"):
         di.posterior(fit, noise="absolute", free=["alpha"], uncertainty="noise")
 
 

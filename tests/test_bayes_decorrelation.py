@@ -80,7 +80,7 @@ def test_friction_or_a_plant_alone_needs_none() -> None:
 
 
 def test_a_curved_ridge_is_walked_along() -> None:
-    # microslip beside a free spring: f_max is open upwards, stiffness = constant - sigma
+    # microslip with a free spring: f_max is open upwards, stiffness = constant - sigma
     data = spring_table(1e-3, 20, 0.003, 0.03)
     posterior = di.posterior(
         data, di.Dahl() + di.Spring(), seed=1, max_steps=3000, uncertainty="noise"

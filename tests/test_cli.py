@@ -153,9 +153,10 @@ def test_a_report_shows_how_waveforms_settled(run: Runner) -> None:
     assert "which has the largest ratio of bias to error" in Path("a.html").read_text(
         encoding="utf-8"
     )
-    Path("map.toml").write_text("[time]\ncolumn = 'clock'\n", encoding="utf-8")
+    Path("columns.toml").write_text("[time]\ncolumn = 'clock'\n", encoding="utf-8")
     wrong = run(
-        "report", "levels.csv", *plant, "--waveforms", "run.csv", "--waveforms-columns", "map.toml",
+        "report", "levels.csv", *plant, "--waveforms", "run.csv",
+        "--waveforms-columns", "columns.toml",
         "-o", "b.html",
     )  # fmt: skip
     assert wrong.status == 1
@@ -188,6 +189,18 @@ def test_simulate_prints_an_experiment_that_it_reads(run: Runner) -> None:
     assert tomllib.loads(text)["excitation"]["levels"] == [1e-3, 2e-3]
 
 
+def test_noise_is_a_share_of_a_table_and_has_the_unit_of_samples(run: Runner) -> None:
+    plant = ("simulate", "--f-max", "2.4N", "--sigma", "5.2N/mm")
+    shown = run(*plant, "--force-std", "0.5 %", "--json")
+    assert json.loads(shown.out)["table"]["force_std"] == 0.005
+    shown = run(*plant, "--force-std", "5mN", "--displacement-std", "0.1um", "--record", "--json")
+    sensors = json.loads(shown.out)["acquisition"]
+    assert sensors["force"]["noise_std"] == 5e-3
+    assert sensors["displacement"]["noise_std"] == pytest.approx(1e-7)
+    assert "--force-std is '5mN'; expected a share" in run(*plant, "--force-std", "5mN").err
+    assert "such as 5e-6 or 5uN" in run(*plant, "--force-std", "1 %", "--record").err
+
+
 def test_a_record_is_simulated_inspected_and_extracted(run: Runner) -> None:
     made = run(
         "simulate", "--f-max", "0.1", "--sigma", "30", "--record", "--levels", "2e-3,8e-3",
@@ -215,9 +228,9 @@ def test_a_proposed_column_map_is_written_and_read(run: Runner) -> None:
     refused = run("fit", "own.csv")
     assert refused.status == 1
     assert "(inspect proposes a column map)" in refused.err
-    assert run("inspect", "own.csv", "-o", "map.toml").status == 0
-    assert run("inspect", "own.csv", "-o", "map.toml").status == 1, "nothing is overwritten"
-    assert run("fit", "own.csv", "--columns", "map.toml").status in (0, 3)
+    assert run("inspect", "own.csv", "-o", "columns.toml").status == 0
+    assert run("inspect", "own.csv", "-o", "columns.toml").status == 1, "nothing is overwritten"
+    assert run("fit", "own.csv", "--columns", "columns.toml").status in (0, 3)
     Path("other.csv").write_text("f [Hz],A [m],gain [N/m],phase [deg]\n2,2e-5,0.038,9.7\n")
     different = run("inspect", "own.csv", "other.csv", "-o", "both.toml")
     assert different.status == 2

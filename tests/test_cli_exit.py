@@ -328,7 +328,7 @@ RECORD = "time [s],displacement [m],force [N]\n0,1,1\n1,2,2\n2,1,1\n"
          "level and level_from_name are both given"),
         (("simulate", "run.toml", "--f-max", "3", "--force-std", "0.1"),
          "--f-max, --force-std is given together with run.toml, which describes the whole"),
-        (("report", "t.csv", "--waveforms-columns", "map.toml"),
+        (("report", "t.csv", "--waveforms-columns", "columns.toml"),
          "--waveforms-columns is given without --waveforms"),
         (("fit", "r.csv", "--record", "--force-gain", "0.5 %"),
          "--force-gain is given together with --record, but a fit of records takes the channels"),

@@ -36,7 +36,7 @@ def odd_columns(tmp_path: Path) -> Path:
     rows = np.column_stack([record.time, 1e3 * x, 1e-3 * force, np.gradient(x, record.time)])
     place = tmp_path / "run.csv"
     np.savetxt(place, rows, delimiter=",", header="t,x,load,velocity [m/s]", comments="")
-    (tmp_path / "map.toml").write_text(MAP)
+    (tmp_path / "columns.toml").write_text(MAP)
     return place
 
 
@@ -56,7 +56,7 @@ def test_a_column_map_is_used(
     code, _, why = told(monkeypatch, capsys, *words)
     assert code == 1
     assert "--columns" in why
-    mapped = (*words, "--columns", odd_columns.with_name("map.toml"))
+    mapped = (*words, "--columns", odd_columns.with_name("columns.toml"))
     code, out, _ = told(monkeypatch, capsys, *mapped)
     assert code == 0
     assert "f_max" in out
@@ -107,7 +107,7 @@ def test_options_of_tables_are_refused(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    place = odd_columns.with_name("map.toml")
+    place = odd_columns.with_name("columns.toml")
     code, _, why = told(
         monkeypatch, capsys, command, odd_columns, "--record", "--columns", place, *words
     )
@@ -118,7 +118,7 @@ def test_options_of_tables_are_refused(
 def test_the_force_is_predicted_although_the_model_has_a_mass(
     odd_columns: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    place = odd_columns.with_name("map.toml")
+    place = odd_columns.with_name("columns.toml")
     words = ("fit", odd_columns, "--record", "--columns", place, "--mass", "free")
     _, out, _ = told(monkeypatch, capsys, *words, "--predicted", "force")
     assert "of the measured force" in out

@@ -1,4 +1,4 @@
-"""Other laws beside the one fitted: which is chosen, by what, and what means the same in all."""
+"""Other laws than the one fitted: which is chosen, by what, and what means the same in all."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_lugre_says_where_sines_cannot_distinguish_it_from_dahl() -> None:
     assert not sentences(0.2)
 
 
-def test_what_is_stated_stands_beside_what_noise_alone_gives() -> None:
+def test_what_is_stated_stands_next_to_what_noise_alone_gives() -> None:
     result = fit(table(noise=1e-3), Dahl() + Mass(0.01))
     found = compare_models(result, {"spring": Dahl() + Spring()})
     assert found.stated is not None

@@ -224,11 +224,11 @@ def test_every_call_is_finite_to_the_edges_of_what_is_accepted(
 
 
 @pytest.mark.parametrize("alpha", [1.0, 2.0])
-def test_slope_at_rest_meets_the_slope_beside_it(alpha: float) -> None:
+def test_slope_at_rest_meets_the_slope_near_it(alpha: float) -> None:
     friction = Dahl(2.0, 3.0, alpha)
-    rest, beside, further = friction.gradient([0.0, 1e-99, 1e-20], names=["amplitude"])["amplitude"]
+    rest, near, further = friction.gradient([0.0, 1e-99, 1e-20], names=["amplitude"])["amplitude"]
     assert rest == pytest.approx(1j * 4.0 * alpha * 9.0 / 2.0 / (3.0 * np.pi), rel=1e-15)
-    assert beside == pytest.approx(rest, rel=1e-13)
+    assert near == pytest.approx(rest, rel=1e-13)
     assert further == pytest.approx(rest, rel=1e-13)
 
 

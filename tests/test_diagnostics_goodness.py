@@ -285,7 +285,7 @@ class TestPhysics:
         assert not judge(data).warnings
 
     def test_units_that_were_mistaken(self) -> None:
-        """Micrometres taken for metres; peak-to-peak amplitudes beside nominal levels."""
+        """Micrometres taken for metres; peak-to-peak amplitudes next to nominal levels."""
         data = table()
         mistaken = replace(data, response=1e-6 * data.response, amplitude=1e6 * amplitudes(data))
         (text, _) = judge(mistaken).warnings

@@ -68,7 +68,7 @@ class TestVerdicts:
         assert found.named(WEAK) == ["sigma"]
         assert found.headline == "Every parameter is determined, but sigma only weakly."
 
-    def test_microslip_beside_a_spring(self) -> None:
+    def test_microslip_with_a_spring(self) -> None:
         """A spring as stiff as the contact: the loss and the sum of stiffnesses are left."""
         model = FRICTION + Spring(SIGMA)
         data = table(model=model, beta=(1e-2, 1e-1), noise=0.004)
@@ -100,7 +100,7 @@ class TestVerdicts:
         assert "the free stiffness can take its place: drive far into slip" in text
 
     def test_friction_lost_in_the_noise_gives_no_advice_on_slip(self) -> None:
-        """Deep slip beside a spring: nothing tells it from microslip, so neither is claimed."""
+        """Deep slip with a spring: nothing tells it from microslip, so neither is claimed."""
         data = table(model=FRICTION + Spring(SIGMA), beta=(1e3, 1e4), noise=0.01, seed=11)
         found = identifiability(fit(data, Dahl() + Spring(), throw=False)).parameters
         assert np.isinf(found["f_max"].interval.upper)

@@ -74,7 +74,7 @@ class TestDamper:
         (trend,) = (t for t in linear.trends if t.covariate == "frequency")
         assert np.expm1(trend.stiffness.value) == pytest.approx(-0.26, abs=0.04)
 
-    def test_other_models_are_compared_beside_it(self, damper: FrequencyResponse) -> None:
+    def test_other_models_are_compared_as_well(self, damper: FrequencyResponse) -> None:
         found = fit(damper, Dahl())
         report = found.fit_report()
         assert "Other models, for comparison" in report
@@ -122,7 +122,7 @@ class TestBeam:
         assert "f_max grows without bound at constant sigma^2/f_max" in found.verdict
         assert "sigma + stiffness" in found.identifiability.determined
 
-    def test_iwan_beside_the_mode(self, beam: FrequencyResponse) -> None:
+    def test_iwan_with_the_mode(self, beam: FrequencyResponse) -> None:
         """The mode stiffens while its loss rises, which no sum of Jenkins elements does."""
         levels = [label for label in beam.levels if label.startswith("Response")]
         data = beam.select(level=levels)

@@ -80,7 +80,7 @@ def by_events(
 
 
 def slipping(stiffnesses: list[float], places: list[float]) -> FloatArray:
-    """Return the motion beside Jenkins elements; a flag where one slips."""
+    """Return the motion with Jenkins elements; a flag where one slips."""
     n = len(places)
 
     def rates(y: FloatArray, _: float, slips: list[bool]) -> list[float]:
@@ -100,7 +100,7 @@ def slipping(stiffnesses: list[float], places: list[float]) -> FloatArray:
 
 
 def crossing() -> FloatArray:
-    """Return the motion beside Dahl friction behind a gap; flags: in the gap, loading."""
+    """Return the motion with Dahl friction behind a gap; flags: in the gap, loading."""
 
     def rates(y: FloatArray, s: float, flags: list[bool]) -> list[float]:
         if flags[0]:

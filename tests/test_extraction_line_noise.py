@@ -22,7 +22,7 @@ def noise_fit(channels: FloatArray, cycles: int, time: FloatArray | None = None)
 
 @pytest.mark.parametrize("cycles", [2, 3, 5, 20])
 @pytest.mark.parametrize("harmonic", [1, 3])
-def test_white_noise_has_its_variance_beside_every_harmonic(cycles: int, harmonic: int) -> None:
+def test_white_noise_has_its_variance_next_to_every_harmonic(cycles: int, harmonic: int) -> None:
     rng = np.random.default_rng(cycles)
     powers, dof = [], 0.0
     for _ in range(300):
@@ -44,10 +44,10 @@ def test_stated_error_is_that_of_the_phasor(
     for _ in range(records):
         force = noise(rng, cycles * PER_CYCLE)
         fit = noise_fit(np.stack([force, force]), cycles)
-        beside = line_noise(fit, [1], cycles, fit.residual)[0]
-        stated = float(beside.matrix[1, 1].real) * fit.phasor_variance(1)
+        near = line_noise(fit, [1], cycles, fit.residual)[0]
+        stated = float(near.matrix[1, 1].real) * fit.phasor_variance(1)
         error = abs(fit.phasors(1)[1]) ** 2
-        inside += error / stated <= stats.f.ppf(0.95, 2, beside.dof)
+        inside += error / stated <= stats.f.ppf(0.95, 2, near.dof)
         ratio += error / stated / records
     assert stats.binomtest(inside, records, 0.95).pvalue > 0.01
 

@@ -140,7 +140,7 @@ def test_an_unsteady_crank_gives_points_with_the_scatter_of_its_cycles(
 ) -> None:
     """The first two files have no plateau within 2 %; all agree with a fit of every cycle.
 
-    Other harmonics state beside it what the displacement's own harmonics add.
+    Other harmonics state in addition what the displacement's own harmonics add.
     """
     ratios, by_distortion, found = [], [], 0
     for name in names:

@@ -236,7 +236,7 @@ def test_pieces_without_points_are_named_and_do_not_stop_the_others(
 
 @pytest.mark.parametrize("ending", ["h5", "parquet", "tdms", "csv"])
 def test_what_inspect_proposes_is_what_extract_accepts(tmp_path: Path, ending: str) -> None:
-    path, proposal = tmp_path / f"run.{ending}", tmp_path / "map.toml"
+    path, proposal = tmp_path / f"run.{ending}", tmp_path / "columns.toml"
     if ending == "csv":
         record(2e-3).save(path)
     else:

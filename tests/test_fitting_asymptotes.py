@@ -23,7 +23,7 @@ def fitted(Z: ArrayLike, model: Element, *, noise: str = "absolute") -> Optimum:
     return solve(Problem(FrequencyResponse(np.ones(n), Z, A), model, noise=noise))
 
 
-def test_microslip_beside_a_spring_determines_two_combinations() -> None:
+def test_microslip_with_a_spring_determines_two_combinations() -> None:
     kappa, K = 2e5, 7.0
     Z = K + 4j / (3.0 * np.pi) * kappa * A + 0.01 * ERROR
     found = fitted(Z, Dahl() + Spring())
@@ -168,7 +168,7 @@ def test_limits_agree_with_dense_scans() -> None:
     assert named >= {Status.CONVERGED, Status.MICROSLIP, Status.GROSS_SLIP, Status.NO_FRICTION}
 
 
-def test_a_given_f_max_far_beyond_the_data_leaves_sigma_to_be_found_beside_a_spring() -> None:
+def test_a_given_f_max_far_beyond_the_data_leaves_sigma_to_be_found_with_a_spring() -> None:
     """Only sigma^2/f_max and sigma + stiffness show: a bent valley, as with f_max free."""
     f, amplitude = np.tile(np.geomspace(0.5, 2.0, 15), 3), np.repeat([1e-6, 3e-6, 1e-5], 15)
     truth = np.array([1e6, 2.0, 1.0, -9.9e5])

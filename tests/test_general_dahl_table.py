@@ -102,7 +102,7 @@ def test_ends_and_what_is_no_number() -> None:
         (harmonic_table(0.0), di.Dahl(alpha=None)),
         (friction_table(), di.Dahl(alpha=None) + di.Spring()),
     ],
-    ids=["free", "given", "harmonics", "beside a spring"],
+    ids=["free", "given", "harmonics", "with a spring"],
 )
 def test_the_posterior_has_the_density_of_its_problem(
     data: di.FrequencyResponse, model: di.Element

@@ -188,9 +188,7 @@ class TestProfile:
         assert tied.lower == pytest.approx(free.lower, rel=1e-3)
 
     @pytest.mark.parametrize("seed", [4, 8, 53, 204])
-    def test_beside_a_hidden_spring_the_limits_are_those_of_a_global_search(
-        self, seed: int
-    ) -> None:
+    def test_with_a_hidden_spring_the_limits_are_those_of_a_global_search(self, seed: int) -> None:
         """The profile's valley is bent and long; fits with the value fixed find it from scratch.
 
         But for the first table, the optimum lies in microslip with the spring at minus infinity,

@@ -337,7 +337,7 @@ def test_constraint_holds_a_plant_together() -> None:
 
 
 def test_constraint_makes_an_optimum_at_infinity_finite() -> None:
-    """Microslip beside a free spring: sigma and f_max run away together until f_max is held."""
+    """Microslip with a free spring: sigma and f_max run away together until f_max is held."""
     small = np.geomspace(1e-6, 1e-4, 16)
     N = FRICTION.describing_function(small) * (1.0 + noise(16, 3e-4, seed=4))
     problem = Problem(FrequencyResponse(np.ones(16), N, small), Dahl() + Spring())

@@ -101,7 +101,7 @@ def test_microslip_is_a_power_law_and_macroslip_is_coulomb_friction() -> None:
         Iwan(chi=-1.5)
 
 
-def test_response_beside_a_plant() -> None:
+def test_response_in_a_plant() -> None:
     plant = Iwan(0.1, 30.0, -0.5, 1.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
     for drive in (0.01, 0.1, 0.5):
         ours = response(plant, 0.6, drive, all_roots=True, steady="describing function")

@@ -198,7 +198,7 @@ def test_argument_of_zero_has_no_step() -> None:
         element.stiffness_gradient(element.known_values(), np.array(1.0), OMEGA)
 
 
-def test_linear_system_beside_friction_replaces_the_lumped_part() -> None:
+def test_linear_system_with_friction_replaces_the_lumped_part() -> None:
     plant = Dahl(0.1, 30.0) + LinearSystem(transfer_function("receptance"), quantity="receptance")
     lumped = Dahl(0.1, 30.0) + Mass(M) + Damper(C) + Spring(K)
     A = np.geomspace(1e-5, 1.0, 7)[:, None]

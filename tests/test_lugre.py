@@ -68,7 +68,7 @@ def test_facts_and_refusals() -> None:
     assert [float(v) for v in LAW.force_limits(values)] == pytest.approx([1.6, 1.6])
 
 
-def test_response_beside_a_plant() -> None:
+def test_response_in_a_plant() -> None:
     plant = LuGre(0.1, 30.0, 1.5, 0.1) + Mass(0.3) + Damper(0.24) + Spring(0.3)
     for drive in (0.02, 0.5):
         ours = response(plant, 0.6, drive, all_roots=True, steady="describing function")

@@ -115,7 +115,7 @@ def test_facts_and_refusals() -> None:
         LAW.force([0.0, 1.0], 2.0)
 
 
-def test_response_beside_a_plant() -> None:
+def test_response_in_a_plant() -> None:
     plant = LAW + Mass(0.3) + Damper(0.1) + Spring(1.0)
     for drive in (0.05, 0.5, 3.0):
         ours = response(plant, 0.6, drive, all_roots=True, steady="describing function")
@@ -152,7 +152,7 @@ def test_the_least_misfit_is_least() -> None:
     assert 0.003 < found.least_misfit < 0.0101
     assert found.least_misfit <= found.misfit <= 1.05 * found.least_misfit
     assert found.stiffness.sum() + found.spring == pytest.approx(6.0, rel=0.05)
-    assert found.beside["damping"] == pytest.approx(0.2, rel=0.2)
+    assert found.parallel["damping"] == pytest.approx(0.2, rel=0.2)
     # another solver over the same laws, and random laws, leave no less
     A, Z = np.asarray(data.amplitude), data.response + 0.1 * data.omega**2
     columns = np.column_stack([jenkins(found.slip / A[:, None], 1)[0], 1.0 + 0j * A,
@@ -165,7 +165,7 @@ def test_the_least_misfit_is_least() -> None:
     )  # fmt: skip
     assert np.sqrt(2.0 * other.cost / 24) == pytest.approx(found.least_misfit, rel=1e-3)
     assert "leaves less than" in found.statement
-    law = found.law() + Mass(0.1) + Damper(found.beside["damping"])
+    law = found.law() + Mass(0.1) + Damper(found.parallel["damping"])
     left = np.abs(1.0 - law.dynamic_stiffness(A, data.omega) / data.response)
     assert np.sqrt(np.mean(left**2)) == pytest.approx(found.misfit, rel=1e-9)
 

@@ -42,7 +42,7 @@ def scenarios() -> dict[str, tuple[di.FrequencyResponse, Any, dict[str, Any]]]:
         "gain from a sheet": (friction_table(8), di.Dahl(), {"sensors": gain}),
         "harmonics, noisy amplitudes": (harmonic_table(0.03), di.Dahl(), {}),
         "student's t": (harmonic_table(0.0), di.Dahl(), {"likelihood": "student_t"}),
-        "beside a spring": (spring_table(0.05), di.Dahl() + di.Spring(), {}),
+        "with a spring": (spring_table(0.05), di.Dahl() + di.Spring(), {}),
     }
 
 

@@ -204,7 +204,7 @@ def test_a_second_mode_is_found_from_the_prior() -> None:
 
 
 def test_a_bolted_ridge_keeps_its_time() -> None:
-    # what once took millions of points: f_max open to its wall beside a free spring
+    # what once took millions of points: f_max open to its wall with a free spring
     data = spring_table(1e-3, 20, 0.003, 0.03)
     grid = di.posterior(data, di.Dahl() + di.Spring(), method="grid", uncertainty="noise")
     assert grid.converged, grid.message
@@ -214,7 +214,7 @@ def test_a_bolted_ridge_keeps_its_time() -> None:
 
 
 def test_friction_that_may_be_none_at_either_end() -> None:
-    # sigma alone shows; beside a free spring friction may as well be none
+    # sigma alone shows; with a free spring friction may as well be none
     data = di.load_dataset("microslip")
     assert isinstance(data, di.FrequencyResponse)
     grid = di.posterior(data, di.Dahl() + di.Spring(), method="grid", uncertainty="noise")

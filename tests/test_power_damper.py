@@ -66,7 +66,7 @@ def test_derivatives_against_high_precision(p: float, k: int) -> None:
 
 
 @pytest.mark.parametrize("p", [0.3, 0.7, 2.0])
-def test_response_beside_it(p: float) -> None:
+def test_response_in_parallel(p: float) -> None:
     plant = PowerDamper(0.4, p) + Dahl(0.1, 30.0) + Mass(0.3) + Spring(3.0)
     for frequency in (0.3, 0.5, 3.0):
         for drive in (0.02, 0.2, 2.0):

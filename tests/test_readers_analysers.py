@@ -34,7 +34,7 @@ def trace(values: Any) -> str:
 
 class TestSr785:
     def read(self, path: Path, **options: Any) -> di.FrequencyResponse:
-        how = {"sweep": "1 to 100 Hz, log", "drive": "0.2 N", "columns": REAL_PART}
+        how = {"sweep": "1:100Hz log", "drive": "0.2 N", "columns": REAL_PART}
         return read_frequency_response(path, **{**how, **options})
 
     def test_trace(self, tmp_path: Path) -> None:
@@ -46,7 +46,7 @@ class TestSr785:
         np.testing.assert_allclose(data.response, receptance(0.2), rtol=1e-8)
         assert set(np.asarray(data.drive)) == {0.2}
         assert set(np.asarray(data.controlled)) == {"force"}
-        linear = self.read(path, sweep="10 to 30 Hz, linear", frequency_hz=(15.5, 20.5))
+        linear = self.read(path, sweep="10:30Hz linear", frequency_hz=(15.5, 20.5))
         np.testing.assert_allclose(linear.frequency_hz, np.arange(16.0, 21.0))
 
     def test_auto_level_holds_the_response(self, tmp_path: Path) -> None:
@@ -61,22 +61,22 @@ class TestSr785:
         path = tmp_path / "trace.asc"
         rows = np.column_stack([20 * np.log10(np.abs(values)), np.degrees(np.angle(values))])
         path.write_text("".join(f"{a:.9f}\t{b:.9f}\n" for a, b in rows))
-        (tmp_path / "map.toml").write_text(
-            'sweep = "1 to 100 Hz, log"\ngain_db = "column 1 [mm/N]"\nphase = "column 2 [deg]"\n'
+        (tmp_path / "columns.toml").write_text(
+            'sweep = "1:100Hz log"\ngain_db = "column 1 [mm/N]"\nphase = "column 2 [deg]"\n'
         )
-        data = read_frequency_response(path, columns=tmp_path / "map.toml", drive="0.2 N")
+        data = read_frequency_response(path, columns=tmp_path / "columns.toml", drive="0.2 N")
         np.testing.assert_allclose(data.response, receptance(0.2), rtol=1e-7)
 
     def test_what_is_missing_is_asked_for(self, tmp_path: Path) -> None:
         path = tmp_path / "trace.asc"
         path.write_text(trace(1e3 * receptance(0.2)))
-        with pytest.raises(DataError, match=r"give sweep=|sweep='1 to 100 Hz, log'"):
+        with pytest.raises(DataError, match=r"give sweep=|sweep='1:100Hz log'"):
             self.read(path, sweep=None)
         with pytest.raises(UnitError, match="column 'real' has no unit"):
             self.read(path, columns=None)
         with pytest.raises(DataError, match="neither an amplitude nor a drive"):
             self.read(path, drive=None)
-        for sweep in ("1 to 100 Hz", "1..100 Hz, log", "100 to 1 Hz, log", "0 to 9 Hz, log"):
+        for sweep in ("1 to 100 Hz", "1..100 Hz, log", "100:1Hz log", "0:9Hz log"):
             with pytest.raises(DataError, match="sweep is"):
                 self.read(path, sweep=sweep)
 
@@ -95,10 +95,10 @@ class TestSr785:
         for force in LEVELS:
             path = tmp_path / f"pivot_{1000 * force:g}mN.asc"
             path.write_text(trace(1e3 * receptance(force)))
-        (tmp_path / "map.toml").write_text('[real]\nunit = "mm/N"\n')
+        (tmp_path / "columns.toml").write_text('[real]\nunit = "mm/N"\n')
         with pytest.raises(SystemExit) as end:
-            main(["fit", str(tmp_path / "*.asc"), "--columns", str(tmp_path / "map.toml"),
-                  "--sweep", "1 to 100 Hz, log", "--level-from-name", "([0-9]+)mN",
+            main(["fit", str(tmp_path / "*.asc"), "--columns", str(tmp_path / "columns.toml"),
+                  "--sweep", "1:100Hz log", "--level-from-name", "([0-9]+)mN",
                   "--drive", "{level} mN", "--mass", "0.01", "--damping", "free",
                   "--noise", "relative"])  # fmt: skip
         out = capsys.readouterr().out

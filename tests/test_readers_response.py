@@ -128,7 +128,7 @@ class TestForms:
         np.testing.assert_allclose(data.response, STIFFNESS * factor)
         assert data.unit == "N m/rad"
 
-    def test_phase_beside_amplitude_and_drive(self) -> None:
+    def test_phase_with_amplitude_and_drive(self) -> None:
         """The phase is that of the quantity named, whatever motion the amplitude is."""
         columns = {
             "frequency_hz": FREQUENCY,
@@ -585,7 +585,7 @@ class TestInspect:
         assert table.covariance is not None
         np.testing.assert_array_equal(same.covariance, table.covariance)
 
-    def test_f_is_force_beside_time_or_motion_and_frequency_else(self, tmp_path: Path) -> None:
+    def test_f_is_force_with_time_or_motion_and_frequency_else(self, tmp_path: Path) -> None:
         path = tmp_path / "a.csv"
         for names, role in (("f,x_um,K", "frequency"), ("t,x,f", "force"), ("x,y,f", "force")):
             path.write_text(f"{names}\n1,100,29.9\n2,900,28.4\n")

@@ -248,7 +248,7 @@ class TestUnusualTables:
         record = read_record(written(tmp_path, "\n".join(["time,x [mm],F [N]", *rows])))
         np.testing.assert_allclose(record.time, [0.0, 0.5, 1.25], atol=1e-9)
         assert "time counted from the stamp" in repr(record)
-        proposal = written(tmp_path, inspect(tmp_path / "run.csv").column_map, "map.toml")
+        proposal = written(tmp_path, inspect(tmp_path / "run.csv").column_map, "columns.toml")
         assert read_record(tmp_path / "run.csv", columns=proposal).n == 3
 
     def test_time_stamps_that_are_none(self, tmp_path: Path) -> None:

@@ -523,7 +523,7 @@ def test_what_records_cannot_do_is_refused_by_name() -> None:
     fit = di.fit(recorded(DAHL, "random", 500, 1e-3), di.Dahl())
     with pytest.raises(ValidationError, match="method given with a posterior of records"):
         di.posterior(fit.records[0], di.Dahl(), method="grid")  # type: ignore[call-overload]
-    with pytest.raises(ValidationError, match="beside a RecordFit"):
+    with pytest.raises(ValidationError, match="together with a RecordFit"):
         di.posterior(fit, di.Dahl())
     with pytest.raises(ModelError, match="there is no model"):
         di.posterior(fit.records[0])

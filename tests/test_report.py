@@ -328,7 +328,7 @@ def test_cycle_by_cycle_sees_what_changes() -> None:
     np.testing.assert_allclose(mean, [0.1, 0.2, 0.3], atol=1e-9)
 
 
-def test_the_bootstrap_stands_beside_the_others_once_it_was_run(tmp_path: Path) -> None:
+def test_the_bootstrap_stands_next_to_the_others_once_it_was_run(tmp_path: Path) -> None:
     fit = di.fit(plain_table(), di.Dahl())
     before = report(fit, tmp_path / "a.md").read_text(encoding="utf-8")
     assert "bootstrap" not in before

@@ -74,7 +74,7 @@ def test_the_header_states_what_was_measured_and_with_what(
     head = text.split("\n## ")[0]
     for row in (
         "| Specimen | Flex pivot 12 |",
-        "| Model | Dahl friction; Dahl friction: dF/dx = sigma",
+        "| Model | Dahl friction: dF/dx = sigma",
         "SHA-256 " + "ab" * 6 + "...",
         "| Instruments | Force sensor, serial 4711, calibrated: 2026-03-01, uncertainty 0.5 %; "
         "LVDT, calibration not stated, uncertainty not stated |",

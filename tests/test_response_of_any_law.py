@@ -1,4 +1,4 @@
-"""The steady response beside every law, against a bracketing root search."""
+"""The steady response in parallel with every law, against a bracketing root search."""
 
 from __future__ import annotations
 

@@ -220,7 +220,7 @@ def limit_cycle() -> tuple[Model, float, float]:
 
 
 @pytest.mark.parametrize("drive", [1e-9, 1e-14, 1e-17, 1e-20, 1e-30])
-def test_a_weakly_driven_limit_cycle_has_two_close_amplitudes_beside_the_small_one(
+def test_a_weakly_driven_limit_cycle_has_two_close_amplitudes_near_the_small_one(
     drive: float,
 ) -> None:
     plant, amplitude, omega = limit_cycle()

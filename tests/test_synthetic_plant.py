@@ -174,7 +174,7 @@ def test_a_linear_system_moves_as_its_elements_do(
 
 
 def test_a_linear_system_with_poles_of_its_own_is_followed_under_either_control() -> None:
-    # a tuned absorber beside the plant: Z has a pole pair that no lumped element has
+    # a tuned absorber in parallel with the plant: Z has a pole pair that no lumped element has
     absorber = LinearSystem(
         control.tf([0.05 * 1.0, 0.05 * 25.0, 0.0, 0.0], [1.0, 1.0, 25.0]),
         quantity="dynamic_stiffness",

@@ -72,7 +72,7 @@ def identity(density: Density | RecordDensity, walkers: int, ensembles: int) -> 
         fixed = [(p.name, p.value) for p in problem.sensors.parameters if not p.free]
         own = {"data": _digest(*data), "noise": problem.noise, "sensors": repr(fixed)}
         errors = density.errors
-        own["errors beside noise"] = (
+        own["errors other than noise"] = (
             "none"
             if errors is None
             else _digest(errors.turn, errors.shared, errors.offset, errors.sizes)

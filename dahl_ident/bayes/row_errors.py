@@ -1,4 +1,4 @@
-r"""What the rows of a table share beside independent noise, in a likelihood.
+r"""What the rows of a table share in addition to independent noise, in a likelihood.
 
 Residuals y have the covariance s^2 (V_n + lambda V_c): noise V_n and what rows have in common V_c
 (scatter between runs and levels, a smooth model error), both relative to the noise's scale s. In

@@ -11,8 +11,10 @@ import shlex
 import shutil
 import sys
 import textwrap
+import threading
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,6 +32,7 @@ NOT_TRUSTED = 3  # the first that is free
 _NARROWEST = 40  # columns; in narrower windows indented lines would hold a word or two
 _STATUS = re.compile(r"\s*(Trusted|Approximate|Not determined|Not described)(?=\.)")
 _STYLES = {"Trusted": "bold green", "Approximate": "bold yellow"}
+_PATIENCE, _REDRAWN = 2.0, 0.1  # s without a sign of progress, and between its changes
 INTERRUPTED = 130  # as shells have it: 128 and the number of SIGINT
 
 
@@ -74,7 +77,7 @@ def in_options(message: str) -> str:
     """Return a message of the library with its arguments as command-line options.
 
     ``give frequency=, or mode='sweep'`` becomes ``give --frequency, or --mode 'sweep'``, and
-    ``columns={'gain': 'K'}`` becomes ``--columns map.toml, a file with the line: gain = "K"``.
+    ``columns={'gain': 'K'}`` becomes ``--columns columns.toml, a file with the line: gain = "K"``.
     """
 
     def option(found: re.Match[str]) -> str:
@@ -113,7 +116,7 @@ def _column_map(found: re.Match[str]) -> str:
             lines.append(f"{role} = {{{parts}}}")
         else:
             lines.append(f"{role} = {json.dumps('...' if entry is ... else entry)}")
-    return f"--columns map.toml, a file with the line: {'; '.join(lines)}"
+    return f"--columns columns.toml, a file with the line: {'; '.join(lines)}"
 
 
 def typed_command() -> str:
@@ -173,6 +176,47 @@ def write_wrapped(text: str) -> None:
             write(line)
         else:
             write(textwrap.fill(line, width, subsequent_indent=indent, break_on_hyphens=False))
+
+
+@contextmanager
+def busy(task: str) -> Iterator[Callable[[int, int], None]]:
+    """Show on a terminal, after two seconds, that a task goes on, and for how long.
+
+    The function that is yielded takes the steps done and their number: then the time left is
+    shown as well.
+    """
+    if _session.quiet or not sys.stderr.isatty():
+        yield lambda _done, _total: None
+        return
+    steps = [0, 0]
+    done = threading.Event()
+    show = threading.Thread(target=_spin, args=(task, steps, done), daemon=True)
+    show.start()
+
+    def update(number: int, total: int) -> None:
+        steps[:] = number, total
+
+    try:
+        yield update
+    finally:
+        done.set()
+        show.join()
+
+
+def _spin(task: str, steps: list[int], done: threading.Event) -> None:
+    """Draw a spinner until the task is done."""
+    if done.wait(_PATIENCE):
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn
+    from rich.progress import TimeElapsedColumn as Elapsed
+    from rich.progress import TimeRemainingColumn as Remaining
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), Elapsed(), Remaining())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        number = bar.add_task(task, total=None)
+        while not done.wait(_REDRAWN):
+            bar.update(number, completed=steps[0], total=steps[1] or None)
 
 
 def write_error(text: str) -> None:

@@ -27,7 +27,7 @@ def number(name: str, text: str, unit: str | None = None) -> float:
     text : str
         As typed.
     unit : str, optional
-        SI unit; by default that of the parameter.
+        SI unit; by default that of the parameter. Of "1", percent are read as well.
 
     Raises
     ------
@@ -36,10 +36,11 @@ def number(name: str, text: str, unit: str | None = None) -> float:
     UnitError
         If its unit has another dimension.
     """
+    share = unit == "1" and text.rstrip().endswith("%")
     try:
-        value = float(text)
+        value = 0.01 * float(text.rstrip()[:-1]) if share else float(text)
     except ValueError:
-        value = _quantity(name, text, unit)
+        value = math.nan if share else _quantity(name, text, unit)
     if not math.isfinite(value):
         raise ModelError(
             f"{name} is {text!r}; expected a number in SI units or with its unit, or '{FREE}'"

@@ -159,7 +159,7 @@ def fit(
             of_records.save(save, overwrite=writing.overwrite)
         _tell_records(of_records, general, report, verbose=verbose)
         if report is not None:
-            write_report_beside([of_records], report, writing, model)
+            write_fit_report([of_records], report, writing, model)
         finish(of_records)
         return
     result = fitted(table, model, estimating)
@@ -174,7 +174,7 @@ def fit(
         if not verbose:
             console.write("-v prints tests of the residuals, other models and the solver's numbers")
     if report is not None:
-        write_report_beside([result], report, writing, model)
+        write_fit_report([result], report, writing, model)
     finish(result)
 
 
@@ -195,7 +195,7 @@ def _compare_saved(
         told += [line for line in headline(found) if line not in told]
         console.write_wrapped("\n".join(told))
     if report is not None:
-        write_report_beside(fits, report, writing, model)
+        write_fit_report(fits, report, writing, model)
     finish(next((fit for fit in fits if not fit.status.usable), fits[0]))
 
 
@@ -326,11 +326,14 @@ def _tell_records(
 
 
 def fitted(data: FrequencyResponse, model: ModelOptions, estimating: Estimating) -> FitResult:
-    """Return the fit of the model to a table."""
+    """Return the fit of the model to a table, with its verdict."""
     from dahl_ident.results import fit as fit_data
 
     how = {**model.keywords(), **estimating.keywords()}
-    return fit_data(data, throw=False, **how)
+    with console.busy("fitting"):
+        result = fit_data(data, throw=False, **how)
+        _ = result.statements  # computed when first asked for
+    return result
 
 
 def check_reports(*places: str | None) -> None:
@@ -359,11 +362,12 @@ def write_report(
     from dahl_ident.reporting import report
 
     options = {**how, "command": console.typed_command(), "overwrite": writing.overwrite}
-    write = partial(report, list(results), **options)
-    return written(write, place, ".html")
+    with console.busy("writing the report") as progress:
+        write = partial(report, list(results), progress=progress, **options)
+        return written(write, place, ".html")
 
 
-def write_report_beside(
+def write_fit_report(
     results: Sequence[FitResult | ChainPosterior | RecordFit | RecordPosterior],
     place: str,
     writing: Writing,

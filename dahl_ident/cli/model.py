@@ -98,7 +98,7 @@ class ModelOptions:
 
         given = self._given(*_FRICTION)
         if self.element:
-            refuse_beside_elements(given)
+            refuse_with_elements(given)
             return elements(self.element)
         values: dict[str, Any] = {name: number_or_free(name, text) for name, text in given.items()}
         return Dahl(**{name: value for name, value in values.items() if value is not None})
@@ -107,7 +107,7 @@ class ModelOptions:
         return {name: text for name in names if (text := getattr(self, name)) is not None}
 
 
-def refuse_beside_elements(given: Mapping[str, Any]) -> None:
+def refuse_with_elements(given: Mapping[str, Any]) -> None:
     """Refuse parameters of the Dahl element if --element describes the friction."""
     if given:
         options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
@@ -171,7 +171,7 @@ def _entry(text: str) -> dict[str, Any]:
 
 
 def in_parallel(friction: Element, others: Mapping[str, float | None]) -> Element:
-    """Return friction with the elements beside it whose parameter is named."""
+    """Return friction with the elements in parallel whose parameter is named."""
     from dahl_ident.elements import Damper, Mass, Spring
 
     kinds = dict(zip(OTHERS, (Mass, Damper, Spring), strict=True))

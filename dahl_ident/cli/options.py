@@ -249,7 +249,7 @@ class Reading:
     frequency: Annotated[float | None, quantity("Frequency of all rows.", "Hz", _READING)] = None
     sweep: Annotated[
         str | None,
-        reading('Frequencies of all rows where no column holds them: "1 to 100 Hz, log".'),
+        reading('Frequencies of all rows where no column holds them: "1:100Hz log".'),
     ] = None
     drive_factor: DriveFactor = None
     drive_factor_uncertainty: DriveFactorUncertainty = None

@@ -63,13 +63,17 @@ class Bench:
     noise: Annotated[
         str | None,
         _bench(
-            "Noise of one cycle: 0.01, or 'relative=0.01,force=1mN,displacement=0.1um'; of a force "
-            "sample with --motion: force=1mN."
+            "Noise of one cycle: '1 %', or 'relative=0.01,force=1mN,displacement=0.1um'; of a "
+            "force sample with --motion: force=1mN."
         ),
     ] = None
     scatter: Annotated[
         float | None,
-        _bench("Scatter of gain and phase between runs, 0.02; by default that of the fit."),
+        quantity(
+            "Scatter of gain and phase between runs, '2 %'; by default that of the fit.",
+            "1",
+            _BENCH,
+        ),
     ] = None
     num_runs: Annotated[int | None, _bench("Number of runs; by default the best one.")] = None
     change_over: Annotated[float, quantity("Time from one level to the next.", "s", _BENCH)] = 1.0

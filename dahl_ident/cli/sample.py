@@ -18,7 +18,7 @@ from dahl_ident.cli.fit import (
     read_records,
     refuse_channels,
     refuse_for_tables,
-    write_report_beside,
+    write_fit_report,
 )
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.option_groups import with_option_groups
@@ -151,7 +151,7 @@ def sample(
     elif report != STANDARD:
         console.write_wrapped(str(posterior))
     if report is not None and not isinstance(posterior, GridPosterior):
-        write_report_beside([posterior], report, writing, model)
+        write_fit_report([posterior], report, writing, model)
     finish(posterior)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import console
-from dahl_ident.cli.distributions import numbers
+from dahl_ident.cli.distributions import number, numbers
 from dahl_ident.cli.files import progress_bar, write_data
 from dahl_ident.cli.model import (
     ELEMENT_HELP,
@@ -17,7 +17,7 @@ from dahl_ident.cli.model import (
     elements,
     in_parallel,
     model_option,
-    refuse_beside_elements,
+    refuse_with_elements,
 )
 from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import (
@@ -31,7 +31,7 @@ from dahl_ident.cli.options import (
     quantity,
     steady_option,
 )
-from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.errors import ModelError, UnitError, ValidationError
 
 if TYPE_CHECKING:
     from dahl_ident.elements import Element
@@ -64,17 +64,17 @@ class Plant:
 
         own = {name: getattr(self, name) for name in ("f_max", "sigma", "alpha")}
         given = {name: value for name, value in own.items() if value is not None}
-        beside = {n: value for n in OTHERS if (value := getattr(self, n)) is not None}
+        others = {n: value for n in OTHERS if (value := getattr(self, n)) is not None}
         if self.element:
-            refuse_beside_elements(given)
-            return in_parallel(elements(self.element), beside)
+            refuse_with_elements(given)
+            return in_parallel(elements(self.element), others)
         missing = [name for name in ("f_max", "sigma") if name not in given]
         if missing:
             raise ValidationError(
                 f"no value for {' and '.join(missing)}; a simulation needs --f-max and --sigma, "
                 "or --element"
             )
-        return in_parallel(Dahl(**given), beside)
+        return in_parallel(Dahl(**given), others)
 
 
 @dataclass(frozen=True)
@@ -107,9 +107,22 @@ class Errors:
     """Noise: relative in a table, absolute in a record."""
 
     displacement_std: Annotated[
-        float, _errors("Displacement noise: of a table, relative; of samples, m.")
-    ] = 0.0
-    force_std: Annotated[float, _errors("Force noise: of a table, relative; of samples, N.")] = 0.0
+        str, _errors("Displacement noise: of a table a share, '0.5 %'; of samples 0.1um.")
+    ] = "0"
+    force_std: Annotated[
+        str, _errors("Force noise: of a table a share, '0.5 %'; of samples 5mN.")
+    ] = "0"
+
+    def of(self, channel: str, unit: str) -> float:
+        """Return the standard deviation of a channel; a share where the unit is 1."""
+        text = getattr(self, f"{channel}_std")
+        try:
+            return number("it", text, unit)
+        except (ModelError, UnitError) as exc:
+            wanted = f"the noise of samples, such as 5e-6 or 5u{unit}"
+            if unit == "1":
+                wanted = "a share of the response, such as 0.005 or '0.5 %'; of samples: --record"
+            raise ValidationError(f"--{channel}-std is {text!r}; expected {wanted}") from exc
 
 
 @dataclass(frozen=True)
@@ -139,7 +152,7 @@ def simulate(
 ) -> None:
     """Simulate an experiment; without an output file, print its description.
 
-    Example: dahl-ident simulate --f-max 0.1 --sigma 30 --force-std 0.01 -o synthetic.csv
+    Example: dahl-ident simulate --f-max 0.1 --sigma 30 --force-std '1 %' -o synthetic.csv
     """
     from dahl_ident.arrays import whole_number
     from dahl_ident.synthetic import Experiment
@@ -184,10 +197,11 @@ def _experiment(plant: Plant, excitation: Excitation, errors: Errors, motion: Mo
     given["frequencies_hz"] = _numbers("frequency", given.pop("frequency"), "Hz")
     steps = SteppedSine(**given)
     if not as_record:
-        return Experiment(truth, steps, table=Table(**vars(errors), **vars(motion)))
+        table = Table(errors.of("displacement", "1"), errors.of("force", "1"), **vars(motion))
+        return Experiment(truth, steps, table=table)
     sensors = Acquisition(
-        displacement=Channel(noise_std=errors.displacement_std),
-        force=Channel(noise_std=errors.force_std),
+        displacement=Channel(noise_std=errors.of("displacement", "m")),
+        force=Channel(noise_std=errors.of("force", "N")),
     )
     return Experiment(truth, steps, sensors)
 

@@ -85,7 +85,7 @@ class ColumnMap:
     controlled : str or mapping, optional
         ``"displacement"`` or ``"force"``; or patterns of level labels for each of the two.
     sweep : str, optional
-        Frequencies of a table without a column of them, such as ``"1 to 100 Hz, log"``.
+        Frequencies of a table without a column of them, such as ``"1:100Hz log"``.
     sample_rate : float, optional
         Hz, for records without a time column.
     drive_factor : str, optional

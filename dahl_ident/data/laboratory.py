@@ -41,8 +41,11 @@ _TEXTS = (
 )  # fmt: skip
 _BLANK = ("specimen", "instruments", "ambient", "measured", "operator")
 _WORDS = {
-    "serial": "serial ", "calibration": "calibrated: ", "uncertainty": "uncertainty ", "k": "k = "
-}  # fmt: skip
+    "serial": "serial ",
+    "calibration": "calibrated: ",
+    "uncertainty": "uncertainty ",
+    "k": "k\u00a0=\u00a0",
+}
 _INSTRUMENT = ("name", "quantity", "model", "serial", "calibration", "channel", "uncertainty", "k")
 
 

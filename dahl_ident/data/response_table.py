@@ -47,7 +47,7 @@ from dahl_ident.units import (
 
 _FORMS = (("response",), ("real", "imag"), ("gain", "phase"), ("gain_db", "phase"))
 _NUMBER = r"([0-9.]+(?:[eE][-+]?[0-9]+)?)"
-_SWEEP = re.compile(rf"\s*{_NUMBER} to {_NUMBER} Hz, (log|linear)\s*")
+_SWEEP = re.compile(rf"\s*{_NUMBER}\s*:\s*{_NUMBER}\s*(Hz|kHz)[\s,]+(log|linear)\s*")
 _UNKNOWN_FREQUENCY = (
     "the table says no frequency: taken as 1 Hz, and good for laws that do not depend on it"
 )
@@ -149,9 +149,10 @@ def _swept(sweep: str, rows: int) -> FloatArray:
     if match is None:
         raise ValidationError(
             f"sweep is {sweep!r}; expected the first and the last frequency and their spacing, "
-            "such as '1 to 100 Hz, log' or '0 to 800 Hz, linear'"
+            "such as '1:100Hz log' or '0:800Hz linear'"
         )
-    first, last, log = float(match[1]), float(match[2]), match[3] == "log"
+    unit = 1e3 if match[3] == "kHz" else 1.0
+    first, last, log = unit * float(match[1]), unit * float(match[2]), match[4] == "log"
     if rows < 2 or not (first > 0.0 if log else first >= 0.0) or not first < last < np.inf:
         raise ValidationError(f"sweep is {sweep!r} for {rows} rows; expected rising frequencies")
     return (np.geomspace if log else np.linspace)(first, last, rows)
@@ -180,7 +181,7 @@ class _Table(Binding):
                 raise ValidationError(
                     "no column holds the frequency (inspect proposes a column map); name it with "
                     "columns={'frequency': ...}, or say what was swept, such as "
-                    "sweep='1 to 100 Hz, log'"
+                    "sweep='1:100Hz log'"
                 )
             if not rows:
                 self.required("frequency")

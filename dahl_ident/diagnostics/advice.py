@@ -84,9 +84,9 @@ def _of_friction(
     limit_lost = any(p.name in lost for p in _scaled(element, _FORCE))
     if spring and unlimited and limit_lost:
         return (
-            f"because friction's share of the response from {least} to {most} is within the noise "
-            f"beside the free {spring}: cover amplitudes where it is larger, reduce the noise, or "
-            f"measure the spring and fix {spring}"
+            f"because friction's share of the response from {least} to {most}, in parallel with "
+            f"the free {spring}, is within the noise: cover amplitudes where it is larger, reduce "
+            f"the noise, or measure the spring and fix {spring}"
         )
     if is_limit and np.isinf(limits.upper):
         if spring:
@@ -101,10 +101,10 @@ def _of_friction(
             f"spring and fix {spring}"
         )
     if is_stiffness and np.isinf(limits.upper) and not limit_lost:
-        beside = f" beside the free {spring}" if spring else ""
+        parallel = f" in parallel with the free {spring}" if spring else ""
         fix = f", or measure the spring and fix {spring}" if spring else ""
         return (
-            f"because every amplitude from {least} slips and friction's stiffness fades{beside}: "
+            f"because every amplitude from {least} slips and friction's stiffness fades{parallel}: "
             f"drive below that{fix}"
         )
     if spring:

@@ -27,7 +27,7 @@ from dahl_ident.diagnostics.error_sources import (
     RUNS,
     TESTS,
 )
-from dahl_ident.diagnostics.formatting import listed, rounded, table
+from dahl_ident.diagnostics.formatting import degrees_text, listed, rounded, table
 from dahl_ident.diagnostics.information import Information
 from dahl_ident.diagnostics.markup import html_table, pair, symbol, tabular, unit
 from dahl_ident.errors import FitError
@@ -149,11 +149,11 @@ class Budget(Mapping[str, ParameterBudget]):
                     value,
                     "combined",
                     "",
-                    f"{p.u:.2g}",
+                    _u(p, p.u),
                     _dof(p.dof),
                     "100 %",
                     f"{p.k:.2f}",
-                    f"{p.U:.2g}",
+                    _u(p, p.U),
                 ]
             )
             lines += [
@@ -161,7 +161,7 @@ class Budget(Mapping[str, ParameterBudget]):
                     "",
                     r.source,
                     r.kind,
-                    f"{r.u:.2g}",
+                    _u(p, r.u),
                     _dof(r.dof),
                     f"{100.0 * r.share:.0f} %",
                     "",
@@ -177,9 +177,9 @@ class Budget(Mapping[str, ParameterBudget]):
             cells
             for p in self.parameters
             for cells in (
-                (f"{p.name} [{p.unit}]", rounded(p.value, p.u)[0], "combined", "", f"{p.u:.2g}",
-                 _dof(p.dof), "100 %", f"{p.k:.2f}", f"{p.U:.2g}"),
-                *(("", "", r.source, r.kind, f"{r.u:.2g}", _dof(r.dof), f"{r.share:.0%}", "", "")
+                (f"{p.name} [{p.unit}]", rounded(p.value, p.u)[0], "combined", "", _u(p, p.u),
+                 _dof(p.dof), "100 %", f"{p.k:.2f}", _u(p, p.U)),
+                *(("", "", r.source, r.kind, _u(p, r.u), _dof(r.dof), f"{r.share:.0%}", "", "")
                   for r in p.rows),
             )
         ]  # fmt: skip
@@ -383,8 +383,12 @@ def _parameter(
     return ParameterBudget(name, unit, value, tuple(rows), total**0.5, dof, coverage_factor(dof))
 
 
+def _u(parameter: ParameterBudget, u: float) -> str:
+    return rounded(parameter.value, u)[1]
+
+
 def _dof(dof: float) -> str:
-    return "inf" if np.isinf(dof) else f"{dof:.3g}"
+    return "inf" if np.isinf(dof) else degrees_text([dof]).replace("more than ", "> ")
 
 
 def _finite(dof: float) -> float | None:

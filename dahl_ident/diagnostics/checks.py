@@ -159,7 +159,7 @@ def _misfit_within_runs(errors: ErrorModel) -> float:
     addition to the model and a change with speed do not count, as bands are centred on them.
     A smooth departure from the law does: parameters of another law have no uncertainty.
     """
-    fitted = (errors.near.fitted, errors.beside_the_law)
+    fitted = (errors.near.fitted, errors.parallel_to_the_law)
     return min(rms_misfit_of(errors.problem, each) for each in fitted)
 
 

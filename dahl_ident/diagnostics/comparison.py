@@ -6,7 +6,7 @@ another shape of loop. Each is judged by how it predicts tests that it was not f
 (:mod:`dahl_ident.diagnostics.predictive_density`). Of those whose density is within one standard
 error of the highest the simplest is the best; so is the one fitted while nothing is higher than it
 by more than chance among many candidates makes.
-AIC and BIC are stated beside, and decide nothing: over harmonics whose covariance is tiny they
+AIC and BIC are stated as well, and decide nothing: over harmonics whose covariance is tiny they
 prefer a model that spoils the fundamental. If no model describes the data, the best of them does
 not either, and one of negative damping is no mechanism's.
 """
@@ -415,7 +415,7 @@ def _falling_force(optimum: Optimum) -> str:
     """Return how much abs(N) falls with the frequency against the model's; "" where it does not.
 
     By straight lines over the frequency's logarithm, whose slopes are a parabola of the
-    amplitude's, beside any smooth dependence on the amplitude.
+    amplitude's, in addition to any smooth dependence on the amplitude.
     """
     problem = optimum.problem
     view, fitted = problem.stiffness_data, problem.predicted_stiffness(optimum.theta).stiffness

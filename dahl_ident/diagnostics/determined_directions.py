@@ -83,7 +83,7 @@ class Basis:
 def chart_of_limit(optimum: Optimum, problem: Problem) -> Chart | None:
     """Return the coordinates of the limit at which an optimum lies; None where it is finite.
 
-    `problem` may have more free parameters, which are coordinates beside those of the limit.
+    `problem` may have more free parameters, coordinates in addition to those of the limit.
     """
     gone = {
         p.name: value

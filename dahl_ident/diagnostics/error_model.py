@@ -246,15 +246,15 @@ class ErrorModel:
         )  # fmt: skip
 
     @cached_property
-    def beside_the_law(self) -> ComplexArray:
-        """Responses (n,) by generalised least squares, with forces beside the model and rates.
+    def parallel_to_the_law(self) -> ComplexArray:
+        """Responses (n,) by generalised least squares, parallel forces and rates included.
 
         Without the smooth departure from the law itself, which its parameters do not describe.
         """
         moved = self.near.J @ (self.generalised @ self.linear.y)
         for source, effect in zip(self.sources, self.projection.effects(), strict=True):
-            beside = source.shapes is None or source.shapes.parallel
-            if source.name == MODEL_ERROR and beside:
+            parallel = source.shapes is None or source.shapes.parallel
+            if source.name == MODEL_ERROR and parallel:
                 moved += source.columns @ effect
         relative = np.einsum("nij,nj->ni", self.relative_units(), moved.reshape(-1, 2))
         return np.asarray(self.near.fitted * np.exp(relative @ np.array([1.0, 1.0j])))
@@ -508,9 +508,9 @@ def _asked_for(
 ) -> VarianceComponents:
     """Return the variances; sources that raise the likelihood by less than their price have none.
 
-    A source that has none beside all others is never missed; of the rest, that which costs the
-    likelihood least leaves first, of a few that cost least by the information on their variances.
-    `floor` has variances at which the covariance is not singular.
+    A source that has none once all others are in is never missed; of the rest, that which costs
+    the likelihood least leaves first, of a few that cost least by the information on their
+    variances. `floor` has variances at which the covariance is not singular.
     """
     most = np.array([s.largest for s in sources])
     price = np.array([s.price for s in sources])

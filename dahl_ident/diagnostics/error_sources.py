@@ -101,7 +101,7 @@ class Shapes:
     places : ndarray, shape (n, 2)
         ln A and ln omega of the rows.
     parallel : bool
-        Whether it is a force beside the model, which depends on frequency alone.
+        Whether it is a force in parallel with the model, which depends on frequency alone.
     unit : float
         Stiffness at unit variance of such a force.
     """
@@ -166,7 +166,7 @@ def noise_of(problem: Problem, theta: FloatArray, *, few: bool) -> tuple[Source,
 
 
 def own_errors(problem: Problem, rows: Sequence[int]) -> tuple[Source, ...]:
-    """Return an error of each of some rows, beside the noise, that no other row shares."""
+    """Return an error of each of some rows, in addition to the noise, that no other row shares."""
     found = []
     for row in rows:
         columns = np.zeros((problem.n_residuals, 2))
@@ -180,11 +180,11 @@ class StructuredSources:
     """The sources that several rows share, and noise of the amplitudes.
 
     Their shapes are those of the model at `theta`. In measured ones the noise itself would be a
-    shape, and explain itself. `beside`, (k, 2), are further places where they are needed.
+    shape, and explain itself. `further`, (k, 2), are further places where they are needed.
     """
 
     def __init__(
-        self, problem: Problem, theta: FloatArray, beside: FloatArray | None = None
+        self, problem: Problem, theta: FloatArray, further: FloatArray | None = None
     ) -> None:
         self._problem = problem
         compliance = problem.data.quantity in COMPLIANCES
@@ -197,7 +197,7 @@ class StructuredSources:
             np.empty((0, data.n)) if data.run is None else _indicators(np.asarray(data.run))
         )
         unit = float(np.abs(view.stiffness[self._fundamental]).max(initial=0.0)) or 1.0
-        every = self._places if beside is None else np.vstack([self._places, beside])
+        every = self._places if further is None else np.vstack([self._places, further])
         self._shapes = (
             Shapes.of(every, parallel=False),
             Shapes.of(every, parallel=True, unit=unit),
@@ -335,7 +335,7 @@ def _sizes(problem: Problem, predicted: ComplexArray) -> ComplexArray:
 
 
 def _absorbed(problem: Problem, J: FloatArray, columns: FloatArray) -> FloatArray:
-    """Return what the model's own linear parts do of forces beside it, as changes of theta."""
+    """Return what the model's linear parts take of forces in parallel, as changes of theta."""
     names = {p.name for e in problem.model.elements if e.is_linear for p in e.parameters}
     own = [i for i, name in enumerate(problem.names) if name in names]
     found = np.zeros((J.shape[1], columns.shape[1]))
@@ -345,7 +345,7 @@ def _absorbed(problem: Problem, J: FloatArray, columns: FloatArray) -> FloatArra
 
 
 def _scattering_parameters(problem: Problem) -> list[int]:
-    """Return the columns of parameters that may differ from run to run, beside the gain."""
+    """Return the columns of parameters that may differ from run to run, in addition to the gain."""
     found = []
     for element in problem.model.elements:
         if element.is_linear:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 _DIGITS = 12  # of a number with a very small uncertainty
+_MANY_DOF = 999.5  # degrees of freedom from which k is that of a normal distribution to 0.1 %
 _LEAST_P = 1e-12  # smaller ones depend on unknown tails
 
 
@@ -107,6 +108,25 @@ def p_text(p: float) -> str:
     ('p = 0.012', 'p < 1e-12')
     """
     return f"p = {p:.2g}" if p >= _LEAST_P else f"p < {_LEAST_P:.0e}"
+
+
+def degrees_text(dof: Iterable[float]) -> str:
+    """Return degrees of freedom in words, or the range of several.
+
+    Examples
+    --------
+    >>> degrees_text([24.08]), degrees_text([math.inf]), degrees_text([57.0, 6250.0])
+    ('24.1', 'infinite', '57 to more than 1000')
+    """
+    several = list(dof) or [math.inf]
+    least, most = min(several), max(several)
+    if least >= _MANY_DOF:
+        return "more than 1000" if math.isfinite(least) else "infinite"
+    last = (
+        "infinite" if math.isinf(most) else f"{most:.3g}" if most < _MANY_DOF else "more than 1000"
+    )
+    text = f"{least:.3g}"
+    return text if text == last else f"{text} to {last}"
 
 
 def listed(words: Sequence[str]) -> str:

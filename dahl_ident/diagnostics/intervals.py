@@ -41,7 +41,7 @@ from dahl_ident.diagnostics.confidence_levels import (
     thresholds,
 )
 from dahl_ident.diagnostics.error_model import ErrorModel
-from dahl_ident.diagnostics.formatting import listed, table
+from dahl_ident.diagnostics.formatting import degrees_text, table
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Optimum
@@ -266,8 +266,9 @@ def combined_intervals(
         )
         lower = np.where(open_below, shape.lower, lower)
         upper = np.where(open_above, shape.upper, upper)
-    shown = listed([f"{nu:.3g}" for nu in np.where(dof < MANY, dof, np.inf)[held]])
-    note = f"every source of the budget: t with {shown} degrees of freedom"
+    shown = degrees_text(np.where(dof < MANY, dof, np.inf)[held])
+    law = "normal distribution" if shown == "infinite" else f"t with {shown} degrees of freedom"
+    note = f"every source of the budget: {law}"
     units = tuple(p.unit for p in optimum.problem.parameters)
     return ConfidenceIntervals("combined", array, optimum.names, units, values, lower, upper, note)
 

@@ -1,4 +1,4 @@
-r"""The estimate: weighted least squares, with one misfit beside the stated covariance.
+r"""The estimate: weighted least squares, with one misfit in addition to the stated covariance.
 
 A row of the covariance C and the fundamental force F_1 of its test counts as one of the covariance
 

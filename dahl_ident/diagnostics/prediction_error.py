@@ -1,7 +1,7 @@
 r"""Error of a prediction of a measurement: parameters, model error, scatter, noise.
 
 At an operating point where the model's relative slopes by the parameters are j, ln gain and phase
-of the device are j delta + sum_k C_k u_k beside the model's, u_k the sources of
+of the device are j delta + sum_k C_k u_k in addition to the model's, u_k the sources of
 :mod:`dahl_ident.diagnostics.error_model` and C_k what they do at that point. Their best linear
 prediction from the residuals y is lambda' y,
 
@@ -57,7 +57,7 @@ def prediction_error(
     amplitude, omega : ndarray, shape (n,)
         Where.
     stiffness : ndarray of complex, shape (n,) or None
-        Dynamic stiffness there; None leaves out forces beside the model.
+        Dynamic stiffness there; None leaves out forces in parallel with the model.
     of_a_test : bool
         With the scatter and noise of one more test; else of the device itself.
 

@@ -3,7 +3,7 @@ r"""How well a model predicts tests that it was not fitted to: the log density o
 Deviations count relative to the fundamental of the same test. Their errors are the stated
 covariance and beyond it a variance each for fundamentals and for harmonics, estimated from what
 this model leaves; so harmonics whose covariance is tiny cannot rule, and a model that misses pays
-for its misses. Beside them stand an unknown gain and phase of each run, with variances estimated
+for its misses. Each run has an unknown gain and phase, with variances estimated
 as well. To first order in the parameters, with X their columns and those of the runs, and D the
 errors' covariance,
 
@@ -25,7 +25,7 @@ from dahl_ident.fitting import Optimum
 
 _EXACT = 1e-5  # relative errors that count as none
 _ROUNDS = 30  # fixed-point steps of the variances, without a test of convergence
-_HEAVY = 4.0  # degrees of freedom of the density beside a robust loss
+_HEAVY = 4.0  # degrees of freedom of the density with a robust loss
 
 
 @dataclass(frozen=True)

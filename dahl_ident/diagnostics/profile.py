@@ -43,7 +43,7 @@ _ENOUGH = 1e-8  # fall of the cost at which a search along a flat valley ends
 _LONGEST = 3.0  # step of a logarithm
 _FARTHEST = 1e6  # conditional standard errors of a parameter that is no logarithm
 _LEAST_X_C = 1e-14  # over the smallest amplitude
-_MOST_X_C, _MOST_X_C_BESIDE = 1e8, 1e5  # over the largest, alone and beside a spring
+_MOST_X_C, _MOST_X_C_WITH_SPRING = 1e8, 1e5  # over the largest, alone and in parallel with a spring
 _SOFTEST, _STIFFEST = 1e-12, 1e6  # sigma over the median stiffness
 _FARTHEST_LOG = 80.0  # of a logarithm, from the optimum
 _FORCE, _STIFFNESS = (1, 0, 0), (1, -1, 0)  # powers of force, displacement and time
@@ -152,7 +152,7 @@ class Profiler:
 
     @cached_property
     def _edges(self) -> list[FloatArray]:
-        """Starts in gross slip, where data beside a free spring do not rule out microslip."""
+        """Starts in gross slip, where data with a free spring do not rule out microslip."""
         sd, found = np.sqrt(np.diagonal(self._optimum.covariance)), []
         for chart in self._microslip_charts:
             f_max, sigma = _friction_of(chart)
@@ -319,10 +319,12 @@ class Profiler:
     def _reach(self) -> _Reach:
         view = self._problem.stiffness_data
         stiffness = view.typical_stiffness
-        beside = any(e.is_linear and e.holds_at_rest for e in self._problem.model.elements)
+        has_spring = any(e.is_linear and e.holds_at_rest for e in self._problem.model.elements)
         return _Reach(
             float(np.log(view.amplitude.min() * _LEAST_X_C)),
-            float(np.log(view.amplitude.max() * (_MOST_X_C_BESIDE if beside else _MOST_X_C))),
+            float(
+                np.log(view.amplitude.max() * (_MOST_X_C_WITH_SPRING if has_spring else _MOST_X_C))
+            ),
             float(np.log(view.amplitude.min())),
             float(np.log(stiffness * _SOFTEST)),
             float(np.log(stiffness * _STIFFEST)),

@@ -67,7 +67,7 @@ def undetermined(
         near = np.mean(np.concatenate([p.path < 2.0 * low for p in paths])) if paths else np.nan
         for parameter in element.parameters:
             error = stderr.get(parameter.name)
-            # a parameter that may be zero, such as an asymmetry, is known beside its bounds
+            # a parameter that may be zero, such as an asymmetry, is known whatever its bounds
             limit = min(parameter.upper, -parameter.lower) if parameter.lower < 0.0 else 0.0
             size = limit if np.isfinite(limit) else 0.0
             if error is None or error <= _UNCERTAIN * max(size, abs(float(parameter.value or 0.0))):

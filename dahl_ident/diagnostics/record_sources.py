@@ -1,4 +1,4 @@
-"""Sources of error of a fit to records beside noise: model, scatter between runs, exponents.
+"""Sources of error of a fit to records other than noise: model, scatter between runs, exponents.
 
 What a model misses differs from place to place, and what a device does from run to run. Blocks of
 the records, or whole records, then ask for other parameters; what their scatter exceeds that of
@@ -106,7 +106,7 @@ def assumed_exponents(
         try:
             found.append(_Search(problem, parameter, values).result(jacobians, residuals))
         except FitError:
-            continue  # no motion beside the estimate
+            continue  # no motion next to the estimate
     return tuple(found)
 
 
@@ -178,7 +178,7 @@ class _Search:
     def _joint(
         self, jacobians: Sequence[FloatArray], at: FloatArray, mean: float
     ) -> list[FloatArray]:
-        """Return the derivatives with those by the exponent's logarithm beside the model's."""
+        """Return the derivatives with respect to the parameters and the exponent's logarithm."""
         problem, name = self.problem, self.parameter.name
         ends = [
             problem.with_fixed({name: self.default * np.exp(mean + d)}) for d in (_STEP, -_STEP)

@@ -1,6 +1,6 @@
 r"""Residuals in units of the noise, and their component orthogonal to the fit.
 
-A question such as "do the data fall with frequency against the model?" is one more column beside
+A question such as "do the data fall with frequency against the model?" is one more column next to
 those of the Jacobian: a small change u of the predicted responses, R -> R exp(gamma u). After
 projection on what the parameters cannot explain, its coefficient and error follow from one inner
 product; several columns together make a chi-square or F test. Nothing is fitted again.

@@ -47,7 +47,7 @@ class SlipDensity:
         Stiffness that slips at each, N/m; smooth, as far as the misfit allows.
     spring : float
         Stiffness that slips nowhere within the amplitudes, N/m.
-    beside : dict of str to float
+    parallel : dict of str to float
         The free linear parameters.
     least_misfit : float
         Root mean square of abs(measured - fitted)/abs(measured) over the fundamentals that the
@@ -59,7 +59,7 @@ class SlipDensity:
     slip: FloatArray
     stiffness: FloatArray
     spring: float
-    beside: dict[str, float]
+    parallel: dict[str, float]
     least_misfit: float
     misfit: float
 
@@ -86,7 +86,7 @@ class SlipDensity:
         return MaxwellSlip(slips[some], stiff[some])
 
 
-def slip_density(data: FrequencyResponse, beside: Element | None = None) -> SlipDensity:
+def slip_density(data: FrequencyResponse, parallel: Element | None = None) -> SlipDensity:
     """Return the density of slip displacements that describes the fundamentals best.
 
     Errors count relative to the measured response.
@@ -95,7 +95,7 @@ def slip_density(data: FrequencyResponse, beside: Element | None = None) -> Slip
     ----------
     data : FrequencyResponse
         With known displacement amplitudes, or drives from which they follow.
-    beside : Element, optional
+    parallel : Element, optional
         Linear elements in parallel, such as ``Mass() + Damper()``; free parameters take any sign,
         except where their bounds allow one only. A free spring is there already.
 
@@ -108,7 +108,7 @@ def slip_density(data: FrequencyResponse, beside: Element | None = None) -> Slip
     DataError
         If fewer than three fundamentals remain.
     ModelError
-        If an element of `beside` is not linear.
+        If an element of `parallel` is not linear.
 
     Notes
     -----
@@ -124,10 +124,10 @@ def slip_density(data: FrequencyResponse, beside: Element | None = None) -> Slip
     >>> print(f"{found.least_misfit:.3f}, {found.stiffness.sum() + found.spring:.0f} N/m")
     0.001, 39999 N/m
     """
-    linear = [] if beside is None else list(as_model(beside).elements)
+    linear = [] if parallel is None else list(as_model(parallel).elements)
     wrong = [e for e in linear if not e.is_linear]
     if wrong:
-        raise ModelError(f"beside has {wrong[0]!r}; expected linear elements, such as Mass()")
+        raise ModelError(f"parallel has {wrong[0]!r}; expected linear elements, such as Mass()")
     system = _system(data, linear)
     n = system.slip.size
     _, least = _solved(system, 0.0)
@@ -136,10 +136,10 @@ def slip_density(data: FrequencyResponse, beside: Element | None = None) -> Slip
          <= max(_ALLOWED * least, _EXACT)),
         _solved(system, 0.0),
     )  # fmt: skip
-    beside_values = dict.fromkeys(system.names, 0.0)
+    parallel_values = dict.fromkeys(system.names, 0.0)
     for name, sign, value in zip(system.names, system.signs, found[n + 1 :], strict=True):
-        beside_values[name] += sign * float(value)
-    return SlipDensity(system.slip, found[:n], float(found[n]), beside_values, least, misfit)
+        parallel_values[name] += sign * float(value)
+    return SlipDensity(system.slip, found[:n], float(found[n]), parallel_values, least, misfit)
 
 
 def least_misfit(data: FrequencyResponse, model: Element) -> float:

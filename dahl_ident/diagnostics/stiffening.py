@@ -1,7 +1,7 @@
 r"""Test for a stiffness that rises with amplitude, which most friction laws exclude.
 
 Re N falls with A for every Dahl element and for every sum of them, whatever the parameters; a
-spring adds a constant. A law says so of itself (`softens`); beside one that does not, there is no
+spring adds a constant. A law says so of itself (`softens`); with one that does not, there is no
 test, and none of rows that are predicted by the exact steady motion: N is that of a displacement
 that is a sine. The real part of the measured dynamic stiffness, less the modelled parts
 of mass and other linear elements, is therefore a falling function of amplitude, and a rise

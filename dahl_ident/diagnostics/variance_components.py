@@ -211,8 +211,8 @@ class RowProjection:
         self._sources = [P[:m] * z if z.ndim == 1 else P[:m] @ z for z in model.Z]
         weighted = P[:m] @ model.y
         if self._rotation is not None:
-            beside = y - self._rotation @ model.y[:m]
-            weighted = self._outside * beside + self._rotation @ weighted
+            outside = y - self._rotation @ model.y[:m]
+            weighted = self._outside * outside + self._rotation @ weighted
         self.weighted = weighted
         """P y, (m,)."""
 
@@ -221,7 +221,7 @@ class RowProjection:
         if self._rotation is None:
             return np.asarray(self._P[np.ix_(rows, rows)])
         own = self._rotation[rows]
-        return np.asarray(self._outside * self._beside(own) + own @ self._P @ own.T)
+        return np.asarray(self._outside * self._complement(own) + own @ self._P @ own.T)
 
     def falls(self, rows: NDArray[np.intp]) -> FloatArray:
         """Return by how much that block falls with each variance, P V_k P, (K, r, r)."""
@@ -231,11 +231,11 @@ class RowProjection:
             turned = part[rows] if own is None else own @ part
             found.append(turned @ turned.T)
         if own is not None:
-            found[0] = found[0] + (self._outside * self._size) ** 2 * self._beside(own)
+            found[0] = found[0] + (self._outside * self._size) ** 2 * self._complement(own)
         return np.array(found)
 
     @staticmethod
-    def _beside(own: FloatArray) -> FloatArray:
+    def _complement(own: FloatArray) -> FloatArray:
         return np.asarray(np.eye(len(own)) - own @ own.T)
 
 

@@ -453,7 +453,7 @@ def _determined(
 ) -> tuple[DeterminedCombination, ...]:
     """Return the combinations of parameters that are not identified, but are together.
 
-    Of `loose` parameters, short of identified, a product needs two: beside known ones it says no
+    Of `loose` parameters, short of identified, a product needs two: with known ones it says no
     more than its one unknown member, which has a verdict of its own.
     """
     units = {p.name: p.unit for p in optimum.problem.parameters}

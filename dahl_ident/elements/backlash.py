@@ -232,7 +232,7 @@ class Backlash(Friction):
         return super().force_history_gradient(values, displacement, velocity, state)
 
     def _is_narrow(self, values: Sequence[FloatArray | float], displacement: FloatArray) -> bool:
-        """Return whether the gap is too narrow beside the path to matter."""
+        """Return whether the gap is too narrow compared with the path to matter."""
         return float(values[-1]) < _NARROWEST * float(np.abs(np.diff(displacement)).sum())
 
     def steady_force(

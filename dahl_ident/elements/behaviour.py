@@ -108,8 +108,8 @@ class Asymptote:
     kept : tuple of (str, mapping of str to float)
         Combinations that stay determined: expression, and the power of each label in it.
     adds_to_spring : str or None
-        A label whose value shows only in the sum with the stiffness of a free spring beside it;
-        the limit exists only beside such a spring.
+        A label whose value shows only in the sum with the stiffness of a free spring in parallel;
+        the limit exists only with such a spring.
     """
 
     name: str

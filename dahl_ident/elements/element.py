@@ -90,7 +90,7 @@ class Element(Behaviour):
     has_memory : bool
         True: the force depends on the displacement's history.
     unique_response : bool
-        True: beside a passive linear part the response to a sine force is unique, because
+        True: in parallel with a passive linear part the response to a sine force is unique, because
         A abs(L + N(A)) rises with A.
     parameters : tuple of Parameter
         In the order of the constructor: declarations on the class, with values on an element.

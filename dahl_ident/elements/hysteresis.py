@@ -209,7 +209,7 @@ def _linear_turning_forces(start: float, heading: FloatArray, legs: FloatArray) 
 
     A leg is the affine map F -> F + c F + b with c = exp(-d) - 1, b = -s c. The maps of blocks
     of about sqrt(n) legs are composed side by side, then carried from block to block; c rather
-    than exp(-d) is kept, since many short legs would lose their sum beside 1.
+    than exp(-d) is kept, since many short legs would lose their sum when added to 1.
     """
     n = legs.size
     size = max(1, int(np.sqrt(n)))

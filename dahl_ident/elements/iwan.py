@@ -66,7 +66,7 @@ class Iwan(Masing):
     Notes
     -----
     D. J. Segalman, A four-parameter Iwan model for lap-type joints, J. Appl. Mech. 72 (2005)
-    752-760. Amplitudes of microslip alone determine sigma (beside a spring: its sum with the
+    752-760. Amplitudes of microslip alone determine sigma (with a spring: its sum with the
     spring's), chi and one coefficient of the power law; f_max and ratio then are not determined.
     Where a force drives it over time, 30 Jenkins elements take its place.
 

@@ -65,7 +65,7 @@ class LinearSystem(Element):
     -----
     In records, a fixed continuous system has a force over time: its Z(s) is a stiffness, a damper,
     a mass, and poles whose states at the first sample are unknowns of the fit. So a receptance with
-    inertia is driven by a measured force without `Mass`; an absorber needs one beside it.
+    inertia is driven by a measured force without `Mass`; an absorber needs one in parallel.
 
     Evaluating outside the frequencies of an FRD, above half a sampling rate, or where the
     response determines no stiffness, raises ValidationError. Derivatives by the arguments

@@ -77,7 +77,7 @@ class SlopeLaw(Element):
     def output(self, force: Any, slope: Any, velocity: Any, values: Sequence[Any]) -> Any:
         """Return the whole force from the state `force`, its slope dF/dx and the velocity.
 
-        The state itself, except in a velocity-dependent law that damps beside it.
+        The state itself, except in a velocity-dependent law that damps in addition.
         """
         return force
 

@@ -4,7 +4,7 @@ With r samples a cycle the harmonics r - k and r + k are sampled as harmonic k, 
 cycle, so that no scatter shows them. A waveform with kinks, such as friction's force, has
 harmonics that fall as a power of their order, between 1/k (steps) and 1/k^3 (reversals of Dahl
 friction). The power is taken from the harmonics that stand out of the noise, and extended to the
-first two that alias. Where r is no whole number the alias lies beside the harmonic, and drops
+first two that alias. Where r is no whole number the alias lies next to the harmonic, and drops
 out of it the more cycles there are.
 """
 
@@ -19,7 +19,7 @@ from dahl_ident.extraction.sine_fit import SineFit
 _CLEAR = 9.0  # power over that of noise, of a harmonic that is seen
 _SEEN_FROM = 1.0 / 3.0  # of the fitted orders: the powers of low ones differ
 _FLATTEST, _STEEPEST = 1.0, 3.0  # powers of the order: jumps of the force, and of its curvature
-_FIRST = 3  # harmonic of friction beside the fundamental
+_FIRST = 3  # harmonic of friction after the fundamental
 _STAYS = 0.01  # of an alias, that matters
 
 
@@ -53,7 +53,7 @@ def aliases_unseen(fit: SineFit, cycles: int) -> bool:
 
 
 def _kept(per_cycle: float, cycles: int) -> float:
-    """Return the share of an alias that stays on the harmonic beside it."""
+    """Return the share of an alias that stays on the harmonic next to it."""
     return float(abs(np.sinc(cycles * (per_cycle - round(per_cycle)))))
 
 

@@ -15,7 +15,7 @@ taken; fewer cycles have too few so close, and all lines up to the next harmonic
 spectral estimate. The noise is taken as circular (its phase is uniform), so n lines of equal
 weight give 2 n degrees of freedom.
 
-The mean (k = 0) has no line at 0 beside it that is noise alone. Its noise is that of the lowest
+The mean (k = 0) has no line at 0 next to it that is noise alone. Its noise is that of the lowest
 lines, each of which appears on both sides: white noise is assumed from there down, so a slower
 drift of the sensor's zero is not in the mean's covariance.
 """
@@ -30,7 +30,7 @@ import numpy as np
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.extraction.sine_fit import SineFit
 
-CYCLES_FOR_SCATTER = 4  # with fewer, lines beside the harmonic are few and far
+CYCLES_FOR_SCATTER = 4  # with fewer, lines next to the harmonic are few and far
 _MOST_LINES = 10  # a side: about 40 degrees of freedom, beyond which a region hardly shrinks
 _MEAN_LINES = 4  # the lowest ones, from which the noise of the mean is judged
 _INDEPENDENT = 0.05  # of the largest eigenvalue: lines that gaps make alike are left out
@@ -40,7 +40,7 @@ _BLOCKS_PER_CYCLE = 128  # slow noise loses 1 % on the line of the ninth harmoni
 
 @dataclass(frozen=True)
 class LineNoise:
-    """Noise beside one harmonic, as that of white noise with the same density there.
+    """Noise next to one harmonic, as that of white noise with the same density there.
 
     `lines` is (2, lines): the errors of motion and force on each line, weighted so that their
     products sum to those of a sample's errors.
@@ -58,7 +58,7 @@ class LineNoise:
 def line_noise(
     fit: SineFit, harmonics: Sequence[int], cycles: int, residual: FloatArray
 ) -> list[LineNoise]:
-    """Return the noise beside each harmonic.
+    """Return the noise next to each harmonic.
 
     Parameters
     ----------

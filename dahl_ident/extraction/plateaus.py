@@ -47,7 +47,7 @@ _SWEEP_CYCLES = (4, 20)  # in a window
 class Span:
     """Start and stop in s, and the frequency in the middle, Hz.
 
-    `earliest` and `latest` are where the spans beside it end and begin.
+    `earliest` and `latest` are where the spans next to it end and begin.
     """
 
     start: float

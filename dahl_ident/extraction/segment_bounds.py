@@ -75,7 +75,7 @@ def steady_part(
         start, stop = (second if early else start), (last if late else stop)
         edges = edges[int(early) : edges.size - int(late)]
         fewer += [early, late]
-    if inside is not None:  # enough are left: the cycle beside a stray departs as well, if less
+    if inside is not None:  # enough are left: the cycle next to a stray departs as well, if less
         start = int(np.searchsorted(time, edges[1])) if start > part.start else start
         stop = int(np.searchsorted(time, edges[-2])) if stop < part.stop else stop
     room = slice(

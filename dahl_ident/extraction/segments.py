@@ -2,7 +2,7 @@
 
 Spans are looked for between crossings first. Where noise drowns those, or they cover little
 of the record, the periods of its strongest line are tried as well, and the longer reading wins.
-Each span then gets its frequency, and the cycles beside it that the same sine fits.
+Each span then gets its frequency, and the cycles next to it that the same sine fits.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def segment_of(
 def _refuse_drift(segment: Segment) -> None:
     """Refuse a given frequency at which the motion's phase drifts from cycle to cycle.
 
-    The phasors of the cycles turn evenly then: their spectrum has its peak beside zero. A phase
+    The phasors of the cycles turn evenly then: their spectrum has its peak next to zero. A phase
     that settles turns them as well, but less and less.
     """
     few = thinned(segment)
@@ -157,12 +157,12 @@ def _refuse_drift(segment: Segment) -> None:
     power = np.abs(np.fft.fft(phasors, _PADDED * counts.size)) ** 2 / cycle.size
     peak = int(np.argmax(power))
     turns = float(np.fft.fftfreq(power.size)[peak])
-    beside = np.angle(found * np.exp(-2j * np.pi * turns * cycle))
+    phases = np.angle(found * np.exp(-2j * np.pi * turns * cycle))
     evenly = True
     if cycle.size >= 2 * _FEWEST_IN_HALF:
-        halves = [float(np.polyfit(*half, 1)[0]) for half in _halves(cycle, beside)]
+        halves = [float(np.polyfit(*half, 1)[0]) for half in _halves(cycle, phases)]
         evenly = abs(halves[1] - halves[0]) < _EVENLY * abs(sum(halves) + 4.0 * np.pi * turns)
-    turns += float(np.polyfit(cycle, beside, 1)[0]) / (2.0 * np.pi)
+    turns += float(np.polyfit(cycle, phases, 1)[0]) / (2.0 * np.pi)
     drift = 2.0 * np.pi * turns * counts.size
     left = float(np.sum(np.abs(found) ** 2)) - power[peak]
     clear = (power[peak] - power[0]) * dof > 2.0 * highest_by_chance(_BY_CHANCE, dof) * left

@@ -4,7 +4,7 @@ Both channels are fitted with the same columns by linear least squares,
 
     y(t) = offset + drift tau + sum_k c_k cos(k theta) + s_k sin(k theta),   k = 1 ... K
 
-so that what is fitted beside the fundamental (odd and even harmonics, offset, drift) does not
+so that what is fitted with the fundamental (odd and even harmonics, offset, drift) does not
 leak into it, and samples are taken where they are: jitter, gaps and missing samples need no
 resampling. A phasor is ``Y_k = c_k - j s_k``, so that ``y = Re(Y_k exp(j k theta))``.
 
@@ -36,7 +36,7 @@ _BLOCK = 16384  # samples whose columns stay in the cache
 _KEPT = 2_000_000  # entries of columns that are kept rather than computed twice
 _BLOCKS_PER_CYCLE = 64  # block means that lose 4e-4 of the fundamental
 _FEWEST_SAMPLES = 2  # that have a phase from one to the next
-_LEAST_WEIGHT = 1e-6  # of a cycle beside the strongest
+_LEAST_WEIGHT = 1e-6  # of a cycle relative to the strongest
 _MAX_STEPS = 20  # at most: without convergence by then the start was wrong
 _TRACKED = 0.1  # phase error that is left to the four-parameter fit, rad
 _STEP_TOLERANCE = 1e-4  # phase at the ends of the segment, rad; its square is the error left

@@ -25,7 +25,7 @@ _FEWEST_PAIRS = 2  # of cycles, that show how alike they are
 _NOISY = 0.03  # of a cycle's log amplitude
 _SINE_IN_NOISE = 0.3  # of the power near the strongest line, where noise spoils the cycles
 _ONE_LINE = 0.8  # of the power, of one level whatever its cycles look like
-_BESIDE = 2  # lines on either side that a line leaks into
+_LEAK = 2  # lines on either side that a line leaks into
 _SPECTRUM_OF = 2**20  # samples at most
 
 
@@ -97,5 +97,5 @@ def _strongest_line(motion: FloatArray) -> tuple[float, int]:
     power = np.abs(np.fft.rfft(part - part.mean())[1:]) ** 2
     total = float(power.sum())
     strongest = int(np.argmax(power))
-    near = power[max(strongest - _BESIDE, 0) : strongest + _BESIDE + 1]
+    near = power[max(strongest - _LEAK, 0) : strongest + _LEAK + 1]
     return (float(near.sum()) / total, strongest + 1) if total else (1.0, motion.size)

@@ -107,7 +107,7 @@ def extract(
         ``num_periods``, ``settling_periods``
             Periods of the segment, and how many leading ones were left out.
         ``covariance_from``
-            "cycles", or "spectrum" with fewer than four: an estimate from farther beside the
+            "cycles", or "spectrum" with fewer than four: an estimate from farther from the
             harmonics.
         ``start_time``, ``end_time``
             First and last sample used, s.

@@ -23,7 +23,7 @@ limit, to five digits or more (three for no full slip). If the sum of squares th
 than at any finite optimum, the limit is the optimum, and phi gives what is determined, with its
 covariance.
 
-In microslip beside a free spring the cost has a long curved valley even where its minimum is
+In microslip with a free spring the cost has a long curved valley even where its minimum is
 finite. The chart (kappa, x_c, sigma + stiffness) straightens it; where f_max is given, the chart
 (sigma, sigma + stiffness).
 """
@@ -53,7 +53,7 @@ _FAR = (1e9, 1e14)
 
 In slip the remaining stiffness of a law decreases only with the square root of the length.
 """
-_FIRMLY = 1e3  # weight of what a limit determines beside single coordinates, in a chart's phi
+_FIRMLY = 1e3  # weight of what a limit determines relative to single coordinates, in a chart's phi
 
 
 @dataclass(frozen=True)
@@ -335,7 +335,7 @@ def _plain(problem: Problem, element: Element, asymptote: Asymptote, spring: boo
 def _microslip(
     problem: Problem, element: Element, asymptote: Asymptote, springs: list[Parameter]
 ) -> list[Limit]:
-    """Return a limit that exists only beside a free spring, for each of them."""
+    """Return a limit that exists only with a free spring, for each of them."""
     pins = _pins(element, asymptote)
     if pins is None or asymptote.follows is None or asymptote.adds_to_spring is None:
         return []

@@ -367,7 +367,7 @@ def _with_drive_error(
     if problem.noise != "measured" or loss != "linear":
         raise ValidationError(
             f"drive_std is given with {problem.noise} noise and {loss} loss; how much it weighs "
-            "beside the response's error is known only with noise='measured', loss='linear'"
+            "in addition to the response's error is known only with noise='measured', loss='linear'"
         )
     spread = _for_rows(non_negative_array(std, "drive_std"), "drive_std", (data.n,))
     cross = None

@@ -234,7 +234,7 @@ def _minimise(
         which = None if active.size == S else active
         new = _State(trial, *evaluate(trial, which))
         evaluations[active] += 1
-        # a fall too small to see beside one enormous row's cost is taken as foretold
+        # a fall too small to see next to one enormous row's cost is taken as predicted
         unseen = foretold <= unseen_change * at.cost
         better = (new.cost < at.cost) | (unseen & (new.cost <= (1.0 + unseen_change) * at.cost))
         gain = np.where(unseen, 1.0, at.cost - new.cost) / np.where(unseen, 1.0, foretold)

@@ -150,7 +150,7 @@ class _Scan:
                 force, length, time = parameter.dimension
                 unit = self.length**length * self.time**time
                 if force:
-                    # beside a force of 1: a length in disguise
+                    # compared with a force of 1: a length in disguise
                     size = 1.0 if scaled else self._force_size()
                     grids.append([size**force * (self.length * s) ** length for s in _LENGTHS])
                 elif parameter.lower < 0.0:

@@ -10,7 +10,7 @@
 4. Where a search has left the bounds, or nothing has converged, `scipy.optimize.least_squares`
    goes on from there.
 
-A robust loss, and a prior beside noise of unknown scale, make the optimum depend on the scale;
+A robust loss, and a prior with noise of unknown scale, make the optimum depend on the scale;
 it is then estimated and the search repeated until both agree. One table is a batch of one.
 """
 

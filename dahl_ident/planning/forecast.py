@@ -1,4 +1,4 @@
-"""What measurements at candidates would determine, beside what earlier data did.
+"""What measurements at candidates would determine, in addition to what earlier data did.
 
 The model error of an earlier fit (:mod:`dahl_ident.diagnostics.departures`) enters as W further
 parameters, shared by earlier and later levels: a level close to a measured one then teaches

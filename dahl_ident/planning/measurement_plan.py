@@ -322,7 +322,7 @@ class Plan:
         return {name: (times, planned[name], even[name]) for name in names}
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw the predicted uncertainty against bench time, beside a logarithmic grid.
+        """Draw the predicted uncertainty against bench time, next to that of a logarithmic grid.
 
         Parameters
         ----------

@@ -217,11 +217,11 @@ class Exchange:
         return result
 
     def _promising(self, chosen: list[int], time: float) -> list[int]:
-        """Return the candidates that look best beside the chosen ones, at equal shares."""
+        """Return the candidates that look best in addition to the chosen ones, at equal shares."""
         rest = np.setdiff1d(self._pool, chosen)
-        beside = np.column_stack([np.tile(chosen, (rest.size, 1)), rest]).astype(np.intp)
-        least = (LEAST_CYCLES / self._bench.frequency_hz[beside]).sum(axis=-1)
-        rooms = time - self._bench.fixed(beside) - least
+        joined = np.column_stack([np.tile(chosen, (rest.size, 1)), rest]).astype(np.intp)
+        least = (LEAST_CYCLES / self._bench.frequency_hz[joined]).sum(axis=-1)
+        rooms = time - self._bench.fixed(joined) - least
         possible = rest[rooms >= 0.0]
         if not possible.size:
             return []

@@ -101,7 +101,7 @@ class SteadyRows:
         """Return whether friction is hardly more than a spring at every row, () or (S,).
 
         Searches for limits go there. The motion is then a sine, while shooting would lose it to
-        rounding beside the spring.
+        rounding relative to the spring.
         """
         low = np.full((), np.inf)
         for element, own in self._model.of(values):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class Cell:
     """A cell of a table: its text, and the number for copying and sorting.
 
-    A struck cell is printed grey and crossed out, with the reason beside it. A link is the address
+    A struck cell is printed grey and crossed out, with the reason next to it. A link is the address
     of another page, relative to this one.
     """
 

@@ -1,4 +1,4 @@
-"""Markdown for wikis and version control, with figures in a folder beside it."""
+"""Markdown for wikis and version control, with figures in a folder next to it."""
 
 from __future__ import annotations
 

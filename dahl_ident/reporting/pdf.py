@@ -21,6 +21,7 @@ from fpdf.syntax import Name, PDFArray, PDFObject
 from dahl_ident.reporting.document import (
     Block,
     Bullets,
+    Cell,
     Document,
     Listing,
     Paragraph,
@@ -36,8 +37,9 @@ _FACES = {"": "DejaVuSans.ttf", "B": "DejaVuSans-Bold.ttf", "I": "DejaVuSans-Obl
 _PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
 _HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; space kept below a heading or a caption
 _LONGEST = 60  # characters of a title at the foot of a page
-_WIDEST = 26  # characters in the widest column of a table
-_MARGIN, _BOLD = 3.0, 1.25  # characters beside the text; how much wider bold ones are
+_WHOLE = 20.0  # mm, of a paragraph that is not divided between pages
+_WIDEST = 75.0  # mm, of a column of a table
+_PADDING = 3.5  # mm, on both sides of a column's text
 _NAME_WIDTH = 38.0  # mm, of the fields' names in the header
 _COLOURS = {
     "trusted": (17, 99, 41),
@@ -170,6 +172,11 @@ def _block(page: FPDF, block: Block) -> None:
 
 
 def _text(page: FPDF, text: str) -> None:
+    """Print a paragraph; one of a few lines is not divided between pages."""
+    height = page.multi_cell(0, 5, text, align="L", dry_run=True, output="HEIGHT")
+    assert isinstance(height, float)
+    if height <= _WHOLE:
+        _turn_unless_room(page, height)
     page.multi_cell(0, 5, text, align="L", new_x="LMARGIN", new_y="NEXT")
     page.ln(1)
 
@@ -211,12 +218,12 @@ def _turn_unless_room(page: FPDF, height: float) -> None:
 
 
 def _table(page: FPDF, table: Table) -> None:
-    _turn_unless_room(page, _BEGINNING)
+    widths = _widths(page, table)
+    beginning = [words(*table.header), *table.rows[:1]]
+    _turn_unless_room(page, _CAPTION_HEIGHT + sum(_height(page, row, widths) for row in beginning))
     page.set_font(_FONT, "B", 9.5)
     _text(page, table.caption)
     page.set_font(_FONT, "", 7.5)
-    texts = [tuple(cell.text for cell in row) for row in table.rows]
-    widths = [_width(name, own) for name, *own in zip(table.header, *texts, strict=True)]
     drawn = _TaggedTable(
         page,
         col_widths=widths,
@@ -291,10 +298,31 @@ class _Structure(StructureTreeBuilder):
         yield from self.doc_struct_elem.k
 
 
-def _width(name: str, texts: Sequence[str]) -> float:
-    """Return the width of a column in characters; its name may be wrapped between words."""
-    longest = max(_BOLD * max(map(len, name.split()), default=0), *map(len, texts), 1)
-    return min(longest, _WIDEST) + _MARGIN
+def _height(page: FPDF, row: Sequence[Cell], widths: Sequence[float]) -> float:
+    """Return about how high a row becomes where its texts are wrapped."""
+    page.set_font(_FONT, "B", 7.5)
+    room = (page.epw * width / sum(widths) - _PADDING for width in widths)
+    lines = (page.get_string_width(c.text) / wide for c, wide in zip(row, room, strict=True))
+    return 4.0 * (1 + int(max(lines))) + 1.0
+
+
+def _widths(page: FPDF, table: Table) -> list[float]:
+    """Return the widths of columns: no word is broken where all words of a row fit on the page."""
+    texts = [tuple(cell.text for cell in row) for row in table.rows]
+    least, wanted = [], []
+    for name, *own in zip(table.header, *texts, strict=True):
+        page.set_font(_FONT, "B", 7.5)
+        widest = max((page.get_string_width(word) for word in name.split()), default=0.0)
+        page.set_font(_FONT, "", 7.5)
+        words_of = {word for text in own for word in text.split()}
+        longest = max((page.get_string_width(word) for word in words_of), default=0.0)
+        whole = max(map(page.get_string_width, own), default=0.0)
+        least.append(min(max(widest, longest), _WIDEST) + _PADDING)
+        wanted.append(max(widest, longest, min(whole, _WIDEST)) + _PADDING)
+    room, more = page.epw - sum(least), sum(wanted) - sum(least)
+    if room >= more or room <= 0.0:
+        return wanted if room >= more else least  # in proportion
+    return [low + (want - low) * room / more for low, want in zip(least, wanted, strict=True)]
 
 
 @cache

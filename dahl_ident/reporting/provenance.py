@@ -76,7 +76,7 @@ def listed_versions() -> str:
 
 def today() -> str:
     """Return date and time of day, with the offset to UTC."""
-    return datetime.datetime.now().astimezone().isoformat(timespec="minutes")
+    return datetime.datetime.now().astimezone().isoformat(" ", timespec="minutes")
 
 
 def parts(data: FrequencyResponse) -> list[Mapping[str, Any]]:

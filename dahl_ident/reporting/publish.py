@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,13 +17,16 @@ from dahl_ident.data import Record
 from dahl_ident.data.laboratory import Metadata, metadata_of
 from dahl_ident.data.storage import place_of, plain_data, refuse_existing, write_whole
 from dahl_ident.errors import DataError, ValidationError
-from dahl_ident.reporting.document import Document, Picture
+from dahl_ident.reporting.document import Block, Document, Picture
 from dahl_ident.reporting.html import html
 from dahl_ident.reporting.markdown import markdown
 from dahl_ident.reporting.overlay import overlay
 from dahl_ident.reporting.record_report import record_document
 from dahl_ident.reporting.sections import Result, document
 from dahl_ident.results import ChainPosterior, FitResult, RecordFit, RecordPosterior
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SCHEMA = 2  # of the JSON report: it rises when readers have to change
 _LONGEST_TITLE = 200  # characters
@@ -39,6 +43,7 @@ def report(
     record: Record | None = None,
     metadata: Mapping[str, Any] | str | Path | None = None,
     overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Write a report on one or several results.
 
@@ -52,7 +57,7 @@ def report(
         reported separately.
     path : path
         Ending in ``.html`` (one file, no network), ``.pdf``, ``.md`` (pictures in a folder
-        beside it) or ``.json``.
+        next to it) or ``.json``.
     title : str, optional
         First line; by default the file's name.
     command : str, optional
@@ -67,6 +72,8 @@ def report(
         counted: ``sensors=Sensors.from_metadata(metadata)``.
     overwrite : bool, default False
         Replace a report that is there already.
+    progress : callable, optional
+        Called with the number of pictures drawn and of all pictures.
 
     Returns
     -------
@@ -111,6 +118,8 @@ def report(
     else:
         whole = overlay(checked, title=title, command=command, metadata=known)
     whole = replace(whole.numbered(), title=_one_line(whole.title))
+    if progress is not None:
+        whole = _counted(whole, progress)
     kind = place.suffix.lower()
     if kind == ".md":
         folder = place.with_name(f"{place.stem}_pictures")
@@ -120,6 +129,26 @@ def report(
         content = _content(whole, kind)
     write_whole(place, content, overwrite=overwrite)
     return place
+
+
+def _counted(whole: Document, progress: Callable[[int, int], None]) -> Document:
+    """Return the document with pictures that tell when they are drawn."""
+    total, drawn = len(_pictures(whole)), iter(range(1, sys.maxsize))
+
+    def counted(block: Block) -> Block:
+        if not isinstance(block, Picture):
+            return block
+        draw = block.draw
+
+        def count() -> Figure:
+            figure = draw()
+            progress(min(next(drawn), total), total)
+            return figure
+
+        return replace(block, draw=count)
+
+    sections = (replace(s, blocks=tuple(map(counted, s.blocks))) for s in whole.sections)
+    return replace(whole, sections=tuple(sections))
 
 
 def _checked(results: list[Any]) -> list[Result]:

@@ -47,6 +47,7 @@ COVERAGE = (
     "The expanded uncertainty U is the combined standard uncertainty u times the coverage factor "
     f"k, for a coverage of about {percent(CONFIDENCE)}."
 )
+_MOST_FILES = 4  # lines of them before the signature
 _FRONT = ("response", "residuals")  # pictures before the details
 
 
@@ -168,6 +169,9 @@ def header(result: Result, given: Metadata) -> tuple[tuple[str, tuple[str, ...]]
     for source in provenance.sources(data):
         before = "" if source.read else "made from "
         files.append(f"{before}{source.file}, SHA-256 {short(source.sha256)}")
+    if len(files) > _MOST_FILES:
+        more = len(files) - _MOST_FILES + 1
+        files[_MOST_FILES - 1 :] = [f"and {more} more files, listed under Origin"]
     made_of = {
         "Model": tuple(_model(result)),
         "Data": (f"{data.n} rows", *files),
@@ -187,7 +191,8 @@ def _model(result: Result) -> Iterator[str]:
         f"{kind[0].upper()}{kind[1:]} friction" if element.has_memory else kind
         for kind, element in zip(kinds, elements, strict=True)
     ]
-    yield " + ".join(names)
+    if len(elements) > 1 or not elements[0].equation:
+        yield " + ".join(names)
     for name, element in zip(names, elements, strict=True):
         if element.equation:
             yield f"{name}: {element.equation}"
@@ -249,7 +254,7 @@ def _assumed(fit: FitResult) -> Iterator[Block]:
         ]
     if exact:
         lines.append(f"Taken as exact: {listed(exact)}.")
-    lines += [f"Prior of {name}: {given}." for name, given in tables.priors(fit).items()]
+    lines += [f"Prior of {name}: {given}." for name, given in tables.priors_in_words(fit)]
     lines.append(NOISE[fit.noise])
     lines += [f"{note[0].upper()}{note[1:]}." for note in provenance.notes(fit.data)]
     lines.append(f"Search: {fit.method}, loss {fit.optimum.loss}.")

@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, percent
-from dahl_ident.diagnostics.formatting import interval, rounded
+from dahl_ident.diagnostics.formatting import degrees_text, interval, rounded, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.diagnostics.verdicts import Verdict
 from dahl_ident.reporting.document import Cell, Table, number, words
 from dahl_ident.results.changes import is_usable
-from dahl_ident.units import si_unit
+from dahl_ident.units import prefix, si_unit
 
 if TYPE_CHECKING:
+    from dahl_ident.arrays import FloatArray
     from dahl_ident.data import FrequencyResponse
     from dahl_ident.diagnostics import ConfidenceIntervals
+    from dahl_ident.diagnostics.bands import DerivedQuantity
     from dahl_ident.diagnostics.budget import Budget
     from dahl_ident.diagnostics.comparison import ModelComparison
     from dahl_ident.results import FitResult
     from dahl_ident.results.chain_posterior import ChainPosterior
 
 _LARGEST = 3  # sources of uncertainty on the first page
+_NO_PART = 1e-6  # share of the variance that the details leave out: a thousandth of u
 _LINEARIZATION_ROWS = 9  # few enough to read, from the smallest amplitude to the largest
 
 
@@ -31,7 +34,13 @@ def answer(fit: FitResult, *, described: bool) -> Table:
     """Return every free parameter with its interval; unusable numbers are struck."""
     limits = fit.conf_interval().at(CONFIDENCE)
     rows = []
-    for name in fit.var_names:
+    for name, p in fit.params.items():
+        if (stated := assumed(fit, name)) is not None:
+            numbers = (Cell(text, struck=not described) for text in (*stated, "-"))
+            notes = words(p.unit or "-", p.description, "assumed; u counts it")
+            rows.append((Cell(name), *numbers, *notes))
+        if not p.vary:
+            continue
         estimate, judged = fit.params[name], fit.identifiability.parameters[name]
         value, error = rounded(estimate.value, estimate.stderr)
         lost = judged.verdict in (Verdict.WEAK, Verdict.NOT_IDENTIFIED)
@@ -63,6 +72,13 @@ def answer(fit: FitResult, *, described: bool) -> Table:
     crossed = any(cell.struck for row in rows for cell in row)
     hint = ". Numbers that are crossed out must not be used" if crossed else ""
     return Table(f"Estimates with their standard uncertainties{hint}", header, tuple(rows))
+
+
+def assumed(fit: FitResult, name: str) -> tuple[str, str] | None:
+    """Return value and uncertainty of a parameter that was not given, such as an exponent."""
+    if fit.errors is None or name not in fit.errors.assumed:
+        return None
+    return rounded(fit.errors.values[name], fit.errors.stderr[name])
 
 
 def uncertainty(found: Budget) -> Table:
@@ -99,11 +115,19 @@ def budget(found: Budget) -> Table:
         )  # fmt: skip
         rows += [
             (
-                Cell(p.name), Cell(row.source), Cell(row.kind), number(row.u, 2), Cell(unit),
-                _dof(row.dof), Cell(f"{100.0 * row.share:.0f} %", row.share), Cell("-"), Cell("-"),
+                Cell(p.name),
+                Cell(row.source),
+                Cell(row.kind),
+                _rounded(p.value, row.u),
+                Cell(unit),
+                _dof(row.dof),
+                Cell(f"{100.0 * row.share:.0f} %", row.share),
+                Cell("-"),
+                Cell("-"),
             )
             for row in p.rows
-        ]  # fmt: skip
+            if row.share > _NO_PART
+        ]
     header = (
         "parameter", "source", "type", "standard uncertainty u", "unit", "degrees of freedom",
         "share", "k", "U = k u",
@@ -114,17 +138,32 @@ def budget(found: Budget) -> Table:
 
 
 def _rounded(value: float, u: float) -> Cell:
-    """Return an uncertainty to two digits, written as beside its estimate."""
+    """Return an uncertainty to two digits, written to the same place as its estimate."""
     return Cell(rounded(value, u)[1], u)
 
 
 def _dof(dof: float) -> Cell:
-    return number(dof, 3) if np.isfinite(dof) else Cell("infinite")
+    return Cell(degrees_text([dof]), dof if np.isfinite(dof) else None)
 
 
 def priors(fit: FitResult) -> dict[str, str]:
     """Return the prior of each parameter that has one, as it is typed."""
     return {name: prior_text(given) for name, given in fit.problem.priors.items()}
+
+
+def priors_in_words(fit: FitResult) -> Iterator[tuple[str, str]]:
+    """Yield each parameter with a prior, and the prior as a reader of a certificate knows it."""
+    known: Mapping[str, Any] = fit.problem.priors
+    for name, given in known.items():
+        unit = fit.params[name].unit
+        if isinstance(given, tuple):
+            lower, upper = given
+            yield name, interval(lower, upper, unit)
+        elif given.dist.name == "norm":
+            mean, std = (float(value) for value in (given.mean(), given.std()))
+            yield name, f"normal, {with_unit(mean, std, unit)}"
+        else:
+            yield name, prior_text(given)
 
 
 def prior_text(given: Any) -> str:
@@ -153,6 +192,8 @@ def parameters(
             Cell(error if estimate.vary else "fixed", _finite(estimate.stderr), bad),
             Cell(estimate.unit or "-"),
         ]
+        if (stated := assumed(fit, name)) is not None:
+            row[1:3] = words(stated[0], f"{stated[1]}, assumed")
         for found in at:
             limits = found.get(name)
             shown = interval(limits.lower, limits.upper, "") if limits else "-"
@@ -188,15 +229,19 @@ def linearization(fit: FitResult) -> Table | None:
     A = fit.problem.stiffness_data.amplitude[fit.data.harmonic == 1]
     sizes = np.geomspace(A.min(), A.max(), _LINEARIZATION_ROWS)
     f = float(np.median(data.frequency_hz))
-    columns: dict[str, list[Cell]] = {
-        f"amplitude [{si_unit('displacement', data.motion)}]": [number(v) for v in sizes]
-    }
-    for found in fit.derived(sizes.tolist(), f):
-        if found.amplitude is not None:
-            value, error = rounded(found.value, found.stderr)
-            lost = fit.status is VerdictStatus.NOT_DESCRIBED
-            cell = Cell(f"{value} \u00b1 {error}", found.value, lost)
-            columns.setdefault(f"{found.name} [{found.unit}]", []).append(cell)
+    columns = dict([_column("amplitude", sizes, si_unit("displacement", data.motion))])
+    derived: dict[str, list[DerivedQuantity]] = {}
+    for quantity in fit.derived(sizes.tolist(), f):
+        if quantity.amplitude is not None:
+            derived.setdefault(quantity.name, []).append(quantity)
+    lost = fit.status is VerdictStatus.NOT_DESCRIBED
+    for name, along in derived.items():
+        power, unit = prefix([quantity.value for quantity in along], along[0].unit)
+        texts = (rounded(q.value / power, q.stderr / power) for q in along)
+        columns[f"{name} [{unit}]"] = [
+            Cell(f"{value} \u00b1 {error}", q.value / power, lost)
+            for (value, error), q in zip(texts, along, strict=True)
+        ]
     rows = tuple(zip(*columns.values(), strict=True))
     caption = f"Friction as an equivalent spring and damper (damping at {f:.4g} Hz)"
     return Table(caption, tuple(columns), rows)
@@ -228,8 +273,7 @@ def measured(data: FrequencyResponse) -> Table:
     for name, kind in (("amplitude", "displacement"), ("drive", "force")):
         values = getattr(data, name)
         if values is not None:
-            cells = [number(v) for v in values]
-            columns.append((f"{name} [{si_unit(kind, data.motion)}]", cells))
+            columns.append(_column(name, values, si_unit(kind, data.motion)))
     columns += [
         (f"gain [{data.unit}]", [number(v, 5) for v in data.gain]),
         ("phase [deg]", [number(v, 4) for v in np.degrees(data.phase)]),
@@ -254,10 +298,7 @@ def extraction(data: FrequencyResponse) -> Table:
     }
     columns = [
         ("frequency [Hz]", [number(v, 5) for v in points.frequency_hz]),
-        (
-            f"amplitude [{si_unit('displacement', points.motion)}]",
-            [number(v) for v in points.amplitude],
-        ),
+        _column("amplitude", points.amplitude, si_unit("displacement", points.motion)),
         ("cycles", [number(v) for v in quality["num_periods"]]),
         ("left out", [number(v) for v in quality["settling_periods"]]),
         ("cycles missing", [number(v) for v in quality["more_periods"]]),
@@ -265,6 +306,12 @@ def extraction(data: FrequencyResponse) -> Table:
         ("verdict", [Cell(str(v)) for v in quality["verdict"]]),
     ]
     return _of_columns("Quality of each point", columns)
+
+
+def _column(name: str, values: FloatArray, unit: str) -> tuple[str, list[Cell]]:
+    """Return a column of numbers with the prefix of its unit that suits them."""
+    power, unit = prefix(values, unit)
+    return f"{name} [{unit}]", [number(v / power) for v in values]
 
 
 def _of_columns(caption: str, columns: Sequence[tuple[str, Sequence[Cell]]]) -> Table:

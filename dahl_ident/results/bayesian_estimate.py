@@ -234,7 +234,7 @@ def posterior(
     if pool is not None and not callable(getattr(pool, "map", None)):
         raise ValidationError(f"pool is {pool!r}; expected an object with map, such as a Pool")
     one_of(uncertainty, "uncertainty", UNCERTAINTIES)
-    _refuse_beside_a_fit(data, options)
+    _refuse_with_a_fit(data, options)
     made: Callable[[Chain, Convergence, Settings], ChainPosterior | RecordPosterior]
     density: LogDensity
     if isinstance(data, FrequencyResponse | FitResult):
@@ -276,7 +276,7 @@ def _refuse_options(kind: str, options: Mapping[str, Any]) -> None:
         )
 
 
-def _refuse_beside_a_fit(data: object, options: Mapping[str, Any]) -> None:
+def _refuse_with_a_fit(data: object, options: Mapping[str, Any]) -> None:
     """Refuse what a fit has already."""
     if not isinstance(data, FitResult | RecordFit):
         return
@@ -285,8 +285,8 @@ def _refuse_beside_a_fit(data: object, options: Mapping[str, Any]) -> None:
     given += ["free"] if tuple(options["free"]) else []
     if given:
         raise ValidationError(
-            f"{', '.join(given)} is given beside a {type(data).__name__}, which has its own; pass "
-            "the data instead"
+            f"{', '.join(given)} is given together with a {type(data).__name__}, which has its "
+            "own; pass the data instead"
         )
 
 

@@ -217,7 +217,7 @@ def _no_prediction(optimum: Optimum) -> str:
     if (data.controlled == "force").any():
         cause = (
             "the drive moves the model without bound; add the mass, damper or spring that friction "
-            "stands beside, or give a start"
+            "is in parallel, or give a start"
         )
     return f"No parameters that were tried predict {name}: {cause}"
 

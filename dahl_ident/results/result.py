@@ -34,7 +34,7 @@ class Estimate:
     Attributes
     ----------
     name, unit, description : str
-        As declared beside the element; the unit is that of the data's motion.
+        As declared by the element; the unit is that of the data's motion.
     value : float
         The estimate, or the fixed value.
     stderr : float or None

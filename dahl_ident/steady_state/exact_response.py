@@ -97,10 +97,10 @@ def exact_motions(
             continue
         found = solved(rows, starts, **how)
         new = kept(rows, found)
-        beside = np.concatenate([rows[new] - 1, rows[new] + 1])
-        inside = (beside >= 0) & (beside < omega.size)
-        inside[inside] &= ~unique[beside[inside]]
-        fronts.append((beside[inside], np.tile(found.starts[new], (2, 1))[inside], directly))
+        nearby = np.concatenate([rows[new] - 1, rows[new] + 1])
+        inside = (nearby >= 0) & (nearby < omega.size)
+        inside[inside] &= ~unique[nearby[inside]]
+        fronts.append((nearby[inside], np.tile(found.starts[new], (2, 1))[inside], directly))
     wanted = [motions[point] for point in points]
     most = max(near.shape[1], *map(len, wanted))
     arrays = np.full((len(wanted), most, 3), np.nan, dtype=np.complex128)

@@ -65,7 +65,7 @@ class Mechanism:
         ------
         ModelError
             If no linear element bounds the motion, it grows without bound, or a law without closed
-            form stands beside no mass.
+            form is parallel to no mass.
         """
         if self.others:
             try:

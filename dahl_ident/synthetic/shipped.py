@@ -61,7 +61,7 @@ def load_dataset(name: str) -> FrequencyResponse | Record:
 
 
 def datasets_directory() -> Path:
-    """Return where the data sets lie: in an installed package, else beside a checkout's.
+    """Return where the data sets lie: in an installed package, else next to a checkout's.
 
     Raises
     ------

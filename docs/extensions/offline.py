@@ -1,7 +1,7 @@
 """A manual that needs no network: formulas as MathML, a search that shows where words stand.
 
 Sphinx's search fetches each page that it found, to quote from it, and a browser does not fetch
-pages that lie on a disk. So the text of all pages is written into one script beside the search. At
+pages that lie on a disk. So the text of all pages is written into one script next to the search. At
 the end it is checked that no page fetches anything from elsewhere.
 """
 

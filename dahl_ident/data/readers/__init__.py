@@ -78,7 +78,7 @@ def read_frequency_response(
         laws that do not depend on the rate.
     sweep : str, optional
         Frequencies of all rows, for a table without a column of them, as some analysers write it:
-        ``"1 to 100 Hz, log"`` or ``"0 to 800 Hz, linear"``.
+        ``"1:100Hz log"`` or ``"0:800Hz linear"``.
     amplitude, drive : str, optional
         One displacement (velocity, acceleration) or force amplitude for the whole file, such
         as ``"5 um rms"`` or ``"0.2 N"``. Braces are filled from the file's name: see
