@@ -17,6 +17,7 @@ TOPICS = (
     "hysteresis",
     "time_domain",
     "steady_state",
+    "error_bars",
     "reading",
     "extraction",
     "long_records",

@@ -20,6 +20,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element, linear_dahl
 from dahl_ident.fitting import solve, solve_many
 from dahl_ident.problem import Problem, ProblemBatch
+from dahl_ident.steady_state import Steady
 
 TITLE = "Least squares"
 
@@ -27,6 +28,7 @@ _POINTS, _TABLES, _NOISE = 30, 10_000, 0.02
 _TRUTH = np.array([0.1, 30.0])
 _AMPLITUDE = np.geomspace(1e-4, 1e-1, _POINTS)
 _PLANT_TRUTH = np.array([0.1, 30.0, 0.3, 0.24, 0.3])
+SINE: Steady = "describing function"
 _PLANT = Dahl() + Mass() + Damper() + Spring()
 _LEVELS, _FREQUENCIES = 12, 60
 _REPLICATES = 1000
@@ -162,7 +164,7 @@ def _plant() -> list[Row]:
     omega = 2.0 * np.pi * frequency
 
     def by_response(values: FloatArray) -> FloatArray:
-        predicted = response(_plant_of(values), frequency, drive).receptance
+        predicted = response(_plant_of(values), frequency, drive, steady=SINE).receptance
         return np.asarray(np.log(measured / predicted).view(np.float64))
 
     def by_brentq(values: FloatArray) -> FloatArray:
@@ -185,12 +187,12 @@ def _plant() -> list[Row]:
         return np.asarray(least_squares(residual, start, x_scale=start).x)
 
     def ours() -> FloatArray:
-        return solve(Problem(data, _PLANT)).values
+        return solve(Problem(data, _PLANT, steady=SINE)).values
 
     np.testing.assert_allclose(ours(), peer(by_response), rtol=1e-5)
     mine, theirs = median_of_pairs(ours, lambda: peer(by_response))
     slow = seconds(lambda: peer(by_brentq))
-    work = f"plant, {_LEVELS} levels x {_FREQUENCIES} frequencies"
+    work = f"plant, {_LEVELS} levels x {_FREQUENCIES} frequencies, describing function"
     return [
         Row(work, mine, theirs, "least_squares over response()", 4.0, faster=True),
         Row(work, mine, slow, "least_squares over brentq a point", 50.0, faster=True),

@@ -8,10 +8,12 @@ import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass
 
+_SIZE = ("size", "smaller")
+
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison: `ours` and `peer` for the same work, in seconds (or bytes, `unit` "B").
+    """One comparison: `ours` and `peer` for the same work, in seconds (or `unit` "B" or "%").
 
     `target` is the bound on the ratio ours/peer (at most), or on peer/ours where `faster`.
     """
@@ -79,8 +81,8 @@ def as_table(title: str, rows: list[Row]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        noun = "time" if row.unit == "s" else "size"
-        sign, unit = (">=", "x faster") if row.faster else ("<=", f"x the {noun}")
+        noun, less = {"s": ("time", "faster"), "%": ("width", "narrower")}.get(row.unit, _SIZE)
+        sign, unit = (">=", f"x {less}") if row.faster else ("<=", f"x the {noun}")
         lines.append(
             f"| {row.work} | {_pretty(row.ours, row.unit)} | {_pretty(row.peer, row.unit)} "
             f"| {row.peer_name} "
@@ -91,6 +93,8 @@ def as_table(title: str, rows: list[Row]) -> str:
 
 
 def _pretty(value: float, unit: str) -> str:
+    if unit == "%":
+        return f"{value:.2g} %"
     for factor, prefix in ((1e-6, "M"), (1e-3, "k"), (1.0, ""), (1e3, "m"), (1e6, "u")):
         if value * factor >= 1.0:
             return f"{value * factor:.3g} {prefix}{unit}"

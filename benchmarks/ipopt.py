@@ -29,7 +29,7 @@ def problem(alpha: float | None = 1.0) -> Problem:
     frequency = np.tile(np.geomspace(0.03, 3.0, FREQUENCIES), LEVELS)
     rng = np.random.default_rng(1)
     error = 0.02 * (rng.standard_normal(drive.size) + 1j * rng.standard_normal(drive.size))
-    measured = response(plant, frequency, drive, steady=SINE).receptance * np.exp(error)
+    measured = response(plant, frequency, drive).receptance * np.exp(error)
     data = FrequencyResponse(
         frequency, measured, drive=drive, controlled="force", quantity="receptance"
     )
