@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import partial
 from typing import Any
 
 import control
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring
@@ -21,6 +23,7 @@ from dahl_ident.synthetic.mechanism import Mechanism
 from dahl_ident.synthetic.waveform import WaveformBuilder
 
 s = control.tf("s")
+described = partial(limit_cycles, steady="describing function")
 FRICTION = Dahl(1.0, 1e4)
 
 
@@ -84,7 +87,7 @@ GRIP = Dahl(0.1, 30.0)
 
 
 def test_disturbances_die_at_the_predicted_rate() -> None:
-    cycle = limit_cycles(ACTIVE, GRIP)[0]
+    cycle = described(ACTIVE, GRIP)[0]
     time, x = turning_points(ACTIVE, GRIP, 0.002, cycle.frequency_hz, 24.0)
     size, when = swing(x), time[1:]
     settled = size[-10:].mean()
@@ -126,6 +129,64 @@ def test_too_much_integral_action_is_held_by_friction_up_to_a_size(
         assert size.max(initial=0.0) < 1e-6 * cycle.amplitude
 
 
+def swings(speed: float, duration: float) -> tuple[FloatArray, FloatArray]:
+    """Return times and displacements of the reversals of ACTIVE with GRIP, kicked from rest."""
+
+    def rates(t: float, y: FloatArray) -> list[float]:
+        x, v, F = y
+        return [v, (0.3 * v - 0.3 * x - F) / 0.3, 30.0 * v * (1.0 - np.sign(v) * F / 0.1)]
+
+    def turns(t: float, y: FloatArray) -> float:
+        return float(y[1])
+
+    def far(t: float, y: FloatArray) -> float:
+        return abs(y[0]) - 1.0
+
+    far.terminal = True  # type: ignore[attr-defined]
+    found = solve_ivp(
+        rates, (0.0, duration), [0.0, speed, 0.0], "DOP853", events=[turns, far], rtol=1e-10,
+        atol=1e-12, max_step=0.05,
+    )  # fmt: skip
+    assert found.t_events is not None
+    assert found.y_events is not None
+    return found.t_events[0], found.y_events[0][:, 0]
+
+
+class TestExactCycles:
+    def test_the_stable_one_is_where_a_kick_ends(self) -> None:
+        cycle = limit_cycles(ACTIVE, GRIP)[0]
+        time, x = swings(0.01, 120.0)
+        assert swing(x)[-6:] == pytest.approx(np.full(6, swing(x)[-1]), rel=1e-3)
+        assert 0.5 / np.diff(time)[-6:].mean() == pytest.approx(cycle.frequency_hz, rel=1e-4)
+        assert swing(x)[-1] == pytest.approx(cycle.amplitude, rel=4.0 * cycle.share)
+
+    def test_the_unstable_one_parts_rest_from_runaway(self) -> None:
+        """The describing function's is 10 % smaller and 5 % faster than the motion in between."""
+        low, high = 0.1, 1.0
+        for _ in range(24):
+            kick = 0.5 * (low + high)
+            runs_away = np.abs(swings(kick, 40.0)[1][-1]) > 0.5
+            low, high = (low, kick) if runs_away else (kick, high)
+        cycle = limit_cycles(ACTIVE, GRIP)[1]
+        time, x = swings(low, 20.0)
+        assert not cycle.stable
+        assert 0.5 / np.diff(time)[1:4].mean() == pytest.approx(cycle.frequency_hz, rel=2e-3)
+        assert swing(x)[1:4].mean() == pytest.approx(cycle.amplitude, rel=cycle.share)
+        assert described(ACTIVE, GRIP)[1].amplitude < 0.92 * swing(x)[1:4].mean()
+
+    def test_limits_that_differ_give_a_mean_and_even_harmonics(self) -> None:
+        uneven = Dahl(0.1, 30.0, asymmetry=0.3)
+        even = limit_cycles(ACTIVE, GRIP)[0]
+        cycle = limit_cycles(ACTIVE, uneven)[0]
+        assert cycle.stable
+        assert cycle.share > 2.0 * even.share
+
+    def test_loops_without_an_equation_of_motion_say_so(self) -> None:
+        sampled = limit_cycles(control.c2d(control.ss(HUNTING), 1e-3, "tustin"), FRICTION)
+        assert "no equation of motion in continuous time" in sampled.approximate
+        assert limit_cycles(HUNTING, FRICTION).approximate == ""
+
+
 def test_negative_damping_against_the_closed_form() -> None:
     """m omega^2 = k + Re N(A) and c omega = Im N(A), one unknown after the other."""
 
@@ -134,7 +195,7 @@ def test_negative_damping_against_the_closed_form() -> None:
         return N.imag - 0.3 * float(np.sqrt((0.3 + N.real) / 0.3))
 
     roots = [np.exp(brentq(loss, *pair, xtol=1e-14)) for pair in ((-12.0, -5.0), (-5.0, 3.0))]
-    cycles = limit_cycles(ACTIVE, GRIP)
+    cycles = described(ACTIVE, GRIP)
     assert [c.amplitude for c in cycles] == pytest.approx(roots, rel=1e-9)
     assert [c.stable for c in cycles] == [True, False]
 
@@ -158,9 +219,9 @@ def test_pid_loops_follow_routh(
     calm = pid_loop(proportional, limit / (1.0 + excess), derivative)
     sigma = stuck * excess * proportional
     friction = Dahl(1.0, sigma)
-    assert limit_cycles(calm, friction) == ()
+    assert described(calm, friction) == ()
     restless = pid_loop(proportional, limit * (1.0 + excess), derivative)
-    (cycle,) = limit_cycles(restless, friction)
+    (cycle,) = described(restless, friction)
     assert not cycle.stable
     value = complex(restless(1j * cycle.omega)) * complex(
         friction.dynamic_stiffness(cycle.amplitude)
@@ -210,7 +271,7 @@ def test_cycles_are_where_roots_pass_the_axis(loop: Any, friction: Element) -> N
 
 
 def test_every_kind_of_system_has_the_same_cycle() -> None:
-    (cycle,) = limit_cycles(HUNTING, FRICTION)
+    (cycle,) = described(HUNTING, FRICTION)
     omega = np.geomspace(1.0, 1000.0, 900)
     for loop in (
         control.ss(HUNTING),
@@ -218,12 +279,12 @@ def test_every_kind_of_system_has_the_same_cycle() -> None:
         LinearSystem(HUNTING * s, quantity="mobility"),
         LinearSystem(1 / HUNTING, quantity="dynamic_stiffness"),
     ):
-        (same,) = limit_cycles(loop, FRICTION)
+        (same,) = described(loop, FRICTION)
         assert same.amplitude == pytest.approx(cycle.amplitude, rel=1e-4)
         assert same.frequency_hz == pytest.approx(cycle.frequency_hz, rel=1e-6)
         assert same.growth_rate == pytest.approx(cycle.growth_rate, rel=1e-3)
-    assert limit_cycles(HUNTING, FRICTION, frequency_range_hz=(20.0, 1e3)) == ()
-    assert limit_cycles(control.frd(HUNTING, omega[omega < 50.0]), FRICTION) == ()
+    assert described(HUNTING, FRICTION, frequency_range_hz=(20.0, 1e3)) == ()
+    assert described(control.frd(HUNTING, omega[omega < 50.0]), FRICTION) == ()
 
 
 def test_delay_brings_hunting_as_its_pade_approximation_says() -> None:
@@ -231,23 +292,23 @@ def test_delay_brings_hunting_as_its_pade_approximation_says() -> None:
     delay, pid = 0.02, 100 + 20 * s
     omega = np.geomspace(1.0, 2000.0, 3000)
     exact = 1.0 / (-(omega**2) + pid(1j * omega) * np.exp(-1j * omega * delay))
-    (cycle,) = limit_cycles(control.frd(exact, omega), FRICTION)
+    (cycle,) = described(control.frd(exact, omega), FRICTION)
     pade = control.tf(*control.pade(delay, 5))
-    (approximate,) = limit_cycles(control.feedback(1 / s**2, pid * pade), FRICTION)
+    (approximate,) = described(control.feedback(1 / s**2, pid * pade), FRICTION)
     assert cycle.stable
     assert approximate.amplitude == pytest.approx(cycle.amplitude, rel=1e-4)
     assert approximate.frequency_hz == pytest.approx(cycle.frequency_hz, rel=1e-6)
 
 
 def test_discrete_loop_nears_its_continuous_origin() -> None:
-    (cycle,) = limit_cycles(HUNTING, FRICTION)
-    (sampled,) = limit_cycles(control.c2d(control.ss(HUNTING), 1e-3, "tustin"), FRICTION)
+    (cycle,) = described(HUNTING, FRICTION)
+    (sampled,) = described(control.c2d(control.ss(HUNTING), 1e-3, "tustin"), FRICTION)
     assert sampled.amplitude == pytest.approx(cycle.amplitude, rel=1e-3)
     assert sampled.stable
 
 
 def test_python_control_finds_the_same_crossings() -> None:
-    cycles = limit_cycles(ACTIVE, GRIP)
+    cycles = described(ACTIVE, GRIP)
     theirs = control.describing_function_response(
         control.tf([1.0], [0.3, -0.3, 0.3]), FrictionNonlinearity(GRIP),
         np.geomspace(1e-4, 1.0, 200), np.geomspace(0.3, 30.0, 800), refine=False,
@@ -258,7 +319,7 @@ def test_python_control_finds_the_same_crossings() -> None:
 
 
 def test_loebs_criterion_is_the_sign_of_the_growth_rate() -> None:
-    for cycle in limit_cycles(ACTIVE, GRIP):
+    for cycle in described(ACTIVE, GRIP):
         slope = complex(GRIP.gradient(cycle.amplitude, ["amplitude"])["amplitude"])
         by_omega = -2.0 * 0.3 * cycle.omega - 0.3j
         loeb = slope.real * by_omega.imag - by_omega.real * slope.imag

@@ -6,7 +6,9 @@ fundamental of a free oscillation x = A cos(omega t) is balanced if
     1 + H(j omega) N(A) = 0,    or    L(omega) + N(A) = 0 with L = 1/H, a dynamic stiffness.
 
 Both curves, -L over frequency and N over amplitude, are drawn in logarithmic polar coordinates,
-where they are smooth and even; their crossings start Newton's method in (ln A, ln omega).
+where they are smooth and even; their crossings start Newton's method in (ln A, ln omega). From
+each crossing the exact periodic motion is found by shooting
+(:mod:`dahl_ident.control_interop.free_motion`).
 Since Im N > 0, only an active loop, one with Im L < 0 at some frequency, can oscillate.
 
 A disturbance dA of the amplitude moves the root by ds = -N'(A) dA/L'(s), so dA grows
@@ -22,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
+from dahl_ident.control_interop.free_motion import free_motion
 from dahl_ident.control_interop.linear_part import (
     coefficients,
     has_polynomials,
@@ -32,6 +35,7 @@ from dahl_ident.control_interop.nonlinearity import friction_and_slope, friction
 from dahl_ident.elements.element import Element, Model, as_model
 from dahl_ident.elements.linear_system import LinearSystem, check_system
 from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.steady_state import Steady, obstacle
 
 _AMPLITUDES_PER_DECADE = 60  # 4 % apart: N is smooth, and crossings are sought between
 _FREQUENCIES_PER_DECADE = 400  # 0.6 % apart; sharper resonances get more of their own
@@ -46,16 +50,20 @@ _RESIDUAL = 1e-6  # of ln(-L/N): where Newton's method converges, far less is le
 
 @dataclass(frozen=True)
 class LimitCycle:
-    """A free oscillation x = A cos(omega t) of a loop with friction.
+    """A free oscillation of a loop with friction.
 
     Attributes
     ----------
     amplitude : float
-        Zero-to-peak displacement A, m (rad in rotation).
+        Zero-to-peak amplitude of the displacement's fundamental, m (rad in rotation).
     frequency_hz : float
         Hz.
     growth_rate : float
-        Rate at which a small disturbance of the amplitude grows, 1/s; negative where it decays.
+        Rate at which the worst small disturbance grows, 1/s; negative where all decay. Of the
+        describing function: a disturbance of the amplitude.
+    share : float
+        Root sum of squares of the displacement's mean and harmonics 2 to 9 over its fundamental;
+        0 of the describing function, which takes the motion for a sine.
 
     Examples
     --------
@@ -67,6 +75,7 @@ class LimitCycle:
     amplitude: float
     frequency_hz: float
     growth_rate: float
+    share: float = 0.0
 
     @property
     def omega(self) -> float:
@@ -75,12 +84,14 @@ class LimitCycle:
 
     @property
     def stable(self) -> bool:
-        """Whether the oscillation is stable (Loeb's criterion)."""
-        return self.growth_rate < 0.0
+        """Whether no small disturbance of the oscillation grows."""
+        return self.growth_rate <= 0.0
 
 
 class LimitCycles(tuple[LimitCycle, ...]):
     """Limit cycles by rising amplitude; where there is none, `reason` says why.
+
+    `approximate` says why they are those of the describing function, where they are.
 
     Examples
     --------
@@ -90,6 +101,7 @@ class LimitCycles(tuple[LimitCycle, ...]):
     """
 
     reason: str = ""
+    approximate: str = ""
 
     def __repr__(self) -> str:
         return super().__repr__() if self else f"no limit cycle: {self.reason}"
@@ -100,8 +112,9 @@ def limit_cycles(
     friction: Element,
     *,
     frequency_range_hz: tuple[float, float] | None = None,
+    steady: Steady = "exact",
 ) -> LimitCycles:
-    """Return every solution of 1 + H(j omega) N(A) = 0 with its stability.
+    """Return the free oscillations near every solution of 1 + H(j omega) N(A) = 0.
 
     Parameters
     ----------
@@ -114,6 +127,10 @@ def limit_cycles(
     frequency_range_hz : (float, float), optional
         Range of the search, Hz. By default three decades beyond all poles and zeros of H and of the
         loop closed by sigma; for an FRD its own range, for a discrete loop up to half its rate.
+    steady : {"exact", "describing function"}, default "exact"
+        "exact": the periodic motion itself, with all harmonics, by shooting from each solution. A
+        loop that has no equation of motion (an FRD, a discrete or delayed one) keeps the
+        describing function's.
 
     Returns
     -------
@@ -131,16 +148,16 @@ def limit_cycles(
     Notes
     -----
     Describing functions assume that x is nearly a sine about zero; they are accurate where H falls
-    steeply with frequency. They do not apply to motions with long rests, such as slow stick-slip
-    caused by integrator wind-up; where such rests occur, an unstable cycle can lie at less than
-    half the amplitude given here.
+    steeply with frequency. Motions with long rests, such as slow stick-slip caused by integrator
+    wind-up, are far from that: an exact unstable cycle can lie at less than half the amplitude of
+    the describing function, and cycles far from any solution of it are not found.
 
     Two cycles closer to each other than the grid, 4 % in amplitude and 0.6 % in frequency, may be
     missed, and so may any below 1e-6 of the smallest or above 1e8 of the largest characteristic
     displacement.
 
-    The stability refers to the amplitude of the oscillation (Loeb's criterion); another mode of the
-    loop can still be unstable.
+    Stability is that of Floquet's multipliers; with the describing function it refers to the
+    amplitude of the oscillation alone (Loeb's criterion), and another mode can still be unstable.
 
     Examples
     --------
@@ -169,7 +186,26 @@ def limit_cycles(
         cycle = _refine(linear, as_model(friction), A[j], omega[i])
         if cycle is not None and omega[0] <= cycle.omega <= omega[-1]:
             found.append(cycle)
-    cycles = LimitCycles(_distinct(found))
+    plant = Model(*linear.elements, *as_model(friction).elements)
+    approximate = obstacle(plant) if steady == "exact" else "as asked for"
+    if not approximate:
+        motions = (free_motion(plant, c.amplitude, c.omega) for c in _distinct(found))
+        exact = [
+            LimitCycle(m.amplitude, m.omega / (2.0 * np.pi), m.growth_rate, m.share)
+            for m in motions
+            if m is not None
+        ]
+        cycles = LimitCycles(_distinct(exact))
+        if found and not cycles:
+            one = _distinct(found)[0]
+            cycles.reason = (
+                f"the describing function has one of {one.amplitude:.3g} m at "
+                f"{one.frequency_hz:.3g} Hz, but no periodic motion is near it"
+            )
+            return cycles
+    else:
+        cycles = LimitCycles(_distinct(found))
+        cycles.approximate = approximate
     if not cycles:
         ends = " to ".join(f"{w / (2.0 * np.pi):.3g}" for w in (omega[0], omega[-1]))
         cycles.reason = f"from {ends} Hz, -1/H meets friction's N(A) at no amplitude"

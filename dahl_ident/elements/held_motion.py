@@ -117,4 +117,6 @@ def _along(
         samples, np.array([corners[0], 0.0, *states]), np.asarray(values, dtype=np.float64),
         chosen=chosen or (), derivatives=chosen is not None,
     )  # fmt: skip
-    return Motion(*(part[back[1:]] for part in found))
+    rows = back[1:]
+    output, by_first, by_parameter, states = (part[rows] for part in found[:-1])
+    return Motion(output, by_first, by_parameter, states, found.map)

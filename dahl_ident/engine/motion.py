@@ -60,12 +60,15 @@ class Motion(NamedTuple):
         Derivatives of the output with respect to the first state.
     by_parameter : ndarray, shape (n, chosen)
     states : ndarray, shape (n, order)
+    map : ndarray, shape (order, order)
+        Derivatives of the last state with respect to the first.
     """
 
     output: FloatArray
     by_first: FloatArray
     by_parameter: FloatArray
     states: FloatArray
+    map: FloatArray
 
 
 def settled(
@@ -151,7 +154,7 @@ def march(
     FitError
         If the motion grows beyond all bounds.
     """
-    found, output, by, states = kernels("samples").march(
+    found, output, by, states, last = kernels("samples").march(
         system.function, system.sizes, system.solved, system.followers, _numbers(knots),
         _numbers(coefficients), _numbers(samples), _numbers(first), _numbers(parameters),
         np.asarray(chosen, dtype=np.int64), int(derivatives), _SAMPLED,
@@ -161,7 +164,7 @@ def march(
             f"the motion grows beyond all bounds at the parameters {parameters.tolist()}"
         )
     n = system.order
-    return Motion(output, by[:, :n], by[:, n + 1 :], states)
+    return Motion(output, by[:, :n], by[:, n + 1 :], states, last[:, :n])
 
 
 def _numbers(array: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ NUMBERS, VECTOR, MATRIX = int64[::1], float64[::1], float64[:, ::1]
 
 
 @njit(
-    types.Tuple((int64, VECTOR, MATRIX, MATRIX))(
+    types.Tuple((int64, VECTOR, MATRIX, MATRIX, MATRIX))(
         FUNCTION, NUMBERS, NUMBERS, NUMBERS, VECTOR, MATRIX, VECTOR, VECTOR, VECTOR, NUMBERS,
         int64, float64,
     ),
@@ -24,6 +24,8 @@ def march(
     f, sizes, solved, followers, knots, coefficients, samples, first, p, chosen, initial, tolerance
 ):
     """Return whether the motion was found, output at the samples, its derivatives, the states.
+
+    Last are the derivatives of the state at the last sample.
 
     The signal is polynomials between knots. Derivatives with respect to the initial states, where
     `initial` is 1, and the parameters `chosen`; one column between them is zero.
@@ -47,4 +49,4 @@ def march(
         np.empty(0), np.empty((0, 1 + q), dtype=np.complex128), samples, output, by, path, w, at,
         matrix, columns,
     )  # fmt: skip
-    return int(done > 0.0), output, by, path
+    return int(done > 0.0), output, by, path, S
