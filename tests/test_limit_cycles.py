@@ -140,7 +140,7 @@ def swings(speed: float, duration: float) -> tuple[FloatArray, FloatArray]:
         return float(y[1])
 
     def far(t: float, y: FloatArray) -> float:
-        return abs(y[0]) - 1.0
+        return float(abs(y[0]) - 1.0)
 
     far.terminal = True  # type: ignore[attr-defined]
     found = solve_ivp(
