@@ -62,7 +62,7 @@ Rho = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
 
 NOISE_MODELS = ("measured", "relative", "absolute")
 
-_ROUNDING = 2.0**-46  # relative rounding error of a response when its residual is computed
+ROUNDING = 2.0**-46  # relative rounding error of a response when its residual is computed
 _GAUSSIAN = 1e15  # degrees of freedom at which the loss is z to rounding
 _AMPLITUDE_STEPS = 40  # a limit for iterations that do not settle
 _AMPLITUDE_TOLERANCE = 1e-10  # of the amplitude's standard deviation
@@ -121,7 +121,7 @@ class Relative(Noise):
     @property
     def rounding(self) -> FloatArray:
         """Rounding error of a logarithm."""
-        return np.asarray(_ROUNDING)
+        return np.asarray(ROUNDING)
 
     def residual(self, predicted: ComplexArray) -> ComplexArray:
         """Return ln(R/R_model), or the scaled difference in rows of harmonics."""
@@ -165,7 +165,7 @@ class Absolute(Noise):
     @property
     def rounding(self) -> FloatArray:
         """Rounding error of the responses' root mean square."""
-        return np.asarray(_ROUNDING * np.sqrt(np.mean(np.abs(self.response) ** 2, axis=-1)))
+        return np.asarray(ROUNDING * np.sqrt(np.mean(np.abs(self.response) ** 2, axis=-1)))
 
     def residual(self, predicted: ComplexArray) -> ComplexArray:
         """Return R - R_model."""

@@ -745,6 +745,9 @@ def test_outlying_devices_are_found_and_false_alarms_are_rare() -> None:
     table, _ = simulated(7, 30, 1, slope=0.0, tau=0.03, omega=0.0, u=0.01)
     table.loc[[4, 9], "f_max"] *= [1.4, 0.7]
     assert population(table)["f_max"].outlying == ("d004", "d009")
+    told = str(population(table)["f_max"])
+    assert told.startswith("f_max: mean ")
+    assert told.endswith("outside the population: d004, d009")
 
 
 def test_control_charts_alarm_at_a_drift_and_seldom_without() -> None:

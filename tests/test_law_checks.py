@@ -44,6 +44,9 @@ SOUND: dict[str, Slope] = {
         p[1] * np.sign(1.0 - d * F / p[0]) * np.abs(1.0 - d * F / p[0]) ** 0.5
     ),
     "no full slip": lambda _, F, d, v, p: p[1] / (1.0 + np.abs(F / p[0]) * (1.0 + d * np.sign(F))),
+    "overflows far beyond slip": lambda _, F, d, v, p: (
+        p[1] * (1.0 - d * F / p[0]) * np.exp(-0.7 * d * F / p[0])
+    ),
 }
 
 WRONG: dict[str, tuple[Slope, str]] = {

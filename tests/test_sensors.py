@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring
+from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring, fit
 from dahl_ident.errors import ValidationError
 from dahl_ident.problem import Problem
 
@@ -100,3 +100,16 @@ def test_an_unknown_gain_leaves_one_friction_parameter() -> None:
         only_f_max = by_motion.to_search([0.1, 30.0 * factor, factor])
         assert np.abs(by_force.residuals(only_x_c)).max() < 1e-13
         assert np.abs(by_motion.residuals(only_f_max)).max() < 1e-13
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-12, 1e-8])
+def test_a_calibration_counts_however_small_the_noise(noise: float) -> None:
+    A = np.geomspace(1e-4, 3e-2, 30)
+    error = 1.0 + noise * np.random.default_rng(0).standard_normal(30)
+    table = FrequencyResponse(np.ones(30), Dahl(0.1, 30.0).describing_function(A) * error, A)
+    gains = {"force_gain": stats.norm(1, 0.0025), "displacement_gain": stats.norm(1, 0.001)}
+    found = fit(table, Dahl(alpha=1.0), sensors=Sensors(**gains))
+    assert found.trusted
+    # F = g_F f_max h(g_x x): f_max has the force's error, sigma that of both
+    assert found.params["f_max"].stderr == pytest.approx(0.1 * 0.0025, rel=1e-2)
+    assert found.params["sigma"].stderr == pytest.approx(30.0 * np.hypot(0.0025, 0.001), rel=1e-2)

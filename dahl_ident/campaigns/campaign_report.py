@@ -144,10 +144,10 @@ def _blocks(p: PopulationParameter) -> Iterator[Block]:
     ]
     yield Table(
         f"{measured} at the mean of the covariates, and its change per unit of each",
-        ("", "value", "standard uncertainty"),
+        ("coefficient", "value", "standard uncertainty"),
         tuple(rows),
     )
-    yield Table(f"Scatter of {measured}", ("", "median", "2.3 %", "97.7 %"), tuple(spread))
+    yield Table(f"Scatter of {measured}", ("source", "median", "2.3 %", "97.7 %"), tuple(spread))
 
     def devices() -> object:
         from dahl_ident.plots import plot_devices

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy import optimize, stats
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.formatting import interval, with_unit
 from dahl_ident.errors import DataError, ValidationError
 
 if TYPE_CHECKING:
@@ -157,6 +158,25 @@ class PopulationParameter:
         """Population mean (the median of a logarithmic one) and its standard uncertainty."""
         value, u = self.coefficients["mean"]
         return (float(np.exp(value)), float(np.exp(value) * u)) if self.logarithmic else (value, u)
+
+    def __str__(self) -> str:
+        value, u = self.mean
+        lines = [f"{self.name}: mean {with_unit(value, u, self.unit)}"]
+        what = f"ln {self.name}" if self.logarithmic else self.name
+        lines += [
+            f"change of {what} per unit of {name}: {with_unit(b, error, '')}"
+            for name, (b, error) in self.coefficients.items()
+            if name != "mean"
+        ]
+        unit = "" if self.logarithmic else self.unit
+        for where, (median, low, high) in (
+            ("devices", self.between_devices), ("runs", self.between_runs)
+        ):  # fmt: skip
+            if high > 0.0:
+                limits = interval(low, high, unit)
+                lines.append(f"scatter of {what} between {where}: {median:.2g} ({limits})")
+        lines.append(f"outside the population: {', '.join(self.outlying) or 'no device'}")
+        return "\n".join(lines)
 
     @property
     def outlying(self) -> tuple[str, ...]:

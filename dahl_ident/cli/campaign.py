@@ -131,6 +131,16 @@ def _check_report(
         texts = [v for task in read.tasks if isinstance(v := task.covariates[column], str)]
         if texts:
             raise ValidationError(f"--covariate {column} is {texts[0]!r}; expected numbers")
+    unused = sorted(
+        name
+        for name in known - set(covariates)
+        if name != order and all(not isinstance(task.covariates[name], str) for task in read.tasks)
+    )
+    if unused:
+        console.note(
+            f"the report does not use {', '.join(unused)}; --covariate {unused[0]} states how "
+            "parameters depend on it"
+        )
 
 
 def _lines() -> Callable[[int, int, Mapping[str, Any]], None]:

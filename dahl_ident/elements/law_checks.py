@@ -325,7 +325,8 @@ class _Trial:
         found = []
         for row in range(self._count):
             slopes = np.concatenate([wide[row] for wide in self._wide])
-            same = np.ptp(slopes) <= _ROUNDING * np.max(np.abs(slopes))
+            slopes = slopes[np.isfinite(slopes)]  # forces far beyond full slip may overflow
+            same = bool(slopes.size) and np.ptp(slopes) <= _ROUNDING * np.max(np.abs(slopes))
             found.append(
                 f"is {slopes[0]:.4g} N/m for every force and direction: a constant number, which "
                 "is a spring without friction; expected a slope that depends on force and "

@@ -19,7 +19,7 @@ from dahl_ident.data.tabular import assumes_frequency
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import DataError, ModelError, ValidationError
-from dahl_ident.noise import Measured, Rho, bend, correct_amplitude, noise_for
+from dahl_ident.noise import ROUNDING, Measured, Rho, bend, correct_amplitude, noise_for
 from dahl_ident.problem.coordinates import (
     Coordinates,
     Interchangeable,
@@ -38,6 +38,10 @@ _Kind = TypeVar("_Kind", bound="Problem")
 
 EXPLICIT = 1e-13
 """Relative error of predictions in closed form or by roots."""
+
+_LOST = 2e-6
+"""Noise of the data's mean over that of a calibration, below which its part of the information
+(1e-12 of it, as a square) is near rounding."""
 
 
 class Quadratic(NamedTuple):
@@ -426,8 +430,13 @@ class Problem:
 
     @property
     def rounding(self) -> FloatArray:
-        """Size of residuals that may be rounding errors alone; no estimated scale is smaller."""
-        return np.asarray(self._noise.rounding * max(1.0, self.accuracy / EXPLICIT))
+        """Size of residuals that may be rounding errors alone; no estimated scale is smaller.
+
+        Nor is it so small that rounding of the information loses what calibrations say of gains.
+        """
+        widths = [float(p.std()) for name, p in self.priors.items() if name.endswith("_gain")]
+        known = _LOST * max(widths, default=0.0) * len(self.data) ** 0.5 / ROUNDING
+        return np.asarray(self._noise.rounding * max(1.0, self.accuracy / EXPLICIT, known))
 
     @property
     def accuracy(self) -> float:

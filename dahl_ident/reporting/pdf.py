@@ -39,6 +39,7 @@ _HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; space kept below a heading or a 
 _LONGEST = 60  # characters of a title at the foot of a page
 _WHOLE = 20.0  # mm, of a paragraph that is not divided between pages
 _WIDEST = 75.0  # mm, of a column of a table
+_UNDIVIDED = 60.0  # mm, of a table that is not divided between pages
 _PADDING = 3.5  # mm, on both sides of a column's text
 _NAME_WIDTH = 38.0  # mm, of the fields' names in the header
 _COLOURS = {
@@ -73,8 +74,13 @@ def pdf(document: Document) -> bytes:
         if not section.blocks:
             continue
         page.ln(3)
-        begins_drawn = isinstance(section.blocks[0], Picture)
-        below = _row_height(pictures[:2]) if begins_drawn else _BEGINNING
+        match section.blocks[0]:
+            case Picture():
+                below = _row_height(pictures[:2])
+            case Table() as table:
+                below = _beginning(page, table, _widths(page, table))
+            case _:
+                below = _BEGINNING
         _turn_unless_room(page, _HEADING_HEIGHT + below)
         page.start_section(section.title)
         _heading(page, section.title, 2)
@@ -219,8 +225,7 @@ def _turn_unless_room(page: FPDF, height: float) -> None:
 
 def _table(page: FPDF, table: Table) -> None:
     widths = _widths(page, table)
-    beginning = [words(*table.header), *table.rows[:1]]
-    _turn_unless_room(page, _CAPTION_HEIGHT + sum(_height(page, row, widths) for row in beginning))
+    _turn_unless_room(page, _beginning(page, table, widths))
     page.set_font(_FONT, "B", 9.5)
     _text(page, table.caption)
     page.set_font(_FONT, "", 7.5)
@@ -296,6 +301,12 @@ class _Structure(StructureTreeBuilder):
                 document.k.append(element)
         yield from (self.struct_tree_root, *groups, self.struct_tree_root.parent_tree)
         yield from self.doc_struct_elem.k
+
+
+def _beginning(page: FPDF, table: Table, widths: Sequence[float]) -> float:
+    """Return the height of a table that must not be divided, else of its first row."""
+    heights = [_height(page, row, widths) for row in (words(*table.header), *table.rows)]
+    return _CAPTION_HEIGHT + sum(heights if sum(heights) < _UNDIVIDED else heights[:2])
 
 
 def _height(page: FPDF, row: Sequence[Cell], widths: Sequence[float]) -> float:

@@ -140,7 +140,9 @@ def _force(law: Law, i: int, v: str) -> str:
 def matlab(result: Any) -> str:
     """Return a script that makes a struct: values, uncertainties, covariance, equations."""
     lines = [f"% the fit is {result.status.value}"]
-    lines += [f"% {e.kind}: {e.equation}" for e in result.model.elements if hasattr(e, "equation")]
+    lines += [
+        f"% {e.kind}: {e.equation}" for e in result.model.elements if getattr(e, "equation", "")
+    ]
     held = {p.name: p.value for p in result.model.parameters}
     for name, p in result.params.items():
         value = held.get(name, p.value)
