@@ -1,4 +1,4 @@
-"""Sweeps of driven plants that scipy integrated: trusted, and the truth inside the intervals.
+"""Sweeps of driven plants: trusted, the truth inside the intervals, on the branch measured.
 
 ``python -m benchmarks.driven_plants`` does the same for ten plants, with more tables and rows.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import dahl_ident as di
 from benchmarks.driven_plants import PLANTS, scored, simulated, table
 
 
@@ -22,3 +23,35 @@ def test_a_sweep_of_another_integrator_is_trusted(number: int) -> None:
     assert score.inside >= score.intervals - 1
     assert abs(np.mean(score.errors)) < 1.0
     assert max(score.spreads) < 0.1
+
+
+@pytest.mark.parametrize("upwards", [True, False])
+def test_a_jump_is_fitted_on_the_branch_that_was_measured(upwards: bool) -> None:
+    """A gap stiffens the plant: swept upwards the large motion lasts, downwards the small one."""
+    known = di.Mass(0.3) + di.Spring(3.0)
+    law = di.Backlash(di.Dahl(2.0, 60.0, alpha=1.0), gap=0.02)
+    frequency = np.linspace(0.8, 1.5, 9)
+    motions = di.response(law + known + di.Damper(0.12), frequency, 0.06, all_roots=True)
+    stable = np.where(motions.stable, motions.displacement, np.nan)
+    assert (np.isfinite(stable).sum(axis=1) > 1).sum() > 4
+    place = np.nanargmax(np.abs(stable) if upwards else -np.abs(stable), axis=1)
+    random = np.random.default_rng(1).standard_normal((2, frequency.size))
+    measured = (
+        stable[np.arange(frequency.size), place]
+        / 0.06
+        * np.exp(0.004 * (random[0] + 1j * random[1]))
+    )
+    order = slice(None) if upwards else slice(None, None, -1)
+    data = di.FrequencyResponse(
+        frequency[order], measured[order], drive=np.full(frequency.size, 0.06),
+        controlled="force", quantity="receptance",
+    )  # fmt: skip
+    unknown = di.Backlash(di.Dahl(2.0, 60.0, alpha=1.0))
+    fit = di.fit(data, unknown + known + di.Damper())
+    assert fit.status.usable
+    for name, truth in (("gap", 0.02), ("damping", 0.12)):
+        assert abs(fit.params[name].value - truth) < 3.0 * (fit.params[name].stderr or 0.0)
+    (jump,) = (finding for finding in fit.findings if finding.code == "jump")
+    ((drive, low, high),) = jump.values["places"]
+    assert (drive, 0.8 < low < 1.0, 1.3 < high <= 1.5) == (0.06, True, True)
+    assert "The response jumps: at 0.06 N from " in fit.verdict

@@ -25,6 +25,7 @@ from dahl_ident.control_interop.nonlinearity import friction_and_slope
 from dahl_ident.control_interop.split import split
 from dahl_ident.elements.element import Element, Model
 from dahl_ident.steady_state import Steady, SteadyResponse, response
+from dahl_ident.steady_state.shooting import NEUTRAL
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class Branches:
     @property
     def stable(self) -> NDArray[np.bool_]:
         """Whether a motion near each response approaches it; False where there is none."""
-        return np.asarray(self.growth_rate < 0.0)
+        return np.asarray(self.growth_rate <= 0.0)
 
 
 def response_branches(
@@ -113,7 +114,9 @@ def response_branches(
     found = response(plant, f, drive, all_roots=True, steady=steady)
     if found.steady == "exact":
         with np.errstate(divide="ignore", invalid="ignore"):
-            return Branches(found, np.log(found.multiplier) * found.frequency_hz)
+            growth = np.log(found.multiplier) * found.frequency_hz
+        neutral = np.abs(found.multiplier - 1.0) < NEUTRAL  # a motion that may lie anywhere
+        return Branches(found, np.where(neutral, 0.0, growth))
     return Branches(found, _slow_growth(friction, linear, found))
 
 

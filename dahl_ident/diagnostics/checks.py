@@ -23,6 +23,7 @@ from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.steady_motion import steady_findings
 from dahl_ident.diagnostics.verdicts import Identifiability
+from dahl_ident.elements import Model
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import LOSSES
 
@@ -45,6 +46,10 @@ class Judged(Protocol):
     @property
     def optimum(self) -> Optimum:
         """The solver's result."""
+
+    @property
+    def model(self) -> Model:
+        """The model with the estimates put in."""
 
     @property
     def goodness(self) -> Goodness:
@@ -297,7 +302,7 @@ def robust_values(
 
 def _steady(fit: Judged) -> Iterator[Finding]:
     """Yield how rows of held force were predicted."""
-    yield from steady_findings(fit.optimum)
+    yield from steady_findings(fit.optimum, fit.model)
 
 
 # Assumed?

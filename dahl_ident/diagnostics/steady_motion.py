@@ -6,9 +6,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import row_names
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
+from dahl_ident.elements import Model
 from dahl_ident.fitting import Optimum
+from dahl_ident.problem.steady_rows import levels
+from dahl_ident.steady_state import response
+from dahl_ident.units import shown_unit
 
 _SEEN = 1e-3  # relative difference that is worth a place
 
@@ -32,8 +37,11 @@ def steady_difference(optimum: Optimum) -> tuple[int, float] | None:
     return row, float(apart[row])
 
 
-def steady_findings(optimum: Optimum) -> Iterator[Finding]:
-    """Yield how driven rows were predicted, and what the other way would have been."""
+def steady_findings(optimum: Optimum, model: Model) -> Iterator[Finding]:
+    """Yield how driven rows were predicted, what the other way would have been, and jumps.
+
+    `model` has the estimates put in.
+    """
     problem = optimum.problem
     forced = problem.data.controlled == "force"
     if not forced.any():
@@ -46,9 +54,32 @@ def steady_findings(optimum: Optimum) -> Iterator[Finding]:
             (row,) = row_names(problem.data, [worst[0]])
             values = {"difference": worst[1], "row": row}
         yield Finding(described, note, "steady", values)
+        yield from _jumps(problem.data, model)
         return
     why = problem.obstacle_to_exact
     if not why and not problem.takes_energy(optimum.theta):
         yield Finding(described, note, "no_steady_motion")
     if why and problem.steady == "exact" and any(not e.is_linear for e in problem.model.elements):
         yield Finding(described, note, "describing_function", {"why": why})
+
+
+def _jumps(data: FrequencyResponse, model: Model) -> Iterator[Finding]:
+    """Yield at which drives, and between which frequencies, there are several stable motions."""
+    if data.drive is None:
+        return
+    rows = np.flatnonzero((data.controlled == "force") & (data.harmonic == 1))
+    f, drive = data.frequency_hz, data.drive
+    sines = response(model, f[rows], drive[rows], all_roots=True, steady="describing function")
+    if not (np.asarray(sines.number_of_solutions) > 1).any():
+        return
+    places = []
+    for level in levels(drive[rows]):
+        there = rows[level]
+        exact = response(model, f[there], drive[there], all_roots=True)
+        several = f[there[np.asarray(exact.stable).sum(axis=1) > 1]]
+        if several.size:
+            mean = float(np.median(drive[there]))
+            places.append((mean, float(several.min()), float(several.max())))
+    if places:
+        values = {"places": tuple(places), "unit": shown_unit("N", data.motion)}
+        yield Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "jump", values)

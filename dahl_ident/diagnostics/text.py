@@ -229,6 +229,17 @@ def _prior_influence(name: str, width: float, ends: Sequence[str], contradicted:
     return f"{name} is known from its prior: posterior width {width:.2f} of the prior's{reach}."
 
 
+def _jump(places: Sequence[tuple[float, float, float]], unit: str) -> str:
+    there = [
+        f"at {drive:.3g} {unit} " + (f"and {a:.4g} Hz" if a == b else f"from {a:.4g} to {b:.4g} Hz")
+        for drive, a, b in places
+    ]
+    return (
+        f"The response jumps: {listed(there)} the plant has more than one stable motion; each row "
+        "there is fitted on the branch that the order of the rows follows."
+    )
+
+
 # Assumed?
 
 
@@ -282,6 +293,7 @@ _TEXT: Mapping[str, Callable[..., str]] = {
     "negative": _negative,
     "slight": _slight,
     "steady": _steady,
+    "jump": _jump,
     "no_steady_motion": lambda: (
         "The force was held, but the describing function predicts the motion: the plant would "
         "drive itself, and no steady motion is there."

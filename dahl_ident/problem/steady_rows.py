@@ -62,7 +62,7 @@ class SteadyRows:
         self._model, self._shooting = model, shooting
         self._omega, self._measured = omega, measured
         self._unique_laws = all(e.is_linear or e.unique_response for e in model.elements)
-        self._order = _sweeps(np.atleast_2d(drive)[0])
+        self._order = levels(np.atleast_2d(drive)[0])
         self._orbits = orbits
 
     def at(self, values: Sequence[FloatArray], drive: FloatArray, chosen: list[int]) -> RowMotion:
@@ -188,7 +188,7 @@ class SteadyRows:
         return result
 
 
-def _sweeps(drive: FloatArray) -> list[NDArray[np.intp]]:
+def levels(drive: FloatArray) -> list[NDArray[np.intp]]:
     """Return the rows of every level, in their order; a level is held to within a tenth."""
     rising = np.argsort(drive, kind="stable")
     level = np.empty(drive.size, dtype=np.intp)
