@@ -326,7 +326,7 @@ def integrated(
 
     def event_of(e: int) -> Callable[[float, FloatArray], float]:
         def event(t: float, w: FloatArray) -> float:
-            shift = 1e-14 * (largest[e] or 1.0) * sides[e]  # what stays at zero is no event
+            shift = 1e-14 * (largest[e] or 1.0) * sides[e]  # what stays at zero is not an event
             return float(oracle.functions(t, w[:n], sides[0])[e] + shift)
 
         event.terminal = True  # type: ignore[attr-defined]  # solve_ivp reads it

@@ -63,7 +63,7 @@ def test_mean_and_second_harmonic_cover_the_truth_as_often_as_stated() -> None:
 
 def test_a_symmetric_force_is_hardly_ever_called_asymmetric() -> None:
     x = A * np.cos(THETA)
-    force = friction(x) + OFFSET  # the zero of a load cell is no asymmetry
+    force = friction(x) + OFFSET  # the zero of a load cell is not an asymmetry
     for seed in range(100):
         data = extract(noisy(seed, x, force), frequency=1.0)
         assert data.harmonic.tolist() == [1, 3, 5, 7, 9]
@@ -88,7 +88,7 @@ def test_asymmetry_is_said_and_its_size_is_right() -> None:
 
 
 def test_the_mean_is_that_of_the_steady_loop() -> None:
-    """A departure that fades is no mean force, and its size adds to the mean's uncertainty."""
+    """A departure that fades is not a mean force, and its size adds to the mean's uncertainty."""
     time = np.arange(20 * 200) / 200.0
     x = A * np.cos(2.0 * np.pi * time)
     slow = Dahl(f_max=1.0, sigma=8.0)

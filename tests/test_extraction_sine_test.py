@@ -1,4 +1,4 @@
-"""Motion that is no sine test is refused, and the route for any motion named; sines are not."""
+"""Motion that is not a sine test is refused, and the route for any motion named; sines are not."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def test_lists_patterns_and_mappings_give_the_same_points_with_their_names(folde
     from_pattern = extract(str(folder / "*.csv"))
     from_mapping = extract({name: record(LEVELS[name]) for name in sorted(LEVELS)})
     assert from_mapping.runs == ["high", "low", "mid"]
-    for data in (from_list, from_pattern):  # a level in a file of its own is no run
+    for data in (from_list, from_pattern):  # a level in a file of its own is not a run
         assert data.levels == ["high", "low", "mid"]
         assert data.run is None
     for data in (from_list, from_pattern, from_mapping):

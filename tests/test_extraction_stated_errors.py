@@ -1,6 +1,6 @@
 """Stated errors against noise that is known: covariance, degrees of freedom, chance, transient.
 
-The samples a cycle are no whole number, so that nothing aliases, and the stated covariance has
+The samples in a cycle are not a whole number, so nothing aliases, and the stated covariance has
 the theory's value: of n samples with noise sigma a phasor has E abs(e)^2 = 4 sigma^2/n.
 """
 

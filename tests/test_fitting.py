@@ -284,7 +284,7 @@ def test_as_many_numbers_as_parameters_leave_no_scale() -> None:
 @pytest.mark.parametrize("loss", ["linear", *LOSSES])
 @pytest.mark.parametrize("copies", [1, 2])
 def test_data_without_noise_are_met_to_rounding(noise: str, loss: str, copies: int) -> None:
-    """Rounding errors are no noise: they repeat, and standard errors cannot be smaller."""
+    """Rounding errors are not noise: they repeat, and standard errors cannot be smaller."""
     amplitude = np.tile(np.geomspace(1e-3, 1e-1, 30), copies)
     N = Dahl(0.1, 30.0).describing_function(amplitude)
     found = fit(FrequencyResponse(np.ones(N.size), N, amplitude), Dahl(), noise=noise, loss=loss)

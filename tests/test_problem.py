@@ -303,7 +303,7 @@ def test_free_and_fixed_reach_model_and_sensors() -> None:
             DataError,
             "rows hold the harmonics 2, and no element of Dahl",
         ),
-        (lambda: ProblemBatch([], FREE), DataError, "data is no table; expected a sequence"),
+        (lambda: ProblemBatch([], FREE), DataError, "data is empty; expected a sequence"),
         (lambda: ProblemBatch(data(), FREE), DataError, "data is one table; expected a sequence"),
         (lambda: Problem(odd(A), FREE), DataError, "data is a ndarray; expected a Frequency"),
         (

@@ -278,7 +278,7 @@ class TestMatlab:
         assert names["cells[0]"].range == "10 to 15"
         assert names["sweep.levels[1].name"].range == "'level 2'"
         assert "nothing" not in names
-        assert 'column = "sweep.levels[*].H"' not in contents.column_map  # H is no usual name
+        assert 'column = "sweep.levels[*].H"' not in contents.column_map  # H is not a usual name
 
     def test_single_numbers_are_no_channels_of_a_record(self, tmp_path: Path) -> None:
         content = {"T": 0.25, "f": 4.0, "time": TIME, "x": X, "F": F}

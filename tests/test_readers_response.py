@@ -378,7 +378,7 @@ class TestDoubts:
         with pytest.raises(DataError, match="creates energy"):
             read({**RECTANGULAR, "imag [N/m]": -4.0, "std": 1.0})
         with pytest.warns(DataWarning, match="creates energy"):
-            # four standard errors from two degrees of freedom are no proof
+            # four standard errors from two degrees of freedom are not proof
             read({**RECTANGULAR, "imag [N/m]": [-9.0, 300.0, 300.0], "std": 1.0})
 
     def test_harmonics_may_have_any_sign(self) -> None:

@@ -414,7 +414,7 @@ class TestStorage:
 
     def test_what_is_no_fit(self, result: FitResult, tmp_path: Path) -> None:
         content = json.loads(result.to_json())
-        with pytest.raises(DataError, match="is no JSON"):
+        with pytest.raises(DataError, match="is not JSON"):
             FitResult.from_json("{")
         with pytest.raises(DataError, match="has the schema None"):
             FitResult.from_json("[]")

@@ -145,10 +145,10 @@ def test_unreadable_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"run\.yaml: expected an experiment in \.toml or \.json"):
         Experiment.read(tmp_path / "run.yaml")
     (tmp_path / "a.toml").write_text("plant = [")
-    with pytest.raises(DataError, match=r"a\.toml: the experiment is no TOML"):
+    with pytest.raises(DataError, match=r"a\.toml: the experiment is not TOML"):
         Experiment.read(tmp_path / "a.toml")
     (tmp_path / "a.json").write_text("{")
-    with pytest.raises(DataError, match=r"a\.json: the experiment is no JSON"):
+    with pytest.raises(DataError, match=r"a\.json: the experiment is not JSON"):
         Experiment.read(tmp_path / "a.json")
     (tmp_path / "b.json").write_text(json.dumps(description(plant=[{"kind": "gear"}])))
     with pytest.raises(DataError, match=r"b\.json: .*kind 'gear'"):

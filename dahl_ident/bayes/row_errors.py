@@ -49,7 +49,7 @@ class RowErrors:
     dof, share : float
         nu and p.
     jacobian : ndarray, shape (m, P)
-        Derivatives by what the data determine, weights included, near the estimate.
+        Derivatives with respect to what the data determine, weights included, near the estimate.
     residuals : ndarray, shape (m,)
         There, weights and offset included.
     scale_known : bool

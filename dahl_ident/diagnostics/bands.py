@@ -245,7 +245,7 @@ def _omega(errors: ErrorModel) -> FloatArray:
 def friction_and_slopes(
     problem: Problem, theta: FloatArray, A: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Return N(A) of the friction, and its derivatives by theta in a last axis."""
+    """Return N(A) of the friction, and its derivatives with respect to theta in a last axis."""
     names = problem.names
     values = values_at(problem, theta)
     slopes = dict(zip(names, problem.value_slopes(theta), strict=True))

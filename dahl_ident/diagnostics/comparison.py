@@ -8,7 +8,7 @@ error of the highest the simplest is the best; so is the one fitted while nothin
 by more than chance among many candidates makes.
 AIC and BIC are stated as well, and decide nothing: over harmonics whose covariance is tiny they
 prefer a model that spoils the fundamental. If no model describes the data, the best of them does
-not either, and one of negative damping is no mechanism's.
+not either, and one of negative damping is not a mechanism's.
 """
 
 from __future__ import annotations

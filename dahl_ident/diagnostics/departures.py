@@ -80,7 +80,7 @@ def departures(
         for source, variance in zip(errors.sources, errors.variances.tolist(), strict=True)
         if source.name == MODEL_ERROR
     }
-    assumed = not errors.tells_noise_apart
+    assumed = not errors.distinguishes_noise
     if assumed:
         found = {_SMOOTH: noise_of_rows(errors) ** 2}
     if not any(found.values()):

@@ -152,7 +152,7 @@ class ErrorModel:
         return self.problem.names
 
     @property
-    def tells_noise_apart(self) -> bool:
+    def distinguishes_noise(self) -> bool:
         """Whether there are enough residuals to tell a model error from noise."""
         return _tells(self.problem, self.assumed)
 

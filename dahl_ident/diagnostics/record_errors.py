@@ -245,7 +245,7 @@ def record_budget(problem: RecordProblem, values: FloatArray, errors: RecordErro
 
 
 def variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the variances of quantities with these derivatives by the estimate.
+    """Return the variances of quantities with these derivatives with respect to the estimate.
 
     Infinite where one depends on a value that is not determined at all.
 

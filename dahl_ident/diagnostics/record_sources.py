@@ -23,7 +23,7 @@ from dahl_ident.problem.record_problem import RecordProblem
 
 BLOCKS = 20
 """Of all records together, from which the model error is estimated."""
-_LEVEL = 0.9995  # of chance, at which scatter between blocks is no noise
+_LEVEL = 0.9995  # of chance, at which scatter between blocks is not noise
 _RUNS_LEVEL = 0.95  # the same between records: counted too often rather than too seldom
 _STEP = 0.01  # of an exponent's logarithm, for slopes
 _LONG = 0.05  # of a step of it, beyond which slopes change

@@ -73,7 +73,7 @@ class Linearization:
     y : ndarray, shape (m,)
         The same, taken linearly to theta.
     J : ndarray, shape (m, Q)
-        Their derivatives by theta.
+        Their derivatives with respect to theta.
     predicted : ndarray of complex, shape (n,)
         Responses, each run's at its own parameters.
     fitted : ndarray of complex, shape (n,)

@@ -17,7 +17,7 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
     Parameters
     ----------
     errors : ErrorModel
-        Its assumed parameters are free in the posterior, so they are no source here.
+        Its assumed parameters are free in the posterior, so they are not a source here.
 
     Returns
     -------

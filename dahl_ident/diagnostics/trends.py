@@ -197,7 +197,7 @@ def _distinct(x: FloatArray) -> int:
 
 
 def _change(part: Coefficient) -> str:
-    """Return "falls by 30 ± 4 %"; a line that steep is no size, only a direction."""
+    """Return "falls by 30 ± 4 %"; a line that steep is not a size, only a direction."""
     word = "rises" if part.value > 0.0 else "falls"
     if abs(part.value) > _STEEPEST:
         return f"{word} more than tenfold"

@@ -43,7 +43,7 @@ class LinearModel:
     y : ndarray, shape (m,)
         Residuals.
     J : ndarray, shape (m, P)
-        Their derivatives by the parameters, of full rank.
+        Their derivatives with respect to the parameters, of full rank.
     known : ndarray, shape (m,)
         Variances that are known, 0 elsewhere.
     Z : sequence of ndarray, shape (m, q) or (m,)

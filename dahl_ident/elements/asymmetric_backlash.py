@@ -40,7 +40,7 @@ def stiffness_gradient(
     gap: FloatArray,
     harmonic: int,
 ) -> StiffnessGradient:
-    """Return F_k/X_1 and its derivatives by f_max, sigma, asymmetry and gap.
+    """Return F_k/X_1 and its derivatives with respect to f_max, sigma, asymmetry and gap.
 
     Parameters
     ----------

@@ -143,7 +143,7 @@ class _Loop:
 
 
 def _integral(b: FloatArray, k: int) -> tuple[ComplexArray, ComplexArray]:
-    """Return D_k(b) and its derivative by b."""
+    """Return D_k(b) and its derivative with respect to b."""
     flat = b.reshape(-1)
     if k == 1:
         one, other = _fundamental(flat)

@@ -159,7 +159,7 @@ class Backlash(Friction):
     def stiffness_slope(
         self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Return F/X of the fundamental and its derivative by amplitude, unchecked."""
+        """Return F/X of the fundamental and its derivative with respect to amplitude, unchecked."""
         known = self._closed(values, amplitude, omega, 1)
         if known is None:
             return super().stiffness_slope(values, amplitude, omega)

@@ -61,9 +61,9 @@ class HistoryGradient(NamedTuple):
     value : ndarray
         Force, N.
     by_state : ndarray
-        Derivative by the force at the first sample; zero without memory.
+        Derivative with respect to the force at the first sample; zero without memory.
     by_parameter : tuple of ndarray
-        Derivative by each parameter of the element, in the order of its `parameters`.
+        Derivative with respect to each parameter of the element, in the order of its `parameters`.
     """
 
     value: FloatArray
@@ -215,7 +215,7 @@ class Behaviour(ABC):
     def stiffness_slope(
         self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Return F/X of the fundamental and its derivative by amplitude, unchecked."""
+        """Return F/X of the fundamental and its derivative with respect to amplitude, unchecked."""
         found = self.stiffness_gradient(values, amplitude, omega)
         return found.value, found.by_amplitude
 
@@ -341,7 +341,7 @@ class Behaviour(ABC):
         Raises
         ------
         ModelError
-            If a parameter has no value, or Z is no rational function of s.
+            If a parameter has no value, or Z is not a rational function of s.
         """
         return None
 

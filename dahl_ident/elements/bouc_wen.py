@@ -129,7 +129,7 @@ class BoucWen(Friction):
     def stiffness_slope(
         self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Return F/X of the fundamental and its derivative by amplitude, unchecked."""
+        """Return F/X of the fundamental and its derivative with respect to amplitude, unchecked."""
         found = self.stiffness_gradient(values, amplitude, omega)
         return found.value, found.by_amplitude
 
@@ -252,7 +252,7 @@ def stiffness_over_sigma(
     *,
     derivatives: bool = True,
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
-    """Return N_k/sigma and, if wanted, its derivatives by amplitude, q and p.
+    """Return N_k/sigma and, if wanted, its derivatives with respect to amplitude, q and p.
 
     Parameters
     ----------
@@ -420,7 +420,7 @@ def _turning_forces(
 def _leg(
     start: FloatArray, path: FloatArray, sigma: float, q: float, p: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return w after a path, its derivative by `start`, and by sigma, q, p (n, 3)."""
+    """Return w after a path, its derivative with respect to `start`, and by sigma, q, p (n, 3)."""
     unloads = start < 0.0
     u = np.where(unloads, -start, 0.0)
     with np.errstate(all="ignore"):

@@ -76,7 +76,7 @@ class Dahl(Friction):
         Exponent, from 1e-9 to 1000: 1 is the linear Dahl model. None: free.
     asymmetry : float or None, default 0
         a, between -1 and 1: the limits are f_max (1 + a) while the displacement rises and
-        f_max (1 - a) while it falls. None: free. At exactly 0 it is no parameter of the element.
+        f_max (1 - a) while it falls. None: free. At exactly 0 it is not a parameter of the element.
         It hardly affects the fundamental, but it determines the mean force and the even harmonics.
     name : str, optional
         Prefix of the parameters' names, such as "pivot" for ``pivot_f_max``; needed where a
@@ -241,7 +241,7 @@ class Dahl(Friction):
     ) -> HistoryGradient:
         """Return the force at every sample with its derivatives, unchecked; exact at alpha = 1.
 
-        While alpha is fixed at 1 the derivative by it is left at zero, as in
+        While alpha is fixed at 1 the derivative with respect to it is left at zero, as in
         :meth:`stiffness_gradient`.
         """
         f_max, sigma, alpha = (float(v) for v in values)

@@ -145,7 +145,7 @@ class Friction(SlopeLaw):
         ModelError
             If a parameter has no value.
         ValidationError
-            If an amplitude is negative, NaN, infinite or complex, or `harmonic` is no whole
+            If an amplitude is negative, NaN, infinite or complex, or `harmonic` is not a whole
             number of at least 1.
 
         Notes

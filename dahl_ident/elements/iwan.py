@@ -156,7 +156,7 @@ class Iwan(Masing):
     def stiffness_slope(
         self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Return F/X of the fundamental and its derivative by amplitude, unchecked."""
+        """Return F/X of the fundamental and its derivative with respect to amplitude, unchecked."""
         _, sigma, chi, ratio = values
         A = np.maximum(np.asarray(amplitude, dtype=np.float64), _REST) + 0.0 * omega
         m, g = _onset(values) / A, np.asarray(chi) + 1.0
@@ -246,7 +246,7 @@ def _rule(harmonic: int) -> tuple[FloatArray, FloatArray]:
 def _lost(
     m: FloatArray, g: FloatArray, harmonic: int, *, derivative: bool
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Return P and, if wanted, its derivative by g at constant m = d_m/A."""
+    """Return P and, if wanted, its derivative with respect to g at constant m = d_m/A."""
     shape = np.broadcast_shapes(np.shape(m), np.shape(g))
     if harmonic % 2 == 0:
         zero = np.zeros(shape, dtype=np.complex128)

@@ -140,7 +140,7 @@ class MaxwellSlip(Masing):
     def stiffness_slope(
         self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Return F/X of the fundamental and its derivative by amplitude, unchecked."""
+        """Return F/X of the fundamental and its derivative with respect to amplitude, unchecked."""
         found = self.stiffness_gradient(values, amplitude, omega)
         return found.value, found.by_amplitude
 

@@ -139,7 +139,7 @@ class PowerDamper(Element):
     def stiffness_slope(
         self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Return F/X of the fundamental and its derivative by amplitude, unchecked."""
+        """Return F/X of the fundamental and its derivative with respect to amplitude, unchecked."""
         N = self.stiffness(values, amplitude, omega)
         with np.errstate(all="ignore"):
             slope = np.where(amplitude > 0.0, (values[1] - 1.0) * N / amplitude, 0.0)

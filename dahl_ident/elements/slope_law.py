@@ -295,7 +295,7 @@ class SlopeLaw(Element):
     def stiffness_slope(
         self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Return F/X of the fundamental and its derivative by amplitude, unchecked."""
+        """Return F/X of the fundamental and its derivative with respect to amplitude, unchecked."""
         if not self.rate_independent:
             found = self._rated_gradient(values, amplitude, omega, 1, [len(values)])
             return found.value, found.by_amplitude

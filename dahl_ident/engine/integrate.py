@@ -40,7 +40,7 @@ _DENSE = 1e-2  # of the tolerance: the same for a polynomial that is read betwee
 _SHARE = _DENSE ** (1.0 / (STAGES + 1))  # of the step
 _TOGETHER = 1e-8  # of the span: events that are as near to each other may change places
 _NEAREST = 0.005  # rad before a turning point: the last step under a sine
-_MOST, _PER_SAMPLE = 20_000, 200  # steps: more is no motion
+_MOST, _PER_SAMPLE = 20_000, 200  # steps: more is not a motion
 _BEYOND_BOUNDS = 1e100  # m/s: far beyond any motion, and its square is still a number
 
 

@@ -4,7 +4,7 @@ With r samples a cycle the harmonics r - k and r + k are sampled as harmonic k, 
 cycle, so that no scatter shows them. A waveform with kinks, such as friction's force, has
 harmonics that fall as a power of their order, between 1/k (steps) and 1/k^3 (reversals of Dahl
 friction). The power is taken from the harmonics that stand out of the noise, and extended to the
-first two that alias. Where r is no whole number the alias lies next to the harmonic, and drops
+first two that alias. Where r is not a whole number the alias lies next to the harmonic, and drops
 out of it the more cycles there are.
 """
 

@@ -369,7 +369,7 @@ def _phasors(
     *,
     sweep: bool,
 ) -> _Phasors:
-    """Fit a segment without its transient, which is no noise, and join the phasors' noise."""
+    """Fit a segment without its transient, which is not noise, and join the phasors' noise."""
     fit = sine_fit(_without(transient, segment, settings), trend=sweep)
     orders = (1, *sorted({*settings.harmonics, *EVEN} - {1}))
     orders = tuple(k for k in orders if k <= fit.orders)
@@ -400,7 +400,7 @@ def _mean_moves(phasors: _Phasors) -> bool:
     """Return whether the mean of a free displacement is still on its way to its place.
 
     Where a soft spring alone centres it, it may go much farther than the amplitude, and its
-    approach is no exponential.
+    approach is not an exponential.
     """
     fit, channel = phasors.fit, phasors.settings.transient_channel
     moved = 2.0 * float(fit.coefficients[1, channel])

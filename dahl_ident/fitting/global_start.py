@@ -354,7 +354,7 @@ def _columns(
             else:
                 value = float("nan") if p.value is None else p.value
             numbers.append(np.asarray(value, dtype=np.float64))
-        with np.errstate(all="ignore"):  # far out a law may overflow, and is no start there
+        with np.errstate(all="ignore"):  # far out a law may overflow, and is not a start there
             return view.of(d.element, numbers, at_nodes=bool(values))
 
     columns = []

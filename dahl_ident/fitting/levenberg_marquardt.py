@@ -2,7 +2,7 @@
 
 Each step solves (H + lambda D) delta = -g with g the gradient of the cost, H its Gauss-Newton
 Hessian and D = diag H, so it does not depend on the parameters' units. lambda starts at almost
-nothing, a Gauss-Newton step; it falls where a step does what H foretold, and rises where the cost
+nothing, a Gauss-Newton step; it falls where a step does what H predicted, and rises where the cost
 does not fall. All problems take their steps together; those that have ended drop out.
 
 A problem has converged where the step after the next, as the steps shrink, would move the
@@ -208,12 +208,12 @@ def _minimise(
     damping, growth = np.full(S, _FIRST_DAMPING), np.full(S, 2.0)
     last = np.full(S, 1e-300)
     for _ in range(steps if P else 0):
-        step, moves, foretold, longest = _step(at, damping, logarithmic)
+        step, moves, predicted, longest = _step(at, damping, logarithmic)
         shortest = tolerance_factor**2 * _tolerance(at, logarithmic, n_residuals, accuracy)
         settled = moves * np.minimum(1.0, moves / last) <= shortest
-        settled |= foretold <= tolerance_factor**2 * _EPS * at.cost
+        settled |= predicted <= tolerance_factor**2 * _EPS * at.cost
         settled &= longest <= tolerance_factor * _LAST_STEP
-        settled |= foretold < enough
+        settled |= predicted < enough
         settled &= damping < _GAUSS_NEWTON
         lost = ~np.isfinite(at.cost) | (damping > _MOST_DAMPING)
         which = None if active.size == S else active
@@ -223,21 +223,21 @@ def _minimise(
         if ended.any():
             settled &= ~lost
             converged[active] = settled
-            ends.put(active, at.moved(settled, step, foretold))
+            ends.put(active, at.moved(settled, step, predicted))
             keep = ~ended
             active, at = active[keep], at.take(keep)
             if not active.size:
                 break
-            step, moves, foretold = step[keep], moves[keep], foretold[keep]
+            step, moves, predicted = step[keep], moves[keep], predicted[keep]
             damping, growth, last = damping[keep], growth[keep], last[keep]
         trial = at.theta + step
         which = None if active.size == S else active
         new = _State(trial, *evaluate(trial, which))
         evaluations[active] += 1
         # a fall too small to see next to one enormous row's cost is taken as predicted
-        unseen = foretold <= unseen_change * at.cost
+        unseen = predicted <= unseen_change * at.cost
         better = (new.cost < at.cost) | (unseen & (new.cost <= (1.0 + unseen_change) * at.cost))
-        gain = np.where(unseen, 1.0, at.cost - new.cost) / np.where(unseen, 1.0, foretold)
+        gain = np.where(unseen, 1.0, at.cost - new.cost) / np.where(unseen, 1.0, predicted)
         calmer = np.maximum(damping * np.maximum(0.05, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
         damping = np.where(better, calmer, np.maximum(damping * growth, 1e-6))
         growth = np.where(better, 2.0, 4.0 * growth)
@@ -285,7 +285,7 @@ class _State:
 def _step(
     at: _State, damping: FloatArray, logarithmic: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the next step, its squared length, the fall of cost foretold, the longest log step.
+    """Return the next step, its squared length, the fall of cost predicted, the longest log step.
 
     The length is among residuals.
     """
@@ -306,8 +306,8 @@ def _step(
     if longest.max() > _LONGEST_STEP:
         delta *= np.minimum(1.0, _LONGEST_STEP / np.maximum(longest, 1e-300))[:, None]
     moves = (delta[:, None, :] @ H @ delta[:, :, None])[:, 0, 0]
-    foretold = -(delta * g).sum(axis=1) - 0.5 * moves
-    return delta / size, moves, np.maximum(foretold, 1e-300), longest
+    predicted = -(delta * g).sum(axis=1) - 0.5 * moves
+    return delta / size, moves, np.maximum(predicted, 1e-300), longest
 
 
 def _tolerance(at: _State, logarithmic: BoolArray, n_residuals: int, accuracy: float) -> FloatArray:

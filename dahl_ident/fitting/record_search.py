@@ -16,7 +16,7 @@ from dahl_ident.problem import Quadratic
 from dahl_ident.problem.record_noise import prediction_error_filter, share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
-_STEPS = 60  # at most; a search without convergence is no estimate
+_STEPS = 60  # at most; a search without convergence is not an estimate
 _SHORT = {"force": 8192, "motion": 4096}  # samples with which a long record is begun
 _COMPARED = 8  # steps after which starts of a driven motion are compared
 _ROUGH = 15  # steps after which the noise is known well enough to say what a step is worth
@@ -30,7 +30,7 @@ _EXACT = 1e-12  # share of variance left that is rounding
 _REPEATS = 12  # a limit for weights that do not settle
 _SETTLED = 0.03  # step in standard errors that no longer matters
 _BANDS = 3  # dead bands tried: one, two and four times the noise that differences show
-_CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that is no chance
+_CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that is not chance
 _LOOSE = 1e4  # of the step at which a search of a long record has converged
 
 

@@ -49,7 +49,7 @@ class Forecast:
     knowledge : Knowledge
         Before the plan.
     candidates : Candidates
-        With derivatives by scaled parameters and W departures, Q together.
+        With derivatives with respect to scaled parameters and W departures, Q together.
     before : ndarray, shape (S, Q, Q)
         Information of the earlier data as their fit judges it.
     searched : ndarray, shape (S, Q, Q)

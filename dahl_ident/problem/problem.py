@@ -435,7 +435,7 @@ class Problem:
         Nor is it so small that rounding of the information loses what calibrations say of gains.
         """
         widths = [float(p.std()) for name, p in self.priors.items() if name.endswith("_gain")]
-        known = _LOST * max(widths, default=0.0) * len(self.data) ** 0.5 / ROUNDING
+        known = _LOST * max(widths, default=0.0) * self.n_residuals**0.5 / ROUNDING
         return np.asarray(self._noise.rounding * max(1.0, self.accuracy / EXPLICIT, known))
 
     @property
@@ -466,7 +466,7 @@ class Problem:
         return self._with_priors(theta, y, [], scale)[..., 0, :]
 
     def jacobian(self, theta: ArrayLike, scale: ArrayLike = 1.0) -> FloatArray:
-        """Return the residuals' derivative by theta, shape (m, P) or (S, m, P)."""
+        """Return the residuals' derivative with respect to theta, shape (m, P) or (S, m, P)."""
         return self.residuals_and_jacobian(theta, scale)[1]
 
     def residuals_and_jacobian(

@@ -51,7 +51,7 @@ class Prediction:
     output : ndarray, shape (n,)
         Predicted samples.
     by : ndarray, shape (n, P)
-        Derivatives by the problem's values; P = 0 where they were not asked for.
+        Derivatives with respect to the problem's values; P = 0 where they were not asked for.
     """
 
     output: FloatArray

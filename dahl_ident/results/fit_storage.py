@@ -117,7 +117,7 @@ def from_json(text: str, source: str = "the text") -> tuple[Optimum, bool]:
     try:
         content = json.loads(text)
     except json.JSONDecodeError as exc:
-        raise DataError(f"{source} is no JSON: {exc}; expected a saved fit") from exc
+        raise DataError(f"{source} is not JSON: {exc}; expected a saved fit") from exc
     return from_dict(content, source)
 
 
@@ -162,7 +162,7 @@ def changed(source: str) -> DataError:
 def _agrees(optimum: Optimum) -> bool:
     """Return whether values and sum of squares are those of the estimate, with these data.
 
-    What a file without a digest is checked by. At a limit the values are no finite numbers, and
+    What a file without a digest is checked by. At a limit the values are not finite numbers, and
     a robust loss has another sum.
     """
     if optimum.status.at_infinity or optimum.loss != "linear":

@@ -65,7 +65,7 @@ class Nonlinear:
     def force_and_slope(
         self, amplitude: FloatArray, vector: IntArray
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Return A N and its derivative by ln A."""
+        """Return A N and its derivative with respect to ln A."""
         force = np.zeros(amplitude.shape, dtype=np.complex128)
         slope = np.zeros(amplitude.shape, dtype=np.complex128)
         (omega,) = _rows((self.omega,), vector)
@@ -161,7 +161,7 @@ class Plant:
     def misfit(
         self, amplitude: FloatArray, force: ComplexArray, slope: ComplexArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return ln(A |Z| / u_0) and its derivative by ln A."""
+        """Return ln(A |Z| / u_0) and its derivative with respect to ln A."""
         rest = amplitude * self.linear
         total = rest + force
         size = np.abs(total)

@@ -179,7 +179,7 @@ def _inverse_cubic(
 ) -> tuple[FloatArray, FloatArray, ComplexArray]:
     """Return A and dlnA/dg at g = ln(A |Z|/u_0) = 0, from Hermite's cubic of ln A over g.
 
-    And the friction force's derivative by ln A there, between those of the nodes.
+    And the friction force's derivative with respect to ln A there, between those of the nodes.
     """
     A, slope = table.amplitude[cell], table.slope[cell]
     g, s = plant.misfit(A, table.force[cell], slope)
@@ -211,7 +211,7 @@ def _polish(
         low[active[~beyond]] = A[~beyond]
         left, right = low[active], high[active]
         kappa = part.conditioning(A, force)
-        with np.errstate(all="ignore"):  # a step from a turning point is no number: bisect
+        with np.errstate(all="ignore"):  # a step from a turning point is not a number: bisect
             step = -g / s
             newton = A * np.exp(step)
             excess = np.expm1(g)  # A |Z|/u_0 - 1, of which rounding leaves eps kappa

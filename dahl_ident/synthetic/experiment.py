@@ -155,7 +155,7 @@ class Experiment:
         try:
             return cls.from_dict(json.loads(text))
         except json.JSONDecodeError as exc:
-            raise DataError(f"the experiment is no JSON: {exc}") from exc
+            raise DataError(f"the experiment is not JSON: {exc}") from exc
 
     def to_toml(self) -> str:
         """Return the description as TOML."""
@@ -173,7 +173,7 @@ class Experiment:
         try:
             return cls.from_dict(tomllib.loads(text))
         except tomllib.TOMLDecodeError as exc:
-            raise DataError(f"the experiment is no TOML: {exc}") from exc
+            raise DataError(f"the experiment is not TOML: {exc}") from exc
 
     @classmethod
     def read(cls, path: str | Path) -> Experiment:
