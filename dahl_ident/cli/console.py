@@ -215,6 +215,7 @@ def _spin(task: str, steps: list[int], done: threading.Event) -> None:
     columns = (SpinnerColumn(), TextColumn("{task.description}"), Elapsed(), Remaining())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         number = bar.add_task(task, total=None)
+        bar.tasks[0].start_time = bar.get_time() - _PATIENCE
         while not done.wait(_REDRAWN):
             bar.update(number, completed=steps[0], total=steps[1] or None)
 
