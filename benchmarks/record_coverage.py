@@ -1,4 +1,4 @@
-"""Coverage of 95 % intervals of fits to records: ``python -m benchmarks.record_coverage N M``.
+"""Coverage of 95.45 % intervals of fits to records: ``python -m benchmarks.record_coverage N M``.
 
 N records of a force and M of a driven motion in each scenario; the table is written to
 docs/validation/records.md.

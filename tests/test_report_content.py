@@ -104,7 +104,7 @@ def test_metadata_from_a_file(fit: di.FitResult, tmp_path: Path) -> None:
     assert facts["metadata"]["measured"] == "2026-11-20"
     assert facts["metadata"]["ambient"] == ["humidity 41 %"]
     place.write_text("specimen = ")
-    with pytest.raises(DataError, match=r"lab\.toml: is not TOML file"):
+    with pytest.raises(DataError, match=r"lab\.toml: is not a TOML file"):
         report(fit, tmp_path / "s.json", metadata=place)
     with pytest.raises(DataError, match=r"absent\.toml: the file cannot be read"):
         report(fit, tmp_path / "s.json", metadata=tmp_path / "absent.toml")

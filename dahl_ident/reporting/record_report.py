@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dahl_ident.data.laboratory import Metadata
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
+from dahl_ident.diagnostics.confidence_levels import percent as of_level
 from dahl_ident.diagnostics.formatting import interval, percent, rounded
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.reporting import posterior_sections, provenance, tables
@@ -30,7 +32,7 @@ from dahl_ident.reporting.document import (
 )
 from dahl_ident.reporting.figures import budget_picture
 from dahl_ident.reporting.overlay import changes_section
-from dahl_ident.reporting.sections import COVERAGE, RELATES, identity, short
+from dahl_ident.reporting.sections import COVERAGE, RELATES, identity, in_words, short
 from dahl_ident.results import RecordFit, RecordPosterior
 from dahl_ident.results.changes import Change, changes, headline
 from dahl_ident.version import __version__
@@ -98,7 +100,7 @@ def record_document(
     count = f"{len(first.records)} record{'s' if len(first.records) > 1 else ''}"
     name = files[0]["file"] if files else count
     header = given.lines | {
-        "Model": tuple(_model(first)),
+        "Model": tuple(in_words(first.problem.model)),
         "Data": (f"{count}, {first.problem.n_residuals} samples", *named),
         "Date of report": (provenance.today(),),
         "Software": (f"dahl_ident {__version__}",),
@@ -153,13 +155,6 @@ def _changes(fits: Sequence[RecordFit]) -> list[Change]:
     return changes(dict(zip(names, fits, strict=True)))
 
 
-def _model(fit: RecordFit) -> Iterator[str]:
-    yield repr(fit.problem.model)
-    for element in fit.problem.model.elements:
-        if element.equation:
-            yield f"{element.kind.replace('_', ' ')}: {element.equation}"
-
-
 def _answer(fit: RecordFit) -> Table:
     limits = fit.conf_interval()
     unusable = not fit.status.usable
@@ -178,7 +173,8 @@ def _answer(fit: RecordFit) -> Table:
             )
         )
     header = (
-        "parameter", "estimate", "standard uncertainty u", "95 % interval", "unit", "description"
+        "parameter", "estimate", "standard uncertainty u", f"{of_level(CONFIDENCE)} interval",
+        "unit", "description",
     )  # fmt: skip
     hint = ". Numbers that are crossed out must not be used" if unusable else ""
     return Table(f"Estimates with their standard uncertainties{hint}", header, tuple(rows))
@@ -236,7 +232,7 @@ def _facts(fit: RecordFit) -> dict[str, Any]:
     limits = fit.conf_interval()
     return {
         "model": repr(fit.problem.model),
-        "equations": list(_model(fit)),
+        "equations": list(in_words(fit.problem.model)),
         "status": str(fit.status),
         "trusted": fit.trusted,
         "verdict": fit.verdict,
@@ -250,7 +246,7 @@ def _facts(fit: RecordFit) -> dict[str, Any]:
                 "stderr": e.stderr,
                 "unit": e.unit,
                 "fixed": not e.vary,
-                "interval_95": list(limits[name]) if e.vary else None,
+                "interval_95.45": list(limits[name]) if e.vary else None,
             }
             for name, e in fit.params.items()
         },

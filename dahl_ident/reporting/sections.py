@@ -13,6 +13,8 @@ from dahl_ident.diagnostics.comparison import compare_models
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, percent
 from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
+from dahl_ident.elements import Element
+from dahl_ident.elements.element import as_model
 from dahl_ident.reporting import posterior_sections, provenance, tables
 from dahl_ident.reporting.document import (
     MARKS,
@@ -173,7 +175,7 @@ def header(result: Result, given: Metadata) -> tuple[tuple[str, tuple[str, ...]]
         more = len(files) - _MOST_FILES + 1
         files[_MOST_FILES - 1 :] = [f"and {more} more files, listed under Origin"]
     made_of = {
-        "Model": tuple(_model(result)),
+        "Model": tuple(in_words(result.problem.model)),
         "Data": (f"{data.n} rows", *files),
     }
     software = {
@@ -183,9 +185,9 @@ def header(result: Result, given: Metadata) -> tuple[tuple[str, tuple[str, ...]]
     return tuple((first | specimen | made_of | of_laboratory | software).items())
 
 
-def _model(result: Result) -> Iterator[str]:
+def in_words(model: Element) -> Iterator[str]:
     """Yield the model in words, then an equation for each of its elements."""
-    elements = result.problem.model.elements
+    elements = as_model(model).elements
     kinds = [element.kind.replace("_", " ") or type(element).__name__ for element in elements]
     names = [
         f"{kind[0].upper()}{kind[1:]} friction" if element.has_memory else kind
@@ -367,7 +369,7 @@ def fit_facts(fit: FitResult) -> dict[str, Any]:
     intervals = fit.conf_interval().at(CONFIDENCE)
     return {
         "model": repr(fit.problem.model),
-        "equations": list(_model(fit)),
+        "equations": list(in_words(fit.problem.model)),
         "status": str(fit.status),
         "trusted": fit.trusted,
         "verdict": fit.verdict,

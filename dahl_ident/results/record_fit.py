@@ -20,10 +20,11 @@ from dahl_ident.data import Record
 from dahl_ident.data.record import cut
 from dahl_ident.data.storage import read_text
 from dahl_ident.diagnostics.bands import DerivedQuantity
-from dahl_ident.diagnostics.budget import Budget
+from dahl_ident.diagnostics.budget import Budget, coverage_factor
 from dahl_ident.diagnostics.checks import doubted
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, percent
 from dahl_ident.diagnostics.doubtful_elements import below_zero, is_single, slight
-from dahl_ident.diagnostics.formatting import rounded, table
+from dahl_ident.diagnostics.formatting import interval, rounded, table
 from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
 from dahl_ident.diagnostics.record_errors import (
     MODEL,
@@ -355,11 +356,11 @@ class RecordFit(Result):
         return float(special.stdtrit(self.errors.dof, 0.975))
 
     def conf_interval(self) -> Mapping[str, tuple[float, float]]:
-        """Return the 95 % interval of every free parameter, by Student's t."""
+        """Return the 95.45 % interval of every free parameter: value -+ k u, as in the budget."""
         found = {}
         for place, name in enumerate(self.var_names):
             p = self.params[name]
-            half = float(special.stdtrit(self.errors.dof_for(place), 0.975)) * (p.stderr or 0.0)
+            half = coverage_factor(self.errors.dof_for(place)) * (p.stderr or 0.0)
             found[name] = (p.value - half, p.value + half)
         return MappingProxyType(found)
 
@@ -392,12 +393,20 @@ class RecordFit(Result):
         str
         """
         own = {p.name for p in self.problem.model.parameters}
-        rows = [["", "value", "stderr", "unit"]]
+        assumed = {one.name for one in self.errors.exponents}
+        limits = self.conf_interval()
+        rows = [["", "value", "stderr", "unit", f"{percent(CONFIDENCE)}", ""]]
         for name, p in self.params.items():
-            if details or name in own:
-                shown = (f"{p.value:g}", "fixed") if not p.vary else rounded(p.value, p.stderr)
-                rows.append([name, *shown, p.unit])
-        parts = [("Verdict", self.statements), ("Parameters", table(rows, (0, 3)).splitlines())]
+            if not details and name not in own:
+                continue
+            if p.vary:
+                within = interval(*limits[name], "")
+                rows.append([name, *rounded(p.value, p.stderr), p.unit, within, ""])
+            else:
+                word = "assumed" if name in assumed else "fixed"
+                rows.append([name, f"{p.value:g}", "", p.unit, "", word])
+        shown = table(rows, (0, 3, 4, 5)).splitlines()
+        parts = [("Verdict", self.statements), ("Parameters", shown)]
         if details:
             parts.append(("Uncertainty budget", str(self.budget()).splitlines()))
             parts.append(("Goodness of fit", self.goodness.lines))
