@@ -38,8 +38,8 @@ _PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
 _HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; space kept below a heading or a caption
 _LONGEST = 60  # characters of a title at the foot of a page
 _WHOLE = 20.0  # mm, of a paragraph that is not divided between pages
+_SIGNATURE, _SMALLEST = 26.0, 0.65  # mm; part of their size to which pictures make room for it
 _WIDEST = 75.0  # mm, of a column of a table
-_UNDIVIDED = 60.0  # mm, of a table that is not divided between pages
 _PADDING = 3.5  # mm, on both sides of a column's text
 _NAME_WIDTH = 38.0  # mm, of the fields' names in the header
 _COLOURS = {
@@ -88,7 +88,7 @@ def pdf(document: Document) -> bytes:
             if not isinstance(block, Picture):
                 _block(page, block)
         for i in range(0, len(pictures), 2):
-            _pictures(page, pictures[i : i + 2])
+            _pictures(page, pictures[i : i + 2], 0.0 if section.details else _SIGNATURE)
     return bytes(page.output())
 
 
@@ -148,7 +148,7 @@ def _header(page: FPDF, document: Document) -> None:
 
 
 def _signature(page: FPDF, signatory: Sequence[str]) -> None:
-    _turn_unless_room(page, 22.0)
+    _turn_unless_room(page, _SIGNATURE)
     page.ln(12)
     page.set_font(_FONT, "", 8)
     width = (page.epw - 2 * _GAP) / 3.0
@@ -199,14 +199,21 @@ class _Drawn:
             self.height = _PICTURE_WIDTH * image.height / image.width
 
 
-def _pictures(page: FPDF, row: Sequence[_Drawn]) -> None:
-    """Draw up to two pictures side by side, their captions below."""
+def _pictures(page: FPDF, row: Sequence[_Drawn], below: float) -> None:
+    """Draw up to two pictures side by side, their captions below.
+
+    They are drawn smaller where this leaves room for what must stand `below` them.
+    """
     _turn_unless_room(page, _row_height(row))
+    room = page.h - page.b_margin - page.get_y() - below - _CAPTION_HEIGHT
+    share = room / max(drawn.height for drawn in row)
+    share = share if _SMALLEST < share < 1.0 else 1.0
     top, ends = page.get_y(), []
     for i, drawn in enumerate(row):
         x = page.l_margin + i * (_PICTURE_WIDTH + _GAP)
-        page.image(drawn.content, x=x, y=top, w=_PICTURE_WIDTH, alt_text=drawn.picture.alt)
-        page.set_xy(x, top + drawn.height + 1.0)
+        wide = share * _PICTURE_WIDTH
+        page.image(drawn.content, x=x, y=top, w=wide, alt_text=drawn.picture.alt)
+        page.set_xy(x, top + share * drawn.height + 1.0)
         page.set_font(_FONT, "I", 8)
         page.multi_cell(_PICTURE_WIDTH, 4, drawn.picture.caption, align="L", new_y="NEXT")
         ends.append(page.get_y())
@@ -304,9 +311,9 @@ class _Structure(StructureTreeBuilder):
 
 
 def _beginning(page: FPDF, table: Table, widths: Sequence[float]) -> float:
-    """Return the height of a table that must not be divided, else of its first row."""
-    heights = [_height(page, row, widths) for row in (words(*table.header), *table.rows)]
-    return _CAPTION_HEIGHT + sum(heights if sum(heights) < _UNDIVIDED else heights[:2])
+    """Return the height of a table's caption, header and first row, which stay together."""
+    rows = (words(*table.header), *table.rows[:1])
+    return _CAPTION_HEIGHT + sum(_height(page, row, widths) for row in rows)
 
 
 def _height(page: FPDF, row: Sequence[Cell], widths: Sequence[float]) -> float:
