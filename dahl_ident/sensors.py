@@ -91,6 +91,34 @@ class Sensors:
                 object.__setattr__(self, name, finite_number(given, name))
         _ = self.parameters  # checks the bounds
 
+    def stated_uncertainties(self) -> dict[str, float]:
+        """Return the standard deviation of each prior about a channel that is right, by name.
+
+        Raises
+        ------
+        ValidationError
+            If a value is not a prior about 1 (the delay: about 0).
+
+        Examples
+        --------
+        >>> from scipy import stats
+        >>> Sensors(force_gain=stats.norm(1.0, 0.005)).stated_uncertainties()
+        {'force_gain': 0.005}
+        """
+        found = {}
+        for name, right in (("force_gain", 1.0), ("displacement_gain", 1.0), ("delay", 0.0)):
+            given = getattr(self, name)
+            if given is not None and not hasattr(given, "logpdf") and given == right:
+                continue
+            if given is None or not hasattr(given, "logpdf") or float(given.mean()) != right:
+                raise ValidationError(
+                    f"sensors state {name}={given!r}; a fit of records expects a prior about "
+                    f"{right:g}, such as scipy.stats.norm({right:g}, 0.005), which counts in the "
+                    "uncertainty: correct the record for what is known, or fit an extracted table"
+                )
+            found[name] = float(given.std())
+        return found
+
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any] | str | Path) -> Sensors:
         """Return the sensors whose calibrations a report's metadata state.

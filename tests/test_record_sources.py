@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy import stats
+from scipy.interpolate import CubicSpline
 
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
+from dahl_ident.elements.element import as_model
+from dahl_ident.errors import ValidationError
 from tests.test_record_fit import DAHL, RATE, driven, recorded, trajectory
 
 
@@ -26,6 +32,53 @@ def test_an_assumed_exponent_counts_as_if_it_were_estimated() -> None:
     assert "exponent" not in sources(given, "f_max")
     assert "Assumed: alpha = 1 exactly" in given.verdict
     assert given.params["f_max"].value == assumed.params["f_max"].value
+
+
+@pytest.mark.parametrize("output", ["force", "motion"])
+@pytest.mark.parametrize(
+    ("channel", "source"),
+    [
+        ("force_gain", "force calibration"), ("displacement_gain", "displacement calibration"),
+        ("delay", "delay between the channels"),
+    ],
+)  # fmt: skip
+def test_calibrations_count_as_they_move_the_estimate(
+    output: str, channel: str, source: str
+) -> None:
+    """Against a fit of the record with that channel wrong by a standard uncertainty."""
+    if output == "force":
+        record, model = (
+            recorded(DAHL + di.Spring(5.0), "random", 1500, 1e-4),
+            as_model(di.Spring(5.0)),
+        )
+    else:
+        record, model = driven(2, 1e-3, 1024), di.Mass(0.3) + di.Damper() + di.Spring()
+    x, force = np.asarray(record.displacement), np.asarray(record.force)
+    u = 0.002 if channel != "delay" else 0.5 / RATE  # s: half a sample
+    wrong = {
+        "force_gain": replace(record, force=(1.0 + u) * force),
+        "displacement_gain": replace(record, displacement=(1.0 + u) * x),
+        "delay": replace(record, displacement=CubicSpline(record.time, x)(record.time - u)),
+    }[channel]
+    law, start = di.Dahl(alpha=1.0), {"f_max": 0.1, "sigma": 30.0 if output == "force" else 300.0}
+    sensors = di.Sensors(**{channel: stats.norm(0.0 if channel == "delay" else 1.0, u)})
+    fit = di.fit(record, law + model, sensors=sensors, start=start)
+    moved = di.fit(wrong, law + model, start=start)
+    for name in ("f_max", "sigma"):
+        shift = abs(moved.params[name].value - fit.params[name].value)
+        row = sources(fit, name)[source]
+        assert row == pytest.approx(shift, rel=0.3)  # to first order
+    assert source not in fit.budget().exact
+    assert sources(di.RecordFit.from_json(fit.to_json()), "f_max")[source] == pytest.approx(
+        sources(fit, "f_max")[source], rel=1e-6
+    )
+
+
+def test_a_record_takes_priors_of_its_channels_alone() -> None:
+    record = recorded(DAHL, "random", 300, 1e-3)
+    for sensors in (di.Sensors(force_gain=None), di.Sensors(force_gain=1.02)):
+        with pytest.raises(ValidationError, match="a fit of records expects a prior about 1"):
+            di.fit(record, di.Dahl(), sensors=sensors)
 
 
 @pytest.mark.parametrize("alpha", [0.5, 0.8, 1.3, 2.0])

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 _ESTIMATING = "Estimating"
 _estimating = in_panel(_ESTIMATING)
-TAKEN = ("model", "free", "fixed", "start")  # by a fit of records
+TAKEN = ("model", "free", "fixed", "start")  # by a fit or posterior of records
 _OF_RECORDS = ("columns", "drive", "drive_factor", "drive_factor_uncertainty", "sheet")
 ReportPlace = Annotated[
     str | None,
@@ -148,9 +148,11 @@ def fit(
                 "--compare is given together with --record, but compares models of tables alone; "
                 "leave it out, and fit each model to the records (hold_out() in Python)"
             )
-        model.refuse_sensors()
         how = refuse_for_tables(
-            "fit", {**model.keywords(), **estimating.keywords()}, Estimating().keywords()
+            "fit",
+            {**model.keywords(), **estimating.keywords()},
+            Estimating().keywords(),
+            (*TAKEN, "sensors"),
         )
         of_records = _fit_records(
             read_records(files, reading, channels), {**how, "output": predicted}

@@ -85,12 +85,12 @@ class ModelOptions:
         }
 
     def refuse_sensors(self) -> None:
-        """Refuse the options of sensors where records are fitted."""
+        """Refuse the options of sensors where a posterior of records is sampled."""
         if given := list(self._given(*_CHANNELS)):
             names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
             raise ValidationError(
-                f"{names} is given together with --record, but a fit of records takes the channels "
-                "as exact; leave it out, or extract a table and fit that"
+                f"{names} is given together with --record, but a posterior of records takes the "
+                "channels as exact; leave it out, or fit the records, which counts it"
             )
 
     def _friction(self) -> Element:

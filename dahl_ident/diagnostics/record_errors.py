@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -36,6 +37,7 @@ _NOT_FOUND = ", though it was not given: with another no motion was found"
 NOISE, DRIVE, FORCE = "noise", "noise in the drive", "force calibration"
 MODEL, DISPLACEMENT = "model error", "noise in the displacement"
 TURNS = "displacement at turning points"
+DISPLACEMENT_GAIN, DELAY = "displacement calibration", "delay between the channels"
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,8 @@ def record_errors(
     scale = np.zeros(values.size)
     for i, parameter in enumerate(problem.free):
         scale[i] = values[i] * parameter.dimension[0]
-    exact = ["displacement calibration", "delay between the channels"]
+    found |= _by_calibration(problem, values, jacobians)
+    exact = [name for name in (DISPLACEMENT_GAIN, DELAY) if name not in found]
     by_force = problem.output == "force" or problem.excitation == "force"
     if problem.output == "motion":
         ratio = drive_noise([record.force_samples for record in problem.records])
@@ -157,10 +160,61 @@ def record_errors(
     stated = [r.drive_factor_uncertainty for r in problem.records]
     factor = max((float(u) for u in stated), default=0.0)
     if factor > 0.0 and by_force:
-        found[FORCE] = factor**2 * np.outer(scale, scale)
-    else:
+        found[FORCE] = found.get(FORCE, 0.0) + factor**2 * np.outer(scale, scale)
+    if FORCE not in found:
         exact.insert(0, FORCE)
     return RecordErrors(found, effective, tuple(exact), len(set(problem.runs)), exponents)
+
+
+def _by_calibration(
+    problem: RecordProblem, values: FloatArray, jacobians: Sequence[FloatArray]
+) -> dict[str, FloatArray]:
+    """Return what stated calibrations do to the estimate, by source.
+
+    A gain changes the units of force or of displacement, and every parameter with them, if all were
+    estimated; known ones stay, which changes the others as if they had been given wrongly. A delay
+    shifts the output in time.
+    """
+    white = [problem.filtered(J) for J in jacobians]
+    size = np.sqrt(sum((J**2).sum(axis=0) for J in white))
+    size = np.where(size > 0.0, size, 1.0)
+    normal = np.linalg.pinv(sum((J / size).T @ (J / size) for J in white), hermitian=True)
+
+    def moved(output: Sequence[FloatArray]) -> FloatArray:
+        parts = zip(white, map(problem.filtered, output), strict=True)
+        return np.asarray(normal @ sum((J / size).T @ y for J, y in parts) / size)
+
+    def predicted(one: RecordProblem) -> list[FloatArray]:
+        places = range(len(problem.records))
+        return [one.predict(values, i, derivatives=False).output for i in places]
+
+    def scaled(place: int) -> FloatArray:
+        change = np.array([p.dimension[place] for p in problem.parameters]) * values
+        known = {p.name: p for p in problem.model.parameters if not p.free and p.dimension[place]}
+        for name, p in known.items():
+            low, high = (
+                predicted(problem.with_fixed({name: (p.value or 0.0) * (1.0 + step)}))
+                for step in (-_STEP, _STEP)
+            )
+            slope = [(b - a) / (2.0 * _STEP) for a, b in zip(low, high, strict=True)]
+            change = change + p.dimension[place] * moved(slope)
+        return change
+
+    def delayed() -> FloatArray:
+        times = [record.time for record in problem.records]
+        return moved([np.gradient(y, t) for y, t in zip(predicted(problem), times, strict=True)])
+
+    ways: dict[str, tuple[str, Callable[[], FloatArray]]] = {
+        "force_gain": (FORCE, partial(scaled, 0)),
+        "displacement_gain": (DISPLACEMENT_GAIN, partial(scaled, 1)),
+        "delay": (DELAY, delayed),
+    }
+    found = {}
+    for name, u in problem.calibration.items():
+        source, change_of = ways[name]
+        change = u * change_of()
+        found[source] = np.outer(change, change)
+    return found
 
 
 def _beyond(larger: FloatArray, known: FloatArray, unit: FloatArray) -> FloatArray:

@@ -103,7 +103,10 @@ class RecordProblem:
         *,
         output: Output | None = None,
         excitation: Excitation = "force",
+        calibration: Mapping[str, float] | None = None,
     ) -> None:
+        self.calibration = dict(calibration or {})
+        """Standard uncertainties of gains and delay of the channels, by the sensors' names."""
         self.records = tuple(records)
         if not self.records:
             raise DataError("there is no record; give one or more")
@@ -253,6 +256,7 @@ class RecordProblem:
             self.model,
             output=self.output,
             excitation=self.excitation,
+            calibration=self.calibration,
         )
         other.watch = self.watch
         return other

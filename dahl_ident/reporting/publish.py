@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 SCHEMA = 2  # of the JSON report: it rises when readers have to change
 _LONGEST_TITLE = 200  # characters
 RecordResult = RecordFit | RecordPosterior
+_Reported = TypeVar("_Reported", bound="Result | RecordResult")
 FORMATS = (".html", ".pdf", ".md", ".json")
 
 
@@ -112,6 +113,7 @@ def report(
                 "fits to records are reported separately; leave out record= and the results "
                 "on frequency responses, and write another report for those"
             )
+        _calibrated(of_records, known)
         whole = record_document(of_records, title=title, command=command, metadata=known)
     elif _on_one_table(checked := _calibrated(_checked(given), known)):
         whole = document(checked, title=title, command=command, record=record, metadata=known)
@@ -164,12 +166,11 @@ def _checked(results: list[Any]) -> list[Result]:
     return results
 
 
-def _calibrated(results: list[Result], known: Metadata) -> list[Result]:
+def _calibrated(results: list[_Reported], known: Metadata) -> list[_Reported]:
     """Return the results, after a check that they count what the instruments state."""
     for name, u in known.calibrations().items():
         for result in results:
-            prior = result.problem.priors.get(name)
-            counted = 0.0 if prior is None else float(prior.std())
+            counted = _counted_calibration(result, name)
             if not math.isclose(counted, u, rel_tol=0.01):
                 taken = f"a standard uncertainty of {counted:.3g}" if counted else "it as exact"
                 raise ValidationError(
@@ -178,6 +179,16 @@ def _calibrated(results: list[Result], known: Metadata) -> list[Result]:
                     "Sensors.from_metadata), and report on that fit"
                 )
     return results
+
+
+def _counted_calibration(result: Result | RecordResult, name: str) -> float:
+    """Return the standard uncertainty of a channel's gain or delay that a result counts."""
+    if isinstance(result, RecordPosterior):
+        return _counted_calibration(result.fit, name)
+    if isinstance(result, RecordFit):
+        return result.problem.calibration.get(name, 0.0)
+    prior = result.problem.priors.get(name)
+    return 0.0 if prior is None else float(prior.std())
 
 
 def _one_line(title: str) -> str:

@@ -78,7 +78,7 @@ def record_document(
                     details=True,
                 )
             )
-        front.append(Section(f"What was assumed{of}", (Bullets(tuple(_assumed(fit, given))),)))
+        front.append(Section(f"What was assumed{of}", (Bullets(tuple(_assumed(fit))),)))
         front.append(Section(f"Pictures{of}", tuple(_pictures(fit, number))))
         derived = fit.derived() if fit.status is not VerdictStatus.NOT_DESCRIBED else ()
         lines = (*fit.goodness.lines, *(f"Derived: {quantity}" for quantity in derived))
@@ -180,7 +180,7 @@ def _answer(fit: RecordFit) -> Table:
     return Table(f"Estimates with their standard uncertainties{hint}", header, tuple(rows))
 
 
-def _assumed(fit: RecordFit, given: Metadata) -> Iterator[str]:
+def _assumed(fit: RecordFit) -> Iterator[str]:
     yield _OUTPUTS[fit.problem.output]
     assumed = {one.name for one in fit.errors.exponents}
     fixed = [
@@ -193,12 +193,6 @@ def _assumed(fit: RecordFit, given: Metadata) -> Iterator[str]:
     for one in fit.errors.exponents:
         yield f"Not given: {one}; its range counts in the uncertainty."
     yield f"Taken as exact: {', '.join(fit.errors.exact)}."
-    if stated := given.calibrations():
-        names = ", ".join(name.replace("_", " ") for name in stated)
-        yield (
-            f"Not counted: the uncertainty of {names} that the instruments state, because a fit of "
-            "records takes the channels as exact; a fit of an extracted table counts it."
-        )
     if fit.weighted:
         yield "Residuals are weighted by their spectrum, because slow noise dominates them."
 

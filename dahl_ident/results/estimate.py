@@ -54,6 +54,7 @@ def fit(
     *,
     free: Iterable[str] = ...,
     fixed: Mapping[str, float] | None = ...,
+    sensors: Sensors | None = ...,
     start: Mapping[str, float] | None = ...,
     output: Output | None = ...,
     excitation: Excitation = ...,
@@ -102,7 +103,8 @@ def fit(
     noise : {"measured", "relative", "absolute"}, optional
         Default: "measured" where the data have a covariance, else "relative".
     sensors : Sensors, optional
-        Gains and delay of the channels; left out, they are taken as exact.
+        Gains and delay of the channels; left out, they are taken as exact. Of records: priors
+        about 1 and 0 alone, whose standard deviations count in the uncertainty.
     loss : {"linear", "huber", "soft_l1", "student_t"}, default "linear"
         A robust loss down-weights outliers; the noise's scale is then estimated robustly.
     start : mapping of str to float, optional
@@ -161,7 +163,7 @@ def fit(
         data = read_frequency_response(cast("pd.DataFrame", data))
     if not isinstance(data, FrequencyResponse):
         taken = {
-            "noise": noise, "sensors": sensors, "constraints": constraints,
+            "noise": noise, "constraints": constraints,
             "drive_std": drive_std, "drive_covariance": drive_covariance,
             "loss": None if loss == "linear" else loss,
             "method": None if method == "lm" else method,
@@ -174,6 +176,7 @@ def fit(
         bound = as_model(model).with_free(free).with_fixed(fixed or {})
         return fit_records(
             records, bound, start=start, output=output, excitation=excitation,
+            calibration=(sensors or Sensors()).stated_uncertainties(),
             throw=throw, progress=progress,
         )  # fmt: skip
     problem = Problem(

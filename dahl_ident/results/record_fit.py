@@ -513,6 +513,7 @@ class RecordFit(Result):
         own = self.problem
         problem = RecordProblem(
             [record], own.model, output=own.output, excitation=own.excitation,
+            calibration=own.calibration,
         ).without_noise(own.displacement_noise)  # fmt: skip
         if initial == "fitted":
             return problem, hold_model(problem, values)
@@ -592,6 +593,7 @@ class RecordFit(Result):
                     "runs": list(problem.runs),
                     "output": problem.output,
                     "excitation": problem.excitation,
+                    "calibration": problem.calibration,
                     "whitening": problem.whitening.tolist(),
                     "displacement_noise": problem.displacement_noise,
                     "names": self.var_names,
@@ -622,7 +624,7 @@ class RecordFit(Result):
             records = [Record(r.pop("time"), **r) for r in held["records"]]
             problem = RecordProblem(
                 records, model_from_description(held["model"]), output=held["output"],
-                excitation=held["excitation"],
+                excitation=held["excitation"], calibration=held.get("calibration"),
             )  # fmt: skip
             problem.runs = tuple(held.get("runs", problem.runs))
             problem = problem.weighted(np.asarray(held["whitening"], dtype=np.float64))
@@ -663,7 +665,7 @@ def fit_records(
     progress : bool, default False
         Show on the terminal how it goes, once it has taken two seconds.
     **how
-        `start`; and `output` and `excitation` of
+        `start`; and `output`, `excitation` and `calibration` of
         :class:`dahl_ident.problem.record_problem.RecordProblem`.
 
     Returns
