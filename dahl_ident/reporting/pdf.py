@@ -180,7 +180,7 @@ def _block(page: FPDF, block: Block) -> None:
 def _text(page: FPDF, text: str) -> None:
     """Print a paragraph; one of a few lines is not divided between pages."""
     height = page.multi_cell(0, 5, text, align="L", dry_run=True, output="HEIGHT")
-    assert isinstance(height, float)
+    assert isinstance(height, float | int)
     if height <= _WHOLE:
         _turn_unless_room(page, height)
     page.multi_cell(0, 5, text, align="L", new_x="LMARGIN", new_y="NEXT")
