@@ -144,11 +144,11 @@ def test_the_hash_is_that_of_the_file_that_was_read(tmp_path: Path) -> None:
     assert len(facts["files"]) == 2, "the shipped file it was made from stands after it"
 
 
-def test_the_order_is_answer_assumed_pictures_details(fit: di.FitResult, tmp_path: Path) -> None:
+def test_the_order_is_answer_assumed_signature_details(fit: di.FitResult, tmp_path: Path) -> None:
     text = text_of(fit)
     sections = re.findall(r"^## (.*)$", text, re.MULTILINE)
     assert sections[:7] == [
-        "Result", "Expanded uncertainty", "What was assumed", "Pictures", "Signature",
+        "Result", "Expanded uncertainty", "What was assumed", "Signature", "Pictures",
         "Sources of uncertainty", "Parameters"
     ]  # fmt: skip
     assumed = text.split("## What was assumed")[1].split("## ")[0]
@@ -328,9 +328,9 @@ def test_the_page_on_a4(fit: di.FitResult, microslip: di.FitResult, tmp_path: Pa
             sizes = {len(text.strip()) > 30 for text in printed}
             assert sizes == {True}, "no page is blank"
             (signed,) = (i for i, text in enumerate(printed) if "Signature" in text)
-            (details,) = (i for i, text in enumerate(printed) if "Estimates and intervals" in text)
+            (pictures,) = (i for i, text in enumerate(printed) if "Figure 1." in text)
             assert signed <= 1
-            assert details == signed + 1
+            assert pictures == signed + 1
             for i, text in enumerate(printed):
                 assert f"Page {i + 1} of {len(printed)}" in text
             rows = [

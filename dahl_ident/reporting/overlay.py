@@ -69,7 +69,7 @@ def overlay(
     sections = (
         Section("Parameters side by side", (_table(names, fits),)),
         changes_section(found),
-        Section("Pictures", (_picture(names, fits),)),
+        Section("Pictures", (_picture(names, fits),), details=True),
         Section("Verdicts", (Bullets(verdicts),), details=True),
     )
     return Document(

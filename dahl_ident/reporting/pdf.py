@@ -38,7 +38,7 @@ _PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
 _HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; space kept below a heading or a caption
 _LONGEST = 60  # characters of a title at the foot of a page
 _WHOLE = 20.0  # mm, of a paragraph that is not divided between pages
-_SIGNATURE, _SMALLEST = 26.0, 0.65  # mm; part of their size to which pictures make room for it
+_SIGNATURE = 26.0  # mm, of the fields for date and signature
 _WIDEST = 75.0  # mm, of a column of a table
 _PADDING = 3.5  # mm, on both sides of a column's text
 _NAME_WIDTH = 38.0  # mm, of the fields' names in the header
@@ -88,7 +88,7 @@ def pdf(document: Document) -> bytes:
             if not isinstance(block, Picture):
                 _block(page, block)
         for i in range(0, len(pictures), 2):
-            _pictures(page, pictures[i : i + 2], 0.0 if section.details else _SIGNATURE)
+            _pictures(page, pictures[i : i + 2])
     return bytes(page.output())
 
 
@@ -199,21 +199,14 @@ class _Drawn:
             self.height = _PICTURE_WIDTH * image.height / image.width
 
 
-def _pictures(page: FPDF, row: Sequence[_Drawn], below: float) -> None:
-    """Draw up to two pictures side by side, their captions below.
-
-    They are drawn smaller where this leaves room for what must stand `below` them.
-    """
+def _pictures(page: FPDF, row: Sequence[_Drawn]) -> None:
+    """Draw up to two pictures side by side, their captions below."""
     _turn_unless_room(page, _row_height(row))
-    room = page.h - page.b_margin - page.get_y() - below - _CAPTION_HEIGHT
-    share = room / max(drawn.height for drawn in row)
-    share = share if _SMALLEST < share < 1.0 else 1.0
     top, ends = page.get_y(), []
     for i, drawn in enumerate(row):
         x = page.l_margin + i * (_PICTURE_WIDTH + _GAP)
-        wide = share * _PICTURE_WIDTH
-        page.image(drawn.content, x=x, y=top, w=wide, alt_text=drawn.picture.alt)
-        page.set_xy(x, top + share * drawn.height + 1.0)
+        page.image(drawn.content, x=x, y=top, w=_PICTURE_WIDTH, alt_text=drawn.picture.alt)
+        page.set_xy(x, top + drawn.height + 1.0)
         page.set_font(_FONT, "I", 8)
         page.multi_cell(_PICTURE_WIDTH, 4, drawn.picture.caption, align="L", new_y="NEXT")
         ends.append(page.get_y())

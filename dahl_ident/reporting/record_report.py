@@ -64,6 +64,7 @@ def record_document(
     for number, fit in enumerate(fits):
         of = f": {fit.problem.model!r}" if several else ""
         front += [Section(f"Result{of}", (_answer(fit), Paragraph(RELATES)))]
+        details.append(Section(f"Pictures{of}", tuple(_pictures(fit, number)), details=True))
         if fit.status is not VerdictStatus.NOT_DESCRIBED and np.isfinite(fit.covar).all():
             found = fit.budget()
             front.append(
@@ -79,7 +80,6 @@ def record_document(
                 )
             )
         front.append(Section(f"What was assumed{of}", (Bullets(tuple(_assumed(fit))),)))
-        front.append(Section(f"Pictures{of}", tuple(_pictures(fit, number))))
         derived = fit.derived() if fit.status is not VerdictStatus.NOT_DESCRIBED else ()
         lines = (*fit.goodness.lines, *(f"Derived: {quantity}" for quantity in derived))
         details.append(Section(f"Goodness of fit{of}", (Bullets(lines),), details=True))

@@ -75,7 +75,7 @@ def document(
         front.append(Section(f"Expanded uncertainty{of}", tuple(_budget(fit))))
         front.append(Section(f"What was assumed{of}", tuple(_assumed(fit))))
         shown = tuple(picture for picture in pictures if picture.name in _FRONT)
-        front.append(Section(f"Pictures{of}", shown))
+        details.append(Section(f"Pictures{of}", shown, details=True))
         details += list(_details(fit, drawn, pictures, of))
     if not fits:
         front += [Section("Result", tuple(posterior_sections.answer(one))) for one in drawn]
@@ -90,7 +90,7 @@ def document(
         header=header(results[0], given),
         sections=(
             *(section for section in front if section.blocks),
-            *details,
+            *(section for section in details if section.blocks),
             *_extraction(data, record),
             Section("Data", tuple(_data(data)), details=True),
             Section(
