@@ -52,7 +52,7 @@ _SET_BY_CAMPAIGN = {"data", "model", "path", "record", "run", "throw", "seed", "
 _FIELD = re.compile(r"\{([A-Za-z_][A-Za-z0-9_]*)\}")
 _COLUMNS = {
     "device", "run", "status", "error", "statements", "points", "runs", "digests", "seconds",
-    "version", "report", "retry", "key",
+    "version", "report", "retry", "refused", "key",
 }  # fmt: skip
 _PREFIXES = ("u_", "U_", "dof_", "unit_", "posterior_")
 """Columns of the table of results, which covariates cannot be called."""

@@ -319,7 +319,7 @@ def _unless_refused(
     for tagged in done:
         held.append(tagged)
         errors = {row.get("error", "") for _, row in held}
-        if len(errors) == 1 and errors.pop().startswith(("ValidationError:", "ModelError:")):
+        if len(errors) == 1 and all(row.get("refused") for _, row in held):
             if len(held) < trials:
                 continue
             raise DataError(f"{source}: the first fits all fail: {tagged[1]['error']}")
@@ -330,7 +330,8 @@ def _unless_refused(
 
 def _whole(task: Task, row: dict[str, Any]) -> dict[str, Any]:
     del row["key"]
-    row.pop("retry", None)
+    for name in ("retry", "refused"):
+        row.pop(name, None)
     labels = {"device": task.device, **({"run": task.run} if task.run else {})}
     return {**labels, **task.covariates, **row, "version": __version__}
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from dahl_ident.errors import DataError
+from dahl_ident.errors import DataError, ModelError, ValidationError
 from dahl_ident.version import __version__
 
 if TYPE_CHECKING:
@@ -62,10 +62,13 @@ class UnseenError(DataError):
     """A file that cannot be read where the fit is made; perhaps it can elsewhere."""
 
 
-def failed(error: str, *, retry: bool = False, seconds: float = 0.0) -> Row:
-    """Return the row of a fit that failed; with `retry`, the same command tries it again."""
+def failed(error: str, *, retry: bool = False, refused: bool = False, seconds: float = 0.0) -> Row:
+    """Return the row of a fit that failed.
+
+    With `retry`, the same command tries it again; `refused` says that options or model are wrong.
+    """
     row: Row = {"status": "failed", "error": error, "digests": [], "seconds": seconds}
-    return {**row, "retry": True} if retry else row
+    return row | {name: True for name, is_so in (("retry", retry), ("refused", refused)) if is_so}
 
 
 def do(job: Job) -> Row:
@@ -98,7 +101,8 @@ def do(job: Job) -> Row:
             retry=True,
         )
     except Exception as exc:  # one device that fails, however, must not end the campaign
-        row = failed(f"{type(exc).__name__}: {' '.join(str(exc).split())}")
+        wrong = isinstance(exc, (ValidationError, ModelError))
+        row = failed(f"{type(exc).__name__}: {' '.join(str(exc).split())}", refused=wrong)
     return {**row, "digests": digests, "seconds": time.perf_counter() - began}
 
 
