@@ -32,7 +32,7 @@ from dahl_ident.campaigns.definition import read_definition
 from dahl_ident.campaigns.engine import Limits, Local, run_jobs
 from dahl_ident.campaigns.population import population
 from dahl_ident.campaigns.run import _unless_refused
-from dahl_ident.campaigns.work import Job
+from dahl_ident.campaigns.work import Job, failed
 from dahl_ident.campaigns.worker import do_within
 from dahl_ident.data.storage import library
 from dahl_ident.errors import DahlIdentError, DataError, ValidationError
@@ -245,7 +245,7 @@ def test_options_that_no_fit_can_use_leave_no_result(
 
 def test_one_device_that_the_options_do_not_fit_is_a_row(tmp_path: Path) -> None:
     """The first of the fits fails with an error of options; the others can use them."""
-    refused = {"status": "failed", "error": "ValidationError: the drive has 3 rows"}
+    refused = failed("ValidationError: the drive has 3 rows", refused=True)
     fine = {"status": "trusted"}
     rows = iter([("a", refused), ("b", fine), ("c", refused)])
     assert list(_unless_refused(rows, 3, "lab")) == [("a", refused), ("b", fine), ("c", refused)]
