@@ -225,7 +225,10 @@ def test_noise_of_a_drive_from_outside_its_band() -> None:
     noise = 0.01 * rng.standard_normal(t.size)
     band = excited(wave + noise)
     inside = float(np.mean(band)) * 1e-4  # white: its variance times the band's share
-    assert drive_noise([wave + noise]) == pytest.approx(inside / 0.5, rel=0.1)
+    found = drive_noise([wave + noise])
+    assert found is not None
+    assert found.share == pytest.approx(inside / 0.5, rel=0.1)
+    assert found.stds == pytest.approx([0.01], rel=0.05)
     assert drive_noise([noise]) is None
 
 

@@ -13,6 +13,7 @@ import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError
+from dahl_ident.synthetic import Acquisition, Experiment, FrequencySweep, simulate
 from tests.test_record_fit import DAHL, RATE, driven, recorded, trajectory
 
 
@@ -32,6 +33,28 @@ def test_an_assumed_exponent_counts_as_if_it_were_estimated() -> None:
     assert "exponent" not in sources(given, "f_max")
     assert "Assumed: alpha = 1 exactly" in given.verdict
     assert given.params["f_max"].value == assumed.params["f_max"].value
+
+
+def test_noise_of_the_drive_moves_a_sweep_as_the_budget_says() -> None:
+    """It moves the plant most near resonance, where damping and friction are determined."""
+    plant = di.Dahl(0.1, 30.0, 1.0) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
+    sweep = FrequencySweep((0.2, 1.0), 0.4, 5.0, 20.0)
+    clean = simulate(Experiment(plant, sweep, Acquisition(sample_rate_hz=32.0)), seed=0)
+    assert isinstance(clean, di.Record)
+    model = di.Dahl(alpha=1.0) + di.Mass() + di.Damper() + di.Spring()
+    truth = {p.name: float(p.value or 0.0) for p in plant.parameters if p.name != "alpha"}
+    errors = []
+    for seed in range(8):
+        noise = np.random.default_rng(seed).standard_normal((2, len(clean)))
+        x = np.asarray(clean.displacement) + 1e-5 * noise[0]
+        force = clean.force_samples + 3e-4 * noise[1]
+        record = di.Record(clean.time, displacement=x, force=force)
+        fit = di.fit(record, model, start=truth)
+        errors.append(
+            [(fit.params[n].value - v) / (fit.params[n].stderr or 0) for n, v in truth.items()]
+        )
+    assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.4
+    assert "noise in the drive" in sources(fit, "damping")
 
 
 @pytest.mark.parametrize("output", ["force", "motion"])

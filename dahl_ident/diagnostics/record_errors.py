@@ -25,12 +25,15 @@ from dahl_ident.diagnostics.record_sources import (
     between_records,
 )
 from dahl_ident.diagnostics.turning_noise import noise_at_turns
+from dahl_ident.errors import FitError
 from dahl_ident.problem.displacement_noise import LEADS
 from dahl_ident.problem.record_noise import drive_noise
 from dahl_ident.problem.record_problem import RecordProblem
 
 _SLIGHT = 1e-6  # relative: noise of the drive below does not count
 _MATTERS = 0.2  # standard errors that noise in the displacement may shift without being counted
+_DRIVE_DRAWS = 4, 16  # of the drive's noise, least and most: the latter know it to a third
+_DRIVE_SAMPLES = 50_000  # that they may have in all: half a second
 _DRAWS = 8  # of noise: the mean square of what they change is known to a half
 _STEP = 1e-5  # relative, of parameters, for slopes of derived quantities
 _NOT_FOUND = ", though it was not given: with another no motion was found"
@@ -104,7 +107,7 @@ def record_errors(
     an assumed exponent changes counts with its range and with what the records say of it. Noise in
     a measured drive makes
     the response look smaller than it is, by the noise's share of the drive's power within its
-    band; a calibration error of the force scales every force. Noise in a
+    band, and makes the plant wander; a calibration error of the force scales every force. Noise in a
     measured displacement counts as far as it shifts the estimate; where the residuals show larger
     errors of the displacement at turning points, what these shift beyond that.
 
@@ -152,11 +155,15 @@ def record_errors(
     exact = [name for name in (DISPLACEMENT_GAIN, DELAY) if name not in found]
     by_force = problem.output == "force" or problem.excitation == "force"
     if problem.output == "motion":
-        ratio = drive_noise([record.force_samples for record in problem.records])
-        if ratio is None:
+        noise = drive_noise([record.force_samples for record in problem.records])
+        if noise is None:
             exact.insert(0, "the drive (its noise cannot be estimated)")
-        elif ratio > _SLIGHT:
-            found[DRIVE] = ratio**2 * np.outer(scale, scale)
+        else:
+            more = _by_drive(problem, values, jacobians, covariance, noise.stds)
+            if noise.share > _SLIGHT:
+                more = more + noise.share**2 * np.outer(scale, scale)
+            if more.any():
+                found[DRIVE] = more
     stated = [r.drive_factor_uncertainty for r in problem.records]
     factor = max((float(u) for u in stated), default=0.0)
     if factor > 0.0 and by_force:
@@ -175,25 +182,14 @@ def _by_calibration(
     estimated; known ones stay, which changes the others as if they had been given wrongly. A delay
     shifts the output in time.
     """
-    white = [problem.filtered(J) for J in jacobians]
-    size = np.sqrt(sum((J**2).sum(axis=0) for J in white))
-    size = np.where(size > 0.0, size, 1.0)
-    normal = np.linalg.pinv(sum((J / size).T @ (J / size) for J in white), hermitian=True)
-
-    def moved(output: Sequence[FloatArray]) -> FloatArray:
-        parts = zip(white, map(problem.filtered, output), strict=True)
-        return np.asarray(normal @ sum((J / size).T @ y for J, y in parts) / size)
-
-    def predicted(one: RecordProblem) -> list[FloatArray]:
-        places = range(len(problem.records))
-        return [one.predict(values, i, derivatives=False).output for i in places]
+    moved = _change_of(problem, jacobians)
 
     def scaled(place: int) -> FloatArray:
         change = np.array([p.dimension[place] for p in problem.parameters]) * values
         known = {p.name: p for p in problem.model.parameters if not p.free and p.dimension[place]}
         for name, p in known.items():
             low, high = (
-                predicted(problem.with_fixed({name: (p.value or 0.0) * (1.0 + step)}))
+                problem.with_fixed({name: (p.value or 0.0) * (1.0 + step)}).outputs(values)
                 for step in (-_STEP, _STEP)
             )
             slope = [(b - a) / (2.0 * _STEP) for a, b in zip(low, high, strict=True)]
@@ -202,7 +198,9 @@ def _by_calibration(
 
     def delayed() -> FloatArray:
         times = [record.time for record in problem.records]
-        return moved([np.gradient(y, t) for y, t in zip(predicted(problem), times, strict=True)])
+        return moved(
+            [np.gradient(y, t) for y, t in zip(problem.outputs(values), times, strict=True)]
+        )
 
     ways: dict[str, tuple[str, Callable[[], FloatArray]]] = {
         "force_gain": (FORCE, partial(scaled, 0)),
@@ -215,6 +213,41 @@ def _by_calibration(
         change = u * change_of()
         found[source] = np.outer(change, change)
     return found
+
+
+def _by_drive(
+    problem: RecordProblem,
+    values: FloatArray,
+    jacobians: Sequence[FloatArray],
+    known: FloatArray,
+    stds: Sequence[float],
+) -> FloatArray:
+    """Return what white noise in the drive does to the estimate beyond what residuals show.
+
+    It moves the plant most where it resonates or where friction slips, and parameters are
+    determined at these places. The `known` covariance takes the residuals as equally large
+    everywhere, so that it shows such noise in part. Draws of the noise have both.
+    """
+    white = [problem.filtered(J) for J in jacobians]
+    change_of = _change_of(problem, jacobians)
+    plain = problem.outputs(values)
+    draws = int(np.clip(_DRIVE_SAMPLES // problem.n_residuals, *_DRIVE_DRAWS))
+    moved, seen, none = np.zeros_like(known), np.zeros_like(known), np.zeros_like(known)
+    for draw in range(draws):
+        try:
+            noisy = problem.with_noisier_drive(stds, draw).outputs(values)
+        except FitError:
+            return none
+        wander = [b - a for a, b in zip(plain, noisy, strict=True)]
+        change = change_of(wander)
+        if not draw and not (change**2 > _MATTERS**2 * known.diagonal()).any():
+            return none
+        moved += np.outer(change, change) / draws
+        seen += sandwich(white, [problem.filtered(y) for y in wander])[0] / draws
+    certain = np.isfinite(known.diagonal()) & (known.diagonal() > 0.0)
+    more = np.where(certain, np.maximum((moved - seen).diagonal(), 0.0), 0.0)
+    size = np.sqrt(more / np.where(certain, known.diagonal(), 1.0))
+    return np.asarray(np.where(np.isfinite(known), known, 0.0) * np.outer(size, size))
 
 
 def _beyond(larger: FloatArray, known: FloatArray, unit: FloatArray) -> FloatArray:
@@ -260,17 +293,27 @@ def _moved(
     ends: Sequence[RecordProblem], values: FloatArray, jacobians: Sequence[FloatArray]
 ) -> tuple[FloatArray, float]:
     """Return the estimate's change between two problems, and the sum of squares it leaves."""
-    size = np.sqrt(sum((J**2).sum(axis=0) for J in jacobians))
+    low, high = (end.outputs(values) for end in ends)
+    output = [b - a for a, b in zip(low, high, strict=True)]
+    change = _change_of(ends[0], jacobians)(output)
+    left = [y - J @ change for y, J in zip(output, jacobians, strict=True)]
+    return change, sum(float(e @ e) for e in left)
+
+
+def _change_of(
+    problem: RecordProblem, jacobians: Sequence[FloatArray]
+) -> Callable[[Sequence[FloatArray]], FloatArray]:
+    """Return how the estimate changes with the measured outputs, to first order."""
+    white = [problem.filtered(J) for J in jacobians]
+    size = np.sqrt(sum((J**2).sum(axis=0) for J in white))
     size = np.where(size > 0.0, size, 1.0)
-    normal, right, square = np.zeros((values.size, values.size)), np.zeros(values.size), 0.0
-    for i, J in enumerate(jacobians):
-        low, high = (end.predict(values, i, derivatives=False).output for end in ends)
-        scaled = J / size
-        normal += scaled.T @ scaled
-        right += scaled.T @ (high - low)
-        square += float((high - low) @ (high - low))
-    change = np.asarray(np.linalg.pinv(normal, hermitian=True) @ right)
-    return change / size, square - float(change @ right)
+    normal = np.linalg.pinv(sum((J / size).T @ (J / size) for J in white), hermitian=True)
+
+    def change(output: Sequence[FloatArray]) -> FloatArray:
+        parts = zip(white, map(problem.filtered, output), strict=True)
+        return np.asarray(normal @ sum((J / size).T @ y for J, y in parts) / size)
+
+    return change
 
 
 def record_budget(problem: RecordProblem, values: FloatArray, errors: RecordErrors) -> Budget:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,22 @@ HIGHEST_ORDER = 60  # of autoregressions: a limit on time; Akaike's criterion ch
 SAMPLES_PER_ORDER = 20  # with fewer, the coefficients follow the noise
 _BAND = 1e-4  # of the drive's largest power: below, the drive is not in its band
 _OUTSIDE = 0.1  # share of frequencies outside the band needed to estimate the noise
+
+
+@dataclass(frozen=True)
+class DriveNoise:
+    """White noise of measured drives.
+
+    Attributes
+    ----------
+    stds : tuple of float
+        Standard deviation in each record, in the drive's unit.
+    share : float
+        Power of the noise over that of the drives, both within their band.
+    """
+
+    stds: tuple[float, ...]
+    share: float
 
 
 def prediction_error_filter(residuals: Sequence[FloatArray]) -> FloatArray:
@@ -71,20 +88,22 @@ def share_in_band(
     return above / below if below > 0.0 else 0.0
 
 
-def drive_noise(drives: Sequence[FloatArray]) -> float | None:
-    """Return the power of a drive's noise over that of the drive, both within its band.
+def drive_noise(drives: Sequence[FloatArray]) -> DriveNoise | None:
+    """Return the noise of measured drives, from their power outside the drive's band.
 
     The noise is taken as white, of the median power outside the band. None where less than a
     tenth of the frequencies lie outside, so that it cannot be estimated.
     """
-    noise, signal = 0.0, 0.0
+    stds, noise, signal = [], 0.0, 0.0
     for drive in drives:
         band, power = excited(drive), _power(drive)
         if np.mean(~band) < _OUTSIDE:
             return None
-        noise += float(np.median(power[~band])) / np.log(2.0) * band.sum() / drive.size
+        mean = float(np.median(power[~band])) / np.log(2.0)
+        stds.append((mean / float((np.hanning(drive.size) ** 2).sum())) ** 0.5)
+        noise += mean * band.sum() / drive.size
         signal += float(power[band].sum()) / drive.size
-    return noise / signal if signal > 0.0 else None
+    return DriveNoise(tuple(stds), noise / signal) if signal > 0.0 else None
 
 
 def excited(drive: FloatArray) -> NDArray[np.bool_]:

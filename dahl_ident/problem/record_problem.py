@@ -350,6 +350,18 @@ class RecordProblem:
         )
         return other
 
+    def with_noisier_drive(self, stds: Sequence[float], draw: int) -> RecordProblem:
+        """Return the same problem, white noise added to the drive of each record."""
+        from dahl_ident.engine import band_limited
+
+        rng = np.random.default_rng(draw)
+        other = copy(self)
+        other._drives = tuple(
+            (time, drive + band_limited(std * rng.standard_normal(time.size), 1.0 / r.sample_rate))
+            for (time, drive), r, std in zip(self._drives, self.records, stds, strict=True)
+        )
+        return other
+
     @cached_property
     def _system(self) -> System:
         from dahl_ident.engine import translate
@@ -487,12 +499,14 @@ class RecordProblem:
     def _first(self) -> FirstState:
         return FirstState(self.model)
 
+    def outputs(self, values: FloatArray) -> list[FloatArray]:
+        """Return the predicted output of each record."""
+        places = range(len(self.records))
+        return [self.predict(values, i, derivatives=False).output for i in places]
+
     def split_residuals(self, values: FloatArray) -> list[FloatArray]:
         """Return measured minus predicted output of each record."""
-        return [
-            y - self.predict(values, i, derivatives=False).output
-            for i, y in enumerate(self.measured)
-        ]
+        return [y - p for y, p in zip(self.measured, self.outputs(values), strict=True)]
 
     def quadratic(self, theta: FloatArray) -> Quadratic:
         """Return cost, gradient and Hessian at search coordinates, (S, P) or (P,).
