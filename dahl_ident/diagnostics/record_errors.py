@@ -100,16 +100,16 @@ def record_errors(
 ) -> RecordErrors:
     """Return the errors of an estimate.
 
-    A model that misses more than noise does so differently from place to place: where the blocks
-    of a record ask for parameters that scatter more than noise explains, the excess is the model
+    A model that misses more than noise does so differently from place to place: where the blocks of
+    a record ask for parameters that scatter more than noise explains, the excess is the model
     error. What the model misses everywhere alike does not show. Where several records ask for
-    parameters that scatter more than that explains, the excess is the scatter between runs. What
-    an assumed exponent changes counts with its range and with what the records say of it. Noise in
-    a measured drive makes
-    the response look smaller than it is, by the noise's share of the drive's power within its
-    band, and makes the plant wander; a calibration error of the force scales every force. Noise in a
-    measured displacement counts as far as it shifts the estimate; where the residuals show larger
-    errors of the displacement at turning points, what these shift beyond that.
+    parameters that scatter more than that explains, the excess is the scatter between runs. What an
+    assumed exponent changes counts with its range and with what the records say of it. Noise in a
+    measured drive makes the response look smaller than it is, by the noise's share of the drive's
+    power within its band, and makes the plant wander; a calibration error of the force scales every
+    force. Noise in a measured displacement counts as far as it shifts the estimate; where the
+    residuals show larger errors of the displacement at turning points, what these shift beyond
+    that.
 
     Parameters
     ----------
