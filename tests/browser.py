@@ -5,10 +5,12 @@ from __future__ import annotations
 import base64
 import json
 import os
+import select
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,10 @@ commands, answers = os.dup2(int(sys.argv[1]), 63), os.dup2(int(sys.argv[2]), 62)
 os.dup2(commands, 3), os.dup2(answers, 4)
 os.execv(sys.argv[3], sys.argv[3:])
 """
+
+
+_SECONDS = 60  # that an answer may take
+_LOADED = "new Promise(r => document.readyState === 'complete' ? r(1) : onload = () => r(1))"
 
 
 class Page:
@@ -52,6 +58,7 @@ class Page:
 
     def _receive(self) -> dict[str, Any]:
         while b"\0" not in self._buffer:
+            assert select.select([self._answers], [], [], _SECONDS)[0], "the browser is silent"
             part = os.read(self._answers, 1 << 16)
             assert part, "the browser ended"
             self._buffer += part
@@ -78,16 +85,46 @@ class Page:
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
 
-    def open(self, file: Path, width: int) -> None:
-        """Load a file in a window of this width."""
+    def open(self, place: Path | str, width: int) -> None:
+        """Load a file, or an address, in a window of this width."""
+        self.resize(width)
+        self.call("Page.navigate", url=place.as_uri() if isinstance(place, Path) else place)
+        self.value(_LOADED)
+
+    def resize(self, width: int) -> None:
+        """Give the window this width."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
             width=width, height=900, deviceScaleFactor=1, mobile=False,
         )  # fmt: skip
-        self.call("Page.navigate", url=file.as_uri())
-        self.value(
-            "new Promise(r => document.readyState === 'complete' ? r(1) : onload = () => r(1))"
-        )
+
+    def choose(self, selector: str, files: Sequence[Path]) -> None:
+        """Choose files in a form."""
+        root = self.call("DOM.getDocument")["root"]["nodeId"]
+        node = self.call("DOM.querySelector", nodeId=root, selector=selector)["nodeId"]
+        self.call("DOM.setFileInputFiles", nodeId=node, files=[str(file) for file in files])
+
+    def press(self, key: str, text: str = "") -> None:
+        """Press and release a key."""
+        codes = {"Tab": 9, "Enter": 13, " ": 32, "ArrowDown": 40}
+        code = codes.get(key, 0)
+        self.call(
+            "Input.dispatchKeyEvent", type="keyDown", key=key, text=text,
+            windowsVirtualKeyCode=code,
+        )  # fmt: skip
+        self.call("Input.dispatchKeyEvent", type="keyUp", key=key, windowsVirtualKeyCode=code)
+
+    def wait(self, condition: str, seconds: float = 60.0) -> None:
+        """Wait until a JavaScript expression is true, over changes of the page as well."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            try:
+                if self.value(condition):
+                    return
+            except AssertionError:  # between two pages
+                pass
+            time.sleep(0.05)
+        raise TimeoutError(f"{condition}: {self.value('document.body.innerText')}")
 
     def value(self, expression: str) -> Any:
         """Return what a JavaScript expression comes to; promises are awaited."""

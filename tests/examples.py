@@ -1,7 +1,8 @@
 """Run the examples in Markdown pages and the notebooks, and keep what they print and draw.
 
 ``python -m tests.examples`` renews the outputs of the README, the how-to pages and the notebooks,
-or of the files that are named; the tests compare them. A ``python`` block goes on where the one
+or of the files that are named; the tests compare them. Without names the pictures of the page
+of ``dahl-ident app`` are renewed as well. A ``python`` block goes on where the one
 before it on its page ended; a ``bash`` block runs in the same folder, with this environment's
 programs first. Of a notebook what is printed is compared; pictures are not.
 """
@@ -141,6 +142,10 @@ def _run_bash(code: str) -> str:
 
 def main(names: list[str]) -> None:
     """Renew the files that are named, or all."""
+    if not names:
+        where = os.environ | {"DAHL_IDENT_PICTURES": str(ROOT / "docs" / "images")}
+        test = [sys.executable, "-m", "pytest", "-q", "tests/test_app_browser.py", "-k", "table"]
+        subprocess.run(test, cwd=ROOT, env=where, check=True)
     chosen = [Path(name).resolve() for name in names] or [*pages(), *notebooks()]
     for each in chosen:
         with tempfile.TemporaryDirectory() as scratch:

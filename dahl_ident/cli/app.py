@@ -17,6 +17,7 @@ from dahl_ident.cli.export import export
 from dahl_ident.cli.extract import extract
 from dahl_ident.cli.fit import fit
 from dahl_ident.cli.inspect import inspect
+from dahl_ident.cli.page import app as app_page
 from dahl_ident.cli.plan import plan
 from dahl_ident.cli.report import report
 from dahl_ident.cli.sample import sample
@@ -38,8 +39,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 commands = (
-    demo, inspect, extract, fit, sample, plan, campaign, report, export, simulate, datasets,
-    template,
+    demo, app_page, inspect, extract, fit, sample, plan, campaign, report, export, simulate,
+    datasets, template,
 )  # fmt: skip
 for command in commands:
     app.command()(command)

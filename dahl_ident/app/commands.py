@@ -1,0 +1,193 @@
+"""From what the forms say to the commands, and the Python, that do it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dahl_ident.elements import Damper, Mass, Spring
+from dahl_ident.elements.element import class_named
+from dahl_ident.errors import DahlIdentError
+from dahl_ident.units import SI_UNITS, parse_quantity
+
+LINEAR = {"mass": Mass, "damping": Damper, "stiffness": Spring}
+"""The options of elements without friction, and their classes."""
+OF_TABLES = ("quantity", "amplitude", "frequency", "sweep", "level_from_name", "controlled")
+OF_RECORDS = ("sample_rate",)
+OF_BOTH = ("drive", "drive_factor")
+ROLES = (
+    "", "time", "displacement", "velocity", "acceleration", "force", "drive", "frequency",
+    "amplitude", "response", "real", "imag", "gain", "gain_db", "phase", "level", "run",
+    "controlled", "harmonic",
+)  # fmt: skip
+"""What a channel can mean; "" is what its name says, or nothing."""
+_COLUMNS, _REPORT = "columns.toml", "report.toml"
+REPORTS = ("report.html", "report.pdf", "report.md")
+"""The last one for the page itself: its tables and pictures."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command of a job: what it does, and its words after ``dahl-ident``."""
+
+    title: str
+    words: tuple[str, ...]
+
+
+def fit_steps(work: Mapping[str, Any], folder: Path, run: str, *, metadata: bool) -> list[Step]:
+    """Return the commands of a fit and its report, in the folder of the work."""
+    source, before = _source(work, folder, run)
+    laws = [word for file in work["laws"] for word in ("--laws", file)]
+    known = ["--metadata", _REPORT] if metadata else []
+    reports = [word for name in REPORTS for word in ("-o", f"{run}/{name}")]
+    saved = f"{run}/fit.json"
+    fit = ("fit", *source, *laws, *_model_words(work["model"]), *known, "--save", saved)
+    return [*before, Step("Fit", fit), Step("Report", ("report", saved, *laws, *known, *reports))]
+
+
+def compare_step(steps: Sequence[Mapping[str, Any]]) -> Step:
+    """Return the command that compares the model of a fit with others."""
+    fit = next(step["words"] for step in steps if step["title"] == "Fit")
+    return Step("Comparison", (*fit[: fit.index("--save")], "--compare"))
+
+
+def plan_step(run: str, form: Mapping[str, str], place: str, laws: Sequence[str]) -> Step:
+    """Return the command that plans the next measurement from a saved fit."""
+    words = ["plan", f"{run}/fit.json", *(word for file in laws for word in ("--laws", file))]
+    words += _options(form, ("frequency", "displacement", "force", "time", "controlled"))
+    for target in form.get("target", "").split():
+        words += ["--target", target]
+    words += ["--table", f"{place}/plan.csv", "--picture", f"{place}/plan.png"]
+    if form.get("sample_rate"):
+        words += ["--sample-rate", form["sample_rate"], "--waveform", f"{place}/waveform.csv"]
+    return Step("Plan", tuple(words))
+
+
+def _source(work: Mapping[str, Any], folder: Path, run: str) -> tuple[list[str], list[Step]]:
+    """Return files with the options for reading them, and an extraction that comes before."""
+    reading = work["reading"]
+    kind = reading.get("kind", "")
+    files = [str(file["stored"]) for file in work["files"]]
+    columns = ["--columns", _COLUMNS] if (folder / _COLUMNS).exists() else []
+    common = [*columns, *_options(reading, OF_BOTH)]
+    if kind == "extract":
+        words = ["extract", *files, *common, *_options(reading, (*OF_RECORDS, "controlled"))]
+        points = f"{run}/points.csv"
+        return [points], [Step("Extraction", (*words, "-o", points))]
+    if kind == "record":
+        return [*files, "--record", *common, *_options(reading, OF_RECORDS)], []
+    return [*files, *common, *_options(reading, OF_TABLES)], []
+
+
+def _model_words(model: Mapping[str, str]) -> list[str]:
+    """Return the options of the model."""
+    law = f"{model['law']}({model['known'].strip()})".removesuffix("()")
+    words = ["--element", f"backlash({law})" if model["play"] else law]
+    for name, value in _linear(model):
+        words += [f"--{name}", value]
+    return words
+
+
+def _linear(model: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Yield the elements without friction that the model has: name, and value or "free"."""
+    for name in LINEAR:
+        how = model.get(name, "none")
+        if how != "none":
+            yield name, "free" if how == "free" else model.get(f"{name}_value", "").strip()
+
+
+def _options(given: Mapping[str, str], names: Sequence[str]) -> list[str]:
+    return [word for name in names for word in _option(name, given.get(name, ""))]
+
+
+def _option(name: str, value: str) -> list[str]:
+    return [f"--{name.replace('_', '-')}", value.strip()] if value.strip() else []
+
+
+def as_python(work: Mapping[str, Any], folder: Path, *, metadata: bool) -> str:
+    """Return a program that does the same."""
+    reading, model = work["reading"], work["model"]
+    kind = reading.get("kind", "")
+    is_table = kind in ("", "table")
+    names = (*OF_BOTH, *(OF_TABLES if is_table else OF_RECORDS))
+    how = {name: reading[name] for name in names if reading.get(name)}
+    if (folder / _COLUMNS).exists():
+        how = {"columns": _COLUMNS, **how}
+    options = "".join(f", {name}={value!r}" for name, value in how.items())
+    files = [str(file["stored"]) for file in work["files"]]
+    data = f"di.read_frequency_response({files!r}{options})"
+    if not is_table:
+        data = f"[di.read_record(file{options}) for file in {files!r}]"
+    data = f"di.extract({data})" if kind == "extract" else data
+    law = class_named(model["law"])
+    name = law.__name__ if law is not None else model["law"]
+    own = law is None or not law.__module__.startswith("dahl_ident.")
+    element = f"{'' if own else 'di.'}{name}({model['known'].strip()})"
+    element = f"di.Backlash({element})" if model["play"] else element
+    for option, value in _linear(model):
+        element += f" + di.{LINEAR[option].__name__}({_in_si(value, option)})"
+    known = f", metadata={_REPORT!r}" if metadata else ""
+    sensors = f", sensors=di.Sensors.from_metadata({_REPORT!r})" if metadata else ""
+    return (
+        f"import dahl_ident as di\n\ndata = {data}\nfit = di.fit(data, {element}{sensors})\n"
+        f"print(fit.verdict)\nfit.save('fit.json')\ndi.report(fit, 'report.html'{known})\n"
+    )
+
+
+def _in_si(text: str, option: str) -> str:
+    """Return a quantity as a number in SI units, as a program states it; "" if it is free."""
+    unit = LINEAR[option].parameters[0].unit
+    kinds = tuple(kind for kind, both in SI_UNITS.items() if unit in both)
+    try:
+        return "" if text == "free" else f"{parse_quantity(text, kinds, option)[0]:.12g}"
+    except DahlIdentError:  # the command says what is wrong with it
+        return text
+
+
+def columns_toml(form: Mapping[str, str]) -> str:
+    """Return the column map of the data form: role, unit and sign of each channel."""
+    lines = []
+    for key, column in form.items():
+        number = key.removeprefix("channel_")
+        role = form.get(f"role_{number}", "")
+        if number == key or not role:
+            continue
+        lines.append(f"[{role}]\ncolumn = {_text(column)}")
+        if form.get(f"unit_{number}", "").strip():
+            lines.append(f"unit = {_text(form[f'unit_{number}'].strip())}")
+        if form.get(f"sign_{number}") == "-1":
+            lines.append("sign = -1")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def report_toml(form: Mapping[str, str]) -> str:
+    """Return the metadata of the report that the form states, empty fields left out."""
+    given = {name: text.strip() for name, text in form.items() if text.strip()}
+    texts = {k.removeprefix("meta_"): v for k, v in given.items() if k.startswith("meta_")}
+    lines = [f"{name} = {_text(text)}\n" for name, text in texts.items()]
+    for channel in ("force", "displacement", "delay"):
+        fields = ("name", "serial", "calibration", "uncertainty", "k")
+        one = {f: given[f"{channel}_{f}"] for f in fields if f"{channel}_{f}" in given}
+        if set(one) - {"k"}:
+            lines.append(f"\n[[instruments]]\nchannel = {_text(channel)}\n")
+            one.setdefault("name", f"{channel} channel".capitalize())
+            lines += [
+                f"{f} = {text if f == 'k' and _is_number(text) else _text(text)}\n"
+                for f, text in one.items()
+            ]
+    return "".join(lines)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _text(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

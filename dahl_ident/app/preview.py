@@ -1,0 +1,147 @@
+"""What files hold, as numbers for a page: channels, problems, points or loops.
+
+Run in a child process, ``python -m dahl_ident.app.preview``, because a file of another may be of
+any size and form: it reads the state of a work on standard input and prints JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tomllib
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dahl_ident.app.commands import OF_BOTH, OF_TABLES
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse, read_frequency_response, read_record
+from dahl_ident.data.readers import open_source
+from dahl_ident.data.readers.inspection import contents
+from dahl_ident.data.response_table import WaveformsError
+from dahl_ident.errors import DahlIdentError
+from dahl_ident.units import parse_quantity
+
+NOTHING_FOUND: Mapping[str, Any] = {
+    "channels": [], "notes": [], "curves": [],
+    "error": "", "kind": "", "summary": "", "format": "", "sampling": "",
+}  # fmt: skip
+_SHOWN = 300  # points of a picture
+
+
+def preview(state: dict[str, Any]) -> dict[str, Any]:
+    """Return channels of the first file, what could be read, and what could not."""
+    found: dict[str, Any] = dict(NOTHING_FOUND, channels=[], notes=[], curves=[])
+    files = [str(file["stored"]) for file in state["files"]]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            _describe(files[0], found)
+            _read(files, state["reading"], found)
+        except (DahlIdentError, ValueError, OSError) as exc:
+            found["error"] = str(exc)
+    found["notes"] += list(dict.fromkeys(str(one.message) for one in caught))
+    return found
+
+
+def _describe(file: str, found: dict[str, Any]) -> None:
+    source = open_source(file)
+    summary = contents(source)
+    place = Path("columns.toml")
+    text = place.read_text("utf-8") if place.exists() else summary.column_map
+    roles: dict[str, Any] = tomllib.loads(text)
+    by_column = {e["column"]: (r, e) for r, e in roles.items() if isinstance(e, dict)}
+    found["format"], found["sampling"] = summary.format, summary.sampling
+    found["notes"] += [*summary.gaps, *summary.notes]
+    for channel, line in zip(source.channels, summary.channels, strict=True):
+        role, entry = by_column.get(channel.name, ("", {}))
+        curve = _thumbnail(channel.values) if channel.kind in "fiu" else []
+        found["channels"].append(
+            {**asdict(line), "role": role, "curve": curve, "sign": entry.get("sign", 1),
+             "unit": entry.get("unit") or channel.unit or ""}
+        )  # fmt: skip
+
+
+def _read(files: Sequence[str], reading: dict[str, str], found: dict[str, Any]) -> None:
+    """Read the files as the commands will, and add what they show."""
+    how: dict[str, Any] = {n: reading[n] for n in OF_BOTH if reading.get(n)}
+    if Path("columns.toml").exists():
+        how["columns"] = "columns.toml"
+    kind = reading.get("kind", "")
+    if kind in ("", "table"):
+        own: dict[str, Any] = {n: reading[n] for n in OF_TABLES if reading.get(n)}
+        if "frequency" in own:
+            own["frequency"] = _hertz(own["frequency"], "frequency")
+        try:
+            table = read_frequency_response(list(files), **how, **own)
+        except WaveformsError:
+            if kind == "table":
+                raise
+        else:
+            found |= {"kind": "table", "summary": repr(table), "curves": _points(table)}
+            return
+    if reading.get("sample_rate"):
+        how["sample_rate"] = _hertz(reading["sample_rate"], "sample_rate")
+    records = [read_record(file, **how) for file in files]
+    found |= {"kind": kind or "record", "summary": "\n".join(map(repr, records))}
+    for record in records:
+        x, y = record.motion_samples, record.force_samples
+        found["curves"].append(_curve(x, y, record.motion_channel, "force or drive", line=True))
+
+
+def _hertz(text: str, what: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return parse_quantity(text, ("frequency",), what)[0]
+
+
+def _points(table: FrequencyResponse) -> list[dict[str, Any]]:
+    first = table.harmonic == 1
+    gain = np.abs(table.response[first])
+    level = next(v for v in (table.amplitude, table.drive) if v is not None)[first]
+    varied = np.unique(level[np.isfinite(level)]).size > 2
+    curves = [_curve(level, gain, "level", f"|{table.quantity}|", logs=True)] if varied else []
+    if np.unique(table.frequency_hz).size > 2:
+        f = table.frequency_hz[first]
+        curves.append(_curve(f, gain, "frequency, Hz", f"|{table.quantity}|", logs=True))
+    return curves
+
+
+def _curve(
+    x: FloatArray, y: FloatArray, name: str, other: str, *, line: bool = False, logs: bool = False
+) -> dict[str, Any]:
+    """Return a curve in the unit square, with the ends of its axes."""
+    keep = np.isfinite(x) & np.isfinite(y) & ((x > 0.0) & (y > 0.0) if logs else True)
+    x, y = x[keep], y[keep]
+    step = max(1, x.size // (10 * _SHOWN))
+    x, y = x[::step], y[::step]
+    ends = [[f"{v.min():.3g}", f"{v.max():.3g}"] if v.size else ["", ""] for v in (x, y)]
+    points = np.column_stack([_unit(np.log(v) if logs else v) for v in (x, y)])
+    return {"x": name, "y": other, "ends": ends, "line": line, "points": points.round(4).tolist()}
+
+
+def _thumbnail(values: Any) -> list[list[float]]:
+    """Return a channel in the unit square; lowest and highest of many samples at each place."""
+    y = np.asarray(values, dtype=np.float64).ravel()
+    y = y[np.isfinite(y)]
+    if y.size < 2:
+        return []
+    if y.size > _SHOWN:
+        parts = np.array_split(y, _SHOWN // 2)
+        y = np.array([v for part in parts for v in (part.min(), part.max())])
+    points: list[list[float]] = np.column_stack([np.linspace(0.0, 1.0, y.size), _unit(y)]).tolist()
+    return points
+
+
+def _unit(values: FloatArray) -> FloatArray:
+    size = float(np.ptp(values)) if values.size else 0.0
+    return np.asarray((values - values.min()) / size if size > 0.0 else np.full(values.shape, 0.5))
+
+
+if __name__ == "__main__":
+    sys.stdout.write(json.dumps(preview(json.load(sys.stdin))))

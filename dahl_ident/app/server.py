@@ -1,0 +1,382 @@
+"""The server: pages from the files of a folder, on this machine alone."""
+
+from __future__ import annotations
+
+import json
+import math
+import secrets
+import shlex
+import subprocess
+import sys
+import webbrowser
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from dahl_ident import reporting
+from dahl_ident.app import commands
+from dahl_ident.app.commands import Step
+from dahl_ident.app.guard import Guard
+from dahl_ident.app.jobs import Jobs, output
+from dahl_ident.app.pages import blocks, laws, loop_of
+from dahl_ident.app.preview import NOTHING_FOUND
+from dahl_ident.app.work import Work
+from dahl_ident.data.storage import save_frame
+from dahl_ident.errors import DahlIdentError
+from dahl_ident.results import FitResult
+
+LIMIT = 2_000_000_000
+"""Bytes that one upload may have."""
+_READ_SECONDS = 600  # for the preview of files
+_DOWNLOADS = {
+    "report.html": "Report", "report.pdf": "Report, PDF", "fit.json": "Fit, JSON",
+    "points.csv": "Points, CSV", "plan.csv": "Plan, CSV", "waveform.csv": "Waveform, CSV",
+}  # fmt: skip
+_EXPORTS = {
+    "latex": "LaTeX", "c": "C", "matlab": "MATLAB", "modelica": "Modelica", "urdf": "URDF",
+    "mujoco": "MuJoCo",
+}  # fmt: skip
+_OF_REPORT = (
+    "sandbox allow-scripts allow-modals allow-downloads; default-src 'none'; img-src data:; "
+    "style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+)
+_HERE = Path(__file__).parent
+
+
+class App:
+    """The pages.
+
+    Parameters
+    ----------
+    root : Path
+        Folder in which each piece of work has a folder.
+    laws : sequence of Path
+        Files with laws of the user, which every command gets.
+    """
+
+    def __init__(self, root: Path, laws: tuple[Path, ...] = ()) -> None:
+        self.root, self.jobs = root, Jobs()
+        self.laws = [str(path.resolve()) for path in laws]
+        self._templates = Environment(
+            loader=FileSystemLoader(_HERE / "templates"),
+            autoescape=select_autoescape(default=True, default_for_string=True),
+            undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        )  # fmt: skip
+
+    def routes(self) -> list[Route | Mount]:
+        """Return what every address shows or does."""
+        get, post = partial(Route, methods=["GET"]), partial(Route, methods=["POST"])
+        return [
+            get("/", self.start),
+            post("/", self.upload),
+            get("/laws/{kind}.svg", self.law),
+            get("/static/report.css", self.styles),
+            Mount("/static", StaticFiles(directory=_HERE / "static")),
+            get("/{work}", self.data),
+            post("/{work}", self.save_data),
+            post("/{work}/files", self.upload),
+            get("/{work}/model", self.model),
+            post("/{work}/model", self.save_model),
+            post("/{work}/commands", self.equivalent),
+            get("/{work}/run-{run:int}", self.run),
+            get("/{work}/run-{run:int}/state", self.state),
+            post("/{work}/run-{run:int}/{what:str}", self.act),
+            get("/{work}/run-{run:int}/file/{path:path}", self.download),
+            get("/{work}/run-{run:int}/export/{to}", self.export),
+        ]
+
+    def _page(self, name: str, status: int = 200, **values: Any) -> Response:
+        text = self._templates.get_template(f"{name}.html").render(now=name, **values)
+        return HTMLResponse(text, status)
+
+    def _work(self, request: Request) -> Work:
+        work = Work.named(self.root, request.path_params["work"])
+        if work is None:
+            raise HTTPException(404, "There is no such work in this folder.")
+        return work
+
+    def _run(self, request: Request) -> tuple[Work, Path]:
+        work = self._work(request)
+        folder = work.folder / f"run-{request.path_params['run']}"
+        if not (folder / "job.json").exists():
+            raise HTTPException(404, "There is no such run.")
+        return work, folder
+
+    async def start(self, request: Request) -> Response:
+        """Show earlier work, and where to drop files."""
+        works = [(work, work.state) for work in Work.all(self.root)]
+        return self._page("start", works=works, root=self.root)
+
+    async def upload(self, request: Request) -> Response:
+        """Store files, in a new piece of work or in one that is there."""
+        async with request.form(max_files=500) as form:
+            files = [f for f in form.getlist("files") if not isinstance(f, str) and f.filename]
+            if not files:
+                raise HTTPException(400, "No file was chosen; go back and choose one or more.")
+            there = "work" in request.path_params
+            work = self._work(request) if there else Work.create(self.root)
+            for file in files:
+                await run_in_threadpool(work.add, file.filename or "file", file.file)
+        return _to(f"/{work.name}")
+
+    async def data(self, request: Request) -> Response:
+        """Show what the files hold, and the form that says what it means."""
+        work = self._work(request)
+        found = await run_in_threadpool(self._preview, work)
+        return self._page("data", work=work, state=work.state, found=found, roles=commands.ROLES)
+
+    def _preview(self, work: Work) -> dict[str, Any]:
+        child = subprocess.run(
+            [sys.executable, "-m", "dahl_ident.app.preview"], cwd=work.folder, check=False,
+            input=json.dumps(work.state).encode(), capture_output=True, timeout=_READ_SECONDS,
+        )  # fmt: skip
+        if child.returncode:
+            last = child.stderr.decode(errors="replace").strip().splitlines()[-1:]
+            error = " ".join(["The files could not be read.", *last])
+            return {**NOTHING_FOUND, "error": error}
+        found: dict[str, Any] = json.loads(child.stdout)
+        for name in ("error", "summary"):
+            found[name] = work.in_users_words(found[name])
+        found["notes"] = [work.in_users_words(note) for note in found["notes"]]
+        return found
+
+    async def save_data(self, request: Request) -> Response:
+        """Store what the channels are; go on, or show again what can be read."""
+        work, form = self._work(request), await _form(request)
+        work.write("columns.toml", commands.columns_toml(form))
+        names = ("kind", *commands.OF_TABLES, *commands.OF_RECORDS, *commands.OF_BOTH)
+        reading = {name: form.get(name, "") for name in names}
+        if form.get("next"):  # what was found has been confirmed
+            reading["kind"] = reading["kind"] or form.get("found", "")
+        work.save(reading=reading, confirmed="next" in form)
+        return _to(f"/{work.name}/model" if form.get("next") else f"/{work.name}")
+
+    async def model(self, request: Request) -> Response:
+        """Show the form of model and knowledge."""
+        work = self._work(request)
+        found = await run_in_threadpool(laws, self.laws)
+        return self._page("model", work=work, state=work.state, laws=found)
+
+    async def save_model(self, request: Request) -> Response:
+        """Store model and knowledge, and start a run."""
+        work, form = self._work(request), await _form(request)
+        work.save(**_knowledge(form))
+        work.write("report.toml", commands.report_toml(form))
+        folder = work.new_run()
+        steps, program = self._commands(work, work.state, folder.name)
+        (folder / "program.py").write_text(program, "utf-8")
+        self.jobs.start(folder, steps, work.folder)
+        return _to(f"/{work.name}/{folder.name}")
+
+    def _commands(self, work: Work, state: dict[str, Any], run: str) -> tuple[list[Step], str]:
+        state["laws"] = self.laws
+        metadata = bool(commands.report_toml(state["report"]))
+        steps = commands.fit_steps(state, work.folder, run, metadata=metadata)
+        return steps, commands.as_python(state, work.folder, metadata=metadata)
+
+    async def equivalent(self, request: Request) -> Response:
+        """Return what the form comes to as commands, and in Python, without starting it."""
+        work, form = self._work(request), await _form(request)
+        run = f"run-{1 + len(work.runs())}"
+        steps, program = self._commands(work, {**work.state, **_knowledge(form)}, run)
+        return JSONResponse({"commands": _typed(steps), "program": program})
+
+    async def run(self, request: Request) -> Response:
+        """Show how a run goes, and its result."""
+        work, folder = self._run(request)
+        job = self.jobs.state(folder)
+        report = folder / "report.md"
+        found = blocks(work.in_users_words(report.read_text("utf-8"))) if report.exists() else []
+        parts = []
+        for part in sorted(folder.glob("*-[0-9]*"), key=lambda p: p.stat().st_mtime):
+            one = self.jobs.state(part)
+            text = work.in_users_words(output(part, len(one["steps"]) - 1))
+            parts.append((part.name, one, text, self._files(part)))
+        return self._page(
+            "run", work=work, state=work.state, folder=folder, job=job, blocks=found, parts=parts,
+            typed=_typed([Step(one["title"], tuple(one["words"])) for one in job["steps"]]),
+            program=(folder / "program.py").read_text("utf-8"), files=self._files(folder),
+            failed=work.in_users_words(job["error"]), exports=_EXPORTS,
+            is_table=_is_table(folder), busy=self.jobs.is_running(folder),
+        )  # fmt: skip
+
+    def _files(self, folder: Path) -> list[tuple[str, str]]:
+        return [
+            (name, text) for name, text in _DOWNLOADS.items()
+            if (folder / name).exists() or (name == "points.csv" and _is_table(folder))
+        ]  # fmt: skip
+
+    async def state(self, request: Request) -> Response:
+        """Return how a run goes, for the page's script."""
+        _, folder = self._run(request)
+        job, left = self.jobs.state(folder), ""
+        if job["left"] is not None:
+            left = f", about {math.ceil(job['left'])} s left"
+        title = job["steps"][min(job["step"], len(job["steps"]) - 1)]["title"]
+        at = f"step {job['step'] + 1} of {len(job['steps'])}"
+        text = f"{title}: {at}, {job['seconds']:.0f} s{left}"
+        return JSONResponse({"busy": self.jobs.is_running(folder), "text": text})
+
+    async def act(self, request: Request) -> Response:
+        """Cancel a run, or start what goes on from its fit."""
+        work, folder = self._run(request)
+        what, form = request.path_params["what"], await _form(request)
+        if what == "cancel":
+            for part in (folder, *folder.glob("*-[0-9]*")):
+                self.jobs.cancel(part)
+        elif what in ("compare", "plan") and not self.jobs.is_running(folder):
+            number = 1 + len(list(folder.glob(f"{what}-*")))
+            part = folder / f"{what}-{number}"
+            part.mkdir()
+            place = f"{folder.name}/{part.name}"
+            step = (
+                commands.plan_step(folder.name, form, place, self.laws)
+                if what == "plan"
+                else commands.compare_step(self.jobs.state(folder)["steps"])
+            )
+            self.jobs.start(part, [step], work.folder)
+        return _to(f"/{work.name}/{folder.name}")
+
+    async def download(self, request: Request) -> Response:
+        """Return a file of a run: one of those that its jobs write, by a name from the folder."""
+        work, folder = self._run(request)
+        wanted = request.path_params["path"]
+        if wanted == "points.csv" and _is_table(folder):
+            await run_in_threadpool(_write_points, folder)
+        there = {str(path.relative_to(folder)): path for path in folder.rglob("*")}
+        path = there.get(wanted)
+        if path is None or not path.is_file() or path.suffix not in (
+            ".html", ".pdf", ".json", ".csv", ".png"
+        ):  # fmt: skip
+            raise HTTPException(404, "There is no such file in this run.")
+        if path.suffix == ".html":  # has its styles in itself
+            return FileResponse(path, headers={"Content-Security-Policy": _OF_REPORT})
+        name = None if path.suffix == ".png" else f"{Path(work.state['title']).stem}_{path.name}"
+        return FileResponse(path, filename=name)
+
+    async def export(self, request: Request) -> Response:
+        """Return the model as another program reads it."""
+        work, folder = self._run(request)
+        to = request.path_params["to"]
+        if to not in _EXPORTS:
+            raise HTTPException(404, "There is no such format.")
+        words = ["export", f"{folder.name}/fit.json", "--to", to, "-o", "-"]
+        made = await run_in_threadpool(
+            subprocess.run, [sys.executable, "-m", "dahl_ident.cli", *words],
+            cwd=work.folder, check=False, capture_output=True,
+        )  # fmt: skip
+        if made.returncode:
+            raise HTTPException(400, made.stderr.decode(errors="replace").strip())
+        where = {"Content-Disposition": f'attachment; filename="friction_{to}.txt"'}
+        return Response(made.stdout, headers=where, media_type="text/plain")
+
+    async def styles(self, request: Request) -> Response:
+        """Return the styles of reports, which the pages share."""
+        return FileResponse(Path(reporting.__file__).with_name("page.css"))
+
+    async def law(self, request: Request) -> Response:
+        """Return the picture of a law's loop."""
+        text = await run_in_threadpool(loop_of, request.path_params["kind"])
+        if text is None:
+            raise HTTPException(404, "There is no picture of this law.")
+        return Response(text, media_type="image/svg+xml")
+
+    async def failed(self, request: Request, exc: Exception) -> Response:
+        """Show an error as a page."""
+        status = exc.status_code if isinstance(exc, HTTPException) else 400
+        text = exc.detail if isinstance(exc, HTTPException) else str(exc)
+        page = self._templates.get_template("error.html").render(error=text)
+        return HTMLResponse(page, status)
+
+
+def _knowledge(form: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """Return what the model form says, as the state keeps it."""
+    model = {name: form.get(name, "") for name in ("law", "known", "play")}
+    for name in commands.LINEAR:
+        model |= {name: form.get(name, "none"), f"{name}_value": form.get(f"{name}_value", "")}
+    kept = ("meta_", "force_", "displacement_", "delay_")
+    return {"model": model, "report": {n: t for n, t in form.items() if n.startswith(kept)}}
+
+
+def _typed(steps: Sequence[Step]) -> str:
+    """Return commands as they are typed."""
+    return "".join(f"{shlex.join(('dahl-ident', *step.words))}\n" for step in steps)
+
+
+def _to(place: str) -> Response:
+    return RedirectResponse(place, status_code=303)
+
+
+async def _form(request: Request) -> dict[str, str]:
+    form = await request.form(max_fields=5000)
+    return {name: value for name, value in form.items() if isinstance(value, str)}
+
+
+def _write_points(folder: Path) -> None:
+    """Write the points of a fit, where an extraction has not done so."""
+    if not (folder / "points.csv").exists():
+        points = FitResult.load(folder / "fit.json").data.to_frame()
+        save_frame(points, folder / "points.csv")
+
+
+def _is_table(folder: Path) -> bool:
+    """Return whether a run fitted a table, whose model can be compared with others."""
+    saved = folder / "fit.json"
+    head = saved.read_text("utf-8")[:200] if saved.exists() else ""
+    return '"schema": "dahl_ident.fit_result"' in head
+
+
+def application(
+    root: Path, token: str, port: int, laws: tuple[Path, ...] = (), limit: int = LIMIT
+) -> tuple[Starlette, Jobs]:
+    """Return the server's application, and its jobs."""
+    app = App(root, laws)
+    errors: Mapping[Any, Any] = {HTTPException: app.failed, DahlIdentError: app.failed}
+    guard = Middleware(Guard, token=token, port=port, limit=limit)
+    return Starlette(routes=app.routes(), middleware=[guard], exception_handlers=errors), app.jobs
+
+
+def serve(root: Path, *, port: int, laws: tuple[Path, ...] = (), browser: bool = True) -> None:
+    """Serve the page until it is interrupted.
+
+    Parameters
+    ----------
+    root : Path
+        Folder for the work.
+    port : int
+        0 takes a free one.
+    laws : tuple of Path
+        Files with laws of the user.
+    browser : bool, default True
+        Open the page.
+    """
+    import socket
+
+    listening = socket.create_server(("127.0.0.1", port))
+    port = listening.getsockname()[1]
+    token = secrets.token_urlsafe(24)
+    app, jobs = application(root, token, port, laws)
+    address = f"http://127.0.0.1:{port}/?token={token}"
+    sys.stdout.write(f"{address}\nwork is kept in {root.resolve()}; Ctrl-C ends the server\n")
+    sys.stdout.flush()
+    if browser:
+        webbrowser.open(address)
+    server = uvicorn.Server(uvicorn.Config(app, log_level="warning", access_log=False))
+    try:
+        server.run(sockets=[listening])
+    except KeyboardInterrupt:
+        pass
+    finally:
+        jobs.stop()

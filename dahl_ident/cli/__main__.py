@@ -1,0 +1,5 @@
+"""``python -m dahl_ident.cli``: the command line, where its script is not on the path."""
+
+from dahl_ident.cli import main
+
+main()
