@@ -42,7 +42,7 @@ unit: install  ## tests and doctests, warnings as errors
 	$(BIN)/pytest -n $(JOBS) --dist worksteal
 
 # What depends on versions: readers, the engine, laws, searches, chains, pictures, reports, storage.
-LOWEST := package engine forced_motion readers_formats readers_strict readers_text record \
+LOWEST := package app engine forced_motion readers_formats readers_strict readers_text record \
 	frequency_response extraction_sources law_checks cli results report_content export fitting \
 	bayes_priors posterior plots driven_iwan synthetic_lab
 

@@ -21,7 +21,7 @@ from dahl_ident.synthetic import Experiment
 from tests.command_line import Runner
 
 COMMANDS = (
-    "demo", "inspect", "extract", "fit", "sample", "plan", "campaign", "report", "export",
+    "demo", "app", "inspect", "extract", "fit", "sample", "plan", "campaign", "report", "export",
     "simulate", "datasets", "template",
 )  # fmt: skip
 PROGRAM = Path(sys.executable).with_name("dahl-ident")
@@ -130,7 +130,10 @@ def test_options_come_from_a_file_and_the_command_line_wins(run: Runner) -> None
     [
         ("[fit]\nnosie = 1\n", "fit has no option nosie; there are "),
         ('nosie = "absolute"\n', "no command has the option nosie; there are "),
-        ('[fti]\nnoise = "absolute"\n', "no command is called fti; there are campaign, datasets, "),
+        (
+            '[fti]\nnoise = "absolute"\n',
+            "no command is called fti; there are app, campaign, datasets, ",
+        ),
         ("fti = 3\n", "no command has the option fti; "),
     ],
 )
@@ -328,8 +331,8 @@ def test_every_help_has_an_example_that_runs(run: Runner, command: str) -> None:
     help_text = " ".join(re.sub("[│╭╮╰╯]", " ", run(command, "--help").out).split())
     found = re.search(r"Example: (dahl-ident .*?)(?= (?:Arguments|Options|Ends) |─|$)", help_text)
     assert found, help_text
-    if command == "demo":
-        return  # run by make demo and by the test of the chain
+    if command in ("demo", "app"):
+        return  # run by make demo and the test of the chain; by the tests of the page
     if command == "campaign":
         run("datasets", "noisy", "-o", "device.csv")
         Path("campaign.toml").write_text(

@@ -8,6 +8,7 @@ from pathlib import Path
 # Rooms side by side with what they do, and what the data have become when they leave the layer.
 LAYERS = (
     ((("cli", "commands"),), ""),
+    ((("app", "the page in the browser"),), ""),
     ((("campaigns", "many devices"),), "one table"),
     ((("reporting", "reports"),), "HTML, PDF, Markdown, JSON"),
     ((("results", "what users hold"),), "FitResult, Posterior"),
