@@ -4,7 +4,8 @@ A parameter is **identified** where the standard deviation of its logarithm is b
 **not identified** above 1, and **weakly identified** between. The standard deviation is the larger
 of two: the first-order one (Fisher information), and that of the profile (width of its 95.45 %
 interval over the widths of the threshold). A parameter short of identified whose profile is
-still open at 99.73 % is not identified. Parameters that may be zero or negative have no
+still open at 99.73 % is not identified. Where every first-order one is below 0.1, profiles are not
+searched: they would differ in the second digit. Parameters that may be zero or negative have no
 logarithm; theirs is the standard deviation over their size, or over a tenth of the size at which
 they would make up the whole response, if that is more.
 
@@ -15,7 +16,7 @@ determined direction is given as a vector.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import combinations
@@ -34,12 +35,13 @@ from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.formatting import interval as interval_text
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import Information, shares
-from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval
+from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval, wald_intervals
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.fitting import Optimum, Status
 
 IDENTIFIED_BELOW = 0.25  # u of a logarithm: 95 % within a factor of 1.6
 NOT_IDENTIFIED_ABOVE = 1.0  # the same: a factor of 7, hardly an order of magnitude
+_NEARLY_LINEAR = 0.1  # u of every logarithm below which profiles are not searched
 _SIZE_THAT_MATTERS = 0.1  # of the response, for parameters that may be zero
 _BY_RANGE = 0.1  # u of a logarithm that the exponent's assumed range makes, not the data
 _MEASURE = "measure more points, or use a model that misses less"
@@ -245,16 +247,16 @@ def identifiability(fit: Fit) -> Identifiability:
     >>> print(identifiability(result).headline)
     Every parameter is identified.
     """
-    return judged(fit.optimum, fit.conf_interval("wald" if fit.first_order else "profile"))
+    return judged(fit.optimum, None if fit.first_order else lambda: fit.conf_interval("profile"))
 
 
 def judged(
     optimum: Optimum,
-    intervals: ConfidenceIntervals,
+    profile_of: Callable[[], ConfidenceIntervals] | None,
     errors: ErrorModel | None = None,
     stated: ConfidenceIntervals | None = None,
 ) -> Identifiability:
-    """Return the verdicts on an optimum, given its profile intervals at the three LEVELS.
+    """Return the verdicts on an optimum, given how to find its profiles at the three LEVELS.
 
     With `errors`, parameters that noise leaves determined and other sources do not are not. The
     limits in the texts are those of `stated`, by default of the profile.
@@ -262,6 +264,10 @@ def judged(
     information, problem = Information(optimum), optimum.problem
     natural = natural_sizes(optimum)
     fisher = np.sqrt(np.diagonal(optimum.covariance)) / natural
+    if profile_of is None or np.all(fisher < _NEARLY_LINEAR):
+        intervals = wald_intervals(optimum, LEVELS)
+    else:
+        intervals = profile_of()
     profile = _profile_std(optimum, intervals, natural)
     verdicts = {
         name: _verdict(float(f), float(p), intervals[name][-1])
@@ -330,8 +336,11 @@ def _lost_beyond_noise(
 
 
 def _signs_unseen(optimum: Optimum) -> dict[str, str]:
-    """Return what is said of friction parameters whose sign the data do not show, by name."""
-    problem, found = optimum.problem, {}
+    """Return what is said of friction parameters whose sign the data do not show, by name.
+
+    Where a mirrored law is the same to a sine, it is to the exact motion.
+    """
+    problem, found = optimum.problem.with_steady("describing function"), {}
     for i in problem.friction_columns.tolist():
         parameter, turned = problem.parameters[i], optimum.theta.copy()
         turned[i] = -turned[i]
@@ -354,7 +363,7 @@ def _order_unseen(optimum: Optimum) -> dict[str, str]:
     Such as exponents of pulling and pushing, whose fundamental is that of the mirrored law. All
     that is exchanged must be like in kind; a move that should have cost something costs nothing.
     """
-    problem, found = optimum.problem, dict[str, str]()
+    problem, found = optimum.problem.with_steady("describing function"), dict[str, str]()
     scale = optimum.scale or 1.0
     for order in _exchanges(optimum):
         move = optimum.theta[order] - optimum.theta

@@ -39,6 +39,7 @@ _REMAINDER = 3e-7  # standard deviations that the last step may leave
 _LAST_STEP = 1e-6  # of a logarithm: the Hessian is that before the last step
 _UNSEEN = 4.0 * _EPS  # relative change of a cost that may be rounding
 _OF_ACCURACY = 0.3  # the same, where predictions are less accurate: of that accuracy
+_OVERTIME = 2.0  # times the steps of another search that has converged, and lower
 NEARLY = 1e-4  # relative difference of costs that are nearly alike
 
 
@@ -123,6 +124,7 @@ def minimise(
     n_residuals: int,
     *,
     inside: Callable[[FloatArray, IntArray | None], BoolArray] | None = None,
+    owner: IntArray | None = None,
     tolerance_factor: float = 1.0,
     enough: float = 0.0,
     steps: int = 80,
@@ -132,14 +134,16 @@ def minimise(
 
     `logarithmic` says which coordinates are logarithms: their steps have a longest length.
     Searches that leave the region `inside`, which is called like `evaluate`, end there, not
-    converged. `tolerance_factor` multiplies the
-    length of the step at which a search has converged; `enough` is a fall of the cost that is
-    not worth a step, however long. `accuracy` is that of predictions, relative to the data.
+    converged; so do those that are still higher after twice the steps in which another one of the
+    same `owner` has converged. `tolerance_factor` multiplies the length of the step at which a
+    search has converged; `enough` is a fall of the cost that is not worth a step, however long.
+    `accuracy` is that of predictions, relative to the data.
     """
+    owner = np.arange(len(theta)) if owner is None else owner
     with np.errstate(all="ignore"):
         return _minimise(
-            evaluate, theta, logarithmic, n_residuals, inside, tolerance_factor, enough, steps,
-            accuracy,
+            evaluate, theta, logarithmic, n_residuals, inside, owner, tolerance_factor, enough,
+            steps, accuracy,
         )  # fmt: skip
 
 
@@ -194,6 +198,7 @@ def _minimise(
     logarithmic: BoolArray,
     n_residuals: int,
     inside: Callable[[FloatArray, IntArray | None], BoolArray] | None,
+    owner: IntArray,
     tolerance_factor: float,
     enough: float,
     steps: int,
@@ -207,7 +212,8 @@ def _minimise(
     active = np.arange(S)
     damping, growth = np.full(S, _FIRST_DAMPING), np.full(S, 2.0)
     last = np.full(S, 1e-300)
-    for _ in range(steps if P else 0):
+    first, lowest = np.full((2, owner.max(initial=0) + 1), np.inf)  # converged one of an owner
+    for count in range(steps if P else 0):
         step, moves, predicted, longest = _step(at, damping, logarithmic)
         shortest = tolerance_factor**2 * _tolerance(at, logarithmic, n_residuals, accuracy)
         settled = moves * np.minimum(1.0, moves / last) <= shortest
@@ -219,10 +225,14 @@ def _minimise(
         which = None if active.size == S else active
         if inside is not None:
             lost |= ~inside(at.theta, which)
+        own = owner[active]
+        lost |= (count > _OVERTIME * first[own]) & (at.cost > lowest[own])
         ended = settled | lost
         if ended.any():
             settled &= ~lost
             converged[active] = settled
+            np.minimum.at(first, own[settled], count)
+            np.minimum.at(lowest, own[settled], at.cost[settled])
             ends.put(active, at.moved(settled, step, predicted))
             keep = ~ended
             active, at = active[keep], at.take(keep)

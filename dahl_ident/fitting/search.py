@@ -120,11 +120,6 @@ def solve(
     own = [p.value for p in problem.parameters if p.value is not None]
     if not limits and len(own) == len(problem.parameters):
         return search.run(Starts(np.zeros(1, np.intp), problem.to_search(own)[None]))[0]
-    if limits and problem.is_exact:
-        sine = problem.with_steady("describing function")
-        optimum = solve(sine, method=method, loss=loss, start=start)
-        if not problem.takes_energy(optimum.theta):
-            return optimum  # no steady motion to begin from
     found = own_starts(problem, resistant=loss != "linear")
     if start is not None:
         given = _completed(problem, start, found.theta[0])
@@ -347,6 +342,7 @@ class _Search:
             logarithmic,
             self.m,
             inside=None if limit else inside,
+            owner=begin.table,
             tolerance_factor=_AT_LIMIT if limit else self.tolerance,
             steps=steps,
             accuracy=problem.accuracy,

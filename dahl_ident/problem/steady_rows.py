@@ -163,7 +163,10 @@ class SteadyRows:
         measured: ComplexArray,
         chosen: list[int],
     ) -> ComplexArray:
-        """Return the motions of one table, each level followed in the order of its rows."""
+        """Return the motions of one table, each level followed in the order of its rows.
+
+        With derivatives, as far as there are any: a search needs all rows, or none.
+        """
         result = np.full((drive.size, 2 + len(chosen)), np.nan, dtype=np.complex128)
         order = self._shooting.system.order
         orbits = np.full((len(self._order), order), np.nan)
@@ -184,6 +187,8 @@ class SteadyRows:
                 nearer = ~(apart[far] <= np.abs(other[:, 0] - at)) & np.isfinite(other[:, 0])
                 X[far[nearer]], own[far[nearer]] = other[nearer], orbit[nearer]
             result[rows] = X
+            if chosen and np.isnan(X).any():
+                break  # of no use to a search
             orbits[sweeps] = own
         return result
 

@@ -156,9 +156,8 @@ class JudgedFit(FitNumbers):
     @cached_property
     def identifiability(self) -> Identifiability:
         """Which parameters, or which combinations of them, the data determine."""
-        method: Method = "wald" if self._first_order else "profile"
-        profile, stated = self.conf_interval(method), self.conf_interval()
-        found = judged(self._optimum, profile, self.errors, stated)
+        profile = None if self._first_order else lambda: self.conf_interval("profile")
+        found = judged(self._optimum, profile, self.errors, self.conf_interval())
         sources: Mapping[str, ParameterBudget] = self.stated_budget or {}
         combinations = tuple(
             replace(c, value=sources[c.expression].value, stderr=sources[c.expression].u)
