@@ -55,6 +55,7 @@ _MOST_COMBINATIONS = 4000  # nodes of all elements together: a limit on memory a
 _MOST_OF_ONE = 1000  # of one element whose curves have to be computed node by node
 _MOST_STARTS = 4  # searches a table: a limit on their cost
 _HOPELESS = 100.0  # times the lowest sum of squares: no start, even with coarse nodes
+_ALIKE = 0.01  # relative difference of the sums of squares of nodes that may be one start
 _AROUND = np.array([-1, 0, 1])  # a node and its neighbours, for a parabola
 
 
@@ -105,7 +106,7 @@ def _starts(problem: Problem, view: StiffnessData) -> Starts:
     best = _vertices(grid, cost, coefficients)
     lead = cost.shape[:-1]
     S, nodes = problem.n_tables, cost.shape[-1]
-    table, place = _local_minima(cost.reshape(S, *grid.shape))
+    table, place = _local_minima(cost.reshape(S, *grid.shape), mixed=grid.mixed)
     at_edge = grid.shape == (nodes,) and ((place == 0) | (place == nodes - 1)).any()
     if at_edge and nodes > sum(_FINE_ENDS):  # bounds may keep an optimum far out from there
         first = np.flatnonzero(np.diff(table, prepend=-1))
@@ -216,6 +217,7 @@ class _Grid:
     target: ComplexArray  # weighted, (..., n)
     weights: FloatArray  # (..., n)
     common: list[_Column]  # the same at every node, curves of shape (..., n)
+    mixed: bool  # nodes of several directions follow each other: neighbours need not be near
 
     def solved(self) -> tuple[FloatArray, FloatArray]:
         """Return the sum of squares, (..., C), and the linear coefficients, (..., C, Q)."""
@@ -314,6 +316,7 @@ def _grid(problem: Problem, view: StiffnessData) -> _Grid:
         (view.stiffness - rest) * view.weights,
         view.weights,
         common,
+        any(len(d.nonlinear) > 1 for d in searched),
     )
 
 
@@ -649,10 +652,11 @@ def _parts(values: ComplexArray) -> FloatArray:
     return np.ascontiguousarray(values).view(np.float64)
 
 
-def _local_minima(cost: FloatArray) -> tuple[IntArray, IntArray]:
+def _local_minima(cost: FloatArray, *, mixed: bool) -> tuple[IntArray, IntArray]:
     """Return each table's lowest local minima over its grid, (S, ...): table and flat index.
 
-    The lowest of a table comes first; a table without any has its first node.
+    The lowest of a table comes first; a table without any has its first node. Where nodes are
+    `mixed`, minima of nearly the same cost count as one: a parameter that does not matter there.
     """
     S = len(cost)
     lowest = cost < np.inf
@@ -667,6 +671,10 @@ def _local_minima(cost: FloatArray) -> tuple[IntArray, IntArray]:
         return table, place
     order = np.lexsort((flat[table, place], table))
     table, place = table[order], place[order]
+    if mixed:
+        found = flat[table, place]
+        alike = (np.diff(table) == 0) & (found[1:] <= (1.0 + _ALIKE) * found[:-1])
+        table, place = table[np.append(True, ~alike)], place[np.append(True, ~alike)]
     first = np.searchsorted(table, table)
     rank = np.arange(table.size) - first
     found = flat[table, place]

@@ -1,0 +1,207 @@
+"""Every law in a driven plant: sweeps of another integrator give back what made them.
+
+Each law is written out once more here, as a rate or as sliders, and integrated by Runge and Kutta's
+method in fixed steps, from near the steady motion until cycles no longer change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import control
+import numpy as np
+import pytest
+
+import dahl_ident as di
+from dahl_ident.arrays import ComplexArray, FloatArray
+
+MASS, DAMPING, STIFFNESS = 0.3, 1.0, 8.0
+F_MAX, SIGMA = 0.1, 30.0
+STEPS, CYCLES = 500, 60
+SETTLED = 1e-5
+NOISE = 0.003
+KNOWN = {"damping": DAMPING, "stiffness": STIFFNESS}
+
+Law = Callable[[FloatArray, FloatArray], FloatArray]
+"""(friction force, velocity) -> rate of the force."""
+
+
+class Exponential(di.Friction):
+    """Linear Dahl, from its slope alone."""
+
+    parameters = di.Dahl.parameters[:2]
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        f_max, sigma = values
+        return sigma * (1.0 - direction * force / f_max)
+
+
+class Jenkins(di.Friction):
+    """A spring that slips: a kink inside the branch."""
+
+    parameters = di.Dahl.parameters[:2]
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        f_max, sigma = values
+        return sigma * (direction * force < f_max)
+
+
+class Sliders(NamedTuple):
+    """Springs in parallel, each with a displacement at which it slips."""
+
+    stiffness: FloatArray
+    slip: FloatArray
+
+
+def dahl(exponent: float = 1.0, asymmetry: float = 0.0) -> Law:
+    """Dahl's law."""
+
+    def rate(force: FloatArray, v: FloatArray) -> FloatArray:
+        side = np.sign(v)
+        margin = 1.0 - side * force / (F_MAX * (1.0 + side * asymmetry))
+        return np.asarray(SIGMA * np.sign(margin) * np.abs(margin) ** exponent * v)
+
+    return rate
+
+
+def bouc_wen(force: FloatArray, v: FloatArray) -> FloatArray:
+    """Exponent 1, with other rates for loading and unloading."""
+    loading = force * v > 0.0
+    return v * (SIGMA + np.where(loading, -300.0, 100.0) * np.abs(force))
+
+
+def lugre(force: FloatArray, v: FloatArray) -> FloatArray:
+    """A limit that falls with the speed."""
+    limit = F_MAX * (1.0 + 0.5 * np.exp(-((v / 0.05) ** 2)))
+    return SIGMA * (v - np.abs(v) * force / limit)
+
+
+def iwan(chi: float, ratio: float, count: int = 400) -> Sliders:
+    """Segalman's density in cells, and the stiffness that slips last."""
+    g = chi + 1.0
+    largest = F_MAX / SIGMA * (1.0 + ratio) / (ratio + g / (g + 1.0))
+    edge = np.linspace(0.0, 1.0, count + 1) ** (1.0 / g)
+    stiffness = SIGMA / (1.0 + ratio) * np.diff(edge**g)
+    mean = g / (g + 1.0) * np.diff(edge ** (g + 1.0)) / np.diff(edge**g)
+    last = SIGMA * ratio / (1.0 + ratio)
+    return Sliders(np.append(stiffness, last), largest * np.append(mean, 1.0))
+
+
+class Case(NamedTuple):
+    """A law to be fitted, what made the data, and its parameters there."""
+
+    law: di.Element
+    by: Law | Sliders
+    truth: dict[str, float]
+    blind: tuple[str, ...] = ()
+    """Parameters that fundamentals cannot determine."""
+    free: tuple[str, ...] = ("damping", "stiffness")
+
+
+BOTH = {"f_max": F_MAX, "sigma": SIGMA}
+ONE = Sliders(np.array([SIGMA]), np.array([F_MAX / SIGMA]))
+PAIR = Sliders(np.array([20.0, 10.0]), np.array([0.002, 0.006]))
+CASES = {
+    "linear Dahl": Case(di.Dahl(alpha=1.0), dahl(), BOTH),
+    "Dahl, free exponent": Case(di.Dahl(alpha=None), dahl(0.7), {**BOTH, "alpha": 0.7}),
+    "asymmetric Dahl": Case(
+        di.Dahl(alpha=1.0, asymmetry=None), dahl(1.0, 0.3), BOTH, blind=("asymmetry",)
+    ),
+    "Bouc-Wen": Case(di.BoucWen(), bouc_wen, {"sigma": SIGMA, "q": 300.0, "p": 100.0}),
+    "LuGre": Case(di.LuGre(), lugre, {**BOTH, "static_ratio": 1.5, "stribeck_speed": 0.05}),
+    "Iwan": Case(di.Iwan(), iwan(-0.3, 0.5), {**BOTH, "chi": -0.3, "ratio": 0.5}),
+    "Maxwell slip": Case(
+        di.MaxwellSlip([0.002, 0.006]), PAIR, {"stiffness_1": 20.0, "stiffness_2": 10.0}
+    ),
+    "power damper": Case(
+        di.PowerDamper() + di.Dahl(F_MAX, SIGMA, 1.0), dahl(), {"coefficient": DAMPING},
+        free=("stiffness",),
+    ),
+    "user's law": Case(Exponential(), dahl(), BOTH),
+    "user's law with a kink": Case(Jenkins(), ONE, BOTH),
+    "linear system": Case(
+        di.LinearSystem(control.tf([1.0], [MASS, DAMPING, STIFFNESS]), quantity="receptance")
+        + di.Dahl(alpha=1.0),
+        dahl(), BOTH, free=(),
+    ),
+}  # fmt: skip
+
+
+def settled(law: Law | Sliders, f: FloatArray, u: FloatArray) -> ComplexArray:
+    """Return the fundamentals of the displacement under u cos(2 pi f t)."""
+    dt = 1.0 / f / STEPS
+    x, v = np.zeros((2, f.size))
+    sliders = law if isinstance(law, Sliders) else None
+    z = np.zeros((1 if sliders is None else sliders.slip.size, f.size))
+    last = np.full(f.size, np.inf, dtype=np.complex128)
+
+    def rates(
+        x: FloatArray, v: FloatArray, z: FloatArray, push: FloatArray, moved: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        if isinstance(law, Sliders):
+            slip = law.slip[:, None]
+            force = law.stiffness @ np.clip(z + moved, -slip, slip)
+            change = np.zeros(z.shape)
+        else:
+            force, change = z[0], law(z[0], v)[None]
+        return v, (push - force - DAMPING * v - STIFFNESS * x) / MASS, change
+
+    for _ in range(CYCLES):
+        X = np.zeros(f.size, dtype=np.complex128)
+        for i in range(STEPS):
+            X += 2.0 / STEPS * x * np.exp(-2j * np.pi * i / STEPS)
+            push = [u * np.cos(2.0 * np.pi * (i + s) / STEPS) for s in (0.0, 0.5, 1.0)]
+            a = rates(x, v, z, push[0], np.zeros(f.size))
+            parts = [a]
+            for share, p in ((0.5, push[1]), (0.5, push[1]), (1.0, push[2])):
+                h = share * dt
+                kx, kv, kz = parts[-1]
+                parts.append(rates(x + h * kx, v + h * kv, z + h * kz, p, h * kx))
+            dx, dv, dz = (
+                dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+                for k1, k2, k3, k4 in zip(*parts, strict=True)
+            )
+            x, v, z = x + dx, v + dv, z + dz
+            if sliders is not None:
+                slip = sliders.slip[:, None]
+                z = np.clip(z + dx, -slip, slip)
+        if np.all(np.abs(X - last) < SETTLED * np.abs(X)):
+            return X
+        last = X
+    raise AssertionError("the motion has not settled")
+
+
+def table(case: Case, levels: int, frequencies: int) -> di.FrequencyResponse:
+    """Return a sweep at some drives, from half the friction force to six times that."""
+    drives = F_MAX * np.geomspace(0.5, 6.0, levels)
+    u, f = (
+        g.ravel() for g in np.meshgrid(drives, np.geomspace(0.4, 2.6, frequencies), indexing="ij")
+    )
+    R = settled(case.by, f, u) / u
+    s = NOISE * np.abs(R)
+    rng = np.random.default_rng(7)
+    return di.FrequencyResponse(
+        f, R + s * (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size)), drive=u,
+        level=u, covariance=s[:, None, None] ** 2 * np.eye(2), controlled="force",
+        quantity="receptance",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_law_in_a_driven_plant_is_found(name: str) -> None:
+    case = CASES[name]
+    size = (3, 4) if name == "Iwan" else (3, 6)  # the slowest: thirty sliders
+    model = case.law
+    if name != "linear system":
+        model = model + di.Mass(MASS)
+    for part, element in (("damping", di.Damper()), ("stiffness", di.Spring())):
+        model = model + element if part in case.free else model
+    fit = di.fit(table(case, *size), model)
+    assert fit.trusted or case.blind, fit.verdict
+    assert fit.identifiability.named(di.diagnostics.Verdict.NOT_IDENTIFIED) == [*case.blind]
+    truth = case.truth | {part: KNOWN[part] for part in case.free}
+    for parameter, true in truth.items():
+        found = fit.params[parameter]
+        assert found.stderr is not None
+        assert abs(found.value - true) < 3.0 * found.stderr, f"{parameter}: {found} for {true}"
