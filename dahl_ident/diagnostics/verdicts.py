@@ -4,7 +4,7 @@ A parameter is **identified** where the standard deviation of its logarithm is b
 **not identified** above 1, and **weakly identified** between. The standard deviation is the larger
 of two: the first-order one (Fisher information), and that of the profile (width of its 95.45 %
 interval over the widths of the threshold). A parameter short of identified whose profile is
-still open at 99.73 % is not identified. Where every first-order one is below 0.1, profiles are not
+still open at 99.73 % is not identified. Where every first-order one is below 0.15, profiles are not
 searched: they would differ in the second digit. Parameters that may be zero or negative have no
 logarithm; theirs is the standard deviation over their size, or over a tenth of the size at which
 they would make up the whole response, if that is more.
@@ -41,7 +41,7 @@ from dahl_ident.fitting import Optimum, Status
 
 IDENTIFIED_BELOW = 0.25  # u of a logarithm: 95 % within a factor of 1.6
 NOT_IDENTIFIED_ABOVE = 1.0  # the same: a factor of 7, hardly an order of magnitude
-_NEARLY_LINEAR = 0.1  # u of every logarithm below which profiles are not searched
+_NEARLY_LINEAR = 0.15  # u of every logarithm: below it, profiles differ in the second digit
 _SIZE_THAT_MATTERS = 0.1  # of the response, for parameters that may be zero
 _BY_RANGE = 0.1  # u of a logarithm that the exponent's assumed range makes, not the data
 _MEASURE = "measure more points, or use a model that misses less"

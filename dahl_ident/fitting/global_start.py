@@ -614,7 +614,7 @@ def _solve_linear(
     left = _projected(columns, Q[..., None, :, :])
     norm = np.sqrt((left * left).sum(axis=-1))
     norm[norm < _DEPENDENT * np.sqrt((columns * columns).sum(axis=-1))] = 0.0
-    left = np.where(norm > 0.0, 1.0, 0.0)[..., None] * left / np.where(norm > 0.0, norm, 1.0)[..., None]
+    left = left / np.where(norm > 0.0, norm, np.inf)[..., None]
     gram = left @ left.swapaxes(-1, -2) + 1e-13 * np.eye(left.shape[-2])
     scaled = np.linalg.solve(gram, left @ rest[..., None])
     rest = rest - (scaled.swapaxes(-1, -2) @ left)[..., 0, :]
