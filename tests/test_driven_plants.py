@@ -55,3 +55,21 @@ def test_a_jump_is_fitted_on_the_branch_that_was_measured(upwards: bool) -> None
     ((drive, low, high),) = jump.values["places"]
     assert (drive, 0.8 < low < 1.0, 1.3 < high <= 1.5) == (0.06, True, True)
     assert "The response jumps: at 0.06 N from " in fit.verdict
+
+
+def test_a_plant_that_feeds_energy_in_is_fitted_by_the_describing_function() -> None:
+    rng = np.random.default_rng(3)
+    f, u = np.tile(np.geomspace(0.4, 2.6, 8), 2), np.repeat([0.05, 0.3], 8)
+    omega = 2.0 * np.pi * f
+    R = 1.0 / (10.0 - 0.3 * omega**2 - 0.3j * omega)
+    s = 0.003 * np.abs(R)
+    noise = rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size)
+    data = di.FrequencyResponse(
+        f, R + s * noise, drive=u, level=u, covariance=s[:, None, None] ** 2 * np.eye(2),
+        controlled="force", quantity="receptance",
+    )  # fmt: skip
+    fit = di.fit(data, di.Dahl(alpha=1.0) + di.Mass(0.3) + di.Damper() + di.Spring(), throw=False)
+    damping = fit.params["damping"]
+    assert damping.stderr is not None
+    assert abs(damping.value + 0.3) < 3.0 * damping.stderr
+    assert any(finding.code == "no_steady_motion" for finding in fit.findings)

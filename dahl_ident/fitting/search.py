@@ -124,7 +124,13 @@ def solve(
     if start is not None:
         given = _completed(problem, start, found.theta[0])
         found = Starts(np.zeros(len(found.theta) + 1, dtype=np.intp), np.vstack([given, found[1]]))
-    return search.run(found)[0]
+    optimum = search.run(found)[0]
+    if limits and problem.is_exact and not problem.takes_energy(optimum.theta):
+        sine = problem.with_steady("describing function")
+        other = solve(sine, method=method, loss=loss, start=start)
+        if not problem.takes_energy(other.theta):
+            return other  # no steady motion is to be found there
+    return optimum
 
 
 def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> OptimumBatch:
