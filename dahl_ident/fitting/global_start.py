@@ -656,7 +656,8 @@ def _local_minima(cost: FloatArray, *, mixed: bool) -> tuple[IntArray, IntArray]
     """Return each table's lowest local minima over its grid, (S, ...): table and flat index.
 
     The lowest of a table comes first; a table without any has its first node. Where nodes are
-    `mixed`, minima of nearly the same cost count as one: a parameter that does not matter there.
+    `mixed`, minima of nearly the same cost count as one where there are others: a parameter may not
+    matter there.
     """
     S = len(cost)
     lowest = cost < np.inf
@@ -672,9 +673,10 @@ def _local_minima(cost: FloatArray, *, mixed: bool) -> tuple[IntArray, IntArray]
     order = np.lexsort((flat[table, place], table))
     table, place = table[order], place[order]
     if mixed:
-        found = flat[table, place]
-        alike = (np.diff(table) == 0) & (found[1:] <= (1.0 + _ALIKE) * found[:-1])
-        table, place = table[np.append(True, ~alike)], place[np.append(True, ~alike)]
+        found, alike = flat[table, place], np.zeros(table.size, dtype=np.bool_)
+        alike[1:] = (np.diff(table) == 0) & (found[1:] <= (1.0 + _ALIKE) * found[:-1])
+        alike &= (np.bincount(table[~alike], minlength=S) > 1)[table]
+        table, place = table[~alike], place[~alike]
     first = np.searchsorted(table, table)
     rank = np.arange(table.size) - first
     found = flat[table, place]
