@@ -115,8 +115,8 @@ CASES = {
         di.MaxwellSlip([0.002, 0.006]), PAIR, {"stiffness_1": 20.0, "stiffness_2": 10.0}
     ),
     "power damper": Case(
-        di.PowerDamper() + di.Dahl(F_MAX, SIGMA, 1.0), dahl(), {"coefficient": DAMPING},
-        free=("stiffness",),
+        di.PowerDamper() + di.Dahl(F_MAX, SIGMA, 1.0), dahl(),
+        {"coefficient": DAMPING, "exponent": 1.0}, free=("stiffness",),
     ),
     "user's law": Case(Exponential(), dahl(), BOTH),
     "user's law with a kink": Case(Jenkins(), ONE, BOTH),

@@ -35,7 +35,7 @@ from dahl_ident.fitting import Optimum
 
 _DETERMINED, _HARDLY = 0.25, 1.0  # u of a logarithm
 # What rounding leaves where a source has no part: variances relative to the combined one.
-_ROUNDING = 1e-12  # of a variance: what arithmetic leaves of a source without effect
+_ROUNDING = 1e-12
 _TYPE_A = (NOISE, MODEL_ERROR, HARMONICS, RUNS, LEVELS, APART, TESTS)
 _CHANNELS = {
     "force_gain": "force calibration",

@@ -95,9 +95,11 @@ class ParameterVerdict:
     verdict : Verdict
         Identified, weakly or not.
     fisher_std, profile_std : float
-        Standard deviation of its logarithm, first order and by its profile; infinite where open.
+        Standard deviation of its logarithm, first order and by its profile; infinite where open,
+        both alike where no profile was searched.
     interval : Interval
-        The 95.45 % interval: the profile's, or the combined one where a fit states it.
+        The 95.45 % interval: the profile's (first order where none was searched), or the combined
+        one where a fit states it.
     reason : str
         Interval and verdict in words, with the reason and what to do where it is not identified.
     """
@@ -259,7 +261,8 @@ def judged(
     """Return the verdicts on an optimum, given how to find its profiles at the three LEVELS.
 
     With `errors`, parameters that noise leaves determined and other sources do not are not. The
-    limits in the texts are those of `stated`, by default of the profile.
+    limits in the texts are those of `stated`, by default those by which it is judged. Without
+    profiles, or where none is needed, that is to first order.
     """
     information, problem = Information(optimum), optimum.problem
     natural = natural_sizes(optimum)
