@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,13 +16,15 @@ from dahl_ident.plots import (
     Curve,
     plot_residuals,
 )
-from dahl_ident.results.judged_fit import JudgedFit
 from dahl_ident.units import si_unit
+
+if TYPE_CHECKING:
+    from dahl_ident.results.fit_result import FitResult
 
 _POINTS = 200  # of a curve that looks smooth
 
 
-def draw_fit(fit: JudgedFit, ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:
+def draw_fit(fit: FitResult, ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:
     """Draw data with error bars and fit with its band, over amplitude or over frequency."""
     return curves.draw(
         fit.data,
@@ -31,7 +34,7 @@ def draw_fit(fit: JudgedFit, ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:
     )
 
 
-def standardized_residuals(fit: JudgedFit) -> FloatArray:
+def standardized_residuals(fit: FitResult) -> FloatArray:
     """Return both residuals of each row in standard deviations, (n, 2); NaN where there is none.
 
     A mean force is real, so that its row has a first residual only.
@@ -42,7 +45,7 @@ def standardized_residuals(fit: JudgedFit) -> FloatArray:
     return residuals
 
 
-def draw_residuals(fit: JudgedFit, against: str | None, ax: Axes | None) -> Axes:
+def draw_residuals(fit: FitResult, against: str | None, ax: Axes | None) -> Axes:
     """Draw both residuals of every row over a quantity, by default the one that suits the table."""
     data = fit.data
     if against is None:
@@ -75,7 +78,7 @@ def draw_residuals(fit: JudgedFit, against: str | None, ax: Axes | None) -> Axes
     )
 
 
-def _stds(fit: JudgedFit, data: FrequencyResponse) -> tuple[FloatArray | None, FloatArray | None]:
+def _stds(fit: FitResult, data: FrequencyResponse) -> tuple[FloatArray | None, FloatArray | None]:
     """Return the standard deviations of gain and phase that the noise model has."""
     gain = data.gain
     if fit.noise == "relative":
@@ -85,7 +88,7 @@ def _stds(fit: JudgedFit, data: FrequencyResponse) -> tuple[FloatArray | None, F
     return (None, None) if data.covariance is None else polar_std(data.response, data.covariance)
 
 
-def _curve(fit: JudgedFit, part: FrequencyResponse, over_frequency: bool) -> Curve:
+def _curve(fit: FitResult, part: FrequencyResponse, over_frequency: bool) -> Curve:
     """Return the fitted response between some rows, what was held interpolated between them."""
     x = curves.abscissa(part, over_frequency)
     order = np.argsort(x)

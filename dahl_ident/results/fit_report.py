@@ -6,12 +6,15 @@ import html
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from dahl_ident.diagnostics.comparison import compare_models
 from dahl_ident.diagnostics.confidence_levels import percent
 from dahl_ident.diagnostics.formatting import interval, rounded, table, with_unit
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals
-from dahl_ident.results.judged_fit import JudgedFit
+
+if TYPE_CHECKING:
+    from dahl_ident.results.fit_result import FitResult
 
 _CORRELATED = 0.1  # smaller correlations change an uncertainty by less than 0.5 %
 _BRIEF = 15  # lines that a reader takes in at a glance
@@ -30,7 +33,7 @@ class Section:
     lines: list[str]
 
 
-def fit_report(fit: JudgedFit, intervals: ConfidenceIntervals, *, details: bool = True) -> str:
+def fit_report(fit: FitResult, intervals: ConfidenceIntervals, *, details: bool = True) -> str:
     """Return the whole report as text, or verdict and parameters on at most 15 lines."""
     sections = _all(fit, intervals)
     if details:
@@ -50,7 +53,7 @@ def _lines(sections: Iterable[Section]) -> Iterator[str]:
         yield from (f"    {line}" for line in section.lines)
 
 
-def as_html(fit: JudgedFit, intervals: ConfidenceIntervals) -> str:
+def as_html(fit: FitResult, intervals: ConfidenceIntervals) -> str:
     """Return the whole report as HTML."""
     parts = []
     for section in _all(fit, intervals):
@@ -59,7 +62,7 @@ def as_html(fit: JudgedFit, intervals: ConfidenceIntervals) -> str:
     return f"<div>{''.join(parts)}</div>"
 
 
-def _all(fit: JudgedFit, intervals: ConfidenceIntervals) -> Iterator[Section]:
+def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[Section]:
     first, *others = fit.statements
     warnings = [f"Warning: {text}." for text in fit.goodness.warnings]
     yield Section("Verdict", [first, *warnings, *others])
@@ -82,7 +85,7 @@ def _all(fit: JudgedFit, intervals: ConfidenceIntervals) -> Iterator[Section]:
     yield Section("Solver", _solver(fit))
 
 
-def _parameters(fit: JudgedFit, intervals: ConfidenceIntervals) -> list[str]:
+def _parameters(fit: FitResult, intervals: ConfidenceIntervals) -> list[str]:
     level = float(intervals.levels[-1])
     rows = [["", "value", "stderr", "unit", f"{percent(level)} ({intervals.method})", ""]]
     for name, p in fit.params.items():
@@ -105,7 +108,7 @@ def _parameters(fit: JudgedFit, intervals: ConfidenceIntervals) -> list[str]:
     return [*table(rows, left=(0, 3, 4, 5)).splitlines(), f"({intervals.note})"]
 
 
-def _correlations(fit: JudgedFit) -> list[str]:
+def _correlations(fit: FitResult) -> list[str]:
     pairs = [
         (a, b, c)
         for i, a in enumerate(fit.var_names)
@@ -116,7 +119,7 @@ def _correlations(fit: JudgedFit) -> list[str]:
     return [f"{a}, {b}: {c:+.3f}" for a, b, c in pairs]
 
 
-def _noise(fit: JudgedFit) -> list[str]:
+def _noise(fit: FitResult) -> list[str]:
     lines = [_NOISE[fit.noise]]
     if not fit.scale_known:
         error = fit.scale / math.sqrt(2.0 * fit.nfree) if fit.nfree > 0 else None
@@ -134,14 +137,14 @@ def _noise(fit: JudgedFit) -> list[str]:
     return lines
 
 
-def _counted(fit: JudgedFit) -> str:
+def _counted(fit: FitResult) -> str:
     """Return how residuals enter the sum, where that is not by their squares alone."""
     if fit.optimum.loss != "linear":
         return " (robust)"
     return "" if fit.problem.gaussian else " (after Student's t)"
 
 
-def _solver(fit: JudgedFit) -> list[str]:
+def _solver(fit: FitResult) -> list[str]:
     return [
         f"{fit.method}, {fit.nfev} evaluations; {fit.ndata} numbers, {fit.nvarys} parameters",
         f"{fit.optimum.status.outcome}; AIC {fit.aic:.2f}, BIC {fit.bic:.2f}",

@@ -1,17 +1,55 @@
-"""The result of a least-squares fit, as users hold it: report, pictures and storage."""
+"""The result of a least-squares fit to a frequency response, under lmfit's names."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from dahl_ident.diagnostics.confidence_levels import LEVELS
-from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Method
-from dahl_ident.errors import ValidationError
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.bands import (
+    DerivedQuantity,
+    ResponseBand,
+    derived,
+    describing_function_band,
+    predicted_backbone,
+    response_band,
+)
+from dahl_ident.diagnostics.bootstrap import REPLICATES, bootstrap_intervals
+from dahl_ident.diagnostics.budget import Budget, ParameterBudget, budget
+from dahl_ident.diagnostics.checks import judgement
+from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
+from dahl_ident.diagnostics.cross_validation import CrossValidation, cross_validation
+from dahl_ident.diagnostics.error_model import ErrorModel, error_model
+from dahl_ident.diagnostics.error_sources import NOISE
+from dahl_ident.diagnostics.goodness import Goodness, goodness
+from dahl_ident.diagnostics.intervals import (
+    METHODS,
+    ConfidenceIntervals,
+    IntervalComparison,
+    Method,
+    combined_intervals,
+    compare,
+    profile_intervals,
+    wald_intervals,
+)
+from dahl_ident.diagnostics.judgement import Judgement
+from dahl_ident.diagnostics.verdicts import Identifiability, judged
+from dahl_ident.elements import Model
+from dahl_ident.errors import FitError, ValidationError, choices
+from dahl_ident.fitting.optimum import Combination, Optimum, propagated
+from dahl_ident.problem import Problem
 from dahl_ident.results import fit_report, fit_storage
-from dahl_ident.results.judged_fit import JudgedFit
+from dahl_ident.results.result import Parameters, Result
+from dahl_ident.units import Quantity
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -19,39 +57,17 @@ if TYPE_CHECKING:
     from dahl_ident.plots import Axes
 
 
-class FitResult(JudgedFit):
+def _part(path: str, text: str) -> Any:
+    """Return a property that hands on a part of the optimum or of the problem."""
+    return property(attrgetter(path), doc=text)
+
+
+class FitResult(Result):
     """What a fit found: estimates, their errors, and whether to trust them.
 
-    Made by :func:`dahl_ident.fit`. Names follow lmfit's ``ModelResult`` where both have the
-    same thing; the covariance is never rescaled silently: `scale` is 1 where the
-    noise is known, else estimated and reported.
-
-    Attributes
-    ----------
-    params : mapping of str to Estimate
-        Every parameter of model and sensors, fixed ones included.
-    var_names : list of str
-        The free ones; they order `covar`.
-    covar : ndarray, shape (nvarys, nvarys)
-        Covariance of the free values, first order; the noise's scale is in it.
-    residual : ndarray, shape (m,)
-        Whitened residuals, two a row of data (in units of the noise where its scale is known),
-        then those of priors.
-    chisqr, redchi : float
-        Sum of squared residuals, and the same over `nfree`.
-    aic, bic : float
-        From the likelihood, with a robust loss from that which it stands for; an estimated noise
-        scale counts as a parameter, one at infinity does not.
-    ndata, nvarys, nfree, nfev : int
-        Real numbers measured (two a row), free parameters, degrees of freedom, evaluations.
-    scale, scale_known : float, bool
-        The noise's scale, and whether it was known beforehand.
-    success, message : bool, str
-        Whether a finite optimum was found, and how the search ended.
-    best_fit : ndarray of complex, shape (n,)
-        Predicted response at the estimate.
-    model : Model
-        The model with the estimates put in.
+    Made by :func:`dahl_ident.fit`. Names follow lmfit's ``ModelResult`` where both have the same
+    thing; the covariance is never rescaled silently: `scale` is 1 where the noise is known, else
+    estimated and reported.
 
     Examples
     --------
@@ -62,6 +78,413 @@ class FitResult(JudgedFit):
     """
 
     _called = "a fit"
+
+    def __init__(self, optimum: Optimum, *, first_order: bool = False) -> None:
+        self.optimum = optimum  #: The solver's plain result.
+        #: Whether errors are of first order alone: with constraints.
+        self.first_order = first_order
+        self._intervals: dict[tuple[Any, ...], ConfidenceIntervals] = {}
+
+    problem: Problem = _part("optimum.problem", "Data, model, noise, sensors as they were fitted.")
+    data: FrequencyResponse = _part("problem.data", "The data that were fitted.")
+    method: str = _part("optimum.method", "The solver.")
+    noise: str = _part("problem.noise", "The noise model.")
+    success: bool = _part("optimum.success", "Whether a finite optimum was found.")
+    message: str = _part("optimum.message", "How the search ended, in words.")
+    combinations: tuple[Combination, ...] = _part(
+        "optimum.combinations", "What the data determine where single parameters run away."
+    )
+    scale_known: bool = _part("optimum.scale_known", "Whether the noise's scale was known before.")
+    ndata: int = _part("problem.n_numbers", "Real numbers: two a row, one that of a mean force.")
+    nfree: int = _part("optimum.dof", "Degrees of freedom.")
+    nfev: int = _part("optimum.nfev", "Evaluations of the residuals.")
+    log_likelihood: float = _part(
+        "optimum.log_likelihood",
+        "Log-density of the data at the optimum, at the likeliest scale where unknown; with a "
+        "robust loss rho, that of the density proportional to exp(-rho/2).",
+    )
+    aic: float = _part(
+        "optimum.aic",
+        "Akaike's criterion, -2 ln L + 2 k; k counts an estimated noise scale, and no parameter "
+        "whose optimum lies at infinity.",
+    )
+    bic: float = _part("optimum.bic", "Schwarz's criterion, -2 ln L + k ln(ndata); k as for `aic`.")
+
+    @cached_property
+    def errors(self) -> ErrorModel | None:
+        """The sources of error; None where there is nothing to estimate them from."""
+        return None if self.first_order else error_model(self.optimum)
+
+    @cached_property
+    def errors_of_combinations(self) -> ErrorModel | None:
+        """The same; also where only combinations of parameters are determined, for these alone."""
+        if self.first_order:
+            return None
+        return self.errors or error_model(self.optimum, of_combinations=True)
+
+    @cached_property
+    def params(self) -> Parameters:
+        """Every parameter of model and sensors, by name, with combined uncertainties.
+
+        Assumed exponents have their estimates, so that all of them together are a model.
+        """
+        values = dict(zip(self.var_names, self.optimum.values.tolist(), strict=True))
+        stderr = dict(self.optimum.stderr)
+        errors = self.errors_of_combinations
+        if errors is not None:
+            known = [name for name in (*values, *errors.assumed) if errors.holds(name)]
+            values |= {name: errors.values[name] for name in known}
+            stderr |= {name: errors.stderr[name] for name in known}
+        return Parameters.of(self.problem, values, stderr)
+
+    @cached_property
+    def stderr_noise(self) -> Mapping[str, float]:
+        """Standard errors of the estimate from noise alone, by name."""
+        found = dict(self.optimum.stderr)
+        errors = self.errors_of_combinations
+        if errors is not None:
+            size = np.abs(errors.problem.value_slopes(errors.theta))
+            noise = size * np.sqrt(np.maximum(np.diagonal(errors.contributions[NOISE]), 0.0))
+            own = dict(zip(errors.names, noise.tolist(), strict=True))
+            found |= {name: own[name] for name in found if errors.holds(name)}
+        return found
+
+    @property
+    def var_names(self) -> list[str]:
+        """Names of the free parameters."""
+        return list(self.problem.names)
+
+    @cached_property
+    def covar(self) -> FloatArray:
+        """Combined covariance of the free values, by every source of error, first order."""
+        errors = self.errors
+        if errors is None:
+            return self.optimum.values_covariance
+        own = [errors.names.index(name) for name in self.var_names]
+        slopes = errors.problem.value_slopes(errors.theta)
+        whole = propagated(errors.covariance, slopes)
+        return np.asarray(whole[np.ix_(own, own)])
+
+    @cached_property
+    def correl(self) -> Mapping[str, Mapping[str, float]]:
+        """Correlation of each pair of free parameters, by both names."""
+        std = np.sqrt(np.diagonal(self.covar))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            matrix = self.covar / np.outer(std, std)
+        names = self.var_names
+        return {
+            a: {b: float(matrix[i, j]) for j, b in enumerate(names) if j != i}
+            for i, a in enumerate(names)
+        }
+
+    @cached_property
+    def _estimate(self) -> Optimum:
+        """The estimate, as an optimum; the search's where nothing else is estimated."""
+        errors = self.errors_of_combinations
+        return self.optimum if errors is None else errors.at_estimate
+
+    @property
+    def residual(self) -> FloatArray:
+        """Whitened residuals at the estimate."""
+        return self._estimate.residuals
+
+    @property
+    def chisqr(self) -> float:
+        """Sum of squared residuals."""
+        return float(self.residual @ self.residual)
+
+    @property
+    def redchi(self) -> float:
+        """`chisqr` over `nfree`; the squared scale where that was estimated."""
+        return self.chisqr / self.nfree if self.nfree > 0 else math.nan
+
+    @property
+    def scale(self) -> float:
+        """Standard deviation of the residuals: 1 where known beforehand."""
+        return self._estimate.scale
+
+    @property
+    def nvarys(self) -> int:
+        """Number of free parameters."""
+        return len(self.problem.names)
+
+    @cached_property
+    def best_fit(self) -> ComplexArray:
+        """Predicted response at the estimate, shape (n,)."""
+        return self._estimate.problem.predict(self._estimate.theta)
+
+    @cached_property
+    def model(self) -> Model:
+        """The model with the estimates put in; parameters stay free or fixed as they were."""
+        model = self.problem.model
+        own = {p.name for p in model.parameters}
+        values = self.problem.to_values(self.optimum.theta).tolist()
+        found = dict(zip(self.var_names, values, strict=True))
+        if self.errors is not None:
+            found = dict(self.errors.values)
+        return model.with_values({name: v for name, v in found.items() if name in own})
+
+    # Judging
+
+    def conf_interval(
+        self,
+        method: Method = "combined",
+        levels: Sequence[float] | float = LEVELS,
+        *,
+        replicates: int = REPLICATES,
+        seed: int = 0,
+    ) -> ConfidenceIntervals:
+        """Return confidence intervals of every free parameter.
+
+        Parameters
+        ----------
+        method : {"combined", "profile", "wald", "bootstrap"}, default "combined"
+            "combined" counts every source of the budget, the others noise alone; see
+            :mod:`dahl_ident.diagnostics.intervals`, which says what to use when.
+        levels : float or sequence of float, default 0.6827, 0.9545, 0.9973
+            Confidence levels.
+        replicates, seed : int
+            Of the bootstrap.
+
+        Returns
+        -------
+        ConfidenceIntervals
+            A mapping from the parameter's name to its intervals; a side on which the data set no
+            limit is open. Profiles never raise, however badly a parameter is determined. Where
+            the fit had constraints, "combined" gives Wald's, and says so.
+
+        Raises
+        ------
+        ValidationError
+            If `method` is unknown, a level is not between 0 and 1, or repetitions of a fit with
+            a robust loss, or profiles or repetitions of one with constraints, are wanted.
+        FitError
+            If there is no optimum to repeat.
+        """
+        if method not in METHODS:
+            raise ValidationError(
+                f"method is {method!r}; expected one of {choices(METHODS, method)}"
+            )
+        levels = tuple(checked_levels(levels).tolist())
+        key = (method, levels, replicates, seed)
+        if key not in self._intervals:
+            self._intervals[key] = self._new_intervals(method, levels, replicates, seed)
+        return self._intervals[key]
+
+    def intervals_run(self, level: float) -> list[ConfidenceIntervals]:
+        """Return the intervals at a level of every method that has been asked for until now."""
+        found = (one for one in self._intervals.values() if np.isclose(one.levels, level).any())
+        return list({one.method: one for one in found}.values())
+
+    def _new_intervals(
+        self, method: Method, levels: Sequence[float], replicates: int, seed: int
+    ) -> ConfidenceIntervals:
+        if self.first_order:
+            if method in ("profile", "bootstrap"):
+                raise ValidationError(
+                    f"method is {method!r}, but the fit had constraints, which profiles and "
+                    "repetitions do not keep; use method='wald', whose covariance is that on the "
+                    "constraints"
+                )
+            note = "first order, noise alone: the fit had constraints"
+            return wald_intervals(self.optimum, levels).noted(note)
+        if method == "combined":
+            errors = self.errors_of_combinations
+            if errors is None:
+                return replace(self.conf_interval("profile", levels), method="combined")
+            return combined_intervals(
+                self.optimum, errors, levels, lambda: self.conf_interval("profile", levels)
+            )
+        if method == "bootstrap":
+            return bootstrap_intervals(self.optimum, levels, replicates, seed)
+        quick = wald_intervals if method == "wald" else profile_intervals
+        return quick(self.optimum, levels)
+
+    def compare_intervals(
+        self,
+        methods: Sequence[Method] = ("wald", "bootstrap", "profile"),
+        levels: Sequence[float] | float = LEVELS,
+    ) -> IntervalComparison:
+        """Return the intervals of several methods side by side, and where they disagree.
+
+        Parameters
+        ----------
+        methods : sequence of str, default ("wald", "bootstrap", "profile")
+            The last is the most trusted; each of the others is compared with it.
+        levels : float or sequence of float, default 0.6827, 0.9545, 0.9973
+            Confidence levels.
+
+        Returns
+        -------
+        IntervalComparison
+            Printed, a table with the disagreements.
+
+        Raises
+        ------
+        ValidationError
+            If there are fewer than two methods, one is unknown, or a level is impossible.
+        """
+        return compare(self.optimum, [self.conf_interval(method, levels) for method in methods])
+
+    @cached_property
+    def identifiability(self) -> Identifiability:
+        """Which parameters, or which combinations of them, the data determine."""
+        profile = None if self.first_order else lambda: self.conf_interval("profile")
+        found = judged(self.optimum, profile, self.errors, self.conf_interval())
+        sources: Mapping[str, ParameterBudget] = self.stated_budget or {}
+        combinations = tuple(
+            replace(c, value=sources[c.expression].value, stderr=sources[c.expression].u)
+            if c.expression in sources
+            else c
+            for c in found.combinations
+        )
+        return replace(found, combinations=combinations)
+
+    @cached_property
+    def goodness(self) -> Goodness:
+        """Whether the residuals are noise, and the estimates physically possible."""
+        return goodness(self.optimum, self.errors_of_combinations)
+
+    @cached_property
+    def cross_validation(self) -> CrossValidation | None:
+        """Held-out tests against their bands; None without tests to hold out."""
+        errors = self.errors_of_combinations
+        return None if errors is None else cross_validation(errors)
+
+    @cached_property
+    def judgement(self) -> Judgement:
+        """Every finding about the fit, and the status that follows from them."""
+        return judgement(self)
+
+    @cached_property
+    def _budget(self) -> Budget:
+        if self.first_order:
+            raise FitError(
+                "no uncertainty budget: the fit had constraints, which its sources do not keep; "
+                "its standard errors are from noise alone"
+            )
+        return budget(self.optimum, self.errors_of_combinations)
+
+    def budget(self) -> Budget:
+        """Return the uncertainty budget: each parameter's sources, combined and expanded.
+
+        Returns
+        -------
+        Budget
+            Printed, a table: source, type A or B, standard uncertainty, degrees of freedom and
+            share; then the combined and the expanded uncertainty.
+        """
+        return self._budget
+
+    @cached_property
+    def stated_budget(self) -> Budget | None:
+        """The uncertainty budget; None where there is nothing to state."""
+        try:
+            return self._budget
+        except FitError:
+            return None
+
+    # What follows from the estimate
+
+    def predict(
+        self,
+        frequency_hz: ArrayLike,
+        *,
+        amplitude: ArrayLike | None = None,
+        drive: ArrayLike | None = None,
+        quantity: Quantity | None = None,
+        noise: bool = True,
+    ) -> ResponseBand:
+        """Return the response that the estimate predicts, with its bands.
+
+        Bands count every source of the budget, and what the device departs from the model.
+
+        Parameters
+        ----------
+        frequency_hz : array_like, shape (n,)
+            Hz.
+        amplitude : array_like, shape (n,), optional
+            Displacement amplitude, m or rad, where that is controlled.
+        drive : array_like, shape (n,), optional
+            Force amplitude, N or N m, where that is controlled. Give one of the two.
+        quantity : str, optional
+            One of the six standard quantities; left out, that of the data.
+        noise : bool, default True
+            The band holds what one more test would measure, its noise and scatter included;
+            False: the device's response itself.
+
+        Returns
+        -------
+        ResponseBand
+            Sensors included: what would be measured. NaN where a drive has no steady amplitude.
+
+        Raises
+        ------
+        ValidationError
+            If both or neither of amplitude and drive are given, a value is not above zero, or
+            the shapes do not go together.
+        """
+        errors = self.errors_of_combinations
+        return response_band(
+            self.optimum, frequency_hz, amplitude, drive, quantity, errors, of_a_test=noise
+        )
+
+    def backbone(self, amplitude: ArrayLike) -> FrequencyResponse:
+        """Return natural frequency and damping ratio of the estimate against amplitude.
+
+        Parameters
+        ----------
+        amplitude : array_like, shape (n,)
+            Displacement amplitude, m or rad.
+
+        Returns
+        -------
+        FrequencyResponse
+            Of the quantity "backbone"; its standard deviations are those of the device's.
+
+        Raises
+        ------
+        ModelError
+            If the model has no mass, or no natural frequency at an amplitude.
+        """
+        return predicted_backbone(self.optimum, self.model, amplitude, self.errors)
+
+    def describing_function(self, amplitude: ArrayLike) -> ResponseBand:
+        """Return N(A) of the friction alone, with bands that hold the device's.
+
+        Parameters
+        ----------
+        amplitude : array_like
+            Displacement amplitude, m or rad.
+
+        Returns
+        -------
+        ResponseBand
+
+        Raises
+        ------
+        ModelError
+            If the model has no friction law.
+        """
+        return describing_function_band(self.optimum, amplitude, self.errors)
+
+    def derived(
+        self, amplitudes: Sequence[float] = (), frequency_hz: float | None = None
+    ) -> tuple[DerivedQuantity, ...]:
+        """Return x_c, energy per cycle, equivalent stiffness and damping, with their errors.
+
+        Parameters
+        ----------
+        amplitudes : sequence of float, optional
+            Where energy, stiffness and damping are wanted, m or rad.
+        frequency_hz : float, optional
+            For the equivalent damping; left out, there is none.
+
+        Returns
+        -------
+        tuple of DerivedQuantity
+        """
+        return tuple(derived(self.optimum, amplitudes, frequency_hz, self.errors))
 
     def fit_report(
         self, method: Method = "combined", level: float = 0.9545, *, details: bool = True
@@ -184,7 +607,7 @@ class FitResult(JudgedFit):
 
     def to_json(self) -> str:
         """Return the fit as JSON: data, model, noise, sensors and optimum."""
-        return fit_storage.to_json(self._optimum, self._first_order)
+        return fit_storage.to_json(self.optimum, self.first_order)
 
     @classmethod
     def from_json(cls, text: str) -> FitResult:
@@ -212,4 +635,4 @@ class FitResult(JudgedFit):
 
     def __repr__(self) -> str:
         estimates = ", ".join(str(self.params[name]) for name in self.var_names)
-        return f"<FitResult: {estimates}; {self._optimum.status.name.lower()}>"
+        return f"<FitResult: {estimates}; {self.optimum.status.name.lower()}>"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.density import SCALE, Density
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.bands import DerivedQuantity, problem_at
 from dahl_ident.diagnostics.budget import Budget
@@ -19,7 +20,6 @@ from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
-from dahl_ident.results.fit_numbers import estimates
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_base import RULE_DRAWS, Posterior
 from dahl_ident.results.posterior_prediction import PredictiveBand, derived_at_draws
@@ -110,12 +110,13 @@ class ResponsePosterior(Posterior):
     @cached_property
     def params(self) -> Parameters:
         """Every parameter by name, posterior mean and standard deviation; fixed ones included."""
-        own = len(self.problem.names)
         values = dict(zip(self.names, self.mean().tolist(), strict=True))
         stderr = dict(zip(self.names, self.std().tolist(), strict=True))
-        found = estimates(self.problem, values, stderr)
-        scale = {name: Estimate.of_scale(values[name], stderr[name]) for name in self.names[own:]}
-        return Parameters(found | scale)
+        found = dict(Parameters.of(self.problem, values, stderr))
+        if self._density.has_scale:
+            at = values[SCALE], stderr[SCALE]
+            found[SCALE] = Estimate(SCALE, "", "noise scale", *at, None, 0.0, math.inf, True)
+        return Parameters(found)
 
     @property
     def data(self) -> FrequencyResponse:

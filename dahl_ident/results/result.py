@@ -17,7 +17,8 @@ from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.formatting import rounded, with_unit
 from dahl_ident.diagnostics.judgement import Finding, Judgement, VerdictStatus
 from dahl_ident.diagnostics.markup import html_table, pair, symbol, tabular, unit
-from dahl_ident.units import Quantity
+from dahl_ident.problem import Problem
+from dahl_ident.units import Quantity, shown_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,11 +58,6 @@ class Estimate:
     max: float
     vary: bool
 
-    @classmethod
-    def of_scale(cls, value: float, stderr: float) -> Estimate:
-        """Return the estimate of an unknown noise scale."""
-        return cls("noise_scale", "", "noise scale", value, stderr, None, 0.0, math.inf, True)
-
     def __str__(self) -> str:
         if not self.vary:
             return f"{self.name} = {self.value:g} {self.unit}".rstrip() + " (fixed)"
@@ -81,6 +77,28 @@ class Parameters(Mapping[str, Estimate]):
 
     def __init__(self, estimates: Mapping[str, Estimate]) -> None:
         self._estimates = dict(estimates)
+
+    @classmethod
+    def of(
+        cls, problem: Problem, values: Mapping[str, float], stderr: Mapping[str, float]
+    ) -> Parameters:
+        """Return all parameters of model and sensors, with the values that were estimated."""
+        sensors = () if problem.sensors.are_exact else problem.sensors.parameters
+        estimates = {}
+        for p in (*problem.model.parameters, *sensors):
+            value = values.get(p.name, p.value)
+            estimates[p.name] = Estimate(
+                name=p.name,
+                unit=shown_unit(p.unit, problem.data.motion),
+                description=p.description,
+                value=math.nan if value is None else value,
+                stderr=stderr.get(p.name),
+                init_value=p.value if p.name in values else None,
+                min=p.lower,
+                max=p.upper,
+                vary=bool(p.free),
+            )
+        return cls(estimates)
 
     def __getitem__(self, name: str) -> Estimate:
         return self._estimates[name]
