@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import os
 import re
 import subprocess
 import sys
@@ -134,23 +135,31 @@ def test_wheel_installs_and_runs_elsewhere(tmp_path: Path) -> None:
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/", "stubs/"))]
 
-    env = tmp_path / "env"
-    subprocess.run([*uv, "venv", "--quiet", "--python", sys.executable, str(env)], check=True)
-    python = env / ("Scripts" if sys.platform == "win32" else "bin") / "python"
-    subprocess.run(
-        [*uv, "pip", "install", "--quiet", "--python", str(python), str(wheel)], check=True
-    )
+    here = tmp_path / "installed"
+    install = [*uv, "pip", "install", "--quiet", "--no-deps", "--target", str(here)]
+    subprocess.run([*install, str(wheel)], check=True)
     code = (
         "import dahl_ident as di; print(di.__file__); "
         "print(abs(di.Dahl(f_max=1.0, sigma=1.0).describing_function(1.0)).round(5)); "
         "print(di.load_dataset('noisy').n, di.load_dataset('unsettled').n)"
     )
     out = subprocess.run(
-        [str(python), "-c", code], cwd=tmp_path, check=True, capture_output=True, text=True
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(here)},
+        check=True,
+        capture_output=True,
+        text=True,
     ).stdout.split()
-    assert Path(out[0]).is_relative_to(env)
+    assert Path(out[0]).is_relative_to(here)
     assert out[1] == "0.79291"
     assert out[2:] == ["30", "2305"]
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    (cited,) = re.findall(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    (newest, *_) = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert cited == newest == di.__version__
 
 
 SECURITY_RELEASES = {  # the first that mends what is public about earlier ones

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from dahl_ident.fitting.optimum import Combination, ConstraintCost, Optimum
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem
 from dahl_ident.sensors import EXACT, Sensors
+from dahl_ident.version import __version__
 
 SCHEMA = "dahl_ident.fit_result"
 VERSION = 3  # of the layout; older ones are read
@@ -49,7 +49,7 @@ def to_dict(optimum: Optimum, first_order: bool) -> dict[str, Any]:
     facts = {
         "schema": SCHEMA,
         "schema_version": VERSION,
-        "dahl_ident_version": version("dahl_ident"),
+        "dahl_ident_version": __version__,
         "data": _describe_data(problem.data),
         "model": describe_model(problem.model),
         "laws": describe_laws(problem.model.elements),

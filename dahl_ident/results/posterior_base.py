@@ -7,7 +7,6 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -22,6 +21,7 @@ from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, Verdi
 from dahl_ident.errors import ValidationError, choices
 from dahl_ident.results.prior_influence import PriorInfluence, prior_influences
 from dahl_ident.results.result import Result
+from dahl_ident.version import __version__
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -229,7 +229,7 @@ class Posterior(Result):
         found = {
             "schema": SCHEMA,
             "schema_version": 1,
-            "dahl_ident_version": version("dahl_ident"),
+            "dahl_ident_version": __version__,
             "status": str(self.status),
             "trusted": self.trusted,
             "statements": list(self.statements),

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
@@ -50,6 +49,7 @@ from dahl_ident.results.hold_out import HeldOut, HoldOut
 from dahl_ident.results.progress import fit_progress
 from dahl_ident.results.result import Estimate, Parameters, Result
 from dahl_ident.units import shown_unit, si_unit
+from dahl_ident.version import __version__
 
 if TYPE_CHECKING:
     from dahl_ident.plots import Axes
@@ -586,7 +586,7 @@ class RecordFit(Result):
                 {
                     "schema": SCHEMA,
                     "schema_version": _SCHEMA_VERSION,
-                    "dahl_ident_version": version("dahl_ident"),
+                    "dahl_ident_version": __version__,
                     "records": records,
                     "model": describe_model(problem.model),
                     "laws": describe_laws(problem.model.elements),
