@@ -705,6 +705,7 @@ def simulated(seed: int, devices: int, runs: int, **truth: float) -> tuple[pd.Da
         {
             "device": np.repeat(names, runs), "status": "trusted", "unit_f_max": "N",
             "f_max": np.exp(y), "u_f_max": truth["u"] * np.exp(y), "t": np.repeat(t, runs),
+            "at": np.arange(y.size),
         }
     )  # fmt: skip
     return table, (level, np.log(0.1) + truth["slope"] * t.mean())
@@ -754,9 +755,9 @@ def test_control_charts_alarm_at_a_drift_and_seldom_without() -> None:
     alarms = caught = 0
     for seed in range(50):
         table, _ = simulated(seed, 60, 1, slope=0.0, tau=0.02, omega=0.0, u=0.005)
-        alarms += len(population(table)["f_max"].out_of_control)
+        alarms += len(population(table, order="at")["f_max"].out_of_control)
         table.loc[50:, "f_max"] *= 1.05  # for 10 fits, two and a half standard deviations
-        caught += any(i >= 50 for i in population(table)["f_max"].out_of_control)
+        caught += any(i >= 50 for i in population(table, order="at")["f_max"].out_of_control)
     # limits from moving ranges of 60 fits and two charts: about 1 alarm in 120
     assert alarms <= 45
     assert caught >= 45
@@ -765,13 +766,53 @@ def test_control_charts_alarm_at_a_drift_and_seldom_without() -> None:
 def test_a_moving_range_chart_by_hand() -> None:
     table, _ = simulated(1, 3, 1, slope=0.0, tau=0.02, omega=0.0, u=0.005)
     table["f_max"] = np.exp([1.0, 1.2, 0.9])
-    fits = population(table)["f_max"].fits
+    fits = population(table, order="at")["f_max"].fits
     sigma = 0.5 * (0.2 + 0.3) / 1.128379
     assert fits["limit"].iloc[0] == pytest.approx(3.0 * sigma, rel=1e-6)
     mean = 3.1 / 3.0
     first = mean + 0.2 * (1.0 - mean)
     assert fits["ewma"].tolist()[:2] == pytest.approx([first, first + 0.2 * (1.2 - first)])
     assert fits["ewma_limit"].iloc[0] == pytest.approx(2.86 * sigma * 0.2)
+
+
+def test_scatter_between_devices_is_no_alarm_where_devices_have_several_fits() -> None:
+    alarms = 0
+    for seed in range(12):
+        table, _ = simulated(seed, 20, 5, slope=0.0, tau=0.05, omega=0.01, u=0.005)
+        alarms += len(population(table, order="at")["f_max"].out_of_control)
+    assert alarms <= 12  # of 1200 fits on two charts; limits of three standard deviations
+    table.loc[[37], "f_max"] *= 1.08
+    assert 37 in population(table, order="at")["f_max"].out_of_control
+
+
+def test_a_device_with_one_fit_is_not_compared_with_others_that_have_several() -> None:
+    table, _ = simulated(1, 8, 3, slope=0.0, tau=0.05, omega=0.01, u=0.005)
+    fits = population(table.drop(index=[0, 1]), order="at")["f_max"].fits
+    assert np.flatnonzero(fits["value"].isna()).tolist() == [0]
+    assert np.isfinite(fits["ewma"][1:]).all()
+
+
+def test_outlying_devices_take_no_part_in_mean_scatter_and_limits() -> None:
+    table, _ = simulated(7, 15, 1, slope=0.0, tau=0.03, omega=0.0, u=0.005)
+    clean = population(table.drop(index=4), order="at")["f_max"]
+    table.loc[[4], "f_max"] *= 1.4
+    table.loc[[4], "u_f_max"] *= 1.4
+    whole = population(table, order="at")["f_max"]
+    assert whole.outlying == ("d004",)
+    assert whole.mean == pytest.approx(clean.mean)
+    assert whole.between_devices == pytest.approx(clean.between_devices)
+    assert whole.devices.loc["d004", "shrunken"] == pytest.approx(table["f_max"][4])
+    assert whole.fits["centre"].iloc[0] == pytest.approx(clean.fits["centre"].iloc[0])
+    assert 4 in whole.out_of_control
+
+
+def test_charts_show_time_only_where_an_order_is_stated() -> None:
+    table, _ = simulated(2, 10, 1, slope=0.0, tau=0.05, omega=0.0, u=0.01)
+    assert "ewma" not in population(table)["f_max"].fits
+    shuffled = table.sample(frac=1.0, random_state=0)
+    pd.testing.assert_frame_equal(
+        population(shuffled, order="at")["f_max"].fits, population(table, order="at")["f_max"].fits
+    )
 
 
 def test_population_matches_a_direct_likelihood() -> None:

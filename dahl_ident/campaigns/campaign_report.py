@@ -124,7 +124,7 @@ def _sentence(p: PopulationParameter) -> str:
     if p.between_runs[0]:
         text += f", between runs {scatter[1]}"
     if p.outlying:
-        text += f"; outside the population: {', '.join(p.outlying)}"
+        text += f"; outside the population and not in these numbers: {', '.join(p.outlying)}"
     if p.out_of_control:
         text += f"; {len(p.out_of_control)} fits outside the control limits"
     return text + "."
@@ -162,12 +162,20 @@ def _blocks(p: PopulationParameter) -> Iterator[Block]:
         from dahl_ident.plots import plot_control_charts
 
         fits = p.fits
+        ewma = [fits[c].to_numpy() for c in ("ewma", "ewma_limit")] if p.ordered else [None, None]
         return plot_control_charts(
-            fits["value"].to_numpy(), fits["ewma"].to_numpy(), float(fits["centre"].iloc[0]),
-            float(fits["limit"].iloc[0]), fits["ewma_limit"].to_numpy(), label=measured,
+            fits["value"].to_numpy(), ewma[0], float(fits["centre"].iloc[0]),
+            float(fits["limit"].iloc[0]), ewma[1], label=measured,
+            x_label="fit, in order of time" if p.ordered else "fit, in the order of the table",
         )  # fmt: skip
 
     beyond = ", ".join(p.outlying) or "none"
+    drift = " and EWMA chart" if p.ordered else "; no order in time is stated, so no EWMA chart"
+    compared = ""
+    if len(p.devices) < len(p.fits):
+        alone = int(p.fits["value"].isna().sum())
+        compared = "; each fit is compared with the others of its device"
+        compared += f", so that {alone} devices with a single fit are not shown" if alone else ""
     yield Picture(
         f"devices_{p.name}",
         f"{p.name} of each device: own estimate, and estimate shrunk towards the population",
@@ -176,8 +184,8 @@ def _blocks(p: PopulationParameter) -> Iterator[Block]:
     )
     yield Picture(
         f"charts_{p.name}",
-        "Individuals (limits: three standard deviations from moving ranges) and EWMA chart, "
-        "corrected for covariates",
+        f"Individuals (limits: three standard deviations from moving ranges){drift}, corrected for "
+        f"covariates{compared}",
         f"{len(p.out_of_control)} of {len(p.fits)} fits lie outside the limits",
         lambda: figure_of(charts()),
     )

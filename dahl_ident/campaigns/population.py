@@ -8,6 +8,10 @@ u_i is the fit's combined standard uncertainty, tau the scatter between devices,
 between runs of one device (only where some device has several fits). tau and omega have flat
 priors, and all results are averaged over their posterior on a grid, so that few devices give wide
 intervals; b is integrated in closed form. The REML estimate is the posterior's mode.
+
+Outlying devices are found first, and take no part in mean, scatter and coefficients. Control charts
+compare a fit with the other fits of its device where there are several, because scatter between
+devices is not a change in time.
 """
 
 from __future__ import annotations
@@ -54,15 +58,15 @@ class _Sums:
     device: NDArray[np.intp]
     devices: int
 
-    def without(self, device: int) -> _Sums:
-        """Return the same without one device."""
-        keep = self.device != device
-        number = self.device[keep] - (self.device[keep] > device)
-        return _Sums(self.y[keep], self.u2[keep], self.X[keep], number, self.devices - 1)
+    @property
+    def repeated(self) -> bool:
+        """Whether some device has several fits."""
+        return len(self.y) > self.devices
 
-    def likelihood(self, tau: float, omega: float) -> float:
-        """Return the restricted log-likelihood of (tau, omega)."""
-        return self.at(tau, omega).log_likelihood
+    def of(self, kept: NDArray[np.bool_]) -> _Sums:
+        """Return the same of some fits."""
+        labels, device = np.unique(self.device[kept], return_inverse=True)
+        return _Sums(self.y[kept], self.u2[kept], self.X[kept], device, labels.size)
 
     def at(self, tau: float, omega: float) -> _Solution:
         """Return the generalised least squares solution at given scatters."""
@@ -70,7 +74,7 @@ class _Sums:
         total = self.of_devices(w)
         shrink = tau**2 / (1.0 + tau**2 * total)
         columns = np.column_stack([self.X, self.y])
-        sums = np.stack([self.of_devices(w * c) for c in columns.T], axis=-1)
+        sums = self.of_devices(w[:, None] * columns)
         G = columns.T @ (w[:, None] * columns) - sums.T @ (shrink[:, None] * sums)
         C = np.asarray(np.linalg.inv(G[:-1, :-1]), dtype=np.float64)
         b = C @ G[:-1, -1]
@@ -81,8 +85,9 @@ class _Sums:
         return _Solution(tau, b, C, float(log_likelihood), away, 1.0 / total)
 
     def of_devices(self, values: FloatArray) -> FloatArray:
-        """Return the sum of values of each device's fits."""
-        return np.bincount(self.device, values, self.devices).astype(np.float64)
+        """Return the sums of values of each device's fits."""
+        sums = [np.bincount(self.device, v, self.devices) for v in np.atleast_2d(values.T)]
+        return np.asarray(np.squeeze(np.stack(sums, axis=-1)), dtype=np.float64)
 
 
 class _Solution(NamedTuple):
@@ -128,8 +133,12 @@ class PopulationParameter:
         Each device: own mean, estimate shrunk towards the population (`shrunken`) with its standard
         uncertainty, and `p`, the probability of a device this distant if it belongs to the
         population.
+    ordered : bool
+        Whether an order in time was stated.
     fits : DataFrame
-        Each fit in its order: individuals chart (`value`, its limits) and EWMA chart.
+        Control charts, a row a fit: individuals (`value`, `centre`, `limit`) and, where an order in
+        time is stated, EWMA (`ewma`, `ewma_limit`). Where devices have several fits, a value is the
+        deviation from the others of its device, and NaN for a device with one.
 
     Examples
     --------
@@ -151,6 +160,7 @@ class PopulationParameter:
     between_devices: tuple[float, float, float]
     between_runs: tuple[float, float, float]
     devices: pd.DataFrame
+    ordered: bool
     fits: pd.DataFrame
 
     @cached_property
@@ -186,9 +196,12 @@ class PopulationParameter:
     @property
     def out_of_control(self) -> tuple[int, ...]:
         """Rows of `fits` outside the limits of either control chart."""
-        beyond = (self.fits["value"] - self.fits["centre"]).abs() > self.fits["limit"]
-        drifted = (self.fits["ewma"] - self.fits["centre"]).abs() > self.fits["ewma_limit"]
-        return tuple(int(i) for i in np.flatnonzero(beyond | drifted))
+        charts = {"value": "limit", "ewma": "ewma_limit"} if self.ordered else {"value": "limit"}
+        beyond = [
+            (self.fits[value] - self.fits["centre"]).abs() > self.fits[limit]
+            for value, limit in charts.items()
+        ]
+        return tuple(int(i) for i in np.flatnonzero(np.any(beyond, axis=0)))
 
 
 @dataclass(frozen=True)
@@ -264,7 +277,8 @@ def population(
     covariates : sequence of str, optional
         Columns on which the parameters may depend, linearly.
     order : str, optional
-        Column that orders the fits in time, for the control charts; by default the table's order.
+        Column that orders the fits in time. Without it the control charts show no drift: there is
+        a chart of individuals in the order of the table, and no EWMA chart.
 
     Returns
     -------
@@ -282,7 +296,9 @@ def population(
 
     Notes
     -----
-    Fits whose status is neither trusted nor approximate are left out, and counted.
+    Fits whose status is neither trusted nor approximate are left out, and counted. Devices outside
+    the population are named, and take no part in its mean, scatter and coefficients, nor in the
+    limits of control charts.
 
     Examples
     --------
@@ -308,8 +324,8 @@ def population(
             f"{chosen['device'].nunique()} devices have usable results; a population needs at "
             "least three"
         )
-    found = {name: _one(chosen, name, list(covariates)) for name in names}
-    return Population(found, len(chosen), {str(k): int(v) for k, v in left_out.items()})
+    evaluated = {name: _one(chosen, name, list(covariates), order is not None) for name in names}
+    return Population(evaluated, len(chosen), {str(k): int(v) for k, v in left_out.items()})
 
 
 def _parameters(table: pd.DataFrame, given: Sequence[str] | None) -> list[str]:
@@ -330,7 +346,9 @@ def _require(table: pd.DataFrame, columns: Sequence[str]) -> None:
         )
 
 
-def _one(table: pd.DataFrame, name: str, covariates: list[str]) -> PopulationParameter:
+def _one(
+    table: pd.DataFrame, name: str, covariates: list[str], ordered: bool
+) -> PopulationParameter:
     import pandas as pd
 
     value, u = _numbers(table, name), _numbers(table, f"u_{name}")
@@ -339,37 +357,43 @@ def _one(table: pd.DataFrame, name: str, covariates: list[str]) -> PopulationPar
     logarithmic = bool((value > 0.0).all())
     y, u = (np.log(value), u / value) if logarithmic else (value, u)
     labels, device = np.unique(table["device"].to_numpy(dtype=str), return_inverse=True)
-    measured = np.array([_numbers(table, c) for c in covariates]).reshape(len(covariates), len(y))
-    centred = measured - measured.mean(axis=1, keepdims=True)
-    X = np.column_stack([np.ones(len(y)), *centred])
+    X = np.stack([np.ones(len(y)), *(_numbers(table, c) for c in covariates)], axis=-1)
+    X[:, 1:] -= X[:, 1:].mean(axis=0)
     if np.linalg.matrix_rank(X / np.maximum(np.abs(X).max(axis=0), 1e-300)) < X.shape[1]:
         raise ValidationError(
             f"the covariates {', '.join(covariates)} are constant or follow from each other in "
             "these fits; leave one out"
         )
-    data = _Sums(y, u**2, X, device, len(labels))
-    repeated = len(y) > len(labels)
-    nodes, weights = _grid(data, repeated)
-    b, cov, shrunken, variance = _averaged(data, nodes, weights)
-    coefficients = {
-        key: (float(b[i]), float(np.sqrt(cov[i, i]))) for i, key in enumerate(["mean", *covariates])
-    }
-    own = data.of_devices(y / u**2) / data.of_devices(u**-2)
+    whole = _Sums(y, u**2, X, device, len(labels))
+    p, outlying = _outlying(whole)
+    inside = ~outlying[device]
+    X[:, 1:] -= X[inside, 1:].mean(axis=0)
+    posterior = _Posterior.of(whole.of(inside))
+    tau, omega = posterior.scatters()
+    own = whole.of_devices(y / u**2) / whole.of_devices(u**-2)
+    w = 1.0 / (omega[0] ** 2 + u**2)
+    alone = whole.of_devices(w)
+    shrunken, variance = whole.of_devices(w * y) / alone, 1.0 / alone
+    shrunken[~outlying], variance[~outlying] = posterior.devices()
     devices = pd.DataFrame({"own": own, "shrunken": shrunken, "u": np.sqrt(variance)}, index=labels)
-    devices["p"], devices["outlying"] = _outlying(data, repeated)
+    devices["p"], devices["outlying"] = p, outlying
     if logarithmic:
         devices["u"] *= np.exp(devices["shrunken"])
         devices[["own", "shrunken"]] = np.exp(devices[["own", "shrunken"]])
+    b, C = posterior.coefficients()
+    charts = _charts(y - X[:, 1:] @ b[1:], device, inside, ordered)
     return PopulationParameter(
         name,
         str(table[f"unit_{name}"].iloc[0]) if f"unit_{name}" in table else "",
         logarithmic,
-        coefficients,
-        _quantiles(nodes[0], weights.sum(axis=1)),
-        _quantiles(nodes[1], weights.sum(axis=0)) if repeated else (0.0, 0.0, 0.0),
+        dict(zip(["mean", *covariates], zip(b.tolist(), np.sqrt(np.diag(C)).tolist(), strict=True),
+                 strict=True)),
+        tau,
+        omega,
         devices,
-        _charts(table, y - centred.T @ b[1:]),
-    )
+        ordered,
+        pd.DataFrame({"device": table["device"].to_numpy(), **charts}),
+    )  # fmt: skip
 
 
 def _numbers(table: pd.DataFrame, column: str) -> FloatArray:
@@ -385,51 +409,61 @@ def _numbers(table: pd.DataFrame, column: str) -> FloatArray:
     return np.asarray(values, dtype=np.float64)
 
 
-_Nodes = tuple[FloatArray, FloatArray]
+class _Posterior(NamedTuple):
+    """Solutions on a grid of tau and omega, with weights of sum 1."""
+
+    data: _Sums
+    nodes: tuple[FloatArray, FloatArray]
+    solutions: list[_Solution]
+    weights: FloatArray
+
+    @classmethod
+    def of(cls, data: _Sums) -> _Posterior:
+        """Return the posterior under flat priors of tau and omega."""
+        mode = _reml(data)
+        nodes = (_nodes(data, mode, 0), _nodes(data, mode, 1) if data.repeated else np.zeros(1))
+        solutions = [data.at(tau, omega) for tau in nodes[0] for omega in nodes[1]]
+        values = np.array([solution.log_likelihood for solution in solutions])
+        widths = [np.gradient(n) if n.size > 1 else np.ones(1) for n in nodes]
+        weights = np.exp(values - values.max()) * np.outer(*widths).ravel()
+        return cls(data, nodes, solutions, weights / weights.sum())
+
+    def coefficients(self) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of b."""
+        b, C = (np.array([getattr(s, name) for s in self.solutions]) for name in ("b", "C"))
+        mean = self.weights @ b
+        away = b - mean
+        return mean, np.tensordot(self.weights, C, 1) + (self.weights[:, None] * away).T @ away
+
+    def devices(self) -> tuple[FloatArray, FloatArray]:
+        """Return mean and variance of each device."""
+        fits = self.data.of_devices(np.ones(len(self.data.y)))
+        x = self.data.of_devices(self.data.X).reshape(len(fits), -1) / fits[:, None]
+        estimates = [solution.shrunken(x) for solution in self.solutions]
+        values, variances = (np.array(part) for part in zip(*estimates, strict=True))
+        mean = self.weights @ values
+        return mean, self.weights @ (variances + (values - mean) ** 2)
+
+    def scatters(self) -> list[tuple[float, float, float]]:
+        """Return median and 95.45 % limits of tau and of omega; zero where there is one node."""
+        weights = self.weights.reshape(len(self.nodes[0]), -1)
+        scatters = []
+        for nodes, marginal in zip(self.nodes, (weights.sum(1), weights.sum(0)), strict=True):
+            cumulative = np.cumsum(marginal) - 0.5 * marginal
+            low, middle, high = np.interp([0.02275, 0.5, 0.97725], cumulative, nodes)
+            scatters.append((float(middle), float(low), float(high)))
+        return scatters
 
 
-def _grid(data: _Sums, repeated: bool) -> tuple[_Nodes, FloatArray]:
-    """Return nodes of tau and of omega, and their posterior under flat priors, of sum 1."""
-    mode = _reml(data, repeated)
-    nodes = (_nodes(data, mode, 0), _nodes(data, mode, 1) if repeated else np.zeros(1))
-    values = np.array([[data.likelihood(t, o) for o in nodes[1]] for t in nodes[0]])
-    widths = [np.gradient(n) if n.size > 1 else np.ones(1) for n in nodes]
-    weights = np.exp(values - values.max()) * widths[0][:, None] * widths[1]
-    return nodes, weights / weights.sum()
-
-
-def _averaged(
-    data: _Sums, nodes: _Nodes, weights: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return mean and covariance of b, and mean and variance of each device, over the grid."""
-    x = np.stack([data.of_devices(c) for c in data.X.T], axis=-1)
-    x /= data.of_devices(np.ones(len(data.y)))[:, None]
-    solutions = [data.at(tau, omega) for tau in nodes[0] for omega in nodes[1]]
-    estimates = [solution.shrunken(x) for solution in solutions]
-    b, C = (np.array([getattr(solution, name) for solution in solutions]) for name in ("b", "C"))
-    values, variances = (np.array(part) for part in zip(*estimates, strict=True))
-    w = weights.ravel()
-    mean, device = w @ b, w @ values
-    covariance = np.tensordot(w, C, 1) + (w[:, None] * (b - mean)).T @ (b - mean)
-    return mean, covariance, device, w @ (variances + (values - device) ** 2)
-
-
-def _quantiles(nodes: FloatArray, weights: FloatArray) -> tuple[float, float, float]:
-    """Return median and 95.45 % limits."""
-    cumulative = np.cumsum(weights) - 0.5 * weights
-    low, middle, high = np.interp([0.02275, 0.5, 0.97725], cumulative, nodes)
-    return float(middle), float(low), float(high)
-
-
-def _reml(data: _Sums, repeated: bool) -> tuple[float, float]:
+def _reml(data: _Sums) -> tuple[float, float]:
     """Return the restricted maximum-likelihood estimates of tau and omega, each 0 or more."""
     spread = float(np.sqrt(np.var(data.y) + data.u2.min()))
 
     def objective(x: FloatArray) -> float:
         tau, omega = np.abs(x) * spread  # even in both, so that zero is an ordinary point
-        return -data.likelihood(tau, omega if repeated else 0.0)
+        return -data.at(tau, omega).log_likelihood
 
-    if not repeated:
+    if not data.repeated:
         best = optimize.minimize_scalar(
             lambda t: objective(np.array([t, 0.0])), bounds=(0.0, _MOST), method="bounded"
         )
@@ -443,34 +477,35 @@ def _reml(data: _Sums, repeated: bool) -> tuple[float, float]:
 def _nodes(data: _Sums, mode: tuple[float, float], axis: int) -> FloatArray:
     """Return nodes from zero to where the likelihood is negligible, finer near zero."""
     point = list(mode)
-    top = data.likelihood(*point)
+    top = data.at(*point).log_likelihood
     step = 0.1 * float(np.sqrt(np.median(data.u2)))
-    while top - data.likelihood(*point) < _GONE:
+    while top - data.at(*point).log_likelihood < _GONE:
         point[axis] = 1.3 * point[axis] + step
     return np.asarray(point[axis] * np.linspace(0.0, 1.0, _NODES) ** 1.5)
 
 
-def _outlying(data: _Sums, repeated: bool) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _outlying(data: _Sums) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return each device's p value against all others, and which are outlying.
 
     Outlying devices are removed one by one, the most distant first, so that they do not mask one
-    another; at most half of the devices are removed.
+    another; at most half of the devices are removed, and two freedoms of the scatter stay, without
+    which its posterior has no end.
     """
     p, outlying = np.ones(data.devices), np.zeros(data.devices, dtype=bool)
     kept, numbers = data, np.arange(data.devices)
     for _ in range(data.devices // 2):
-        worst = int(np.argmax(np.abs(kept.at(*_reml(kept, repeated)).distances())))
+        worst = int(np.argmax(np.abs(kept.at(*_reml(kept)).distances())))
         fits = kept.device == worst
-        others = kept.without(worst)
+        others = kept.of(~fits)
         freedom = others.devices - others.X.shape[1]
-        if freedom < 1 or np.linalg.matrix_rank(others.X) < others.X.shape[1]:
+        if freedom < 2 or np.linalg.matrix_rank(others.X) < others.X.shape[1]:
             break
-        tau, omega = _reml(others, repeated)
+        tau, omega = _reml(others)
         solution = others.at(tau, omega)
         w = 1.0 / (omega**2 + kept.u2[fits])
         x = (w[:, None] * kept.X[fits]).sum(axis=0) / w.sum()
-        rest = float((w * kept.y[fits]).sum() / w.sum() - x @ solution.b)
-        distance = rest / np.sqrt(tau**2 + 1.0 / w.sum() + x @ solution.C @ x)
+        deviation = float((w * kept.y[fits]).sum() / w.sum() - x @ solution.b)
+        distance = deviation / np.sqrt(tau**2 + 1.0 / w.sum() + x @ solution.C @ x)
         # the most distant of all: Sidak's correction for the number of devices
         alone = 2.0 * stats.t.sf(abs(distance), freedom)
         p[numbers[worst]] = -np.expm1(kept.devices * np.log1p(-min(alone, 1.0 - 1e-16)))
@@ -481,27 +516,34 @@ def _outlying(data: _Sums, repeated: bool) -> tuple[FloatArray, NDArray[np.bool_
     return p, outlying
 
 
-def _charts(table: pd.DataFrame, y: FloatArray) -> pd.DataFrame:
-    """Return the control charts of fits in their order, corrected for covariates."""
-    import pandas as pd
+def _charts(
+    y: FloatArray, device: NDArray[np.intp], inside: NDArray[np.bool_], ordered: bool
+) -> dict[str, Any]:
+    """Return control charts of fits; `inside` are those that set centre and limits.
 
-    centre = y.mean()
-    sigma = np.abs(np.diff(y)).mean() / _MOVING_RANGE
-    ewma = np.empty(y.size)
-    last = centre
-    for i, value in enumerate(y):
-        last = last + EWMA_WEIGHT * (value - last)
-        ewma[i] = last
-    steps = np.arange(1, y.size + 1)
-    grown = 1.0 - (1.0 - EWMA_WEIGHT) ** (2 * steps)
-    width = EWMA_WIDTH * sigma * np.sqrt(EWMA_WEIGHT / (2.0 - EWMA_WEIGHT) * grown)
-    return pd.DataFrame(
-        {
-            "device": table["device"].to_numpy(),
-            "value": y,
-            "centre": centre,
-            "limit": 3.0 * sigma,
-            "ewma": ewma,
-            "ewma_limit": width,
-        }
-    )
+    Where devices have several fits, a value is the deviation from the mean of its device, enlarged
+    to the variance of a single fit; the scatter is that of successive fits of one device.
+    """
+    fits = np.bincount(device)[device]
+    repeated = bool(fits.max() > 1)
+    group = device if repeated else np.zeros_like(device)
+    rows = np.flatnonzero(inside)
+    rows = rows[np.argsort(group[rows], kind="stable")]
+    ranges = np.abs(np.diff(y[rows]))[np.diff(group[rows]) == 0]
+    sigma = float(ranges.mean()) / _MOVING_RANGE if ranges.size else np.nan
+    centre = float(y[inside].mean())
+    if repeated:
+        away = y - (np.bincount(device, y) / np.bincount(device))[device]
+        y = centre + np.where(fits > 1, away * np.sqrt(fits / np.maximum(fits - 1, 1)), np.nan)
+    charts: dict[str, Any] = {"value": y, "centre": centre, "limit": 3.0 * sigma}
+    if not ordered:
+        return charts
+    charted = np.flatnonzero(np.isfinite(y))
+    ewma, width = np.full((2, y.size), np.nan)
+    mean = centre
+    for step, i in enumerate(charted, start=1):
+        mean += EWMA_WEIGHT * (y[i] - mean)
+        grown = 1.0 - (1.0 - EWMA_WEIGHT) ** (2 * step)
+        ewma[i] = mean
+        width[i] = EWMA_WIDTH * sigma * np.sqrt(EWMA_WEIGHT / (2.0 - EWMA_WEIGHT) * grown)
+    return {**charts, "ewma": ewma, "ewma_limit": width}

@@ -79,35 +79,38 @@ def plot_devices(
 
 def plot_control_charts(
     value: FloatArray,
-    ewma: FloatArray,
+    ewma: FloatArray | None,
     centre: float,
     limit: float,
-    ewma_limit: FloatArray,
+    ewma_limit: FloatArray | None = None,
     *,
     label: str,
+    x_label: str = "fit",
     ax: Sequence[Axes] | None = None,
-) -> tuple[Axes, Axes]:
-    """Draw the individuals chart and the EWMA chart of fits in their order.
+) -> tuple[Axes, ...]:
+    """Draw the individuals chart of fits and, where they have an order in time, the EWMA chart.
 
     Parameters
     ----------
-    value, ewma : ndarray, shape (n,)
-        The fits, and their exponentially weighted mean.
+    value : ndarray, shape (n,)
+        The fits; NaN is not drawn.
+    ewma : ndarray, shape (n,), or None
+        Their exponentially weighted mean; None where the fits have no order in time.
     centre : float
         Centre line.
     limit : float
         Distance of the individuals' limits from it.
-    ewma_limit : ndarray, shape (n,)
+    ewma_limit : ndarray, shape (n,), optional
         The same of the EWMA chart.
-    label : str
-        Axis label.
+    label, x_label : str
+        Axis labels.
     ax : two Axes, optional
         New where left out.
 
     Returns
     -------
-    individuals, ewma : Axes
-        Points outside the limits are marked.
+    tuple of Axes
+        Individuals, then EWMA. Points outside the limits are marked.
 
     Examples
     --------
@@ -118,16 +121,20 @@ def plot_control_charts(
     'ln f_max'
     """
     with style.house_style():
-        upper, lower = style.axes_pair(ax, size=(6.4, 4.4))
+        charts = [(label, value, np.full(value.size, limit))]
+        if ewma is None or ewma_limit is None:
+            axes: tuple[Axes, ...] = (style.axes(ax[0] if ax else None, size=(6.4, 2.6)),)
+        else:
+            charts.append((f"{label}, EWMA", ewma, ewma_limit))
+            axes = style.axes_pair(ax, size=(6.4, 4.4))
         n = np.arange(1, value.size + 1)
-        limits = np.full(value.size, limit)
-        for axis, line, width in ((upper, value, limits), (lower, ewma, ewma_limit)):
+        for axis, (name, line, width) in zip(axes, charts, strict=True):
             axis.axhline(centre, color=style.GREY, lw=1.0)
             axis.plot(n, centre + width, "--", color=style.GREY, lw=1.0)
             axis.plot(n, centre - width, "--", color=style.GREY, lw=1.0)
             axis.plot(n, line, "-o", color=style.BLUE, lw=0.8, ms=3)
             beyond = np.abs(line - centre) > width
             axis.plot(n[beyond], line[beyond], "s", mfc="none", ms=8, color=style.VERMILION)
-        upper.set_ylabel(label)
-        lower.set(ylabel=f"{label}, EWMA", xlabel="fit")
-        return upper, lower
+            axis.set_ylabel(name)
+        axes[-1].set_xlabel(x_label)
+        return axes
