@@ -233,6 +233,27 @@ class TestPlan:
         even = plan.planner.forecast.expected(*plan.planner.search.logarithmic_grid(25.0))
         assert even["f_max"].after > 1.5 * plan.expected["f_max"].after
 
+    @pytest.mark.parametrize("known", [False, True])
+    def test_its_data_alone_can_be_used(self, known: bool) -> None:
+        """One amplitude, or two levels without a covariance, cannot show a wrong model."""
+        limits = {"displacement": (1e-4, 9.0 * X_C), "frequency_hz": 5.0, "time": 60.0}
+        plan = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="f_max", draws=20)
+        A = np.array([step.level for step in plan.steps])
+        std = 0.01 / np.sqrt([step.measured_cycles for step in plan.steps])
+        exact, rng = (
+            di.Dahl(F_MAX, SIGMA, alpha=1.0).describing_function(A),
+            np.random.default_rng(1),
+        )
+        usable = 0
+        for _ in range(20):
+            response = exact * np.exp(std * (rng.standard_normal((2, len(A))).T @ [1.0, 1.0j]))
+            covariance = (std * np.abs(response))[:, None, None] ** 2 * np.eye(2)
+            data = FrequencyResponse(
+                np.full(len(A), 5.0), response, A, covariance=covariance if known else None
+            )
+            usable += di.fit(data, LINEAR).status in ("trusted", "approximate")
+        assert usable >= 19
+
     def test_levels_do_not_lean_on_ranges(self) -> None:
         """In gross slip two close levels would do for the spring if stiffness were known."""
         plan = di.plan(

@@ -100,6 +100,11 @@ class Knowledge:
         """Return the knowledge restricted to some of the draws."""
         return replace(self, theta=self.theta[draws], information=self.information[draws])
 
+    def thinned(self, most: int) -> Knowledge:
+        """Return the knowledge at no more than `most` of the draws, evenly spread."""
+        S = len(self.theta)
+        return self.only(np.unique(np.linspace(0, S - 1, min(S, most)).astype(int)))
+
     def model_values(self) -> list[FloatArray]:
         """Return every parameter of the model at every draw, shape (S, 1) each, or ()."""
         drawn = dict(zip(self.names, self.values.T, strict=True))

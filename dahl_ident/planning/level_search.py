@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from dahl_ident.diagnostics.stiffening import LEAST_DOF
+from dahl_ident.diagnostics.trends import LEAST_RANGE
 from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
 from dahl_ident.planning.candidates import larger_rows
 from dahl_ident.planning.criteria import LevelInformation, Objective, Term
 from dahl_ident.planning.forecast import Forecast, typical
-from dahl_ident.planning.optimal_design import Exchange, Selection, continuous_design
+from dahl_ident.planning.optimal_design import Coverage, Exchange, Selection, continuous_design
 from dahl_ident.planning.quantities import sizes
 from dahl_ident.planning.question import Question
 
@@ -25,6 +28,7 @@ _HELPS = 0.1  # of what the square root of the time would do, below which more t
 _CLOSE = 0.985  # fraction of the target at which the search stops
 _NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _UNKNOWN = 1e-2  # the same of a suspected parameter, which is known within a decade or so
+_APART = 2.0  # times the range that a fit takes as one amplitude: measured ones are not exact
 _GRID_LEVELS = 10  # of the usual plan that the best one is compared with
 
 
@@ -101,7 +105,7 @@ class LevelSearch:
         most = _MOST_RUNS if self.forecast.scatter > 0.0 else 1
         for runs in (q.runs,) if q.runs else range(1, most + 1):
             search = Exchange(
-                self.objective(weight, runs), self.bench, self.pool(time), self._fewest
+                self.objective(weight, runs), self.bench, self.pool(time), self._coverage
             )
             found = search.best(time / runs, start)
             if found is None:
@@ -114,12 +118,16 @@ class LevelSearch:
             start = found.levels.tolist()
         return best
 
-    @property
-    def _fewest(self) -> int:
-        """Levels needed for at least one degree of freedom, with two numbers per level."""
-        known = self.question.knowledge
-        earlier = known.problem is not None or known.sample_noise is not None
-        return 1 if earlier or self.forecast.candidates.motions else len(known.names) // 2 + 1
+    @cached_property
+    def _coverage(self) -> Coverage:
+        """What levels need for a fit to them alone that can tell a wrong model from noise."""
+        known, candidates = self.question.knowledge, self.forecast.candidates
+        amplitude = np.log(np.median(candidates.amplitude, axis=0))
+        if known.problem is not None or known.sample_noise is not None or candidates.motions:
+            return Coverage(1, 0.0, amplitude)
+        fitted = len(known.names) - len(known.assumed)
+        span = _APART * LEAST_RANGE if np.ptp(amplitude) >= _APART * LEAST_RANGE else 0.0
+        return Coverage((LEAST_DOF + fitted + 1) // 2, span, amplitude)
 
     def pool(self, time: float) -> Any:
         """Return promising candidates: those of the continuous design, and evenly spread ones."""

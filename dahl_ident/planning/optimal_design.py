@@ -131,17 +131,45 @@ class Selection:
     value: float
 
 
+@dataclass(frozen=True)
+class Coverage:
+    """What levels need so that their data can be judged.
+
+    Attributes
+    ----------
+    fewest : int
+        Number of levels, at least.
+    span : float
+        ln of the largest displacement amplitude over the smallest, at least.
+    amplitude : ndarray, shape (K,)
+        ln of the displacement amplitude of every candidate.
+    """
+
+    fewest: int
+    span: float
+    amplitude: FloatArray
+
+    def wide(self, levels: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return which sets of levels, (..., m), span enough."""
+        return np.asarray(np.ptp(self.amplitude[levels], axis=-1) >= self.span)
+
+
 class Exchange:
     """The search for levels, with settling and change-over.
 
-    There are at least `fewest` levels where the time allows as many, so that a fit has residuals.
+    They have the coverage that their data need, where the time allows it.
     """
 
     def __init__(
-        self, objective: Objective, bench: BenchTime, pool: NDArray[np.intp], fewest: int = 1
+        self,
+        objective: Objective,
+        bench: BenchTime,
+        pool: NDArray[np.intp],
+        coverage: Coverage | None = None,
     ) -> None:
         self._objective, self._bench, self._pool = objective, bench, pool
-        self._fewest = fewest
+        self._coverage = coverage or Coverage(1, 0.0, np.zeros(objective.candidates))
+        self._fewest = self._coverage.fewest
 
     def best(self, time: float, start: Sequence[int] = ()) -> Selection | None:
         """Return the best levels for one run of `time` s; None where nothing can be measured."""
@@ -212,6 +240,8 @@ class Exchange:
             levels = np.array([trials[i] for i in same], dtype=np.intp)
             sub, cycles = self._share(levels, time, 15)
             enough = np.asarray(np.isfinite(cycles).all(axis=-1))
+            if size >= self._fewest:
+                enough &= self._coverage.wide(levels)
             value = sub.at(np.where(enough[:, None], cycles, 1.0)).value
             result[same] = np.where(enough, value, -np.inf)
         return result
@@ -222,10 +252,12 @@ class Exchange:
         joined = np.column_stack([np.tile(chosen, (rest.size, 1)), rest]).astype(np.intp)
         least = (LEAST_CYCLES / self._bench.frequency_hz[joined]).sum(axis=-1)
         rooms = time - self._bench.fixed(joined) - least
-        possible = rest[rooms >= 0.0]
+        fits = rooms >= 0.0
+        if joined.shape[1] >= self._fewest:
+            fits &= self._coverage.wide(joined)
+        possible, rooms = rest[fits], rooms[fits] / (len(chosen) + 1.0)
         if not possible.size:
             return []
-        rooms = rooms[rooms >= 0.0] / (len(chosen) + 1.0)
         f = self._bench.frequency_hz
         own = LEAST_CYCLES + rooms * f[possible]
         totals = []

@@ -46,7 +46,7 @@ from dahl_ident.units import si_unit
 _NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
 _FEW_LEVELS = 60  # candidates with which the effect of a wider limit is judged
-_MOTION_DRAWS = 24  # at which the records of motions are computed
+_SLOW_DRAWS = 24  # of motions in time, and of exact steady motions: as many as the search takes
 _CORRECTIONS = 6  # of the repeats of motions, each by the whole information
 _NEARLY = 0.99  # of the longest plan: whole cycles leave some of the time
 _AIMED = 0.999  # fraction of the target
@@ -186,8 +186,7 @@ def plan(
     asked = motions_asked(candidates)
     if asked:
         _only_motions(wanted, scatter, suspects, controlled, runs, larger)
-        some = np.unique(np.linspace(0, draws - 1, min(draws, _MOTION_DRAWS)).astype(int))
-        known = replace(knowledge.only(some), errors=None, scatter=0.0)
+        known = replace(knowledge.thinned(_SLOW_DRAWS), errors=None, scatter=0.0)
         question = Question(
             known, bench, controlled, CycleNoise(0.0), wanted, numbers, 0.0, 1, costs, None, {},
             recorded_force(noise, sample_rate, knowledge), asked,
@@ -198,6 +197,8 @@ def plan(
             "plan: sample_rate is that of records of motions in time; leave it out for settled "
             "sines, or give candidates='trapezoid'"
         )
+    if controlled == "force" and knowledge.steady == "exact":
+        knowledge = knowledge.thinned(_SLOW_DRAWS)
     question = Question(
         knowledge, bench, controlled, noise_of(noise, knowledge), wanted, numbers,
         knowledge.scatter if scatter is None else float(non_negative_array(scatter, "scatter")),
