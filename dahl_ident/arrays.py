@@ -33,11 +33,6 @@ def real_array(value: ArrayLike, name: str) -> FloatArray:
     -------
     ndarray of float
         A new array, or `value` itself if it already was one.
-
-    Raises
-    ------
-    ValidationError
-        If the values are complex, truth values, text, dates or ragged.
     """
     refuse_masked(value, name)
     try:

@@ -185,11 +185,6 @@ def parse_unit(text: str) -> Unit:
     -------
     Unit
 
-    Raises
-    ------
-    UnitError
-        If the text is not a unit.
-
     Examples
     --------
     >>> unit = parse_unit("um rms")
@@ -234,11 +229,6 @@ def kind_of(unit: Unit, kinds: tuple[str, ...], what: str) -> tuple[str, Motion,
     factor : float
         SI value of one of the unit.
 
-    Raises
-    ------
-    UnitError
-        If its dimension matches none of them.
-
     Examples
     --------
     >>> kind_of(parse_unit("mm/N"), QUANTITIES, "gain")
@@ -260,11 +250,6 @@ def kind_of(unit: Unit, kinds: tuple[str, ...], what: str) -> tuple[str, Motion,
 
 def factor_to(unit: Unit, si: str, what: str) -> float:
     """Return the value of one `unit` in the SI unit `si`, angles counting as pure numbers.
-
-    Raises
-    ------
-    UnitError
-        If the dimensions differ.
 
     Examples
     --------
@@ -341,11 +326,6 @@ def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float,
         In SI; an amplitude marked rms or pp becomes zero to peak.
     kind : str
     motion : {"translation", "rotation"}
-
-    Raises
-    ------
-    UnitError
-        If the text is not a number with a unit of one of `kinds`.
 
     Examples
     --------

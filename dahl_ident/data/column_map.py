@@ -117,11 +117,6 @@ def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -
     -------
     ColumnMap
 
-    Raises
-    ------
-    DataError
-        If the file cannot be read, or an entry is unknown or of the wrong kind.
-
     Examples
     --------
     >>> column_map({"force": {"column": "F", "unit": "kN"}}).roles["force"].unit
@@ -236,13 +231,7 @@ class Binding:
             )
 
     def channel(self, role: str) -> Channel | None:
-        """Return the channel of a role, or None where the file has none.
-
-        Raises
-        ------
-        DataError
-            If the map names a column that does not exist, or several columns fit the role.
-        """
+        """Return the channel of a role, or None where the file has none."""
         channel = self._find(role)
         if channel is not None:
             self.used.add(channel.name)
@@ -305,13 +294,7 @@ class Binding:
         return scaled(self.source.numbers(channel), spec.sign * spec.factor)
 
     def unit(self, role: str, channel: Channel) -> Unit:
-        """Return the unit: the map's, the header's, the one in the name, or another column's.
-
-        Raises
-        ------
-        UnitError
-            If there is none, or it cannot be read.
-        """
+        """Return the unit: the map's, the header's, the one in the name, or another column's."""
         text = self.map.roles.get(role, Column()).unit or channel.unit
         if text is None and plain(channel.short or channel.name) in self.columns[role].names:
             text = channel.unit_in_name
@@ -442,13 +425,7 @@ def scaled(values: FloatArray, factor: float) -> FloatArray:
 
 
 def by_level(source: Source, columns: ColumnMap) -> dict[str | None, ColumnMap]:
-    """Resolve ``*`` in paths: one column map for each level, or the map itself.
-
-    Raises
-    ------
-    DataError
-        If the columns do not have the same levels.
-    """
+    """Resolve ``*`` in paths: one column map for each level, or the map itself."""
     starred = {r: c for r, c in columns.roles.items() if c.column and "*" in c.column}
     if not starred:
         return {None: columns}

@@ -135,15 +135,7 @@ class Metadata:
 
 
 def metadata_of(given: Mapping[str, Any] | str | Path | None) -> Metadata:
-    """Return metadata from a mapping or a TOML file.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read or is not TOML.
-    ValidationError
-        If a field is unknown, or has the wrong type.
-    """
+    """Return metadata from a mapping or a TOML file."""
     if given is None:
         return Metadata()
     if isinstance(given, Mapping):

@@ -67,14 +67,7 @@ def check_drive(data: FrequencyResponse, doubt: Doubt) -> None:
 
 
 def check_energy(file: str, data: FrequencyResponse, doubt: Doubt) -> None:
-    """Warn of single rows that create energy, refuse a table that does as a whole.
-
-    Raises
-    ------
-    DataError
-        If the sum of A^2 Im Z is significantly below zero. Without a covariance an error of
-        10 % of each response is allowed for.
-    """
+    """Warn of single rows that create energy, refuse a table that does as a whole."""
     fundamental = data.harmonic == 1
     if not fundamental.any():
         return

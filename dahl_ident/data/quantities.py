@@ -50,13 +50,7 @@ def power_of_s(omega: FloatArray, power: int) -> ComplexArray:
 def converted(
     response: ComplexArray, omega: FloatArray, source: Quantity, target: Quantity
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Return the response as `target`, and its complex derivative with respect to the source.
-
-    Raises
-    ------
-    ValidationError
-        If a response of zero would have to be inverted.
-    """
+    """Return the response as `target`, and its complex derivative with respect to the source."""
     given, wanted = DEFINITIONS[source], DEFINITIONS[target]
     turn = given.exponent * wanted.exponent
     factor = power_of_s(omega, wanted.power - turn * given.power)

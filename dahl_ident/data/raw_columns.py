@@ -147,11 +147,6 @@ class Source:
 
         The last part of a path is enough where it is the only one of its name; ``column 2`` is the
         second channel where none is called so.
-
-        Raises
-        ------
-        DataError
-            If there is none, or more than one.
         """
         exact = [c for c in self.channels if text in (c.name, c.header)]
         loose = [c for c in self.channels if plain(c.name) == plain(text)]
@@ -200,13 +195,7 @@ class Source:
         return channels
 
     def numbers(self, channel: Channel, *, infinite: bool = False) -> FloatArray:
-        """Return a channel's numbers, finite unless said, or name the cell that holds another.
-
-        Raises
-        ------
-        DataError
-            If a cell holds text, is empty, NaN or infinite.
-        """
+        """Return a channel's numbers, finite unless said, or name the cell that holds another."""
         values = channel.values
         if values.dtype.kind == "c":
             raise DataError(
@@ -238,13 +227,7 @@ class Source:
         return values
 
     def complex_numbers(self, channel: Channel) -> ComplexArray:
-        """Return a channel's complex numbers, also those written as text, such as ``5+1i``.
-
-        Raises
-        ------
-        DataError
-            If a cell holds something else.
-        """
+        """Return a channel's complex numbers, also those written as text, such as ``5+1i``."""
         values = np.atleast_1d(channel.values)
         if values.dtype.kind == "U":
             values = np.array([self._complex_cell(channel, i) for i in range(values.size)])
@@ -300,13 +283,7 @@ class Source:
 
 
 def words(cells: Iterable[str]) -> NDArray[np.str_]:
-    """Return cells as text; of a longer one the first letters, and a mark that no number has.
-
-    Raises
-    ------
-    MemoryError
-        If one long cell among many short ones would make an array far larger than the text.
-    """
+    """Return cells as text; of a longer one the first letters, and a mark that no number has."""
     short = [c if len(c) <= _LONGEST_WORD else f"{c[:_LONGEST_WORD]}..." for c in cells]
     lengths = [len(cell) for cell in short]
     if 4 * len(short) * max(lengths, default=0) > max(_PADDING[0], _PADDING[1] * sum(lengths)):

@@ -28,13 +28,7 @@ _DRIVE_UNITS: dict[str, DriveUnit] = {"voltage": "V", "current": "A"}
 def record_from(
     source: Source, columns: ColumnMap, missing: Literal["error", "drop"] = "error"
 ) -> Record:
-    """Return the record that a source holds.
-
-    Raises
-    ------
-    DataError, UnitError
-        Naming file, row and column.
-    """
+    """Return the record that a source holds."""
     bound = Binding(source, columns, RECORD_COLUMNS)
     channels = _channels(bound)
     bound.same_length(channels)

@@ -79,13 +79,7 @@ class ResponseOptions:
 def response_from(
     source: Source, columns: ColumnMap, options: ResponseOptions
 ) -> FrequencyResponse:
-    """Return the frequency response that a source holds, all its levels in one table.
-
-    Raises
-    ------
-    DataError, UnitError
-        Naming file, row and column.
-    """
+    """Return the frequency response that a source holds, all its levels in one table."""
     source = replace(source, channels=tuple(map(_as_gain, source.channels)))
     source, options = _with_stated(source, columns, options)
     whole = Binding(source, columns, RESPONSE_COLUMNS)

@@ -35,15 +35,7 @@ _IRREGULAR = {stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "sock
 
 
 def save_frame(frame: pd.DataFrame, path: str | Path, *, overwrite: bool = False) -> Path:
-    """Write a table in the format of the path's extension.
-
-    Raises
-    ------
-    ValidationError
-        If the extension is none that is written.
-    DataError
-        If a file is there already and `overwrite` is not set, or the place cannot be written to.
-    """
+    """Write a table in the format of the path's extension."""
     place = Path(path)
     packed = place.suffix.lower() == ".gz"
     suffix = (place.with_suffix("") if packed else place).suffix.lower()
@@ -59,13 +51,7 @@ def save_frame(frame: pd.DataFrame, path: str | Path, *, overwrite: bool = False
 
 
 def place_of(path: str | Path, what: str, endings: Sequence[str]) -> Path:
-    """Return the path, which has to have one of the endings.
-
-    Raises
-    ------
-    ValidationError
-        If it has another.
-    """
+    """Return the path, which has to have one of the endings."""
     place = Path(path)
     if place.suffix.lower() not in endings:
         raise ValidationError(
@@ -76,13 +62,7 @@ def place_of(path: str | Path, what: str, endings: Sequence[str]) -> Path:
 
 
 def regular(path: str | Path, what: str = "the file") -> Path:
-    """Return the path of a file, which has to be a regular one: others may never end.
-
-    Raises
-    ------
-    DataError
-        If there is none, or it is a folder, a pipe, a device or a socket.
-    """
+    """Return the path of a file, which has to be a regular one: others may never end."""
     place = Path(path)
     try:
         kind = stat.S_IFMT(place.stat().st_mode)
@@ -98,13 +78,7 @@ def regular(path: str | Path, what: str = "the file") -> Path:
 
 
 def read_text(path: str | Path, what: str = "the file") -> str:
-    """Return the text of a file.
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, or is not text.
-    """
+    """Return the text of a file."""
     try:
         return regular(path, what).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as exc:
@@ -113,13 +87,7 @@ def read_text(path: str | Path, what: str = "the file") -> str:
 
 
 def refuse_existing(path: Path) -> None:
-    """Refuse to replace a file.
-
-    Raises
-    ------
-    DataError
-        If there is one, or a folder.
-    """
+    """Refuse to replace a file."""
     if path.is_dir():
         raise DataError(f"{path} is a folder; give the path of a file in it")
     if path.exists():
@@ -129,13 +97,7 @@ def refuse_existing(path: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes, *, overwrite: bool = False) -> None:
-    """Write a file so that it is there whole or not at all.
-
-    Raises
-    ------
-    DataError
-        If a file is there already and `overwrite` is not set, or the place cannot be written to.
-    """
+    """Write a file so that it is there whole or not at all."""
     if not overwrite:
         refuse_existing(path)
     try:
@@ -267,13 +229,7 @@ def _texts(frame: pd.DataFrame, change: Callable[[str], str]) -> pd.DataFrame:
 
 
 def library(module: str, extra: str | None = None) -> Any:
-    """Import a library that reads a format.
-
-    Raises
-    ------
-    MissingDependencyError
-        If it is not installed, with the command that installs it.
-    """
+    """Import a library that reads a format."""
     try:
         return importlib.import_module(module)
     except ImportError as exc:
@@ -297,13 +253,7 @@ def digest(value: Any) -> str:
 
 
 def read_metadata(text: Any) -> dict[str, Any]:
-    """Return what an earlier save of this package wrote together with a table.
-
-    Raises
-    ------
-    ValueError
-        If it is something else: no JSON object, too deep, or with entries of other types.
-    """
+    """Return what an earlier save of this package wrote together with a table."""
     try:
         content = json.loads(text)
         known = isinstance(content, dict) and all(

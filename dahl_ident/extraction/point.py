@@ -269,11 +269,6 @@ def measure(
     """Turn a segment of known phase, and the record's samples, into a point.
 
     In a sweep amplitude and response may change linearly, and no cycles are left out.
-
-    Raises
-    ------
-    ExtractionError
-        If it is shorter than two cycles, or motion or force is not dominated by one sine.
     """
     found = whole_cycles(segment)
     if found < FEWEST_CYCLES:

@@ -37,13 +37,7 @@ class Mechanism:
 
     @classmethod
     def of(cls, plant: Element) -> Mechanism:
-        """Return the parts of a model whose parameters all have values.
-
-        Raises
-        ------
-        ModelError
-            If a parameter has no value, or a linear system has no equation of motion.
-        """
+        """Return the parts of a model whose parameters all have values."""
         plant.known_values()
         plant = as_model(plant)
         friction, others = [], []
@@ -59,14 +53,7 @@ class Mechanism:
         return cls(tuple(friction), linear, tuple(others), plant)
 
     def displacement_under(self, force: Waveform, progress: Progress | None = None) -> Signal:
-        """Return x(t) for a force u(t), from rest.
-
-        Raises
-        ------
-        ModelError
-            If no linear element bounds the motion, it grows without bound, or a law without closed
-            form is parallel to no mass.
-        """
+        """Return x(t) for a force u(t), from rest."""
         if self.others:
             try:
                 return self._integrated(force)
@@ -98,13 +85,7 @@ class Mechanism:
         return lambda at: np.asarray(curve(at))
 
     def force_under(self, displacement: Waveform, progress: Progress | None = None) -> Signal:
-        """Return the force F(t) for a displacement x(t), from rest.
-
-        Raises
-        ------
-        ModelError
-            If the linear part needs more than the second derivative of the displacement.
-        """
+        """Return the force F(t) for a displacement x(t), from rest."""
         polynomial, rest = self.linear.split()
         if polynomial.size > 3:
             raise ModelError(

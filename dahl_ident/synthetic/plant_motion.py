@@ -69,11 +69,6 @@ def simulate_plant(
     -------
     Trajectory
         x(t), m, from 0 to the end of `force`.
-
-    Raises
-    ------
-    ModelError
-        If the motion grows beyond all bounds.
     """
     run = _Run(system, _Friction(friction))
     with np.errstate(all="ignore"):

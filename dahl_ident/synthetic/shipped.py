@@ -61,13 +61,7 @@ def load_dataset(name: str) -> FrequencyResponse | Record:
 
 
 def datasets_directory() -> Path:
-    """Return where the data sets lie: in an installed package, else next to a checkout's.
-
-    Raises
-    ------
-    DataError
-        If they lie in neither place.
-    """
+    """Return where the data sets lie: in an installed package, else next to a checkout's."""
     for place in _PLACES:
         if place.is_dir():
             return place

@@ -394,13 +394,7 @@ def run_names(paths: Sequence[PathLike | pd.DataFrame]) -> list[str]:
 
 
 def refuse_repeated(sources: Sequence[Any]) -> None:
-    """Refuse a file that is named twice, whose rows would count twice.
-
-    Raises
-    ------
-    DataError
-        Naming the file.
-    """
+    """Refuse a file that is named twice, whose rows would count twice."""
     seen: set[Path] = set()
     for source in sources:
         if isinstance(source, (str, Path)):

@@ -36,13 +36,7 @@ _NUMPY_ERRORS = (
 def tree_source(
     file: File, kind: str, leaves: Iterator[Leaf], metadata: Mapping[str, Any] | None = None
 ) -> Source:
-    """Return the numeric vectors and matrices of a tree as channels.
-
-    Raises
-    ------
-    DataError
-        If there are none, or more than a laboratory's file has.
-    """
+    """Return the numeric vectors and matrices of a tree as channels."""
     channels: list[Channel] = []
     notes: list[str] = []
     for path, value, unit in leaves:

@@ -31,13 +31,7 @@ _TABLES = ("channels", "signals", "columns", "data", "rows")
 
 
 def read_json(file: File) -> Source:
-    """Return the columns of a JSON file.
-
-    Raises
-    ------
-    DataError
-        If it is not JSON, or holds neither columns nor rows nor channels.
-    """
+    """Return the columns of a JSON file."""
     try:
         text = utf8(file.lines(b"[{")).decode("utf-8", "replace")
         file.refuse_above_limit(8 * text.count(","), f"JSON of {text.count(',')} numbers")

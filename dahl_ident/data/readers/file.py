@@ -140,13 +140,7 @@ class File:
         return self.data
 
     def refuse_above_limit(self, claimed: int, what: str) -> None:
-        """Refuse content that would take more memory than a file of this size may.
-
-        Raises
-        ------
-        DataError
-            Naming what it is.
-        """
+        """Refuse content that would take more memory than a file of this size may."""
         if claimed > self.limit:
             raise DataError(
                 f"{self.name}: {what} would take {_bytes(claimed)}, and the file has "
@@ -156,13 +150,7 @@ class File:
 
 
 def open_file(path: str | Path) -> File:
-    """Look at a file, ``-`` being standard input.
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, is empty, or holds another format than its extension says.
-    """
+    """Look at a file, ``-`` being standard input."""
     if str(path) == "-":
         if sys.stdin is None:
             raise DataError("standard input is closed; pipe the file into it, or name the file")

@@ -32,13 +32,7 @@ _DAMAGED = (
 
 
 def read_hdf5(file: File) -> Source:
-    """Return the data sets of an HDF5 or MATLAB v7.3 file.
-
-    Raises
-    ------
-    DataError
-        If the file is damaged, or claims more than it can hold.
-    """
+    """Return the data sets of an HDF5 or MATLAB v7.3 file."""
     h5py = library("h5py")
     _refuse_fatal(file, h5py)
     try:

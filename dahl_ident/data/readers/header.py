@@ -79,13 +79,7 @@ def best_run(rows: Iterable[Sequence[str] | None], mark: str) -> Run | None:
 def refuse_second_header(
     rows: Sequence[Sequence[str] | None], start: int, mark: str, where: Callable[[int], str]
 ) -> None:
-    """Refuse rows of the table's own form above its header: the file has another one there.
-
-    Raises
-    ------
-    DataError
-        Naming the row above and the first row of the table by `where`.
-    """
+    """Refuse rows of the table's own form above its header: the file has another one there."""
     first = _numeric(rows[start] or [], mark)
     for i in range(start if first.count(True) > 1 else 0):
         row = rows[i]
@@ -190,13 +184,7 @@ def are_units(cells: Sequence[str]) -> bool:
 def named_channels(
     columns: Sequence[NDArray[Any]], named: Header, file: str
 ) -> tuple[Channel, ...]:
-    """Return the columns with their names and units, blank ones without a name left out.
-
-    Raises
-    ------
-    DataError
-        If rows are longer than the header, or several headers differ.
-    """
+    """Return the columns with their names and units, blank ones without a name left out."""
     if named.contradicted:
         raise DataError(
             f"{file}: several lines above the numbers name the columns, with different units or "

@@ -209,14 +209,7 @@ def merged_axes(channels: list[Channel]) -> list[Channel]:
 
 
 def read_tdms(file: File) -> Source:
-    """Return the channels of a TDMS file; evenly sampled ones get a time channel.
-
-    Raises
-    ------
-    DataError
-        If the file is damaged: what the library only warns of, such as a last segment that is
-        cut off, is damage too.
-    """
+    """Return the channels of a TDMS file; evenly sampled ones get a time channel."""
     nptdms = library("nptdms", "tdms")
     stream: Any = io.BytesIO(file.content) if file.content is not None else None
     if stream is None:
@@ -256,13 +249,7 @@ class _Bounded(io.BufferedReader):
 
 
 def _begun_again(file: File) -> list[int]:
-    """Return the numbers of later segments that state the sampling of a waveform again.
-
-    Raises
-    ------
-    DataError
-        If bytes are left behind the last segment: some were added, and shifted the samples.
-    """
+    """Return the numbers of later segments that state the sampling of a waveform again."""
     found, number = [], 0
     with contextlib.ExitStack() as stack:
         place = file.stream()
@@ -380,13 +367,7 @@ def instrument_source(
     notes: Sequence[str] = (),
     doubts: Sequence[str] = (),
 ) -> Source:
-    """Return the channels of an instrument's file.
-
-    Raises
-    ------
-    DataError
-        If there are none.
-    """
+    """Return the channels of an instrument's file."""
     if not channels:
         raise DataError(f"{file.name}: the file holds no channels")
     return Source(

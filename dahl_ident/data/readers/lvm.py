@@ -28,13 +28,7 @@ Lines = list[tuple[int, str]]
 
 
 def read_lvm(file: File) -> Source:
-    """Return the channels of all segments of a LabVIEW measurement file.
-
-    Raises
-    ------
-    DataError
-        If a line or a sample is missing, or a cell holds no number.
-    """
+    """Return the channels of all segments of a LabVIEW measurement file."""
     text = utf8(file.lines()).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     lines = [(i + 1, line) for i, line in enumerate(text.split("\n"))]
     head, rest = _up_to_end(file, _without_special(lines), 0)

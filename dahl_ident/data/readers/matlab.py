@@ -42,13 +42,7 @@ class _DamagedError(Exception):
 
 
 def read_matlab(file: File) -> Source:
-    """Return the arrays of a MATLAB v4, v5 or v7 file.
-
-    Raises
-    ------
-    DataError
-        If the file is damaged.
-    """
+    """Return the arrays of a MATLAB v4, v5 or v7 file."""
     data = file.data
     level_5 = data.startswith(b"MATLAB 5.0 MAT-file")
     try:

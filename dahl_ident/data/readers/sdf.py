@@ -63,11 +63,6 @@ def read_sdf(file: File) -> Source:
 
     A frequency response is in the engineering units of its channels. Where its coherence is in the
     file too, the standard deviation follows from it.
-
-    Raises
-    ------
-    DataError
-        If the file is damaged, or holds a kind of data that is not read.
     """
     try:
         return _Sdf(file).source()

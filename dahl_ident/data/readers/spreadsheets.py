@@ -34,13 +34,7 @@ _ENDINGS = {"excel": ".xlsx", "ods": ".ods"}
 
 
 def read_workbook(file: File, sheet: str | None = None) -> Source:
-    """Return the table on a sheet; without a name, on the only sheet that has one.
-
-    Raises
-    ------
-    DataError
-        If the workbook is damaged, or no sheet or several hold a table.
-    """
+    """Return the table on a sheet; without a name, on the only sheet that has one."""
     library("python_calamine", "excel")
     sheets = _cells(file)
     if sheet is not None:
@@ -130,13 +124,7 @@ def _column(cells: list[Any]) -> NDArray[Any]:
 
 
 def read_parquet(file: File) -> Source:
-    """Return the columns of a Parquet file, each read when it is used.
-
-    Raises
-    ------
-    DataError
-        If the file is damaged, or claims more than it can hold.
-    """
+    """Return the columns of a Parquet file, each read when it is used."""
     library("pyarrow", "parquet")
     pq = library("pyarrow.parquet")
     try:

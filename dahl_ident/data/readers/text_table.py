@@ -91,13 +91,7 @@ class _Layout:
 
 
 def read_text_table(file: File) -> Source:
-    """Return the columns of a text table.
-
-    Raises
-    ------
-    DataError
-        If the bytes are not text, or no table of numbers is found, or lines differ in width.
-    """
+    """Return the columns of a text table."""
     data, name = utf8(file.data), file.name
     if b"\0" in data:
         raise DataError(
