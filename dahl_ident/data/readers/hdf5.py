@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
-import time
-import warnings
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -17,11 +13,12 @@ from numpy.typing import NDArray
 
 from dahl_ident.data.raw_columns import Source, Stored, words
 from dahl_ident.data.readers.array_trees import Leaf, tree_source
+from dahl_ident.data.readers.child_process import apart
 from dahl_ident.data.readers.file import DEEPEST, MOST_CHANNELS, File
 from dahl_ident.data.storage import library, read_metadata
 from dahl_ident.errors import DataError
 
-_SECONDS, _CPU_SECONDS = 60, 1  # a look at a good file takes some milliseconds,
+_SECONDS = 1  # a look at a good file takes some milliseconds,
 _BYTES_A_SECOND = 1_000_000  # and at one of many small objects 0.2 ms for each 300 bytes
 _PACKING = {"scale_factor", "add_offset", "_FillValue", "missing_value"}
 _LOOKED_AT = 1 << 24  # bytes in all
@@ -71,51 +68,23 @@ def _check_size(file: File, start: int) -> None:
 
 
 def _refuse_fatal(file: File, h5py: Any) -> None:
-    """Look at everything in the file in a process of its own, which damage may end or hang.
-
-    The library trusts what a file says of its own structure. Systems without ``fork`` go without.
-    """
-    if not hasattr(os, "fork"):
-        return
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # other threads are not touched
-        process = os.fork()
-    if process == 0:  # pragma: no cover
-        with contextlib.suppress(BaseException):
-            _look(file, h5py)
-        os._exit(0)  # an error will be met again, and named, by the reader
-    deadline = time.monotonic() + _SECONDS
-    done, status = os.waitpid(process, os.WNOHANG)
-    while not done and time.monotonic() < deadline:
-        time.sleep(0.001)
-        done, status = os.waitpid(process, os.WNOHANG)
-    if not done:
-        os.kill(process, signal.SIGKILL)
-        os.waitpid(process, 0)
-    if status or not done:
-        raise DataError(
-            f"{file.name}: the file is damaged: the HDF5 library "
-            f"{'fails' if done else 'hangs'} on its structure"
-        )
-
-
-def _look(file: File, h5py: Any) -> None:  # pragma: no cover
     """Visit every object, and read the data sets whose places the file has to look up."""
-    import resource
 
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    seconds = _CPU_SECONDS + file.length // _BYTES_A_SECOND
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-    with h5py.File(file.stream(), "r") as root:
-        dict(root.attrs)
-        left = _LOOKED_AT
-        for _, item in _Tree(file, root, h5py).all_items(root, 0):
-            with contextlib.suppress(*_DAMAGED):
-                dict(item.attrs)
-            if isinstance(item, h5py.Dataset) and item.chunks is not None:
+    def look() -> None:  # pragma: no cover
+        with contextlib.suppress(Exception), h5py.File(file.stream(), "r") as root:
+            dict(root.attrs)  # an error will be met again, and named, by the reader
+            left = _LOOKED_AT
+            for _, item in _Tree(file, root, h5py).all_items(root, 0):
                 with contextlib.suppress(*_DAMAGED):
-                    _ = item[()] if item.nbytes < left else (item[:1], item[-1:])
-                left -= min(item.nbytes, left)
+                    dict(item.attrs)
+                if isinstance(item, h5py.Dataset) and item.chunks is not None:
+                    with contextlib.suppress(*_DAMAGED):
+                        _ = item[()] if item.nbytes < left else (item[:1], item[-1:])
+                    left -= min(item.nbytes, left)
+
+    error = apart(look, seconds=_SECONDS + file.length // _BYTES_A_SECOND).error
+    if error:
+        raise DataError(f"{file.name}: the file is damaged: {error} on its structure")
 
 
 class _Tree:

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import marshal
-import subprocess
-import sys
-import tempfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +14,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.data.levels import stated_levels
 from dahl_ident.data.raw_columns import Channel, Source, Stored, split_header, words
-from dahl_ident.data.readers import sheet_process
+from dahl_ident.data.readers.child_process import apart
 from dahl_ident.data.readers.file import MOST_CHANNELS, ZIP_ERRORS, File
 from dahl_ident.data.readers.header import best_run, header, named_channels, refuse_second_header
 from dahl_ident.data.storage import library, read_metadata
@@ -29,13 +25,11 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _HEAD_ROWS = 400  # looked at as text, which takes long, to find the table
-_MEGABYTES, _SECONDS = 1000, 30  # that reading may take: a small archive can unpack to anything
-_ENDINGS = {"excel": ".xlsx", "ods": ".ods"}
+_BYTES, _SECONDS = 1 << 30, 15  # that reading may take: a small archive can unpack to anything
 
 
 def read_workbook(file: File, sheet: str | None = None) -> Source:
     """Return the table on a sheet; without a name, on the only sheet that has one."""
-    library("python_calamine", "excel")
     sheets = _cells(file)
     if sheet is not None:
         if sheet not in sheets:
@@ -63,25 +57,31 @@ def _cells(file: File) -> dict[str, list[list[Any]]]:
         broken = archive.testzip()
     if broken is not None:
         raise DataError(f"{file.name}: the workbook is damaged: the check sum of {broken} differs")
-    with contextlib.ExitStack() as stack:
-        path = file.path if file.content is None else None
-        if path is None:
-            folder = stack.enter_context(tempfile.TemporaryDirectory())
-            path = Path(folder) / f"book{_ENDINGS[file.format]}"
-            path.write_bytes(file.data)
-        command = [sys.executable, "-I", sheet_process.__file__, str(path), str(_MEGABYTES)]
-        try:
-            done = subprocess.run(command, capture_output=True, timeout=_SECONDS, check=False)
-        except subprocess.TimeoutExpired:
-            raise DataError(
-                f"{file.name}: the workbook takes more than {_SECONDS} s to read; expected a table "
-                "of measurements. Save the sheet as .csv"
-            ) from None
-    if done.returncode:
-        words = done.stderr.decode("utf-8", "replace").strip().splitlines()
-        why = words[-1][:200] if words else f"its reader ended with status {done.returncode}"
-        raise DataError(f"{file.name}: the workbook is damaged, or too large: {why}")
-    return dict(marshal.loads(done.stdout))
+    calamine = library("python_calamine", "excel")
+
+    def read() -> dict[str, list[list[Any]]]:  # pragma: no cover
+        stream = file.stream()
+        with stream.open("rb") if isinstance(stream, Path) else stream as content:
+            book = calamine.CalamineWorkbook.from_filelike(content)
+            return {name: _rows(book, name) for name in book.sheet_names}
+
+    cells, error = apart(read, seconds=_SECONDS, bytes_at_most=_BYTES)
+    if error:
+        raise DataError(f"{file.name}: the workbook is damaged, or too large: {error[:200]}")
+    sheets: dict[str, list[list[Any]]] = cells
+    return sheets
+
+
+def _rows(book: Any, name: str) -> list[list[Any]]:  # pragma: no cover
+    """Return the cells of a sheet; numbers, text and truth values as they are, dates as text."""
+    try:
+        rows = book.get_sheet_by_name(name).to_python(skip_empty_area=False)
+    except Exception as exc:
+        if "worksheet" in type(exc).__name__.lower() or "chart" in str(exc).lower():
+            return []  # a sheet of diagrams
+        raise
+    plain = (float, int, str, bool)
+    return [[cell if isinstance(cell, plain) else str(cell) for cell in row] for row in rows]
 
 
 def _table(file: File, sheet: str, cells: list[list[Any]]) -> Source | None:
