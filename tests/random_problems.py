@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dahl_ident import Dahl, FrequencyResponse, Spring
+from dahl_ident import Dahl, FrequencyResponse, Model, Spring
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements import Element, Model
-from dahl_ident.elements.element import as_model
+from dahl_ident.elements import Element
 from dahl_ident.fitting.levenberg_marquardt import minimise
 from dahl_ident.problem import Problem
 
@@ -127,7 +126,7 @@ def _searched(problem: Problem, starts: FloatArray) -> Case:
 
 
 def _with_spring() -> Model:
-    return as_model(Dahl() + Spring())
+    return Model(Dahl() + Spring())
 
 
 def _case(problem: Problem, cost: FloatArray, ln_x_c: FloatArray, ln_sigma: FloatArray) -> Case:

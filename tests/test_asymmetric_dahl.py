@@ -11,10 +11,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import ive
 
-from dahl_ident import Dahl, Mass
+from dahl_ident import Dahl, Friction, Mass, Model
 from dahl_ident.elements.description import describe_model, model_from_description
-from dahl_ident.elements.element import as_model
-from dahl_ident.elements.friction import Friction
 from dahl_ident.errors import ValidationError
 
 AT_REST = np.zeros(())
@@ -113,7 +111,7 @@ def test_the_even_bessel_functions_carry_it() -> None:
 
 def test_derivatives_are_differences_of_the_values() -> None:
     labels = ["f_max", "sigma", "asymmetry"]
-    law = as_model(Dahl(1.0, 20.0, asymmetry=0.2)).with_free(labels)
+    law = Model(Dahl(1.0, 20.0, asymmetry=0.2)).with_free(labels)
     A, h = np.array([0.01, 0.1, 1.0]), 1e-6
     for k in (0, 1, 2, 3):
         found = law.stiffness_gradient(law.known_values(), A, AT_REST, k)
@@ -148,7 +146,7 @@ def test_description_and_refusals() -> None:
 @pytest.mark.parametrize("k", [0, 1, 2, 3])
 def test_derivatives_against_high_precision(k: int) -> None:
     rng = np.random.default_rng(k)
-    law = as_model(Dahl(1.0, 3.0, asymmetry=0.2)).with_free(["f_max", "sigma", "asymmetry"])
+    law = Model(Dahl(1.0, 3.0, asymmetry=0.2)).with_free(["f_max", "sigma", "asymmetry"])
     for beta in 10.0 ** rng.uniform(-2.0, 2.0, 2):
         at = [2.0, 50.0, float(rng.uniform(-0.8, 0.8)), float(beta) / 25.0]
         values = [np.asarray(v) for v in (*at[:2], 1.0, at[2])]

@@ -17,6 +17,7 @@ from dahl_ident import (
     FrequencyResponse,
     Friction,
     Mass,
+    Model,
     PowerDamper,
     Spring,
     fit,
@@ -25,7 +26,6 @@ from dahl_ident import (
 from dahl_ident.arrays import ComplexArray
 from dahl_ident.cli.model import elements
 from dahl_ident.elements.description import describe_model, model_from_description
-from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ModelError
 from tests.test_generic_friction import Jenkins
 from tests.test_response_of_any_law import all_amplitudes
@@ -119,7 +119,7 @@ def test_the_force_steps_through_the_gap() -> None:
 
 
 def test_derivatives_are_differences_of_the_values() -> None:
-    law = as_model(Backlash(Dahl(1.0, 3.0), 0.8)).with_free(["f_max", "sigma", "gap"])
+    law = Model(Backlash(Dahl(1.0, 3.0), 0.8)).with_free(["f_max", "sigma", "gap"])
     A, values = np.array([0.7, 2.0, 5.0]), law.known_values()
     found = law.stiffness_gradient(values, A, AT_REST)
     for i, b in ((3, 0.4),):
@@ -130,7 +130,7 @@ def test_derivatives_are_differences_of_the_values() -> None:
 def test_derivatives_of_linear_dahl_are_exact() -> None:
     rng = np.random.default_rng(11)
     places, weights = np.array([1.0, -1.0, 2.0, -2.0]), np.array([8.0, -8.0, -1.0, 1.0]) / 12e-5
-    law = as_model(Backlash(Dahl(1.0, 3.0), 0.8)).with_free(["f_max", "sigma", "gap"])
+    law = Model(Backlash(Dahl(1.0, 3.0), 0.8)).with_free(["f_max", "sigma", "gap"])
     for i in range(24):
         f_max, sigma = 10.0 ** rng.uniform(-2.0, 2.0, 2)
         b = f_max / sigma * 10.0 ** rng.uniform(-2.0, 1.0)
@@ -177,7 +177,7 @@ def test_two_limits_behind_a_gap_are_those_of_the_general_loop() -> None:
         asymmetry, gap = rng.uniform(-0.7, 0.7), f_max / sigma * 10.0 ** rng.uniform(-2.0, 1.0)
         A = 0.5 * gap + f_max / sigma * 10.0 ** rng.uniform(-1.0, 1.2, 2)
         law = Backlash(Dahl(f_max, sigma, asymmetry=asymmetry), gap)
-        free = as_model(law).with_free(["f_max", "sigma", "asymmetry", "gap"])
+        free = Model(law).with_free(["f_max", "sigma", "asymmetry", "gap"])
         values, k = law.known_values(), i % 8
         found = free.stiffness_gradient(values, A, AT_REST, k)
         # an exponent of 1 to rounding has no closed form

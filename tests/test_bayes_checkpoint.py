@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,13 @@ import pytest
 
 import dahl_ident as di
 from dahl_ident.data import storage
-from dahl_ident.data.storage import library
 from dahl_ident.errors import SamplingError
 from dahl_ident.problem import Problem
 from dahl_ident.results import ChainPosterior
 from tests.bayes_cases import friction_table
 
 STEPS = 3000
-h5py = library("h5py")
+h5py = import_module("h5py")
 ROOT = Path(__file__).parents[1]
 LONG_RUN = f"""
 import sys

@@ -19,6 +19,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from datetime import date
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +28,13 @@ import pandas as pd
 import pytest
 
 import dahl_ident as di
+from dahl_ident import population
 from dahl_ident.campaigns.campaign_report import write_campaign_report
 from dahl_ident.campaigns.definition import read_definition
 from dahl_ident.campaigns.engine import Limits, Local, run_jobs
-from dahl_ident.campaigns.population import population
 from dahl_ident.campaigns.run import _unless_refused
 from dahl_ident.campaigns.work import Job, failed
 from dahl_ident.campaigns.worker import do_within
-from dahl_ident.data.storage import library
 from dahl_ident.errors import DahlIdentError, DataError, ValidationError
 from tests.command_line import Runner
 
@@ -510,7 +510,7 @@ def test_a_scheduler_behind_certificates(tmp_path: Path, monkeypatch: pytest.Mon
     (tmp_path / "distributed.yaml").write_text(
         json.dumps({"distributed": {"comm": {"require-encryption": True, "tls": tls}}})
     )
-    settings = library("dask").config  # read before the variable below: this process has no key
+    settings = import_module("dask.config")  # read before the variable: no key in this process
     monkeypatch.setenv("DASK_CONFIG", str(tmp_path))
     given = {f"distributed.comm.tls.{name}": value for name, value in tls.items()}
     with Cluster(tmp_path, "tls://") as cluster:
@@ -863,5 +863,7 @@ def test_report_of_a_campaign(tmp_path: Path) -> None:
     assert "d003: not determined" in page
     for one in (found, None):
         place = write_campaign_report(table, one, tmp_path / "c.pdf", overwrite=True)
-        text = "".join(page.extract_text() for page in library("pypdf").PdfReader(place).pages)
+        text = "".join(
+            page.extract_text() for page in import_module("pypdf").PdfReader(place).pages
+        )
         assert ("Population: f_max" in text) == (one is not None)

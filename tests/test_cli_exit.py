@@ -7,12 +7,12 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 import dahl_ident as di
-from dahl_ident.data.storage import library
 from dahl_ident.errors import DataError, SamplingError
 from tests.bayes_cases import friction_table
 from tests.command_line import Runner
@@ -90,7 +90,7 @@ def test_an_interrupted_chain_says_how_it_goes_on(tmp_path: Path) -> None:
         "chain.h5 holds the chain so far; the same command continues from there",
         "interrupted; no file is incomplete",
     ]
-    with library("h5py").File(chain, "r") as file:
+    with import_module("h5py").File(chain, "r") as file:
         assert len(file["points"]) >= 50
     assert sorted(p.name for p in tmp_path.iterdir()) == ["chain.h5", "levels.csv"]
 

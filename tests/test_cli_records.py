@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.cli.app import main
+from dahl_ident.cli import main
 from dahl_ident.errors import DataError
 from tests.command_line import Runner
 from tests.test_record_fit import DAHL, recorded

@@ -8,9 +8,9 @@ import control
 import numpy as np
 import pytest
 
+from dahl_ident import LinearSystem
 from dahl_ident.elements import Dahl, Damper, Mass, Model, Parameter, Spring
 from dahl_ident.elements.description import describe_model, model_from_description
-from dahl_ident.elements.linear_system import LinearSystem
 from dahl_ident.errors import ModelError
 
 OMEGA = np.array([1.0, 20.0, 300.0])

@@ -15,7 +15,6 @@ from mpmath import mpf
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Dahl, Damper, Element, LinearSystem, Mass, Model, Parameter, Spring
-from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ModelError, ValidationError
 
 control: Any = importlib.import_module("control")
@@ -64,7 +63,7 @@ every_element = pytest.mark.parametrize("element", EVERY.values(), ids=EVERY.key
 
 def all_free(element: Element) -> Model:
     """Return the element with every parameter free, so that every derivative is computed."""
-    return as_model(element).with_free([p.name for p in element.parameters])
+    return Model(element).with_free([p.name for p in element.parameters])
 
 
 # shapes
@@ -144,7 +143,7 @@ def exactly(element: Element, p: Sequence[mpf], A: mpf, omega: mpf, harmonic: in
     """Return F_k/X_1 of any element or sum, in mpmath."""
     total, first = mpmath.mpc(0), 0
     s = 1j * omega
-    for part in as_model(element).elements:
+    for part in Model(element).elements:
         own = p[first : first + len(part.parameters)]
         first += len(own)
         if isinstance(part, Dahl):
@@ -191,7 +190,7 @@ def test_values_and_all_derivatives_against_30_digits(element: Element, harmonic
 
 @every_element
 def test_linear_elements_answer_no_harmonic(element: Element) -> None:
-    friction = [e for e in as_model(element).elements if isinstance(e, Dahl)]
+    friction = [e for e in Model(element).elements if isinstance(e, Dahl)]
     third = element.dynamic_stiffness(AMPLITUDE, OMEGA, harmonic=3)
     expected = sum(
         (e.dynamic_stiffness(AMPLITUDE, OMEGA, harmonic=3) for e in friction), np.zeros((3, 4))
@@ -215,7 +214,7 @@ def test_other_units_scale_parameters_as_their_units_say(
 ) -> None:
     if isinstance(element, LinearSystem) and not element.parameters:
         return  # a fixed system has no parameter to scale
-    model = as_model(element)
+    model = Model(element)
     scaled = model.with_parameters(
         {
             p.name: replace(

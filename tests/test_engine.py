@@ -28,9 +28,9 @@ from benchmarks.motion_oracles import (
     fixed_point,
     integrated,
 )
+from dahl_ident import Parameter
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.equations import law_equations, plant_equations
-from dahl_ident.elements.parameter import Parameter
 from dahl_ident.engine import band_limited, march, settled, translate
 from dahl_ident.errors import FitError
 

@@ -12,17 +12,18 @@ from dahl_ident import (
     BoucWen,
     Dahl,
     Element,
+    Experiment,
     Iwan,
     LuGre,
     MaxwellSlip,
+    Model,
     PowerDamper,
     Record,
     simulate,
 )
 from dahl_ident.elements.description import describe_model, model_from_description
-from dahl_ident.elements.element import KINDS, as_model
-from dahl_ident.synthetic.excitation import SteppedSine
-from dahl_ident.synthetic.experiment import Experiment
+from dahl_ident.elements.element import KINDS
+from dahl_ident.synthetic import SteppedSine
 from tests.test_generic_friction import Jenkins
 
 LINEAR = {"mass", "damper", "spring", "linear_system"}
@@ -60,7 +61,7 @@ def test_the_force_over_time_has_the_harmonics(law: Element) -> None:
 
 @every_law
 def test_derivatives_are_differences(law: Element) -> None:
-    model = as_model(law).with_free([p.name for p in law.parameters])
+    model = Model(law).with_free([p.name for p in law.parameters])
     values, A, w = model.known_values(), np.array([0.7, 2.0]), np.array(2.0)
     for k in (0, 1, 2, 3):
         found = model.stiffness_gradient(values, A, w, k)

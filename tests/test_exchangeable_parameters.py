@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.diagnostics.verdicts import Verdict
+from dahl_ident.diagnostics import Verdict
 
 
 class PullPush(di.Friction):

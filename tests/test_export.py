@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -18,7 +19,6 @@ from scipy.integrate import solve_ivp
 
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data.storage import library
 from dahl_ident.elements import Element, Model
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
 from tests.command_line import Runner
@@ -109,7 +109,7 @@ def plant(fit: di.FitResult, mass: float, drive: Callable[[float], float], end: 
 
 @pytest.mark.parametrize("law", [DAHL, di.LuGre(0.1, 30.0, 1.5, 5e-3, 0.02, 0.1)])
 def test_mujoco_moves_as_the_model(law: Element) -> None:
-    mujoco = library("mujoco")
+    mujoco = import_module("mujoco")
     fit = fitted(law + di.Damper(0.2) + di.Mass(0.3), law + di.Damper() + di.Mass(0.3))
     model = mujoco.MjModel.from_xml_string(fit.export("mujoco"))
     state = mujoco.MjData(model)
@@ -129,7 +129,7 @@ def test_mujoco_moves_as_the_model(law: Element) -> None:
 
 
 def test_mujoco_takes_a_friction_limit_alone() -> None:
-    mujoco = library("mujoco")
+    mujoco = import_module("mujoco")
     fit = fitted(di.Dahl(0.1, 30.0, alpha=0.5) + di.Mass(0.3), di.Dahl(alpha=0.5) + di.Mass(0.3))
     model = mujoco.MjModel.from_xml_string(fit.export("mujoco-frictionloss"))
     assert model.dof_frictionloss[0] == pytest.approx(fit.params["f_max"].value, rel=1e-9)
@@ -188,7 +188,7 @@ def test_matlab_ufloat_and_latex_have_the_budget() -> None:
         assert float(assigned[f"u.{name}"]) == budget[name].u
     numbers: dict[str, Any] = {}
     exec(str(fit.export("ufloat")), numbers)
-    covariance = library("uncertainties").covariance_matrix([numbers[name] for name in names])
+    covariance = import_module("uncertainties").covariance_matrix([numbers[name] for name in names])
     np.testing.assert_allclose(covariance, budget.covariance, rtol=1e-9)
     table = str(fit.export("latex"))
     assert r"$f_\mathrm{max}$ & $0.1" in table
@@ -204,12 +204,12 @@ def test_gtc_has_the_budget_source_by_source() -> None:
     fit = fitted(DAHL + di.Spring(2.0), di.Dahl(alpha=1.0) + di.Spring())
     budget = fit.budget()
     names = list(budget)
-    gtc, persistence = library("GTC"), library("GTC.persistence")
+    gtc, persistence = import_module("GTC"), import_module("GTC.persistence")
     archive = persistence.loads_json(str(fit.export("gtc")))
     first, *others = archive.extract(*names)
     for name, number in zip(names, (first, *others), strict=True):
         assert gtc.uncertainty(number) == pytest.approx(budget[name].u, rel=1e-9)
-        parts = {one.label: one.u for one in library("GTC.reporting").budget(number, trim=0)}
+        parts = {one.label: one.u for one in import_module("GTC.reporting").budget(number, trim=0)}
         for row in budget[name].rows:
             assert parts[f"{name}: {row.source}"] == pytest.approx(row.u, rel=1e-9)
     r = budget.covariance[0, 1] / (budget[names[0]].u * budget[names[1]].u)

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring, fit, response
+from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Model, Sensors, Spring, fit, response
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.element import as_model
 from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting import Status, solve, solve_many
 from dahl_ident.fitting.levenberg_marquardt import minimise
@@ -133,8 +132,8 @@ def test_units_do_not_matter(exponent: int) -> None:
 
 
 def test_a_parameter_at_its_bound_is_named() -> None:
-    capped = as_model(Dahl()).with_parameters(
-        {"f_max": as_model(Dahl()).parameters[0].__class__(
+    capped = Model(Dahl()).with_parameters(
+        {"f_max": Model(Dahl()).parameters[0].__class__(
             "f_max", "N", "friction limit", lower=0.0, upper=0.08, transform="log"
         )}
     )  # fmt: skip

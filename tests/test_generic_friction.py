@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp, trapezoid
 
-from dahl_ident import Backlash, Dahl, Friction, Parameter
+from dahl_ident import Backlash, Dahl, Friction, Model, Parameter
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ModelError
 
 
@@ -102,8 +101,8 @@ def test_batches_of_parameters_and_rest() -> None:
 
 
 def test_derivatives_agree_with_those_of_the_closed_forms() -> None:
-    law = as_model(SlopeOfDahl(1.3, 7.0, 2.0)).with_free(["f_max", "sigma", "alpha"])
-    exact = as_model(Dahl(1.3, 7.0, 2.0)).with_free(["f_max", "sigma", "alpha"])
+    law = Model(SlopeOfDahl(1.3, 7.0, 2.0)).with_free(["f_max", "sigma", "alpha"])
+    exact = Model(Dahl(1.3, 7.0, 2.0)).with_free(["f_max", "sigma", "alpha"])
     A = np.geomspace(1e-2, 1e2, 13)
     for k in (1, 3):
         ours = law.stiffness_gradient(law.known_values(), A, np.zeros(()), k)
@@ -118,7 +117,7 @@ def test_derivatives_agree_with_those_of_the_closed_forms() -> None:
 
 
 def test_derivatives_of_the_elastoplastic_law_against_its_closed_form() -> None:
-    law = as_model(Jenkins(3.0, 1.0)).with_free(["stiffness", "slip"])
+    law = Model(Jenkins(3.0, 1.0)).with_free(["stiffness", "slip"])
     A = np.array([0.5, 1.3, 5.0, 40.0])
     ours = law.stiffness_gradient(law.known_values(), A, np.zeros(()))
     h = 1e-5

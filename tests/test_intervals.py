@@ -19,7 +19,7 @@ from dahl_ident.diagnostics.confidence_levels import LEVELS, thresholds
 from dahl_ident.diagnostics.intervals import compare, profile_intervals, wald_intervals
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.errors import ValidationError
-from dahl_ident.fitting.status import Status
+from dahl_ident.fitting import Status
 from dahl_ident.results import FitResult
 from tests.friction_tables import X_C, amplitudes, plant_table, table
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -11,7 +12,17 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from dahl_ident import BoucWen, Dahl, Damper, FitResult, LinearSystem, Mass, Spring, steady_state
+from dahl_ident import (
+    BoucWen,
+    Dahl,
+    Damper,
+    FitResult,
+    LinearSystem,
+    Mass,
+    Spring,
+    load_dataset,
+    steady_state,
+)
 from dahl_ident import fit as any_fit
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
@@ -19,13 +30,10 @@ from dahl_ident.data.quantities import converted
 from dahl_ident.diagnostics.intervals import Method
 from dahl_ident.elements import Element
 from dahl_ident.errors import FitError, ModelError, ValidationError
-from dahl_ident.fitting import ipopt, solve
+from dahl_ident.fitting import Optimum, Status, ipopt, solve
 from dahl_ident.fitting.ipopt import solve_ipopt
-from dahl_ident.fitting.optimum import Optimum
-from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem as AnyProblem
 from dahl_ident.sensors import Sensors
-from dahl_ident.synthetic.shipped import datasets_directory, load_dataset
 
 # closed forms are fast, and predict the same whichever way the search came; exact rows further down
 Problem: Any = partial(AnyProblem, steady="describing function")
@@ -205,6 +213,8 @@ SHIPPED: dict[str, tuple[Element, Sensors | None, str]] = {
     "delayed": (Dahl(), Sensors(delay=None), "linear"),
 }
 
+SETS = Path(__file__).parents[1] / "datasets" / "synthetic"
+
 
 @pytest.mark.filterwarnings("ignore::dahl_ident.errors.DataWarning")  # noise turned a phase over
 @pytest.mark.parametrize("name", SHIPPED)
@@ -217,7 +227,7 @@ def test_same_optimum_on_shipped_tables(name: str) -> None:
 
 
 def test_every_shipped_table_is_compared() -> None:
-    described = (json.loads(file.read_text()) for file in datasets_directory().glob("*.json"))
+    described = (json.loads(file.read_text()) for file in SETS.glob("*.json"))
     assert {d["name"] for d in described if d["kind"] == "frequency_response"} == set(SHIPPED)
 
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
+from dahl_ident import Model
 from dahl_ident.elements import Element
-from dahl_ident.elements.element import Model, as_model
 from tests.command_line import Runner
 from tests.test_every_law import LAWS
 from tests.test_response_of_any_law import all_amplitudes
@@ -36,7 +36,7 @@ def asked(kind: str) -> Model:
     law = known(kind)
     changes = {p.name: p.described("free") for p in law.parameters[:_FREE]}
     changes |= {p.name: p.fixed(p.value) for p in law.parameters[_FREE:] if p.value is not None}
-    return as_model(law).with_parameters(changes)
+    return Model(law).with_parameters(changes)
 
 
 def data(kind: str) -> di.FrequencyResponse:

@@ -25,7 +25,7 @@ from matplotlib.transforms import Bbox
 
 import dahl_ident as di
 from dahl_ident import plots
-from dahl_ident.control_interop.linearization import LoopMargins
+from dahl_ident.control_interop import LoopMargins
 from dahl_ident.elements.linear_dahl import describing_function
 from dahl_ident.errors import ValidationError
 from dahl_ident.plots import Curve, style

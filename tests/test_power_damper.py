@@ -8,9 +8,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from dahl_ident import Dahl, Damper, Mass, PowerDamper, Spring, response
+from dahl_ident import Dahl, Damper, Mass, Model, PowerDamper, Spring, response
 from dahl_ident.elements.description import describe_model, model_from_description
-from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError
 from tests.test_response_of_any_law import all_amplitudes
 
@@ -52,7 +51,7 @@ def test_its_special_cases() -> None:
 @pytest.mark.parametrize("p", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("k", [1, 3])
 def test_derivatives_against_high_precision(p: float, k: int) -> None:
-    law = as_model(PowerDamper(2.0, p)).with_free(["coefficient", "exponent", "reference_speed"])
+    law = Model(PowerDamper(2.0, p)).with_free(["coefficient", "exponent", "reference_speed"])
     A, omega, h = 0.3, 7.0, 1e-5
     found = law.stiffness_gradient(law.known_values(), np.asarray(A), np.asarray(omega), k)
     size = abs(exactly(2.0, p, A, omega, 1))

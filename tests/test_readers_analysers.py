@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.cli.app import main
+from dahl_ident.cli import main
 from dahl_ident.data import inspect, read_frequency_response
 from dahl_ident.errors import DataError, DataWarning, UnitError
 

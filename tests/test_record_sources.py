@@ -10,8 +10,8 @@ from scipy import stats
 from scipy.interpolate import CubicSpline
 
 import dahl_ident as di
+from dahl_ident import Model
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError
 from dahl_ident.synthetic import Acquisition, Experiment, FrequencySweep, simulate
 from tests.test_record_fit import DAHL, RATE, driven, recorded, trajectory
@@ -72,7 +72,7 @@ def test_calibrations_count_as_they_move_the_estimate(
     if output == "force":
         record, model = (
             recorded(DAHL + di.Spring(5.0), "random", 1500, 1e-4),
-            as_model(di.Spring(5.0)),
+            Model(di.Spring(5.0)),
         )
     else:
         record, model = driven(2, 1e-3, 1024), di.Mass(0.3) + di.Damper() + di.Spring()

@@ -19,7 +19,7 @@ from dahl_ident.reporting.document import Cell, Document, Section, Table
 from dahl_ident.reporting.html import html
 from dahl_ident.reporting.pdf import pdf
 from dahl_ident.reporting.settling import cycle_by_cycle
-from dahl_ident.results.chain_posterior import ChainPosterior
+from dahl_ident.results import ChainPosterior
 from tests.browser import CHROMIUM, Page, chromium
 
 NASTY = "<img src=x onerror=alert(1)>&\"'|*_`[x](y)#.csv"

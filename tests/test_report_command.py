@@ -13,9 +13,9 @@ from scipy import stats
 
 import dahl_ident as di
 from dahl_ident.reporting.equivalent_command import equivalent_command
-from dahl_ident.synthetic.shipped import datasets_directory
 from tests.command_line import Runner
 
+SETS = Path(__file__).parents[1] / "datasets" / "synthetic"
 A = np.geomspace(3e-4, 3e-2, 12)
 NOISE = 0.01 * np.random.default_rng(3).standard_normal((2, 12))
 
@@ -92,7 +92,7 @@ def test_of_any_law(run: Runner, model: di.Element, told: str) -> None:
 
 
 def test_of_waveforms(run: Runner) -> None:
-    record = di.read_record(datasets_directory() / "plant_recording.csv.gz")
+    record = di.read_record(SETS / "plant_recording.csv.gz")
     data = di.extract(record, controlled="force", harmonics=[1], num_periods=8)
     data = data.select(rows=data.quality["verdict"] == "good")
     plant = di.Dahl() + di.Mass() + di.Damper() + di.Spring()

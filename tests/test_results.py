@@ -32,7 +32,7 @@ from dahl_ident import (
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.storage import digest
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
-from dahl_ident.fitting.status import Status
+from dahl_ident.fitting import Status
 from dahl_ident.problem import Problem
 from tests.friction_tables import FRICTION, amplitudes, plant_table, table
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.results.result import Result
 
 
 class Elastoplastic(di.Friction):
@@ -52,8 +51,7 @@ def fit(data: di.FrequencyResponse) -> di.FitResult:
 
 def test_fit_and_grid_find_the_truth(fit: di.FitResult, data: di.FrequencyResponse) -> None:
     grid = di.posterior(data, Elastoplastic(), method="grid", tolerance=3e-3)
-    results: list[Result] = [fit, grid]
-    for result in results:
+    for result in (fit, grid):
         for name, truth in TRUTH.items():
             estimate = result.params[name]
             assert estimate.stderr is not None

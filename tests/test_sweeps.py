@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.cli.app import main
+from dahl_ident.cli import main
 from dahl_ident.data.levels import one_run
 from dahl_ident.synthetic import Acquisition, Channel, Experiment, FrequencySweep, SteppedSine
 

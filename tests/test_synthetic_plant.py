@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from dahl_ident import BoucWen, Dahl, Damper, LinearSystem, Mass, Spring, response
+from dahl_ident import BoucWen, Dahl, Damper, LinearSystem, Mass, Model, Spring, response
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element
-from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ModelError
 from dahl_ident.synthetic import AmplitudeRamp, FrequencySweep, SteppedSine
 from dahl_ident.synthetic.mechanism import Mechanism, Signal
@@ -130,7 +129,7 @@ def test_forces_balance_at_every_instant(plant: Element, level: float) -> None:
     x = motion(time)
     v = np.gradient(x, time, edge_order=2)
     a = np.gradient(v, time, edge_order=2)
-    total = as_model(plant).force(x, velocity=v, acceleration=a)
+    total = Model(plant).force(x, velocity=v, acceleration=a)
     # second differences jump where friction's stiffness does, at reversals
     misfit = np.abs(total - force.value(time))[2:-2]
     assert np.quantile(misfit, 0.99) < 2e-4 * level

@@ -18,9 +18,9 @@ from dahl_ident import (
     fit,
     load_dataset,
 )
+from dahl_ident.diagnostics import Verdict
 from dahl_ident.diagnostics.checks import robust_values
 from dahl_ident.diagnostics.stiffening import Stiffening, stiffening
-from dahl_ident.diagnostics.verdicts import Verdict
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
 
 
