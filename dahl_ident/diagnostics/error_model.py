@@ -187,6 +187,11 @@ class ErrorModel:
         errors = size * np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0))
         return dict(zip(self.names, errors.tolist(), strict=True))
 
+    def std(self, directions: FloatArray) -> FloatArray:
+        """Return the combined standard uncertainty of directions . theta, for (..., Q)."""
+        variance = np.einsum("...i,ij,...j->...", directions, self.covariance, directions)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
     def holds(self, name: str) -> bool:
         """Return whether a parameter is determined, where the data leave some directions open."""
         if self.basis is None:

@@ -9,6 +9,7 @@ from typing import Any
 from dahl_ident.diagnostics.formatting import listed, p_text, percent, with_unit
 
 _MOST_DEPARTURES = 3  # in the verdict; the details list all
+_MOST_ROWS = 3  # the same
 
 
 def sentence(code: str, values: Mapping[str, Any]) -> str:
@@ -23,8 +24,9 @@ def sentence(code: str, values: Mapping[str, Any]) -> str:
 
 
 def joined(parts: Sequence[str], most: int = 100) -> str:
-    """Return parts as one text, no more than so many of them."""
-    return "; ".join([*parts[:most], *(["..."] if len(parts) > most else [])])
+    """Return parts as one text: no more than so many of them, and how many others there are."""
+    others = len(parts) - most
+    return "; ".join([*parts[:most], *([f"{others} more"] if others > 0 else [])])
 
 
 def departures(objections: Sequence[str]) -> str:
@@ -52,6 +54,8 @@ def _identified(identified: Sequence[str], weak: Sequence[str], by_prior: Sequen
 
 
 def _undetermined(determined: Sequence[str], weak: Sequence[str], lost: Sequence[str]) -> str:
+    if weak and not determined:
+        return f"Only {_are(weak)} determined, and only weakly; not {listed(lost)}."
     only = f"Only {_are(determined)} determined" if determined else "Nothing is determined"
     weakly = f", {listed(weak)} weakly" if weak else ""
     return f"{only}{weakly}; not {listed(lost)}."
@@ -109,7 +113,8 @@ def _noise(rms: float, hints: Sequence[str], scatter: str) -> str:
 
 
 def _rows_apart(names: Sequence[str], rows: int, rms: float, remaining: str) -> str:
-    them, named = "them", f"Only {len(names)} of {rows} rows ({joined(names, 10)}) contradict"
+    which = joined(names, _MOST_ROWS)
+    them, named = "them", f"Only {len(names)} of {rows} rows ({which}) contradict"
     if len(names) == 1:
         them, named = "it", f"Only the row at {names[0]} contradicts"
     left = remaining[0].lower() + remaining[1:].rstrip(".")
@@ -121,7 +126,7 @@ def _rows_apart(names: Sequence[str], rows: int, rms: float, remaining: str) -> 
 
 
 def _suspicious(names: Sequence[str], neighbours: str) -> str:
-    rows = joined(names, 5)
+    rows = joined(names, _MOST_ROWS)
     if neighbours:
         return (
             f"Suspicious rows: {rows}; without them the model describes the data, but they are "
@@ -131,9 +136,10 @@ def _suspicious(names: Sequence[str], neighbours: str) -> str:
 
 
 def _flagged(points: Sequence[str]) -> str:
+    which = joined(points, _MOST_ROWS)
     return (
-        f"The extraction flagged {len(points)} of the points fitted ({joined(points, 3)}): measure "
-        "them again, or select the good ones."
+        f"The extraction flagged {len(points)} of the points fitted ({which}): measure them again, "
+        "or select the good ones."
     )
 
 
@@ -169,10 +175,10 @@ def _prior(name: str, value: float, mean: float, std: float) -> str:
 
 
 def _moved(names: Sequence[str], rows: Sequence[str]) -> str:
-    named = "; ".join(rows[:5]) or "the rows with the largest residuals"
+    which = "the suspicious rows" if rows else "the rows with the largest residuals"
     return (
-        f"A robust fit moves {listed(names)} by more than one standard uncertainty: look at "
-        f'{named}, or fit with loss="huber".'
+        f"A robust fit moves {listed(names)} by more than one standard uncertainty: check {which}, "
+        'or fit with loss="huber".'
     )
 
 

@@ -56,6 +56,10 @@ _MOST_EXCHANGED = 6  # parameters, in pairs
 _VECTOR_PART = 0.05  # component of the undetermined direction worth naming
 
 
+Spread = Callable[[FloatArray], FloatArray]
+"""Standard deviation of directions . theta, shape (...), for directions (..., P)."""
+
+
 class Verdict(Enum):
     """How well a parameter is determined."""
 
@@ -291,7 +295,10 @@ def judged(
             verdicts[name] = Verdict.BY_PRIOR
     lost = frozenset(n for n, v in verdicts.items() if v is Verdict.NOT_IDENTIFIED)
     loose = lost | {n for n, v in verdicts.items() if v is Verdict.WEAK}
-    found = _determined(optimum, information, lost, loose)
+    if errors is None or errors.basis is not None:
+        determined = _determined(optimum, information.std, lost, loose)
+    else:  # the estimate has every source of error, and assumed exponents among its parameters
+        determined = _determined(errors.at_estimate, errors.std, lost, loose)
     parameters = {}
     for i, (name, parameter) in enumerate(zip(problem.names, problem.parameters, strict=True)):
         unit = parameter.unit
@@ -306,13 +313,13 @@ def judged(
             name, unit, verdicts[name], float(fisher[i]), float(profile[i]), limits, reason
         )
     direction = {}
-    if lost - blind.keys() and not found:
+    if lost - blind.keys() and not determined:
         vector = information.weakest(natural)
         parts = zip(problem.names, vector.tolist(), strict=True)
         direction = {n: v for n, v in parts if abs(v) > _VECTOR_PART}
         direction = direction if len(direction) > 1 else {}
     rows = dict(zip(problem.names, shares(optimum), strict=True))
-    return Identifiability(parameters, found, information.rank, direction, rows)
+    return Identifiability(parameters, determined, information.rank, direction, rows)
 
 
 def _set_by_prior(optimum: Optimum, errors: ErrorModel | None) -> list[str]:
@@ -461,7 +468,7 @@ def _shown(limits: Sequence[Interval], verdict: Verdict) -> Interval:
 
 
 def _determined(
-    optimum: Optimum, information: Information, lost: frozenset[str], loose: frozenset[str]
+    optimum: Optimum, std_of: Spread, lost: frozenset[str], loose: frozenset[str]
 ) -> tuple[DeterminedCombination, ...]:
     """Return the combinations of parameters that are not identified, but are together.
 
@@ -489,24 +496,24 @@ def _determined(
         enough = bool(members & lost) and len(members & loose) > 1
         if not (members <= lost if candidate.is_sum else enough):
             continue
-        std = float(information.std(candidate.direction))
-        if candidate.is_sum and std > float(information.std(_split(candidate)).min()):
+        std = float(std_of(candidate.direction))
+        if candidate.is_sum and std > float(std_of(_split(candidate)).min()):
             continue  # one of its parts alone is known better
         if std < IDENTIFIED_BELOW:
             size = abs(candidate.value) * std
             found.append(
                 DeterminedCombination(candidate.expression, candidate.unit, candidate.value, size)
             )
-    return tuple(found) if found else _stiffness_seen(optimum, information, loose)
+    return tuple(found) if found else _stiffness_seen(optimum, std_of, loose)
 
 
 def _stiffness_seen(
-    optimum: Optimum, information: Information, loose: frozenset[str]
+    optimum: Optimum, std_of: Spread, loose: frozenset[str]
 ) -> tuple[DeterminedCombination, ...]:
     seen = stiffness_seen(optimum)
     if seen is None or not seen.members <= loose or not np.isfinite(seen.value):
         return ()
-    std = float(information.std(seen.direction))
+    std = float(std_of(seen.direction))
     if not std < IDENTIFIED_BELOW:
         return ()
     return (DeterminedCombination(seen.expression, seen.unit, seen.value, abs(seen.value) * std),)
