@@ -17,9 +17,9 @@ from dahl_ident.elements import Model
 from dahl_ident.elements.description import model_from_description
 from dahl_ident.errors import DataError
 from dahl_ident.synthetic import Experiment, load_dataset, shipped
-from dahl_ident.synthetic.catalogue import DATA_SETS
 from dahl_ident.synthetic.regenerate import main, make, readme
 
+DATA_SETS = shipped.data_sets()
 FOLDER = Path(__file__).parents[1] / "datasets" / "synthetic"
 TABLES = [name for name, one in DATA_SETS.items() if one.kind == "frequency_response"]
 RECORDS = [name for name, one in DATA_SETS.items() if one.kind == "record"]

@@ -14,9 +14,9 @@ from dahl_ident.errors import ValidationError
 
 
 def _names(incomplete: str) -> list[str]:
-    from dahl_ident.synthetic.catalogue import DATA_SETS
+    from dahl_ident.synthetic.shipped import data_sets
 
-    return starting(DATA_SETS)(incomplete)
+    return starting(data_sets())(incomplete)
 
 
 @with_option_groups
@@ -39,7 +39,7 @@ def datasets(
     Example: dahl-ident datasets noisy -o noisy.csv
     """
     from dahl_ident.synthetic import load_dataset
-    from dahl_ident.synthetic.catalogue import DATA_SETS
+    from dahl_ident.synthetic.shipped import data_sets
 
     if output is not None and name is None:
         raise ValidationError("--output needs the name of a data set; leave it out to list them")
@@ -54,9 +54,9 @@ def datasets(
             console.write(repr(data))
         return
     if general.json:
-        console.write_json([_facts(one.name) for one in DATA_SETS.values()])
+        console.write_json([_facts(one.name) for one in data_sets().values()])
         return
-    for one in DATA_SETS.values():
+    for one in data_sets().values():
         kind = one.kind.replace("_", " ")
         console.write_wrapped(
             f"{one.name} ({kind}): {one.teaches}. Determines {', '.join(one.identifiable)}."
@@ -64,7 +64,7 @@ def datasets(
 
 
 def _facts(name: str) -> dict[str, object]:
-    from dahl_ident.synthetic.catalogue import DATA_SETS
+    from dahl_ident.synthetic.shipped import data_sets
 
-    facts = vars(DATA_SETS[name])
-    return {k: v for k, v in facts.items() if k != "experiment"} | {"kind": DATA_SETS[name].kind}
+    one = data_sets()[name]
+    return {k: v for k, v in vars(one).items() if k != "experiment"} | {"kind": one.kind}

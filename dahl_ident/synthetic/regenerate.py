@@ -1,8 +1,9 @@
 """Write the shipped data sets anew: ``python -m dahl_ident.synthetic.regenerate``.
 
-Each is a data file, a JSON file with its truth, experiment, seed and SHA-256, and a row of the
-README's table. On one platform and version the files come out the same to the byte; anywhere,
-their values agree to 1e-12.
+Each is a data file, a JSON file that declares it, to which its truth and SHA-256 are added, and a
+row of the README's table. A new one begins as a JSON file with name, experiment, seed, teaches,
+identifiable, not_identifiable and caution. On one platform and version the files come out the same
+to the byte; anywhere, their values agree to 1e-12.
 """
 
 from __future__ import annotations
@@ -16,9 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from dahl_ident.data import FrequencyResponse, Record
-from dahl_ident.synthetic.catalogue import DATA_SETS, DataSet
 from dahl_ident.synthetic.lab import simulate
-from dahl_ident.synthetic.shipped import datasets_directory
+from dahl_ident.synthetic.shipped import DataSet, data_sets, datasets_directory
 
 
 def make(one: DataSet) -> Record | FrequencyResponse:
@@ -53,7 +53,7 @@ def readme() -> str:
         f"| `{one.name}` | {one.kind.replace('_', ' ')} | {one.teaches} "
         f"| {', '.join(one.identifiable)} | {', '.join(one.not_identifiable) or '-'} "
         f"| {one.caution or '-'} |"
-        for one in DATA_SETS.values()
+        for one in data_sets().values()
     ]
     return _README.format(rows="\n".join(rows))
 
@@ -83,13 +83,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("names", nargs="*", help="all, if none is named")
     parser.add_argument("--directory", type=Path, default=None, help="where to write them")
     given = parser.parse_args(arguments)
-    unknown = [name for name in given.names if name not in DATA_SETS]
+    known = data_sets()
+    unknown = [name for name in given.names if name not in known]
     if unknown:
-        parser.error(f"there is no data set {', '.join(unknown)}; there are {', '.join(DATA_SETS)}")
+        parser.error(f"there is no data set {', '.join(unknown)}; there are {', '.join(known)}")
     directory = given.directory or datasets_directory()
-    for name in given.names or DATA_SETS:
-        write(DATA_SETS[name], directory)
-        sys.stdout.write(f"{directory / DATA_SETS[name].file}\n")
+    for name in given.names or known:
+        write(known[name], directory)
+        sys.stdout.write(f"{directory / known[name].file}\n")
     (directory / "README.md").write_text(readme(), encoding="utf-8")
     return 0
 

@@ -1,18 +1,72 @@
-"""Loading of the shipped data sets, each with its true parameters."""
+"""The data sets that ship: what each teaches, how it was made, and what it can determine.
+
+Each is a file of data and a JSON file that declares it.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from dahl_ident.data import FrequencyResponse, Record, read_frequency_response, read_record
 from dahl_ident.errors import DataError, choices
+from dahl_ident.synthetic.experiment import Experiment
 
 _PACKAGE = Path(__file__).parents[1]  # the folder dahl_ident
 _PLACES = (_PACKAGE / "datasets" / "synthetic", _PACKAGE.parent / "datasets" / "synthetic")
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """One shipped data set, as its JSON file declares it.
+
+    `identifiable` are the parameters that the data determine (standard deviation of the logarithm
+    below 0.25), `not_identifiable` those that they do not: a fit has to say so. `caution` is the
+    flaw of the data that an analysis has to report, or an empty string.
+    """
+
+    name: str
+    experiment: Experiment
+    seed: int
+    teaches: str
+    identifiable: tuple[str, ...]
+    not_identifiable: tuple[str, ...]
+    caution: str
+
+    @classmethod
+    def of(cls, declared: dict[str, Any]) -> DataSet:
+        """Return the data set that a JSON file declares."""
+        return cls(
+            declared["name"],
+            Experiment.from_dict(declared["experiment"]),
+            declared["seed"],
+            declared["teaches"],
+            tuple(declared["identifiable"]),
+            tuple(declared["not_identifiable"]),
+            declared["caution"],
+        )
+
+    @property
+    def kind(self) -> str:
+        """What the set holds: "frequency_response" or "record"."""
+        return "record" if self.experiment.table is None else "frequency_response"
+
+    @property
+    def file(self) -> str:
+        """Name of the data file."""
+        return f"{self.name}.csv.gz" if self.kind == "record" else f"{self.name}.csv"
+
+
+@cache
+def data_sets() -> dict[str, DataSet]:
+    """Return every shipped data set by its name, in the order of their seeds."""
+    files = sorted(datasets_directory().glob("*.json"))
+    sets = [DataSet.of(json.loads(file.read_text(encoding="utf-8"))) for file in files]
+    return {one.name: one for one in sorted(sets, key=lambda one: one.seed)}
 
 
 def load_dataset(name: str) -> FrequencyResponse | Record:
