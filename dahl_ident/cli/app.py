@@ -11,18 +11,14 @@ import typer
 
 from dahl_ident.cli import console
 from dahl_ident.cli.campaign import campaign
-from dahl_ident.cli.datasets import datasets
 from dahl_ident.cli.demo import demo
-from dahl_ident.cli.export import export
 from dahl_ident.cli.extract import extract
-from dahl_ident.cli.fit import fit
-from dahl_ident.cli.inspect import inspect
-from dahl_ident.cli.page import app as app_page
+from dahl_ident.cli.fit import fit, report
+from dahl_ident.cli.one_step import app as app_page
+from dahl_ident.cli.one_step import datasets, export, inspect, template
 from dahl_ident.cli.plan import plan
-from dahl_ident.cli.report import report
 from dahl_ident.cli.sample import sample
 from dahl_ident.cli.simulate import simulate
-from dahl_ident.cli.template import template
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.version import __version__
 

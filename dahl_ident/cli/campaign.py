@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import console
-from dahl_ident.cli.option_groups import with_option_groups
-from dahl_ident.cli.options import General, Laws, Writing, quantity
+from dahl_ident.cli.options import General, Laws, Writing, quantity, with_option_groups
 from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:

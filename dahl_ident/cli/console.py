@@ -21,11 +21,12 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from dahl_ident.cli.options import STANDARD
+from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+STANDARD = "-"  # standard input or output, in place of a file's name
 BAD_INPUT = 1  # exit status, as are the others; the one of any uncaught error
 WRONG_USE = 2  # as click has it for unknown options
 NOT_TRUSTED = 3  # the first that is free
@@ -73,6 +74,27 @@ def open_streams() -> bool:
     return there
 
 
+def option(name: str) -> str:
+    """Return how an argument is written on the command line."""
+    return f"--{name.replace('_', '-')}"
+
+
+def refuse(names: Iterable[str], why: str) -> None:
+    """Refuse the options of these names, if there are any; `why` ends "are given"."""
+    if options := ", ".join(map(option, names)):
+        raise ValidationError(f"{options} is given {why}")
+
+
+def changed(*groups: Any) -> list[str]:
+    """Return the names of the options of some groups that are not at their defaults."""
+    return [
+        name
+        for group in groups
+        for name, value in vars(group).items()
+        if value != getattr(type(group)(), name)
+    ]
+
+
 def in_options(message: str) -> str:
     """Return a message of the library with its arguments as command-line options.
 
@@ -80,32 +102,30 @@ def in_options(message: str) -> str:
     ``columns={'gain': 'K'}`` becomes ``--columns columns.toml, a file with the line: gain = "K"``.
     """
 
-    def option(found: re.Match[str]) -> str:
-        name, value = found.groups()
-        if value == "True":
-            return f"--{name.replace('_', '-')}"
-        return f"--{name.replace('_', '-')}{' ' if value else ''}{value}"
+    def argument(match: re.Match[str]) -> str:
+        name, value = match.groups()
+        return f"{option(name)} {value}".rstrip() if value != "True" else option(name)
 
-    def assigned(found: re.Match[str]) -> str:
-        pairs = re.findall(r"'([^']+)': (?:\((\w+), (\w+)\)|([^,}]+))", found[2])
-        return " ".join(f"{found[1]} {n}={value or f'{a}:{b}'}" for n, a, b, value in pairs)
+    def assigned(match: re.Match[str]) -> str:
+        pairs = re.findall(r"'([^']+)': (?:\((\w+), (\w+)\)|([^,}]+))", match[2])
+        return " ".join(f"{match[1]} {n}={value or f'{a}:{b}'}" for n, a, b, value in pairs)
 
     message = re.sub(r"columns=(\{(?:[^{}]|\{[^{}]*\})*\})", _column_map, message)
-    message = re.sub(r"(?<![\w.(-])([a-z]+(?:_[a-z]+)*)=(True\b|['\"\w]?)", option, message)
+    message = re.sub(r"(?<![\w.(-])([a-z]+(?:_[a-z]+)*)=(True\b|['\"\w]?)", argument, message)
     message = re.sub(r"(--(?:ranges|target|start|suspects)) ?\{([^}]*)\}", assigned, message)
     message = re.sub(r"limits\['([a-z]+)(?:_hz)?'\]", r"--\1", message)
     return message.replace("di.fit(record, model)", "dahl-ident fit --record")
 
 
-def _column_map(found: re.Match[str]) -> str:
+def _column_map(match: re.Match[str]) -> str:
     """Return the options, or the line of the file, that correspond to a map in Python.
 
     ``extract`` has an option for the column of each role.
     """
     try:
-        entries = ast.literal_eval(found[1])
+        entries = ast.literal_eval(match[1])
     except (SyntaxError, ValueError):
-        return found[0]
+        return match[0]
     if _session.typed[:1] == ["extract"] and not any(isinstance(e, dict) for e in entries.values()):
         named = (f"--{role} {'...' if e is ... else shlex.quote(e)}" for role, e in entries.items())
         return " ".join(named)

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import console, extract
+from dahl_ident.cli.estimation import as_json, finish
 from dahl_ident.cli.files import make_folder, progress_bar
-from dahl_ident.cli.fit import as_json, finish
-from dahl_ident.cli.option_groups import with_option_groups
-from dahl_ident.cli.options import General, Writing
+from dahl_ident.cli.options import General, Writing, with_option_groups
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse, Record

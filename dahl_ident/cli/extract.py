@@ -4,47 +4,30 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dahl_ident.cli import console
+from dahl_ident.cli.console import STANDARD, changed, option
 from dahl_ident.cli.files import write_data, write_picture
-from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import (
-    STANDARD,
-    Channel,
-    Channels,
-    DriveFactor,
-    DriveFactorUncertainty,
-    Files,
     General,
-    Sheet,
     Writing,
     controlled_option,
     in_panel,
     one_of,
     quantity,
-    reading,
+    with_option_groups,
 )
+from dahl_ident.cli.reading import Files, RecordReading
+from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
 
 _EXTRACTING = "Extracting"
 _extracting = in_panel(_EXTRACTING)
-
-
-@dataclass(frozen=True)
-class RecordReading(Channels):
-    """Reading of records; the options of ``read_record``."""
-
-    columns: Annotated[Path | None, reading("Column map, a TOML file.")] = None
-    drive: Channel = None
-    drive_factor: DriveFactor = None
-    drive_factor_uncertainty: DriveFactorUncertainty = None
-    sheet: Sheet = None
 
 
 @dataclass(frozen=True)
@@ -71,8 +54,6 @@ class Extracting:
 
     def keywords(self) -> dict[str, Any]:
         """Return the arguments of ``extract``."""
-        from dahl_ident.errors import ValidationError
-
         try:
             harmonics = (
                 None if self.harmonics is None else [int(k) for k in self.harmonics.split(",")]
@@ -129,12 +110,12 @@ def extract(
         console.write_json(_rows(data))
     elif output != STANDARD:
         show(data)
-    tell_of_sweeps(data, files, vars(reading), extracting.controlled)
+    _tell_of_sweeps(data, files, reading, extracting.controlled)
     judge(data)
 
 
-def tell_of_sweeps(
-    data: FrequencyResponse, files: list[str], reading: dict[str, Any], controlled: str
+def _tell_of_sweeps(
+    data: FrequencyResponse, files: list[str], reading: RecordReading, controlled: str
 ) -> None:
     """Say how to fit waveforms that were swept too fast for a table."""
     from dahl_ident.extraction.point import TOO_FAST
@@ -142,8 +123,8 @@ def tell_of_sweeps(
     verdicts = _one_row_a_point(data).quality["verdict"]
     fast = [str(verdict) for verdict in verdicts if TOO_FAST in str(verdict)]
     if fast:
-        given = (item for item in reading.items() if item[1] != vars(RecordReading())[item[0]])
-        words = [w for name, value in given for w in (f"--{name.replace('_', '-')}", str(value))]
+        named = changed(reading)
+        words = [word for n in named for word in (option(n), str(getattr(reading, n)))]
         if controlled == "force":  # which moves a mass
             words += ["--mass", "free", "--damping", "free", "--stiffness", "free"]
         command = shlex.join(["dahl-ident", "fit", "--record", *files, *words])

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from dahl_ident.cli.options import STANDARD
+from dahl_ident.cli.console import STANDARD
 
 _T = TypeVar("_T")
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from dahl_ident.cli.console import refuse
 from dahl_ident.cli.distributions import FREE, known, number_or_free
 from dahl_ident.cli.options import in_panel
 from dahl_ident.errors import ModelError, ValidationError, choices
@@ -86,12 +87,11 @@ class ModelOptions:
 
     def refuse_sensors(self) -> None:
         """Refuse the options of sensors where a posterior of records is sampled."""
-        if given := list(self._given(*_CHANNELS)):
-            names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-            raise ValidationError(
-                f"{names} is given together with --record, but a posterior of records takes the "
-                "channels as exact; leave it out, or fit the records, which counts it"
-            )
+        refuse(
+            self._given(*_CHANNELS),
+            "together with --record, but a posterior of records takes the channels as exact; "
+            "leave it out, or fit the records, which counts it",
+        )
 
     def _friction(self) -> Element:
         from dahl_ident.elements import Dahl
@@ -109,12 +109,11 @@ class ModelOptions:
 
 def refuse_with_elements(given: Mapping[str, Any]) -> None:
     """Refuse parameters of the Dahl element if --element describes the friction."""
-    if given:
-        options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-        raise ValidationError(
-            f"{options} is given together with --element; write such values inside the element, as "
-            "in --element 'dahl(f_max=0.1)'"
-        )
+    refuse(
+        given,
+        "together with --element; write such values inside the element, as in --element "
+        "'dahl(f_max=0.1)'",
+    )
 
 
 def elements(texts: Sequence[str]) -> Element:

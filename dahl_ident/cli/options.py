@@ -1,46 +1,58 @@
-"""Common options: reading and writing of files, printing of results."""
+"""Common options, and how several of them are declared once.
+
+A command takes a dataclass of options as one argument; :func:`with_option_groups` presents its
+fields to Typer as single options and combines them again before the command runs.
+"""
 
 from __future__ import annotations
 
-import glob
+import functools
+import inspect
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
+from dahl_ident.cli import console
 from dahl_ident.cli.config import take_options
+from dahl_ident.cli.console import STANDARD
 from dahl_ident.errors import DataError, ModelError, UnitError, ValidationError, choices
 
-if TYPE_CHECKING:
-    from dahl_ident.data import FrequencyResponse
 
-STANDARD = "-"
-_READING = "Reading"
+def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
+    """Return `command` with the fields of its dataclass arguments as separate options."""
+    hints = get_type_hints(command, include_extras=True)
+    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    parameters = []
+    for name, parameter in inspect.signature(command).parameters.items():
+        if name in groups:
+            typed = get_type_hints(groups[name], include_extras=True)
+            parameters += [
+                parameter.replace(name=f.name, default=f.default, annotation=typed[f.name])
+                for f in fields(groups[name])
+            ]
+        else:
+            parameters.append(parameter.replace(annotation=hints[name]))
+
+    @functools.wraps(command)
+    def run(**typed: Any) -> None:
+        built = {
+            name: group(**{f.name: typed.pop(f.name) for f in fields(group)})
+            for name, group in groups.items()
+        }
+        command(**typed, **built)
+
+    parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters]
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined] # typer reads it
+    run.__annotations__ = {p.name: p.annotation for p in parameters}
+    return run
 
 
 def in_panel(panel: str) -> Callable[[str], Any]:
     """Return what makes options of one panel of the help from their texts."""
     return lambda help_text: typer.Option(help=help_text, rich_help_panel=panel)
-
-
-reading = in_panel(_READING)
-
-
-def _existing(patterns: list[str]) -> list[str]:
-    """Return the files of all patterns; refuse absent ones before heavy libraries are loaded."""
-    files: list[str] = []
-    for pattern in patterns:
-        if pattern == STANDARD or Path(pattern).exists():
-            files.append(pattern)
-        elif glob.has_magic(pattern):
-            from dahl_ident.extraction.sources import matching
-
-            files += matching(pattern)
-        else:
-            raise DataError(f"{pattern}: the file cannot be read: No such file or directory")
-    return files
 
 
 def one_of(help_text: str, panel: str | None, values: str) -> Any:
@@ -99,29 +111,10 @@ def quantity(help_text: str, unit: str, panel: str | None = None) -> Any:
     return typer.Option(help=help_text, parser=parse, metavar=f"<{unit}>", rich_help_panel=panel)
 
 
-Files = Annotated[
-    list[str],
-    typer.Argument(help="Files to read, or patterns; - is standard input.", callback=_existing),
-]
-Channel = Annotated[
-    str | None,
-    reading('Its column, with unit if needed: "x \\[mm]".'),
-]
-DriveFactor = Annotated[
-    str | None,
-    reading('Force for one unit of drive, "12.5 N/V".'),
-]
-DriveFactorUncertainty = Annotated[
-    float | None,
-    reading("Its relative standard uncertainty."),
-]
-Sheet = Annotated[str | None, reading("Sheet of an Excel workbook.")]
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
 
 
 def _silence(quiet: bool) -> bool:
-    from dahl_ident.cli import console
-
     console.be_quiet(quiet)
     return quiet
 
@@ -214,70 +207,3 @@ class Writing:
                 raise DataError(
                     f"{place}: there is no folder {place.parent}; make it, or give another place"
                 )
-
-
-@dataclass(frozen=True)
-class Channels:
-    """What ``read_record`` is told of the channels of a record."""
-
-    time: Channel = None
-    displacement: Channel = None
-    velocity: Channel = None
-    acceleration: Channel = None
-    force: Channel = None
-    sample_rate: Annotated[
-        float | None, quantity("For files without a time column.", "Hz", _READING)
-    ] = None
-    missing: Annotated[
-        str, one_of("Treatment of empty samples: error or drop.", _READING, "error|drop")
-    ] = "error"
-
-
-@dataclass(frozen=True)
-class Reading:
-    """Reading of tables; the options of ``read_frequency_response``."""
-
-    columns: Annotated[Path | None, reading("Column map, a TOML file.")] = None
-    quantity: Annotated[
-        str | None,
-        reading("Response quantity, such as receptance; by default it follows from the unit."),
-    ] = None
-    amplitude: Annotated[str | None, reading('Displacement amplitude, "5 um rms".')] = None
-    drive: Annotated[
-        str | None, reading('Force amplitude, "0.2 N" or "{level} N"; of a record its column.')
-    ] = None
-    frequency: Annotated[float | None, quantity("Frequency of all rows.", "Hz", _READING)] = None
-    sweep: Annotated[
-        str | None,
-        reading('Frequencies of all rows where no column holds them: "1:100Hz log".'),
-    ] = None
-    drive_factor: DriveFactor = None
-    drive_factor_uncertainty: DriveFactorUncertainty = None
-    level: Annotated[str | None, reading("Label for all rows.")] = None
-    level_from_name: Annotated[
-        str | None, reading("Regular expression for file names; its group is the level.")
-    ] = None
-    controlled: Annotated[str | None, controlled_option(_READING)] = None
-    where: Annotated[
-        str | None,
-        reading("Keep the rows that meet a condition: '0.2 <= frequency_hz < 5 and level > 3'."),
-    ] = None
-    levels: Annotated[str | None, reading("Keep only these levels: 1,2,5.")] = None
-    runs: Annotated[
-        str | None,
-        reading(
-            "Keep only these runs: day1,day2. Each of several files is a run, or a level if "
-            "it holds one of its own."
-        ),
-    ] = None
-    sheet: Sheet = None
-    passive: Annotated[bool, reading("Refuse a table with a net gain of energy.")] = True
-
-    def read(self, files: list[str]) -> FrequencyResponse:
-        """Read the files into one table."""
-        from dahl_ident.cli.row_selection import selected
-        from dahl_ident.data import read_frequency_response
-
-        given = dict(vars(self))
-        where, levels, runs = (given.pop(name) for name in ("where", "levels", "runs"))
-        return selected(read_frequency_response(files, **given), where, levels, runs)

@@ -10,10 +10,9 @@ import typer
 
 from dahl_ident.cli import console
 from dahl_ident.cli.distributions import ends, number
+from dahl_ident.cli.estimation import saved_fit
 from dahl_ident.cli.files import write_picture
-from dahl_ident.cli.fit import saved_fit
 from dahl_ident.cli.model import ModelOptions
-from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import (
     General,
     Laws,
@@ -24,6 +23,7 @@ from dahl_ident.cli.options import (
     one_of,
     quantity,
     steady_option,
+    with_option_groups,
 )
 from dahl_ident.errors import ValidationError
 

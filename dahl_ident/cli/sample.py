@@ -8,38 +8,33 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from dahl_ident.cli import console
+from dahl_ident.cli.console import STANDARD, changed, refuse
 from dahl_ident.cli.distributions import prior
-from dahl_ident.cli.fit import (
-    TAKEN,
+from dahl_ident.cli.estimation import (
     AsRecords,
     ReportPlace,
     check_reports,
     finish,
-    read_records,
-    refuse_channels,
-    refuse_for_tables,
-    write_fit_report,
+    for_records,
+    noise_option,
+    report_also,
 )
 from dahl_ident.cli.model import ModelOptions
-from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import (
-    STANDARD,
-    Channels,
-    Files,
     General,
     Laws,
-    Reading,
     Writing,
     in_panel,
-    noise_option,
     one_of,
     steady_option,
+    with_option_groups,
 )
-from dahl_ident.errors import ValidationError
+from dahl_ident.cli.reading import Channels, Files, Reading
 
 _SAMPLING = "Sampling"
 _sampling = in_panel(_SAMPLING)
 _CHAIN = ("seed", "steps", "max_steps", "ess", "walkers", "ensembles", "resume")
+_OF_RECORDS = ("model", "free", "fixed", "start", "priors", "progress", *_CHAIN)
 
 
 @dataclass(frozen=True)
@@ -89,23 +84,18 @@ class Sampling:
 
     def keywords(self) -> dict[str, Any]:
         """Return the arguments of ``posterior``."""
-        given = dict(vars(self))
-        given["priors"] = dict(prior(text) for text in given.pop("prior") or [])
+        how = dict(vars(self))
+        how["priors"] = dict(prior(text) for text in how.pop("prior") or [])
         if self.seed is None and (self.resume is None or not self.resume.exists()):
-            given["seed"] = 1
-        return {**given, "progress": sys.stderr.isatty()}
+            how["seed"] = 1
+        return {**how, "progress": sys.stderr.isatty()}
 
     def check(self, report: str | None) -> None:
         """Refuse options of a chain with --method grid."""
-        chain = Sampling()
-        given = [n for n in _CHAIN if n != "seed" and getattr(self, n) != getattr(chain, n)]
-        given += ["report"] if report is not None else []
-        if self.method == "grid" and given:
-            options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-            raise ValidationError(
-                f"{options} is given together with --method grid, which runs no chain; leave one "
-                "out"
-            )
+        of_chain = [name for name in changed(self) if name in _CHAIN and name != "seed"]
+        of_chain += ["report"] if report is not None else []
+        if self.method == "grid":
+            refuse(of_chain, "together with --method grid, which runs no chain; leave one out")
 
 
 @with_option_groups
@@ -132,17 +122,17 @@ def sample(
     writing.check([report], files, json=general.json)
     check_reports(report)
     sampling.check(report)
-    plant, how = model.keywords(), sampling.keywords()
+    how = {**model.keywords(), **sampling.keywords()}
     data: Any
     if record:
         model.refuse_sensors()
-        data = read_records(files, reading, channels)
-        plant, how = _for_records(plant, how)
+        data = reading.read_records(files, channels)
+        how = for_records("posterior", how, vars(Sampling()), _OF_RECORDS)
     else:
-        refuse_channels(channels)
+        channels.refuse()
         data = reading.read(files)
     try:
-        posterior = estimate_posterior(data, **plant, **how)
+        posterior = estimate_posterior(data, **how)
     except KeyboardInterrupt:
         console.write_error(_kept(sampling.resume))
         raise
@@ -150,18 +140,9 @@ def sample(
         console.write_json(posterior.to_dict())
     elif report != STANDARD:
         console.write_wrapped(str(posterior))
-    if report is not None and not isinstance(posterior, GridPosterior):
-        write_fit_report([posterior], report, writing, model)
+    if not isinstance(posterior, GridPosterior):  # of which there is no report
+        report_also([posterior], report, writing, model.metadata)
     finish(posterior)
-
-
-def _for_records(
-    plant: dict[str, Any], how: dict[str, Any]
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the options that a posterior of records takes; others that were given are refused."""
-    own = refuse_for_tables("posterior", {**plant, **how}, vars(Sampling()), (*TAKEN, *_CHAIN))
-    chain = [n for n in ("priors", *_CHAIN, "progress") if n in how]
-    return {n: own[n] for n in TAKEN if n in own}, {n: how[n] for n in chain}
 
 
 def _kept(chain: Path | None) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import console
+from dahl_ident.cli.console import changed, refuse
 from dahl_ident.cli.distributions import number, numbers
 from dahl_ident.cli.files import progress_bar, write_data
 from dahl_ident.cli.model import (
@@ -19,7 +20,6 @@ from dahl_ident.cli.model import (
     model_option,
     refuse_with_elements,
 )
-from dahl_ident.cli.option_groups import with_option_groups
 from dahl_ident.cli.options import (
     General,
     Laws,
@@ -30,6 +30,7 @@ from dahl_ident.cli.options import (
     one_of,
     quantity,
     steady_option,
+    with_option_groups,
 )
 from dahl_ident.errors import ModelError, UnitError, ValidationError
 
@@ -160,13 +161,11 @@ def simulate(
 
     laws.run()
     whole_number(seed, "seed", 0)
-    defaults = vars(Plant()) | vars(Excitation()) | vars(Errors()) | vars(Motion())
-    given = vars(plant) | vars(excitation) | vars(errors) | vars(motion)
-    idle = [f"--{k.replace('_', '-')}" for k, v in given.items() if v != defaults[k]]
-    if experiment is not None and idle:
-        raise ValidationError(
-            f"{', '.join(idle)} is given together with {experiment}, which describes the whole "
-            "experiment; leave one of them out"
+    if experiment is not None:
+        refuse(
+            changed(plant, excitation, errors, motion),
+            f"together with {experiment}, which describes the whole experiment; leave one of them "
+            "out",
         )
     inputs = [] if experiment is None else [experiment]
     writing.check([output], inputs, json=general.json)

@@ -1,0 +1,165 @@
+"""What the commands that estimate share: saved fits, reports, JSON, exit status."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from dahl_ident.cli import console
+from dahl_ident.cli.console import STANDARD, refuse
+from dahl_ident.cli.files import written
+from dahl_ident.cli.options import Writing, one_of
+from dahl_ident.errors import DataError
+
+if TYPE_CHECKING:
+    from dahl_ident.results import ChainPosterior, FitResult, RecordFit, RecordPosterior
+    from dahl_ident.results.result import Result
+
+    Reported = FitResult | ChainPosterior | RecordFit | RecordPosterior
+
+ReportPlace = Annotated[
+    str | None,
+    typer.Option(help="Report to write: .html, .pdf, .md or .json; - is HTML on standard output."),
+]
+AsRecords = Annotated[
+    bool,
+    typer.Option(
+        "--record",
+        help="The files are records of any motion; each is a run, or a level if each holds a sweep "
+        "at one level that no other holds. Files that plainly hold waveforms need no --record.",
+    ),
+]
+
+
+def noise_option(panel: str) -> Any:
+    """Return the option of the noise of the rows."""
+    return one_of(
+        "measured, relative or absolute; by default measured if a covariance is known.",
+        panel,
+        "measured|relative|absolute",
+    )
+
+
+def for_records(
+    what: str, options: Mapping[str, Any], unset: Mapping[str, Any], taken: Collection[str]
+) -> dict[str, Any]:
+    """Return the options that an estimate from records takes; others that are set are refused."""
+    refuse(
+        [n for n, value in options.items() if n in unset and n not in taken and value != unset[n]],
+        f"together with --record; a {what} of records takes none of them",
+    )
+    return {name: value for name, value in options.items() if name in taken}
+
+
+def is_saved(file: str) -> bool:
+    """Return whether a file holds a saved fit."""
+    from dahl_ident.data.storage import read_text
+
+    return file.endswith(".json") and '"schema": "dahl_ident.' in read_text(Path(file))
+
+
+def saved_fit(file: str) -> FitResult | RecordFit:
+    """Return the fit of a table or of records that a file holds."""
+    from dahl_ident.results import FitResult, RecordFit
+    from dahl_ident.results.record_fit import SCHEMA
+
+    try:
+        return FitResult.load(file)
+    except DataError as exc:
+        if repr(SCHEMA) not in str(exc):
+            raise
+        return RecordFit.load(file)
+
+
+def check_reports(*places: str | None) -> None:
+    """Refuse reports of an unknown kind before any work is done."""
+    from dahl_ident.data.storage import place_of
+
+    for place in places:
+        if place is not None and place != STANDARD:
+            from dahl_ident.reporting.publish import FORMATS
+
+            place_of(place, "a report", FORMATS)
+
+
+def write_report(results: Sequence[Reported], place: str, writing: Writing, **how: Any) -> str:
+    """Write a report, as HTML where that is standard output, and return where it is.
+
+    `how` are further arguments of ``report``.
+    """
+    from dahl_ident.reporting import report
+
+    options = {**how, "command": console.typed_command(), "overwrite": writing.overwrite}
+    with console.busy("writing the report") as progress:
+        return written(partial(report, results, progress=progress, **options), place, ".html")
+
+
+def report_also(
+    results: Sequence[Reported], place: str | None, writing: Writing, metadata: Path | None
+) -> None:
+    """Write a report in addition to other output, where there is a place for it."""
+    if place is None:
+        return
+    written_to = write_report(results, place, writing, metadata=metadata)
+    if written_to != STANDARD:
+        console.note(f"report: {written_to}")
+
+
+def as_json(result: FitResult | RecordFit) -> dict[str, Any]:
+    """Return a fit as plain data."""
+    from dahl_ident.results import RecordFit
+
+    facts: dict[str, Any] = {
+        "status": str(result.status),
+        "trusted": result.trusted,
+        "verdict": result.verdict,
+        "success": result.success,
+        "message": result.message,
+        "findings": [finding.to_dict() for finding in result.findings],
+    }
+    limits: Mapping[str, Any]
+    if isinstance(result, RecordFit):
+        limits = result.conf_interval()
+        facts |= {
+            "effective_samples": result.effective_samples,
+            "share_left": result.goodness.share_left,
+        }
+    else:
+        from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
+
+        limits = result.conf_interval().at(CONFIDENCE)
+        budget, errors = result.stated_budget, result.errors
+        assumed = () if errors is None else errors.assumed
+        facts |= {
+            "assumed": {
+                name: {"value": errors.values[name], "stderr": errors.stderr[name]}
+                for name in assumed
+                if errors is not None
+            },
+            "budget": None if budget is None else budget.to_dict(),
+            "determined": [str(c) for c in result.identifiability.combinations],
+            "warnings": list(result.goodness.warnings),
+            "suspicious": [str(point) for point in result.goodness.suspicious],
+            "noise": result.noise,
+            "scale": result.scale,
+            "redchi": result.redchi,
+        }
+    facts["params"] = {
+        name: {**vars(estimate), "interval": limits.get(name) if estimate.vary else None}
+        for name, estimate in result.params.items()
+    }
+    return facts
+
+
+def worst(results: Sequence[Any]) -> Any:
+    """Return the first result that cannot be used, or the first one."""
+    return next((one for one in results if not one.status.usable), results[0])
+
+
+def finish(result: Result) -> None:
+    """End with status 3 if the result cannot be used."""
+    console.finish(result.status.usable, str(result.findings[0]))

@@ -1,0 +1,219 @@
+"""Commands of one step: inspect, export, datasets, template and app."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dahl_ident.cli import console
+from dahl_ident.cli.console import STANDARD
+from dahl_ident.cli.estimation import finish, saved_fit
+from dahl_ident.cli.files import write_data, written
+from dahl_ident.cli.options import (
+    General,
+    Laws,
+    Seed,
+    Writing,
+    one_of,
+    starting,
+    with_option_groups,
+)
+from dahl_ident.cli.reading import Files
+from dahl_ident.errors import ValidationError, choices
+
+_TEMPLATES = ("report", "options", "columns", "campaign")
+
+
+@with_option_groups
+def inspect(
+    files: Files,
+    general: General,
+    writing: Writing,
+    sheet: Annotated[str | None, typer.Option(help="Sheet of an Excel workbook.")] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Column map to write, .toml, for --columns."),
+    ] = None,
+) -> None:
+    """List channels, units, ranges, sampling and gaps, and propose a column map.
+
+    Example: dahl-ident datasets plant_recording -o - | dahl-ident inspect -
+    """
+    from dahl_ident.data import inspect as contents_of
+    from dahl_ident.data.storage import write_whole
+
+    writing.check([output])
+    read_files = [contents_of(file, sheet=sheet) for file in files]
+    if output is not None:
+        proposed = {contents.column_map: contents.name for contents in read_files}
+        if len(proposed) > 1:
+            raise typer.BadParameter(
+                f"{' and '.join(list(proposed.values())[:2])} need different column maps; "
+                "write one for each"
+            )
+        content = f"{next(iter(proposed))}\n".encode()
+        write_whole(output, content, overwrite=writing.overwrite)
+    if general.json:
+        console.write_json([asdict(contents) for contents in read_files])
+        return
+    console.write("\n\n".join(repr(contents) for contents in read_files))
+
+
+@with_option_groups
+def export(
+    files: Files,
+    general: General,
+    laws: Laws,
+    writing: Writing,
+    to: Annotated[
+        str,
+        one_of(
+            "Format: a simulator, a controller, a paper, or other budgets.",
+            None,
+            "mujoco|mujoco-frictionloss|urdf|modelica|matlab|c|gtc|ufloat|latex|draws",
+        ),
+    ] = "",
+    output: Annotated[
+        str, typer.Option("--output", "-o", help="File; - is standard output.")
+    ] = "-",
+    size: Annotated[int, typer.Option(help="Number of draws.")] = 1000,
+    seed: Seed = 0,
+) -> None:
+    """Write a fit saved by fit --save in the form that another program reads.
+
+    Example: dahl-ident export fit.json --to mujoco -o joint.xml
+    """
+    laws.run()
+    if not to:
+        raise typer.BadParameter("missing; expected a format, such as --to c", param_hint="--to")
+    if general.json:
+        raise ValidationError("--json is given, but the format of an export is that of --to")
+    if len(files) != 1:
+        raise ValidationError(f"{len(files)} files are given; expected one saved fit")
+    writing.check([output], files)
+    fit = saved_fit(files[0])
+
+    def write(place: str | Path) -> Path:
+        return Path(fit.export(to, place, overwrite=writing.overwrite, size=size, seed=seed))
+
+    written(write, output, ".csv")
+    finish(fit)
+
+
+def _names(incomplete: str) -> list[str]:
+    from dahl_ident.synthetic.shipped import data_sets
+
+    return starting(data_sets())(incomplete)
+
+
+@with_option_groups
+def datasets(
+    general: General,
+    writing: Writing,
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            help="Data set to describe or copy; lists all if left out.", autocompletion=_names
+        ),
+    ] = None,
+    output: Annotated[
+        str | None,
+        typer.Option("--output", "-o", help="File to copy it to; - is standard output, as CSV."),
+    ] = None,
+) -> None:
+    """List the shipped synthetic data sets, or copy one to a file.
+
+    Example: dahl-ident datasets noisy -o noisy.csv
+    """
+    from dahl_ident.synthetic import load_dataset
+    from dahl_ident.synthetic.shipped import data_sets
+
+    if output is not None and name is None:
+        raise ValidationError("--output needs the name of a data set; leave it out to list them")
+    writing.check([output], json=general.json)
+    if name is not None:
+        data = load_dataset(name)
+        if output is not None:
+            write_data(data, output, overwrite=writing.overwrite)
+        elif general.json:
+            console.write_json(data.provenance)
+        else:
+            console.write(repr(data))
+        return
+    if general.json:
+        console.write_json(
+            [
+                {k: v for k, v in vars(one).items() if k != "experiment"} | {"kind": one.kind}
+                for one in data_sets().values()
+            ]
+        )
+        return
+    for one in data_sets().values():
+        kind = one.kind.replace("_", " ")
+        console.write_wrapped(
+            f"{one.name} ({kind}): {one.teaches}. Determines {', '.join(one.identifiable)}."
+        )
+
+
+@with_option_groups
+def template(
+    writing: Writing,
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="report (for --metadata), options (for --config), columns (for --columns) or "
+            "campaign.",
+            autocompletion=starting(_TEMPLATES),
+        ),
+    ],
+    output: Annotated[
+        str, typer.Option("--output", "-o", help="File; - is standard output.")
+    ] = STANDARD,
+) -> None:
+    """Print a TOML file with its fields explained, to fill in.
+
+    Example: dahl-ident template report -o report.toml
+    """
+    from dahl_ident.data.storage import write_whole
+
+    if name not in _TEMPLATES:
+        raise ValidationError(
+            f"there is no template {name!r}; there are {choices(_TEMPLATES, name)}"
+        )
+    writing.check([output])
+    content = (Path(__file__).parent / "templates" / f"{name}.toml").read_bytes()
+
+    def write(place: str | Path) -> Path:
+        write_whole(Path(place), content, overwrite=writing.overwrite)
+        return Path(place)
+
+    written(write, output, ".toml")
+
+
+@with_option_groups
+def app(
+    laws: Laws,
+    folder: Annotated[
+        Path, typer.Argument(help="Folder in which the work is kept, one folder for each.")
+    ] = Path(),
+    port: Annotated[int, typer.Option(help="Port; 0 takes a free one.", min=0, max=65535)] = 0,
+    browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
+) -> None:
+    """Open a page in the browser that goes from files to a signed report, on this machine alone.
+
+    Example: dahl-ident app measurements
+    """
+    try:
+        from dahl_ident.app import serve
+    except ModuleNotFoundError as exc:
+        raise ValidationError(
+            f"the page needs {exc.name}, which is not installed; "
+            "install it with pip install 'dahl_ident[app]'"
+        ) from exc
+    if not folder.is_dir():
+        raise ValidationError(f"{folder} is not a folder; make it, or give one that is there")
+    laws.run()
+    serve(folder, port=port, laws=tuple(laws.laws or ()), browser=browser)
