@@ -518,8 +518,9 @@ def test_report(tmp_path: Path, ending: str) -> None:
     else:
         for caption in ("Measured and fitted force", "Residuals over displacement"):
             assert caption in text
-    with pytest.raises(ValidationError, match="reported separately"):
-        di.report([fit, di.fit(di.load_dataset("noisy"), di.Dahl())], tmp_path / "other.html")
+    tables = [di.fit(di.load_dataset(name), di.Dahl()) for name in ("noisy", "clean")]
+    with pytest.raises(ValidationError, match="several tables"):
+        di.report([fit, *tables], tmp_path / "other.html")
 
 
 def test_what_records_cannot_do_is_refused_by_name() -> None:

@@ -439,3 +439,29 @@ def test_the_energy_of_a_cycle_has_the_uncertainty_of_the_budget(fit: di.FitResu
     truth = di.Dahl(0.1, 30.0, alpha=1.0).loop(A, 20001)
     assert abs(lost - abs(float(trapezoid(truth[1], truth[0])))) < 3.0 * u
     assert u > 0.5 * lost * fit.budget()["f_max"].u / fit.budget()["f_max"].value
+
+
+@pytest.mark.parametrize("f_max", [0.1, 0.07])
+def test_a_table_and_waveforms_of_one_test_are_compared(f_max: float, tmp_path: Path) -> None:
+    time = np.arange(400) / 100.0
+    x = 5e-3 * np.sin(2.0 * time) * (0.2 + 0.8 * np.sin(0.6 * time) ** 2)
+    noise = 5e-4 * np.random.default_rng(1).standard_normal(400)
+    force = di.Dahl(f_max, 30.0, 1.0).force(x) + noise
+    fits: list[Any] = [
+        di.fit(measured(0.1, 1), di.Dahl()),
+        di.fit(di.Record(time, displacement=x, force=force), di.Dahl()),
+    ]
+    place = report(fits, tmp_path / "both.json")
+    facts = json.loads(place.read_text("utf-8"))
+    pytest.importorskip("jsonschema").validate(facts, SCHEMA)
+    assert {change["parameter"] for change in facts["changes"]} == {"f_max", "sigma"}
+    assert ("f_max" in facts["disagree"]) is (f_max != 0.1)
+    first = facts["verdict"][0]
+    if f_max == 0.1:
+        assert first == "Table and waveforms agree within their uncertainties."
+    else:
+        assert first.startswith("Table and waveforms disagree: f_max is 0.0")
+        assert " from the table and 0.07" in first
+    text = report(fits, tmp_path / "both.md").read_text("utf-8")
+    assert text.index("## Table and waveforms") < text.index("## Result")
+    assert text.count("## Result") == 2

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from dahl_ident.data.storage import place_of, plain_data, refuse_existing, write
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.reporting.document import Block, Document, Picture
 from dahl_ident.reporting.html import html
+from dahl_ident.reporting.joint import joint
 from dahl_ident.reporting.markdown import markdown
 from dahl_ident.reporting.overlay import overlay
 from dahl_ident.reporting.record_report import record_document
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 SCHEMA = 2  # of the JSON report: it rises when readers have to change
 _LONGEST_TITLE = 200  # characters
 RecordResult = RecordFit | RecordPosterior
-_Reported = TypeVar("_Reported", bound="Result | RecordResult")
 FORMATS = (".html", ".pdf", ".md", ".json")
 
 
@@ -49,13 +49,14 @@ def report(
     """Write a report on one or several results.
 
     Results on the same data are reported together. Fits on different data (devices, dates) are
-    overlaid, and the changes of their parameters listed with their significance.
+    overlaid, and the changes of their parameters listed with their significance. Of a fit of a
+    table and a fit of the waveforms of the same test, the parameters are compared, and the report
+    begins with whether they agree.
 
     Parameters
     ----------
     results : FitResult, ChainPosterior, RecordFit, RecordPosterior, or sequence of them
-        The results to report. Results on different data have to be fits. Fits to records are
-        reported separately.
+        The results to report. Results on different data have to be fits.
     path : path
         Ending in ``.html`` (one file, no network), ``.pdf``, ``.md`` (pictures in a folder
         next to it) or ``.json``.
@@ -86,8 +87,8 @@ def report(
     ValidationError
         If there is no result, the ending is another one, the record is of other data, a field of
         the metadata is unknown, an instrument states an uncertainty that the fit did not count,
-        or a posterior is on other data than the first result, or fits
-        to records are mixed with other results.
+        a posterior is on other data than the first result, or fits of records are given together
+        with fits of several tables.
     DataError
         If the metadata cannot be read, a file is there already and `overwrite` is not set, or the
         place cannot be written to.
@@ -106,19 +107,28 @@ def report(
         refuse_existing(place)
     given = list(results) if isinstance(results, Sequence) else [results]
     known = metadata_of(metadata)
-    of_records = [result for result in given if isinstance(result, (RecordFit, RecordPosterior))]
-    if of_records:
-        if len(of_records) < len(given) or record is not None:
+    _check(given)
+    _check_calibrations(given, known)
+    how: dict[str, Any] = {"title": title, "command": command, "metadata": known}
+    of_records = [one for one in given if isinstance(one, (RecordFit, RecordPosterior))]
+    of_tables = [one for one in given if isinstance(one, (FitResult, ChainPosterior))]
+    if not of_tables:
+        if record is not None:
             raise ValidationError(
-                "fits to records are reported separately; leave out record= and the results "
-                "on frequency responses, and write another report for those"
+                "record= is given, the waveforms of a table, but no result on a table; leave it out"
             )
-        _calibrated(of_records, known)
-        whole = record_document(of_records, title=title, command=command, metadata=known)
-    elif _on_one_table(checked := _calibrated(_checked(given), known)):
-        whole = document(checked, title=title, command=command, record=record, metadata=known)
+        whole = record_document(of_records, **how)
+    elif not _on_one_table(of_tables):
+        if of_records:
+            raise ValidationError(
+                "fits of several tables are reported together with no fit of records; give those "
+                "of one table, or write a report for each"
+            )
+        whole = overlay(of_tables, **how)
     else:
-        whole = overlay(checked, title=title, command=command, metadata=known)
+        whole = document(of_tables, record=record, **how)
+        if of_records:
+            whole = joint(whole, record_document(of_records, **how), given)
     whole = replace(whole.numbered(), title=_one_line(whole.title))
     if progress is not None:
         whole = _counted(whole, progress)
@@ -153,21 +163,20 @@ def _counted(whole: Document, progress: Callable[[int, int], None]) -> Document:
     return replace(whole, sections=tuple(sections))
 
 
-def _checked(results: list[Any]) -> list[Result]:
-    """Return the results, after a check of their types."""
+def _check(results: Sequence[object]) -> None:
+    """Refuse what is not a result that can be reported."""
     if not results:
         raise ValidationError("there is no result to report on; expected at least one")
     for i, result in enumerate(results):
-        if not isinstance(result, (FitResult, ChainPosterior)):
+        if not isinstance(result, (FitResult, ChainPosterior, RecordFit, RecordPosterior)):
             raise ValidationError(
                 f"result {i} is a {type(result).__name__}; expected a FitResult, a RecordFit or a "
                 "Posterior"
             )
-    return results
 
 
-def _calibrated(results: list[_Reported], known: Metadata) -> list[_Reported]:
-    """Return the results, after a check that they count what the instruments state."""
+def _check_calibrations(results: Sequence[Result | RecordResult], known: Metadata) -> None:
+    """Refuse results that do not count what the instruments state."""
     for name, u in known.calibrations().items():
         for result in results:
             counted = _counted_calibration(result, name)
@@ -178,7 +187,6 @@ def _calibrated(results: list[_Reported], known: Metadata) -> list[_Reported]:
                     f"fit takes {taken}; fit with --metadata and this file (in Python with "
                     "Sensors.from_metadata), and report on that fit"
                 )
-    return results
 
 
 def _counted_calibration(result: Result | RecordResult, name: str) -> float:
