@@ -39,8 +39,7 @@ if TYPE_CHECKING:
     from dahl_ident.extraction import extract
     from dahl_ident.planning import plan
     from dahl_ident.reporting import report
-    from dahl_ident.results import FitResult, RecordFit, fit, fit_many
-    from dahl_ident.results.bayesian_estimate import posterior
+    from dahl_ident.results import FitResult, RecordFit, fit, fit_many, posterior
     from dahl_ident.sensors import Sensors
     from dahl_ident.steady_state import response
     from dahl_ident.synthetic import Experiment, load_dataset, simulate

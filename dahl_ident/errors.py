@@ -163,7 +163,7 @@ class SamplingError(DahlIdentError, RuntimeError):
     ----------
     message : str
         What happened, and what to do.
-    posterior : ChainPosterior, optional
+    posterior : Posterior, optional
         The chain so far, where there is one.
 
     Examples

@@ -19,7 +19,7 @@ import dahl_ident as di
 from dahl_ident.data import storage
 from dahl_ident.errors import SamplingError
 from dahl_ident.problem import Problem
-from dahl_ident.results import ChainPosterior
+from dahl_ident.results import Posterior
 from tests.bayes_cases import friction_table
 
 STEPS = 3000
@@ -36,7 +36,7 @@ di.posterior(
 """
 
 
-def sampled(path: Path | None, **options: Any) -> ChainPosterior:
+def sampled(path: Path | None, **options: Any) -> Posterior:
     return di.posterior(friction_table(), di.Dahl(), resume=path, **options, uncertainty="noise")
 
 

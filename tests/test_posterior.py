@@ -18,15 +18,15 @@ from dahl_ident.bayes.moves import EnsembleMove
 from dahl_ident.bayes.priors import joint_prior
 from dahl_ident.errors import DataError, SamplingError, ValidationError
 from dahl_ident.problem import Problem
-from dahl_ident.results import ChainPosterior, Posterior
-from dahl_ident.results.predictive_checks import pointwise_log_likelihood
+from dahl_ident.results import Posterior
+from dahl_ident.results.posterior_checks import pointwise_log_likelihood
 from tests.bayes_cases import friction_table, harmonic_table, spring_table, with_covariance
 
 LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
 
 
 @pytest.fixture(scope="module")
-def posterior() -> ChainPosterior:
+def posterior() -> Posterior:
     return di.posterior(friction_table(), di.Dahl(), seed=1, uncertainty="noise")
 
 
@@ -82,7 +82,7 @@ def test_sampling_agrees_with_integration(name: str) -> None:
             assert abs(squares.mean() - variance) < 4.0 * error
 
 
-def test_the_summary_is_that_of_the_draws(posterior: ChainPosterior) -> None:
+def test_the_summary_is_that_of_the_draws(posterior: Posterior) -> None:
     table = posterior.summary()
     values = posterior.values
     assert list(table.index) == ["f_max", "sigma", "noise_scale"]
@@ -95,7 +95,7 @@ def test_the_summary_is_that_of_the_draws(posterior: ChainPosterior) -> None:
     assert np.all(table["r_hat"].to_numpy() < 1.01)
 
 
-def test_emcees_names(posterior: ChainPosterior) -> None:
+def test_emcees_names(posterior: Posterior) -> None:
     whole = posterior.get_chain()
     assert whole.shape == (posterior.steps, 128, 3)
     some = posterior.get_chain(discard=100, thin=3)
@@ -132,7 +132,7 @@ def test_a_chain_that_never_moved_is_refused_with_its_chain(
     assert caught.value.posterior.get_chain().shape == (40, 128, 3)
 
 
-def test_the_report_names_priors(posterior: ChainPosterior) -> None:
+def test_the_report_names_priors(posterior: Posterior) -> None:
     text = str(posterior)
     assert text.startswith("Converged: ")
     assert "f_max: log-uniform from" in text
@@ -148,7 +148,7 @@ def test_a_prior_dominated_parameter_is_named() -> None:
     assert "f_max is known from its prior: posterior width 0." in str(posterior)
 
 
-def test_derived_quantities(posterior: ChainPosterior) -> None:
+def test_derived_quantities(posterior: Posterior) -> None:
     x_c = posterior.function(lambda f_max, sigma, **_: f_max / sigma)
     exact = posterior.values[:, 0] / posterior.values[:, 1]
     assert x_c["median"] == pytest.approx(np.median(exact))
@@ -157,7 +157,7 @@ def test_derived_quantities(posterior: ChainPosterior) -> None:
         posterior.function(lambda **_: 1.0)
 
 
-def test_prediction_bands_hold_the_best_fit(posterior: ChainPosterior) -> None:
+def test_prediction_bands_hold_the_best_fit(posterior: Posterior) -> None:
     data = posterior.data
     band = posterior.predict(data.frequency_hz, amplitude=data.amplitude)
     optimum = di.fit(data, di.Dahl()).optimum  # noise alone, at the exponent that is assumed
@@ -227,11 +227,11 @@ def test_results_are_saved_and_never_overwritten(tmp_path: Path) -> None:
 
 def test_options_of_the_other_method_are_refused() -> None:
     with pytest.raises(ValidationError, match="steps given with method='grid', which has no such"):
-        di.posterior(friction_table(), di.Dahl(), method="grid", steps=100, uncertainty="noise")  # type: ignore[call-overload]
+        di.posterior(friction_table(), di.Dahl(), method="grid", steps=100, uncertainty="noise")
     with pytest.raises(ValidationError, match="tolerance given with method='mcmc'"):
-        di.posterior(friction_table(), di.Dahl(), tolerance=1e-2, uncertainty="noise")  # type: ignore[call-overload]
+        di.posterior(friction_table(), di.Dahl(), tolerance=1e-2, uncertainty="noise")
     with pytest.raises(ValidationError, match="method is 'nuts'; expected one of mcmc, grid"):
-        di.posterior(friction_table(), di.Dahl(), method="nuts", uncertainty="noise")  # type: ignore[call-overload]
+        di.posterior(friction_table(), di.Dahl(), method="nuts", uncertainty="noise")
 
 
 def test_predictive_checks_pass_the_right_model_and_fail_the_wrong_one() -> None:
@@ -282,7 +282,7 @@ def test_student_t_is_a_density() -> None:
     assert total == pytest.approx(1.0, abs=2e-3)
 
 
-def test_arviz_gets_every_group(posterior: ChainPosterior) -> None:
+def test_arviz_gets_every_group(posterior: Posterior) -> None:
     exported = posterior.to_arviz()
     groups = set(exported.groups())
     assert {
@@ -301,7 +301,7 @@ def test_arviz_gets_every_group(posterior: ChainPosterior) -> None:
     assert np.abs(observed).max() < 4.0 * replicated.std()
 
 
-def test_pictures(posterior: ChainPosterior) -> None:
+def test_pictures(posterior: Posterior) -> None:
     plt = import_module("matplotlib.pyplot")
     assert posterior.plot_corner().shape == (3, 3)
     assert len(posterior.plot_trace()) == 3

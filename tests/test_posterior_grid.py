@@ -19,7 +19,7 @@ from dahl_ident.bayes.priors import JointPrior, ParameterPrior, joint_prior
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
 from dahl_ident.problem import Problem
-from dahl_ident.results import GridPosterior
+from dahl_ident.results import Posterior
 from tests.bayes_cases import (
     FRICTION,
     X_C,
@@ -105,7 +105,7 @@ def gauss(low: float, high: float, panels: int) -> tuple[FloatArray, FloatArray]
 
 
 def brute_force(
-    grid: GridPosterior, priors: dict[str, Any], panels: int
+    grid: Posterior, priors: dict[str, Any], panels: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return nodes all over the prior, (..., D), and the probability that the grid gives them."""
     density = Density(grid.problem, joint_prior(grid.problem, priors))

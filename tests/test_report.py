@@ -19,7 +19,7 @@ from dahl_ident.reporting.document import Cell, Document, Section, Table
 from dahl_ident.reporting.html import html
 from dahl_ident.reporting.pdf import pdf
 from dahl_ident.reporting.settling import cycle_by_cycle
-from dahl_ident.results import ChainPosterior
+from dahl_ident.results import Posterior
 from tests.browser import CHROMIUM, Page, chromium
 
 NASTY = "<img src=x onerror=alert(1)>&\"'|*_`[x](y)#.csv"
@@ -38,13 +38,13 @@ def fit() -> di.FitResult:
 
 
 @pytest.fixture(scope="module")
-def posterior(fit: di.FitResult) -> ChainPosterior:
+def posterior(fit: di.FitResult) -> Posterior:
     return di.posterior(fit, seed=3)
 
 
 @pytest.fixture(scope="module")
 def page_file(
-    fit: di.FitResult, posterior: ChainPosterior, tmp_path_factory: pytest.TempPathFactory
+    fit: di.FitResult, posterior: Posterior, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     return report([fit, posterior], tmp_path_factory.mktemp("report") / "report.html")
 
@@ -110,9 +110,7 @@ def test_the_same_result_gives_the_same_pictures(fit: di.FitResult, tmp_path: Pa
     assert pictures[0] == pictures[1]
 
 
-def test_json_holds_the_numbers(
-    fit: di.FitResult, posterior: ChainPosterior, tmp_path: Path
-) -> None:
+def test_json_holds_the_numbers(fit: di.FitResult, posterior: Posterior, tmp_path: Path) -> None:
     told = json.loads(report([fit, posterior], tmp_path / "report.json").read_text())
     f_max = told["fits"][0]["parameters"]["f_max"]
     assert f_max["value"] == fit.params["f_max"].value

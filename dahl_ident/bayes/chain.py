@@ -13,11 +13,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, positive_number, whole_number
 from dahl_ident.bayes.convergence import Convergence, judge
 from dahl_ident.bayes.density import LogDensity
 from dahl_ident.bayes.moves import moves_for
+from dahl_ident.errors import ValidationError
 
+_LEAST_STEPS = 20  # with fewer no autocorrelation can be estimated
 _FIRST_CHECK = 200  # steps: three times WARM_UP and LENGTH at an autocorrelation time of 1
 _GROWTH = 1.25  # from check to check: at most a quarter more steps than are needed
 _ROUND = 50  # steps: checks are at round numbers
@@ -61,6 +63,39 @@ class Settings:
     steps: int | None
     most_steps: int
     wanted: float
+
+    @classmethod
+    def of(
+        cls,
+        dims: int,
+        *,
+        seed: int | None,
+        steps: int | None,
+        max_steps: int,
+        ess: float,
+        walkers: int | None,
+        ensembles: int,
+    ) -> Settings:
+        """Return checked settings for so many parameters, with a seed."""
+        whole_number(ensembles, "ensembles", 2)
+        if walkers is None:
+            walkers = ensembles * max(32, 6 * dims)
+        whole_number(walkers, "walkers", ensembles * max(8, 4 * dims))
+        if walkers % (2 * ensembles):
+            raise ValidationError(
+                f"walkers is {walkers}; expected a multiple of {2 * ensembles}, because each of "
+                f"{ensembles} ensembles moves in halves"
+            )
+        if seed is None:
+            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        return cls(
+            walkers,
+            ensembles,
+            whole_number(seed, "seed", 0),
+            None if steps is None else whole_number(steps, "steps", _LEAST_STEPS),
+            whole_number(max_steps, "max_steps", _LEAST_STEPS),
+            positive_number(ess, "ess"),
+        )
 
 
 @dataclass(frozen=True)

@@ -47,18 +47,21 @@ _KNOTS = ndtr(np.linspace(-4.5, 4.5, 46))  # of the distribution function behind
 
 
 @dataclass(frozen=True)
-class WeightedPoints:
-    """A posterior as points theta, (N, D), and their probabilities, (N,), which sum to 1.
-
-    `log_evidence` has the relative error `error`, and so has every probability; `evaluations`
-    counts the points at which the density was computed.
-    """
+class WeightedDraws:
+    """A posterior as draws theta, (N, D), and their probabilities, (N,), which sum to 1."""
 
     theta: FloatArray
     weights: FloatArray
-    log_evidence: float
-    error: float
-    evaluations: int
+
+    @classmethod
+    def alike(cls, theta: FloatArray) -> WeightedDraws:
+        """Return draws that count the same."""
+        return cls(theta, np.full(len(theta), 1.0 / len(theta)))
+
+    def drawn(self, size: int, seed: int) -> FloatArray:
+        """Return some of them by chance, (size, D)."""
+        shares = None if np.ptp(self.weights) == 0.0 else self.weights
+        return np.random.default_rng(seed).choice(self.theta, size=size, p=shares)
 
     def quantiles(self, axis: int, probabilities: FloatArray) -> FloatArray:
         """Return quantiles of one theta."""
@@ -78,12 +81,28 @@ class WeightedPoints:
 
     @cached_property
     def _distribution(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Of every axis: theta in order, and the probability below."""
+        """Of every axis: theta in order, and the probability below; as NumPy has it where alike."""
+        if np.ptp(self.weights) == 0.0:
+            below = np.linspace(0.0, 1.0, len(self.theta))
+            return [(x, below) for x in np.sort(self.theta, axis=0).T]
         orders = np.argsort(self.theta, axis=0).T
         return [
             (x[order], np.cumsum(self.weights[order]) - 0.5 * self.weights[order])
             for x, order in zip(self.theta.T, orders, strict=True)
         ]
+
+
+@dataclass(frozen=True)
+class WeightedPoints(WeightedDraws):
+    """Importance points.
+
+    `log_evidence` has the relative error `error`, and so has every probability; `evaluations`
+    counts the points at which the density was computed.
+    """
+
+    log_evidence: float
+    error: float
+    evaluations: int
 
 
 def integrate(
@@ -281,7 +300,7 @@ def _error(theta: FloatArray, weights: FloatArray) -> float:
     R = len(theta)
     evidence = R * weights.sum(axis=1)
     errors = [evidence.var(ddof=1)]
-    pooled = WeightedPoints(theta.reshape(-1, theta.shape[-1]), weights.ravel(), 0.0, 0.0, 0)
+    pooled = WeightedDraws(theta.reshape(-1, theta.shape[-1]), weights.ravel())
     for axis in range(theta.shape[-1]):
         limits = pooled.quantiles(axis, _LIMITS)
         below = theta[..., axis] < limits[:, None, None]

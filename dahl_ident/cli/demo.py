@@ -17,7 +17,7 @@ from dahl_ident.cli.options import General, Writing, with_option_groups
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse, Record
-    from dahl_ident.results import ChainPosterior, FitResult
+    from dahl_ident.results import FitResult, Posterior
 
 _DATASET = "plant_recording"
 
@@ -60,7 +60,7 @@ def demo(
 
 def _chain(
     origin: Mapping[str, Any], table: Path, page: Path, *, overwrite: bool
-) -> tuple[FitResult, ChainPosterior]:
+) -> tuple[FitResult, Posterior]:
     """Run every step from the recording to the report, and print a heading for each."""
     from dahl_ident.data import inspect, read_record
     from dahl_ident.synthetic.shipped import datasets_directory
@@ -89,12 +89,9 @@ def _extracted(record: Record) -> FrequencyResponse:
     return extract.good_points(data)
 
 
-def _estimated(
-    data: FrequencyResponse, truth: Mapping[str, float]
-) -> tuple[FitResult, ChainPosterior]:
+def _estimated(data: FrequencyResponse, truth: Mapping[str, float]) -> tuple[FitResult, Posterior]:
     from dahl_ident.elements import Dahl, Damper, Mass, Spring
-    from dahl_ident.results import fit
-    from dahl_ident.results.bayesian_estimate import posterior
+    from dahl_ident.results import fit, posterior
 
     console.heading("3. fit: friction, mass, damper and spring, nothing known beforehand")
     result = fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
@@ -109,7 +106,7 @@ def _estimated(
 
 
 def _report(
-    results: Sequence[FitResult | ChainPosterior], page: Path, record: Record, *, overwrite: bool
+    results: Sequence[FitResult | Posterior], page: Path, record: Record, *, overwrite: bool
 ) -> None:
     from dahl_ident.reporting import report
 

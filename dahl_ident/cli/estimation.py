@@ -16,10 +16,10 @@ from dahl_ident.cli.options import Writing, one_of
 from dahl_ident.errors import DataError
 
 if TYPE_CHECKING:
-    from dahl_ident.results import ChainPosterior, FitResult, RecordFit, RecordPosterior
+    from dahl_ident.results import FitResult, Posterior, RecordFit, RecordPosterior
     from dahl_ident.results.result import Result
 
-    Reported = FitResult | ChainPosterior | RecordFit | RecordPosterior
+    Reported = FitResult | Posterior | RecordFit | RecordPosterior
 
 ReportPlace = Annotated[
     str | None,

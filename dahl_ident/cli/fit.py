@@ -284,7 +284,7 @@ def report(
             raise ValidationError("--bootstrap is given with a fit of records; leave it out")
         fit.conf_interval("bootstrap", seed=seed)
     if posterior:
-        from dahl_ident.results.bayesian_estimate import posterior as estimate_posterior
+        from dahl_ident.results import posterior as estimate_posterior
 
         results.append(estimate_posterior(fits[0], seed=seed, progress=sys.stderr.isatty()))
     how = {"title": title, "record": record, "metadata": model.metadata}

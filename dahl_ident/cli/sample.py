@@ -90,10 +90,9 @@ class Sampling:
             how["seed"] = 1
         return {**how, "progress": sys.stderr.isatty()}
 
-    def check(self, report: str | None) -> None:
+    def check(self) -> None:
         """Refuse options of a chain with --method grid."""
         of_chain = [name for name in changed(self) if name in _CHAIN and name != "seed"]
-        of_chain += ["report"] if report is not None else []
         if self.method == "grid":
             refuse(of_chain, "together with --method grid, which runs no chain; leave one out")
 
@@ -115,13 +114,12 @@ def sample(
 
     Example: dahl-ident datasets noisy -o - | dahl-ident sample - --prior f_max=0.01:1
     """
-    from dahl_ident.results import GridPosterior
-    from dahl_ident.results.bayesian_estimate import posterior as estimate_posterior
+    from dahl_ident.results import posterior as estimate_posterior
 
     laws.run()
     writing.check([report], files, json=general.json)
     check_reports(report)
-    sampling.check(report)
+    sampling.check()
     how = {**model.keywords(), **sampling.keywords()}
     data: Any
     if record:
@@ -140,8 +138,7 @@ def sample(
         console.write_json(posterior.to_dict())
     elif report != STANDARD:
         console.write_wrapped(str(posterior))
-    if not isinstance(posterior, GridPosterior):  # of which there is no report
-        report_also([posterior], report, writing, model.metadata)
+    report_also([posterior], report, writing, model.metadata)
     finish(posterior)
 
 

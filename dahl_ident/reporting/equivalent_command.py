@@ -10,7 +10,7 @@ from dahl_ident.elements.law_checks import is_of_package
 from dahl_ident.elements.law_files import own_laws, source_path
 from dahl_ident.reporting.provenance import parts
 from dahl_ident.reporting.tables import prior_text
-from dahl_ident.results import ChainPosterior, FitResult
+from dahl_ident.results import FitResult, Posterior
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
@@ -26,7 +26,7 @@ _OPTIONS = {"f_max", "sigma", "alpha", "mass", "damping", "stiffness"}
 """Parameters with an option of their own; other elements are written with --element."""
 
 
-def equivalent_command(results: Sequence[FitResult | ChainPosterior]) -> str | None:
+def equivalent_command(results: Sequence[FitResult | Posterior]) -> str | None:
     """Return the commands, one per line; None if no options describe data or model."""
     source = _source(results[0].data)
     elements = (e for result in results for e in result.problem.model.elements)
@@ -114,11 +114,13 @@ def _fit(fit: FitResult) -> list[str]:
     ]  # fmt: skip
 
 
-def _sample(posterior: ChainPosterior) -> list[str]:
+def _sample(posterior: Posterior) -> list[str]:
     priors = [f"{name}={prior_text(given)}" for name, given in posterior.given_priors.items()]
+    how = ["--method", "grid"]
+    if posterior.is_chain:
+        how = ["--seed", str(posterior.seed), "--steps", str(posterior.steps)]
     return [
-        "sample", *_model(posterior.asked), "--noise", posterior.problem.noise,
-        "--seed", str(posterior.seed), "--steps", str(posterior.steps),
+        "sample", *_model(posterior.asked), "--noise", posterior.problem.noise, *how,
         *_changed(
             likelihood=(posterior.likelihood, "gaussian"),
             uncertainty=(posterior.uncertainty, "combined"),

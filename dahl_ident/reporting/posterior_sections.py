@@ -19,53 +19,56 @@ from dahl_ident.reporting.document import (
     Table,
     number,
 )
-from dahl_ident.results.chain_posterior import ChainDraws
-from dahl_ident.results.posterior_base import QUANTILES
+from dahl_ident.results import Posterior
+from dahl_ident.results.posterior_result import QUANTILES
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-def sections(posterior: ChainDraws) -> Iterator[Section]:
+def sections(posterior: Posterior) -> Iterator[Section]:
     """Yield numbers and pictures of a posterior."""
     yield Section("Posterior", tuple(_numbers(posterior)), details=True)
-    pictures = (_corner(posterior), _trace(posterior))
+    pictures = (_corner(posterior), *([_trace(posterior)] if posterior.is_chain else []))
     yield Section("Pictures of the posterior", pictures, details=True)
 
 
-def verdict(posterior: ChainDraws) -> list[str]:
+def verdict(posterior: Posterior) -> list[str]:
     """Return whether it can be used, which parameters the prior determines, and misfits."""
     return [f"Posterior: {posterior.findings[0]}", *map(str, posterior.findings[1:])]
 
 
-def answer(posterior: ChainDraws) -> Iterator[Block]:
+def answer(posterior: Posterior) -> Iterator[Block]:
     """Yield the summary of a posterior and its priors; the numbers are struck if not trusted."""
     yield _summary(posterior)
     yield Bullets(tuple(f"Prior of {name}: {text}" for name, text in posterior.priors.items()))
 
 
-def _summary(posterior: ChainDraws) -> Table:
-    columns = ["mean", "std", *QUANTILES, "mcse", "ess", "r_hat"]
+def _summary(posterior: Posterior) -> Table:
+    summary = posterior.summary()
+    columns = [name for name in summary.columns if name != "unit"]
     rows = tuple(
         (Cell(str(name)), Cell(str(row["unit"]) or "-"), *_row(row))
-        for name, row in posterior.summary().iterrows()
+        for name, row in summary.iterrows()
     )
     if not posterior.trusted:
         rows = tuple((*row[:2], *(replace(cell, struck=True) for cell in row[2:])) for row in rows)
     return Table("Posterior of each parameter", ("parameter", "unit", *columns), rows)
 
 
-def _numbers(posterior: ChainDraws) -> Iterator[Block]:
+def _numbers(posterior: Posterior) -> Iterator[Block]:
     yield Paragraph(posterior.message)
     yield _summary(posterior)
-    yield Paragraph(
-        "mcse is the Monte Carlo standard error of the mean, ess the effective number of draws, "
-        "r_hat compares independent ensembles and is 1 if they agree."
-    )
+    if posterior.is_chain:
+        yield Paragraph(
+            "mcse is the Monte Carlo standard error of the mean, ess the effective number of "
+            "draws, r_hat compares independent ensembles and is 1 if they agree."
+        )
     yield Paragraph(f"Priors (likelihood: {posterior.likelihood.replace('_', ' ')}):")
     yield Bullets(tuple(f"{name}: {text}" for name, text in posterior.priors.items()))
     yield Bullets(tuple(map(str, posterior.findings)))
-    yield Paragraph(f"Seed {posterior.seed}; the same seed gives the same chain.")
+    if posterior.is_chain:
+        yield Paragraph(f"Seed {posterior.seed}; the same seed gives the same chain.")
 
 
 def _row(row: pd.Series[Any]) -> Iterator[Cell]:
@@ -77,11 +80,14 @@ def _row(row: pd.Series[Any]) -> Iterator[Cell]:
         if name == "mean":
             yield Cell(error, std)
     for name, digits in (("mcse", 2), ("ess", 4), ("r_hat", 5)):
-        yield number(row[name], digits) if np.isfinite(row[name]) else Cell("-")
+        if name in row:
+            yield number(row[name], digits) if np.isfinite(row[name]) else Cell("-")
 
 
-def _corner(posterior: ChainDraws) -> Picture:
-    correlation = np.corrcoef(posterior.values.T).reshape(len(posterior.names), -1)
+def _corner(posterior: Posterior) -> Picture:
+    covariance = np.atleast_2d(np.cov(posterior.values.T, aweights=posterior.weights))
+    size = np.sqrt(covariance.diagonal())
+    correlation = covariance / np.outer(size, size)
     i, j = np.unravel_index(np.argmax(np.abs(np.triu(correlation, 1))), correlation.shape)
     finding = (
         f"The strongest correlation is {correlation[i, j]:.2f}, between {posterior.names[i]} and "
@@ -97,7 +103,7 @@ def _corner(posterior: ChainDraws) -> Picture:
     )
 
 
-def _trace(posterior: ChainDraws) -> Picture:
+def _trace(posterior: Posterior) -> Picture:
     return Picture(
         "trace",
         "Paths of the walkers; the shaded warm-up is not used in any result.",

@@ -24,7 +24,7 @@ from dahl_ident.reporting.markdown import markdown
 from dahl_ident.reporting.overlay import overlay
 from dahl_ident.reporting.record_report import record_document
 from dahl_ident.reporting.sections import Result, document
-from dahl_ident.results import ChainPosterior, FitResult, RecordFit, RecordPosterior
+from dahl_ident.results import FitResult, Posterior, RecordFit, RecordPosterior
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,7 +55,7 @@ def report(
 
     Parameters
     ----------
-    results : FitResult, ChainPosterior, RecordFit, RecordPosterior, or sequence of them
+    results : FitResult, Posterior, RecordFit, RecordPosterior, or sequence of them
         The results to report. Results on different data have to be fits.
     path : path
         Ending in ``.html`` (one file, no network), ``.pdf``, ``.md`` (pictures in a folder
@@ -111,7 +111,11 @@ def report(
     _check_calibrations(given, known)
     how: dict[str, Any] = {"title": title, "command": command, "metadata": known}
     of_records = [one for one in given if isinstance(one, (RecordFit, RecordPosterior))]
-    of_tables = [one for one in given if isinstance(one, (FitResult, ChainPosterior))]
+    of_tables = [
+        one
+        for one in given
+        if isinstance(one, (FitResult, Posterior)) and not isinstance(one, RecordPosterior)
+    ]
     if not of_tables:
         if record is not None:
             raise ValidationError(
@@ -168,7 +172,7 @@ def _check(results: Sequence[object]) -> None:
     if not results:
         raise ValidationError("there is no result to report on; expected at least one")
     for i, result in enumerate(results):
-        if not isinstance(result, (FitResult, ChainPosterior, RecordFit, RecordPosterior)):
+        if not isinstance(result, (FitResult, Posterior, RecordFit, RecordPosterior)):
             raise ValidationError(
                 f"result {i} is a {type(result).__name__}; expected a FitResult, a RecordFit or a "
                 "Posterior"

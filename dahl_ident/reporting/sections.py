@@ -31,10 +31,10 @@ from dahl_ident.reporting.document import (
 from dahl_ident.reporting.equivalent_command import equivalent_command
 from dahl_ident.reporting.figures import budget_picture, pictures_of_fit
 from dahl_ident.reporting.settling import settling
-from dahl_ident.results import ChainPosterior, FitResult
+from dahl_ident.results import FitResult, Posterior
 from dahl_ident.version import __version__
 
-Result = FitResult | ChainPosterior
+Result = FitResult | Posterior
 
 NOISE = {
     "measured": "The covariance of every point is known from the measurement; residuals are in "
@@ -63,7 +63,7 @@ def document(
 ) -> Document:
     """Return the report on fits and posteriors of the same data."""
     fits = [result for result in results if isinstance(result, FitResult)]
-    drawn = [result for result in results if isinstance(result, ChainPosterior)]
+    drawn = [result for result in results if isinstance(result, Posterior)]
     data = results[0].data
     given = metadata or Metadata()
     repeated = command or equivalent_command(results)
@@ -268,7 +268,7 @@ def _value(name: str, value: float, unit: str) -> str:
 
 
 def _details(
-    fit: FitResult, drawn: Sequence[ChainPosterior], pictures: Sequence[Picture], of: str
+    fit: FitResult, drawn: Sequence[Posterior], pictures: Sequence[Picture], of: str
 ) -> Iterator[Section]:
     if sources := tuple(_sources(fit)):
         yield Section(f"Sources of uncertainty{of}", sources, details=True)
@@ -287,7 +287,7 @@ def _details(
     yield Section(f"More pictures{of}", others, details=True)
 
 
-def _parameters(fit: FitResult, drawn: Sequence[ChainPosterior]) -> Iterator[Block]:
+def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
     fit.conf_interval("wald")
     if not fit.first_order:
         fit.conf_interval("profile")

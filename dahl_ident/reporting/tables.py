@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from dahl_ident.diagnostics.bands import DerivedQuantity
     from dahl_ident.diagnostics.budget import Budget
     from dahl_ident.diagnostics.comparison import ModelComparison
-    from dahl_ident.results import FitResult
-    from dahl_ident.results.chain_posterior import ChainPosterior
+    from dahl_ident.results import FitResult, Posterior
 
 _LARGEST = 3  # sources of uncertainty on the first page
 _NO_PART = 1e-6  # share of the variance that the details leave out: a thousandth of u
@@ -175,7 +174,7 @@ def prior_text(given: Any) -> str:
 
 
 def parameters(
-    fit: FitResult, intervals: Sequence[ConfidenceIntervals], drawn: Sequence[ChainPosterior]
+    fit: FitResult, intervals: Sequence[ConfidenceIntervals], drawn: Sequence[Posterior]
 ) -> Table:
     """Return every parameter with its intervals, one column a method."""
     at = [one.at(CONFIDENCE) for one in intervals]
@@ -211,12 +210,11 @@ def method_name(intervals: ConfidenceIntervals) -> str:
     return "Wald" if intervals.method == "wald" else intervals.method
 
 
-def credible_interval(posterior: ChainPosterior, name: str) -> str:
+def credible_interval(posterior: Posterior, name: str) -> str:
     """Return the central interval of a posterior, rounded as the others are."""
     if name not in posterior.names:
         return "-"
-    values = posterior.values[:, posterior.names.index(name)]
-    lower, upper = np.quantile(values, [0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE])
+    lower, upper = posterior.quantile(name, [0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE])
     return interval(float(lower), float(upper), "")
 
 

@@ -8,18 +8,15 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.bayes.chain import Settings
-from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.sample import ChainSample
 from dahl_ident.data.storage import library
-from dahl_ident.results.predictive_checks import pointwise_log_likelihood, replicated_noise
+from dahl_ident.results.posterior_checks import pointwise_log_likelihood, replicated_noise
 
 _PRIOR_DRAWS = 1000  # probabilities to 1.6 %
 
 
-def to_arviz(
-    density: Density, points: FloatArray, settings: Settings, convergence: Convergence, seed: int
-) -> Any:
+def to_arviz(density: Density, sample: ChainSample, seed: int) -> Any:
     """Return InferenceData or a DataTree, whichever the installed ArviZ has.
 
     A row's observed value is its whitened residual at the posterior mean; replicates are the
@@ -29,7 +26,7 @@ def to_arviz(
         warnings.simplefilter("ignore", FutureWarning)  # ArviZ 0.23 announces 1.0 at import
         arviz = library("arviz", "arviz")
     random = np.random.default_rng(seed)
-    kept = _thinned(points, settings.ensembles, convergence)
+    kept = _thinned(sample)
     groups: dict[str, dict[str, Any]] = {
         "posterior": _by_name(density, density.to_values(kept)),
         "prior": _by_name(density, _prior(density, random)),
@@ -50,10 +47,11 @@ def to_arviz(
     return arviz.from_dict(**groups)
 
 
-def _thinned(points: FloatArray, ensembles: int, convergence: Convergence) -> FloatArray:
+def _thinned(sample: ChainSample) -> FloatArray:
     """Return coordinates by ensemble, (ensembles, draws, D), about independent."""
+    ensembles, convergence = sample.settings.ensembles, sample.convergence
     thin = max(1, int(np.ceil(convergence.tau.max())))
-    kept = points[convergence.discard :: thin]
+    kept = sample.chain.points[convergence.discard :: thin]
     steps, walkers, D = kept.shape
     by_ensemble = kept.reshape(steps, ensembles, walkers // ensembles, D)
     return by_ensemble.transpose(1, 0, 2, 3).reshape(ensembles, -1, D)

@@ -1,23 +1,40 @@
-"""The public functions ``fit`` and ``fit_many``: from data and a model to estimates."""
+"""The public functions from data and a model to results: ``fit``, ``fit_many``, ``posterior``."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, cast, overload
+from contextlib import nullcontext
+from dataclasses import replace
+from functools import partial
+from inspect import signature
+from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dahl_ident.bayes.chain import Pool, Settings
+from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.priors import PriorLike, joint_prior
+from dahl_ident.bayes.record_density import RecordDensity, record_prior
+from dahl_ident.bayes.sample import ChainSample, Start, sample_chain, sample_points
+from dahl_ident.bayes.walker_start import optimum_of, scattered, starting_points
 from dahl_ident.data import FrequencyResponse, Record, read_frequency_response
+from dahl_ident.data.columns import one_of
 from dahl_ident.data.rows import row_names
+from dahl_ident.diagnostics.error_model import EXPONENT, with_assumed
+from dahl_ident.diagnostics.shared_errors import row_errors
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
-from dahl_ident.errors import FitError, ValidationError
+from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting import Optimum, solve, solve_many
 from dahl_ident.problem import Problem, ProblemBatch
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
+from dahl_ident.results.posterior_result import Posterior
+from dahl_ident.results.progress import progress_bar
 from dahl_ident.results.record_fit import RecordFit, fit_records
+from dahl_ident.results.record_posterior import RecordPosterior
 from dahl_ident.sensors import Sensors
 from dahl_ident.steady_state import Steady
 
@@ -27,6 +44,9 @@ if TYPE_CHECKING:
     from dahl_ident.elements.equations import Excitation
     from dahl_ident.fitting.constraints import Constraints
     from dahl_ident.problem.record_problem import Output
+
+METHODS = ("mcmc", "grid")
+UNCERTAINTIES = ("combined", "noise")
 
 
 @overload
@@ -276,3 +296,249 @@ def fit_many(
         tables, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady
     )
     return FitBatch(tuple(tables), solve_many(batch))
+
+
+def posterior(
+    data: FrequencyResponse | FitResult | Record | Sequence[Record] | RecordFit,
+    model: Element | None = None,
+    *,
+    method: str = "mcmc",
+    priors: Mapping[str, PriorLike] | None = None,
+    free: Iterable[str] = (),
+    fixed: Mapping[str, float] | None = None,
+    noise: str | None = None,
+    sensors: Sensors | None = None,
+    steady: Steady | None = None,
+    likelihood: str = "gaussian",
+    uncertainty: str = "combined",
+    seed: int | None = None,
+    steps: int | None = None,
+    max_steps: int = 20000,
+    ess: float = 2000.0,
+    walkers: int | None = None,
+    ensembles: int = 4,
+    resume: str | os.PathLike[str] | None = None,
+    pool: Pool | None = None,
+    progress: bool = False,
+    tolerance: float = 1e-3,
+) -> Posterior:
+    """Return the posterior of a model's parameters, by Markov chain or by integration.
+
+    Parameters
+    ----------
+    data : FrequencyResponse, Record, sequence of Record, FitResult or RecordFit
+        What was measured; or a fit, whose data, model, noise and sensors are taken over. Records
+        are fitted first; where `output`, `excitation` or `start` is needed, give their fit.
+    model : Element, optional
+        One element or a sum, such as ``Dahl() + Mass(0.3)``; left out with a fit.
+    method : {"mcmc", "grid"}, default "mcmc"
+        "mcmc" samples with emcee. "grid" integrates over up to three free parameters with
+        importance points: no chain, the same answer at every call, and the evidence. An unknown
+        noise scale is integrated analytically there and does not count among the three.
+    priors : mapping of str to distribution or (low, high), optional
+        By parameter: a frozen distribution of scipy.stats over the value, or bounds, between
+        which positive parameters are log-uniform and the others uniform. Parameters left out
+        get wide bounds from the size of the data, which the report states.
+    free, fixed, noise, sensors, steady
+        As for :func:`dahl_ident.fit`. Sensors may have any prior here.
+    likelihood : {"gaussian", "student_t", "none"}, default "gaussian"
+        "student_t" makes outliers count less (4 degrees of freedom; on a grid it needs noise of
+        known scale); "none" gives the prior.
+    uncertainty : {"combined", "noise"}, default "combined"
+        "combined" counts every source of the fit's uncertainty budget that was estimated from the
+        data, such as scatter between runs and model error, and samples exponents that were not
+        given, log-uniform over their range, which takes several times as long as a given one.
+        "noise" counts independent noise alone, as do likelihoods other than "gaussian". The
+        verdict says which.
+    seed : int, optional
+        The same seed gives the same chain. Left out, one is drawn, and reported. A grid needs
+        none.
+    steps : int, optional
+        Total number of steps, warm-up included. Left out, the chain runs until it has
+        converged: 50 autocorrelation times after warm-up, R-hat below 1.01, and `ess`.
+    max_steps : int, default 20000
+        Where to stop a chain that does not converge.
+    ess : float, default 2000
+        Effective number of draws wanted for every parameter.
+    walkers : int, optional
+        In all ensembles together. Default: 32 an ensemble, or more for many parameters.
+    ensembles : int, default 4
+        Groups of walkers that are independent of each other.
+    resume : path, optional
+        HDF5 file that keeps the chain: begun where there is none, continued to the *total*
+        number of steps where there is. It is whole at every moment, also after a crash, and the
+        resulting chain is the same however often it was interrupted.
+    pool : object with map, optional
+        Spreads the likelihood over processes. Left out, one process computes all walkers at
+        once, which is faster unless a single likelihood takes milliseconds.
+    progress : bool, default False
+        Show a bar on the terminal, with the time that is left.
+    tolerance : float, default 1e-3
+        With "grid": relative error of the evidence and error of probabilities to be reached.
+
+    Returns
+    -------
+    Posterior
+        Of records, a ``RecordPosterior``. Its first line says where it has not converged.
+
+    Raises
+    ------
+    SamplingError
+        If no place of finite density is found, the scale of the noise cannot be estimated, the
+        chain never moved (it is in the error's `posterior`), `resume` names a file that is
+        damaged, in use, or of another run, or more than three parameters are free on a grid.
+    ModelError
+        If nothing is free, or a name is unknown.
+    DataError
+        If the rows lack what their model or noise needs.
+    ValidationError
+        If an option or a prior is not as described, or belongs to the other method.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import dahl_ident as di
+    >>> A = np.geomspace(1e-3, 1e-2, 9)
+    >>> N = di.Dahl(f_max=0.1, sigma=30.0).describing_function(A)
+    >>> noise = np.random.default_rng(1).normal(scale=0.02, size=(2, 9))
+    >>> data = di.FrequencyResponse(np.ones(9), N * np.exp(noise[0] + 1j * noise[1]), A)
+    >>> chain = di.posterior(data, di.Dahl(), seed=1)
+    >>> chain.converged, chain.names
+    (True, ('f_max', 'sigma', 'alpha', 'noise_scale'))
+    >>> grid = di.posterior(data, di.Dahl(), method="grid")
+    >>> grid.converged, round(float(grid.quantile("f_max", 0.5)), 2)
+    (True, 0.1)
+    """
+    options = {**locals()}
+    one_of(method, "method", METHODS)
+    of_records = not isinstance(data, FrequencyResponse | FitResult)
+    _refuse_options("a posterior of records" if of_records else f"method={method!r}", options)
+    if pool is not None and not callable(getattr(pool, "map", None)):
+        raise ValidationError(f"pool is {pool!r}; expected an object with map, such as a Pool")
+    one_of(uncertainty, "uncertainty", UNCERTAINTIES)
+    _refuse_with_a_fit(data, options)
+
+    def chain(density: Density | RecordDensity, start: Start) -> ChainSample:
+        settings = Settings.of(
+            len(density.names), seed=seed, steps=steps, max_steps=max_steps, ess=ess,
+            walkers=walkers, ensembles=ensembles,
+        )  # fmt: skip
+        with progress_bar(settings) if progress else nullcontext() as bar:
+            listeners = [] if bar is None else [bar]
+            return sample_chain(
+                density, start, settings, seed=seed, resume=resume, pool=pool, listeners=listeners
+            )
+
+    if not isinstance(data, FrequencyResponse | FitResult):
+        recorded = (
+            data
+            if isinstance(data, RecordFit)
+            else fit(data, _checked(model), free=free, fixed=fixed, throw=False)
+        )
+        of_motion = _record_density(recorded, priors)
+        start = partial(scattered, of_motion, of_motion.centre, of_motion.root)
+        result: Posterior = RecordPosterior(recorded, of_motion, chain(of_motion, start))
+        result.chain.check(result.names, result)
+        return result
+    fitted = data if isinstance(data, FitResult) else None
+    if fitted is not None and fitted.first_order:
+        raise ValidationError(
+            "the fit had constraints, which a posterior does not take; pass the data instead"
+        )
+    if isinstance(data, FrequencyResponse):
+        problem = Problem(
+            data, _checked(model), noise=noise, sensors=sensors, free=free, fixed=fixed,
+            steady=steady or "exact",
+        )  # fmt: skip
+        optimum = optimum_of(problem)
+        fitted = None if optimum is None else FitResult(optimum)
+    else:
+        problem = data.problem
+    if fitted is None or likelihood != "gaussian":
+        uncertainty = "noise"
+    density, optimum = _density(problem, fitted, priors, likelihood, uncertainty)
+    if method == "grid":
+        points = sample_points(density, optimum, problem.names, tolerance)
+        return Posterior(density, points, fitted, uncertainty)
+    drawn = chain(density, partial(starting_points, density, optimum))
+    result = Posterior(density, drawn, fitted, uncertainty)
+    drawn.check(result.names, result)
+    return result
+
+
+_CHAIN_ONLY = ("steps", "max_steps", "ess", "walkers", "ensembles", "resume", "pool")
+_TABLES_ONLY = ("method", "noise", "sensors", "steady", "likelihood", "uncertainty")
+_REFUSED = {
+    "a posterior of records": (*_TABLES_ONLY, "pool", "tolerance"),
+    "method='mcmc'": ("tolerance",),
+    "method='grid'": _CHAIN_ONLY,
+}
+
+
+def _refuse_options(kind: str, options: Mapping[str, Any]) -> None:
+    """Refuse options that a kind of posterior does not have, unless they are left as they are."""
+    defaults = signature(posterior).parameters
+    given = [name for name in _REFUSED[kind] if options[name] != defaults[name].default]
+    if given:
+        raise ValidationError(
+            f"{', '.join(given)} given with {kind}, which has no such option; leave it out"
+        )
+
+
+def _refuse_with_a_fit(data: object, options: Mapping[str, Any]) -> None:
+    """Refuse what a fit has already."""
+    if not isinstance(data, FitResult | RecordFit):
+        return
+    names = ("model", "noise", "sensors", "fixed", "steady")
+    given = [name for name in names if options[name] is not None]
+    given += ["free"] if tuple(options["free"]) else []
+    if given:
+        raise ValidationError(
+            f"{', '.join(given)} is given together with a {type(data).__name__}, which has its "
+            "own; pass the data instead"
+        )
+
+
+def _checked(model: Element | None) -> Element:
+    if model is None:
+        raise ModelError("there is no model; give one, such as Dahl(), or pass a fit")
+    return model
+
+
+def _record_density(fit: RecordFit, priors: Mapping[str, PriorLike] | None) -> RecordDensity:
+    values, count = fit.optimum.values, len(fit.problem.free)
+    prior = record_prior(fit.problem, priors, values)
+    covariance = fit.covar[:count, :count]
+    return RecordDensity(fit.problem, values, covariance, fit.errors.dof, prior)
+
+
+def _density(
+    problem: Problem,
+    fit: FitResult | None,
+    priors: Mapping[str, PriorLike] | None,
+    likelihood: str,
+    uncertainty: str,
+) -> tuple[Density, Optimum | None]:
+    """Return the density with every source of error, or noise alone, and where to start from."""
+    from scipy import stats
+
+    given, optimum = dict(priors or {}), None if fit is None else fit.optimum
+    if fit is None or optimum is None or uncertainty == "noise":
+        values = None if optimum is None else optimum.values
+        return Density(problem, joint_prior(problem, given, values), likelihood), optimum
+    _, assumed = with_assumed(problem)
+    wider = problem.like(free=assumed) if assumed else problem
+    errors = fit.errors_of_combinations
+    known = dict(zip(optimum.names, optimum.theta.tolist(), strict=True))
+    theta = np.array([known.get(p.name, np.log(p.value or 1.0)) for p in wider.parameters])
+    if errors is not None:
+        theta = errors.theta
+    ranges = {p.name: p.prior for p in wider.parameters if p.prior is not None}
+    of_assumed = {
+        name: ranges[name] if one.source == EXPONENT else stats.norm(1.0, one.std)
+        for name, one in assumed.items()
+    }
+    shared = None if errors is None else row_errors(errors)
+    prior = joint_prior(wider, given, wider.to_values(theta), of_assumed)
+    density = Density(wider, prior, likelihood, shared)
+    return density, replace(optimum, problem=wider, theta=theta)

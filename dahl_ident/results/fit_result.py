@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -48,18 +47,13 @@ from dahl_ident.errors import FitError, ValidationError, choices
 from dahl_ident.fitting.optimum import Combination, Optimum, propagated
 from dahl_ident.problem import Problem
 from dahl_ident.results import fit_report, fit_storage
-from dahl_ident.results.result import Parameters, Result
+from dahl_ident.results.result import Parameters, Result, part
 from dahl_ident.units import Quantity
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from dahl_ident.plots import Axes
-
-
-def _part(path: str, text: str) -> Any:
-    """Return a property that hands on a part of the optimum or of the problem."""
-    return property(attrgetter(path), doc=text)
 
 
 class FitResult(Result):
@@ -85,30 +79,30 @@ class FitResult(Result):
         self.first_order = first_order
         self._intervals: dict[tuple[Any, ...], ConfidenceIntervals] = {}
 
-    problem: Problem = _part("optimum.problem", "Data, model, noise, sensors as they were fitted.")
-    data: FrequencyResponse = _part("problem.data", "The data that were fitted.")
-    method: str = _part("optimum.method", "The solver.")
-    noise: str = _part("problem.noise", "The noise model.")
-    success: bool = _part("optimum.success", "Whether a finite optimum was found.")
-    message: str = _part("optimum.message", "How the search ended, in words.")
-    combinations: tuple[Combination, ...] = _part(
+    problem: Problem = part("optimum.problem", "Data, model, noise, sensors as they were fitted.")
+    data: FrequencyResponse = part("problem.data", "The data that were fitted.")
+    method: str = part("optimum.method", "The solver.")
+    noise: str = part("problem.noise", "The noise model.")
+    success: bool = part("optimum.success", "Whether a finite optimum was found.")
+    message: str = part("optimum.message", "How the search ended, in words.")
+    combinations: tuple[Combination, ...] = part(
         "optimum.combinations", "What the data determine where single parameters run away."
     )
-    scale_known: bool = _part("optimum.scale_known", "Whether the noise's scale was known before.")
-    ndata: int = _part("problem.n_numbers", "Real numbers: two a row, one that of a mean force.")
-    nfree: int = _part("optimum.dof", "Degrees of freedom.")
-    nfev: int = _part("optimum.nfev", "Evaluations of the residuals.")
-    log_likelihood: float = _part(
+    scale_known: bool = part("optimum.scale_known", "Whether the noise's scale was known before.")
+    ndata: int = part("problem.n_numbers", "Real numbers: two a row, one that of a mean force.")
+    nfree: int = part("optimum.dof", "Degrees of freedom.")
+    nfev: int = part("optimum.nfev", "Evaluations of the residuals.")
+    log_likelihood: float = part(
         "optimum.log_likelihood",
         "Log-density of the data at the optimum, at the likeliest scale where unknown; with a "
         "robust loss rho, that of the density proportional to exp(-rho/2).",
     )
-    aic: float = _part(
+    aic: float = part(
         "optimum.aic",
         "Akaike's criterion, -2 ln L + 2 k; k counts an estimated noise scale, and no parameter "
         "whose optimum lies at infinity.",
     )
-    bic: float = _part("optimum.bic", "Schwarz's criterion, -2 ln L + k ln(ndata); k as for `aic`.")
+    bic: float = part("optimum.bic", "Schwarz's criterion, -2 ln L + k ln(ndata); k as for `aic`.")
 
     @cached_property
     def errors(self) -> ErrorModel | None:

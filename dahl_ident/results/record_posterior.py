@@ -9,20 +9,19 @@ from typing import Any, Literal
 import numpy as np
 
 from dahl_ident.arrays import whole_number
-from dahl_ident.bayes.chain import Chain, Settings
-from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.record_density import RecordDensity
+from dahl_ident.bayes.sample import Sample
 from dahl_ident.data import Record
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.record_errors import record_assumptions, record_derived
-from dahl_ident.results.chain_posterior import ChainDraws
+from dahl_ident.results.posterior_result import Posterior, doubts_of
 from dahl_ident.results.record_fit import RecordBand, RecordFit
 from dahl_ident.results.result import Estimate, Parameters
 
 
-class RecordPosterior(ChainDraws):
+class RecordPosterior(Posterior):
     """Draws from the posterior given records, with the verdict on whether they can be trusted.
 
     Made by :func:`dahl_ident.posterior`. Its parameters are the model's; states, offsets and
@@ -44,18 +43,8 @@ class RecordPosterior(ChainDraws):
     (('f_max', 'sigma'), 50)
     """
 
-    _density: RecordDensity
-
-    def __init__(
-        self,
-        fit: RecordFit,
-        density: RecordDensity,
-        chain: Chain,
-        convergence: Convergence,
-        settings: Settings,
-    ) -> None:
-        self.fit, self._density, self._chain = fit, density, chain
-        self.convergence, self._settings = convergence, settings
+    def __init__(self, fit: RecordFit, density: RecordDensity, sample: Sample) -> None:
+        self.fit, self._density, self.sample = fit, density, sample
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -84,8 +73,12 @@ class RecordPosterior(ChainDraws):
         return tuple(record.provenance for record in self.fit.records)
 
     @property
-    def _counted_fit(self) -> RecordFit:
+    def _counted_fit(self) -> RecordFit:  # type: ignore[override]
         return self.fit
+
+    @property
+    def _misfits(self) -> tuple[Finding, ...]:
+        return doubts_of(self.fit)
 
     @property
     def _notes(self) -> tuple[Finding, ...]:

@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -126,6 +127,11 @@ class Parameters(Mapping[str, Estimate]):
             for p in self.values()
         ]
         return tabular(("", "value", "$u$", "unit"), rows)
+
+
+def part(path: str, text: str) -> Any:
+    """Return a property that hands on a part of what a result consists of."""
+    return property(attrgetter(path), doc=text)
 
 
 class Result(ABC):

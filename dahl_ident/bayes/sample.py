@@ -1,0 +1,229 @@
+"""A posterior as weighted draws: of a Markov chain, or at importance points.
+
+Both have coordinates theta with weights, whether they can be used, and why not.
+"""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray, positive_number
+from dahl_ident.bayes.chain import Chain, Listener, Pool, Settings, run
+from dahl_ident.bayes.checkpoint import identity, open_chain
+from dahl_ident.bayes.convergence import Convergence
+from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.importance import WeightedDraws, WeightedPoints, integrate
+from dahl_ident.bayes.noise_scale import with_scale
+from dahl_ident.bayes.record_density import RecordDensity
+from dahl_ident.bayes.walker_start import centre_and_covariance
+from dahl_ident.errors import SamplingError
+from dahl_ident.fitting import Optimum
+
+_MOST_AXES = 3  # the number of points is a power of the number of axes
+
+Start = Callable[[int, np.random.Generator], FloatArray]
+"""Returns as many points of finite density as there are walkers."""
+
+
+class Sample(ABC):
+    """Weighted draws from a posterior, and whether they can be used."""
+
+    @property
+    @abstractmethod
+    def draws(self) -> WeightedDraws:
+        """All draws that count, search coordinates."""
+
+    @property
+    @abstractmethod
+    def converged(self) -> bool:
+        """Whether the numbers can be used."""
+
+    @property
+    @abstractmethod
+    def message(self) -> str:
+        """Whether the numbers can be used, and what is missing if not."""
+
+    @property
+    @abstractmethod
+    def facts(self) -> Mapping[str, Any]:
+        """How the draws were made, as plain data."""
+
+    def columns(self, std: FloatArray) -> dict[str, FloatArray]:
+        """Return what a summary states of each parameter in addition to moments and quantiles."""
+        return {}
+
+
+@dataclass(frozen=True)
+class ChainSample(Sample):
+    """The draws of a Markov chain, without its warm-up."""
+
+    chain: Chain
+    convergence: Convergence
+    settings: Settings
+
+    @cached_property
+    def draws(self) -> WeightedDraws:
+        """All coordinates after warm-up."""
+        kept = self.chain.points[self.convergence.discard :]
+        return WeightedDraws.alike(kept.reshape(-1, kept.shape[-1]))
+
+    @property
+    def converged(self) -> bool:
+        """Whether the chain is long enough to be used."""
+        return self.convergence.reached
+
+    @property
+    def message(self) -> str:
+        """Whether the chain has converged, and what is missing if not."""
+        steps, warm_up = self.chain.steps, self.convergence.discard
+        kept = f"{steps - warm_up} steps of {self.settings.walkers} walkers"
+        if self.converged:
+            return f"Converged: {kept} after {warm_up} of warm-up."
+        return (
+            f"NOT CONVERGED after {steps} steps: {'; '.join(self.convergence.lacks)}. The "
+            "numbers are provisional: run more steps, or give narrower priors."
+        )
+
+    @property
+    def facts(self) -> Mapping[str, Any]:
+        """Seed and number of steps."""
+        return {
+            "seed": self.settings.seed,
+            "steps": self.chain.steps,
+            "warm_up": self.convergence.discard,
+        }
+
+    def columns(self, std: FloatArray) -> dict[str, FloatArray]:
+        """Return Monte Carlo errors, effective numbers of draws, and R-hat."""
+        ess = self.convergence.ess if self.converged else np.full(len(std), np.nan)
+        return {"mcse": std / np.sqrt(ess), "ess": ess, "r_hat": self.convergence.r_hat}
+
+    def check(self, names: Sequence[str], result: Any) -> None:
+        """Raise where nothing can be said of the chain; the error carries the result."""
+        if self.convergence.usable:
+            return
+        still = ~np.isfinite(self.convergence.tau)
+        stuck = [name for name, there in zip(names, still, strict=True) if there]
+        raise SamplingError(
+            f"some walkers never moved in {', '.join(stuck)} over {self.chain.steps} steps, so "
+            "that nothing is known about the chain; it is in this error's `posterior`. Run more "
+            "steps, or look for a prior or data that leave next to no room",
+            result,
+        )
+
+
+@dataclass(frozen=True)
+class PointSample(Sample):
+    """Importance points: the same at every call, with the error of every probability."""
+
+    density: Density
+    integral: WeightedPoints
+    tolerance: float
+
+    @cached_property
+    def draws(self) -> WeightedDraws:
+        """The points, an unknown noise scale included."""
+        found = self.integral
+        if not self.density.has_scale:
+            return found
+        return WeightedDraws(with_scale(self.density, found), found.weights)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the error is as small as was asked for."""
+        return self.integral.error <= self.tolerance
+
+    @property
+    def message(self) -> str:
+        """The error of the integral, and whether it is small enough."""
+        points = self.integral
+        text = f"error {points.error:.1g} of the probability, {points.evaluations} points"
+        if self.converged:
+            return f"Converged: {text}."
+        return (
+            f"NOT CONVERGED: {text}, expected {self.tolerance:.1g}. The numbers are provisional: "
+            "use method='mcmc', or give narrower priors."
+        )
+
+    @property
+    def facts(self) -> Mapping[str, Any]:
+        """The evidence with its error, and the number of points."""
+        return {
+            name: getattr(self.integral, name) for name in ("log_evidence", "error", "evaluations")
+        }
+
+
+def sample_chain(
+    density: Density | RecordDensity,
+    start: Start,
+    settings: Settings,
+    *,
+    seed: int | None = None,
+    resume: str | os.PathLike[str] | None = None,
+    pool: Pool | None = None,
+    listeners: Sequence[Listener] = (),
+) -> ChainSample:
+    """Run a chain, from its file and into it where there is one.
+
+    The seed of a file is kept; a `seed` that differs from it is refused.
+    """
+    with ExitStack() as stack:
+        every, stored = [*listeners], None
+        if resume is not None:
+            of = identity(density, settings.walkers, settings.ensembles)
+            file = stack.enter_context(open_chain(resume, of))
+            stored = file.load()
+            if stored is not None and seed not in (None, stored.seed):
+                raise SamplingError(
+                    f"{os.fspath(resume)} was begun with seed {stored.seed}, but seed is {seed}; "
+                    "leave it out to resume, or give another file"
+                )
+            if stored is not None:
+                settings = replace(settings, seed=stored.seed)
+            file.begin(settings.seed)
+            every.append(file)
+        if stored is None:
+            random = np.random.default_rng(settings.seed)
+            chain = Chain.at(start(settings.walkers, random), settings.seed)
+        else:
+            chain = stored.chain
+
+        def tell(chain: Chain, verdict: Convergence | None) -> None:
+            for listener in every:
+                listener(chain, verdict)
+
+        chain, verdict = run(density, chain, settings, pool=pool, listener=tell)
+    return ChainSample(chain, verdict, settings)
+
+
+def sample_points(
+    density: Density, optimum: Optimum | None, given: Sequence[str], tolerance: float
+) -> PointSample:
+    """Integrate a density of few parameters; `given` are those that were left free by the user."""
+    names = density.problem.names
+    if len(names) > _MOST_AXES:
+        assumed = [name for name in names if name not in given]
+        instead = f"give {', '.join(assumed)} or " if assumed else ""
+        raise SamplingError(
+            f"{len(names)} parameters are free ({', '.join(names)}); a grid takes up to "
+            f"{_MOST_AXES}: {instead}fix some, or use method='mcmc'"
+        )
+    positive_number(tolerance, "tolerance")
+    centre, covariance = centre_and_covariance(density, optimum, np.random.default_rng(0))
+    integral = integrate(
+        density.marginal,
+        density.prior,
+        centre,
+        covariance,
+        density.decorrelation,
+        tolerance=tolerance,
+    )
+    return PointSample(density, integral, tolerance)

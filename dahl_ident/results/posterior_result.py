@@ -1,0 +1,623 @@
+"""The posterior of a model's parameters, as users hold it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dahl_ident.arrays import (
+    FloatArray,
+    array_between,
+    finite_array,
+    positive_array,
+    whole_number,
+)
+from dahl_ident.bayes.convergence import Convergence
+from dahl_ident.bayes.density import SCALE, Density, LogDensity
+from dahl_ident.bayes.priors import PriorLike
+from dahl_ident.bayes.sample import ChainSample, PointSample, Sample
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.data.storage import plain_data
+from dahl_ident.diagnostics.bands import DerivedQuantity, problem_at
+from dahl_ident.diagnostics.budget import Budget
+from dahl_ident.diagnostics.checks import assumptions, doubted
+from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
+from dahl_ident.errors import FitError, ModelError, ValidationError, choices
+from dahl_ident.fitting import Optimum
+from dahl_ident.problem import Problem
+from dahl_ident.results.arviz_export import to_arviz
+from dahl_ident.results.fit_result import FitResult
+from dahl_ident.results.posterior_checks import (
+    PredictiveCheck,
+    PriorInfluence,
+    predictive_checks,
+    prior_influences,
+)
+from dahl_ident.results.posterior_prediction import PredictiveBand, derived_at_draws
+from dahl_ident.results.result import Estimate, Parameters, Result, part
+from dahl_ident.units import Quantity
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SCHEMA = "dahl_ident.posterior"
+
+RULE_DRAWS = 4000
+"""Draws that statements rest on."""
+_CHECK_DRAWS = 1000  # a share of 1 % has an error of 0.3 %
+_END = 1e-6  # of the probability, beyond which draws are few
+QUANTILES = {"2.5%": 0.025, "16%": 0.16, "median": 0.5, "84%": 0.84, "97.5%": 0.975}
+
+
+class Posterior(Result):
+    """Parameters, priors and weighted draws of one posterior density.
+
+    Made by :func:`dahl_ident.posterior`. The draws are those of a Markov chain, under emcee's names
+    where both have the same thing, or importance points (``method="grid"``), which are the same at
+    every call and state their error. An unknown scale of the noise is shown as ``noise_scale``.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> data = di.load_dataset("noisy")
+    >>> chain = di.posterior(data, di.Dahl(), seed=1, steps=60)
+    >>> chain.names, chain.steps, chain.converged
+    (('f_max', 'sigma', 'alpha'), 60, False)
+    >>> grid = di.posterior(data, di.Dahl(alpha=1.0), method="grid")
+    >>> print(grid.message)
+    Converged: error 0.0006 of the probability, 56448 points.
+    >>> low, high = grid.quantile("f_max", [0.025, 0.975])
+    >>> print(f"f_max from {low:.4f} to {high:.4f} N")
+    f_max from 0.0993 to 0.1004 N
+    """
+
+    _called = "a posterior"
+
+    def __init__(
+        self,
+        density: Density,
+        sample: Sample,
+        fit: FitResult | None = None,
+        uncertainty: str = "noise",
+    ) -> None:
+        self._density: LogDensity = density
+        self.sample = sample  #: The weighted draws, search coordinates.
+        self.problem = density.problem  #: Data, model, noise and sensors.
+        self._fit = fit
+        #: What is counted: every source of the fit's budget, "combined", or "noise" alone.
+        self.uncertainty = uncertainty
+
+    names: tuple[str, ...] = part(
+        "_density.names", "Names of the parameters, the model's first, an unknown noise scale last."
+    )
+    likelihood: str = part(
+        "_density.likelihood", 'How rows count: "gaussian", "student_t" or "none".'
+    )
+    priors: Mapping[str, str] = part("_density.priors", "Every prior in words.")
+    converged: bool = part("sample.converged", "Whether the numbers can be used.")
+    message: str = part(
+        "sample.message", "Whether the numbers can be used, and what is missing if not."
+    )
+
+    @property
+    def var_names(self) -> list[str]:
+        """Names of the free parameters, an unknown noise scale last."""
+        return list(self.names)
+
+    @property
+    def asked(self) -> Problem:
+        """The problem as it was given, before exponents that were not given became parameters."""
+        return self.problem if self._fit is None else self._fit.problem
+
+    @property
+    def data(self) -> FrequencyResponse:
+        """The data."""
+        return self.problem.data
+
+    @property
+    def optimum(self) -> Optimum | None:
+        """The least-squares optimum from which the search started; None with too few data."""
+        return None if self._fit is None else self._fit.optimum
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """SI units of the parameters."""
+        known = [p.unit for p in self.problem.parameters]
+        return (*known, *([""] * (len(self.names) - len(known))))
+
+    @property
+    def given_priors(self) -> Mapping[str, PriorLike]:
+        """The priors that were given, as they were given; the others follow the data's size."""
+        parts = self._density.prior.priors
+        return {part.parameter.name: part.given for part in parts if part.source == "given"}
+
+    # Numbers
+
+    @cached_property
+    def params(self) -> Parameters:
+        """Every parameter by name, posterior mean and standard deviation; fixed ones included."""
+        values = dict(zip(self.names, self.mean().tolist(), strict=True))
+        stderr = dict(zip(self.names, self.std().tolist(), strict=True))
+        shown = dict(Parameters.of(self.problem, values, stderr))
+        if SCALE in values:
+            at = values[SCALE], stderr[SCALE]
+            shown[SCALE] = Estimate(SCALE, "", "noise scale", *at, None, 0.0, math.inf, True)
+        return Parameters(shown)
+
+    @cached_property
+    def values(self) -> FloatArray:
+        """Values of all draws that count, shape (N, D), SI units."""
+        return self._density.to_values(self.sample.draws.theta)
+
+    @property
+    def weights(self) -> FloatArray:
+        """Probabilities of the draws, shape (N,), which sum to 1."""
+        return self.sample.draws.weights
+
+    @property
+    def points(self) -> tuple[FloatArray, FloatArray]:
+        """Weights, shape (N,), and search coordinates, (N, D), of all draws."""
+        return self.weights, self.sample.draws.theta
+
+    def mean(self) -> FloatArray:
+        """Return the means of the parameters, in the order of `names`."""
+        return np.asarray(self.weights @ self.values)
+
+    def std(self) -> FloatArray:
+        """Return the standard deviations of the parameters, in the order of `names`."""
+        return np.asarray(np.sqrt(self.weights @ (self.values - self.mean()) ** 2))
+
+    def quantile(self, name: str, probabilities: ArrayLike) -> FloatArray:
+        """Return quantiles of one parameter.
+
+        Parameters
+        ----------
+        name : str
+            One of `names`.
+        probabilities : float or array_like, shape (Q,)
+            From 1e-6 to 1 - 1e-6.
+
+        Returns
+        -------
+        ndarray, shape () or (Q,)
+            In SI units.
+        """
+        axis = self._axis(name)
+        q = np.atleast_1d(array_between(probabilities, "probabilities", _END, 1.0 - _END))
+        theta = self.sample.draws.quantiles(axis, q)
+        values = np.exp(theta) if self._density.logarithmic[axis] else theta
+        return values.reshape(np.shape(probabilities))
+
+    def marginal(self, name: str, values: ArrayLike) -> FloatArray:
+        """Return the posterior density of one parameter.
+
+        Parameters
+        ----------
+        name : str
+            One of `names`.
+        values : array_like, shape (Q,)
+            In SI units; those of a positive parameter above zero.
+
+        Returns
+        -------
+        ndarray, shape (Q,)
+            Probability per SI unit.
+        """
+        axis = self._axis(name)
+        logarithmic = self._density.logarithmic[axis]
+        x = (positive_array if logarithmic else finite_array)(values, name)
+        theta = np.log(x) if logarithmic else x
+        return self.sample.draws.density(axis, theta) / (x if logarithmic else 1.0)
+
+    def _axis(self, name: str) -> int:
+        if name not in self.names:
+            raise ModelError(f"there is no {name!r}; expected one of {choices(self.names, name)}")
+        return self.names.index(name)
+
+    def function(self, of: Callable[..., Any], name: str = "function") -> Mapping[str, float]:
+        """Return mean, std and quantiles of a function of the parameters.
+
+        Parameters
+        ----------
+        of : callable
+            Takes arrays of values by parameter name, such as
+            ``lambda f_max, sigma, **_: f_max / sigma``.
+        name : str, default "function"
+            For messages.
+
+        Returns
+        -------
+        dict of str to float
+            ``mean, std, 2.5%, 16%, median, 84%, 97.5%``.
+        """
+        weights = self.weights
+        values = dict(zip(self.names, self.values.T, strict=True))
+        if not self.is_chain:  # in which the noise scale is integrated out
+            values.pop(SCALE, None)
+        x = np.asarray(of(**values))
+        if x.shape != weights.shape:
+            raise ValidationError(
+                f"{name} has shape {x.shape}; expected one number a draw, {weights.shape}"
+            )
+        mean = float(weights @ x)
+        moments = {"mean": mean, "std": float(np.sqrt(weights @ (x - mean) ** 2))}
+        quantiles = type(self.sample.draws)(x[:, None], weights).quantiles(0, _LEVELS).tolist()
+        return moments | dict(zip(QUANTILES, quantiles, strict=True))
+
+    def summary(self) -> pd.DataFrame:
+        """Return one row a parameter: moments, quantiles, and the errors of a chain.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``mean, std, 2.5%, 16%, median, 84%, 97.5%``; of a chain ``mcse``, the Monte
+            Carlo standard error of the mean, ``ess``, the effective number of draws, and
+            ``r_hat``; ``unit``. ``ess`` and ``mcse`` are NaN where the chain has not converged.
+        """
+        import pandas as pd
+
+        columns: dict[str, Any] = {"mean": self.mean(), "std": self.std()}
+        quantiles = np.stack([self.quantile(name, _LEVELS) for name in self.names])
+        columns |= dict(zip(QUANTILES, quantiles.T, strict=True))
+        columns |= self.sample.columns(columns["std"])
+        columns["unit"] = list(self.units)
+        return pd.DataFrame(columns, index=pd.Index(self.names, name="parameter"))
+
+    def draws(self, size: int, seed: int = 0) -> FloatArray:
+        """Return values drawn from the posterior, shape (size, number of parameters)."""
+        return self._density.to_values(self._drawn(size, seed))
+
+    def _drawn(self, size: int, seed: int) -> FloatArray:
+        """Return the coordinates of draws."""
+        return self.sample.draws.drawn(whole_number(size, "size", 1), seed)
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return every draw, one column a parameter; those of a grid have a column ``weight``."""
+        import pandas as pd
+
+        frame = pd.DataFrame(self.values, columns=list(self.names))
+        return frame if self.is_chain else frame.assign(weight=self.weights)
+
+    # Importance points
+
+    @property
+    def _points(self) -> PointSample:
+        if not isinstance(self.sample, PointSample):
+            raise ValidationError("a chain has no evidence; use method='grid'")
+        return self.sample
+
+    log_evidence: float = part(
+        "_points.integral.log_evidence",
+        "Logarithm of the data's density under model and prior; differences between models of the "
+        "same data are logarithms of Bayes factors, in which the scale's prior 1/s cancels.",
+    )
+    error: float = part(
+        "_points.integral.error",
+        "Relative error of the evidence, and error of any probability, with 95 % confidence.",
+    )
+    evaluations: int = part(
+        "_points.integral.evaluations", "Points at which the likelihood was computed."
+    )
+
+    # The chain
+
+    @property
+    def is_chain(self) -> bool:
+        """Whether the draws are those of a Markov chain."""
+        return isinstance(self.sample, ChainSample)
+
+    @property
+    def chain(self) -> ChainSample:
+        """The Markov chain with its convergence and settings."""
+        if not isinstance(self.sample, ChainSample):
+            raise ValidationError("method='grid' runs no chain; use method='mcmc'")
+        return self.sample
+
+    convergence: Convergence = part("chain.convergence", "The verdict on the chain's length.")
+    seed: int = part("chain.settings.seed", "With which the same chain comes out again.")
+    steps: int = part("chain.chain.steps", "Total number of steps, warm-up included.")
+    warm_up: int = part("convergence.discard", "Steps that numbers and pictures leave out.")
+
+    def get_chain(self, discard: int = 0, thin: int = 1, flat: bool = False) -> FloatArray:
+        """Return parameter values along the chain, in SI units.
+
+        Parameters
+        ----------
+        discard : int, default 0
+            Steps to leave out at the beginning; `warm_up` is the number that `summary` takes.
+        thin : int, default 1
+            Keep every thin-th step.
+        flat : bool, default False
+            Join steps and walkers.
+
+        Returns
+        -------
+        ndarray, shape (steps, walkers, D) or (steps * walkers, D)
+            Walkers are ordered by ensemble.
+        """
+        points = self.chain.chain.points
+        return self._density.to_values(_thinned(points, discard, thin, flat))
+
+    def get_log_prob(self, discard: int = 0, thin: int = 1, flat: bool = False) -> FloatArray:
+        """Return the log-posterior, per unit of search coordinate, along the chain."""
+        return _thinned(self.chain.chain.log_density, discard, thin, flat)
+
+    def get_autocorr_time(self) -> FloatArray:
+        """Return the integrated autocorrelation time of each parameter, in steps."""
+        return self.convergence.tau
+
+    def to_arviz(self, seed: int = 0) -> Any:
+        """Return the posterior for ArviZ: InferenceData below version 1.0, DataTree from there.
+
+        Groups ``posterior``, ``prior``, ``log_likelihood``, ``observed_data`` and
+        ``posterior_predictive``. Its chains are the ensembles, thinned by the autocorrelation
+        time, because walkers of one ensemble are not independent.
+
+        Parameters
+        ----------
+        seed : int, default 0
+            Of the draws from the prior and of the replicated noise.
+
+        Returns
+        -------
+        arviz.InferenceData or xarray.DataTree
+            Responses are held as whitened residuals, real and imaginary part.
+
+        Raises
+        ------
+        MissingDependencyError
+            If ArviZ is not installed.
+        ValidationError
+            If there is no chain, or it is one of records.
+        """
+        if not isinstance(self._density, Density):
+            raise ValidationError("a posterior of records has no form for ArviZ")
+        return to_arviz(self._density, self.chain, seed)
+
+    # Judging
+
+    @cached_property
+    def judgement(self) -> Judgement:
+        """Every finding about the posterior, and the status that follows from them.
+
+        Not determined where it has not converged, or a prior that nobody gave sets a parameter;
+        not described where data or prior object; approximate where the fit's numbers are.
+        """
+        return Judgement((*self._objections, *self._notes, *doubted(*self._provenances)))
+
+    @cached_property
+    def prior_influences(self) -> tuple[PriorInfluence, ...]:
+        """The parameters that the prior determines rather than the data, or against them."""
+        if self.likelihood == "none":
+            return ()
+        return prior_influences(self._density.prior, self._drawn(RULE_DRAWS, 0))
+
+    @cached_property
+    def checks(self) -> tuple[PredictiveCheck, ...]:
+        """Posterior predictive checks of the residuals, with noise alone.
+
+        None where the prior was sampled, or where rows share errors; the fit's tests count there.
+        """
+        density, counted = self._density, self._counted_fit is not None
+        if self.likelihood == "none" or counted or not isinstance(density, Density):
+            return ()
+        return predictive_checks(density, self._drawn(_CHECK_DRAWS, 0), np.random.default_rng(0))
+
+    @property
+    def _objections(self) -> Iterator[Finding]:
+        """Yield what speaks against the numbers."""
+        code = "sampled" if self.converged else "not_converged"
+        severity = VerdictStatus.TRUSTED if self.converged else VerdictStatus.NOT_DETERMINED
+        yield Finding(Question.DETERMINED, severity, code, {"message": self.message})
+        lost = VerdictStatus.NOT_DESCRIBED if self.converged else VerdictStatus.NOT_DETERMINED
+        default = {p.parameter.name for p in self._density.prior.priors if p.source == "default"}
+        for rule in self.prior_influences:
+            left_open = VerdictStatus.NOT_DETERMINED if rule.name in default else None
+            severity = lost if rule.contradicted else left_open or VerdictStatus.TRUSTED
+            yield rule.finding(severity)
+        yield from (replace(finding, severity=lost) for finding in self._misfits)
+        fit = self._counted_fit
+        if fit is not None and fit.status is not VerdictStatus.NOT_DESCRIBED:
+            yield from (f for f in fit.findings if f.severity is VerdictStatus.APPROXIMATE)
+
+    @property
+    def _provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
+        """Where the data come from."""
+        return (self.data.provenance,)
+
+    @property
+    def _counted_fit(self) -> FitResult | None:
+        """The fit whose sources of error are counted; None where noise alone is."""
+        return self._fit if self.uncertainty == "combined" else None
+
+    @property
+    def _misfits(self) -> tuple[Finding, ...]:
+        """Where the data contradict the model; with the fit's errors, what its status rests on."""
+        fit = self._counted_fit
+        if fit is None:
+            lost = Question.DESCRIBED, VerdictStatus.NOT_DESCRIBED
+            failed = (check for check in self.checks if not check.passed)
+            return tuple(Finding(*lost, "predictive_check", {"text": str(c)}) for c in failed)
+        if fit.status is VerdictStatus.NOT_DETERMINED and fit.goodness.objections:
+            return tuple(fit.goodness.findings())
+        return doubts_of(fit)
+
+    @property
+    def _notes(self) -> tuple[Finding, ...]:
+        """What the numbers count and assume, and the evidence."""
+        note = Question.ASSUMED, VerdictStatus.TRUSTED
+        notes: tuple[Finding, ...] = ()
+        if isinstance(self.sample, PointSample):
+            values = {"ln": self.log_evidence}
+            notes = (Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "evidence", values),)
+        fit = self._fit
+        if fit is None or self.likelihood == "none":
+            return notes
+        if self._counted_fit is not None:
+            shared = getattr(self._density, "errors", None)
+            names = ["noise"] if shared is None else list(shared.counted)
+            free = [n for n in self.problem.names if n not in fit.problem.names]
+            ranges = (f"{name} as a parameter, which was not given" for name in free)
+            counted = Finding(*note, "counted", {"sources": (*names, *ranges)})
+            return (counted, *assumptions(fit.optimum, fit.errors), *notes)
+        if fit.errors is None:
+            return (*assumptions(fit.optimum, None), *notes)
+        std = dict(zip(self.names, self.std().tolist(), strict=True))
+        u = [f"{fit.params[n].stderr:.2g} instead of {std[n]:.2g} for {n}" for n in fit.var_names]
+        compared = Finding(*note, "noise_alone", {"compared": tuple(u)})
+        return (compared, *assumptions(fit.optimum, None), *notes)
+
+    # What follows
+
+    def budget(self) -> Budget:
+        """Return the uncertainty budget of the least-squares fit to the same data and model.
+
+        Raises
+        ------
+        FitError
+            If there are too few data for one.
+        """
+        if self._fit is None:
+            raise FitError("there are too few data for a least-squares fit, so there is no budget")
+        return self._fit.budget()
+
+    def predict(
+        self,
+        frequency_hz: Any,
+        /,
+        *,
+        amplitude: ArrayLike | None = None,
+        drive: ArrayLike | None = None,
+        quantity: Quantity | None = None,
+        size: int = 1000,
+        seed: int = 0,
+    ) -> Any:
+        """Return the response at draws from the posterior, with its bands.
+
+        Parameters
+        ----------
+        frequency_hz, amplitude, drive, quantity
+            As for :meth:`dahl_ident.FitResult.predict`.
+        size, seed : int, default 1000 and 0
+            Of the draws.
+
+        Returns
+        -------
+        PredictiveBand
+        """
+        there = problem_at(self.problem, frequency_hz, amplitude, drive, quantity)
+        return PredictiveBand(there.predict(self._drawn(size, seed)[:, : len(there.names)]))
+
+    def derived(
+        self, amplitudes: Sequence[float] = (), frequency_hz: float | None = None
+    ) -> tuple[DerivedQuantity, ...]:
+        """Return x_c, energy per cycle, equivalent stiffness and damping: means and deviations.
+
+        Parameters
+        ----------
+        amplitudes, frequency_hz
+            As for :meth:`dahl_ident.FitResult.derived`.
+
+        Returns
+        -------
+        tuple of DerivedQuantity
+        """
+        theta = self._drawn(RULE_DRAWS, 0)[:, : len(self.problem.names)]
+        return tuple(derived_at_draws(self.problem, theta, amplitudes, frequency_hz))
+
+    def plot(self, kind: str | None = None, ax: Any = None) -> Any:
+        """Draw the posterior.
+
+        Parameters
+        ----------
+        kind : {"corner", "trace"}, optional
+            "corner" (the default): the density of each parameter and of each pair. "trace": the
+            walkers' paths, for a chain.
+        ax : axes, optional
+            As the function of this name in :mod:`dahl_ident.plots` takes them.
+
+        Returns
+        -------
+        ndarray of Axes
+        """
+        kinds = {"corner": self.plot_corner, "trace": self.plot_trace}
+        if not self.is_chain:
+            del kinds["trace"]
+        if kind is not None and kind not in kinds:
+            raise ValidationError(f"kind is {kind!r}; expected one of {choices(kinds, kind)}")
+        return kinds[kind or "corner"](ax=ax)
+
+    def plot_corner(self, **options: Any) -> NDArray[Any]:
+        """Draw marginals and pairs; options as :func:`dahl_ident.plots.plot_corner`."""
+        from dahl_ident.plots import plot_corner
+
+        draws = self.draws(RULE_DRAWS)
+        return plot_corner(self._labels, draws, log=self._density.logarithmic, **options)
+
+    def plot_trace(self, **options: Any) -> NDArray[Any]:
+        """Draw the walkers' paths; options as :func:`dahl_ident.plots.plot_trace`."""
+        from dahl_ident.plots import plot_trace
+
+        paths, log = self.get_chain(), self._density.logarithmic
+        return plot_trace(self._labels, paths, discard=self.warm_up, log=log, **options)
+
+    @property
+    def _labels(self) -> list[str]:
+        pairs = zip(self.names, self.units, strict=True)
+        return [f"{name} ({unit})" if unit else name for name, unit in pairs]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return verdict, numbers and priors as plain data; draws are not included."""
+        return {
+            "schema": SCHEMA,
+            "schema_version": 1,
+            "dahl_ident_version": version("dahl_ident"),
+            "status": str(self.status),
+            "trusted": self.trusted,
+            "statements": list(self.statements),
+            "converged": self.converged,
+            "message": self.message,
+            "likelihood": self.likelihood,
+            "priors": dict(self.priors),
+            "set_by_prior": [rule.name for rule in self.prior_influences],
+            "findings": [finding.to_dict() for finding in self.findings],
+            "summary": self.summary().to_dict(orient="index"),
+            **self.sample.facts,
+        }
+
+    def to_json(self) -> str:
+        """Return :meth:`to_dict` as JSON text."""
+        return json.dumps(plain_data(self.to_dict(), not_finite=str), allow_nan=False, indent=1)
+
+    def __str__(self) -> str:
+        table = self.summary().to_string(float_format=lambda v: f"{v:.5g}")
+        priors = [f"  {name}: {text}" for name, text in self.priors.items()]
+        said = [str(f) for f in self.findings if f.code not in ("sampled", "not_converged")]
+        return "\n".join([self.message, *said, "", table, "", "Priors:", *priors])
+
+    def __repr__(self) -> str:
+        first = self.message.partition(":")[0]
+        return f"<{type(self).__name__}: {', '.join(self.names)}; {first}>"
+
+
+_LEVELS = np.array(list(QUANTILES.values()))
+
+
+def doubts_of(fit: Result) -> tuple[Finding, ...]:
+    """Return what the status of a fit rests on, where the fit does not describe the data."""
+    if fit.status is not VerdictStatus.NOT_DESCRIBED:
+        return ()
+    return tuple(f for f in fit.findings if f.severity is not VerdictStatus.TRUSTED)
+
+
+def _thinned(array: FloatArray, discard: int, thin: int, flat: bool) -> FloatArray:
+    kept = array[whole_number(discard, "discard", 0) :: whole_number(thin, "thin", 1)]
+    return kept.reshape(-1, *kept.shape[2:]) if flat else kept
