@@ -27,7 +27,6 @@ from dahl_ident.diagnostics.slip_density import slip_density
 from dahl_ident.elements import Element
 from dahl_ident.elements.masing import jenkins
 from dahl_ident.errors import DataError, ModelError, ValidationError
-from dahl_ident.plots.slip_displacements import plot_slip_density
 from tests.test_generic_friction import Jenkins
 from tests.test_response_of_any_law import all_amplitudes
 
@@ -191,15 +190,12 @@ def test_the_verdict_says_what_such_laws_leave(truth: Element, said: str) -> Non
     assert f"{100.0 * bound:.2g} % (rms of the fundamental)" in found.verdict
 
 
-def test_the_density_is_refused_and_drawn() -> None:
+def test_the_density_is_refused() -> None:
     data = table(LAW)
     with pytest.raises(ModelError, match="expected linear elements"):
         slip_density(data, Dahl())
     with pytest.raises(DataError, match="at least three"):
         slip_density(data.select(rows=np.arange(24) < 2))
-    found = slip_density(data)
-    axis = plot_slip_density(found.slip, found.stiffness)
-    assert axis.get_ylabel() == "stiffness [% of sum]"
 
 
 def test_the_verdict_is_silent_where_such_laws_leave_more_than_the_model() -> None:

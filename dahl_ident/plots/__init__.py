@@ -4,27 +4,25 @@ from __future__ import annotations
 
 from matplotlib.axes import Axes
 
-from dahl_ident.plots.backbone import plot_backbone
-from dahl_ident.plots.bench_time import plot_bench_time
-from dahl_ident.plots.budget import plot_budget
 from dahl_ident.plots.control_charts import plot_control_charts, plot_devices
 from dahl_ident.plots.control_loops import plot_margins, plot_nichols, plot_nyquist
 from dahl_ident.plots.corner import plot_corner, plot_trace
-from dahl_ident.plots.cycles import plot_cycles
 from dahl_ident.plots.fit_diagnostics import (
+    plot_bench_time,
+    plot_budget,
     plot_correlation,
     plot_information,
     plot_profile,
     plot_residuals,
 )
-from dahl_ident.plots.frequency import plot_frequency_response
-from dahl_ident.plots.friction import (
+from dahl_ident.plots.friction import plot_loops, plot_recorded_loops, plot_universal_curve
+from dahl_ident.plots.responses import (
+    Curve,
     plot_amplitude_response,
-    plot_loops,
-    plot_universal_curve,
+    plot_backbone,
+    plot_frequency_response,
 )
-from dahl_ident.plots.gain_phase import Curve
-from dahl_ident.plots.waveforms import plot_recorded_loops, plot_waveforms
+from dahl_ident.plots.waveforms import plot_cycles, plot_waveforms
 
 __all__ = [
     "Axes",

@@ -11,6 +11,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.plots import style
 
 
+@style.house_style()
 def plot_devices(
     names: Sequence[str],
     own: FloatArray,
@@ -52,31 +53,31 @@ def plot_devices(
     >>> [tick.get_text() for tick in axis.get_xticklabels()]
     ['a', 'c', 'b']
     """
-    with style.house_style():
-        axis = style.axes(ax, size=(6.4, 3.2))
-        order = np.argsort(own, kind="stable")
-        place = np.arange(order.size)
-        axis.axhline(mean, color=style.GREY, lw=1.0, label="population mean")
-        axis.errorbar(
-            place, shrunken[order], 2.0 * u[order], fmt="o", color=style.BLUE, capsize=0,
-            lw=1.0, label="shrunk towards the population, with 2 u",
+    axis = style.axes(ax, size=(6.4, 3.2))
+    order = np.argsort(own, kind="stable")
+    place = np.arange(order.size)
+    axis.axhline(mean, color=style.GREY, lw=1.0, label="population mean")
+    axis.errorbar(
+        place, shrunken[order], 2.0 * u[order], fmt="o", color=style.BLUE, capsize=0,
+        lw=1.0, label="shrunk towards the population, with 2 u",
+    )  # fmt: skip
+    axis.plot(place, own[order], "x", color=style.VERMILION, label="own estimate")
+    marked = [i for i, k in enumerate(order) if names[k] in set(outlying)]
+    if marked:
+        axis.plot(
+            marked, own[order][marked], "s", mfc="none", ms=9, color=style.BLACK,
+            label="outside the population",
         )  # fmt: skip
-        axis.plot(place, own[order], "x", color=style.VERMILION, label="own estimate")
-        marked = [i for i, k in enumerate(order) if names[k] in set(outlying)]
-        if marked:
-            axis.plot(
-                marked, own[order][marked], "s", mfc="none", ms=9, color=style.BLACK,
-                label="outside the population",
-            )  # fmt: skip
-        if order.size <= 40:
-            axis.set_xticks(place, [names[k] for k in order], rotation=90)
-        else:
-            axis.set_xlabel(f"{order.size} devices in the order of their own estimate")
-        axis.set_ylabel(label)
-        axis.legend(loc="upper left")
-        return axis
+    if order.size <= 40:
+        axis.set_xticks(place, [names[k] for k in order], rotation=90)
+    else:
+        axis.set_xlabel(f"{order.size} devices in the order of their own estimate")
+    axis.set_ylabel(label)
+    axis.legend(loc="upper left")
+    return axis
 
 
+@style.house_style()
 def plot_control_charts(
     value: FloatArray,
     ewma: FloatArray | None,
@@ -120,21 +121,20 @@ def plot_control_charts(
     >>> upper.get_ylabel()
     'ln f_max'
     """
-    with style.house_style():
-        charts = [(label, value, np.full(value.size, limit))]
-        if ewma is None or ewma_limit is None:
-            axes: tuple[Axes, ...] = (style.axes(ax[0] if ax else None, size=(6.4, 2.6)),)
-        else:
-            charts.append((f"{label}, EWMA", ewma, ewma_limit))
-            axes = style.axes_pair(ax, size=(6.4, 4.4))
-        n = np.arange(1, value.size + 1)
-        for axis, (name, line, width) in zip(axes, charts, strict=True):
-            axis.axhline(centre, color=style.GREY, lw=1.0)
-            axis.plot(n, centre + width, "--", color=style.GREY, lw=1.0)
-            axis.plot(n, centre - width, "--", color=style.GREY, lw=1.0)
-            axis.plot(n, line, "-o", color=style.BLUE, lw=0.8, ms=3)
-            beyond = np.abs(line - centre) > width
-            axis.plot(n[beyond], line[beyond], "s", mfc="none", ms=8, color=style.VERMILION)
-            axis.set_ylabel(name)
-        axes[-1].set_xlabel(x_label)
-        return axes
+    charts = [(label, value, np.full(value.size, limit))]
+    if ewma is None or ewma_limit is None:
+        axes: tuple[Axes, ...] = (style.axes(ax[0] if ax else None, size=(6.4, 2.6)),)
+    else:
+        charts.append((f"{label}, EWMA", ewma, ewma_limit))
+        axes = style.axes_pair(ax, size=(6.4, 4.4))
+    n = np.arange(1, value.size + 1)
+    for axis, (name, line, width) in zip(axes, charts, strict=True):
+        axis.axhline(centre, color=style.GREY, lw=1.0)
+        axis.plot(n, centre + width, "--", color=style.GREY, lw=1.0)
+        axis.plot(n, centre - width, "--", color=style.GREY, lw=1.0)
+        axis.plot(n, line, "-o", color=style.BLUE, lw=0.8, ms=3)
+        beyond = np.abs(line - centre) > width
+        axis.plot(n[beyond], line[beyond], "s", mfc="none", ms=8, color=style.VERMILION)
+        axis.set_ylabel(name)
+    axes[-1].set_xlabel(x_label)
+    return axes

@@ -13,6 +13,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.plots import style
 
 
+@style.house_style()
 def plot_nyquist(
     levels: Sequence[tuple[str, ArrayLike]], *, label: str = "response", ax: Axes | None = None
 ) -> Axes:
@@ -37,16 +38,16 @@ def plot_nyquist(
     >>> plot_nyquist([("1 N", [1.0, 0.5 - 0.5j, 0.0])]).get_xlabel()
     'Re response'
     """
-    with style.house_style():
-        axis = style.axes(ax)
-        for (name, values), look in _styled(levels):
-            R = np.asarray(values, dtype=np.complex128)
-            axis.plot(R.real, R.imag, **look, label=name)
-        axis.set(xlabel=f"Re {label}", ylabel=f"Im {label}")
-        axis.set_aspect("equal", adjustable="datalim")
-        return _with_legend(axis, levels)
+    axis = style.axes(ax)
+    for (name, values), look in _styled(levels):
+        R = np.asarray(values, dtype=np.complex128)
+        axis.plot(R.real, R.imag, **look, label=name)
+    axis.set(xlabel=f"Re {label}", ylabel=f"Im {label}")
+    axis.set_aspect("equal", adjustable="datalim")
+    return _with_legend(axis, levels)
 
 
+@style.house_style()
 def plot_nichols(
     levels: Sequence[tuple[str, ArrayLike]], *, gain_label: str = "gain", ax: Axes | None = None
 ) -> Axes:
@@ -72,16 +73,16 @@ def plot_nichols(
     >>> plot_nichols([("1 N", [1.0, 0.5 - 0.5j])], gain_label="receptance [m/N]").get_ylabel()
     'receptance [dB re m/N]'
     """
-    with style.house_style():
-        axis = style.axes(ax)
-        for (name, values), look in _styled(levels):
-            R = np.asarray(values, dtype=np.complex128)
-            axis.plot(np.degrees(np.unwrap(np.angle(R))), _decibels(np.abs(R)), **look, label=name)
-        label = gain_label.replace("[", "[dB re ") if "[" in gain_label else f"{gain_label} [dB]"
-        axis.set(xlabel="phase [degrees]", ylabel=label)
-        return _with_legend(axis, levels)
+    axis = style.axes(ax)
+    for (name, values), look in _styled(levels):
+        R = np.asarray(values, dtype=np.complex128)
+        axis.plot(np.degrees(np.unwrap(np.angle(R))), _decibels(np.abs(R)), **look, label=name)
+    label = gain_label.replace("[", "[dB re ") if "[" in gain_label else f"{gain_label} [dB]"
+    axis.set(xlabel="phase [degrees]", ylabel=label)
+    return _with_legend(axis, levels)
 
 
+@style.house_style()
 def plot_margins(
     amplitude: ArrayLike,
     gain_margin: ArrayLike,
@@ -116,24 +117,21 @@ def plot_margins(
     >>> bottom.get_ylabel()
     'phase margin [degrees]'
     """
-    with style.house_style():
-        top, bottom = style.axes_pair(ax)
-        gain = _decibels(gain_margin)
-        decibel_band = None if gain_band is None else tuple(_decibels(g) for g in gain_band)
-        rows = ((top, gain, decibel_band), (bottom, phase_margin_deg, phase_band))
-        for axis, values, band in rows:
-            axis.plot(amplitude, _drawable(values), color=style.FIT)
-            if band is not None:
-                low, high = (_drawable(limit) for limit in band)
-                axis.fill_between(
-                    np.asarray(amplitude), low, high, color=style.FIT, alpha=0.2, lw=0
-                )
-            _mark_infinite(axis, amplitude, values)
-        top.set(xscale="log", ylabel="gain margin [dB]")
-        bottom.set(xscale="log", xlabel="amplitude [m]", ylabel="phase margin [degrees]")
-        for axis in (top, bottom):
-            style.readable_log_ticks(axis)
-        return top, bottom
+    top, bottom = style.axes_pair(ax)
+    gain = _decibels(gain_margin)
+    decibel_band = None if gain_band is None else tuple(_decibels(g) for g in gain_band)
+    rows = ((top, gain, decibel_band), (bottom, phase_margin_deg, phase_band))
+    for axis, values, band in rows:
+        axis.plot(amplitude, _drawable(values), color=style.FIT)
+        if band is not None:
+            low, high = (_drawable(limit) for limit in band)
+            axis.fill_between(np.asarray(amplitude), low, high, color=style.FIT, alpha=0.2, lw=0)
+        _mark_infinite(axis, amplitude, values)
+    top.set(xscale="log", ylabel="gain margin [dB]")
+    bottom.set(xscale="log", xlabel="amplitude [m]", ylabel="phase margin [degrees]")
+    for axis in (top, bottom):
+        style.readable_log_ticks(axis)
+    return top, bottom
 
 
 def _decibels(gain: ArrayLike) -> FloatArray:

@@ -17,6 +17,7 @@ _WIDE = 3.0  # half a decade; narrower, logarithmic ticks are hard to read
 _QUANTILES = (0.16, 0.5, 0.84)  # median, and one standard deviation to either side
 
 
+@style.house_style()
 def plot_corner(
     names: Sequence[str],
     draws: ArrayLike,
@@ -51,36 +52,36 @@ def plot_corner(
     >>> plot_corner(["a", "b"], draws).shape
     (2, 2)
     """
-    with style.house_style():
-        values = np.asarray(draws, dtype=float)
-        p = values.shape[1]
-        logs = _logarithmic(values, log)
-        if ax is None:
-            side = 1.6 + 1.1 * p
-            grid = style.new_axes(p, p, size=(side, side), sharex=False)
+    values = np.asarray(draws, dtype=float)
+    p = values.shape[1]
+    logs = _logarithmic(values, log)
+    if ax is None:
+        side = 1.6 + 1.1 * p
+        grid = style.new_axes(p, p, size=(side, side), sharex=False)
+    else:
+        grid = np.asarray(ax, dtype=object)
+        if grid.shape != (p, p):
+            raise ValidationError(f"ax has shape {grid.shape}; expected {(p, p)}")
+    edges = [_edges(values[:, i], logs[i]) for i in range(p)]
+    for (i, j), axis in np.ndenumerate(grid):
+        if j > i:
+            axis.set_axis_off()
+            continue
+        axis.set_xscale("log" if logs[j] else "linear")
+        axis.set_yscale("log" if logs[i] and i != j else "linear")
+        for line in (axis.xaxis, axis.yaxis):
+            style.few_plain_ticks(line)
+        if i == j:
+            _marginal(axis, values[:, i], edges[i])
         else:
-            grid = np.asarray(ax, dtype=object)
-            if grid.shape != (p, p):
-                raise ValidationError(f"ax has shape {grid.shape}; expected {(p, p)}")
-        edges = [_edges(values[:, i], logs[i]) for i in range(p)]
-        for (i, j), axis in np.ndenumerate(grid):
-            if j > i:
-                axis.set_axis_off()
-                continue
-            axis.set_xscale("log" if logs[j] else "linear")
-            axis.set_yscale("log" if logs[i] and i != j else "linear")
-            for line in (axis.xaxis, axis.yaxis):
-                style.few_plain_ticks(line)
-            if i == j:
-                _marginal(axis, values[:, i], edges[i])
-            else:
-                pair = [edges[j], edges[i]]
-                axis.hist2d(values[:, j], values[:, i], pair, cmap="Blues", rasterized=True)
-            _mark(axis, names, i, j, truth or {})
-            _name_outer_axes(axis, names, i, j)
-        return grid
+            pair = [edges[j], edges[i]]
+            axis.hist2d(values[:, j], values[:, i], pair, cmap="Blues", rasterized=True)
+        _mark(axis, names, i, j, truth or {})
+        _name_outer_axes(axis, names, i, j)
+    return grid
 
 
+@style.house_style()
 def plot_trace(
     names: Sequence[str],
     chain: ArrayLike,
@@ -115,24 +116,23 @@ def plot_trace(
     >>> len(plot_trace(["a", "b"], chain, discard=10))
     2
     """
-    with style.house_style():
-        values = np.asarray(chain, dtype=float)
-        p = values.shape[2]
-        logs = _logarithmic(values.reshape(-1, p), log)
-        if ax is None:
-            rows = style.new_axes(p, 1, size=(5.4, 1.0 + 1.3 * p), sharex=True)[:, 0]
-        else:
-            rows = np.ravel(np.asarray(ax, dtype=object))
-        shown = values[:, :: max(1, values.shape[1] // 32)]
-        for i, axis in enumerate(rows):
-            axis.plot(shown[:, :, i], color=style.BLUE, alpha=0.35, lw=0.5, rasterized=True)
-            if discard:
-                axis.axvspan(0, discard, color=style.GREY, alpha=0.25, lw=0)
-            axis.set_yscale("log" if logs[i] else "linear")
-            style.few_plain_ticks(axis.yaxis, most=4)
-            axis.set_ylabel(style.on_two_lines(names[i]))
-        rows[-1].set_xlabel("step")
-        return rows
+    values = np.asarray(chain, dtype=float)
+    p = values.shape[2]
+    logs = _logarithmic(values.reshape(-1, p), log)
+    if ax is None:
+        rows = style.new_axes(p, 1, size=(5.4, 1.0 + 1.3 * p), sharex=True)[:, 0]
+    else:
+        rows = np.ravel(np.asarray(ax, dtype=object))
+    shown = values[:, :: max(1, values.shape[1] // 32)]
+    for i, axis in enumerate(rows):
+        axis.plot(shown[:, :, i], color=style.BLUE, alpha=0.35, lw=0.5, rasterized=True)
+        if discard:
+            axis.axvspan(0, discard, color=style.GREY, alpha=0.25, lw=0)
+        axis.set_yscale("log" if logs[i] else "linear")
+        style.few_plain_ticks(axis.yaxis, most=4)
+        axis.set_ylabel(style.on_two_lines(names[i]))
+    rows[-1].set_xlabel("step")
+    return rows
 
 
 def _logarithmic(values: FloatArray, log: Sequence[bool]) -> list[bool]:

@@ -1,4 +1,4 @@
-"""Diagnostic plots of a fit: residuals, profiles, correlation, information of each point."""
+"""Diagnostic plots of a fit: residuals, profiles, correlation, information, budget, bench time."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from dahl_ident.plots import style
 
 _LARGEST_DISC = 250.0  # area, points squared
 _MOST_JOINED = 6  # curves; with more, lines between points only confuse
+_HATCHES = ("", "////", "....", "xxxx", "\\\\\\\\", "----")
 
 
+@style.house_style()
 def plot_residuals(
     x: ArrayLike,
     first: ArrayLike,
@@ -59,28 +61,25 @@ def plot_residuals(
     >>> plot_residuals([1.0, 2.0], [0.1, -0.2], [1.0, 0.3]).get_ylabel()
     'residual [standard deviations]'
     """
-    with style.house_style():
-        axis = style.axes(ax)
-        where = np.asarray(x)
-        axis.axhspan(-2.0, 2.0, color=style.GREY, alpha=0.12, lw=0)
-        axis.axhline(0.0, color=style.GREY, lw=0.8)
-        for y, name, colour, marker in zip(
-            (first, second), names, style.SERIES, style.MARKERS, strict=False
-        ):
-            axis.plot(where, y, marker, color=colour, label=name)
-            for part in _curves(where, group):
-                axis.plot(where[part], np.asarray(y)[part], lw=0.6, color=colour)
-        for index in np.asarray(suspicious, dtype=int):
-            for y in (first, second):
-                axis.plot(
-                    where[index], np.asarray(y)[index], "o", mfc="none", mec=style.PURPLE, ms=10
-                )
-        if where.min() > 0.0 and where.max() > 5.0 * where.min():
-            axis.set_xscale("log")
-            style.readable_log_ticks(axis)
-        axis.set(xlabel=x_label, ylabel="residual [standard deviations]")
-        style.legend_above(axis)
-        return axis
+    axis = style.axes(ax)
+    where = np.asarray(x)
+    axis.axhspan(-2.0, 2.0, color=style.GREY, alpha=0.12, lw=0)
+    axis.axhline(0.0, color=style.GREY, lw=0.8)
+    for y, name, colour, marker in zip(
+        (first, second), names, style.SERIES, style.MARKERS, strict=False
+    ):
+        axis.plot(where, y, marker, color=colour, label=name)
+        for part in _curves(where, group):
+            axis.plot(where[part], np.asarray(y)[part], lw=0.6, color=colour)
+    for index in np.asarray(suspicious, dtype=int):
+        for y in (first, second):
+            axis.plot(where[index], np.asarray(y)[index], "o", mfc="none", mec=style.PURPLE, ms=10)
+    if where.min() > 0.0 and where.max() > 5.0 * where.min():
+        axis.set_xscale("log")
+        style.readable_log_ticks(axis)
+    axis.set(xlabel=x_label, ylabel="residual [standard deviations]")
+    style.legend_above(axis)
+    return axis
 
 
 def _curves(x: FloatArray, group: ArrayLike | None) -> Iterator[NDArray[np.intp]]:
@@ -93,6 +92,7 @@ def _curves(x: FloatArray, group: ArrayLike | None) -> Iterator[NDArray[np.intp]
             yield rows[np.argsort(x[rows])]
 
 
+@style.house_style()
 def plot_profile(
     value: ArrayLike,
     deviance: ArrayLike,
@@ -131,23 +131,23 @@ def plot_profile(
     >>> axis.get_xlabel()
     'k [N/m]'
     """
-    with style.house_style():
-        axis = style.axes(ax)
-        axis.plot(value, deviance, color=style.BLUE, marker=".", lw=1.2)
-        axis.axvline(best, color=style.FIT, lw=0.8)
-        for name, height in limits.items():
-            axis.axhline(height, color=style.GREY, lw=0.8, ls="--")
-            axis.annotate(
-                name, (1.02, height), xycoords=("axes fraction", "data"), va="center", fontsize=7,
-                color=style.GREY, annotation_clip=False,
-            )  # fmt: skip
-        top = 1.2 * max(limits.values())
-        axis.set(xlabel=label, ylabel="rise of deviance", ylim=(-0.02 * top, top))
-        axis.set_xscale("log" if log else "linear")
-        style.few_plain_ticks(axis.xaxis)
-        return axis
+    axis = style.axes(ax)
+    axis.plot(value, deviance, color=style.BLUE, marker=".", lw=1.2)
+    axis.axvline(best, color=style.FIT, lw=0.8)
+    for name, height in limits.items():
+        axis.axhline(height, color=style.GREY, lw=0.8, ls="--")
+        axis.annotate(
+            name, (1.02, height), xycoords=("axes fraction", "data"), va="center", fontsize=7,
+            color=style.GREY, annotation_clip=False,
+        )  # fmt: skip
+    top = 1.2 * max(limits.values())
+    axis.set(xlabel=label, ylabel="rise of deviance", ylim=(-0.02 * top, top))
+    axis.set_xscale("log" if log else "linear")
+    style.few_plain_ticks(axis.xaxis)
+    return axis
 
 
+@style.house_style()
 def plot_correlation(
     names: Sequence[str], correlation: ArrayLike, *, ax: Axes | None = None
 ) -> Axes:
@@ -173,21 +173,21 @@ def plot_correlation(
     >>> len(axis.texts)
     4
     """
-    with style.house_style():
-        axis = style.axes(ax, size=(3.6, 3.2))
-        matrix = np.asarray(correlation)
-        axis.imshow(matrix, cmap="PuOr", vmin=-1.0, vmax=1.0)
-        for (i, j), value in np.ndenumerate(matrix):
-            axis.text(
-                j, i, f"{value:.2f}", ha="center", va="center", fontsize=8,
-                color="white" if abs(value) > 0.6 else "black",
-            )  # fmt: skip
-        axis.set_xticks(range(len(names)), names, rotation=30, ha="right")
-        axis.set_yticks(range(len(names)), names)
-        axis.grid(visible=False)
-        return axis
+    axis = style.axes(ax, size=(3.6, 3.2))
+    matrix = np.asarray(correlation)
+    axis.imshow(matrix, cmap="PuOr", vmin=-1.0, vmax=1.0)
+    for (i, j), value in np.ndenumerate(matrix):
+        axis.text(
+            j, i, f"{value:.2f}", ha="center", va="center", fontsize=8,
+            color="white" if abs(value) > 0.6 else "black",
+        )  # fmt: skip
+    axis.set_xticks(range(len(names)), names, rotation=30, ha="right")
+    axis.set_yticks(range(len(names)), names)
+    axis.grid(visible=False)
+    return axis
 
 
+@style.house_style()
 def plot_information(
     x: ArrayLike,
     shares: Mapping[str, ArrayLike],
@@ -221,27 +221,135 @@ def plot_information(
     >>> [label.get_text() for label in axis.get_yticklabels()], axis.texts[0].get_text()
     (['f_max'], '80 %')
     """
-    with style.house_style():
-        axis = style.axes(ax, size=(4.6, 1.2 + 0.5 * len(shares)))
-        where = np.asarray(x, dtype=float)
-        parts = [np.nan_to_num(np.asarray(share, dtype=float)) for share in shares.values()]
-        area = _LARGEST_DISC / (max(float(part.max()) for part in parts) or 1.0)
-        for line, (part, colour) in enumerate(
-            zip(parts, itertools.cycle(style.SERIES), strict=False)
-        ):
-            axis.scatter(
-                where, np.full(where.size, line), s=area * part, color=colour, alpha=0.6,
-                edgecolor=style.BLACK, lw=0.5, zorder=3,
+    axis = style.axes(ax, size=(4.6, 1.2 + 0.5 * len(shares)))
+    where = np.asarray(x, dtype=float)
+    parts = [np.nan_to_num(np.asarray(share, dtype=float)) for share in shares.values()]
+    area = _LARGEST_DISC / (max(float(part.max()) for part in parts) or 1.0)
+    for line, (part, colour) in enumerate(zip(parts, itertools.cycle(style.SERIES), strict=False)):
+        axis.scatter(
+            where, np.full(where.size, line), s=area * part, color=colour, alpha=0.6,
+            edgecolor=style.BLACK, lw=0.5, zorder=3,
+        )  # fmt: skip
+        largest = int(np.argmax(part))
+        if part[largest] > 0.0:
+            axis.annotate(
+                f"{100.0 * part[largest]:.0f} %", (where[largest], line), (0, 10),
+                textcoords="offset points", ha="center", fontsize=7,
             )  # fmt: skip
-            largest = int(np.argmax(part))
-            if part[largest] > 0.0:
-                axis.annotate(
-                    f"{100.0 * part[largest]:.0f} %", (where[largest], line), (0, 10),
-                    textcoords="offset points", ha="center", fontsize=7,
+    axis.set(xlabel=x_label, xscale="log", ylim=(len(shares) - 0.4, -0.8))
+    axis.set_title("share of the information, by area", fontsize=8, loc="left")
+    axis.set_yticks(range(len(shares)), list(shares))
+    axis.margins(x=0.08)
+    style.readable_log_ticks(axis)
+    return axis
+
+
+@style.house_style()
+def plot_budget(
+    rows: Sequence[tuple[str, str, float]],
+    *,
+    x_label: str = "share of the variance [%]",
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the contributions to each parameter's variance as a stacked bar.
+
+    Parameters
+    ----------
+    rows : sequence of (parameter, source, share)
+        Shares between 0 and 1; those of one parameter sum to 1. Bars stand in the order in which
+        parameters first appear, sources likewise.
+    x_label : str
+        Axis label.
+    ax : Axes, optional
+        New where left out.
+
+    Returns
+    -------
+    Axes
+        One bar for each parameter. Sources differ in colour and hatching; shares of 10 % and more
+        are written on them.
+
+    Examples
+    --------
+    >>> axis = plot_budget([("f_max", "noise", 0.25), ("f_max", "force calibration", 0.75)])
+    >>> [text.get_text() for text in axis.texts]
+    ['25 %', '75 %']
+    """
+    parameters = list(dict.fromkeys(parameter for parameter, _, _ in rows))
+    sources = list(dict.fromkeys(source for _, source, _ in rows))
+    legend_rows = -(-len(sources) // 3)
+    size = (5.6, 1.0 + 0.45 * len(parameters) + 0.2 * legend_rows)
+    axis = style.axes(ax, size=size)
+    ends = np.zeros(len(parameters))
+    for i, source in enumerate(sources):
+        widths = np.zeros(len(parameters))
+        for parameter, name, share in rows:
+            if name == source:
+                widths[parameters.index(parameter)] += 100.0 * share
+        colour = style.SERIES[i % len(style.SERIES)]
+        axis.barh(
+            range(len(parameters)), widths, left=ends, height=0.6, label=source, lw=1.0,
+            color="white" if i else colour, edgecolor=colour, hatch=_HATCHES[i % len(_HATCHES)],
+        )  # fmt: skip
+        for line, (start, width) in enumerate(zip(ends, widths, strict=True)):
+            if width >= 10.0:
+                axis.text(
+                    start + 0.5 * width, line, f"{width:.0f} %", ha="center", va="center",
+                    fontsize=7, bbox={"fc": "white", "ec": "none", "pad": 1.0},
                 )  # fmt: skip
-        axis.set(xlabel=x_label, xscale="log", ylim=(len(shares) - 0.4, -0.8))
-        axis.set_title("share of the information, by area", fontsize=8, loc="left")
-        axis.set_yticks(range(len(shares)), list(shares))
-        axis.margins(x=0.08)
-        style.readable_log_ticks(axis)
-        return axis
+        ends += widths
+    axis.set(xlabel=x_label, xlim=(0.0, 100.0), ylim=(len(parameters) - 0.4, -0.6))
+    axis.set_yticks(range(len(parameters)), parameters)
+    axis.grid(visible=False, axis="y")
+    axis.legend(ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2)
+    return axis
+
+
+@style.house_style()
+def plot_bench_time(
+    curves: Mapping[str, tuple[ArrayLike, ArrayLike, ArrayLike]],
+    target: Mapping[str, float] | None = None,
+    *,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw relative standard uncertainties over bench time.
+
+    Parameters
+    ----------
+    curves : mapping of str to (time, planned, grid)
+        For each quantity: seconds, and its uncertainty by plans and by a logarithmic grid; NaN
+        where a time is too short.
+    target : mapping of str to float, optional
+        Wanted uncertainties, drawn as dotted lines.
+    ax : Axes, optional
+        New where left out.
+
+    Returns
+    -------
+    Axes
+        Plans solid, grids dashed; both axes logarithmic.
+
+    Examples
+    --------
+    >>> axis = plot_bench_time({"f_max": ([10.0, 40.0], [0.02, 0.01], [0.04, 0.02])})
+    >>> len(axis.lines)
+    2
+    """
+    axis = style.axes(ax, size=(5.2, 3.4))
+    for i, (name, (time, planned, grid)) in enumerate(curves.items()):
+        colour = style.SERIES[i % len(style.SERIES)]
+        axis.plot(time, 100.0 * np.asarray(planned), "o-", color=colour, label=f"{name}, plan")
+        if np.isfinite(grid).any():
+            axis.plot(
+                time, 100.0 * np.asarray(grid), "s--", color=colour, mfc="white",
+                label=f"{name}, logarithmic grid",
+            )  # fmt: skip
+        if target and name in target:
+            axis.axhline(100.0 * target[name], color=colour, ls=":", lw=1.0)
+    axis.set(
+        xscale="log", yscale="log", xlabel="bench time [s]",
+        ylabel="relative uncertainty [%]",
+    )  # fmt: skip
+    style.readable_log_ticks(axis)
+    axis.legend()
+    return axis

@@ -1,4 +1,4 @@
-"""Recorded waveforms against time, and hysteresis loops."""
+"""Waveforms against time, cycles of an extraction, and fits of records."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.errors import ValidationError
 from dahl_ident.plots import style
+from dahl_ident.plots.friction import plot_recorded_loops
 
 
+@style.house_style()
 def plot_waveforms(
     time: ArrayLike,
     channels: Sequence[tuple[str, ArrayLike]],
@@ -49,65 +51,139 @@ def plot_waveforms(
     >>> rows[0].get_ylabel(), rows[0].get_xlabel()
     ('force [N]', 'time [s]')
     """
-    with style.house_style():
-        if ax is None:
-            size = (6.4, 0.8 + 1.4 * len(channels))
-            rows = style.new_axes(len(channels), 1, size=size, sharex=True)[:, 0]
-        else:
-            rows = np.ravel(np.asarray(ax, dtype=object))
-            if rows.size != len(channels):
-                raise ValidationError(
-                    f"ax holds {rows.size} axes; expected {len(channels)}, one for each channel"
-                )
-        predicted = [*fitted, *[None] * (len(channels) - len(fitted))]
-        for axis, (label, samples), model in zip(rows, channels, predicted, strict=True):
-            axis.plot(time, samples, color=style.BLUE, lw=0.8, label="measured")
-            if model is not None:
-                axis.plot(time, model, "--", color=style.VERMILION, lw=1.0, label="fit")
-                style.legend_above(axis)
-            axis.set_ylabel(label)
-        rows[-1].set_xlabel("time [s]")
-        return rows
+    if ax is None:
+        size = (6.4, 0.8 + 1.4 * len(channels))
+        rows = style.new_axes(len(channels), 1, size=size, sharex=True)[:, 0]
+    else:
+        rows = np.ravel(np.asarray(ax, dtype=object))
+        if rows.size != len(channels):
+            raise ValidationError(
+                f"ax holds {rows.size} axes; expected {len(channels)}, one for each channel"
+            )
+    predicted = [*fitted, *[None] * (len(channels) - len(fitted))]
+    for axis, (label, samples), model in zip(rows, channels, predicted, strict=True):
+        axis.plot(time, samples, color=style.BLUE, lw=0.8, label="measured")
+        if model is not None:
+            axis.plot(time, model, "--", color=style.VERMILION, lw=1.0, label="fit")
+            style.legend_above(axis)
+        axis.set_ylabel(label)
+    rows[-1].set_xlabel("time [s]")
+    return rows
 
 
-def plot_recorded_loops(
-    displacement: ArrayLike,
-    force: ArrayLike,
+@style.house_style()
+def plot_cycles(
+    response: ArrayLike,
+    force_mean: ArrayLike,
     *,
-    fitted: ArrayLike | None = None,
-    displacement_label: str = "displacement [m]",
-    force_label: str = "force [N]",
-    ax: Axes | None = None,
-) -> Axes:
-    """Draw recorded force against motion, with the force that a fit gives over it.
+    left_out: int = 0,
+    response_std: float | None = None,
+    mean_std: float | None = None,
+    ax: Sequence[Axes] | None = None,
+) -> tuple[Axes, Axes]:
+    """Draw how one point settled: its response and mean force, cycle by cycle.
 
     Parameters
     ----------
-    displacement, force : array_like, shape (n,)
-        Samples; the motion may be a velocity or an acceleration as well.
-    fitted : array_like, shape (n,), optional
-        The model's force at these samples.
-    displacement_label, force_label : str
-        Axis labels with units.
-    ax : Axes, optional
+    response : array_like of complex, shape (n,)
+        Dynamic stiffness of each cycle, N/m.
+    force_mean : array_like, shape (n,)
+        Mean force of each cycle, N; its decay is the first sign of unsettled friction.
+    left_out : int, default 0
+        Leading cycles that were left out, shaded.
+    response_std, mean_std : float, optional
+        Standard deviation of one cycle's value, drawn as a band around the median.
+    ax : sequence of two Axes, optional
         New where left out.
 
     Returns
     -------
-    Axes
-        Force over motion.
+    tuple of Axes
+        Response above, in percent of its median and relative to it; mean force below.
 
     Examples
     --------
-    >>> plot_recorded_loops([0.0, 1.0], [0.0, 2.0]).get_xlabel()
-    'displacement [m]'
+    >>> top, bottom = plot_cycles([1 + 1j, 1 + 0.9j], [0.1, 0.0])
+    >>> bottom.get_ylabel()
+    'mean force [N]'
     """
-    with style.house_style():
-        axis = style.axes(ax)
-        axis.plot(displacement, force, color=style.BLUE, lw=0.8, label="measured")
-        if fitted is not None:
-            axis.plot(displacement, fitted, "--", color=style.VERMILION, lw=1.0, label="fit")
-            style.legend_above(axis)
-        axis.set(xlabel=displacement_label, ylabel=force_label)
-        style.few_plain_ticks(axis.xaxis, most=6)
+    top, bottom = style.axes_pair(ax)
+    R, mean = np.asarray(response), np.asarray(force_mean)
+    cycle = np.arange(1, R.size + 1)
+    middle = np.median(R[left_out:].real) + 1j * np.median(R[left_out:].imag)
+    away = 100.0 * (R - middle) / np.abs(middle)
+    top.plot(cycle, away.real, "o-", color=style.BLUE, lw=0.8, label="real part")
+    top.plot(cycle, away.imag, "s-", color=style.VERMILION, lw=0.8, label="imaginary part")
+    bottom.plot(cycle, mean, "o-", color=style.GREEN, lw=0.8)
+    if response_std is not None:
+        half = 200.0 * response_std / np.abs(middle)
+        top.axhspan(-half, half, color=style.GREY, alpha=0.15, lw=0)
+    if mean_std is not None:
+        centre, half = np.median(mean[left_out:]), 2.0 * mean_std
+        bottom.axhspan(centre - half, centre + half, color=style.GREY, alpha=0.15, lw=0)
+    for axis in (top, bottom) if left_out else ():
+        axis.axvspan(0.5, left_out + 0.5, color=style.GREY, alpha=0.3, lw=0)
+    top.set(ylabel="response, off its median [%]")
+    bottom.set(xlabel="cycle", ylabel="mean force [N]")
+    style.legend_above(top)
+    return top, bottom
+
+
+@style.house_style()
+def draw_record_fit(fit: Any, kind: str, number: int, ax: Axes | None = None) -> Axes:
+    """Draw one record of a fit.
+
+    Parameters
+    ----------
+    fit : RecordFit
+    kind : {"time", "loop", "residuals", "residuals_displacement"}
+    number : int
+        Which record.
+    ax : Axes, optional
+        To draw residuals into.
+
+    Returns
+    -------
+    matplotlib Axes
+
+    Raises
+    ------
+    ValidationError
+        If the kind is unknown, or displacement is wanted that the record does not have.
+    """
+    record, residual = fit.records[number], fit.residuals[number]
+    measured = fit.problem.measured[number]
+    labels = {name.partition(" ")[0]: str(name) for name in record.to_frame().columns}  # with units
+    channel = "force" if fit.problem.output == "force" else record.motion_channel
+    if kind == "time":
+        axes = plot_waveforms(record.time, [(channel, measured)], fitted=[measured - residual])
+        axis: Axes = axes[0]
         return axis
+    if kind == "loop":
+        if record.displacement is None:
+            raise ValidationError("a loop needs displacement, which the record does not have")
+        force = record.force_samples
+        fitted = measured - residual if fit.problem.output == "force" else None
+        return plot_recorded_loops(
+            record.displacement,
+            force,
+            fitted=fitted,
+            displacement_label=labels["displacement"],
+            force_label=labels.get("force", "force"),
+        )
+    if kind not in ("residuals", "residuals_displacement"):
+        raise ValidationError(
+            f"kind is {kind!r}; expected time, loop, residuals or residuals_displacement"
+        )
+    over, label = record.time, "time [s]"
+    if kind != "residuals":
+        if record.displacement is None:
+            raise ValidationError("the record has no displacement to draw residuals against")
+        over, label = record.displacement, labels["displacement"]
+    axis = ax or style.new_axes(1, 1, size=(6.4, 3.0), sharex=True)[0, 0]
+    axis.plot(over, residual, color=style.BLUE, lw=0.6)
+    axis.axhline(0.0, color="0.5", lw=0.6)
+    axis.set_xlabel(label)
+    axis.set_ylabel(f"measured minus fitted {channel}")
+    axis.set_title(f"{np.sqrt(np.mean(residual**2)):.3g} rms")
+    return axis

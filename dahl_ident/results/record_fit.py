@@ -560,7 +560,7 @@ class RecordFit(Result):
         -------
         matplotlib Axes
         """
-        from dahl_ident.plots.record_fit import draw_record_fit
+        from dahl_ident.plots.waveforms import draw_record_fit
 
         return draw_record_fit(self, kind or "time", record, ax)
 
