@@ -28,7 +28,7 @@ from dahl_ident.cli.model import elements
 from dahl_ident.elements.description import describe_model, model_from_description
 from dahl_ident.errors import ModelError
 from tests.test_generic_friction import Jenkins
-from tests.test_response_of_any_law import all_amplitudes
+from tests.test_law_contract import all_amplitudes
 
 AT_REST = np.zeros(())
 

@@ -11,6 +11,8 @@ import pytest
 import dahl_ident as di
 from dahl_ident.diagnostics import Verdict
 
+ROWS = 6  # of a harmonic; the loop of each is integrated in every step
+
 
 class PullPush(di.Friction):
     """Linear Dahl with a limit for pulling and one for pushing: the mirrored law exchanges them."""
@@ -27,11 +29,11 @@ class PullPush(di.Friction):
 
 def data(harmonics: tuple[int, ...], pull: float, push: float) -> di.FrequencyResponse:
     rng = np.random.default_rng(5)
-    A = np.tile(np.geomspace(1e-3, 3e-2, 10), len(harmonics))
-    k = np.repeat(harmonics, 10)
+    A = np.tile(np.geomspace(1e-3, 3e-2, ROWS), len(harmonics))
+    k = np.repeat(harmonics, ROWS)
     law = PullPush(pull, push, 30.0)
     Z = np.array([law.dynamic_stiffness(a, harmonic=int(n)) for a, n in zip(A, k, strict=True)])
-    size = np.abs(np.tile(Z[:10], len(harmonics)))
+    size = np.abs(np.tile(Z[:ROWS], len(harmonics)))
     Z = Z + 0.005 * size * (rng.standard_normal(A.size) + 1j * rng.standard_normal(A.size))
     Z[k == 0] = Z[k == 0].real
     return di.FrequencyResponse(

@@ -9,7 +9,7 @@ import pytest
 from dahl_ident import Damper, FrequencyResponse, Iwan, Mass, MaxwellSlip, Spring, response
 from dahl_ident.errors import ValidationError
 from dahl_ident.problem import Problem
-from tests.test_response_of_any_law import all_amplitudes
+from tests.test_law_contract import all_amplitudes
 
 AT_REST = np.zeros(())
 

@@ -12,13 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import dahl_ident as di
 from dahl_ident import Model
 from dahl_ident.elements import Element
 from tests.command_line import Runner
 from tests.test_every_law import LAWS
-from tests.test_response_of_any_law import all_amplitudes
+from tests.test_generic_friction import Jenkins
 
 KINDS = sorted(LAWS)
 every_kind = pytest.mark.parametrize("kind", KINDS)
@@ -57,12 +58,38 @@ def fitted(kind: str) -> di.FitResult:
     return di.fit(data(kind), asked(kind))
 
 
+def all_amplitudes(plant: Element, frequency_hz: float, drive: float) -> list[float]:
+    """Return every amplitude at which the plant needs the drive, by a bracketing root search."""
+    omega = 2.0 * np.pi * frequency_hz
+    A = np.geomspace(1e-9, 1e3, 2000)
+    excess = np.abs(A * plant.dynamic_stiffness(A, omega)) - drive
+    crossings = np.flatnonzero(excess[1:] * excess[:-1] < 0.0)
+    return [
+        brentq(
+            lambda a: abs(a * complex(plant.dynamic_stiffness(a, omega))) - drive,
+            A[i], A[i + 1], rtol=1e-13, xtol=1e-300,
+        )
+        for i in crossings
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("frequency_hz", "drive"), [(0.4, 1.1), (0.0, 0.05), (1.5, 3.0)])
 @every_kind
-def test_response_is_what_a_root_search_finds(kind: str) -> None:
+def test_response_is_what_a_root_search_finds(kind: str, frequency_hz: float, drive: float) -> None:
     plant = known(kind) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3, name="base")
-    found = di.response(plant, 0.4, 1.1, all_roots=True, steady="describing function")
-    expected = all_amplitudes(plant, 0.4, 1.1)
-    np.testing.assert_allclose(np.ravel(found.amplitude), expected, rtol=1e-7)
+    response = di.response(plant, frequency_hz, drive, all_roots=True, steady="describing function")
+    expected = all_amplitudes(plant, frequency_hz, drive)
+    assert len(expected) == int(response.number_of_solutions)
+    np.testing.assert_allclose(np.ravel(response.amplitude), expected, rtol=1e-7)
+
+
+def test_no_element_that_depends_on_amplitude_is_taken_as_linear() -> None:
+    plant = Jenkins(3.0, 0.004, name="joint") + di.Damper(0.05) + di.Spring(2.0)
+    response = di.response(plant, 0.5, 0.05, steady="describing function")
+    (expected,) = all_amplitudes(plant, 0.5, 0.05)
+    as_if_linear = 0.05 / abs(complex(plant.dynamic_stiffness(0.0, np.pi)))
+    assert float(np.ravel(response.amplitude)[0]) == pytest.approx(expected, rel=1e-8)
+    assert abs(expected / as_if_linear - 1.0) > 0.5
 
 
 @every_kind
@@ -86,6 +113,20 @@ def test_ipopt_and_grid_agree_with_it(kind: str) -> None:
     grid = di.posterior(fit.data, asked(kind), method="grid", tolerance=1e-2, uncertainty="noise")
     for name in fit.var_names:
         assert abs(grid.params[name].value - best(fit)[name]) < 1.5 * fit.stderr_noise[name]
+    for result in (fit, grid):
+        assert np.isfinite(result.predict([1.0], amplitude=[1.0]).gain()[1]).all()
+
+
+def test_a_chain_agrees_with_the_fit_and_its_energy_with_the_closed_form() -> None:
+    fit = fitted("jenkins")
+    chain = di.posterior(fit, seed=1, steps=60)
+    for name in fit.var_names:
+        error = fit.params[name].stderr
+        assert error is not None
+        assert abs(chain.params[name].value - fit.params[name].value) < error
+    for result in (fit, chain):
+        energy = next(q for q in result.derived([2.0]) if q.name.startswith("energy"))
+        assert abs(energy.value - 4.0 * 3.0 * 0.3 * (2.0 - 0.3)) < 4.0 * energy.stderr
 
 
 @every_kind

@@ -28,7 +28,7 @@ from dahl_ident.elements import Element
 from dahl_ident.elements.masing import jenkins
 from dahl_ident.errors import DataError, ModelError, ValidationError
 from tests.test_generic_friction import Jenkins
-from tests.test_response_of_any_law import all_amplitudes
+from tests.test_law_contract import all_amplitudes
 
 SLIPS, STIFF = np.array([0.1, 0.3, 1.0]), np.array([3.0, 2.0, 1.0])
 LAW = MaxwellSlip(SLIPS, STIFF)

@@ -11,7 +11,7 @@ import pytest
 from dahl_ident import Dahl, Damper, Mass, Model, PowerDamper, Spring, response
 from dahl_ident.elements.description import describe_model, model_from_description
 from dahl_ident.errors import ValidationError
-from tests.test_response_of_any_law import all_amplitudes
+from tests.test_law_contract import all_amplitudes
 
 
 def exactly(c: float, p: float, A: float, omega: float, k: int) -> complex:
