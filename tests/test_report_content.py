@@ -456,6 +456,7 @@ def test_a_table_and_waveforms_of_one_test_are_compared(f_max: float, tmp_path: 
     pytest.importorskip("jsonschema").validate(facts, SCHEMA)
     assert {change["parameter"] for change in facts["changes"]} == {"f_max", "sigma"}
     assert ("f_max" in facts["disagree"]) is (f_max != 0.1)
+    assert (facts["status"] == "not described") is (f_max != 0.1)
     first = facts["verdict"][0]
     if f_max == 0.1:
         assert first == "Table and waveforms agree within their uncertainties."

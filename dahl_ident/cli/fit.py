@@ -249,11 +249,13 @@ def report(
 ) -> None:
     """Fit and write a report; or write a report on fits saved by fit --save.
 
-    Several saved fits are overlaid, and the changes from each to the next are listed.
+    Several saved fits are overlaid, and the changes from each to the next are listed. A fit of a
+    table and one of its waveforms are compared; the exit status is 3 if they disagree.
 
     Example: dahl-ident datasets noisy -o - | dahl-ident report - -o report.html
     """
     from dahl_ident.data import read_record
+    from dahl_ident.reporting.joint import disagreements
     from dahl_ident.results import RecordFit
 
     laws.run()
@@ -293,4 +295,6 @@ def report(
         console.write_json(places)
     elif STANDARD not in places:
         console.write("\n".join(places))
+    contradictions = disagreements(fits)
+    console.finish(not contradictions, " ".join(contradictions))
     finish(worst(fits))

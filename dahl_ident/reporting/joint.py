@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import product
 
 from dahl_ident.diagnostics.formatting import rounded, with_unit
+from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.reporting.document import MARKS, Cell, Document, Paragraph, Section, Table
 from dahl_ident.results import FitResult, RecordFit
 from dahl_ident.results.changes import SIGNIFICANT, Change, changes
@@ -27,14 +28,16 @@ def joint(table: Document, waveforms: Document, results: Sequence[object]) -> Do
         *table.sections,
         *(replace(section, title=f"{section.title}: waveforms") for section in waveforms.sections),
     ]
-    order = list(MARKS)
+    statuses = [table.status, waveforms.status]
+    if disagreements(results):  # one model, with its uncertainties, does not describe both
+        statuses.append(str(VerdictStatus.NOT_DESCRIBED))
     header = dict(table.header)
     header["Data"] = (*header["Data"], *dict(waveforms.header)["Data"])
     return replace(
         table,
-        status=max(table.status, waveforms.status, key=order.index),
+        status=max(statuses, key=list(MARKS).index),
         verdict=(
-            *_sentences(differences),
+            *_comparison_in_words(results),
             *(f"Table: {line}" for line in table.verdict),
             *(f"Waveforms: {line}" for line in waveforms.verdict),
         ),
@@ -71,32 +74,37 @@ def _disagree(change: Change, differences: Sequence[_Difference]) -> bool:
     return change.p * sum(math.isfinite(c.p) for c, _, _ in differences) < SIGNIFICANT
 
 
-def _sentences(differences: Sequence[_Difference]) -> Iterator[str]:
-    for change, fit, other in differences:
+def disagreements(results: Sequence[object]) -> list[str]:
+    """Return a sentence for each parameter that a table and waveforms give differently."""
+    differences = list(_differences(results))
+    sentences = []
+    for change, *fits in differences:
         if _disagree(change, differences):
-            name, unit = change.parameter, change.unit
-            one, two = (
-                with_unit(e.value, e.stderr or 0.0, unit)
-                for e in (fit.params[name], other.params[name])
-            )
-            yield (
+            name = change.parameter
+            estimates = (fit.params[name] for fit in fits)
+            one, two = (with_unit(e.value, e.stderr or 0.0, change.unit) for e in estimates)
+            sentences.append(
                 f"Table and waveforms disagree: {name} is {one} from the table and {two} from the "
                 f"waveforms ({change.p_text}). At least one has an error that its uncertainty does "
                 "not hold."
             )
-    usable = [change for change, _, _ in differences if math.isfinite(change.p)]
-    if usable and not any(_disagree(change, differences) for change in usable):
-        yield "Table and waveforms agree within their uncertainties."
-    elif not usable:
-        yield "Table and waveforms cannot be compared: they have no usable estimate in common."
+    return sentences
+
+
+def _comparison_in_words(results: Sequence[object]) -> list[str]:
+    if sentences := disagreements(results):
+        return sentences
+    if any(math.isfinite(change.p) for change, _, _ in _differences(results)):
+        return ["Table and waveforms agree within their uncertainties."]
+    return ["Table and waveforms cannot be compared: they have no usable estimate in common."]
 
 
 def _comparison(differences: Sequence[_Difference]) -> Section:
     rows = []
-    for change, fit, other in differences:
+    for change, *fits in differences:
         estimates = []
-        for one in (fit, other):
-            estimate = one.params[change.parameter]
+        for fit in fits:
+            estimate = fit.params[change.parameter]
             value, error = rounded(estimate.value, estimate.stderr or 0.0)
             estimates.append(Cell(f"{value} \u00b1 {error}", estimate.value))
         value, error = rounded(change.change, change.u)
