@@ -15,6 +15,7 @@ import pytest
 
 import dahl_ident as di
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import Parameter
 
 MASS, DAMPING, STIFFNESS = 0.3, 1.0, 8.0
 F_MAX, SIGMA = 0.1, 30.0
@@ -99,6 +100,16 @@ class Case(NamedTuple):
     free: tuple[str, ...] = ("damping", "stiffness")
 
 
+def oscillator(mass: float, damping: float, stiffness: float) -> Any:
+    """The receptance of the plant without friction."""
+    return control.tf([1.0], [mass, damping, stiffness])
+
+
+def positive(start: float) -> Parameter:
+    """A free argument of a linear system."""
+    return Parameter("", "", "", start, free=True, lower=0.0, transform="log")
+
+
 BOTH = {"f_max": F_MAX, "sigma": SIGMA}
 ONE = Sliders(np.array([SIGMA]), np.array([F_MAX / SIGMA]))
 PAIR = Sliders(np.array([20.0, 10.0]), np.array([0.002, 0.006]))
@@ -124,6 +135,14 @@ CASES = {
         di.LinearSystem(control.tf([1.0], [MASS, DAMPING, STIFFNESS]), quantity="receptance")
         + di.Dahl(alpha=1.0),
         dahl(), BOTH, free=(),
+    ),
+    "linear system, free parameters": Case(
+        di.LinearSystem(
+            oscillator, quantity="receptance",
+            parameters={"mass": MASS, "damping": positive(1.5), "stiffness": positive(5.0)},
+        )
+        + di.Dahl(alpha=1.0),
+        dahl(), BOTH,
     ),
 }  # fmt: skip
 
@@ -193,10 +212,11 @@ def test_a_law_in_a_driven_plant_is_found(name: str) -> None:
     case = CASES[name]
     size = (3, 4) if name == "Iwan" else (3, 6)  # the slowest: thirty sliders
     model = case.law
-    if name != "linear system":
+    if "linear system" not in name:
         model = model + di.Mass(MASS)
     for part, element in (("damping", di.Damper()), ("stiffness", di.Spring())):
-        model = model + element if part in case.free else model
+        known = part in case.free and part not in {p.name for p in case.law.parameters}
+        model = model + element if known else model
     fit = di.fit(table(case, *size), model)
     assert fit.trusted or case.blind, fit.verdict
     assert fit.identifiability.named(di.diagnostics.Verdict.NOT_IDENTIFIED) == [*case.blind]

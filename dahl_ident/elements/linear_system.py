@@ -34,6 +34,10 @@ from dahl_ident.units import QUANTITIES, Quantity
 
 _VANISHES = 1e-12  # of its terms: a sum that is 0 but for rounding
 _UNSTABLE = 1e-9  # of the fastest pole: a real part above grows
+_NO_STEP = (
+    "{} is exactly 0, which gives its derivative no step; start it from a small number, or write "
+    "the function with an offset"
+)
 _FORCE_OVER_MOTION = ("dynamic_stiffness", "mechanical_impedance", "apparent_mass")
 
 
@@ -63,9 +67,10 @@ class LinearSystem(Element):
 
     Notes
     -----
-    In records, a fixed continuous system has a force over time: its Z(s) is a stiffness, a damper,
-    a mass, and poles whose states at the first sample are unknowns of the fit. So a receptance with
-    inertia is driven by a measured force without `Mass`; an absorber needs one in parallel.
+    A continuous system has an equation of motion: its Z(s) is a stiffness, a damper, a mass, and
+    poles. So a receptance with inertia is driven by a force without `Mass`; an absorber needs one
+    in parallel. In records only a fixed system has one, and the states of its poles at the first
+    sample are unknowns of the fit.
 
     Evaluating outside the frequencies of an FRD, above half a sampling rate, or where the
     response determines no stiffness, raises ValidationError. Derivatives by the arguments
@@ -137,7 +142,7 @@ class LinearSystem(Element):
         harmonic: int = 1,
     ) -> ComplexArray:
         """Return Z(omega); the amplitude does not matter, and a sine answers no harmonic."""
-        Z = self._for_each_vector(values, omega, harmonic, self._curve, rows=1)[0]
+        Z = self._for_each_vector(values, omega, harmonic, self._curve, size=1)[0]
         return np.asarray(Z + 0.0 * amplitude)
 
     def stiffness_gradient(
@@ -159,8 +164,8 @@ class LinearSystem(Element):
         free = [p.name for p in self.parameters if p.free]
         if free:
             raise ModelError(
-                f"{self!r} leaves {', '.join(free)} free, and only a fixed system has an equation "
-                "of motion; fix it, or build what is unknown from Mass, Damper and Spring"
+                f"{self!r} leaves {', '.join(free)} free, and only a fixed system has a force over "
+                "time in a record; fix it, or build what is unknown from Mass, Damper and Spring"
             )
         at = tuple(float(v) for v in self.known_values())
         if self._parts is None or self._parts[0] != at:
@@ -173,14 +178,19 @@ class LinearSystem(Element):
         lean = control.tf(Z.numerator, Z.denominator).minreal()
         if lean.den[0][0].size < Z.denominator.size:
             Z = Rational(lean.num[0][0], lean.den[0][0])
+        self._check_growth(Z)
         polynomial, rest = Z.split()
-        if polynomial.size > 3:
-            raise ModelError(
-                f"the dynamic stiffness of {self!r} grows as s^{polynomial.size - 1}; an equation "
-                "of motion allows s^2, a mass: give the system at its point of drive"
-            )
         k, c, m = [*polynomial[::-1].tolist(), 0.0, 0.0][:3]
         return (k, c, m), rest.state_space()
+
+    def _check_growth(self, Z: Rational) -> None:
+        """Refuse a dynamic stiffness that grows faster than that of a mass."""
+        power = Z.numerator.size - Z.denominator.size
+        if power > 2:
+            raise ModelError(
+                f"the dynamic stiffness of {self!r} grows as s^{power}; an equation "
+                "of motion allows s^2, a mass: give the system at its point of drive"
+            )
 
     @property
     def n_states(self) -> int:
@@ -372,19 +382,21 @@ class LinearSystem(Element):
         omega: FloatArray,
         harmonic: int,
         work: Callable[[tuple[float, ...], FloatArray], ComplexArray],
-        rows: int,
+        size: int,
     ) -> ComplexArray:
-        """Return what `work` gives for every parameter vector, shape (rows, *broadcast)."""
+        """Return what `work` gives for every parameter vector, shape (size, *broadcast)."""
         batch = np.broadcast_shapes(*(np.shape(v) for v in values))
         shape = np.broadcast_shapes(batch, np.shape(omega))
-        result = np.zeros((rows, *shape), dtype=np.complex128)
+        result = np.zeros((size, *shape), dtype=np.complex128)
         if harmonic != 1:
             return result
         vectors = np.stack([np.broadcast_to(v, batch).ravel() for v in (*values, np.zeros(batch))])
         which = np.broadcast_to(np.arange(vectors.shape[1]).reshape(batch), shape)
         frequencies = np.broadcast_to(omega, shape)
         for i, vector in enumerate(vectors[:-1].T.tolist()):
-            result[:, which == i] = work(tuple(vector), frequencies[which == i])
+            finite = np.isfinite(vector).all()  # a search may try others
+            rows = which == i
+            result[:, rows] = work(tuple(vector), frequencies[rows]) if finite else np.nan
         return result
 
     def system_at(self, values: Sequence[float]) -> Any:
@@ -395,8 +407,13 @@ class LinearSystem(Element):
         check_system(system, "system")
         return system
 
-    def polynomials(self) -> tuple[FloatArray, FloatArray]:
+    def polynomials(self, values: Sequence[float] | None = None) -> tuple[FloatArray, FloatArray]:
         """Return numerator and denominator of the response, from the highest power of s down.
+
+        Parameters
+        ----------
+        values : sequence of float, optional
+            Of the parameters, in their order; left out, those that they have.
 
         Raises
         ------
@@ -404,7 +421,9 @@ class LinearSystem(Element):
             If a parameter has no value, or the system is discrete or an FRD.
         """
         control = importlib.import_module("control")
-        system = self.system_at([float(v) for v in self.known_values()])
+        if values is None:
+            values = [float(v) for v in self.known_values()]
+        system = self.system_at(values)
         if isinstance(system, control.FRD) or not system.isctime():
             raise ModelError(
                 f"{self!r} is not a rational function of s, and so has no equation of motion in "
@@ -421,10 +440,12 @@ class LinearSystem(Element):
             numerator = np.where(sizes > _VANISHES * sizes.max(), numerator, 0.0)
         return numerator, denominator
 
-    def rational_stiffness(self) -> tuple[FloatArray, FloatArray]:
+    def rational_stiffness(
+        self, values: Sequence[float] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """Return numerator and denominator of Z(s), from the highest power of s down."""
         definition = DEFINITIONS[self.quantity]
-        above, below = self.polynomials()[:: definition.exponent]
+        above, below = self.polynomials(values)[:: definition.exponent]
         power = definition.power_in_stiffness
         return (
             np.append(above, np.zeros(max(power, 0))),
@@ -443,10 +464,7 @@ class LinearSystem(Element):
         rows = [self._curve(vector, omega)]
         for i, (label, value) in enumerate(zip(self._labels, vector, strict=True)):
             if value == 0.0:
-                raise ModelError(
-                    f"{label} is exactly 0, which gives its derivative no step; start it from a "
-                    "small number, or write the function with an offset"
-                )
+                raise ModelError(_NO_STEP.format(label))
             step = STEP * value
             terms = [
                 weight / step * self._curve(_moved(vector, i, place * step), omega)
@@ -460,6 +478,132 @@ class LinearSystem(Element):
         _, _, rest = super().__repr__().partition("(")
         separator = "" if rest == ")" else ", "
         return f"LinearSystem({self._quantity} of {what}{separator}{rest}"
+
+
+class LinearEquation(LinearSystem):
+    """The equation of motion of a linear system with free parameters, in its coefficients.
+
+    Z(s) = k + c s + m s^2 + (b_1 p^(n-1) + ... + b_n)/(p^n + a_1 p^(n-1) + ... + a_n), p = s/rate.
+    The coefficients are its parameters; :meth:`coefficients` gives them from those of the system.
+
+    Parameters
+    ----------
+    system : LinearSystem
+        With free parameters. Its degree is that at values near their starts, or near 1.
+
+    Raises
+    ------
+    ModelError
+        If it is not rational in s, or Z grows faster than s^2.
+    """
+
+    def __init__(self, system: LinearSystem) -> None:
+        self.__dict__.update(system.__dict__)
+        self._origin = system
+        shifts = np.random.default_rng(1).uniform(0.8, 1.2, len(system.parameters))
+        near = [  # so that no term vanishes by chance
+            float(np.clip(shift * (1.0 if p.value is None else p.value), p.lower, p.upper))
+            for p, shift in zip(system.parameters, shifts, strict=True)
+        ]
+        Z = self._rational(near).trimmed()
+        self._check_growth(Z)
+        self._degrees = Z.numerator.size - 1, Z.denominator.size - 1
+        self._rate = typical_rate(Z.denominator)
+        self._has_mass = self._degrees[0] - self._degrees[1] == 2
+        n = self._degrees[1]
+        labels = ["k", "c", "m", *(f"a{i + 1}" for i in range(n)), *(f"b{i + 1}" for i in range(n))]
+        first = system.parameters[0].name
+        self.parameters = tuple(_parameter(f"{label} of {first}", None) for label in labels)
+
+    @property
+    def n_states(self) -> int:
+        """Poles of the dynamic stiffness."""
+        return self._degrees[1]
+
+    @property
+    def has_inertia(self) -> bool:
+        """Whether Z(s) grows as s^2."""
+        return self._has_mass
+
+    def mechanics(
+        self,
+        values: Sequence[Any],
+        displacement: Any,
+        velocity: Any,
+        direction: Any,
+        states: Sequence[Any],
+    ) -> Mechanics:
+        """Return mass, the rest of the force, and the changes of the states, in metres."""
+        n = self.n_states
+        k, c, m, *others = values
+        a, b = others[:n], others[n:]
+        inputs = [displacement, *states][:n]
+        if n:
+            inputs[0] = displacement - sum(x * z for x, z in zip(a, states, strict=True))
+        force = k * displacement + c * velocity
+        force = force + sum(x * z for x, z in zip(b, states, strict=True))
+        return Mechanics(m, force, [self._rate * x for x in inputs])
+
+    def coefficients(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the coefficients at values of the system's parameters, and their derivatives.
+
+        Parameters
+        ----------
+        values : ndarray, shape (rows, P)
+
+        Returns
+        -------
+        coefficients : ndarray, shape (rows, Q)
+            NaN where the values are not finite, or the system has another degree there.
+        slopes : ndarray, shape (rows, Q, P)
+            By central differences.
+        """
+        vectors, which = np.unique(values, axis=0, return_inverse=True)
+        rows = np.array([self._with_slopes(vector) for vector in vectors.tolist()])
+        rows = rows[which.ravel()]
+        return rows[..., 0], rows[..., 1:]
+
+    def _with_slopes(self, vector: list[float]) -> FloatArray:
+        """Return the coefficients and their derivatives by each parameter, (Q, 1 + P)."""
+        columns = [self._at(vector)]
+        for i, (parameter, value) in enumerate(zip(self._origin.parameters, vector, strict=True)):
+            if value == 0.0:
+                raise ModelError(_NO_STEP.format(parameter.name))
+            step = STEP * value
+            terms = [
+                weight / step * self._at(_moved(tuple(vector), i, place * step))
+                for place, weight in STENCIL
+            ]
+            columns.append(np.sum(terms, axis=0))
+        return np.stack(columns, axis=-1)
+
+    def _at(self, vector: Sequence[float]) -> FloatArray:
+        """Return the coefficients at one vector of the system's parameters."""
+        above, below = self._degrees
+        unknown = np.full(3 + 2 * below, np.nan)
+        if not np.isfinite(vector).all():
+            return unknown
+        Z = self._rational(vector)
+        numerator, denominator = _of_degree(Z.numerator, above), _of_degree(Z.denominator, below)
+        if numerator is None or denominator is None or denominator[0] == 0.0:
+            return unknown
+        polynomial, rest = Rational(numerator, denominator).split()
+        k, c, m = [*polynomial[::-1].tolist(), 0.0, 0.0][:3]
+        powers = self._rate ** np.arange(1, below + 1)
+        b = np.append(np.zeros(below - min(below, rest.numerator.size)), rest.numerator)
+        b = b[b.size - below :] / denominator[0]
+        return np.concatenate([[k, c, m], denominator[1:] / denominator[0] / powers, b / powers])
+
+    def _rational(self, vector: Sequence[float]) -> Rational:
+        return Rational(*self._origin.rational_stiffness(vector)).without_common_zeros_at_0()
+
+
+def _of_degree(polynomial: FloatArray, degree: int) -> FloatArray | None:
+    """Return a polynomial of a degree; None where it has a higher one."""
+    size = degree + 1
+    if np.any(polynomial[: max(0, polynomial.size - size)]):
+        return None
+    return np.append(np.zeros(max(0, size - polynomial.size)), polynomial[-size:])
 
 
 def dynamic_stiffness(system: Any, quantity: Quantity, omega: FloatArray) -> ComplexArray:

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.element import Element, as_model
+from dahl_ident.elements.element import Element, Model, as_model
 from dahl_ident.elements.equations import plant_equations
+from dahl_ident.elements.linear_system import LinearEquation, LinearSystem
 from dahl_ident.errors import ModelError
 
 if TYPE_CHECKING:
@@ -75,12 +76,25 @@ def obstacle(model: Element) -> str:
     if all(element.is_linear for element in model.elements):
         return LINEAR
     try:
+        model = _in_coefficients(model)
         if not model.has_inertia:
             return "the model has no mass"
         plant_equations(model)
     except ModelError as error:
         return str(error).partition(";")[0].partition(", so")[0]
     return ""
+
+
+def _in_coefficients(model: Model) -> Model:
+    """Return the model with linear systems that have free parameters in their coefficients."""
+    free = [
+        isinstance(element, LinearSystem) and any(p.free for p in element.parameters)
+        for element in model.elements
+    ]
+    if not any(free):
+        return model
+    pairs = zip(model.elements, free, strict=True)
+    return Model(*(LinearEquation(element) if f else element for element, f in pairs))
 
 
 class Shooting:
@@ -104,6 +118,7 @@ class Shooting:
 
     def __init__(self, model: Element) -> None:
         self._model = as_model(model)
+        self._in_coefficients = _in_coefficients(self._model)
         self._system: System | None = None
 
     @property
@@ -112,7 +127,7 @@ class Shooting:
         if self._system is None:
             from dahl_ident.engine import translate
 
-            self._system = translate(plant_equations(self._model))
+            self._system = translate(plant_equations(self._in_coefficients))
         return self._system
 
     def __call__(
@@ -149,6 +164,11 @@ class Shooting:
         stable : bool, default True
             Whether a motion that is not stable counts as none.
         """
+        values, slopes = self._coefficients(values)
+        wanted = tuple(chosen)
+        if slopes is not None:
+            slopes = slopes[:, :, wanted]
+            chosen = np.flatnonzero(slopes.any(axis=(0, 2))).tolist()
         ask = _Ask(values, omega, drive, tuple(chosen), tuple(harmonics), stable)
         result = _empty(omega.size, len(harmonics), len(chosen), self.system.order)
         possible = np.isfinite(values).all(axis=1) & np.isfinite(omega) & np.isfinite(drive)
@@ -161,7 +181,28 @@ class Shooting:
         if stable or np.all(values == values[0]):  # a search passes values at which nothing settles
             self._solve(result, possible & ~result.found & ~unstable, ask, finer=_FINER)
         self._solve(result, possible & ~result.found & unstable, ask, cycles=_LONG)
+        if slopes is not None:
+            result = result._replace(by_parameter=result.by_parameter @ slopes[:, chosen])
         return result
+
+    def _coefficients(self, values: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+        """Return the numbers in the equations, and their derivatives unless they are the values."""
+        pairs = list(zip(self._model.elements, self._in_coefficients.elements, strict=True))
+        if all(element is other for element, other in pairs):
+            return values, None
+        numbers, blocks, first = [], [], 0
+        for element, other in pairs:
+            own = values[:, first : first + len(element.parameters)]
+            block = np.zeros((len(values), len(other.parameters), values.shape[1]))
+            if isinstance(other, LinearEquation):
+                own, block[:, :, first : first + len(element.parameters)] = other.coefficients(own)
+            else:
+                place = np.arange(len(element.parameters))
+                block[:, place, first + place] = 1.0
+            numbers.append(own)
+            blocks.append(block)
+            first += len(element.parameters)
+        return np.concatenate(numbers, axis=1), np.concatenate(blocks, axis=1)
 
     def _solve(
         self,
