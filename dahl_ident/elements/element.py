@@ -145,6 +145,10 @@ class Element(Behaviour):
         """Return this element, or a faster variant of it for very many evaluations."""
         return self
 
+    def coarser(self) -> Element:
+        """Return this element, or one whose motion under a force costs less and is nearly alike."""
+        return self
+
     def describe(self) -> dict[str, Any]:
         """Return kind, name and parameters as plain data."""
         name = {"name": self.name} if self.name else {}
@@ -491,10 +495,15 @@ class Model(Element):
         >>> Model(Dahl(alpha=2.0)).tabulated()
         TabulatedDahl(f_max=free, sigma=free, alpha=2)
         """
-        faster = [element.tabulated() for element in self._elements]
-        if all(new is old for new, old in zip(faster, self._elements, strict=True)):
-            return self
-        return Model(*faster)
+        return self._replaced([element.tabulated() for element in self._elements])
+
+    def coarser(self) -> Model:
+        """Return the model of elements whose motion under a force costs less, or itself."""
+        return self._replaced([element.coarser() for element in self._elements])
+
+    def _replaced(self, elements: Sequence[Element]) -> Model:
+        same = all(new is old for new, old in zip(elements, self._elements, strict=True))
+        return self if same else Model(*elements)
 
     def of(self, values: Sequence[Value]) -> Iterator[tuple[Element, Sequence[Value]]]:
         """Yield every element with its own part of the model's parameter `values`."""

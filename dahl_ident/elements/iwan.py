@@ -33,7 +33,8 @@ from dahl_ident.elements.behaviour import SOFTENED, StiffnessGradient
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 
-_SLIDERS = 30  # Jenkins elements in the place of the law where a force drives it
+_SLIDERS = 30  # Jenkins elements in the place of the law where a force drives it: 6e-5 of f_max
+_FEW_SLIDERS = 8  # 1e-3 of f_max, at a tenth of the cost: near enough for a search to begin with
 _REST = 1e-100  # m, below every amplitude allowed: d_m/A does not overflow
 _NARROWEST = 1e-6  # of the onset: near chi = -1 the stiffness is never all there
 _DEEP = 1e-8  # d_m/A below which the incomplete beta function is its series
@@ -99,10 +100,18 @@ class Iwan(Masing):
         ),
     )  # fmt: skip
 
+    _count = _SLIDERS
+
     @property
     def n_states(self) -> int:
         """The forces of the Jenkins elements in the law's place."""
-        return _SLIDERS
+        return self._count
+
+    def coarser(self) -> Iwan:
+        """Return this law with fewer Jenkins elements in its place."""
+        copy = self.with_bound(self.parameters)
+        copy._count = _FEW_SLIDERS
+        return copy
 
     def sliders(self, values: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
         """Return stiffnesses and slip displacements whose backbone curve is a polygon in this one.
@@ -110,16 +119,15 @@ class Iwan(Masing):
         The slip displacements are d_m (i/n)^2, and the forces there those of this curve.
         """
         _, sigma, chi, ratio = values
+        n = self._count
         d = _onset_of(values)
         places: list[Any] = [0.0]
         forces: list[Any] = [0.0]
-        for share in (np.arange(1, _SLIDERS + 1) / _SLIDERS).tolist():
+        for share in (np.arange(1, n + 1) / n).tolist():
             lost = share ** (2.0 * chi + 2.0) / ((1.0 + ratio) * (chi + 2.0))
             places.append(d * share**2)
             forces.append(sigma * places[-1] * (1.0 - lost))
-        slopes = [
-            (forces[i + 1] - forces[i]) / (places[i + 1] - places[i]) for i in range(_SLIDERS)
-        ]
+        slopes = [(forces[i + 1] - forces[i]) / (places[i + 1] - places[i]) for i in range(n)]
         stiffnesses = [a - b for a, b in zip(slopes, [*slopes[1:], 0.0], strict=True)]
         return stiffnesses, places[1:]
 

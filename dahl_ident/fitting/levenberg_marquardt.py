@@ -129,6 +129,7 @@ def minimise(
     enough: float = 0.0,
     steps: int = 80,
     accuracy: float = EXPLICIT,
+    bounds: tuple[FloatArray, FloatArray] | None = None,
 ) -> Minima:
     """Return the minima of the costs that searches from `theta`, shape (S, P), find.
 
@@ -137,13 +138,14 @@ def minimise(
     converged; so do those that are still higher after twice the steps in which another one of the
     same `owner` has converged. `tolerance_factor` multiplies the length of the step at which a
     search has converged; `enough` is a fall of the cost that is not worth a step, however long.
-    `accuracy` is that of predictions, relative to the data.
+    `accuracy` is that of predictions, relative to the data. No step leads beyond `bounds` of
+    theta; a coordinate at its bound that would go on stays there.
     """
     owner = np.arange(len(theta)) if owner is None else owner
     with np.errstate(all="ignore"):
         return _minimise(
             evaluate, theta, logarithmic, n_residuals, inside, owner, tolerance_factor, enough,
-            steps, accuracy,
+            steps, accuracy, bounds,
         )  # fmt: skip
 
 
@@ -203,6 +205,7 @@ def _minimise(
     enough: float,
     steps: int,
     accuracy: float,
+    bounds: tuple[FloatArray, FloatArray] | None,
 ) -> Minima:
     S, P = theta.shape
     unseen_change = _UNSEEN if accuracy <= EXPLICIT else _OF_ACCURACY * accuracy
@@ -214,7 +217,7 @@ def _minimise(
     last = np.full(S, 1e-300)
     first, lowest = np.full((2, owner.max(initial=0) + 1), np.inf)  # converged one of an owner
     for count in range(steps if P else 0):
-        step, moves, predicted, longest = _step(at, damping, logarithmic)
+        step, moves, predicted, longest = _step(at, damping, logarithmic, bounds)
         shortest = tolerance_factor**2 * _tolerance(at, logarithmic, n_residuals, accuracy)
         settled = moves * np.minimum(1.0, moves / last) <= shortest
         settled |= predicted <= tolerance_factor**2 * _EPS * at.cost
@@ -293,7 +296,10 @@ class _State:
 
 
 def _step(
-    at: _State, damping: FloatArray, logarithmic: BoolArray
+    at: _State,
+    damping: FloatArray,
+    logarithmic: BoolArray,
+    bounds: tuple[FloatArray, FloatArray] | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the next step, its squared length, the fall of cost predicted, the longest log step.
 
@@ -304,6 +310,11 @@ def _step(
     size = np.where((size > 0.0) & np.isfinite(size), size, 1.0)
     H = at.hessian / (size[:, :, None] * size[:, None, :])
     g = at.gradient / size
+    if bounds is not None:
+        low, high = bounds
+        held = ((at.theta <= low) & (g > 0.0)) | ((at.theta >= high) & (g < 0.0))
+        g = np.where(held, 0.0, g)
+        H = np.where(held[:, :, None] | held[:, None, :], np.eye(P), H)
     damped = H + damping[:, None, None] * np.eye(P)
     if not np.isfinite(damped).all():
         bad = ~np.isfinite(damped).all(axis=(1, 2))
@@ -315,6 +326,8 @@ def _step(
     longest = np.abs(delta / size * logarithmic).max(axis=1)
     if longest.max() > _LONGEST_STEP:
         delta *= np.minimum(1.0, _LONGEST_STEP / np.maximum(longest, 1e-300))[:, None]
+    if bounds is not None:
+        delta = (np.clip(at.theta + delta / size, low, high) - at.theta) * size
     moves = (delta[:, None, :] @ H @ delta[:, :, None])[:, 0, 0]
     predicted = -(delta * g).sum(axis=1) - 0.5 * moves
     return delta / size, moves, np.maximum(predicted, 1e-300), longest

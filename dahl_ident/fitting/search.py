@@ -273,6 +273,11 @@ class _Search:
     def _search(self, begin: Starts, scale: float) -> Ends:
         if not self.limits:
             return Ends(self._descend(begin, scale, steps=_BRIEF))
+        coarser = self.problem.coarser()
+        if coarser is not self.problem and len(begin.table) > self.problem.n_tables:
+            search = _Search(coarser, self.loss, self.method, self.tolerance)
+            tables = np.arange(self.problem.n_tables)
+            begin = Starts(tables, search._descend(begin, scale).theta)
         ends = Ends(self._descend(begin, scale))
         doubtful = ~ends.minima.converged | (self._friction_error(ends, scale) > DOUBTFUL)
         if doubtful.any() and self.problem.is_exact:
@@ -281,8 +286,7 @@ class _Search:
             where = np.flatnonzero(doubtful)
             part = self._of(where)
             ends.put(where, part._look_wider(ends.take(where), begin.of(where), scale))
-        held = (doubtful | self._strayed) & self.bounded
-        for table in np.flatnonzero(held | ~ends.minima.converged).tolist():
+        for table in np.flatnonzero(self._strayed | ~ends.minima.converged).tolist():
             if table not in ends.limits:
                 ends.put_one(table, self._trust_region(table, ends, begin, scale))
         return ends
@@ -342,6 +346,8 @@ class _Search:
                 lambda theta: one.quadratic(theta, scale), phi[0], logarithmic, self.m,
                 accuracy=problem.accuracy,
             )  # fmt: skip
+            if minima is not None and not self._within(minima.theta).all():
+                minima = None
         minima = minima or minimise(
             evaluate,
             phi,
@@ -352,13 +358,18 @@ class _Search:
             tolerance_factor=_AT_LIMIT if limit else self.tolerance,
             steps=steps,
             accuracy=problem.accuracy,
+            bounds=(self.low, self.high) if self.bounded and chart is None else None,
         )
         if self.bounded:
             theta = minima.theta if chart is None else chart.of(begin.table).theta(minima.theta)
-            within = ((theta >= self.low) & (theta <= self.high)).all(axis=1)
+            within = self._within(theta)
             minima.converged[:] &= within
             self._strayed[begin.table[~within]] = True
         return minima if each else minima.best(begin.table, S)
+
+    def _within(self, theta: FloatArray) -> NDArray[np.bool_]:
+        """Return which searches are within the parameters' bounds."""
+        return np.asarray(((theta >= self.low) & (theta <= self.high)).all(axis=1))
 
     def _by_scipy(
         self,

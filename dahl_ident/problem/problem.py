@@ -225,6 +225,19 @@ class Problem:
         other._set_rows(self._rows, self.noise)
         return other
 
+    def coarser(self) -> Self:
+        """Return a problem that costs less and predicts nearly the same; itself where none does."""
+        model = self.model.coarser() if self.is_exact else self.model
+        if model is self.model:
+            return self
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        for stale in ("stiffness_data", "obstacle_to_exact", "_shooting"):
+            other.__dict__.pop(stale, None)
+        other.model = model
+        other._set_rows(self._rows, self.noise)
+        return other
+
     def takes_energy(self, theta: FloatArray) -> bool:
         """Return whether every motion takes energy from the drive, by the describing function.
 
