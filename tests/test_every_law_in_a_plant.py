@@ -78,7 +78,7 @@ def lugre(force: FloatArray, v: FloatArray) -> FloatArray:
     return SIGMA * (v - np.abs(v) * force / limit)
 
 
-def iwan(chi: float, ratio: float, count: int = 400) -> Sliders:
+def iwan(chi: float, ratio: float, count: int = 150) -> Sliders:
     """Segalman's density in cells, and the stiffness that slips last."""
     g = chi + 1.0
     largest = F_MAX / SIGMA * (1.0 + ratio) / (ratio + g / (g + 1.0))

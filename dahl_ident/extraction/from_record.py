@@ -21,7 +21,7 @@ from dahl_ident.extraction.plateaus import MODES, Mode
 from dahl_ident.extraction.point import Point, Settings, measure
 from dahl_ident.extraction.segments import record_cycles, record_spans, segment_of
 from dahl_ident.extraction.sine_fit import FEWEST_CYCLES, HARMONICS
-from dahl_ident.extraction.sine_test import ROUTE, not_a_sine_test
+from dahl_ident.extraction.sine_test import ROUTE, SWEEP_ROUTE, is_sweep, not_a_sine_test
 
 _WELL_COVERED = 0.8  # of the moving time: points that cover more of it are none by chance
 
@@ -125,7 +125,7 @@ def _points(
         except ExtractionError as exc:
             refused.append(str(exc))
     if frequency is None:
-        _refuse_other_motion(samples.motion, runs, points)
+        _refuse_other_motion(record, samples.motion, runs, points)
     if not points:
         raise ExtractionError(_summary(refused))
     for point in points:
@@ -135,7 +135,7 @@ def _points(
 
 
 def _refuse_other_motion(
-    motion: FloatArray, runs: Sequence[Cycles], points: Sequence[Point]
+    record: Record, motion: FloatArray, runs: Sequence[Cycles], points: Sequence[Point]
 ) -> None:
     """Refuse a record that is not a sine measurement, even if some points occur by chance."""
     moving = sum(float(np.sum(run.stop - run.start)) for run in runs)
@@ -144,7 +144,10 @@ def _refuse_other_motion(
         return
     reason = not_a_sine_test(motion, runs, covered=measured / moving if moving else 0.0)
     if reason:
-        raise ExtractionError(f"{reason}; {ROUTE}")
+        route = ROUTE
+        if is_sweep(record_cycles(record.time, record.force_samples, None)):
+            route = SWEEP_ROUTE.format(file=(record.provenance or {}).get("file", "FILE"))
+        raise ExtractionError(f"{reason}; {route}")
 
 
 def _summary(refused: Sequence[str]) -> str:

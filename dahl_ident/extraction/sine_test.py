@@ -19,8 +19,15 @@ ROUTE = (
     "expected levels or a sweep of one sine; for any other motion fit the waveform itself: "
     "di.fit(record, model)"
 )
+SWEEP_ROUTE = (
+    "the force is a sweep of one sine, which the motion is too unsteady to follow in a table; fit "
+    "the waveforms: dahl-ident fit --record {file} --mass free --damping free --stiffness free, or "
+    "di.fit(record, model)"
+)
 _PERIOD_CHANGE = 0.03  # limit from one cycle to the next (median by energy) of a sine measurement
 _AMPLITUDE_CHANGE = 0.1  # the same of the amplitude, which resonances change faster
+_SWEEP_RANGE = 0.2  # of the log period: less may be chance
+_FEWEST_OF_SWEEP = 6  # cycles: four changes of the period's change
 _FEWEST_PAIRS = 2  # of cycles, that show how alike they are
 _NOISY = 0.03  # of a cycle's log amplitude
 _SINE_IN_NOISE = 0.3  # of the power near the strongest line, where noise spoils the cycles
@@ -57,6 +64,20 @@ def not_a_sine_test(motion: FloatArray, runs: Sequence[Cycles], covered: float) 
         f"not a sine test: neighbouring cycles of the motion differ by {100.0 * period:.2g} % in "
         f"period and {100.0 * amplitude:.2g} % in amplitude (median), and {power}"
     )
+
+
+def is_sweep(runs: Sequence[Cycles]) -> bool:
+    """Return whether a drive is one sine whose period changes evenly from cycle to cycle."""
+    if not runs:
+        return False
+    run = max(runs, key=len)
+    period = np.log(run.stop - run.start)
+    if len(run) < _FEWEST_OF_SWEEP or np.ptp(period) < _SWEEP_RANGE:
+        return False
+    energy = np.exp(2.0 * (run.log_amplitude - run.log_amplitude.max()) + period)[1:-1]
+    bend = _median(np.abs(np.diff(period, 2)), energy)
+    steps = _median(np.abs(np.diff(run.log_amplitude))[1:], energy)
+    return bend <= _PERIOD_CHANGE and steps <= _AMPLITUDE_CHANGE
 
 
 def _neighbours(runs: Sequence[Cycles]) -> tuple[float, float, float, int]:

@@ -87,14 +87,14 @@ def obstacle(model: Element) -> str:
 
 def _in_coefficients(model: Model) -> Model:
     """Return the model with linear systems that have free parameters in their coefficients."""
-    free = [
-        isinstance(element, LinearSystem) and any(p.free for p in element.parameters)
+    elements = [
+        LinearEquation(element)
+        if isinstance(element, LinearSystem) and any(p.free for p in element.parameters)
+        else element
         for element in model.elements
     ]
-    if not any(free):
-        return model
-    pairs = zip(model.elements, free, strict=True)
-    return Model(*(LinearEquation(element) if f else element for element, f in pairs))
+    same = all(new is old for new, old in zip(elements, model.elements, strict=True))
+    return model if same else Model(*elements)
 
 
 class Shooting:
