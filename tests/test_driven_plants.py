@@ -73,3 +73,23 @@ def test_a_plant_that_feeds_energy_in_is_fitted_by_the_describing_function() -> 
     assert damping.stderr is not None
     assert abs(damping.value + 0.3) < 3.0 * damping.stderr
     assert any(finding.code == "no_steady_motion" for finding in fit.findings)
+
+
+def test_a_force_that_is_not_a_sine_is_named_with_the_command_for_its_waveforms() -> None:
+    plant = di.Dahl(0.1, 30.0, 1.0) + di.Mass(0.3) + di.Damper(1.0) + di.Spring(8.0)
+    f = np.tile(np.geomspace(0.4, 2.0, 5), 2)
+    u = np.repeat([0.15, 0.4], 5)
+    R = di.response(plant, f, u).receptance
+    rng = np.random.default_rng(3)
+    s = 0.003 * np.abs(R)
+    share = np.full(f.size, 0.9999)
+    share[3] = 1.0 / 1.01  # a tenth of the force is not the sine
+    sweep = di.FrequencyResponse(
+        f, R + s * (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size)), drive=u,
+        covariance=s[:, None, None] ** 2 * np.eye(2), controlled="force", quantity="receptance",
+        quality={"force_share": share}, provenance={"file": "run 7.csv"},
+    )  # fmt: skip
+    fit = di.fit(sweep, di.Dahl(alpha=1.0) + di.Mass(0.3) + di.Damper() + di.Spring())
+    assert fit.trusted
+    assert f"The force at {f[3]:.4g} Hz, 150 mN is 10 % away from the sine" in fit.verdict
+    assert "dahl-ident fit --record 'run 7.csv' --mass free" in fit.verdict

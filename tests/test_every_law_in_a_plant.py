@@ -1,6 +1,6 @@
 """Every law in a driven plant: sweeps of another integrator give back what made them.
 
-Each law is written out once more here, as a rate or as sliders, and integrated by Runge and Kutta's
+Each law is written out once more, as a rate or along its path, and integrated by Runge and Kutta's
 method in fixed steps, from near the steady motion until cycles no longer change.
 """
 
@@ -54,6 +54,48 @@ class Sliders(NamedTuple):
     stiffness: FloatArray
     slip: FloatArray
 
+    def at_rest(self, n: int) -> FloatArray:
+        """Return the springs' extensions of n plants."""
+        return np.zeros((self.slip.size, n))
+
+    def after(self, z: FloatArray, moved: FloatArray) -> FloatArray:
+        """Return the extensions after a displacement."""
+        return np.clip(z + moved, -self.slip[:, None], self.slip[:, None])
+
+    def force(self, z: FloatArray) -> FloatArray:
+        """Return the springs' force."""
+        return np.asarray(self.stiffness @ z)
+
+
+class Play(NamedTuple):
+    """Linear Dahl friction behind a gap: its force, and the place in the gap."""
+
+    half: float
+
+    def at_rest(self, n: int) -> FloatArray:
+        """Return force and place of n plants."""
+        return np.zeros((2, n))
+
+    def after(self, z: FloatArray, moved: FloatArray) -> FloatArray:
+        """Return both after a displacement: unloading, then the gap, then loading."""
+        force, place = z
+        s, left = np.sign(moved), np.abs(moved)
+        back = F_MAX / SIGMA * np.log1p(np.maximum(-s * force, 0.0) / F_MAX)
+        first = np.minimum(left, back)
+        force = np.where(left < back, loaded(force, s, first), np.where(back > 0.0, 0.0, force))
+        crossed = np.where(s * force > 0.0, 0.0, np.minimum(left - first, self.half - s * place))
+        crossed = np.where(left < back, 0.0, crossed)
+        return np.array([loaded(force, s, left - first - crossed), place + s * crossed])
+
+    def force(self, z: FloatArray) -> FloatArray:
+        """Return the friction force."""
+        return np.asarray(z[0])
+
+
+def loaded(force: FloatArray, side: FloatArray, path: FloatArray) -> FloatArray:
+    """Return linear Dahl friction after a path in one direction."""
+    return np.asarray(side * F_MAX - (side * F_MAX - force) * np.exp(-path * SIGMA / F_MAX))
+
 
 def dahl(exponent: float = 1.0, asymmetry: float = 0.0) -> Law:
     """Dahl's law."""
@@ -93,7 +135,7 @@ class Case(NamedTuple):
     """A law to be fitted, what made the data, and its parameters there."""
 
     law: di.Element
-    by: Law | Sliders
+    by: Law | Sliders | Play
     truth: dict[str, float]
     blind: tuple[str, ...] = ()
     """Parameters that fundamentals cannot determine."""
@@ -129,6 +171,7 @@ CASES = {
         di.PowerDamper() + di.Dahl(F_MAX, SIGMA, 1.0), dahl(),
         {"coefficient": DAMPING, "exponent": 1.0}, free=("stiffness",),
     ),
+    "Backlash": Case(di.Backlash(di.Dahl(alpha=1.0)), Play(0.001), {**BOTH, "gap": 0.002}),
     "user's law": Case(Exponential(), dahl(), BOTH),
     "user's law with a kink": Case(Jenkins(), ONE, BOTH),
     "linear system": Case(
@@ -147,21 +190,19 @@ CASES = {
 }  # fmt: skip
 
 
-def settled(law: Law | Sliders, f: FloatArray, u: FloatArray) -> ComplexArray:
+def settled(law: Law | Sliders | Play, f: FloatArray, u: FloatArray) -> ComplexArray:
     """Return the fundamentals of the displacement under u cos(2 pi f t)."""
     dt = 1.0 / f / STEPS
     x, v = np.zeros((2, f.size))
-    sliders = law if isinstance(law, Sliders) else None
-    z = np.zeros((1 if sliders is None else sliders.slip.size, f.size))
+    path = law if isinstance(law, (Sliders, Play)) else None
+    z = np.zeros((1, f.size)) if path is None else path.at_rest(f.size)
     last = np.full(f.size, np.inf, dtype=np.complex128)
 
     def rates(
         x: FloatArray, v: FloatArray, z: FloatArray, push: FloatArray, moved: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        if isinstance(law, Sliders):
-            slip = law.slip[:, None]
-            force = law.stiffness @ np.clip(z + moved, -slip, slip)
-            change = np.zeros(z.shape)
+        if isinstance(law, (Sliders, Play)):
+            force, change = law.force(law.after(z, moved)), np.zeros(z.shape)
         else:
             force, change = z[0], law(z[0], v)[None]
         return v, (push - force - DAMPING * v - STIFFNESS * x) / MASS, change
@@ -181,10 +222,8 @@ def settled(law: Law | Sliders, f: FloatArray, u: FloatArray) -> ComplexArray:
                 dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
                 for k1, k2, k3, k4 in zip(*parts, strict=True)
             )
-            x, v, z = x + dx, v + dv, z + dz
-            if sliders is not None:
-                slip = sliders.slip[:, None]
-                z = np.clip(z + dx, -slip, slip)
+            x, v = x + dx, v + dv
+            z = z + dz if path is None else path.after(z, dx)
         if np.all(np.abs(X - last) < SETTLED * np.abs(X)):
             return X
         last = X

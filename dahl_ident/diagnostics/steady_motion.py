@@ -16,6 +16,7 @@ from dahl_ident.steady_state import response
 from dahl_ident.units import shown_unit
 
 _SEEN = 1e-3  # relative difference that is worth a place
+_DISTORTED = 0.05  # of a force, noise included: less changes the fundamental by well below 1 %
 
 
 def steady_difference(optimum: Optimum) -> tuple[int, float] | None:
@@ -54,6 +55,7 @@ def steady_findings(optimum: Optimum, model: Model) -> Iterator[Finding]:
             (row,) = row_names(problem.data, [worst[0]])
             values = {"difference": worst[1], "row": row}
         yield Finding(described, note, "steady", values)
+        yield from _distorted(problem.data)
         yield from _jumps(problem.data, model)
         return
     why = problem.obstacle_to_exact
@@ -61,6 +63,24 @@ def steady_findings(optimum: Optimum, model: Model) -> Iterator[Finding]:
         yield Finding(described, note, "no_steady_motion")
     if why and problem.steady == "exact" and any(not e.is_linear for e in problem.model.elements):
         yield Finding(described, note, "describing_function", {"why": why})
+
+
+def _distorted(data: FrequencyResponse) -> Iterator[Finding]:
+    """Yield where the force is farthest from the sine for which the motion is predicted."""
+    share = data.quality.get("force_share")
+    if share is None:
+        return
+    share = np.where(data.controlled == "force", np.asarray(share, dtype=np.float64), 1.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        apart = np.nan_to_num(np.sqrt(1.0 / share - 1.0))
+    row = int(np.argmax(apart))
+    if apart[row] > _DISTORTED:
+        (name,) = row_names(data, [row])
+        provenance = data.provenance or {}
+        parts = provenance.get("parts", (provenance,))
+        files = tuple(dict.fromkeys(str(p["file"]) for p in parts if "file" in p))
+        values = {"row": name, "distortion": float(apart[row]), "files": files}
+        yield Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "distorted_force", values)
 
 
 def _jumps(data: FrequencyResponse, model: Model) -> Iterator[Finding]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -246,6 +247,15 @@ def _jump(places: Sequence[tuple[float, float, float]], unit: str) -> str:
     )
 
 
+def _distorted_force(row: str, distortion: float, files: Sequence[str]) -> str:
+    plant = ("--mass", "free", "--damping", "free", "--stiffness", "free")
+    command = shlex.join(["dahl-ident", "fit", "--record", *(files or ["FILE"]), *plant])
+    return (
+        f"The force at {row} is {percent(distortion)} away from the sine that it is taken for; "
+        f"fit the waveforms instead: {command}."
+    )
+
+
 # Assumed?
 
 
@@ -300,6 +310,7 @@ _TEXT: Mapping[str, Callable[..., str]] = {
     "slight": _slight,
     "steady": _steady,
     "jump": _jump,
+    "distorted_force": _distorted_force,
     "no_steady_motion": lambda: (
         "The force was held, but the describing function predicts the motion: the plant would "
         "drive itself, and no steady motion is there."
