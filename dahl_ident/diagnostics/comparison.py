@@ -43,6 +43,7 @@ _SEEN = 3.0  # rms differences over noise that has been averaged over all rows
 _STATED = "every source"  # of error is counted in what the fit states
 _RUNAWAY = 100.0  # times as large: a candidate's parameter that the data leave open
 _PLACES = 6  # of a change: less is rounding
+_VAGUE = 0.5  # relative standard error from which a parameter is not determined
 _LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
 
 
@@ -86,6 +87,13 @@ class ComparedModel:
         known = [f"{n} = {with_unit(v, e, unit)}" for n, v, e, unit in rows if np.isfinite(e)]
         unknown = [name for name, error in o.stderr.items() if not np.isfinite(error)]
         return ", ".join(known + ([f"{listed(unknown)} not determined"] if unknown else []))
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the data determine every parameter that cannot be negative."""
+        o = self.optimum
+        rows = zip(o.problem.parameters, o.values.tolist(), o.stderr.values(), strict=True)
+        return all(error < _VAGUE * value for p, value, error in rows if p.lower == 0.0)
 
     @cached_property
     def meaning(self) -> dict[str, float]:
@@ -141,14 +149,25 @@ class ModelComparison:
 
     @cached_property
     def best(self) -> ComparedModel:
-        """The simplest model within one standard error of the highest predictive density."""
-        highest = max(self.models, key=lambda model: model.density.total)
+        """The simplest model within one standard error of the highest predictive density.
+
+        Apart from the one that was fitted, only models count whose parameters are determined, and
+        whose force limit and stiffness are not a hundred times those of the fit.
+        """
+        first = self.models[0]
+        possible = [m for m in self.models if m is first or self._is_sound(m)]
+        highest = max(possible, key=lambda model: model.density.total)
         alike = []
-        for model in self.models:
+        for model in possible:
             gain, error = highest.density.gain_over(model.density)
             if gain <= max(error, _BY_CHANCE):
                 alike.append(model)
         return min(alike, key=lambda model: (len(model.optimum.names), -model.density.total))
+
+    def _is_sound(self, model: ComparedModel) -> bool:
+        keys = ("force limit", "stiffness at zero force")
+        sizes = [(model.meaning[k], self.models[0].meaning[k]) for k in keys]
+        return model.is_determined and not any(b > 0.0 and a > _RUNAWAY * b for a, b in sizes)
 
     @property
     def headline(self) -> str:
@@ -159,7 +178,8 @@ class ModelComparison:
         gain, error = best.density.gain_over(first.density)
         text = (
             f"{best.name} would be better: the log density of tests left out is higher by "
-            f"{gain:.0f} ± {error:.0f}."
+            f"{gain:.0f} ± {error:.0f}. It leaves {percent(best.density.misfit)} of the "
+            f"fundamental, and {_noise(best.optimum.problem)}."
         )
         absurd = [f"There {warning}." for warning in negative_parameters(best.optimum)]
         return " ".join([text, *absurd])
@@ -255,6 +275,17 @@ def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
     }
 
 
+def _noise(problem: Problem) -> str:
+    """Return how large the noise of the fundamental is, in words."""
+    rows = problem.data.harmonic == 1
+    covariance = problem.data.covariance
+    if not problem.scale_known or covariance is None:
+        return "how much of that is noise is not known"
+    size = np.abs(problem.data.response[rows])
+    share = np.trace(covariance[rows], axis1=1, axis2=2) / size**2
+    return f"the noise is {percent(float(np.sqrt(np.mean(share))))}"
+
+
 def _change(value: float, before: float) -> str:
     with np.errstate(all="ignore"):
         ratio = round(float(np.float64(value) / before - 1.0), _PLACES)
@@ -274,8 +305,8 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
         Models to compare with, by a name for each. Left out: for a Dahl element another exponent,
         two elements, two limits (where even harmonics are given), a gap, Bouc-Wen's and Iwan's
         law, LuGre's where the force falls with the frequency, Maxwell slip where parallel Jenkins
-        elements would leave much less; and a spring and, where the frequency changes, a mass and a
-        damper added.
+        elements would leave much less; a spring and a power damper added and, where the frequency
+        changes, a mass and a damper.
 
     Returns
     -------
@@ -374,14 +405,16 @@ def _candidates(
     added: dict[str, Element] = {}
     if not any(is_spring(e) for e in model.elements):
         added["spring added"] = Spring()
-    if f.max() > _RATES * f.min():
-        kinds = {e.kind for e in model.elements}
-        power = PowerDamper().started((_force(optimum), 0.5, 1.0))
-        rated: tuple[Element, ...] = (Mass(), Damper(), power)
-        for element in rated:
-            if element.kind not in kinds:
-                added[f"{element.kind.replace('_', ' ')} added"] = element
+    kinds = {e.kind for e in model.elements}
+    rated: tuple[Element, ...] = (PowerDamper().started((_force(optimum), 0.5, 1.0)),)
+    if f.max() > _RATES * f.min():  # at one frequency a mass is a spring
+        rated = (Mass(), Damper(), *rated)
+    for element in rated:
+        if element.kind not in kinds:
+            added[f"{element.kind.replace('_', ' ')} added"] = element
     span = f"{misfit}; frequencies from {f.min():.3g} to {f.max():.3g} Hz"
+    if not f.max() > _RATES * f.min():
+        span = f"{misfit}; one frequency, so only the amplitude can tell"
     base = [e.started([values[p.name] for p in e.parameters]) for e in model.elements]
     for name, element in added.items():
         started = all(np.isfinite(values[p.name]) for p in model.parameters)
