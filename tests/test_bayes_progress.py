@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.bayes.chain import Settings
+from dahl_ident.bayes.chain import ChainSettings
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.results.progress import expected_steps
 from tests.bayes_cases import friction_table
 
-SETTINGS = Settings(128, 4, 1, None, 20000, 2000.0)
+SETTINGS = ChainSettings(128, 4, 1, None, 20000, 2000.0)
 
 
 def verdict(tau: float, ess: float) -> Convergence:

@@ -38,7 +38,7 @@ class Pool(Protocol):
 
 
 @dataclass(frozen=True)
-class Settings:
+class ChainSettings:
     """How a chain is run.
 
     Attributes
@@ -75,7 +75,7 @@ class Settings:
         ess: float,
         walkers: int | None,
         ensembles: int,
-    ) -> Settings:
+    ) -> ChainSettings:
         """Return checked settings for so many parameters, with a seed."""
         whole_number(ensembles, "ensembles", 2)
         if walkers is None:
@@ -140,7 +140,7 @@ Listener = Callable[[Chain, Convergence | None], None]
 def run(
     density: LogDensity,
     chain: Chain,
-    settings: Settings,
+    settings: ChainSettings,
     *,
     pool: Pool | None = None,
     listener: Listener | None = None,
@@ -174,7 +174,7 @@ def next_check(steps: int, end: int) -> int:
     return min(check, end)
 
 
-def _sampler(density: LogDensity, settings: Settings, pool: Pool | None) -> Any:
+def _sampler(density: LogDensity, settings: ChainSettings, pool: Pool | None) -> Any:
     from emcee import EnsembleSampler
 
     function = density if pool is None else _Mapped(density, pool)

@@ -41,7 +41,7 @@ Identity = Mapping[str, str]
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredChain:
     """A chain read from a file, with its seed."""
 
     chain: Chain
@@ -100,7 +100,7 @@ class ChainFile:
         self._latest: Chain | None = None
         self._due = 0.0
 
-    def load(self) -> Stored | None:
+    def load(self) -> StoredChain | None:
         """Return the chain in the file, None where there is no file yet.
 
         Raises
@@ -189,7 +189,7 @@ def _write(path: Path, chain: Chain, seed: int, identity: Identity) -> None:
         ) from exc
 
 
-def _read(path: Path) -> tuple[Stored, dict[str, str]]:
+def _read(path: Path) -> tuple[StoredChain, dict[str, str]]:
     h5py = library("h5py")
 
     try:
@@ -233,13 +233,13 @@ def _arrays(chain: Chain) -> dict[str, np.ndarray[Any, Any]]:
     return dict(zip(_NAMES, values, strict=True))
 
 
-def _stored(arrays: Mapping[str, Any], seed: int) -> Stored:
+def _stored(arrays: Mapping[str, Any], seed: int) -> StoredChain:
     position, has_gauss, cached = arrays["random_rest"].tolist()
     state: RandomState = (
         "MT19937", arrays["random_key"], int(position), int(has_gauss), cached,
     )  # fmt: skip
     chain = Chain(arrays["points"], arrays["log_density"], arrays["start"], state)
-    return Stored(chain, seed)
+    return StoredChain(chain, seed)
 
 
 def _digest(*parts: Any) -> str:

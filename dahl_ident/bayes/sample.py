@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray, positive_number
-from dahl_ident.bayes.chain import Chain, Listener, Pool, Settings, run
+from dahl_ident.bayes.chain import Chain, ChainSettings, Listener, Pool, run
 from dahl_ident.bayes.checkpoint import identity, open_chain
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density
@@ -67,7 +67,7 @@ class ChainSample(Sample):
 
     chain: Chain
     convergence: Convergence
-    settings: Settings
+    settings: ChainSettings
 
     @cached_property
     def draws(self) -> WeightedDraws:
@@ -164,7 +164,7 @@ class PointSample(Sample):
 def sample_chain(
     density: Density | RecordDensity,
     start: Start,
-    settings: Settings,
+    settings: ChainSettings,
     *,
     seed: int | None = None,
     resume: str | os.PathLike[str] | None = None,

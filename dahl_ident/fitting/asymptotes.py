@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Asymptote, Element, Parameter
 from dahl_ident.fitting.directions import Direction, Directions, directions, free_springs
-from dahl_ident.fitting.optimum import Combination, blanked
+from dahl_ident.fitting.optimum import DeterminedCombination, blanked
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem
 
@@ -129,7 +129,7 @@ class Limit:
         slopes: FloatArray,
         covariance: FloatArray,
         lost: NDArray[np.bool_],
-    ) -> tuple[Combination, ...]:
+    ) -> tuple[DeterminedCombination, ...]:
         """Return what is determined; `slopes` is dtheta/dphi, and the last two are of phi."""
         found = []
         for expression, powers in self.kept:
@@ -137,13 +137,15 @@ class Limit:
             if not by_phi.any() or (lost & (np.abs(by_phi) > 0.0)).any():
                 continue
             value = float(np.exp(powers @ theta))
-            found.append(Combination(expression, value, value * _spread(by_phi, covariance)))
+            found.append(
+                DeterminedCombination(expression, value, value * _spread(by_phi, covariance))
+            )
         if self.chart.tied is not None:
             spring, sigma = self.chart.tied
             place = int(np.flatnonzero(self.chart.matrix[spring])[0])
             error = float(np.sqrt(covariance[place, place]))
             text = f"{self.names[sigma]} + {self.names[spring]}"
-            found.append(Combination(text, float(phi[place]), error))
+            found.append(DeterminedCombination(text, float(phi[place]), error))
         return tuple(found)
 
     def spread(

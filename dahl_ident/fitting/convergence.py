@@ -10,7 +10,7 @@ from dahl_ident.fitting.asymptotes import Limit
 from dahl_ident.fitting.levenberg_marquardt import IntArray, Minima
 from dahl_ident.fitting.losses import Loss
 from dahl_ident.fitting.optimum import (
-    Combination,
+    DeterminedCombination,
     OptimumBatch,
     at_bound,
     estimated_scale,
@@ -119,7 +119,7 @@ def optima(
     with np.errstate(invalid="ignore"):  # infinite variances of what no residual holds
         covariance = inner * (final / scale)[:, None, None] ** 2
     status: list[Status] = []
-    combinations: dict[int, tuple[Combination, ...]] = {}
+    combinations: dict[int, tuple[DeterminedCombination, ...]] = {}
     outside: NDArray[np.bool_] = np.zeros(S, dtype=np.bool_)
     if problem.is_bounded:
         outside = np.any(at_bound(problem, theta), axis=1)

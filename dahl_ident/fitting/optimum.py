@@ -25,7 +25,7 @@ _PART = 1e-4  # of a parameter in such a direction that matters
 
 
 @dataclass(frozen=True)
-class Combination:
+class DeterminedCombination:
     """A combination of parameters that the data determine although its parts run away."""
 
     expression: str
@@ -95,7 +95,7 @@ class Optimum:
         The solver.
     loss : str
         "linear", or the robust loss.
-    combinations : tuple of Combination
+    combinations : tuple of DeterminedCombination
         What is determined where the optimum lies at infinity.
     constraint_cost : ConstraintCost or None
         What constraints cost; None where there are none, or the loss is robust.
@@ -114,7 +114,7 @@ class Optimum:
     message: str
     method: str
     loss: str = "linear"
-    combinations: tuple[Combination, ...] = field(default=())
+    combinations: tuple[DeterminedCombination, ...] = field(default=())
     constraint_cost: ConstraintCost | None = None
 
     @property
@@ -215,7 +215,7 @@ class OptimumBatch(Sequence[Optimum]):
     undetermined: NDArray[np.bool_]
     method: str
     loss: str
-    combinations: Mapping[int, tuple[Combination, ...]]
+    combinations: Mapping[int, tuple[DeterminedCombination, ...]]
     """Of the tables at a limit."""
     meanings: Mapping[int, str]
     """Of their limits, where the status does not say it."""

@@ -20,8 +20,8 @@ from dahl_ident.elements import Model
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.bench_time import BenchTime
 from dahl_ident.planning.criteria import LevelInformation
-from dahl_ident.planning.knowledge import Knowledge, placeholder, to_values
-from dahl_ident.planning.trajectories import Motion
+from dahl_ident.planning.knowledge import Knowledge, placeholder
+from dahl_ident.planning.trajectories import PlannedMotion
 from dahl_ident.problem import Problem
 
 CONTROLLED = ("displacement", "force")
@@ -35,7 +35,7 @@ _CHECKED_DRAWS = 25  # at which the number of steady amplitudes is counted
 
 
 @dataclass(frozen=True)
-class Limits:
+class BenchLimits:
     """Limits of the bench; lower limits are 0 where only the upper limit is given.
 
     Attributes
@@ -54,7 +54,7 @@ class Limits:
     time: float = np.inf
 
     @classmethod
-    def of(cls, given: Mapping[str, Any] | None) -> Limits:
+    def of(cls, given: Mapping[str, Any] | None) -> BenchLimits:
         """Return the limits of a mapping.
 
         Raises
@@ -87,7 +87,7 @@ class Limits:
             found[name] = tuple(pair)
         return cls(**found)
 
-    def relaxed(self, name: str, factor: float) -> Limits:
+    def relaxed(self, name: str, factor: float) -> BenchLimits:
         """Return the limits with one of them `factor` times wider at both ends."""
         low, high = getattr(self, name)
         changed: dict[str, Any] = {name: (low / factor, high * factor)}
@@ -139,7 +139,7 @@ class Candidates:
         phase.
     variance : ndarray, shape (S, K)
         Of ln gain and phase in one cycle.
-    motions : tuple of Motion
+    motions : tuple of PlannedMotion
         Motions in time whose periods the cycles are; empty for sines.
     """
 
@@ -151,7 +151,7 @@ class Candidates:
     rows: FloatArray
     offsets: FloatArray
     variance: FloatArray
-    motions: tuple[Motion, ...] = ()
+    motions: tuple[PlannedMotion, ...] = ()
 
     @property
     def count(self) -> int:
@@ -180,7 +180,7 @@ class Candidates:
 
 
 def grid(
-    knowledge: Knowledge, limits: Limits, controlled: str, count: int
+    knowledge: Knowledge, limits: BenchLimits, controlled: str, count: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return levels and frequencies of about `count` candidates, before limits are applied."""
     if not np.isfinite(limits.frequency_hz[1]):
@@ -209,7 +209,7 @@ def grid(
     return np.tile(levels, n), np.repeat(frequencies, len(levels))
 
 
-def level_range(knowledge: Knowledge, limits: Limits, controlled: str) -> tuple[float, float]:
+def level_range(knowledge: Knowledge, limits: BenchLimits, controlled: str) -> tuple[float, float]:
     """Return the lowest and the highest level: the limits, or what the knee suggests."""
     low, high = getattr(limits, controlled)
     if controlled == "force":
@@ -232,7 +232,7 @@ def evaluate(
     level: FloatArray,
     frequency_hz: FloatArray,
     controlled: str,
-    limits: Limits,
+    limits: BenchLimits,
     noise: CycleNoise,
 ) -> Candidates:
     """Return the candidates that every limit allows.
@@ -276,7 +276,7 @@ def evaluate(
     )  # fmt: skip
 
 
-def allowed(limits: Limits, sizes: Mapping[str, FloatArray], count: int) -> NDArray[np.bool_]:
+def allowed(limits: BenchLimits, sizes: Mapping[str, FloatArray], count: int) -> NDArray[np.bool_]:
     """Return which of `count` candidates stay within every limit at nearly all draws.
 
     Raises
@@ -442,6 +442,3 @@ def larger_rows(
         problem,
         theta,
     )
-
-
-__all__ = ["Candidates", "CycleNoise", "Limits", "bench_time", "evaluate", "grid", "to_values"]

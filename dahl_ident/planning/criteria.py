@@ -136,7 +136,7 @@ class Term:
 
 
 @dataclass(frozen=True)
-class Point:
+class DesignPoint:
     """A criterion's value at each design, and its sensitivity for each term's packed rows."""
 
     value: FloatArray
@@ -184,7 +184,7 @@ class Objective:
             result = result + term.weight * term.value_and_slope(M)[0]
         return result
 
-    def at(self, cycles: FloatArray) -> Point:
+    def at(self, cycles: FloatArray) -> DesignPoint:
         """Return values and sensitivities at the cycles of every candidate, (..., K)."""
         value, found = np.zeros(cycles.shape[:-1]), []
         for term in self.terms:
@@ -194,9 +194,9 @@ class Objective:
             factor = term.weight * self.runs / term.levels.draws
             by_total = factor * (back.swapaxes(-1, -2) @ slope @ back)
             found.append(by_total.reshape(*value.shape, -1))
-        return Point(value, tuple(found))
+        return DesignPoint(value, tuple(found))
 
-    def gradient(self, point: Point) -> FloatArray:
+    def gradient(self, point: DesignPoint) -> FloatArray:
         """Return the derivative by the cycles of each of this objective's candidates, (..., K)."""
         return np.asarray(
             sum(

@@ -17,7 +17,7 @@ from dahl_ident.planning.criteria import LevelInformation, Objective, Term
 from dahl_ident.planning.forecast import Forecast, typical
 from dahl_ident.planning.optimal_design import Coverage, Exchange, Selection, continuous_design
 from dahl_ident.planning.quantities import sizes
-from dahl_ident.planning.question import Question
+from dahl_ident.planning.question import PlanRequest
 
 _POOL = 80  # candidates: the time of the search grows with their number
 _MOST_RUNS = 8  # against scatter between runs: a ninth would gain 6 %
@@ -45,7 +45,7 @@ class Solution:
 class LevelSearch:
     """The search for levels and cycles: candidates evaluated once, then solved for any time."""
 
-    def __init__(self, question: Question, forecast: Forecast, bench: BenchTime) -> None:
+    def __init__(self, question: PlanRequest, forecast: Forecast, bench: BenchTime) -> None:
         self.question, self.forecast, self.bench = question, forecast, bench
         some = forecast.thinned()
         self._few, self._main = some.draws, some.term(question.wanted)

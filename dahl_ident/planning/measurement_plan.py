@@ -26,7 +26,7 @@ _CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the plan's time, in the picture
 
 
 @dataclass(frozen=True)
-class Step:
+class PlanStep:
     """One level of a run, or one motion in time.
 
     Attributes
@@ -39,7 +39,7 @@ class Step:
         Cycles before measuring, and measured: the repeats of a motion.
     seconds : float
         Change-over, settling and measuring.
-    motion : Motion or None
+    motion : PlannedMotion or None
         The motion in time that is repeated, None for a sine.
     """
 
@@ -48,7 +48,7 @@ class Step:
     settling_cycles: int
     measured_cycles: int
     seconds: float
-    motion: trajectories.Motion | None = None
+    motion: trajectories.PlannedMotion | None = None
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Plan:
     ----------
     controlled : {"displacement", "force"}
         What the levels are amplitudes of.
-    steps : tuple of Step
+    steps : tuple of PlanStep
         One run, in its order.
     runs : int
         Number of equal runs.
@@ -119,7 +119,7 @@ class Plan:
     """
 
     controlled: str
-    steps: tuple[Step, ...]
+    steps: tuple[PlanStep, ...]
     runs: int
     seconds: float
     expected: Mapping[str, Expected]
@@ -254,7 +254,7 @@ class Plan:
         write_whole(place, frame.to_csv(index=False).encode(), overwrite=overwrite)
         return place
 
-    def _check_moves(self, motions: list[trajectories.Motion]) -> None:
+    def _check_moves(self, motions: list[trajectories.PlannedMotion]) -> None:
         """Check that the moves to the motions' starts are within the limits of the exciter."""
         limits, place = self.planner.question.limits, 0.0
         for i, motion in enumerate(motions, start=1):
@@ -410,10 +410,10 @@ class Plan:
         ]
 
 
-def vars_of(one: Step | Expected) -> dict[str, Any]:
+def vars_of(one: PlanStep | Expected) -> dict[str, Any]:
     """Return the fields of a step or an expectation; of a motion what describes it."""
     found = dict(vars(one))
-    if not isinstance(one, Step):
+    if not isinstance(one, PlanStep):
         return found
     motion = found.pop("motion")
     if motion is None:

@@ -18,9 +18,9 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.bench_time import LEAST_CYCLES
-from dahl_ident.planning.candidates import Candidates, Limits, allowed
+from dahl_ident.planning.candidates import BenchLimits, Candidates, allowed
 from dahl_ident.planning.knowledge import Knowledge
-from dahl_ident.planning.trajectories import SAMPLES_PER_CYCLE, Motion, Multisine, Trapezoid
+from dahl_ident.planning.trajectories import SAMPLES_PER_CYCLE, Multisine, PlannedMotion, Trapezoid
 from dahl_ident.problem.record_problem import RecordProblem
 
 _PER_PERIOD = 400  # samples at which derivatives are computed: integrals hold to about 1e-3
@@ -32,7 +32,7 @@ _SLOWER = 2.0  # times, from speed to speed and from band to band
 _LINES = 10  # of a multisine, its highest frequency over its lowest
 
 
-def motions_of(kind: str, limits: Limits, levels: tuple[float, float]) -> list[Motion]:
+def motions_of(kind: str, limits: BenchLimits, levels: tuple[float, float]) -> list[PlannedMotion]:
     """Return the candidates that a kind of motion stands for, within the limits.
 
     Raises
@@ -41,7 +41,7 @@ def motions_of(kind: str, limits: Limits, levels: tuple[float, float]) -> list[M
         If a limit is missing that a motion of the kind needs.
     """
     amplitudes = np.geomspace(*levels, _LEVELS).tolist()
-    found: list[Motion] = []
+    found: list[PlannedMotion] = []
     if kind == "trapezoid":
         for name in ("speed", "acceleration"):
             if not np.isfinite(getattr(limits, name)[1]):
@@ -74,7 +74,7 @@ class RecordedForce:
     noise: float
     sample_rate: float
 
-    def information(self, knowledge: Knowledge, motion: Motion, repeats: int) -> FloatArray:
+    def information(self, knowledge: Knowledge, motion: PlannedMotion, repeats: int) -> FloatArray:
         """Return the information of one record, (S, P, P): all its repeats, own unknowns out."""
         rate = min(self.sample_rate, _PER_PERIOD / motion.period)
         return _of_record(_sums(knowledge, motion, rate), repeats, motion.period) * (
@@ -83,7 +83,7 @@ class RecordedForce:
 
 
 @dataclass(frozen=True)
-class _Sums:
+class _RepeatSums:
     """Products of derivatives, (S, repeats, n, n), n = P + states + 2, and what repeats add."""
 
     products: FloatArray
@@ -91,7 +91,7 @@ class _Sums:
     force: FloatArray  # (S,), largest
 
 
-def _sums(knowledge: Knowledge, motion: Motion, rate: float) -> _Sums:
+def _sums(knowledge: Knowledge, motion: PlannedMotion, rate: float) -> _RepeatSums:
     m = max(round(motion.period * rate), _LEAST_SAMPLES)
     time = np.arange(float(_SIMULATED * m)) * (motion.period / m)
     record = Record(time, displacement=motion.displacement(time), force=np.zeros(time.size))
@@ -109,10 +109,10 @@ def _sums(knowledge: Knowledge, motion: Motion, rate: float) -> _Sums:
         blocks = by.reshape(_SIMULATED, m, n)
         found.append(blocks.swapaxes(1, 2) @ blocks)
         force.append(float(np.abs(predicted.output).max()))
-    return _Sums(np.array(found), P, np.array(force))
+    return _RepeatSums(np.array(found), P, np.array(force))
 
 
-def _of_record(sums: _Sums, repeats: int, period: float) -> FloatArray:
+def _of_record(sums: _RepeatSums, repeats: int, period: float) -> FloatArray:
     """Return the information of the parameters after elimination, for unit noise."""
     n, P = sums.products.shape[-1], sums.parameters
     whole = np.zeros((len(sums.products), n, n))
@@ -136,9 +136,12 @@ def _of_record(sums: _Sums, repeats: int, period: float) -> FloatArray:
 
 
 def evaluate_motions(
-    knowledge: Knowledge, motions: Sequence[Motion], limits: Limits, recorded: RecordedForce,
+    knowledge: Knowledge,
+    motions: Sequence[PlannedMotion],
+    limits: BenchLimits,
+    recorded: RecordedForce,
     lasting: float | None = None,
-) -> Candidates:  # fmt: skip
+) -> Candidates:
     """Return the candidates that every limit allows, with the information of a repeat.
 
     It is the mean over the repeats of a record of `lasting` s, or of `_REPEATS` repeats.

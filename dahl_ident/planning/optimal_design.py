@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
-from dahl_ident.planning.criteria import Objective, Point
+from dahl_ident.planning.criteria import DesignPoint, Objective
 
 _IMPROVES = 1e-3  # least improvement of the logarithm by a change of the levels
 _ROUNDS = 12  # at most; a round without improvement is the last
@@ -118,7 +118,7 @@ def _shared(
             continue
         new_rate = objective.gradient(new) * frequency_hz
         seconds, rate = np.where(fell, seconds, moved), np.where(fell, rate, new_rate)
-        point = Point(np.where(fell[..., 0], point.value, new.value), new.sensitivities)
+        point = DesignPoint(np.where(fell[..., 0], point.value, new.value), new.sensitivities)
     return np.asarray(seconds)
 
 

@@ -15,9 +15,9 @@ from dahl_ident.errors import ValidationError
 from dahl_ident.planning.bench_time import LEAST_CYCLES
 from dahl_ident.planning.candidates import (
     CONTROLLED,
+    BenchLimits,
     Candidates,
     CycleNoise,
-    Limits,
     bench_time,
     evaluate,
     grid,
@@ -27,19 +27,19 @@ from dahl_ident.planning.criteria import Objective, Term
 from dahl_ident.planning.forecast import Forecast
 from dahl_ident.planning.knowledge import Ranges, gather
 from dahl_ident.planning.level_search import LONGEST, LevelSearch, Solution
-from dahl_ident.planning.measurement_plan import Expected, Plan, Step
+from dahl_ident.planning.measurement_plan import Expected, Plan, PlanStep
 from dahl_ident.planning.motion_information import evaluate_motions, motions_of, root
 from dahl_ident.planning.optimal_design import continuous_design
 from dahl_ident.planning.quantities import RESPONSE, is_expanded, sizes
 from dahl_ident.planning.question import (
-    Question,
+    PlanRequest,
     larger_model,
     motions_asked,
     noise_of,
     recorded_force,
     targets_of,
 )
-from dahl_ident.planning.trajectories import Motion
+from dahl_ident.planning.trajectories import PlannedMotion
 from dahl_ident.steady_state import STEADY, Steady
 from dahl_ident.units import si_unit
 
@@ -63,7 +63,7 @@ def plan(
     scatter: float | None = None,
     runs: int | None = None,
     controlled: str = "displacement",
-    candidates: int | str | Sequence[tuple[float, float]] | Sequence[Motion] = 240,
+    candidates: int | str | Sequence[tuple[float, float]] | Sequence[PlannedMotion] = 240,
     larger: Element | None = None,
     suspects: Mapping[str, float] | None = None,
     change_over: float = 1.0,
@@ -167,7 +167,7 @@ def plan(
     """
     whole_number(draws, "draws", 2)
     one_of(controlled, "controlled", CONTROLLED)
-    bench = Limits.of(limits)
+    bench = BenchLimits.of(limits)
     knowledge = gather(source, ranges, draws, seed)
     if steady is not None:
         one_of(steady, "steady", STEADY)
@@ -187,7 +187,7 @@ def plan(
     if asked:
         _only_motions(wanted, scatter, suspects, controlled, runs, larger)
         known = replace(knowledge.thinned(_SLOW_DRAWS), errors=None, scatter=0.0)
-        question = Question(
+        question = PlanRequest(
             known, bench, controlled, CycleNoise(0.0), wanted, numbers, 0.0, 1, costs, None, {},
             recorded_force(noise, sample_rate, knowledge), asked,
         )  # fmt: skip
@@ -199,7 +199,7 @@ def plan(
         )
     if controlled == "force" and knowledge.steady == "exact":
         knowledge = knowledge.thinned(_SLOW_DRAWS)
-    question = Question(
+    question = PlanRequest(
         knowledge, bench, controlled, noise_of(noise, knowledge), wanted, numbers,
         knowledge.scatter if scatter is None else float(non_negative_array(scatter, "scatter")),
         None if runs is None else whole_number(runs, "runs", 1),
@@ -239,7 +239,7 @@ def _only_motions(
             )
 
 
-def _of_motions(question: Question, limits: Limits) -> Plan:
+def _of_motions(question: PlanRequest, limits: BenchLimits) -> Plan:
     """Return the better of two plans of motions.
 
     The first takes a repeat as worth the same share of a long record for every motion; the second
@@ -254,14 +254,17 @@ def _of_motions(question: Question, limits: Limits) -> Plan:
 
 
 def _options(
-    question: Question, limits: Limits, count: int = _FEW_LEVELS, lasting: float | None = None
+    question: PlanRequest,
+    limits: BenchLimits,
+    count: int = _FEW_LEVELS,
+    lasting: float | None = None,
 ) -> Candidates:
     """Return the candidates of a question within limits; motions repeated for `lasting` s."""
     q = question
     if q.recorded is None:
         level, frequency = grid(q.knowledge, limits, q.controlled, count)
         return evaluate(q.knowledge, level, frequency, q.controlled, limits, q.noise)
-    asked: Sequence[Motion] | str = q.motions
+    asked: Sequence[PlannedMotion] | str = q.motions
     if isinstance(asked, str):
         asked = motions_of(asked, limits, level_range(q.knowledge, limits, q.controlled))
     return evaluate_motions(q.knowledge, asked, limits, q.recorded, lasting)
@@ -270,7 +273,7 @@ def _options(
 class Planner:
     """One planning problem: its candidates, the search among them, and the plan in words."""
 
-    def __init__(self, question: Question, candidates: Candidates) -> None:
+    def __init__(self, question: PlanRequest, candidates: Candidates) -> None:
         self.question = q = question
         bench = bench_time(candidates, q.knowledge, **q.costs)
         settles = np.isfinite(bench.fixed(np.arange(candidates.count)[:, None]))
@@ -349,7 +352,7 @@ class Planner:
         settling = self.search.bench.settling_cycles(chosen.levels)
         options = self.forecast.candidates.only(chosen.levels)
         steps = tuple(
-            Step(level, f, int(wait), int(n), q.costs["change_over"] + (wait + n) / f, motion)
+            PlanStep(level, f, int(wait), int(n), q.costs["change_over"] + (wait + n) / f, motion)
             for level, f, wait, n, motion in zip(
                 options.level.tolist(), options.frequency_hz.tolist(), settling.tolist(),
                 chosen.cycles.tolist(), options.motions or (None,) * len(settling), strict=True,
@@ -419,7 +422,7 @@ class Planner:
             f"{base / most[helps]:.2g} times smaller"
         )
 
-    def _within_reach(self, name: str, limits: Limits) -> float:
+    def _within_reach(self, name: str, limits: BenchLimits) -> float:
         """Return the uncertainty of one quantity by the best continuous design."""
         q = self.question
         options = _options(q, limits)

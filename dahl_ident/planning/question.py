@@ -12,18 +12,18 @@ from dahl_ident.arrays import non_negative_array, positive_number
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError
-from dahl_ident.planning.candidates import CycleNoise, Limits
+from dahl_ident.planning.candidates import BenchLimits, CycleNoise
 from dahl_ident.planning.knowledge import Knowledge
 from dahl_ident.planning.motion_information import RecordedForce
-from dahl_ident.planning.trajectories import KINDS, Motion
+from dahl_ident.planning.trajectories import KINDS, PlannedMotion
 
 
 @dataclass(frozen=True)
-class Question:
+class PlanRequest:
     """The arguments of :func:`plan` in checked form; `recorded` only for motions in time."""
 
     knowledge: Knowledge
-    limits: Limits
+    limits: BenchLimits
     controlled: str
     noise: CycleNoise
     wanted: dict[str, float]
@@ -34,7 +34,7 @@ class Question:
     larger: Any
     suspects: dict[str, float]
     recorded: RecordedForce | None = None
-    motions: str | tuple[Motion, ...] = ()
+    motions: str | tuple[PlannedMotion, ...] = ()
 
 
 def noise_of(given: float | Mapping[str, float] | None, knowledge: Knowledge) -> CycleNoise:
@@ -59,7 +59,7 @@ def noise_of(given: float | Mapping[str, float] | None, knowledge: Knowledge) ->
     return CycleNoise(**{"relative": 0.0, **parts})
 
 
-def motions_asked(candidates: Any) -> str | tuple[Motion, ...]:
+def motions_asked(candidates: Any) -> str | tuple[PlannedMotion, ...]:
     """Return the motions in time among the candidates' forms, empty for sines."""
     if isinstance(candidates, str):
         if candidates not in KINDS:

@@ -21,7 +21,7 @@ UNITS = {
 _FINE = 64  # places a line at which a multisine's peaks are looked for: within 0.1 %
 
 
-class Motion(Protocol):
+class PlannedMotion(Protocol):
     """One period of a motion, which begins and ends at rest at the same place."""
 
     @property
@@ -224,7 +224,7 @@ def seconds_of_move(distance: float, speed: float, acceleration: float) -> float
 
 
 def course(
-    motions: Sequence[Motion], repeats: Sequence[int], change_over: float, time: FloatArray
+    motions: Sequence[PlannedMotion], repeats: Sequence[int], change_over: float, time: FloatArray
 ) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
     """Return displacement, number of the motion, and whether it is measured, at any times.
 

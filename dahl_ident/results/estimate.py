@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dahl_ident.bayes.chain import Pool, Settings
+from dahl_ident.bayes.chain import ChainSettings, Pool
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import PriorLike, joint_prior
 from dahl_ident.bayes.record_density import RecordDensity, record_prior
@@ -419,7 +419,7 @@ def posterior(
     _refuse_with_a_fit(data, options)
 
     def chain(density: Density | RecordDensity, start: Start) -> ChainSample:
-        settings = Settings.of(
+        settings = ChainSettings.of(
             len(density.names), seed=seed, steps=steps, max_steps=max_steps, ess=ess,
             walkers=walkers, ensembles=ensembles,
         )  # fmt: skip

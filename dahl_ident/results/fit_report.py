@@ -26,7 +26,7 @@ _NOISE = {
 
 
 @dataclass(frozen=True)
-class Section:
+class ReportPart:
     """A heading with its lines."""
 
     title: str
@@ -43,11 +43,13 @@ def fit_report(fit: FitResult, intervals: ConfidenceIntervals, *, details: bool 
     room = _BRIEF - 1 - len(numbers)
     if len(verdict.lines) > room:
         left = len(verdict.lines) - room + 1
-        verdict = Section(verdict.title, [*verdict.lines[: room - 1], f"({left} more statements)"])
+        verdict = ReportPart(
+            verdict.title, [*verdict.lines[: room - 1], f"({left} more statements)"]
+        )
     return "\n".join([*_lines([verdict]), *numbers])
 
 
-def _lines(sections: Iterable[Section]) -> Iterator[str]:
+def _lines(sections: Iterable[ReportPart]) -> Iterator[str]:
     for section in sections:
         yield section.title
         yield from (f"    {line}" for line in section.lines)
@@ -62,27 +64,27 @@ def as_html(fit: FitResult, intervals: ConfidenceIntervals) -> str:
     return f"<div>{''.join(parts)}</div>"
 
 
-def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[Section]:
+def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[ReportPart]:
     first, *others = fit.statements
     warnings = [f"Warning: {text}." for text in fit.goodness.warnings]
-    yield Section("Verdict", [first, *warnings, *others])
-    yield Section("Parameters", _parameters(fit, intervals))
+    yield ReportPart("Verdict", [first, *warnings, *others])
+    yield ReportPart("Parameters", _parameters(fit, intervals))
     combined = [str(c) for c in fit.identifiability.combinations]
     if combined:
-        yield Section("Determined combinations", combined)
+        yield ReportPart("Determined combinations", combined)
     derived = [str(q) for q in fit.derived()]
     if derived:
-        yield Section("Derived", derived)
+        yield ReportPart("Derived", derived)
     if fit.stated_budget is not None:
-        yield Section("Uncertainty budget", str(fit.stated_budget).splitlines())
+        yield ReportPart("Uncertainty budget", str(fit.stated_budget).splitlines())
     correlations = _correlations(fit)
     if correlations:
-        yield Section("Correlations", correlations)
-    yield Section("Noise", _noise(fit))
-    yield Section("Goodness of fit", fit.goodness.details or ["no test applies"])
+        yield ReportPart("Correlations", correlations)
+    yield ReportPart("Noise", _noise(fit))
+    yield ReportPart("Goodness of fit", fit.goodness.details or ["no test applies"])
     if not fit.goodness.acceptable:
-        yield Section("Other models, for comparison", str(compare_models(fit)).splitlines())
-    yield Section("Solver", _solver(fit))
+        yield ReportPart("Other models, for comparison", str(compare_models(fit)).splitlines())
+    yield ReportPart("Solver", _solver(fit))
 
 
 def _parameters(fit: FitResult, intervals: ConfidenceIntervals) -> list[str]:

@@ -44,7 +44,7 @@ from dahl_ident.diagnostics.judgement import Judgement
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
 from dahl_ident.elements import Model
 from dahl_ident.errors import FitError, ValidationError, choices
-from dahl_ident.fitting.optimum import Combination, Optimum, propagated
+from dahl_ident.fitting.optimum import DeterminedCombination, Optimum, propagated
 from dahl_ident.problem import Problem
 from dahl_ident.results import fit_report, fit_storage
 from dahl_ident.results.result import Parameters, Result, part
@@ -85,7 +85,7 @@ class FitResult(Result):
     noise: str = part("problem.noise", "The noise model.")
     success: bool = part("optimum.success", "Whether a finite optimum was found.")
     message: str = part("optimum.message", "How the search ended, in words.")
-    combinations: tuple[Combination, ...] = part(
+    combinations: tuple[DeterminedCombination, ...] = part(
         "optimum.combinations", "What the data determine where single parameters run away."
     )
     scale_known: bool = part("optimum.scale_known", "Whether the noise's scale was known before.")

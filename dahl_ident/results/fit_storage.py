@@ -21,7 +21,7 @@ from dahl_ident.data.storage import digest, plain_data, read_text
 from dahl_ident.elements.description import describe_model, model_from_description
 from dahl_ident.elements.law_files import describe_laws, require_laws
 from dahl_ident.errors import DataError
-from dahl_ident.fitting.optimum import Combination, ConstraintCost, Optimum
+from dahl_ident.fitting.optimum import ConstraintCost, DeterminedCombination, Optimum
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem
 from dahl_ident.sensors import EXACT, Sensors
@@ -203,7 +203,7 @@ def _optimum(content: Mapping[str, Any]) -> Optimum:
         loss=stored["loss"],
         constraint_cost=_constraint_cost(stored.get("constraint_cost")),
         combinations=tuple(
-            Combination(c["expression"], float(c["value"]), float(c["stderr"]))
+            DeterminedCombination(c["expression"], float(c["value"]), float(c["stderr"]))
             for c in stored["combinations"]
         ),
     )

@@ -10,7 +10,7 @@ from dahl_ident.diagnostics.formatting import percent, table
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutPart:
     """A part of the records, predicted by a fit to the others.
 
     Attributes
@@ -40,16 +40,16 @@ class HoldOut:
 
     Attributes
     ----------
-    parts : tuple of HeldOut
+    parts : tuple of HeldOutPart
         Each left out in turn.
 
     Examples
     --------
-    >>> HoldOut((HeldOut(1, 0.0, 5.0, 500, 0.021, 0.95),)).inside
+    >>> HoldOut((HeldOutPart(1, 0.0, 5.0, 500, 0.021, 0.95),)).inside
     0.95
     """
 
-    parts: tuple[HeldOut, ...]
+    parts: tuple[HeldOutPart, ...]
 
     @property
     def inside(self) -> float:

@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from dahl_ident.bayes.chain import Chain, Listener, Settings
+from dahl_ident.bayes.chain import Chain, ChainSettings, Listener
 from dahl_ident.bayes.convergence import LENGTH, Convergence
 
 
-def expected_steps(settings: Settings, verdict: Convergence | None) -> int | None:
+def expected_steps(settings: ChainSettings, verdict: Convergence | None) -> int | None:
     """Return the total number of steps as far as known: None before the first verdict."""
     if settings.steps is not None:
         return settings.steps
@@ -22,7 +22,7 @@ def expected_steps(settings: Settings, verdict: Convergence | None) -> int | Non
 
 
 @contextmanager
-def progress_bar(settings: Settings) -> Iterator[Listener]:
+def progress_bar(settings: ChainSettings) -> Iterator[Listener]:
     """Yield a listener that moves a bar."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn

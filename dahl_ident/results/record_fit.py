@@ -45,7 +45,7 @@ from dahl_ident.fitting.record_search import RecordOptimum, hold_model, solve_re
 from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.results.fit_storage import check_digest, check_schema, sealed
-from dahl_ident.results.hold_out import HeldOut, HoldOut
+from dahl_ident.results.hold_out import HeldOutPart, HoldOut
 from dahl_ident.results.progress import fit_progress
 from dahl_ident.results.result import Estimate, Parameters, Result
 from dahl_ident.units import shown_unit, si_unit
@@ -503,7 +503,9 @@ class RecordFit(Result):
             band = fit.predict(piece)
             inside = np.mean((band.measured >= band.lower) & (band.measured <= band.upper))
             first, last = float(piece.time[0]), float(piece.time[-1])
-            found.append(HeldOut(number, first, last, len(piece), band.rms_share, float(inside)))
+            found.append(
+                HeldOutPart(number, first, last, len(piece), band.rms_share, float(inside))
+            )
         return HoldOut(tuple(found))
 
     def started(
