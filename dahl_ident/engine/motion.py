@@ -129,6 +129,7 @@ def march(
     *,
     chosen: Sequence[int] = (),
     derivatives: bool = False,
+    finer: float = 1.0,
 ) -> Motion:
     """Return the motion of a system whose drive, or held displacement, is polynomials in time.
 
@@ -148,6 +149,8 @@ def march(
         Parameters whose derivatives are wanted.
     derivatives : bool, default False
         Whether any are.
+    finer : float, default 1
+        How many times smaller the error of a step is than usual.
 
     Raises
     ------
@@ -157,7 +160,7 @@ def march(
     found, output, by, states, last = kernels("samples").march(
         system.function, system.sizes, system.solved, system.followers, _numbers(knots),
         _numbers(coefficients), _numbers(samples), _numbers(first), _numbers(parameters),
-        np.asarray(chosen, dtype=np.int64), int(derivatives), _SAMPLED,
+        np.asarray(chosen, dtype=np.int64), int(derivatives), _SAMPLED / finer,
     )  # fmt: skip
     if not found or not np.isfinite(output).all():
         raise FitError(

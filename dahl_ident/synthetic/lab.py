@@ -14,13 +14,12 @@ from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.steady_state import response
 from dahl_ident.synthetic.excitation import SteppedSine
 from dahl_ident.synthetic.experiment import Experiment
-from dahl_ident.synthetic.mechanism import Mechanism, Signal
-from dahl_ident.synthetic.plant_motion import Progress
+from dahl_ident.synthetic.mechanism import Mechanism, Progress, Signal
 from dahl_ident.synthetic.randomness import Draws
 from dahl_ident.synthetic.table_errors import Phasors, Table, receptance_table, stiffness_table
 from dahl_ident.synthetic.waveform import Waveform
 
-GENERATOR = "dahl_ident.synthetic 2"
+GENERATOR = "dahl_ident.synthetic 3"
 """Raised whenever the same experiment and seed would give other values."""
 
 IntArray = NDArray[np.int64]
@@ -38,7 +37,7 @@ def simulate(
     experiment : Experiment
         Mechanism, excitation, sensors, and whether a record or a table is wanted.
     seed : int
-        Whole number >= 0. The same seed gives the same values to 1e-12 on every platform.
+        Whole number >= 0. The same seed gives the same values to 1e-10 on every platform.
     progress : callable, optional
         Called from time to time with the completed fraction, while a plant is simulated.
 
@@ -59,10 +58,11 @@ def simulate(
 
     Notes
     -----
-    A displacement-controlled mechanism is exact (Eqn. 3 from turning point to turning point).
-    A force-controlled plant (Eqn. 53) is solved to about 1e-11 of its motion, reversals located;
-    the describing function is not used. Tables of it contain the exact steady motion,
-    :func:`dahl_ident.response`, unless the table asks for the describing function.
+    The friction of a displacement-controlled mechanism is exact (Eqn. 3 from turning point to
+    turning point). The equation of motion of a force-controlled plant (Eqn. 53) is integrated to
+    about 1e-11 of its motion, reversals located; the describing function is not used. Tables of it
+    contain the exact steady motion, :func:`dahl_ident.response`, unless the table asks for the
+    describing function.
 
     Examples
     --------
