@@ -54,17 +54,9 @@ _SHOWN = 10  # rows that a warning names
 
 @dataclass(frozen=True)
 class Column:
-    """The column of a role, with its unit, sign and factor.
+    """The column of a role, by its usual name where there is no other, with its sign and factor.
 
-    Parameters
-    ----------
-    column : str or None
-        Name or path; None where the usual name is meant.
-    unit : str or None
-        Overrides the file's unit.
-    sign : {1, -1}
-    factor : float
-        Constant factor, sign not included.
+    A `unit` overrides the file's.
     """
 
     column: str | None = None
@@ -75,24 +67,7 @@ class Column:
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """Roles and other information that a file does not contain.
-
-    Parameters
-    ----------
-    roles : mapping of str to Column
-    quantity : str, optional
-        What gain and phase, or real and imaginary part, are.
-    controlled : str or mapping, optional
-        ``"displacement"`` or ``"force"``; or patterns of level labels for each of the two.
-    sweep : str, optional
-        Frequencies of a table without a column of them, such as ``"1:100Hz log"``.
-    sample_rate : float, optional
-        Hz, for records without a time column.
-    drive_factor : str, optional
-        Force for one unit of drive, such as ``"12.5 N/V"``.
-    drive_factor_uncertainty : float
-        Its relative standard uncertainty.
-    """
+    """Roles and other information that a file does not contain; see `read_frequency_response`."""
 
     roles: Mapping[str, Column] = field(default_factory=dict)
     quantity: Quantity | None = None
@@ -104,18 +79,7 @@ class ColumnMap:
 
 
 def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -> ColumnMap:
-    """Read a column map.
-
-    Parameters
-    ----------
-    value : mapping, path of a TOML file, or None
-        As the module describes it.
-    **overrides
-        Entries that replace those of `value`; None counts as absent.
-
-    Returns
-    -------
-    ColumnMap
+    """Read a column map from a mapping or a TOML file; `overrides` replace what it says.
 
     Examples
     --------

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,9 +25,6 @@ from dahl_ident.arrays import (
 from dahl_ident.data.quantities import polar_std
 from dahl_ident.errors import ValidationError, choices
 from dahl_ident.units import Motion, si_unit
-
-if TYPE_CHECKING:
-    from dahl_ident.data.frequency_response import FrequencyResponse
 
 Check = Callable[[ArrayLike, str], NDArray[Any]]
 CONTROLLED = ("displacement", "force")
@@ -184,16 +181,9 @@ def check_mean_covariance(
 class Column:
     """A column of a frequency response.
 
-    Attributes
-    ----------
-    check : callable
-        Returns an array of allowed values, or raises an error that names the column.
-    shape : tuple of int
-        Of one row's value.
-    repeats : bool
-        Whether one value may be given for all rows.
-    needs : tuple of str
-        Columns without which it means nothing.
+    `check` returns an array of allowed values, or raises an error that names the column; `shape` is
+    that of one row's value; where it `repeats`, one value may be given for all rows; without the
+    columns that it `needs` it means nothing.
     """
 
     check: Check
@@ -226,29 +216,20 @@ COLUMNS = {
 }
 
 
-Saved = Callable[["FrequencyResponse"], NDArray[Any] | None]
+Table = Any
+"""A frequency response, whose own module uses this one."""
+Saved = Callable[[Table], NDArray[Any] | None]
 
 
 @dataclass(frozen=True)
 class FileColumn:
-    """A column of a file.
+    """A column of a file, with its name and others under which it is found without a map.
 
-    Attributes
-    ----------
-    names : tuple of str
-        Its own, and others under which it is found without a column map.
-    unit : str
-        In which it is saved, such as ``({displacement})*({response})``; empty where it has none.
-    like : tuple of str
-        Columns of which the first that is there gives the unit, where its header has none.
-    least : str
-        What is expected of its numbers, where negative ones are refused.
-    saved : callable, optional
-        Returns its values in a frequency response.
-    form : str
-        The only form of table that has it: "rectangular", "polar" or "backbone"; empty for all.
-    header : str
-        With which it is saved; by default its name with its unit in brackets.
+    `unit` is that in which it is saved, such as ``({displacement})*({response})``; where a header
+    has none, the first column of `like` gives it. `least` says what is expected of numbers of which
+    negative ones are refused. `saved` returns its values in a frequency response; `form` is the
+    only form of table that has it: "rectangular", "polar" or "backbone". It is saved under
+    `header`, by default its name with its unit in brackets.
     """
 
     names: tuple[str, ...]
@@ -264,7 +245,7 @@ class FileColumn:
         kinds = {kind: si_unit(kind, motion) for kind in ("displacement", "force")}
         return self.unit.format(**kinds, response=si_unit(quantity, motion))
 
-    def header_of(self, data: FrequencyResponse) -> str:
+    def header_of(self, data: Table) -> str:
         """Return the header with which it is saved."""
         unit = f" [{self.unit_of(data.motion, data.quantity)}]" if self.unit else ""
         return self.header or f"{self.names[0]}{unit}"
@@ -278,7 +259,7 @@ class FileColumn:
 def _of(name: str, *part: int) -> Saved:
     """Return a function of a frequency response that gives a column, or a part of each row's."""
 
-    def saved(data: FrequencyResponse) -> NDArray[Any] | None:
+    def saved(data: Table) -> NDArray[Any] | None:
         values = getattr(data, name)
         return None if values is None else values[(slice(None), *part)]
 
@@ -288,7 +269,7 @@ def _of(name: str, *part: int) -> Saved:
 def _polar(axis: int) -> Saved:
     """Return a function that gives the standard deviation of gain (0) or phase, in degrees (1)."""
 
-    def saved(data: FrequencyResponse) -> NDArray[Any] | None:
+    def saved(data: Table) -> NDArray[Any] | None:
         if data.covariance is None:
             return None
         std = polar_std(data.response, data.covariance)[axis]
@@ -297,11 +278,11 @@ def _polar(axis: int) -> Saved:
     return saved
 
 
-def backbone_std(data: FrequencyResponse, axis: int) -> FloatArray:
+def backbone_std(data: Table, axis: int) -> FloatArray:
     """Return the standard deviation of a backbone's frequencies, Hz (0), or damping ratios (1)."""
     assert data.covariance is not None  # a backbone has one
     std = np.sqrt(data.covariance[:, axis, axis])
-    return std if axis else data.frequency_hz * std
+    return np.asarray(std if axis else data.frequency_hz * std)
 
 
 _A, _F, _R = "{displacement}", "{force}", "{response}"

@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.data.columns import Table
 from dahl_ident.data.quantities import polar_std
 from dahl_ident.errors import ValidationError
 from dahl_ident.units import engineering, si_unit
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from dahl_ident.data.frequency_response import FrequencyResponse
 
 _SAME_FREQUENCY = 5e-3  # relative
 _NOMINAL = 1.5  # factor within which a numeric level is the amplitude that was held
@@ -30,11 +29,11 @@ Stds = tuple[FloatArray | None, FloatArray | None]
 
 
 def draw(
-    data: FrequencyResponse,
+    data: Table,
     ax: Any = None,
     *,
-    stds: Callable[[FrequencyResponse], Stds] | None = None,
-    fitted: Callable[[FrequencyResponse, bool], Any] | None = None,
+    stds: Callable[[Table], Stds] | None = None,
+    fitted: Callable[[Table, bool], Any] | None = None,
 ) -> tuple[Any, Any]:
     """Draw gain and phase of the fundamental, over amplitude or frequency as suits the table.
 
@@ -71,7 +70,7 @@ def draw(
 
 
 def draw_backbone(
-    data: FrequencyResponse, stds: tuple[FloatArray, FloatArray], ax: Any = None
+    data: Table, stds: tuple[FloatArray, FloatArray], ax: Any = None
 ) -> tuple[Any, Any]:
     """Draw natural frequency and damping ratio over amplitude, with their standard deviations."""
     from dahl_ident.plots import plot_backbone
@@ -101,37 +100,37 @@ def draw_waveforms(time: FloatArray, frame: pd.DataFrame, kind: str, ax: Any = N
     raise ValidationError(f"kind is {kind!r}; expected 'waveforms' or 'loops'")
 
 
-def _stds(data: FrequencyResponse) -> Stds:
+def _stds(data: Table) -> Stds:
     return (None, None) if data.covariance is None else polar_std(data.response, data.covariance)
 
 
-def is_force_controlled(data: FrequencyResponse) -> bool:
+def is_force_controlled(data: Table) -> bool:
     """Return whether most rows were driven by force."""
     return bool(np.mean(data.controlled == "force") > 0.5)
 
 
-def held_amplitude(data: FrequencyResponse) -> FloatArray:
+def held_amplitude(data: Table) -> FloatArray:
     """Return the controlled amplitude, or the other one if that is unknown."""
     held, other = data.amplitude, data.drive
     if is_force_controlled(data):
         held, other = other, held
     found = other if held is None else held
     assert found is not None  # a table has one of the two
-    return found
+    return np.asarray(found)
 
 
-def held_label(data: FrequencyResponse) -> str:
+def held_label(data: Table) -> str:
     """Return the axis label of that amplitude."""
     kind = "force" if held_amplitude(data) is data.drive else "displacement"
     return f"{kind} amplitude [{si_unit(kind, data.motion)}]"
 
 
-def gain_label(data: FrequencyResponse) -> str:
+def gain_label(data: Table) -> str:
     """Return the axis label of the gain."""
     return f"{data.quantity.replace('_', ' ')} [{data.unit}]"
 
 
-def is_over_frequency(data: FrequencyResponse) -> bool:
+def is_over_frequency(data: Table) -> bool:
     """Return whether curves over frequency suit the table better than curves over amplitude."""
     parts = [data.select(level=label) for label in data.levels] or [data]
     return all(
@@ -139,7 +138,7 @@ def is_over_frequency(data: FrequencyResponse) -> bool:
     )
 
 
-def curves(data: FrequencyResponse) -> list[tuple[str, FrequencyResponse]]:
+def curves(data: Table) -> list[tuple[str, Table]]:
     """Return the parts of the table that make one curve each, with their labels.
 
     One a level over frequency, or one a frequency over amplitude.
@@ -151,7 +150,7 @@ def curves(data: FrequencyResponse) -> list[tuple[str, FrequencyResponse]]:
     return [(f"{f:.4g} Hz", data.select(rows=nominal == f)) for f in np.unique(nominal)]
 
 
-def curve_of_row(data: FrequencyResponse) -> FloatArray:
+def curve_of_row(data: Table) -> FloatArray:
     """Return for each row the frequency or the level's index that it shares with its curve."""
     if not is_over_frequency(data):
         return _nominal_frequency(data.frequency_hz)
@@ -160,17 +159,17 @@ def curve_of_row(data: FrequencyResponse) -> FloatArray:
     return np.array([data.levels.index(label) for label in data.level.tolist()], dtype=float)
 
 
-def abscissa(part: FrequencyResponse, over_frequency: bool) -> FloatArray:
+def abscissa(part: Table, over_frequency: bool) -> FloatArray:
     """Return the places of some rows on the axis."""
     return part.frequency_hz if over_frequency else held_amplitude(part)
 
 
-def abscissa_label(data: FrequencyResponse) -> str:
+def abscissa_label(data: Table) -> str:
     """Return the label of the axis that suits the table."""
     return "frequency [Hz]" if is_over_frequency(data) else held_label(data)
 
 
-def _level(label: Any, part: FrequencyResponse) -> str:
+def _level(label: Any, part: Table) -> str:
     """Return a level with a unit if it is the controlled amplitude and not just a name."""
     if not isinstance(label, (int, float)):
         return str(label)

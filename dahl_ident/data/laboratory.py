@@ -51,17 +51,10 @@ _INSTRUMENT = ("name", "quantity", "model", "serial", "calibration", "channel", 
 
 @dataclass(frozen=True)
 class Instrument:
-    """An instrument and its calibration.
+    """An instrument and its calibration, described in one line.
 
-    Attributes
-    ----------
-    text : str
-        One line: name, quantity, model, serial, calibration, uncertainty.
-    channel : str
-        "force", "displacement" or "delay"; empty where its uncertainty belongs to no channel.
-    u : float
-        Standard uncertainty of the channel: a share of force or displacement, s of a delay; 0
-        where none is stated.
+    `u` is the standard uncertainty of its channel, "force", "displacement" or "delay": a share of
+    force or displacement, s of a delay; 0 where none is stated.
     """
 
     text: str
@@ -73,13 +66,7 @@ class Instrument:
 class Metadata:
     """Metadata that a laboratory states; the usual fields left out are printed as blank lines.
 
-    Attributes
-    ----------
-    texts : mapping
-        Text of each field by its name in the file: title, number, laboratory and so on.
-    ambient : tuple of str
-        Such as "temperature 22.1 °C".
-    instruments : tuple of Instrument
+    `texts` are those of title, number, laboratory and so on, by their names in the file.
     """
 
     texts: Mapping[str, str] = field(default_factory=dict)

@@ -24,7 +24,6 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from dahl_ident.data.raw_columns import split_header
 from dahl_ident.errors import DahlIdentError, DataError, MissingDependencyError, ValidationError
 
 if TYPE_CHECKING:
@@ -331,13 +330,13 @@ def _hdf5(frame: pd.DataFrame) -> bytes:
     with h5py.File(buffer, "w") as root:
         root.attrs["dahl_ident"] = json.dumps(frame.attrs["dahl_ident"], ensure_ascii=False)
         for label in frame.columns:
-            name, unit = split_header(str(label))
+            name, _, unit = str(label).removesuffix("]").partition(" [")
             values = frame[label].to_numpy()
             text = values.dtype.kind not in "fiub"
             item = root.create_dataset(
                 name, data=values, dtype=h5py.string_dtype() if text else values.dtype
             )
-            if unit is not None:
+            if unit:
                 item.attrs["unit"] = unit
     return buffer.getvalue()
 
