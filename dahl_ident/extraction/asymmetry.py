@@ -31,18 +31,8 @@ def asymmetry(
 ) -> float:
     """Return the force's even harmonics over its fundamental, 0 where they are not significant.
 
-    Parameters
-    ----------
-    orders : ndarray, shape (n,)
-        Even orders from 2 on.
-    force : ndarray of complex, shape (n,)
-        Phasors over that of the fundamental.
-    variance : ndarray, shape (n,)
-        E abs(error)^2 of each.
-    dof : ndarray, shape (n,)
-        Its degrees of freedom.
-    displacement : ndarray, shape (n,)
-        Size of the displacement's phasors over that of its fundamental.
+    `force` and `displacement` are phasors of even orders over those of the fundamental, with E
+    abs(error)^2 of the former as `variance` and its degrees of freedom.
     """
     if orders.size == 0:
         return 0.0

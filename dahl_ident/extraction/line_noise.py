@@ -58,23 +58,9 @@ class LineNoise:
 def line_noise(
     fit: SineFit, harmonics: Sequence[int], cycles: int, residual: FloatArray
 ) -> list[LineNoise]:
-    """Return the noise next to each harmonic.
+    """Return the noise next to each harmonic of a fit over two or more whole cycles.
 
-    Parameters
-    ----------
-    fit : SineFit
-        Fit over a whole number of cycles.
-    harmonics : sequence of int
-        Which harmonics.
-    cycles : int
-        How many cycles, at least 2.
-    residual : ndarray, shape (2, n)
-        What the fit, and the transient, leave of motion and force.
-
-    Returns
-    -------
-    list of LineNoise
-        One for each harmonic.
+    `residual` is what the fit and the transient leave of motion and force.
     """
     reach = cycles // 2 if cycles >= CYCLES_FOR_SCATTER else cycles - 1
     side = min(reach, _MOST_LINES)

@@ -110,23 +110,10 @@ class _Piece:
 
 
 def find_spans(runs: Sequence[Cycles], mode: Mode, fewest: int, window: int | None) -> list[Span]:
-    """Return the spans of a record in order of time.
+    """Return the spans of runs of consecutive cycles, in order of time.
 
-    Parameters
-    ----------
-    runs : sequence of Cycles
-        Runs of consecutive cycles.
-    mode : {"auto", "steps", "sweep"}
-        Plateaus, sweeps, or whichever there is more of.
-    fewest : int
-        Cycles that a plateau has at least.
-    window : int or None
-        Cycles in a window of a sweep; None: as many as change little.
-
-    Returns
-    -------
-    list of Span
-        None where there is neither.
+    Plateaus of `fewest` cycles at least, windows of sweeps, or whichever there is more of. A
+    `window` has that many cycles, or else as many as change little.
     """
     pieces = [piece for cycles in runs for piece in _pieces(cycles) if len(piece) >= fewest]
     plateaus = [piece for piece in pieces if not piece.trending]

@@ -44,19 +44,8 @@ def steady_part(
 ) -> slice:
     """Return the part of a record without cycles at its ends that stray, or with more that fit.
 
-    Parameters
-    ----------
-    time, motion : ndarray
-        The record.
-    segment : Segment
-        The part's samples with the phase of a steady sine.
-    part, room : slice
-        Where the segment is, and where it may grow.
-
-    Returns
-    -------
-    slice
-        Where the room ends there may be a partial cycle.
+    `segment` is the part with the phase of a steady sine, `room` where it may grow. Where the room
+    ends there may be a partial cycle.
     """
     edges = cycle_edges(segment)
     start, stop = part.start, part.stop

@@ -39,14 +39,8 @@ _SPECTRUM_OF = 2**20  # samples at most
 def not_a_sine_test(motion: FloatArray, runs: Sequence[Cycles], covered: float) -> str:
     """Return why the motion is not a sine measurement; empty where it may be one.
 
-    Parameters
-    ----------
-    motion : ndarray
-        Samples of the record.
-    runs : sequence of Cycles
-        Its cycles between crossings.
-    covered : float
-        Share of the moving time that the points found cover; chance makes some of any motion.
+    `runs` are its cycles between crossings, `covered` is the share of the moving time that points
+    cover; chance makes some of any motion.
     """
     noise, period, amplitude, pairs = _neighbours(runs)
     unlike = period > _PERIOD_CHANGE or amplitude > _AMPLITUDE_CHANGE

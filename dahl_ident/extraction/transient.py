@@ -83,23 +83,10 @@ class Transient:
 def estimate_transient(
     fit: SineFit, channel: int, displacement_phase: float, response: complex
 ) -> Transient:
-    """Estimate the departure that a segment starts with.
+    """Return the departure that a segment starts with, at its first sample, and its rate.
 
-    Parameters
-    ----------
-    fit : SineFit
-        Fit from where the amplitude became constant, over at most `MOST_CYCLES`.
-    channel : {0, 1}
-        Where to look: 1, the force, unless the force is controlled.
-    displacement_phase : float
-        Phase of the displacement's phasor, rad.
-    response : complex
-        Dynamic stiffness; its phase determines beta if the decay does not.
-
-    Returns
-    -------
-    Transient
-        Departure at the first sample, and rate.
+    The fit is from where the amplitude became constant, over at most `MOST_CYCLES`; the phase of
+    the response, a dynamic stiffness, determines the rate if the decay does not.
     """
     drifting = fit.residual[channel] + fit.coefficients[1, channel] * fit.segment.tau
     few = thinned(replace(fit.segment, channels=drifting[None]))
