@@ -20,20 +20,7 @@ SMALLEST, LARGEST = 1e-90, 1e90
 
 
 def real_array(value: ArrayLike, name: str) -> FloatArray:
-    """Return `value` as a float array, or raise an error that says what it is.
-
-    Parameters
-    ----------
-    value : array_like
-        Numbers of any shape.
-    name : str
-        The argument's name, for the message.
-
-    Returns
-    -------
-    ndarray of float
-        A new array, or `value` itself if it already was one.
-    """
+    """Return `value` as a float array, or raise an error that names the argument."""
     refuse_masked(value, name)
     try:
         array = np.asarray(value)

@@ -141,21 +141,10 @@ _LONGEST = 60  # characters; longer text in brackets is a remark
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A unit that was read from text.
+    """A unit as it was written, and its value in SI units without the marker of an amplitude.
 
-    Parameters
-    ----------
-    text : str
-        As it was written.
-    factor : float
-        Its value in SI units, without the marker.
-    dimension : tuple of (str, float)
-        Exponents of the SI base units, the radian among them, sorted by name.
-    marker : {"zero to peak", "rms", "peak to peak"} or None
-        Whether an amplitude in this unit is rms or peak to peak, say; None where the text does not
-        say.
-    decibel : bool
-        Whether numbers are in decibels relative to this unit.
+    `dimension` has the exponents of the SI base units, the radian among them, sorted by name. The
+    marker is None where the text has none; `decibel` numbers are relative to this unit.
     """
 
     text: str
@@ -173,17 +162,10 @@ class Unit:
 def parse_unit(text: str) -> Unit:
     """Read a unit such as ``"um rms"`` or ``"(m/s^2)/N"``.
 
-    Parameters
-    ----------
-    text : str
-        Products by space, ``*``, a dot or a hyphen; powers as ``m/s^2``, ``m/s2`` or ``m/s²``;
-        amplitudes marked ``rms``, ``pp`` or ``pk`` at the end; decibels as ``dB`` followed by
-        the reference unit. ``g`` is the gram; the acceleration is ``g_n``, and ``g`` is read so
-        only where :func:`kind_of` needs an acceleration.
-
-    Returns
-    -------
-    Unit
+    Products are written with a space, ``*``, a dot or a hyphen; powers as ``m/s^2``, ``m/s2`` or
+    ``m/s²``; amplitudes are marked ``rms``, ``pp`` or ``pk`` at the end; decibels are ``dB`` with
+    the reference unit. ``g`` is the gram; the acceleration is ``g_n``, and ``g`` is read so only
+    where :func:`kind_of` needs an acceleration.
 
     Examples
     --------
@@ -211,23 +193,9 @@ def parse_unit(text: str) -> Unit:
 
 
 def kind_of(unit: Unit, kinds: tuple[str, ...], what: str) -> tuple[str, Motion, float]:
-    """Say which of `kinds` a unit belongs to.
+    """Return which of `kinds`, keys of `SI_UNITS`, a unit belongs to, its motion and its SI value.
 
-    Parameters
-    ----------
-    unit : Unit
-        What was read.
-    kinds : tuple of str
-        The kinds that are possible here, keys of `SI_UNITS`.
-    what : str
-        What has the unit, for the message.
-
-    Returns
-    -------
-    kind : str
-    motion : {"translation", "rotation"}
-    factor : float
-        SI value of one of the unit.
+    `what` has the unit, for the message.
 
     Examples
     --------
@@ -320,12 +288,7 @@ def shown_unit(unit: str, motion: Motion) -> str:
 def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float, str, Motion]:
     """Read a number with its unit, such as ``"0.2 N"`` or ``"5 um rms"``.
 
-    Returns
-    -------
-    value : float
-        In SI; an amplitude marked rms or pp becomes zero to peak.
-    kind : str
-    motion : {"translation", "rotation"}
+    Returns its SI value, zero to peak where it is an amplitude, its kind and its motion.
 
     Examples
     --------
