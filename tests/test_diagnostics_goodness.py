@@ -53,9 +53,10 @@ def swept_table(fall: float, noise: float = 0.01, seed: int = 1) -> FrequencyRes
 
 class TestSilence:
     def test_p_values_are_uniform_and_alarms_are_rare(self) -> None:
-        found = [judge(table(seed=seed, n=8 + 22 * (seed % 2))) for seed in range(300)]
-        assert sum(not g.acceptable for g in found) <= 8
-        assert 4 <= sum(bool(g.hints) for g in found) <= 32
+        found = [judge(table(seed=seed, n=8 + 22 * (seed % 2))) for seed in range(60)]
+        # of 60: at 1, 5 and 2 % more than these come once in 3,000, 1,000 and 1,000 times
+        assert sum(not g.acceptable for g in found) <= 4
+        assert 1 <= sum(bool(g.hints) for g in found) <= 9
         for p in (
             [g.trends[0].p_value for g in found],
             [g.exponent.p_value for g in found if g.exponent],
@@ -63,7 +64,7 @@ class TestSilence:
             assert stats.kstest(p, "uniform").pvalue > 1e-3
         runs = [g.runs[0].p_value for g in found if g.runs]
         assert np.mean(np.array(runs) < 0.05) < 0.09
-        assert sum(bool(g.suspicious) for g in found) <= 12
+        assert sum(bool(g.suspicious) for g in found) <= 5
 
     def test_known_noise(self) -> None:
         data = table(seed=2)

@@ -52,7 +52,7 @@ class TestStiffening:
         assert "which this law cannot describe" in result.verdict
 
     def test_noise_alone_seldom_looks_so(self) -> None:
-        made = [rise(stiffened(0.0, noise=0.05, seed=seed)) for seed in range(80)]
+        made = [rise(stiffened(0.0, noise=0.05, seed=seed)) for seed in range(30)]
         p = np.array([1.0 if one is None else one.p_value for one in made])
         assert np.mean(p < 0.05) < 0.1
 
@@ -159,7 +159,7 @@ class TestWords:
 
 class TestComparison:
     def test_chance_does_not_make_another_model_the_best(self) -> None:
-        for seed in range(12):
+        for seed in range(6):
             found = compare_models(fit(table(seed=seed), Dahl()))
             assert found.best is found.models[0]
 
