@@ -7,20 +7,19 @@ Only keys and positions of lines are held in memory.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
-from dahl_ident.data.storage import inert, library, put_in_place
+from dahl_ident.data.storage import inert, put_in_place
 from dahl_ident.errors import DataError
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 _ROWS_AT_ONCE = 2000
-"""Rows of the table in memory; about 10 MB."""
+"""Rows that are in memory as dictionaries, which are ten times as large as in a table."""
 _FIRST = ("device", "run", "status", "error", "statements")
 
 
@@ -94,35 +93,35 @@ def finished(path: Path) -> tuple[dict[str, int], list[float], int]:
     return places, seconds, end
 
 
-def write_tables(rows: Callable[[], Iterator[dict[str, Any]]], folder: Path) -> dict[str, int]:
+def write_tables(rows: Iterable[Mapping[str, Any]], folder: Path) -> dict[str, int]:
     """Write ``results.csv`` and, where pyarrow is installed, ``results.parquet``, atomically.
-
-    `rows` is called once for the columns and once for each file.
 
     Returns
     -------
     dict of str to int
         How many rows there are of each status.
     """
-    columns: dict[str, type] = {}
-    statuses: dict[str, int] = {}
-    for row in rows():
-        statuses[row["status"]] = statuses.get(row["status"], 0) + 1
-        for name, value in _flat(row).items():
-            if value is not None:
-                columns[name] = str if columns.get(name, type(value)) is str else type(value)
-    rest = [c for c in columns if c not in _FIRST]
-    order = [*(c for c in _FIRST if c in columns), *sorted(rest)]
-    writers = {"results.csv": _csv}
+    import pandas as pd
+
+    flat = map(_flat, rows)
+    blocks = iter(lambda: list(islice(flat, _ROWS_AT_ONCE)), [])
+    table = pd.concat([pd.DataFrame(), *map(pd.DataFrame, blocks)], ignore_index=True)
+    first = [name for name in _FIRST if name in table]
+    table = table[[*first, *sorted(map(str, set(table) - set(first)))]]
+    is_number = pd.api.types.is_numeric_dtype
+    table = table.astype({c: "float64" if is_number(table[c]) else "string" for c in table})
+    writers: dict[str, Callable[[Path], object]] = {
+        "results.csv": partial(inert(table).to_csv, index=False, lineterminator="\n")
+    }
     if find_spec("pyarrow") is not None:
-        writers["results.parquet"] = _parquet
+        writers["results.parquet"] = partial(table.to_parquet, engine="pyarrow", index=False)
     for name, write in writers.items():
-        path, frames = folder / name, _frames(rows, order, columns)
+        path = folder / name
         try:
-            put_in_place(path, partial(write, frames))
+            put_in_place(path, write)
         except OSError as exc:
             raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
-    return statuses
+    return dict(Counter(table["status"].tolist())) if len(table) else {}
 
 
 def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -136,41 +135,3 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
         else:
             flat[name] = value
     return flat
-
-
-def _frames(
-    rows: Callable[[], Iterator[dict[str, Any]]],
-    order: Sequence[str],
-    columns: Mapping[str, type],
-) -> Iterator[pd.DataFrame]:
-    import pandas as pd
-
-    def frame(block: list[dict[str, Any]]) -> pd.DataFrame:
-        table = pd.DataFrame.from_records(block, columns=list(order))
-        kinds = {c: "string" if columns[c] is str else "float64" for c in order}
-        return table.astype(kinds)
-
-    block: list[dict[str, Any]] = []
-    for row in rows():
-        block.append(_flat(row))
-        if len(block) == _ROWS_AT_ONCE:
-            yield frame(block)
-            block = []
-    yield frame(block)
-
-
-def _csv(frames: Iterator[pd.DataFrame], path: Path) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        for number, frame in enumerate(frames):
-            inert(frame).to_csv(file, index=False, header=number == 0, lineterminator="\n")
-
-
-def _parquet(frames: Iterator[pd.DataFrame], path: Path) -> None:
-    pyarrow, parquet = library("pyarrow"), library("pyarrow.parquet")
-    writer = None
-    for frame in frames:
-        table = pyarrow.Table.from_pandas(frame, preserve_index=False)
-        writer = writer or parquet.ParquetWriter(path, table.schema)
-        writer.write_table(table)
-    if writer is not None:
-        writer.close()

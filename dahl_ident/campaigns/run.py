@@ -266,12 +266,8 @@ def campaign(
                 except LostError as exc:
                     lost = exc
             there = [tag for tag in tagged if tag[0] in journal.places]
-
-            def rows() -> Iterator[dict[str, Any]]:
-                found = journal.rows(key for key, _ in there)
-                for (_, task), row in zip(there, found, strict=True):
-                    yield _whole(task, row)
-
+            done_rows = journal.rows(key for key, _ in there)
+            rows = (_whole(t, row) for (_, t), row in zip(there, done_rows, strict=True))
             statuses = write_tables(rows, folder)
     if lost is not None:
         raise DataError(
