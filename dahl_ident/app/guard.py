@@ -25,16 +25,8 @@ _HEADERS = {
 class Guard:
     """Refuses requests without the token, by another name of this machine, or from other pages.
 
-    Parameters
-    ----------
-    app : callable
-        What it guards.
-    token : str
-        In the address at first, then in a cookie that no other site's requests carry.
-    port : int
-        Of the server.
-    limit : int
-        Bytes of one request's body.
+    The token is in the address at first, then in a cookie that no other site's requests carry;
+    `limit` is the size of one request's body in bytes.
     """
 
     def __init__(self, app: ASGIApp, token: str, port: int, limit: int) -> None:

@@ -56,15 +56,7 @@ _HERE = Path(__file__).parent
 
 
 class App:
-    """The pages.
-
-    Parameters
-    ----------
-    root : Path
-        Folder in which each piece of work has a folder.
-    laws : sequence of Path
-        Files with laws of the user, which every command gets.
-    """
+    """The pages; `root` holds a folder for each piece of work, every command gets the `laws`."""
 
     def __init__(self, root: Path, laws: tuple[Path, ...] = ()) -> None:
         self.root, self.jobs = root, Jobs()
@@ -349,19 +341,7 @@ def application(
 
 
 def serve(root: Path, *, port: int, laws: tuple[Path, ...] = (), browser: bool = True) -> None:
-    """Serve the page until it is interrupted.
-
-    Parameters
-    ----------
-    root : Path
-        Folder for the work.
-    port : int
-        0 takes a free one.
-    laws : tuple of Path
-        Files with laws of the user.
-    browser : bool, default True
-        Open the page.
-    """
+    """Serve the page until it is interrupted; port 0 takes a free one."""
     import socket
 
     listening = socket.create_server(("127.0.0.1", port))

@@ -41,43 +41,7 @@ def write_campaign_report(
     reports: Path | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Write the report of a campaign.
-
-    Parameters
-    ----------
-    table : DataFrame
-        That of a campaign.
-    found : Population or None
-        Its evaluation by :func:`population`; None where too few devices were usable.
-    path : path
-        Ending in ``.html`` or ``.pdf``.
-    title : str
-        First line.
-    reports : Path, optional
-        Folder of the reports of single fits, to which the devices link.
-    overwrite : bool, default False
-        Replace a report that is there already.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    ValidationError
-        If the ending is another one.
-    DataError
-        If a file is there already and `overwrite` is not set, or the place cannot be written to.
-
-    Examples
-    --------
-    >>> from tempfile import mkdtemp
-    >>> import pandas as pd
-    >>> table = pd.DataFrame({"device": ["d1"], "status": ["failed"], "error": ["no such file"]})
-    >>> write_campaign_report(table, None, Path(mkdtemp()) / "campaign.html").name
-    'campaign.html'
-    """
+    """Write the report of a campaign; `reports` is the folder of the fits' reports, for links."""
     from dahl_ident.data.storage import place_of, write_whole
     from dahl_ident.reporting.html import html
     from dahl_ident.reporting.pdf import pdf

@@ -119,26 +119,10 @@ class Definition:
 
 
 def read_definition(source: str | Path | Mapping[str, Any]) -> Definition:
-    """Return a checked campaign.
+    """Return a checked campaign from a TOML file, or from its content.
 
-    Parameters
-    ----------
-    source : path or mapping
-        A TOML file, or its content; paths of a mapping are relative to the working folder.
-
-    Returns
-    -------
-    Definition
-        With every file found and every covariate known.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read, a table or option is unknown, the pattern finds no file or no
-        device, two files have the same device and run, or a covariate is missing, is given twice
-        or is called as a column of results.
-    ModelError
-        If an element of the model is unknown.
+    Every file exists and every covariate is known; the paths of a mapping are relative to the
+    working folder.
     """
     if isinstance(source, Mapping):
         content, name, folder = dict(source), "the campaign", Path.cwd()

@@ -231,28 +231,9 @@ class Scheduler(Place):
 def run_jobs(
     jobs: Iterable[tuple[_Tag, Job]], place: Place, limits: Limits, patience: float = PATIENCE
 ) -> Iterator[tuple[_Tag, Row]]:
-    """Yield the row of each job as it is completed.
+    """Yield the row of each job as it is completed; jobs are read as they are needed.
 
-    Parameters
-    ----------
-    jobs : iterable of (tag, Job)
-        Read as they are needed, so that a million of them need little memory.
-    place : Place
-        Where they are done.
-    limits : Limits
-        Of each of them.
-    patience : float
-        Seconds for which the place may not answer.
-
-    Yields
-    ------
-    tag, row
-        In the order of completion.
-
-    Raises
-    ------
-    LostError
-        If the place does not answer for longer.
+    Raises LostError where the place does not answer for `patience` seconds.
     """
     waiting, again = iter(jobs), list[tuple[_Tag, Job]]()
     under_way: dict[Future[Row], tuple[tuple[_Tag, Job], float]] = {}

@@ -24,15 +24,7 @@ _FIRST = ("device", "run", "status", "error", "statements")
 
 
 class Journal:
-    """The lines of one campaign.
-
-    Attributes
-    ----------
-    places : dict of str to int
-        Position of the line of each finished key.
-    seconds : list of float
-        How long the fits took that did not fail.
-    """
+    """The lines of one campaign: where that of each finished key is, and how long fits took."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -94,13 +86,7 @@ def finished(path: Path) -> tuple[dict[str, int], list[float], int]:
 
 
 def write_tables(rows: Iterable[Mapping[str, Any]], folder: Path) -> dict[str, int]:
-    """Write ``results.csv`` and, where pyarrow is installed, ``results.parquet``, atomically.
-
-    Returns
-    -------
-    dict of str to int
-        How many rows there are of each status.
-    """
+    """Write ``results.csv`` and, with pyarrow, ``results.parquet``; return counts of statuses."""
     import pandas as pd
 
     flat = map(_flat, rows)

@@ -65,13 +65,7 @@ def common(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line; always ends with SystemExit.
-
-    Parameters
-    ----------
-    arguments : list of str, optional
-        As typed after ``dahl-ident``; by default those of the process.
-    """
+    """Run the command line as typed after ``dahl-ident``; always ends with SystemExit."""
     typed = sys.argv[1:] if arguments is None else arguments
     # the matrices are small: numerical threads would wait for each other longer than they work
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -75,12 +74,13 @@ def campaign(
     laws.run()
     read = read_definition(definition)
     _check_report(report, writing.overwrite, covariate, order, read)
-    with ExitStack() as stack:
-        progress = stack.enter_context(_progress()) if sys.stderr.isatty() else _lines()
+    with console.busy("fits") as show:
+        update = show if sys.stderr.isatty() else _lines()
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # this command says it itself
         done = run_campaign(
             definition, jobs=jobs, scheduler=scheduler, timeout=timeout, memory=memory,
-            patience=patience, send_files=send_files, dry_run=dry_run, redo=redo, progress=progress,
+            patience=patience, send_files=send_files, dry_run=dry_run, redo=redo,
+            progress=lambda number, total, _: update(number, total),
         )  # fmt: skip
     if report is not None and not dry_run:
         place = done.report(
@@ -142,11 +142,11 @@ def _check_report(
         )
 
 
-def _lines() -> Callable[[int, int, Mapping[str, Any]], None]:
+def _lines() -> Callable[[int, int], None]:
     """Print rate and time left once a minute, for logs."""
     began = shown = time.monotonic()
 
-    def update(done: int, total: int, _: Mapping[str, Any]) -> None:
+    def update(done: int, total: int) -> None:
         nonlocal shown
         now = time.monotonic()
         if now - shown >= _LINE_EVERY:
@@ -156,26 +156,3 @@ def _lines() -> Callable[[int, int, Mapping[str, Any]], None]:
             console.note(f"{done} of {total} fits, {rate:.3g} a second, {left:.0f} minutes left")
 
     return update
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[int, int, Mapping[str, Any]], None]]:
-    """Show a bar with rate and time left."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TaskProgressColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (BarColumn(), MofNCompleteColumn(), TaskProgressColumn(show_speed=True),
-               TimeRemainingColumn())  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("fits", total=None)
-
-        def update(done: int, total: int, _: Mapping[str, Any]) -> None:
-            bar.update(task, completed=done, total=total)
-
-        yield update

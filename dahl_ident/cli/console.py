@@ -199,21 +199,21 @@ def write_wrapped(text: str) -> None:
 
 
 @contextmanager
-def busy(task: str) -> Iterator[Callable[[int, int], None]]:
+def busy(task: str) -> Iterator[Callable[[float, float], None]]:
     """Show on a terminal, after two seconds, that a task goes on, and for how long.
 
-    The function that is yielded takes the steps done and their number: then the time left is
-    shown as well.
+    The function that is yielded takes the steps done and their number: then these, and the time
+    left, are shown as well.
     """
     if _session.quiet or not sys.stderr.isatty():
         yield lambda _done, _total: None
         return
-    steps = [0, 0]
+    steps = [0.0, 0.0]
     done = threading.Event()
     show = threading.Thread(target=_spin, args=(task, steps, done), daemon=True)
     show.start()
 
-    def update(number: int, total: int) -> None:
+    def update(number: float, total: float) -> None:
         steps[:] = number, total
 
     try:
@@ -223,7 +223,7 @@ def busy(task: str) -> Iterator[Callable[[int, int], None]]:
         show.join()
 
 
-def _spin(task: str, steps: list[int], done: threading.Event) -> None:
+def _spin(task: str, steps: list[float], done: threading.Event) -> None:
     """Draw a spinner until the task is done."""
     if done.wait(_PATIENCE):
         return
@@ -237,7 +237,8 @@ def _spin(task: str, steps: list[int], done: threading.Event) -> None:
         number = bar.add_task(task, total=None)
         bar.tasks[0].start_time = bar.get_time() - _PATIENCE
         while not done.wait(_REDRAWN):
-            bar.update(number, completed=steps[0], total=steps[1] or None)
+            counted = f"{task} {steps[0]:g} of {steps[1]:g}" if steps[1] > 1.0 else task
+            bar.update(number, description=counted, completed=steps[0], total=steps[1] or None)
 
 
 def write_error(text: str) -> None:

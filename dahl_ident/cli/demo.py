@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +12,7 @@ import typer
 
 from dahl_ident.cli import console, extract
 from dahl_ident.cli.estimation import as_json, finish
-from dahl_ident.cli.files import make_folder, progress_bar
+from dahl_ident.cli.files import make_folder
 from dahl_ident.cli.options import General, Writing, with_option_groups
 
 if TYPE_CHECKING:
@@ -63,6 +63,7 @@ def _chain(
 ) -> tuple[FitResult, Posterior]:
     """Run every step from the recording to the report, and print a heading for each."""
     from dahl_ident.data import inspect, read_record
+    from dahl_ident.reporting import report
     from dahl_ident.synthetic.shipped import datasets_directory
 
     file = datasets_directory() / origin["file"]
@@ -73,9 +74,12 @@ def _chain(
     data.save(table, overwrite=overwrite)
     result, posterior = _estimated(data, origin["truth"])
     console.heading("6. report")
-    with progress_bar() as bar:
-        bar.add_task("drawing", total=None)
-        _report([result, posterior], page, record, overwrite=overwrite)
+    command = console.typed_command()
+    with console.busy("drawing") as progress:
+        report(
+            [result, posterior], page, record=record, command=command, overwrite=overwrite,
+            progress=progress,
+        )  # fmt: skip
     console.write(f"table: {table}\nreport: {page.resolve()}")
     return result, posterior
 
@@ -103,15 +107,6 @@ def _estimated(data: FrequencyResponse, truth: Mapping[str, float]) -> tuple[Fit
     chain = posterior(result, seed=1)
     console.write(str(chain))
     return result, chain
-
-
-def _report(
-    results: Sequence[FitResult | Posterior], page: Path, record: Record, *, overwrite: bool
-) -> None:
-    from dahl_ident.reporting import report
-
-    command = console.typed_command()
-    report(list(results), page, command=command, record=record, overwrite=overwrite)
 
 
 def _compare(result: FitResult, truth: Mapping[str, float]) -> None:

@@ -18,24 +18,7 @@ _QUANTITY = re.compile(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\s\d.,]?.*?)\s*"
 
 
 def number(name: str, text: str, unit: str | None = None) -> float:
-    """Return a number in SI, or one with its unit such as ``50um``.
-
-    Parameters
-    ----------
-    name : str
-        For the message; its last word may be that of a parameter.
-    text : str
-        As typed.
-    unit : str, optional
-        SI unit; by default that of the parameter. Of "1", percent are read as well.
-
-    Raises
-    ------
-    ModelError
-        If the text is not a value.
-    UnitError
-        If its unit has another dimension.
-    """
+    """Return a number in SI, or one with its unit, ``50um``; by default the parameter has it."""
     share = unit == "1" and text.rstrip().endswith("%")
     try:
         value = 0.01 * float(text.rstrip()[:-1]) if share else float(text)
@@ -117,13 +100,7 @@ def values(option: str, assigned: Sequence[str]) -> dict[str, float]:
 
 
 def distribution(name: str, text: str) -> Any:
-    """Return a frozen distribution of scipy.stats, called as in Python.
-
-    Raises
-    ------
-    ValidationError
-        If there is no such distribution, or these are not its arguments.
-    """
+    """Return a frozen distribution of scipy.stats, called as in Python."""
     from scipy import stats
 
     call = _CALL.fullmatch(text.strip())

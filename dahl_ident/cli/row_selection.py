@@ -28,13 +28,7 @@ _COMPARE: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
 def selected(
     data: FrequencyResponse, where: str | None, levels: str | None, runs: str | None
 ) -> FrequencyResponse:
-    """Return the rows selected by the options --where, --levels and --runs.
-
-    Raises
-    ------
-    ValidationError
-        If a condition cannot be understood, names an unknown column, or selects no row.
-    """
+    """Return the rows selected by the options --where, --levels and --runs."""
     for option, column, text in (("--levels", "level", levels), ("--runs", "run", runs)):
         if text is not None:
             data = _labelled(data, option, column, [part.strip() for part in text.split(",")])

@@ -10,7 +10,7 @@ import typer
 from dahl_ident.cli import console
 from dahl_ident.cli.console import changed, refuse
 from dahl_ident.cli.distributions import number, numbers
-from dahl_ident.cli.files import progress_bar, write_data
+from dahl_ident.cli.files import write_data
 from dahl_ident.cli.model import (
     ELEMENT_HELP,
     MODEL,
@@ -177,9 +177,8 @@ def simulate(
     if output is None:
         console.write(described.to_json() if general.json else described.to_toml())
         return
-    with progress_bar() as bar:
-        task = bar.add_task("simulating", total=1.0)
-        data = run(described, seed=seed, progress=lambda done: bar.update(task, completed=done))
+    with console.busy("simulating") as update:
+        data = run(described, seed=seed, progress=lambda done: update(done, 1.0))
     write_data(data, output, overwrite=writing.overwrite)
 
 

@@ -46,13 +46,7 @@ def overlay(
     command: str | None = None,
     metadata: Metadata | None = None,
 ) -> Document:
-    """Return the comparison of fits on different data, each with the one before it.
-
-    Raises
-    ------
-    ValidationError
-        If a result is not a fit, or the fits measure different quantities.
-    """
+    """Return the comparison of fits on different data, each with the one before it."""
     fits = [result for result in results if isinstance(result, FitResult)]
     if len(fits) < len(results):
         raise ValidationError(

@@ -20,15 +20,7 @@ _LISTED_ELSEWHERE = {"parts", "file", "sha256", "notes", "warnings"}
 
 @dataclass(frozen=True)
 class SourceFile:
-    """A file that the data came from.
-
-    Attributes
-    ----------
-    file, sha256 : str
-        Its name, and the hash of its content; empty if unknown.
-    read : bool
-        Whether the data were read from it; otherwise it is the original of such a file.
-    """
+    """A file that the data came from; `read` is false for the original of such a file."""
 
     file: str
     sha256: str

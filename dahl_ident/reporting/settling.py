@@ -21,13 +21,7 @@ _INTEGRATIONS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
 
 def settling(data: FrequencyResponse, record: Record) -> Picture:
-    """Return the figure of the point with the largest ratio of bias to error.
-
-    Raises
-    ------
-    ValidationError
-        If the data were not extracted from this record.
-    """
+    """Return the figure of the point with the largest ratio of bias to error."""
     _check_origin(data, record)
     points = data.select(harmonic=1)
     assert points.covariance is not None  # extraction gives it
