@@ -101,13 +101,7 @@ class ChainFile:
         self._due = 0.0
 
     def load(self) -> StoredChain | None:
-        """Return the chain in the file, None where there is no file yet.
-
-        Raises
-        ------
-        SamplingError
-            If the file is not a complete chain with this identity.
-        """
+        """Return the chain in the file, None where there is no file yet."""
         if not self.path.exists():
             return None
         stored, found = _read(self.path)
@@ -144,14 +138,7 @@ class ChainFile:
 
 @contextmanager
 def open_chain(path: str | os.PathLike[str], identity: Identity) -> Iterator[ChainFile]:
-    """Lock a chain's file for the duration of a run; write the last steps at its end.
-
-    Raises
-    ------
-    SamplingError
-        If the path is a folder, its folder does not exist, it cannot be written, or another run
-        holds the lock.
-    """
+    """Lock a chain's file for the duration of a run; write the last steps at its end."""
     file = Path(path)
     if file.is_dir():
         raise SamplingError(f"{file} is a folder; give the path of a file in it")

@@ -115,23 +115,7 @@ def integrate(
     tolerance: float = 1e-3,
     most: int = 2**18,
 ) -> WeightedPoints:
-    """Return a density as weighted points, with its integral.
-
-    Parameters
-    ----------
-    log_density : callable
-        theta (S, D) -> (S,); -inf outside the prior.
-    prior : JointPrior
-        Of theta.
-    centre, covariance : ndarray, shapes (D,) and (D, D)
-        Where the density is large, and about its covariance.
-    decorrelation : Decorrelation, optional
-        Coordinates in which ridges are straight.
-    tolerance : float
-        Relative error to be reached.
-    most : int
-        Number of points at which refinement ends in any case.
-    """
+    """Return a density as weighted points, with its integral."""
     target = _Target(log_density, prior, decorrelation)
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         mixture = _fitted(target, centre, covariance)

@@ -220,28 +220,7 @@ def joint_prior(
     estimate: FloatArray | None = None,
     assumed: Mapping[str, PriorLike] | None = None,
 ) -> JointPrior:
-    """Return the prior of every free parameter of a problem.
-
-    Parameters
-    ----------
-    problem : Problem
-        Priors of its sensors are used as they are.
-    priors : mapping of str to distribution or (low, high), optional
-        By parameter name; the other parameters get the default.
-    estimate : ndarray, shape (P,), optional
-        Least-squares values, which the default bounds of plant parameters include; infinite where
-        there is no finite optimum.
-    assumed : mapping of str to distribution or (low, high), optional
-        Priors of parameters that nobody gave.
-
-    Raises
-    ------
-    ModelError
-        If a name is not that of a free parameter.
-    ValidationError
-        If a prior is neither a distribution nor two bounds in order, or a parameter has no
-        default.
-    """
+    """Return the prior of every free parameter of a problem."""
     return prior_of(
         problem.parameters,
         np.full(len(problem.names), np.nan) if estimate is None else estimate,
@@ -256,25 +235,7 @@ def prior_of(
     sources: Mapping[str, Mapping[str, Any]],
     default: Callable[[Parameter, float], tuple[float, float]],
 ) -> JointPrior:
-    """Return the prior of every parameter from the first source that has one, or else bounds.
-
-    Parameters
-    ----------
-    parameters : sequence of Parameter
-    estimate : ndarray, shape (P,)
-        Least-squares values, not finite where unknown.
-    sources : mapping of str to mapping of str to distribution or (low, high)
-        Priors by source and name, those that were given under "given".
-    default : callable
-        Returns the bounds of a parameter with an estimate.
-
-    Raises
-    ------
-    ModelError
-        If a prior was given for another name.
-    ValidationError
-        If a prior is neither a distribution nor two bounds in order.
-    """
+    """Return the prior of every parameter from the first source that has one, or else bounds."""
     names = [p.name for p in parameters]
     unknown = [name for name in sources.get("given", {}) if name not in names]
     if unknown:
@@ -353,20 +314,7 @@ def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[f
 def default_bounds(
     parameter: Parameter, estimate: float, sizes_of: Callable[[], FloatArray]
 ) -> tuple[float, float]:
-    """Return wide bounds of a value.
-
-    Parameters
-    ----------
-    parameter : Parameter
-    estimate : float
-        Of its value, not finite where unknown.
-    sizes_of : callable
-        Returns the sizes that the data give the parameter's unit.
-
-    Returns
-    -------
-    tuple of float
-    """
+    """Return wide bounds of a value."""
     if parameter.prior is not None:
         low, high = _widened(parameter, *parameter.prior)
     elif not any(parameter.dimension):

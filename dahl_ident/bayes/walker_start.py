@@ -64,23 +64,7 @@ def scattered(
     random: np.random.Generator,
     arranged: Callable[[FloatArray], FloatArray] = np.asarray,
 ) -> FloatArray:
-    """Return `walkers` points of finite density around a centre, (walkers, D).
-
-    Parameters
-    ----------
-    density : LogDensity
-    centre : ndarray, shape (D,)
-    root : ndarray, shape (D, D)
-        Of the posterior's covariance, about.
-    walkers : int
-    random : Generator
-    arranged : callable, optional
-        Puts coordinates that can change places in order.
-
-    Returns
-    -------
-    ndarray
-    """
+    """Return `walkers` points of finite density around a centre, (walkers, D)."""
     spread = np.full(walkers, _WIDER)
     points = np.empty((walkers, len(centre)))
     missing = np.arange(walkers)

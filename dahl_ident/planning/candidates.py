@@ -20,7 +20,7 @@ from dahl_ident.elements import Model
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.bench_time import BenchTime
 from dahl_ident.planning.criteria import LevelInformation
-from dahl_ident.planning.knowledge import Knowledge, placeholder
+from dahl_ident.planning.knowledge import Knowledge
 from dahl_ident.planning.trajectories import PlannedMotion
 from dahl_ident.problem import Problem
 
@@ -55,13 +55,7 @@ class BenchLimits:
 
     @classmethod
     def of(cls, given: Mapping[str, Any] | None) -> BenchLimits:
-        """Return the limits of a mapping.
-
-        Raises
-        ------
-        ValidationError
-            If a name is unknown, or a range does not rise.
-        """
+        """Return the limits of a mapping."""
         if not isinstance(given, Mapping):
             raise ValidationError(
                 "limits: expected a mapping, such as {'displacement': 1e-3, 'frequency_hz': 5, "
@@ -235,15 +229,8 @@ def evaluate(
     limits: BenchLimits,
     noise: CycleNoise,
 ) -> Candidates:
-    """Return the candidates that every limit allows.
-
-    Raises
-    ------
-    ValidationError
-        If none remains; the message names the limit that excludes most.
-    """
-    data = placeholder(level, frequency_hz, controlled, knowledge.motion)
-    problem = _problem(data, knowledge)
+    """Return the candidates that every limit allows."""
+    problem = knowledge.problem_at(level, frequency_hz, controlled)
     predicted, changes = problem.prediction_and_jacobian(knowledge.theta)
     if controlled == "force":
         force = np.broadcast_to(level, predicted.shape)
@@ -277,13 +264,7 @@ def evaluate(
 
 
 def allowed(limits: BenchLimits, sizes: Mapping[str, FloatArray], count: int) -> NDArray[np.bool_]:
-    """Return which of `count` candidates stay within every limit at nearly all draws.
-
-    Raises
-    ------
-    ValidationError
-        If none does; the message names the limit that excludes most.
-    """
+    """Return which of `count` candidates stay within every limit at nearly all draws."""
     possible, refused = np.ones(count, dtype=bool), {}
     for name, size in sizes.items():
         low, high = getattr(limits, name)
@@ -320,12 +301,6 @@ def _single_valued(
             "or add damping"
         )
     return single
-
-
-def _problem(data: Any, knowledge: Knowledge) -> Problem:
-    return Problem(
-        data, knowledge.model, noise="relative", sensors=knowledge.sensors, steady=knowledge.steady
-    )
 
 
 def bench_time(
@@ -387,23 +362,9 @@ def larger_rows(
 
     Where displacement is controlled, the second harmonic counts in addition to the fundamental,
     because only it shows asymmetry; the noise of a harmonic's force is that of the fundamental's.
-
-    Returns
-    -------
-    names : tuple of str
-        Free parameters of the larger model, P'.
-    rows, offsets : ndarray, shape (S, K, m, P') and (S, K, m, 2)
-    problem : Problem
-        Of the candidates' fundamentals.
-    theta : ndarray, shape (S, P')
-        The draws, and the larger model's own values.
     """
-    own = placeholder(
-        candidates.level, candidates.frequency_hz, candidates.controlled, knowledge.motion
-    )
-    problem = Problem(
-        own, larger, noise="relative", sensors=knowledge.sensors, steady=knowledge.steady
-    )
+    places = candidates.level, candidates.frequency_hz, candidates.controlled
+    problem = knowledge.problem_at(*places, model=larger)
     drawn = dict(zip(knowledge.names, knowledge.values.T, strict=True))
     columns = []
     for p in problem.parameters:
@@ -422,12 +383,7 @@ def larger_rows(
     size = 1.0 / np.sqrt(candidates.variance)[..., None, None]
     rows, offsets = [], []
     for k in orders:
-        part = placeholder(
-            candidates.level, candidates.frequency_hz, candidates.controlled, knowledge.motion, k
-        )
-        one = Problem(
-            part, larger, noise="absolute", sensors=knowledge.sensors, steady=knowledge.steady
-        )
+        one = knowledge.problem_at(*places, model=larger, harmonic=k, noise="absolute")
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = one.prediction_jacobian(theta) / fundamental[..., None]
         # within a gap there is no response, and no information

@@ -20,7 +20,7 @@ from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.departures import Departures, departures
 from dahl_ident.planning.candidates import Candidates
 from dahl_ident.planning.criteria import Term
-from dahl_ident.planning.knowledge import Knowledge, placeholder
+from dahl_ident.planning.knowledge import Knowledge
 from dahl_ident.planning.measurement_plan import Expected
 from dahl_ident.planning.quantities import (
     RESPONSE,
@@ -30,7 +30,6 @@ from dahl_ident.planning.quantities import (
     product,
     sizes,
 )
-from dahl_ident.problem import Problem
 
 _NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _ROUNDING = 1e-14  # of a parameter's information: less is rounding, and could cancel to nothing
@@ -194,12 +193,7 @@ def _departures(knowledge: Knowledge, candidates: Candidates) -> Departures | No
     if errors is None:
         return None
     own = [errors.names.index(name) for name in knowledge.names]
-    there = placeholder(
-        candidates.level, candidates.frequency_hz, candidates.controlled, knowledge.motion
-    )
-    problem = Problem(
-        there, knowledge.model, noise="relative", sensors=knowledge.sensors, steady=knowledge.steady
-    )
+    problem = knowledge.problem_at(candidates.level, candidates.frequency_hz, candidates.controlled)
     theta = errors.theta[own]
     predicted = problem.predict(theta)
     amplitude = candidates.level

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import FloatArray, finite_array
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.departures import noise_of_rows, scatter_of_runs
-from dahl_ident.diagnostics.error_model import ErrorModel, error_model
+from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError, choices
@@ -105,6 +105,26 @@ class Knowledge:
         S = len(self.theta)
         return self.only(np.unique(np.linspace(0, S - 1, min(S, most)).astype(int)))
 
+    def problem_at(
+        self,
+        levels: FloatArray,
+        frequency_hz: FloatArray,
+        controlled: str,
+        *,
+        model: Model | None = None,
+        harmonic: int = 1,
+        noise: str = "relative",
+    ) -> Problem:
+        """Return the problem of levels whose response is not yet measured."""
+        held: dict[str, Any] = {"drive" if controlled == "force" else "amplitude": levels}
+        data = FrequencyResponse(
+            frequency_hz, np.ones(len(levels)), controlled=controlled, motion=self.motion,
+            harmonic=harmonic, **held,
+        )  # fmt: skip
+        return Problem(
+            data, model or self.model, noise=noise, sensors=self.sensors, steady=self.steady
+        )
+
     def model_values(self) -> list[FloatArray]:
         """Return every parameter of the model at every draw, shape (S, 1) each, or ()."""
         drawn = dict(zip(self.names, self.values.T, strict=True))
@@ -120,13 +140,7 @@ def to_values(theta: FloatArray, parameters: Sequence[Parameter]) -> FloatArray:
 
 
 def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowledge:
-    """Return the knowledge from a model with ranges, a fit or a posterior.
-
-    Raises
-    ------
-    ValidationError
-        If `source` is something else, or nothing bounds a parameter.
-    """
+    """Return the knowledge from a model with ranges, a fit or a posterior."""
     rng = np.random.default_rng(seed)
     if isinstance(source, Element):
         return _of_model(as_model(source), ranges or {}, draws, rng)
@@ -137,7 +151,7 @@ def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowled
     if hasattr(source, "optimum") and hasattr(source.optimum, "problem"):
         if isinstance(source.optimum.problem, RecordProblem):
             return _of_record_fit(source, ranges or {}, draws, rng)
-        return _of_fit(source.optimum, ranges or {}, draws, rng)
+        return _of_fit(source, ranges or {}, draws, rng)
     raise ValidationError(
         f"plan: got a {type(source).__name__}; expected a model such as Dahl(), a fit, or a "
         "posterior"
@@ -173,7 +187,8 @@ def _of_model(model: Model, ranges: Ranges, draws: int, rng: np.random.Generator
     )
 
 
-def _of_fit(optimum: Any, ranges: Ranges, draws: int, rng: np.random.Generator) -> Knowledge:
+def _of_fit(fit: Any, ranges: Ranges, draws: int, rng: np.random.Generator) -> Knowledge:
+    optimum, errors = fit.optimum, fit.errors
     problem: Problem = optimum.problem
     centre, std = _moments(problem.parameters, ranges)
     theta = np.array(optimum.theta, dtype=np.float64)
@@ -186,7 +201,6 @@ def _of_fit(optimum: Any, ranges: Ranges, draws: int, rng: np.random.Generator) 
                 "or plan from the model with ranges="
             )
     prior = _leaned_on(problem.parameters, centre, std)
-    errors = error_model(optimum)
     if errors is not None:
         return _of_errors(errors, prior, draws, rng)
     theta = np.where(finite, theta, centre)
@@ -371,19 +385,3 @@ def _row_noise(problem: Problem, scale: float) -> tuple[float, float]:
         cycles = float(np.median(data.dof)) + 1.0
     variance = 0.5 * np.trace(data.covariance, axis1=1, axis2=2) / size**2
     return float(np.sqrt(np.median(variance))), cycles
-
-
-def placeholder(
-    levels: FloatArray,
-    frequency_hz: FloatArray,
-    controlled: str,
-    motion: Motion,
-    harmonic: int = 1,
-) -> FrequencyResponse:
-    """Return a table of candidates whose response is not yet measured."""
-    kind = "drive" if controlled == "force" else "amplitude"
-    where: dict[str, Any] = {kind: levels}
-    return FrequencyResponse(
-        frequency_hz, np.ones(len(levels)), controlled=controlled, motion=motion,
-        harmonic=harmonic, **where,
-    )  # fmt: skip

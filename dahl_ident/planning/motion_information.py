@@ -33,13 +33,7 @@ _LINES = 10  # of a multisine, its highest frequency over its lowest
 
 
 def motions_of(kind: str, limits: BenchLimits, levels: tuple[float, float]) -> list[PlannedMotion]:
-    """Return the candidates that a kind of motion stands for, within the limits.
-
-    Raises
-    ------
-    ValidationError
-        If a limit is missing that a motion of the kind needs.
-    """
+    """Return the candidates that a kind of motion stands for, within the limits."""
     amplitudes = np.geomspace(*levels, _LEVELS).tolist()
     found: list[PlannedMotion] = []
     if kind == "trapezoid":
@@ -145,11 +139,6 @@ def evaluate_motions(
     """Return the candidates that every limit allows, with the information of a repeat.
 
     It is the mean over the repeats of a record of `lasting` s, or of `_REPEATS` repeats.
-
-    Raises
-    ------
-    ValidationError
-        If none remains, or the sample rate is too low for all.
     """
     rate = recorded.sample_rate
     resolved = [one for one in motions if one.fastest_hz * SAMPLES_PER_CYCLE <= rate]

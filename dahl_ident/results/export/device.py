@@ -53,24 +53,7 @@ class Device:
 
 
 def device(result: Any, form: str, carried: Mapping[str, str]) -> Device:
-    """Return the device of a fit.
-
-    Parameters
-    ----------
-    result : FitResult or RecordFit
-        The fit.
-    form : str
-        Name of the format, for messages.
-    carried : mapping of str to str
-        Kinds of laws that the format carries, each with what it leaves out of it, or "".
-
-    Raises
-    ------
-    FitError
-        If a parameter has no finite value.
-    ModelError
-        If the format does not carry a law.
-    """
+    """Return the device of a fit."""
     laws, lumped = [], dict.fromkeys(LUMPED.values(), 0.0)
     notes = [f"made by dahl_ident {__version__}, SI units; the fit is {result.status.value}"]
     lost = [name for name, p in result.params.items() if not math.isfinite(p.value)]
@@ -109,13 +92,7 @@ def _values(element: Any) -> dict[str, float]:
 
 
 def linear(law: Law, form: str) -> tuple[str, ...]:
-    """Return what to say where a format takes the exponent of Dahl for 1 and has one limit.
-
-    Raises
-    ------
-    ModelError
-        If the force would differ by more than 2 % of f_max.
-    """
+    """Return what to say where a format takes the exponent of Dahl for 1 and has one limit."""
     if law.values.get("asymmetry"):
         raise ModelError(f"{form} has one limit of friction for both directions, and the model two")
     a = law["alpha"] - 1.0

@@ -18,13 +18,7 @@ _WIDE = 0.2  # relative uncertainty beyond which a positive parameter is drawn i
 
 
 def uncertain(result: Any) -> tuple[dict[str, ParameterBudget], FloatArray]:
-    """Return the budgets of the model's free parameters, and the covariance of their values.
-
-    Raises
-    ------
-    FitError
-        If one of them has no finite uncertainty.
-    """
+    """Return the budgets of the model's free parameters, and the covariance of their values."""
     budget = result.budget()
     own = {p.name for p in result.model.parameters if result.params[p.name].vary}
     places = [i for i, name in enumerate(budget) if name in own]
