@@ -26,7 +26,6 @@ from dahl_ident import (
 from dahl_ident import fit as any_fit
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.data.quantities import converted
 from dahl_ident.diagnostics.intervals import Method
 from dahl_ident.elements import Element
 from dahl_ident.errors import FitError, ModelError, ValidationError
@@ -66,13 +65,21 @@ def covariance_of(truth: Element = FRICTION, size: float = 0.02) -> FloatArray:
     return np.abs(N)[:, None, None] ** 2 * size**2 * np.eye(2)
 
 
+def of_quantity(receptance: ComplexArray, frequency_hz: FloatArray, quantity: str) -> ComplexArray:
+    """Return another standard quantity of the same motion."""
+    s, R = 2j * np.pi * frequency_hz, receptance
+    return {
+        "receptance": R, "mobility": s * R, "accelerance": s**2 * R, "dynamic_stiffness": 1.0 / R,
+        "mechanical_impedance": 1.0 / (s * R), "apparent_mass": 1.0 / (s**2 * R),
+    }[quantity]  # fmt: skip
+
+
 def plant_data(
     levels: int = 5, frequencies: int = 12, quantity: Any = "receptance", size: float = 0.02
 ) -> FrequencyResponse:
     drive = np.repeat(np.geomspace(0.02, 5.0, levels), frequencies)
     frequency = np.tile(np.geomspace(0.03, 3.0, frequencies), levels)
-    receptance = response(PLANT, frequency, drive).receptance
-    R, _ = converted(receptance, 2.0 * np.pi * frequency, "receptance", quantity)
+    R = of_quantity(response(PLANT, frequency, drive).receptance, frequency, quantity)
     return FrequencyResponse(
         frequency,
         R * np.exp(noise(drive.size, size)),

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from tests.command_line import Runner
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -15,11 +15,8 @@ COMMANDS = sorted(set(re.findall(r"^dahl-ident (\w+)(.*?)(?:#|$)", README, re.MU
 
 
 @pytest.mark.parametrize(("command", "rest"), COMMANDS)
-def test_commands_have_the_options_that_are_shown(command: str, rest: str) -> None:
-    program = Path(sys.executable).with_name("dahl-ident")
-    helped = subprocess.run(
-        [program, command, "--help"], capture_output=True, text=True, check=True
-    ).stdout
+def test_commands_have_the_options_that_are_shown(command: str, rest: str, run: Runner) -> None:
+    helped = run(command, "--help").out
     for option in re.findall(r"(?<=\s)--?[a-z][a-z-]*", rest):
         assert option in helped
 

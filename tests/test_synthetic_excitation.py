@@ -10,10 +10,10 @@ import pytest
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError
 from dahl_ident.synthetic import AmplitudeRamp, FrequencySweep, SteppedSine
-from dahl_ident.synthetic.excitation import Excitation
 from dahl_ident.synthetic.randomness import Draws
 from dahl_ident.synthetic.waveform import Waveform
 
+Excitation = AmplitudeRamp | FrequencySweep | SteppedSine
 RUNS: list[Excitation] = [
     SteppedSine((1e-3, 2e-3), (2.0, 3.0), settling_periods=3, num_periods=2),
     SteppedSine((2e-3,), (2.0,), settling_periods=1, num_periods=2, rest=0.7),

@@ -26,7 +26,6 @@ from dahl_ident.synthetic import (
     Table,
     simulate,
 )
-from dahl_ident.synthetic.excitation import Excitation
 
 FRICTION = Dahl(0.1, 30.0)
 PLANT = FRICTION + Mass(0.3) + Damper(0.24) + Spring(0.3)
@@ -463,6 +462,6 @@ def test_tables_scale_with_their_units(seed: int, f_max: float, x_c: float) -> N
 
 
 @pytest.mark.parametrize("excitation", [AmplitudeRamp(1e-3, 1e-2, 2.0, 3.0), STEPS])
-def test_a_record_lasts_as_long_as_its_excitation(excitation: Excitation) -> None:
+def test_a_record_lasts_as_long_as_its_excitation(excitation: AmplitudeRamp | SteppedSine) -> None:
     measured = record(Experiment(FRICTION, excitation, Acquisition(100.0)))
     assert measured.time[-1] == pytest.approx(excitation.waveform(0).duration, abs=0.01)
