@@ -131,10 +131,10 @@ class PointSample(Sample):
     @cached_property
     def draws(self) -> WeightedDraws:
         """The points, an unknown noise scale included."""
-        found = self.integral
+        points = self.integral
         if not self.density.has_scale:
-            return found
-        return WeightedDraws(_with_scale(self.density, found), found.weights)
+            return points
+        return WeightedDraws(_with_scale(self.density, points), points.weights)
 
     @property
     def converged(self) -> bool:

@@ -145,7 +145,7 @@ def fit(
         Of records whose motion is predicted: "base" where their force channel is the acceleration
         of the base, m/s^2, and the motion relative to it.
     throw : bool, default True
-        Raise where the data give no finite optimum; otherwise return what was found, with its
+        Raise where the data give no finite optimum; otherwise return the best point, with its
         `status`.
     progress : bool, default False
         Of records: show on the terminal how the search goes, once it has taken two seconds.
@@ -202,10 +202,10 @@ def fit(
     problem = Problem(
         data, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady
     )
-    own = {
+    of_ipopt = {
         "constraints": constraints, "drive_std": drive_std, "drive_covariance": drive_covariance
     }  # fmt: skip
-    beyond = [name for name, value in own.items() if value is not None]
+    beyond = [name for name, value in of_ipopt.items() if value is not None]
     if method == "ipopt":
         from dahl_ident.fitting.ipopt import solve_ipopt
 

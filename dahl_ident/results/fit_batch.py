@@ -79,8 +79,8 @@ class FitBatch(Sequence[FitResult]):
     @cached_property
     def _combined(self) -> FloatArray:
         every = (fit.params for fit in self)
-        found = [[(p[name].value, p[name].stderr) for name in self.var_names] for p in every]
-        return np.array(found, dtype=np.float64)
+        pairs = [[(p[name].value, p[name].stderr) for name in self.var_names] for p in every]
+        return np.array(pairs, dtype=np.float64)
 
     @property
     def estimates(self) -> FloatArray:

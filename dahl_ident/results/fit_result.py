@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 
 
 class FitResult(Result):
-    """What a fit found: estimates, their errors, and whether to trust them.
+    """The result of a fit: estimates, their errors, and whether to trust them.
 
     Made by :func:`dahl_ident.fit`. Names follow lmfit's ``ModelResult`` where both have the same
     thing; the covariance is never rescaled silently: `scale` is 1 where the noise is known, else
@@ -134,14 +134,14 @@ class FitResult(Result):
     @cached_property
     def stderr_noise(self) -> Mapping[str, float]:
         """Standard errors of the estimate from noise alone, by name."""
-        found = dict(self.optimum.stderr)
+        stderr = dict(self.optimum.stderr)
         errors = self.errors_of_combinations
         if errors is not None:
             size = np.abs(errors.problem.value_slopes(errors.theta))
             noise = size * np.sqrt(np.maximum(np.diagonal(errors.contributions[NOISE]), 0.0))
-            own = dict(zip(errors.names, noise.tolist(), strict=True))
-            found |= {name: own[name] for name in found if errors.holds(name)}
-        return found
+            by_name = dict(zip(errors.names, noise.tolist(), strict=True))
+            stderr |= {name: by_name[name] for name in stderr if errors.holds(name)}
+        return stderr
 
     @property
     def var_names(self) -> list[str]:
@@ -154,10 +154,10 @@ class FitResult(Result):
         errors = self.errors
         if errors is None:
             return self.optimum.values_covariance
-        own = [errors.names.index(name) for name in self.var_names]
+        free = [errors.names.index(name) for name in self.var_names]
         slopes = errors.problem.value_slopes(errors.theta)
         whole = propagated(errors.covariance, slopes)
-        return np.asarray(whole[np.ix_(own, own)])
+        return np.asarray(whole[np.ix_(free, free)])
 
     @cached_property
     def correl(self) -> Mapping[str, Mapping[str, float]]:
@@ -211,12 +211,12 @@ class FitResult(Result):
     def model(self) -> Model:
         """The model with the estimates put in; parameters stay free or fixed as they were."""
         model = self.problem.model
-        own = {p.name for p in model.parameters}
+        names = {p.name for p in model.parameters}
         values = self.problem.to_values(self.optimum.theta).tolist()
-        found = dict(zip(self.var_names, values, strict=True))
+        estimates = dict(zip(self.var_names, values, strict=True))
         if self.errors is not None:
-            found = dict(self.errors.values)
-        return model.with_values({name: v for name, v in found.items() if name in own})
+            estimates = dict(self.errors.values)
+        return model.with_values({name: v for name, v in estimates.items() if name in names})
 
     # Judging
 
@@ -267,8 +267,8 @@ class FitResult(Result):
 
     def intervals_run(self, level: float) -> list[ConfidenceIntervals]:
         """Return the intervals at a level of every method that has been asked for until now."""
-        found = (one for one in self._intervals.values() if np.isclose(one.levels, level).any())
-        return list({one.method: one for one in found}.values())
+        run = (one for one in self._intervals.values() if np.isclose(one.levels, level).any())
+        return list({one.method: one for one in run}.values())
 
     def _new_intervals(
         self, method: Method, levels: Sequence[float], replicates: int, seed: int
@@ -324,15 +324,15 @@ class FitResult(Result):
     def identifiability(self) -> Identifiability:
         """Which parameters, or which combinations of them, the data determine."""
         profile = None if self.first_order else lambda: self.conf_interval("profile")
-        found = judged(self.optimum, profile, self.errors, self.conf_interval())
+        verdicts = judged(self.optimum, profile, self.errors, self.conf_interval())
         sources: Mapping[str, ParameterBudget] = self.stated_budget or {}
         combinations = tuple(
             replace(c, value=sources[c.expression].value, stderr=sources[c.expression].u)
             if c.expression in sources
             else c
-            for c in found.combinations
+            for c in verdicts.combinations
         )
-        return replace(found, combinations=combinations)
+        return replace(verdicts, combinations=combinations)
 
     @cached_property
     def goodness(self) -> Goodness:
@@ -526,9 +526,9 @@ class FitResult(Result):
         for name, p in self.params.items():
             known = {"lower": limits[name].lower, "upper": limits[name].upper} if p.vary else {}
             rows[name] = {**asdict(p), **known}
-        found = pd.DataFrame.from_dict(rows, orient="index").rename_axis("parameter")
+        table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("parameter")
         columns = ["value", "stderr", "lower", "upper", "unit", "vary", "description"]
-        return found.reindex(columns=[*columns, "init_value", "min", "max"])
+        return table.reindex(columns=[*columns, "init_value", "min", "max"])
 
     def plot(self, kind: str | None = None, ax: Any = None) -> Any:
         """Draw the fit.

@@ -71,14 +71,16 @@ def predictive_checks(
     y = np.broadcast_to(y, (len(theta), density.problem.n_residuals // 2)) / scale[:, None]
     order = _neighbours(density.problem.data)
     noise = replicated_noise(density, y.shape, random)
-    found = []
+    checks = []
     for name, statistic in _STATISTICS.items():
         if name == "size" and density.has_scale:
             continue
         observed, replicated = statistic(y[:, order]), statistic(noise[:, order])
         share = float(np.mean(replicated >= observed))
-        found.append(PredictiveCheck(name, float(observed.mean()), float(replicated.mean()), share))
-    return tuple(found)
+        checks.append(
+            PredictiveCheck(name, float(observed.mean()), float(replicated.mean()), share)
+        )
+    return tuple(checks)
 
 
 def replicated_noise(
@@ -165,8 +167,8 @@ class PriorInfluence:
 
 def prior_influences(prior: JointPrior, points: FloatArray) -> tuple[PriorInfluence, ...]:
     """Return the parameters that the prior determines, from posterior draws of theta."""
-    found = [_rule(part, points[:, i]) for i, part in enumerate(prior.priors)]
-    return tuple(rule for rule in found if rule is not None)
+    rules = [_rule(part, points[:, i]) for i, part in enumerate(prior.priors)]
+    return tuple(rule for rule in rules if rule is not None)
 
 
 def _rule(part: ParameterPrior, theta: FloatArray) -> PriorInfluence | None:
