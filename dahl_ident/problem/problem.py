@@ -427,7 +427,7 @@ class Problem:
     def prediction_and_jacobian(self, theta: ArrayLike) -> tuple[ComplexArray, ComplexArray]:
         """Return R, shape (n,) or (S, n), and dR/dtheta, (n, P) or (S, n, P)."""
         theta = self._coordinates.checked(theta)
-        found, shape = self._predictor(theta), self._shape(theta)
+        found, shape = self._prediction(theta, derivatives=True), self._shape(theta)
         changes = [np.broadcast_to(d, shape) for d in found.changes]
         return np.array(np.broadcast_to(found.value, shape)), np.stack(changes, axis=-1)
 
