@@ -214,7 +214,7 @@ class MissingDependencyError(DahlIdentError, ImportError):
 
 
 class MultipleSolutionsWarning(UserWarning):
-    """A plant with negative damping has several steady amplitudes, of which one was chosen.
+    """A plant with negative damping, or a gap, has several steady amplitudes; one was chosen.
 
     Examples
     --------

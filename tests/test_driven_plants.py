@@ -93,3 +93,11 @@ def test_a_force_that_is_not_a_sine_is_named_with_the_command_for_its_waveforms(
     assert fit.trusted
     assert f"The force at {f[3]:.4g} Hz, 150 mN is 10 % away from the sine" in fit.verdict
     assert "dahl-ident fit --record 'run 7.csv' --mass free" in fit.verdict
+
+
+def test_points_without_a_stable_motion_are_named() -> None:
+    law = di.Backlash(di.Dahl(0.1, 30.0, 1.0), 0.01)
+    plant = law + di.Mass(0.3) + di.Damper(0.3) + di.Spring(8.0)
+    steady = di.response(plant, [0.4, 0.58, 2.6], [0.05, 0.05, 0.6])
+    assert steady.stable.tolist() == [False, False, True]
+    assert steady.message.startswith("2 of 3 points: no stable motion of the drive's period")

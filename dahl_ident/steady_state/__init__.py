@@ -23,7 +23,7 @@ all.
 from __future__ import annotations
 
 from dahl_ident.steady_state.forced import SteadyResponse, response
-from dahl_ident.steady_state.implicit import solve
+from dahl_ident.steady_state.roots import solve
 from dahl_ident.steady_state.shooting import ACCURACY, STEADY, Shooting, Steady, obstacle
 
 __all__ = [

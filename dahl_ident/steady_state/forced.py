@@ -54,8 +54,8 @@ class SteadyResponse:
     number_of_solutions : ndarray of int
         How many amplitudes the point has; shape of frequency and drive.
     message : str
-        Empty where every point has exactly one amplitude; else which have none or several,
-        and why.
+        Empty where every point has exactly one amplitude, and it is stable; else which have none,
+        several, or none that is stable, and why.
     harmonic_share : ndarray
         Mean displacement and harmonics 2 to 9, root sum of squares, over the fundamental; zero for
         the describing function, which has none.
@@ -206,7 +206,13 @@ def response(
         amplitude = np.abs(X)
     found = ~np.isnan(amplitude)
     count = found.sum(axis=1).reshape(shape)
-    message = _message(count, np.broadcast_to(f, shape), np.broadcast_to(u0, shape))
+    with np.errstate(invalid="ignore"):
+        unstable = exact & found.any(axis=1) & ~(multiplier < 1.0 + NEUTRAL).any(axis=1)
+    active = points.linear.imag < 0.0
+    message = _message(
+        count, active.reshape(shape), unstable.reshape(shape), np.broadcast_to(f, shape),
+        np.broadcast_to(u0, shape),
+    )  # fmt: skip
     if steady == "exact" and not exact.all() and why != LINEAR:
         taken = f"the describing function stands for the exact motion ({why or 'at 0 Hz'})"
         message = "; ".join(filter(None, (message, taken)))
@@ -251,8 +257,17 @@ def _read_only(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
     return array[()]
 
 
-def _message(count: IntArray, frequency_hz: FloatArray, drive: FloatArray) -> str:
-    """Return which points have no amplitude or several, and why; empty where all have one."""
+def _message(
+    count: IntArray,
+    active: BoolArray,
+    unstable: BoolArray,
+    frequency_hz: FloatArray,
+    drive: FloatArray,
+) -> str:
+    """Return which points have no amplitude, several, or none that is stable, and why.
+
+    Empty where all have one that is; `active` says where the linear part feeds energy in.
+    """
     verdicts = (
         (
             count == 0,
@@ -260,8 +275,17 @@ def _message(count: IntArray, frequency_hz: FloatArray, drive: FloatArray) -> st
             "least 4/pi times the friction limit; add damping or a spring, or lower the drive)",
         ),
         (
-            count > 1,
+            (count > 1) & active,
             "several steady amplitudes (the linear part has negative damping there)",
+        ),
+        (
+            (count > 1) & ~active,
+            "several steady amplitudes (the law allows them, as a gap does)",
+        ),
+        (
+            unstable,
+            "no stable motion of the drive's period (a device moves otherwise there; leave such "
+            "points out of a fit)",
         ),
     )
     parts = []

@@ -1,33 +1,31 @@
 """All amplitudes at which A |L + N(A)| equals the drive.
 
-**Passive points** (Im L >= 0) have one. It is bracketed by bisection over the nodes of a table
-of the friction force A N against ln A, started by inverse cubic interpolation, and polished by
-Newton's method in ln A that never leaves its bracket. With the dense table used for many
-points, one step from the interpolated start is enough almost everywhere.
+**Passive points** (Im L >= 0) have one. It lies between the bounds that |N| and A |N| set, and is
+found by Newton's method in ln A, which never leaves its bracket.
 
-**Active points** (Im L < 0) may have several. All lie between the bounds that |N| and A |N|
-set. A grid over this range finds the cells where A |Z| crosses the drive, each of which contains
-one amplitude, and those where A |Z| has an extremum near the drive, which contain two if it reaches
-the drive. Extrema closer to each other than the grid's nodes, 1.8 % in amplitude, may be missed.
+**Active points** (Im L < 0) may have several, between the same bounds. A grid over this range finds
+the cells where A |Z| crosses the drive, each of which contains one amplitude, and those where A |Z|
+has an extremum near the drive, which contain two if it reaches the drive. Extrema closer to each
+other than the grid's nodes, 1.8 % in amplitude, may be missed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.steady_state.plant import EPS, BoolArray, IntArray, Nonlinear, Plant
+from dahl_ident.elements.element import Element
+from dahl_ident.steady_state.plant import EPS, BoolArray, IntArray, Nonlinear, Plant, flatten
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
-_NODES_PER_DECADE = (4, 180)  # fewest for few points, most for many: beyond, tables only cost
 _SCAN_PER_DECADE = 128  # 1.8 % apart: closer pairs of roots may be missed
+_COARSE_SCAN = 32  # the same where only one amplitude is needed
 _SCAN_CELLS = 2**15  # points times nodes of the scan that are processed at once
-_CHUNK = 4096  # points solved together: their scratch arrays stay in the processor's cache
 
 
 class Roots(NamedTuple):
@@ -38,6 +36,32 @@ class Roots(NamedTuple):
 
     amplitude: FloatArray
     force: ComplexArray
+
+
+def solve(
+    model: Element,
+    values: Sequence[FloatArray],
+    omega: FloatArray,
+    drive: FloatArray,
+    start: FloatArray | None = None,
+) -> FloatArray:
+    """Return the displacement amplitude A with A |Z(A, omega)| = drive, unchecked.
+
+    All arguments broadcast, `values` (in the order of the model's parameters) included, so a
+    batch of parameter vectors has arrays of shape (S, 1). NaN where there is no amplitude. Of
+    several amplitudes the one nearest to `start` in ratio, else the smallest; two may be
+    missed where A |Z| turns twice within 7.5 % of amplitude.
+    """
+    plant, shape = flatten(model, values, omega, drive)
+    roots = find_roots(plant, _COARSE_SCAN).amplitude * plant.unit[:, None]
+    if start is None or roots.shape[1] == 1:
+        return roots[:, 0].reshape(shape)
+    near = np.broadcast_to(start, shape).reshape(-1, 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.abs(np.log(roots / near))
+    distance[np.isnan(distance)] = np.inf
+    nearest = distance.argmin(axis=1)[:, None]
+    return np.take_along_axis(roots, nearest, axis=1).reshape(shape)
 
 
 def find_roots(plant: Plant, per_decade: int = _SCAN_PER_DECADE) -> Roots:
@@ -52,21 +76,16 @@ def find_roots(plant: Plant, per_decade: int = _SCAN_PER_DECADE) -> Roots:
         return Roots(amplitude[:, None], (amplitude * plant.linear)[:, None])
     known = np.isfinite(plant.linear)
     if plant.friction.unique:
-        sound = np.isfinite(np.add(*_knees(plant.friction)))
+        sound = _sound(plant.friction)
         known &= sound[plant.vector] if sound.size > 1 else sound
     passive = known & plant.friction.unique & (plant.linear.imag >= -plant.rounding)
     single = passive & ~(resonant & (plant.drive >= plant.largest_friction()))
     amplitude = np.full(plant.drive.shape, np.nan)
     force = np.full(plant.drive.shape, np.nan, dtype=np.complex128)
-    if single.any():
-        table = _tabulate(plant.friction, int(single.sum()))
-        settled = ~single
-        for points in _chunks(single):
-            part = _interpolated_roots(plant.at(points), table)
-            amplitude[points], force[points], settled[points] = part
-        rest = np.flatnonzero(~settled)
-        amplitude[rest] = _bracketed_roots(plant.at(rest), table, amplitude[rest])
-        force[rest] = plant.at(rest).force(amplitude[rest])
+    alone = np.flatnonzero(single)
+    if alone.size:
+        amplitude[alone] = _single_roots(plant.at(alone))
+        force[alone] = plant.at(alone).force(amplitude[alone])
     active = np.flatnonzero(known & ~passive)
     if not active.size:
         return Roots(amplitude[:, None], force[:, None])
@@ -79,116 +98,21 @@ def find_roots(plant: Plant, per_decade: int = _SCAN_PER_DECADE) -> Roots:
     return roots
 
 
-def _chunks(chosen: BoolArray) -> Iterator[IntArray | slice]:
-    """Yield the chosen points in parts; as slices, which copy nothing, where all are chosen."""
-    points = None if chosen.all() else np.flatnonzero(chosen)
-    for first in range(0, chosen.size if points is None else points.size, _CHUNK):
-        part = slice(first, first + _CHUNK)
-        yield part if points is None else points[part]
-
-
-class _Table(NamedTuple):
-    """Friction force against amplitude, the nodes of one parameter vector after another."""
-
-    nodes: int  # per vector; 2^k - 1, so that bisection takes k steps
-    amplitude: FloatArray
-    force: ComplexArray
-    slope: ComplexArray  # by ln A
-    sure_step: float  # steps of ln A, times kappa, after which linear corrections are exact
-
-
-def _knees(friction: Nonlinear) -> tuple[FloatArray, FloatArray]:
-    """Return the knees' decimal logarithms, one a vector; not finite beyond a law's range."""
+def _sound(friction: Nonlinear) -> BoolArray:
+    """Return which vectors are within the laws' range, (1,) or (vectors,)."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        low, high = (np.atleast_1d(np.log10(knee)) for knee in friction.knees())
-    return low, high
+        low, high = (np.log(np.atleast_1d(knee)) for knee in friction.knees())
+    return np.asarray(np.isfinite(low + high))
 
 
-def _tabulate(friction: Nonlinear, points: int) -> _Table:
-    """Return the friction force from deep microslip to deep slip of every element.
-
-    A vector has about as many nodes as there are points to solve for it, within limits.
-    """
-    low, high = (np.where(np.isfinite(knee), knee, 0.0) for knee in _knees(friction))
-    low, high = low - 6.0, high + 5.0
-    decades = float(np.max(high - low))
-    fewest, most = (decades * n for n in _NODES_PER_DECADE)
-    least = np.clip(points / low.size, fewest, most)
-    nodes = 2 ** int(np.ceil(np.log2(least))) - 1
-    amplitude = 10.0 ** np.linspace(low, high, nodes, axis=-1).ravel()
-    vector = np.repeat(np.arange(low.size), nodes)
-    spacing = decades * np.log(10.0) / nodes
-    force, slope = friction.force_and_slope(amplitude, vector)
-    return _Table(nodes, amplitude, force, slope, min(1e-9, float(1e-13 / spacing**2)))
-
-
-def _interpolated_roots(plant: Plant, table: _Table) -> tuple[FloatArray, ComplexArray, BoolArray]:
-    """Return amplitude and force of each passive point, and whether one step was enough."""
-    below = _search(plant, table)
-    with np.errstate(all="ignore"):  # beyond the table's ends the result is not used
-        start, per_misfit, slope = _inverse_cubic(plant, table, _cell(plant, table, below))
-        friction = plant.friction.force(start, plant.vector)
-        rest = start * plant.linear
-        force = rest + friction
-        step = (plant.drive / np.abs(force) - 1.0) * per_misfit
-        settled = np.abs(step) * plant.conditioning(start, friction) < table.sure_step
-        settled &= (below > 0) & (below < table.nodes)
-        return start + start * step, force + (rest + slope) * step, settled
-
-
-def _bracketed_roots(plant: Plant, table: _Table, guess: FloatArray) -> FloatArray:
-    """Return the one amplitude of each passive point, in its cell or beyond the table's ends."""
-    below = _search(plant, table)
-    left, right = _cell(plant, table, below)
-    A0, A1 = table.amplitude[left], table.amplitude[right]
-    stuck, slipping = below == 0, below == table.nodes
+def _single_roots(plant: Plant) -> FloatArray:
+    """Return the one amplitude of each passive point."""
     low, high = plant.bounds()
-    low = np.where(stuck, np.minimum(low, A1), A0)
-    high = np.where(slipping, np.maximum(high, A0), A1)
     largest = plant.largest_friction()
-    with np.errstate(divide="ignore"):
-        linear = plant.drive / np.abs(plant.linear + table.force[left] / A0)
-        excess = np.sqrt(np.abs(plant.drive - largest)) * np.sqrt(plant.drive + largest)
-        start = np.where(stuck, linear, np.where(slipping, excess / np.abs(plant.linear), guess))
+    with np.errstate(divide="ignore", invalid="ignore"):  # in gross slip the friction is known
+        slipping = np.sqrt(plant.drive - largest) * np.sqrt(plant.drive + largest)
+        start = slipping / np.abs(plant.linear)
     return _polish(plant, low, high, start, np.ones(low.shape, dtype=bool))
-
-
-def _cell(plant: Plant, table: _Table, below: IntArray) -> IntArray:
-    """Return the nodes left and right of each solution; the end node twice beyond the ends."""
-    sides = np.stack([np.maximum(below - 1, 0), np.minimum(below, table.nodes - 1)])
-    sides += plant.vector * table.nodes
-    return sides
-
-
-def _search(plant: Plant, table: _Table) -> IntArray:
-    """Return the number of nodes with A |Z| below the drive, by bisection without branches."""
-    offset = plant.vector * table.nodes - 1
-    last_below = offset.copy()
-    width = (table.nodes + 1) // 2
-    while width:
-        node = last_below + width
-        total = table.amplitude.take(node, mode="clip") * plant.linear
-        total += table.force.take(node, mode="clip")
-        last_below += width * (np.abs(total) < plant.drive)
-        width //= 2
-    return last_below - offset
-
-
-def _inverse_cubic(
-    plant: Plant, table: _Table, cell: IntArray
-) -> tuple[FloatArray, FloatArray, ComplexArray]:
-    """Return A and dlnA/dg at g = ln(A |Z|/u_0) = 0, from Hermite's cubic of ln A over g.
-
-    And the friction force's derivative with respect to ln A there, between those of the nodes.
-    """
-    A, slope = table.amplitude[cell], table.slope[cell]
-    g, s = plant.misfit(A, table.force[cell], slope)
-    width, log_ratio = g[1] - g[0], np.log(A[1] / A[0])
-    t = -g[0] / width
-    m0, m1 = width / s
-    y = t * ((1 - t) ** 2 * m0 + t * ((3 - 2 * t) * log_ratio + (t - 1) * m1))
-    rise = 6 * t * (1 - t) * log_ratio + (1 - t) * (1 - 3 * t) * m0 + t * (3 * t - 2) * m1
-    return A[0] * np.exp(y), rise / width, slope[0] + (slope[1] - slope[0]) * (y / log_ratio)
 
 
 def _polish(
