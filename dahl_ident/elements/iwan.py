@@ -33,8 +33,8 @@ from dahl_ident.elements.behaviour import SOFTENED, StiffnessGradient
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 
-_SLIDERS = 30  # Jenkins elements in the place of the law where a force drives it: 6e-5 of f_max
-_FEW_SLIDERS = 8  # 1e-3 of f_max, at a tenth of the cost: near enough for a search to begin with
+_SLIDERS = 30  # Jenkins elements in the place of the law where a force drives it: 2e-4 of f_max
+_FEW_SLIDERS = 8  # 3e-3 of f_max, at a tenth of the cost: near enough for a search to begin with
 _REST = 1e-100  # m, below every amplitude allowed: d_m/A does not overflow
 _NARROWEST = 1e-6  # of the onset: near chi = -1 the stiffness is never all there
 _DEEP = 1e-8  # d_m/A below which the incomplete beta function is its series
