@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from dahl_ident import (
     FrequencyResponse,
     LuGre,
     Mass,
+    PowerDamper,
     Spring,
     compare_models,
     fit,
@@ -135,3 +138,33 @@ def test_what_is_stated_stands_next_to_what_noise_alone_gives() -> None:
     assert found.stated["force limit"] == pytest.approx(result.params["f_max"].value)
     assert [row[0] for row in found.meanings] == ["every source", "as fitted", "spring"]
     assert float(found.meanings[0][1]) == pytest.approx(result.params["f_max"].value, rel=5e-3)
+
+
+def test_a_damper_is_told_from_another_loop_at_one_frequency() -> None:
+    """Without a damper among the candidates, Bouc-Wen's law took its place."""
+    A = np.geomspace(3e-4, 3e-2, 12)
+    truth = Dahl(0.1, 30.0, alpha=1.0) + PowerDamper(0.02, 0.5)
+    exact = truth.dynamic_stiffness(A, np.full(A.size, 2.0 * np.pi))
+    noise = 0.01 * np.random.default_rng(0).standard_normal((2, A.size)).T @ [1.0, 1.0j]
+    data = FrequencyResponse(np.ones(A.size), exact * np.exp(noise), A)
+    comparison = compare_models(fit(data, Dahl(alpha=1.0), throw=False))
+    assert comparison.best.name == "power damper added"
+    assert comparison.best.meaning["force limit"] == pytest.approx(0.1, rel=0.03)
+    assert "of the fundamental, and how much of that is noise is not known" in comparison.headline
+
+
+def test_models_whose_parameters_are_open_are_not_recommended() -> None:
+    """In gross slip one of two elements is as stiff as one likes, however well both predict."""
+    A = np.geomspace(0.5, 5.0, 12)
+    exact = Dahl(0.1, 30.0, alpha=1.0).describing_function(A) * (1.0 + 0.05 * np.sin(9.0 * A))
+    data = FrequencyResponse(np.ones(A.size), exact, A)
+    comparison = compare_models(fit(data, Dahl(alpha=1.0), throw=False))
+    first, *others = comparison.models
+    two = next(m for m in others if m.name == "two Dahl elements")
+    better = replace(two.density, tests=two.density.tests + 10.0)
+    assert not two.is_determined
+    assert replace(comparison, models=(first, replace(two, density=better))).best is first
+    sprung = next(m for m in others if m.name == "spring added")
+    assert sprung.is_determined
+    best = replace(comparison, models=(first, replace(sprung, density=better))).best
+    assert best.name == "spring added"
