@@ -51,9 +51,9 @@ def converted(
     response: ComplexArray, omega: FloatArray, source: Quantity, target: Quantity
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return the response as `target`, and its complex derivative with respect to the source."""
-    given, wanted = DEFINITIONS[source], DEFINITIONS[target]
-    turn = given.exponent * wanted.exponent
-    factor = power_of_s(omega, wanted.power - turn * given.power)
+    old, new = DEFINITIONS[source], DEFINITIONS[target]
+    turn = old.exponent * new.exponent
+    factor = power_of_s(omega, new.power - turn * old.power)
     if turn == 1:
         return response * factor, factor
     zero = np.flatnonzero(response == 0.0)

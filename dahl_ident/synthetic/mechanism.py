@@ -147,9 +147,9 @@ class SpringMotion:
             path = 0.5 * (low + high)
             x = self._x[i] + heading * path
             for j, law in enumerate(self._laws):
-                found = law.branch(_values(law), heading * start[j], path)
-                assert found is not None
-                forces[j] = heading * found[0]
+                branch = law.branch(_values(law), heading * start[j], path)
+                assert branch is not None  # such laws alone come here
+                forces[j] = heading * branch[0]
             beyond = heading * (self._stiffness * x + forces.sum(axis=0) - u) > 0.0
             low, high = np.where(beyond, low, path), np.where(beyond, path, high)
         return x, forces
@@ -188,7 +188,7 @@ class DampedMotion:
                 law.branch(_values(law), heading * start, path)
                 for law, start in zip(laws, at_turn, strict=True)
             )
-            return [heading * float(found[0]) for found in branches if found is not None]
+            return [heading * float(branch[0]) for branch in branches if branch is not None]
 
         def speed(t: float, x: FloatArray) -> float:
             spring = stiffness * float(x[0])
