@@ -427,7 +427,7 @@ def test_the_status_is_coloured_on_a_terminal_unless_no_color(tmp_path: Path) ->
 def test_a_progress_bar_stays_out_of_the_results(tmp_path: Path) -> None:
     pty = pytest.importorskip("pty", reason="terminals are POSIX")
     table = tmp_path / "noisy.csv"
-    assert subprocess.run([str(PROGRAM), "datasets", "noisy", "-o", str(table)]).returncode == 0
+    di.load_dataset("noisy").save(table)
     ours, theirs = pty.openpty()
     done = subprocess.run(
         [str(PROGRAM), "sample", str(table), "--steps", "30", "--json"],
@@ -476,14 +476,14 @@ def test_a_bootstrap_from_a_negative_seed_is_refused(run: Runner) -> None:
         ("template op", "options"),
     ],
 )
-def test_the_shell_completes_commands_and_values(words: str, completed: str) -> None:
+def test_the_shell_completes_commands_and_values(
+    run: Runner, monkeypatch: pytest.MonkeyPatch, words: str, completed: str
+) -> None:
     typed = f"dahl-ident {words}"
-    environment = {
-        **os.environ, "_DAHL_IDENT_COMPLETE": "complete_bash", "COMP_WORDS": typed,
-        "COMP_CWORD": str(len(typed.split()) - 1),
-    }  # fmt: skip
-    done = subprocess.run([str(PROGRAM)], env=environment, capture_output=True, text=True)
-    assert done.stdout.split() == [completed]
+    monkeypatch.setenv("_DAHL_IDENT_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", typed)
+    monkeypatch.setenv("COMP_CWORD", str(len(typed.split()) - 1))
+    assert run().out.split() == [completed]
 
 
 def test_every_template_is_read_by_its_option(run: Runner) -> None:
