@@ -248,7 +248,7 @@ def test_predictive_checks_pass_the_right_model_and_fail_the_wrong_one() -> None
 def test_checks_of_a_right_model_are_calibrated() -> None:
     # over many tables, the shares must not be crowded at the end that means a misfit
     shares = []
-    for seed in range(12):
+    for seed in range(8):
         table = friction_table(15, noise=0.05, seed=seed)
         drawn = di.posterior(table, di.Dahl(), seed=1, steps=150, uncertainty="noise")
         shares += [check.share for check in drawn.checks]
