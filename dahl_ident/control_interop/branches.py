@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
 from dahl_ident.control_interop.limit_cycles import stiffness_of, stiffness_slope
+from dahl_ident.control_interop.linear_part import split
 from dahl_ident.control_interop.nonlinearity import friction_and_slope
-from dahl_ident.control_interop.split import split
 from dahl_ident.elements.element import Element, Model
 from dahl_ident.steady_state import Steady, SteadyResponse, response
 from dahl_ident.steady_state.shooting import NEUTRAL

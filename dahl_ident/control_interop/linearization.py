@@ -28,9 +28,9 @@ from dahl_ident.arrays import (
 from dahl_ident.control_interop.linear_part import (
     coefficients,
     controller_response,
+    split,
     transfer_stiffness,
 )
-from dahl_ident.control_interop.split import split
 from dahl_ident.elements.element import Element, as_model
 from dahl_ident.errors import ValidationError
 
