@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 
+NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _POWER = 4.0  # q: 1 would add the targets' variances, infinity would use only the largest
 
 

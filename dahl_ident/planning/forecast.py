@@ -19,7 +19,7 @@ from dahl_ident.data.quantities import DEFINITIONS
 from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.departures import Departures, departures
 from dahl_ident.planning.candidates import Candidates
-from dahl_ident.planning.criteria import Term
+from dahl_ident.planning.criteria import NOTHING, Term
 from dahl_ident.planning.knowledge import Knowledge
 from dahl_ident.planning.measurement_plan import Expected
 from dahl_ident.planning.quantities import (
@@ -31,10 +31,9 @@ from dahl_ident.planning.quantities import (
     sizes,
 )
 
-_NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _ROUNDING = 1e-14  # of a parameter's information: less is rounding, and could cancel to nothing
 _NONE = 1e12  # information on departures that are left out
-_SEARCHED = 24  # draws that the search for levels averages over
+SEARCHED = 24  # draws that the search for levels averages over
 _SEARCHED_WITH_DEPARTURES = 2  # the same of many parameters more, close to the fit's estimate
 _PLACES = 24  # of the candidates, over which the response is averaged
 
@@ -111,7 +110,7 @@ class Forecast:
     def thinned(self) -> Forecast:
         """Return the forecast at the few draws that a search averages over."""
         S = len(self.before)
-        most = _SEARCHED if self.departures == 0 else _SEARCHED_WITH_DEPARTURES
+        most = SEARCHED if self.departures == 0 else _SEARCHED_WITH_DEPARTURES
         some = np.unique(np.linspace(0, S - 1, min(S, most)).astype(int))
         return replace(
             self,
@@ -250,10 +249,10 @@ def covariance_of(M: FloatArray) -> FloatArray:
     In units in which the diagonal is 1, so that much information on one parameter does not hide
     that there is none on another.
     """
-    size = np.sqrt(np.diagonal(M, axis1=-2, axis2=-1) + _NOTHING)
+    size = np.sqrt(np.diagonal(M, axis1=-2, axis2=-1) + NOTHING)
     units = size[..., :, None] * size[..., None, :]
     eye = np.eye(M.shape[-1])
-    return np.asarray(np.linalg.inv((M + _NOTHING * eye) / units + _ROUNDING * eye) / units)
+    return np.asarray(np.linalg.inv((M + NOTHING * eye) / units + _ROUNDING * eye) / units)
 
 
 def typical(u: FloatArray) -> float:

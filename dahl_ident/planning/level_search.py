@@ -13,7 +13,7 @@ from dahl_ident.diagnostics.stiffening import LEAST_DOF
 from dahl_ident.diagnostics.trends import LEAST_RANGE
 from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
 from dahl_ident.planning.candidates import larger_rows
-from dahl_ident.planning.criteria import LevelInformation, Objective, Term
+from dahl_ident.planning.criteria import NOTHING, LevelInformation, Objective, Term
 from dahl_ident.planning.forecast import Forecast, typical
 from dahl_ident.planning.optimal_design import Coverage, Exchange, Selection, continuous_design
 from dahl_ident.planning.quantities import sizes
@@ -26,7 +26,6 @@ LONGEST = 30.0 * 86400.0  # s, of a plan for which no time is given: a month
 _TIMES = 20  # corrections of the time that reaches a target
 _HELPS = 0.1  # of what the square root of the time would do, below which more time is useless
 _CLOSE = 0.985  # fraction of the target at which the search stops
-_NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _UNKNOWN = 1e-2  # the same of a suspected parameter, which is known within a decade or so
 _APART = 2.0  # times the range that a fit takes as one amplitude: measured ones are not exact
 _GRID_LEVELS = 10  # of the usual plan that the best one is compared with
@@ -67,7 +66,7 @@ class LevelSearch:
             before = own.like(model=q.larger, sensors=q.knowledge.sensors)
             scale = 1.0 if own.scale_known else float(q.knowledge.row_noise or 1.0)
             known = known + before.information(theta, scale) * np.outer(size, size)
-        self._suspects_before = known + _NOTHING * np.eye(P)
+        self._suspects_before = known + NOTHING * np.eye(P)
         known = known + _UNKNOWN * np.eye(P)
         for j, name in enumerate(q.knowledge.names):
             i = names.index(name)

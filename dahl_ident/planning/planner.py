@@ -23,8 +23,8 @@ from dahl_ident.planning.candidates import (
     grid,
     level_range,
 )
-from dahl_ident.planning.criteria import Objective, Term
-from dahl_ident.planning.forecast import Forecast
+from dahl_ident.planning.criteria import NOTHING, Objective, Term
+from dahl_ident.planning.forecast import SEARCHED, Forecast
 from dahl_ident.planning.knowledge import Ranges, gather
 from dahl_ident.planning.level_search import LONGEST, LevelSearch, Solution
 from dahl_ident.planning.measurement_plan import Expected, Plan, PlanStep
@@ -43,10 +43,8 @@ from dahl_ident.planning.trajectories import PlannedMotion
 from dahl_ident.steady_state import STEADY, Steady
 from dahl_ident.units import si_unit
 
-_NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
 _FEW_LEVELS = 60  # candidates with which the effect of a wider limit is judged
-_SLOW_DRAWS = 24  # of motions in time, and of exact steady motions: as many as the search takes
 _CORRECTIONS = 6  # of the repeats of motions, each by the whole information
 _NEARLY = 0.99  # of the longest plan: whole cycles leave some of the time
 _AIMED = 0.999  # fraction of the target
@@ -128,7 +126,8 @@ def plan(
         With ``controlled="force"``: how the response is predicted. Left out, as in the fit given,
         or "exact".
     draws : int, default 200
-        Parameter vectors that the criterion is averaged over.
+        Parameter vectors that the criterion is averaged over; of motions in time, and of exact
+        steady motions, at most 24.
     seed : int, default 0
         Of the draws.
 
@@ -186,7 +185,7 @@ def plan(
     asked = motions_asked(candidates)
     if asked:
         _only_motions(wanted, scatter, suspects, controlled, runs, larger)
-        known = replace(knowledge.thinned(_SLOW_DRAWS), errors=None, scatter=0.0)
+        known = replace(knowledge.thinned(SEARCHED), errors=None, scatter=0.0)
         question = PlanRequest(
             known, bench, controlled, CycleNoise(0.0), wanted, numbers, 0.0, 1, costs, None, {},
             recorded_force(noise, sample_rate, knowledge), asked,
@@ -198,7 +197,7 @@ def plan(
             "sines, or give candidates='trapezoid'"
         )
     if controlled == "force" and knowledge.steady == "exact":
-        knowledge = knowledge.thinned(_SLOW_DRAWS)
+        knowledge = knowledge.thinned(SEARCHED)
     question = PlanRequest(
         knowledge, bench, controlled, noise_of(noise, knowledge), wanted, numbers,
         knowledge.scatter if scatter is None else float(non_negative_array(scatter, "scatter")),
@@ -427,7 +426,7 @@ class Planner:
         q = self.question
         options = _options(q, limits)
         some = Forecast.of(q.knowledge, options, q.wanted, q.scatter).thinned()
-        known = some.before + _NOTHING * np.eye(some.before.shape[-1])
+        known = some.before + NOTHING * np.eye(some.before.shape[-1])
         levels = some.candidates.information(q.scatter)
         term = Term(levels, known, some.directions[name], np.zeros(1, dtype=int))
         time = limits.time if np.isfinite(limits.time) else 1000.0
