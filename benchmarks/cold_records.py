@@ -19,7 +19,7 @@ from dahl_ident.errors import DahlIdentError
 from tests import cold_records as cold
 from tests.cold_records import Case
 
-SEEDS = 4
+SEEDS = 6
 CASES: dict[str, Callable[[int], Case]] = {
     **{f"Dahl, driven, sigma {s:g} N/m": partial(cold.fast, s) for s in (300.0, 3e3, 3e4)},
     **{f"Backlash, gap {g:g} x_c, force measured": partial(cold.play, g) for g in (0.5, 2.0, 6.0)},

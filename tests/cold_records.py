@@ -57,9 +57,9 @@ def noisy(x: FloatArray, share: float, seed: int) -> FloatArray:
     )
 
 
-def fast(sigma: float, seed: int) -> Case:
+def fast(sigma: float, seed: int, n: int = 768) -> Case:
     """Return friction whose x_c/v is far below the sampling interval where sigma is high."""
-    n, rate, f_max = 768, 100.0, 0.5
+    rate, f_max = 100.0, 0.5
     force, drive = multisine(n, rate, 0.3, 7.7, 3.0, seed)
 
     def rates(t: float, y: FloatArray, u: float) -> list[float]:

@@ -27,20 +27,18 @@ def assert_found(case: Case) -> None:
             assert u < 0.3 * abs(value), (parameter.name, found.value, u)
 
 
-@pytest.mark.parametrize("sigma", [300.0, 3000.0, 30000.0])
+@pytest.mark.parametrize("sigma", [300.0, 30000.0])
 def test_friction_faster_than_the_sampling(sigma: float) -> None:
-    assert_found(cold.fast(sigma, 0))
+    assert_found(cold.fast(sigma, 0, 512))
 
 
 @pytest.mark.parametrize("gap", [0.5, 2.0, 6.0])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_backlash_with_measured_displacement(gap: float, seed: int) -> None:
     assert_found(cold.play(gap, seed))
 
 
-@pytest.mark.parametrize(
-    ("made", "seed"), [(cold.lugre, 0), (cold.lugre, 1), (cold.slips, 1), (cold.iwan, 1)]
-)
+@pytest.mark.parametrize(("made", "seed"), [(cold.lugre, 0), (cold.slips, 1), (cold.iwan, 1)])
 def test_driven_plants(made: Callable[[int], Case], seed: int) -> None:
     assert_found(made(seed))
 
