@@ -71,7 +71,7 @@ def limits(record: di.Record, hz: float) -> tuple[float, float]:
 def without(problem: RecordProblem, values: FloatArray, dropped: tuple[str, ...]) -> FloatArray:
     """Return the least squares of the plain residuals, parameters of some names held at zero."""
     kept = np.array([not name.startswith(dropped) for name in problem.names])
-    positive = problem.logarithmic[kept]
+    positive = problem.space.positive[kept]
     unit = np.where(positive, 1.0, np.maximum(np.abs(values[kept]), _SMALLEST))
 
     def at(z: FloatArray) -> FloatArray:

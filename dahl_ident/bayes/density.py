@@ -44,6 +44,12 @@ class LogDensity(ABC):
 
     prior: JointPrior
     likelihood: str
+    normalised: bool = True
+    """Whether the density is that of the data, and not only up to a factor."""
+
+    def marginal(self, theta: FloatArray) -> FloatArray:
+        """Return the log-density of theta, (S, P), an unknown scale integrated out."""
+        return self(theta)
 
     @abstractmethod
     def __call__(self, x: FloatArray) -> FloatArray:

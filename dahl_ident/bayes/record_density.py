@@ -52,6 +52,7 @@ class RecordDensity(LogDensity):
     dof: float
     prior: JointPrior
     likelihood = "gaussian"
+    normalised = False
 
     @property
     def centre(self) -> FloatArray:

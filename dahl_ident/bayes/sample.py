@@ -20,12 +20,10 @@ from dahl_ident.arrays import FloatArray, positive_number
 from dahl_ident.bayes.chain import Chain, ChainSettings, Listener, Pool, run
 from dahl_ident.bayes.checkpoint import identity, open_chain
 from dahl_ident.bayes.convergence import Convergence
-from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.density import Density, LogDensity
 from dahl_ident.bayes.importance import WeightedDraws, WeightedPoints, in_blocks, integrate
 from dahl_ident.bayes.record_density import RecordDensity
-from dahl_ident.bayes.walker_start import centre_and_covariance
-from dahl_ident.errors import SamplingError
-from dahl_ident.fitting import Optimum
+from dahl_ident.errors import SamplingError, ValidationError
 
 _MOST_AXES = 3  # the number of points is a power of the number of axes
 
@@ -124,7 +122,7 @@ class ChainSample(Sample):
 class PointSample(Sample):
     """Importance points: the same at every call, with the error of every probability."""
 
-    density: Density
+    density: LogDensity
     integral: WeightedPoints
     tolerance: float
 
@@ -132,7 +130,7 @@ class PointSample(Sample):
     def draws(self) -> WeightedDraws:
         """The points, an unknown noise scale included."""
         points = self.integral
-        if not self.density.has_scale:
+        if not isinstance(self.density, Density) or not self.density.has_scale:
             return points
         return WeightedDraws(_with_scale(self.density, points), points.weights)
 
@@ -154,11 +152,19 @@ class PointSample(Sample):
         )
 
     @property
+    def log_evidence(self) -> float:
+        """The logarithm of the evidence."""
+        if not self.density.normalised:
+            raise ValidationError(
+                "a posterior of records has no evidence: their likelihood is known up to a factor"
+            )
+        return self.integral.log_evidence
+
+    @property
     def facts(self) -> Mapping[str, Any]:
-        """The evidence with its error, and the number of points."""
-        return {
-            name: getattr(self.integral, name) for name in ("log_evidence", "error", "evaluations")
-        }
+        """The evidence, where there is one, the error, and the number of points."""
+        names = (*["log_evidence"] * self.density.normalised, "error", "evaluations")
+        return {name: getattr(self.integral, name) for name in names}
 
 
 def sample_chain(
@@ -205,10 +211,17 @@ def sample_chain(
 
 
 def sample_points(
-    density: Density, optimum: Optimum | None, given: Sequence[str], tolerance: float
+    density: LogDensity,
+    begin: Callable[[], tuple[FloatArray, FloatArray]],
+    given: Sequence[str],
+    tolerance: float,
 ) -> PointSample:
-    """Integrate a density of few parameters; `given` are those that were left free by the user."""
-    names = density.problem.names
+    """Integrate a density of few parameters.
+
+    `begin` returns a centre and a covariance, (P,) and (P, P); `given` names the parameters that
+    were left free by the user.
+    """
+    names = [part.parameter.name for part in density.prior.priors]
     if len(names) > _MOST_AXES:
         assumed = [name for name in names if name not in given]
         instead = f"give {', '.join(assumed)} or " if assumed else ""
@@ -217,7 +230,7 @@ def sample_points(
             f"{_MOST_AXES}: {instead}fix some, or use method='mcmc'"
         )
     positive_number(tolerance, "tolerance")
-    centre, covariance = centre_and_covariance(density, optimum, np.random.default_rng(0))
+    centre, covariance = begin()
     integral = integrate(
         density.marginal,
         density.prior,

@@ -111,6 +111,7 @@ def report_also(
 
 def as_json(result: FitResult | RecordFit) -> dict[str, Any]:
     """Return a fit as plain data."""
+    from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
     from dahl_ident.results import RecordFit
 
     facts: dict[str, Any] = {
@@ -121,17 +122,14 @@ def as_json(result: FitResult | RecordFit) -> dict[str, Any]:
         "message": result.message,
         "findings": [finding.to_dict() for finding in result.findings],
     }
-    limits: Mapping[str, Any]
+    limits = result.conf_interval().at(CONFIDENCE)
+    first = int(isinstance(result, RecordFit))  # intervals of tables begin with their level
     if isinstance(result, RecordFit):
-        limits = result.conf_interval()
         facts |= {
             "effective_samples": result.effective_samples,
             "share_left": result.goodness.share_left,
         }
     else:
-        from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
-
-        limits = result.conf_interval().at(CONFIDENCE)
         budget, errors = result.stated_budget, result.errors
         assumed = () if errors is None else errors.assumed
         facts |= {
@@ -149,7 +147,7 @@ def as_json(result: FitResult | RecordFit) -> dict[str, Any]:
             "redchi": result.redchi,
         }
     facts["params"] = {
-        name: {**vars(estimate), "interval": limits.get(name) if estimate.vary else None}
+        name: {**vars(estimate), "interval": limits[name][first:] if estimate.vary else None}
         for name, estimate in result.params.items()
     }
     return facts

@@ -139,7 +139,7 @@ def _rival(optimum: Optimum, element: Element, label: str, lost: frozenset[str])
     """Return the same parameter of another element of this law, if it is not determined either."""
     for other in optimum.problem.model.elements:
         if other is not element and other.kind == element.kind and label in other.labels:
-            name = other.parameter(label).name
+            name: str = other.parameter(label).name
             if name in lost:
                 return name
     return ""

@@ -34,10 +34,12 @@ from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, intervals_from_search
 from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.fitting import Optimum, solve_many
+from dahl_ident.fitting.record_search import solve_repetitions
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import ProblemBatch
 
 REPLICATES = 4999  # seven of them lie beyond either limit of the 99.73 % interval
+_OF_RECORDS = 199  # each of which is searched alone: enough for the 95.45 % interval
 _FEWEST = 99  # with fewer a tail of 1 % holds no replicate
 _AT_LIMIT = 0.01  # of the replicates, from which on the tails cannot be distinguished
 
@@ -58,8 +60,10 @@ class Replicates:
     gone: NDArray[np.bool_]
 
 
-def replicate(optimum: Optimum, replicates: int, seed: int) -> Replicates:
+def replicate(optimum: Optimum, replicates: int | None, seed: int) -> Replicates:
     """Return fits to `replicates` simulated repetitions of the measurement."""
+    if replicates is None:
+        replicates = REPLICATES if optimum.problem.settled else _OF_RECORDS
     count = whole_number(replicates, "replicates", _FEWEST)
     if optimum.loss != "linear":
         raise ValidationError(
@@ -70,19 +74,23 @@ def replicate(optimum: Optimum, replicates: int, seed: int) -> Replicates:
         raise FitError("there is no optimum to simulate repetitions from")
     scale = 1.0 if optimum.scale_known else optimum.scale
     problem, rng = optimum.problem, np.random.default_rng(whole_number(seed, "seed", 0))
-    responses = problem.draw(optimum.theta, scale, count, rng)
-    found = solve_many(ProblemBatch.replicates(problem, responses), start=optimum.theta)
-    error = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
-    gone = ~(np.isfinite(found.values) & np.isfinite(error) & (error > 0.0))
+    if problem.settled:
+        responses = problem.draw(optimum.theta, scale, count, rng)
+        found = solve_many(ProblemBatch.replicates(problem, responses), start=optimum.theta)
+        theta, error = found.theta, np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+        gone = ~(np.isfinite(found.values) & np.isfinite(error) & (error > 0.0))
+    else:
+        theta, error = solve_repetitions(optimum, count, rng)
+        gone = ~(np.isfinite(theta) & np.isfinite(error) & (error > 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.where(gone, np.nan, (found.theta - optimum.theta) / error)
+        t = np.where(gone, np.nan, (theta - optimum.theta) / error)
     return Replicates(t, gone)
 
 
 def bootstrap_intervals(
     optimum: Optimum,
     levels: Sequence[float] = LEVELS,
-    replicates: int = REPLICATES,
+    replicates: int | None = None,
     seed: int = 0,
 ) -> ConfidenceIntervals:
     """Return studentised bootstrap intervals.
@@ -93,8 +101,8 @@ def bootstrap_intervals(
         The estimate, by least squares without a robust loss.
     levels : sequence of float, default 0.6827, 0.9545, 0.9973
         Confidence levels.
-    replicates : int, default 4999
-        At least 99; the 99.73 % level needs some thousands.
+    replicates : int, optional
+        At least 99; the 99.73 % level needs some thousands. Left out: 4999, of records 199.
     seed : int, default 0
         Of the simulated noise; the same seed gives the same intervals.
 
@@ -113,13 +121,14 @@ def bootstrap_intervals(
     array = checked_levels(levels)
     drawn = replicate(optimum, replicates, seed)
     tail = 0.5 * (1.0 - array)
-    symmetric = bool(drawn.gone.any(axis=1).mean() > _AT_LIMIT)
+    count = optimum.problem.n_reported
+    symmetric = bool(drawn.gone[:, :count].any(axis=1).mean() > _AT_LIMIT)
     error = np.sqrt(np.diagonal(optimum.covariance))
     lower, upper = (
-        np.full((len(array), len(error)), -np.inf),
-        np.full((len(array), len(error)), np.inf),
+        np.full((len(array), count), -np.inf),
+        np.full((len(array), count), np.inf),
     )
-    for i in np.flatnonzero(np.isfinite(error)):
+    for i in np.flatnonzero(np.isfinite(error[:count])):
         t = drawn.studentised[~drawn.gone[:, i], i]
         known = drawn.gone[:, i].mean() <= tail
         if known.any():

@@ -26,6 +26,7 @@ from dahl_ident.diagnostics.verdicts import Identifiability
 from dahl_ident.elements import Model
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import LOSSES
+from dahl_ident.fitting.optimum import ConstraintCost
 
 _TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
@@ -217,7 +218,11 @@ def _slight(fit: Judged) -> Iterator[Finding]:
 
 def _constraints(fit: Judged) -> Iterator[Finding]:
     """Yield the constraints that the data contradict."""
-    cost = fit.optimum.constraint_cost
+    yield from contradicted(fit.optimum.constraint_cost)
+
+
+def contradicted(cost: ConstraintCost | None) -> Iterator[Finding]:
+    """Yield constraints whose cost is not due to chance."""
     if cost is not None and cost.p_value <= _CHANCE:
         values = {
             "texts": tuple(cost.texts),

@@ -331,7 +331,7 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
             "compare_models got several fits; it takes one, and a mapping of names to other models "
             "of its data. What changed between fits of different data is in di.report([fit, ...])"
         )
-    if not isinstance(fit.optimum, Optimum):
+    if not fit.optimum.problem.settled:
         raise ValidationError(
             "compare_models got a fit of records; it takes a fit of a table. Compare models of "
             "records by fitting each, and by what their hold_out() says"

@@ -546,7 +546,10 @@ def _by_alpha(optimum: Optimum, name: str) -> ComplexArray:
         theta[i] = known.get(parameter.name, np.log(parameter.value or 1.0))
     response, jacobian = freed.predict(theta), freed.prediction_jacobian(theta)
     changes = jacobian[:, freed.names.index(name)]
-    return np.divide(changes, response, out=np.zeros_like(changes), where=response != 0.0)
+    ratio: ComplexArray = np.divide(
+        changes, response, out=np.zeros_like(changes), where=response != 0.0
+    )
+    return ratio
 
 
 def _third_harmonic(optimum: Optimum, space: ResidualSpace) -> ThirdHarmonic | None:

@@ -29,7 +29,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.budget import coverage_factor
@@ -45,6 +44,7 @@ from dahl_ident.diagnostics.formatting import degrees_text, table
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Optimum
+from dahl_ident.problem.space import Space
 
 Method = Literal["combined", "wald", "profile", "bootstrap"]
 _BY_FACTOR = 0.2  # u of a logarithm, above which an interval is a factor either way
@@ -239,22 +239,10 @@ def combined_intervals(
         ]
     )
     k = np.array([[coverage_factor(nu, level) for nu in dof] for level in array.tolist()])
-    theta, positive = errors.theta[place], logarithmic(optimum)
+    positive = optimum.problem.space.positive
     values = errors.problem.to_values(errors.theta)[place]
-    narrow = positive & (u <= _BY_FACTOR)
-    half = k * u
-    low, high = optimum.problem.bounds()
-    with np.errstate(over="ignore", invalid="ignore"):
-        ends = [
-            np.where(
-                narrow,
-                values * (1.0 + sign * half),
-                optimum.problem.to_values(np.clip(theta + sign * half, low, high)),
-            )
-            for sign in (-1.0, 1.0)
-        ]
-    least, most = (optimum.problem.to_values(bound) for bound in (low, high))
-    lower, upper = np.maximum(ends[0], least), np.minimum(ends[1], most)
+    slopes = optimum.problem.space.slopes(values)
+    lower, upper = around(optimum.problem.space, values, u * slopes, k)
     by_noise = np.sqrt(np.diagonal(optimum.covariance))
     doubtful = ~held | ~(by_noise <= _LARGE)
     if doubtful.any():
@@ -273,26 +261,43 @@ def combined_intervals(
     return ConfidenceIntervals("combined", array, optimum.names, units, values, lower, upper, note)
 
 
+def around(
+    space: Space, values: FloatArray, u: FloatArray, k: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the limits value -+ k u within the bounds, each (L, P).
+
+    Of a positive parameter whose u is above 20 %, value times or over exp(k u / value).
+    """
+    least, most = (space.to_values(bound) for bound in space.bounds)
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        relative = np.where(space.positive, u / values, 0.0)
+        by_factor = space.positive & ~(relative <= _BY_FACTOR)
+        lower, upper = (
+            np.where(by_factor, values * np.exp(sign * k * relative), values + sign * k * u)
+            for sign in (-1.0, 1.0)
+        )
+    return np.maximum(lower, least), np.minimum(upper, most)
+
+
 def intervals_from_search(
     optimum: Optimum, method: Method, levels: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> ConfidenceIntervals:
     """Return intervals whose limits are given in search coordinates, shape (L, P)."""
-    problem = optimum.problem
+    problem, count = optimum.problem, lower.shape[1]  # of records, the model's parameters alone
+    theta = np.broadcast_to(optimum.theta, (len(levels), len(optimum.theta))).copy()
     low, high = problem.bounds()
+    ends = []
+    for limit in (np.maximum(lower, low[:count]), np.minimum(upper, high[:count])):
+        theta[:, :count] = limit
+        ends.append(problem.to_values(theta)[:, :count])
     if optimum.scale_known:
         law = "normal and chi-square" if problem.gaussian else "Student's t row by row"
         note = f"noise as given by the data: {law}"
     else:
         note = f"noise scale estimated: t and F with {optimum.dof} degrees of freedom"
+    names, units = problem.names[:count], tuple(p.unit for p in problem.parameters[:count])
     return ConfidenceIntervals(
-        method,
-        levels,
-        problem.names,
-        tuple(p.unit for p in problem.parameters),
-        optimum.values,
-        problem.to_values(np.maximum(lower, low)),
-        problem.to_values(np.minimum(upper, high)),
-        note,
+        method, levels, names, units, optimum.values[:count], ends[0], ends[1], note
     )
 
 
@@ -366,15 +371,20 @@ def compare(
     if len(intervals) < 2:
         raise ValidationError(f"{len(intervals)} intervals given; a comparison needs two or more")
     last, found = intervals[-1], []
+    count = min(len(one.names) for one in intervals)
+    theta = optimum.theta[:count]
     for other in intervals[:-1]:
         if not np.array_equal(other.levels, last.levels):
             raise ValidationError(f"{other.method} and {last.method} intervals differ in level")
         for side in ("lower", "upper"):
-            ours, theirs = (_search(optimum, getattr(one, side)) for one in (last, other))
+            ours, theirs = (
+                _search(optimum, getattr(one, side)[:, :count]) for one in (last, other)
+            )
             with np.errstate(invalid="ignore"):
-                apart = np.abs(ours - theirs) > tolerance * np.abs(ours - optimum.theta)
+                apart = np.abs(ours - theirs) > tolerance * np.abs(ours - theta)
             apart |= np.isinf(ours) != np.isinf(theirs)
-            apart &= ~np.isclose(getattr(last, side), getattr(other, side), rtol=_ROUNDING, atol=0)
+            a, b = (getattr(one, side)[:, :count] for one in (last, other))
+            apart &= ~np.isclose(a, b, rtol=_ROUNDING, atol=0)
             found += [
                 Disagreement(
                     last.names[i],
@@ -388,13 +398,8 @@ def compare(
     return IntervalComparison(tuple(intervals), tuple(found))
 
 
-def logarithmic(optimum: Optimum) -> NDArray[np.bool_]:
-    """Return which parameters are positive."""
-    return np.array([p.transform == "log" for p in optimum.problem.parameters])
-
-
 def _search(optimum: Optimum, values: FloatArray) -> FloatArray:
     """Return search coordinates, infinite where a value has none."""
-    positive = logarithmic(optimum)
+    positive = optimum.problem.space.positive[: values.shape[-1]]
     with np.errstate(divide="ignore"):
         return np.where(positive, np.log(np.where(positive, values, 1.0)), values)

@@ -31,6 +31,7 @@ from dahl_ident.fitting.asymptotes import Chart, microslip_charts
 from dahl_ident.fitting.global_start import edge_starts
 from dahl_ident.fitting.levenberg_marquardt import minimise
 from dahl_ident.fitting.losses import loss_named
+from dahl_ident.fitting.optimum import inverse
 from dahl_ident.fitting.search import DOUBTFUL
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Quadratic
@@ -58,8 +59,8 @@ class Profiler:
         self._optimum, self._problem = optimum, optimum.problem
         self._searched = self._problem.near(optimum.theta)
         self._scale = 1.0 if optimum.scale_known else optimum.scale
-        self._loss = loss_named(optimum.loss)
-        self._logarithmic = np.array([p.transform == "log" for p in self._problem.parameters])
+        self._loss = loss_named(optimum.loss, self._problem.parts)
+        self._logarithmic = self._problem.space.positive
         self._low, self._high = self._problem.bounds()
 
     # Limits
@@ -69,7 +70,7 @@ class Profiler:
 
         `thresholds` are roots of the deviance. Minus and plus infinity where a side is open.
         """
-        P, L = len(self._problem.names), len(thresholds)
+        P, L = self._problem.n_reported, len(thresholds)
         lower, upper = np.full((L, P), -np.inf), np.full((L, P), np.inf)
         if np.isfinite(self._scale) and np.isfinite(thresholds).all():
             ends = np.stack([lower, upper])
@@ -91,10 +92,10 @@ class Profiler:
 
         Limits are searched with a prediction near the optimum that is far cheaper.
         """
-        P, far = len(self._optimum.theta), ends[:, np.argmax(ends[1].max(axis=1))]
-        place, index = far.ravel(), np.tile(np.arange(P), 2)
+        far = ends[:, np.argmax(ends[1].max(axis=1))]
+        place, index = far.ravel(), np.tile(np.arange(far.shape[1]), 2)
         known = np.isfinite(place)
-        index, moved = index[known], (place - self._optimum.theta[np.tile(np.arange(P), 2)])[known]
+        index, moved = index[known], (place - self._optimum.theta[index])[known]
         if not index.size:
             return True
         theta = self._optimum.theta + moved[:, None] * self._tangents[index]
@@ -163,7 +164,7 @@ class Profiler:
 
     @cached_property
     def _microslip_charts(self) -> list[Chart]:
-        return microslip_charts(self._problem)
+        return microslip_charts(self._problem) if self._problem.settled else []
 
     def _along(self, tangent: FloatArray, moved: FloatArray) -> FloatArray:
         """Return the change of theta along its tangent, in logarithms of bearable length."""
@@ -196,8 +197,9 @@ class Profiler:
         if beyond.any():
             theta = self._minimised(held | beyond, np.clip(theta, self._low, self._high))
         cost, gradient, hessian = self._quadratic(theta)
-        deviance = 2.0 * (cost - self._least) * self._stretch
-        slope = gradient[rows, index] * self._stretch
+        stretch = self._stretch[index]
+        deviance = 2.0 * (cost - self._least) * stretch
+        slope = gradient[rows, index] * stretch
         return _Solution(theta, deviance, slope, _tangent(hessian, index))
 
     def _minimised(self, held: BoolArray, start: FloatArray) -> FloatArray:
@@ -220,7 +222,8 @@ class Profiler:
         ).theta
 
     def _quadratic(self, theta: FloatArray) -> Quadratic:
-        return self._searched.quadratic(theta, self._scale, self._loss)
+        found: Quadratic = self._searched.quadratic(theta, self._scale, self._loss)
+        return found
 
     @cached_property
     def _least(self) -> float:
@@ -238,15 +241,20 @@ class Profiler:
         return _tangent(hessian, np.arange(P))
 
     @cached_property
-    def _stretch(self) -> float:
-        """Return the factor that gives a robust loss's deviance the spread of a chi-square."""
-        if self._loss is None:
-            return 1.0
-        expected = np.diagonal(np.linalg.pinv(self._at_optimum.hessian))
+    def _stretch(self) -> FloatArray:
+        """Return the factors that give each deviance the spread of a chi-square.
+
+        That of a robust loss has one; that of residuals correlated in time one a parameter.
+        """
+        if self._loss is None and self._problem.settled:
+            return np.ones(len(self._optimum.theta))
+        expected = np.diagonal(inverse(self._at_optimum.hessian)[0])
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = expected / np.diagonal(self._optimum.covariance)
-        ratio = ratio[np.isfinite(ratio) & (ratio > 0.0)]
-        return float(np.median(ratio)) if ratio.size else 1.0
+        known = np.isfinite(ratio) & (ratio > 0.0)
+        if self._problem.settled:
+            ratio = np.full(ratio.shape, np.median(ratio[known]) if known.any() else 1.0)
+        return np.where(known | self._problem.settled, ratio, 1.0)
 
     # Where a search begins and where it gives up
 
@@ -308,7 +316,7 @@ class Profiler:
     def _friction(self) -> list[tuple[Parameter, Parameter]]:
         """Force limit and stiffness of every law that they scale together."""
         pairs: list[tuple[Parameter, Parameter]] = []
-        for element in self._problem.model.elements:
+        for element in self._problem.model.elements if self._problem.settled else ():
             scale = {element.parameter(s).dimension: s for s in element.scale_parameters}
             if element.has_memory and {*scale} == {_FORCE, _STIFFNESS}:
                 force, stiffness = scale[_FORCE], scale[_STIFFNESS]

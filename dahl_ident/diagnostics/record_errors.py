@@ -26,6 +26,7 @@ from dahl_ident.diagnostics.record_sources import (
 )
 from dahl_ident.diagnostics.turning_noise import noise_at_turns
 from dahl_ident.errors import FitError
+from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.problem.displacement_noise import LEADS
 from dahl_ident.problem.record_noise import drive_noise
 from dahl_ident.problem.record_problem import RecordProblem
@@ -138,7 +139,7 @@ def record_errors(
     if exponents:
         found[EXPONENT] = np.asarray(sum(one.contribution for one in exponents))
     if problem.output == "force":
-        moved = _by_displacement(problem, values, jacobians)
+        moved = _by_displacement(problem, values, jacobians, residuals)
         matters = moved.diagonal() > _MATTERS**2 * covariance.diagonal()
         if matters[: len(problem.free)].any():
             found[DISPLACEMENT] = moved
@@ -171,6 +172,26 @@ def record_errors(
     if FORCE not in found:
         exact.insert(0, FORCE)
     return RecordErrors(found, effective, tuple(exact), len(set(problem.runs)), exponents)
+
+
+def errors_on_constraints(
+    optimum: Optimum, jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]
+) -> RecordErrors:
+    """Return the errors of an estimate on constraints, from noise alone.
+
+    The optimum's covariance has the directions that the constraints leave; in these the residuals'
+    correlation is accounted for.
+    """
+    slopes = optimum.problem.value_slopes(optimum.theta)
+    lost = np.isinf(optimum.covariance.diagonal())
+    values, vectors = np.linalg.eigh(np.where(lost | lost[:, None], 0.0, optimum.covariance))
+    along = slopes[:, None] * vectors[:, values > _SLIGHT**2 * values[-1]]
+    reduced, effective = sandwich([J @ along for J in jacobians], residuals)
+    covariance = along @ reduced @ along.T
+    covariance[lost, lost] = np.inf
+    exact = ("every source other than noise",)
+    runs = len(set(optimum.problem.runs))
+    return RecordErrors({NOISE: covariance}, effective, exact, runs, ())
 
 
 def _by_calibration(
@@ -259,7 +280,10 @@ def _beyond(larger: FloatArray, known: FloatArray, unit: FloatArray) -> FloatArr
 
 
 def _by_displacement(
-    problem: RecordProblem, values: FloatArray, jacobians: Sequence[FloatArray]
+    problem: RecordProblem,
+    values: FloatArray,
+    jacobians: Sequence[FloatArray],
+    residuals: Sequence[FloatArray],
 ) -> FloatArray:
     """Return the mean square change of the estimate with the displacement's noise.
 
@@ -282,11 +306,11 @@ def _by_displacement(
 
     noise = problem.estimated_noise
     moved, left = noisier(noise)
-    residuals = sum(float(e @ e) for e in problem.split_residuals(values))
-    if left <= residuals:
+    squares = sum(float(e @ e) for e in residuals)
+    if left <= squares:
         return moved
     # rough motion looks like noise, but so much noise would leave larger residuals
-    return noisier(noise * (residuals / left) ** 0.5)[0]
+    return noisier(noise * (squares / left) ** 0.5)[0]
 
 
 def _moved(

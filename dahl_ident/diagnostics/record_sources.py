@@ -158,12 +158,12 @@ class _Search:
             wanted = mean + float(step[self.place])
             after = float(np.clip(wanted, *self.limits))
             part = (after - mean) / (wanted - mean) if wanted != mean else 1.0
-            chain = problem.slopes(at)
+            chain = problem.space.slopes(at)
             turn = np.delete(step, self.place) / np.where(chain == 0.0, np.inf, chain)
-            long = part * float(np.abs(turn[problem.relative]).max(initial=0.0))
+            long = part * float(np.abs(turn[problem.space.relative]).max(initial=0.0))
             if long > _FARTHEST:
                 part, after = part * _FARTHEST / long, mean + (after - mean) * _FARTHEST / long
-            at, mean = problem.values(problem.theta(at) + part * turn), after
+            at, mean = problem.to_values(problem.to_search(at) + part * turn), after
             there = problem.with_fixed({self.parameter.name: self.default * np.exp(mean)})
             found = [there.predict(at, i) for i in range(len(problem.records))]
             left = [

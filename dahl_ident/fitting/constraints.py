@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from dahl_ident.errors import ModelError, ValidationError
-from dahl_ident.problem import Problem
+from dahl_ident.problem import BaseProblem
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -44,16 +44,13 @@ class Relations:
         return sum(self.equal)
 
     @classmethod
-    def of(cls, problem: Problem, constraints: Constraints | None) -> Relations:
+    def of(cls, problem: BaseProblem, constraints: Constraints | None) -> Relations:
         """Read the user's comparisons, or say what they are instead."""
         import casadi as ca
 
         if constraints is None:
             return cls((), (), None)
-        symbols = _Symbols(
-            (p.name, ca.SX.sym(p.name))
-            for p in (*problem.model.parameters, *problem.sensors.parameters)
-        )
+        symbols = _Symbols((p.name, ca.SX.sym(p.name)) for p in problem.every_parameter)
         free = ca.vertcat(*(symbols[name] for name in problem.names))
         texts, equal, differences = [], [], []
         for index, item in enumerate(_called(constraints, symbols)):
@@ -77,21 +74,21 @@ class Relations:
         function = ca.Function("differences", list(symbols.values()), [ca.vertcat(*differences)])
         return cls(tuple(texts), tuple(equal), function)
 
-    def at(self, problem: Problem, theta: ca.SX) -> ca.SX:
+    def at(self, problem: BaseProblem, theta: ca.SX) -> ca.SX:
         """Return lhs - rhs as expressions of the search coordinates theta."""
         import casadi as ca
 
         if self.differences is None:
             return ca.SX(0, 1)
-        place = {p.name: (i, p.transform) for i, p in enumerate(problem.parameters)}
         values = []
-        for parameter in (*problem.model.parameters, *problem.sensors.parameters):
-            if parameter.name not in place:
+        for parameter in problem.every_parameter:
+            if parameter.name in problem.names:
+                index = problem.names.index(parameter.name)
+                values.append(problem.space.value(index, theta[index], ca))
+            else:
                 values.append(ca.SX(float(parameter.value or 0.0)))
-                continue
-            index, transform = place[parameter.name]
-            values.append(ca.exp(theta[index]) if transform == "log" else theta[index])
-        return self.differences.call(values)[0]
+        differences: ca.SX = self.differences.call(values)[0]
+        return differences
 
 
 class _Symbols(dict[str, "ca.SX"]):

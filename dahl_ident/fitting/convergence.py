@@ -18,7 +18,7 @@ from dahl_ident.fitting.optimum import (
     robust_information,
 )
 from dahl_ident.fitting.status import Status
-from dahl_ident.problem import Problem
+from dahl_ident.problem import BaseProblem
 
 
 class Ends:
@@ -84,7 +84,7 @@ class Ends:
 
 
 def optima(
-    problem: Problem,
+    problem: BaseProblem,
     ends: Ends,
     scale: float,
     loss: Loss | None,
@@ -167,7 +167,7 @@ def optima(
 
 
 def _information(
-    problem: Problem,
+    problem: BaseProblem,
     theta: FloatArray,
     scale: float,
     loss: Loss | None,

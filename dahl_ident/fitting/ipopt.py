@@ -40,9 +40,12 @@ from dahl_ident.fitting.optimum import (
     robust_information,
     scale_ratio,
 )
+from dahl_ident.fitting.record_search import Tell
+from dahl_ident.fitting.record_start import record_starts
 from dahl_ident.fitting.search import solve
 from dahl_ident.fitting.status import Status
-from dahl_ident.problem import Problem, Quadratic
+from dahl_ident.problem import BaseProblem, Problem, Quadratic
+from dahl_ident.problem.record_problem import RecordProblem
 
 _TOLERANCE = 1e-11  # of the scaled gradient: well below the smallest step that a report shows
 _ITERATIONS = 300  # a limit for searches that do not end
@@ -64,20 +67,21 @@ _WORDS = {
 
 
 def solve_ipopt(
-    problem: Problem,
+    problem: BaseProblem,
     *,
     constraints: Constraints | None = None,
     start: Mapping[str, float] | None = None,
     loss: str = "linear",
     drive_std: ArrayLike | None = None,
     drive_covariance: ArrayLike | None = None,
+    tell: Tell | None = None,
 ) -> Optimum:
     """Return the minimum of a problem's sum of squares under constraints.
 
     Parameters
     ----------
-    problem : Problem
-        One table.
+    problem : BaseProblem
+        One table, or records.
     constraints : callable, optional
         Takes a mapping of every parameter's name to its casadi symbol, returns comparisons with
         ``<=``, ``>=`` or ``==``.
@@ -91,6 +95,9 @@ def solve_ipopt(
     drive_covariance : (n, 2) array_like, optional
         Covariance of the drive with the real and the imaginary part of the response: the
         response is a quotient with the force, so they share the force's error.
+
+    tell : callable, optional
+        As for `solve`.
 
     Returns
     -------
@@ -123,20 +130,28 @@ def solve_ipopt(
     >>> print(f"{tied.values[1] / tied.values[0]:.6f}")
     250.000000
     """
-    given, problem = problem, _with_drive_error(problem, loss, drive_std, drive_covariance)
+    given = problem
+    if drive_std is not None or drive_covariance is not None:
+        assert isinstance(problem, Problem)
+        problem = _with_drive_error(problem, loss, drive_std, drive_covariance)
     relations = Relations.of(problem, constraints)
     # a start takes no noise of the drive, which takes many times as long; a cost does
-    begin = solve(problem if relations.texts else given, loss=loss, start=start)
+    begin = solve(problem if relations.texts else given, loss=loss, start=start, tell=tell)
     if begin.status.at_infinity and not relations.texts and problem is given:
         return replace(begin, method="ipopt")
-    if begin.problem.steady != problem.steady:  # no steady motion to begin from
-        problem = problem.with_steady(begin.problem.steady)
+    if isinstance(problem, Problem):  # where there is no steady motion to begin from, a sine
+        if begin.problem.steady != problem.steady:
+            problem = problem.with_steady(begin.problem.steady)
+    else:
+        problem = begin.problem  # as its noise asked for
     adapts = not problem.scale_known and bool(loss != "linear" or problem.priors)
     target = Target(problem, begin.scale if adapts else 1.0, loss)
     found = _search(target, begin, relations)
     dof = problem.n_numbers + len(problem.priors) - len(problem.names) + relations.freedom_lost
     for _ in range(_RESCALINGS if adapts and relations.texts else 0):
-        ratio = scale_ratio(problem, found.theta, target.scale, loss_named(loss), dof)
+        ratio = scale_ratio(
+            problem, found.theta, target.scale, loss_named(loss, problem.parts), dof
+        )
         if abs(ratio - 1.0) < _SAME_SCALE:
             break
         target = replace(target, scale=target.scale * ratio)
@@ -150,21 +165,21 @@ class Target:
 
     Attributes
     ----------
-    problem : Problem
-        One table.
+    problem : BaseProblem
+        One table, or records.
     scale : float
         What the data's residuals are divided by.
     loss : str
         "linear" or a robust loss, see :mod:`dahl_ident.fitting.losses`.
     """
 
-    problem: Problem
+    problem: BaseProblem
     scale: float = 1.0
     loss: str = "linear"
 
     def at(self, theta: FloatArray) -> Quadratic:
         """Return the cost, half the sum of losses, with its derivatives; theta (P,) or (S, P)."""
-        return self.problem.quadratic(theta, self.scale, loss_named(self.loss))
+        return self.problem.quadratic(theta, self.scale, loss_named(self.loss, self.problem.parts))
 
 
 @dataclass(frozen=True)
@@ -202,7 +217,7 @@ def _search(target: Target, begin: Optimum, relations: Relations) -> _Found:
     low, high = problem.bounds()
     found += [
         _descend(target, theta, relations)
-        for theta in np.clip(starts(problem)[:_MOST_STARTS], low, high)
+        for theta in np.clip(_starts(problem)[:_MOST_STARTS], low, high)
         if np.isfinite(target.at(theta).cost)
     ]
     if not found:
@@ -212,6 +227,14 @@ def _search(target: Target, begin: Optimum, relations: Relations) -> _Found:
         found.append(_descend(target, best.theta, relations))
         best = best if found[-1].failure else found[-1]
     return replace(best, evaluations=sum(end.evaluations for end in found))
+
+
+def _starts(problem: BaseProblem) -> FloatArray:
+    """Return the search coordinates of global starts."""
+    if isinstance(problem, RecordProblem):
+        return problem.to_search(record_starts(problem))
+    assert isinstance(problem, Problem)
+    return starts(problem)
 
 
 def _descend(
@@ -305,7 +328,7 @@ def _units(target: Target, start: FloatArray) -> tuple[FloatArray, float, float,
     m = problem.n_residuals + len(problem.priors)
     reach = np.sqrt(np.maximum(np.diagonal(at.hessian), 0.0) / m)  # rms change of the residuals
     reach = np.where((reach > 0.0) & np.isfinite(reach), reach, 1.0)
-    logarithmic = np.array([p.transform == "log" for p in problem.parameters])
+    logarithmic = problem.space.positive
     whole = np.max(reach * np.where(logarithmic, 1.0, np.abs(start)))
     residual = max(float(np.sqrt(2.0 * at.cost / m)), _LEAST_RESIDUAL * float(whole))
     unit = residual / reach
@@ -386,7 +409,7 @@ def _for_rows(value: FloatArray, name: str, shape: tuple[int, ...]) -> FloatArra
 
 def _ended(target: Target, found: _Found, relations: Relations, begin: Optimum) -> Optimum:
     """Return the optimum with status, sentence and covariance."""
-    problem, loss = target.problem, loss_named(target.loss)
+    problem, loss = target.problem, loss_named(target.loss, target.problem.parts)
     if found.return_status == "Infeasible_Problem_Detected":
         raise FitError(
             f"no parameters satisfy the constraints {'; '.join(relations.texts)} within the "
@@ -412,7 +435,7 @@ def _constrained(
     result: Optimum, target: Target, found: _Found, relations: Relations, begin: Optimum
 ) -> Optimum:
     """Return `result` as found, not reordered, with the covariance on the constraints."""
-    problem, loss = target.problem, loss_named(target.loss)
+    problem, loss = target.problem, loss_named(target.loss, target.problem.parts)
     dof = result.dof + relations.freedom_lost
     scale = target.scale
     if not problem.scale_known and loss is None and not problem.priors:
@@ -465,7 +488,7 @@ def _constraint_cost(
 
 def _information(target: Target, found: _Found, dof: int) -> FloatArray:
     """Return the information of theta, constraints aside."""
-    problem, loss = target.problem, loss_named(target.loss)
+    problem, loss = target.problem, loss_named(target.loss, target.problem.parts)
     if loss is None:
         return problem.information(found.theta, target.scale)
     return robust_information(problem, found.theta, target.scale, loss, dof)

@@ -1,16 +1,17 @@
 """Robust losses, which down-weight rows far from the model.
 
-A row has two residuals, real and imaginary part or ln gain and phase; it counts as rho(z), with
-z the sum of their squares over the noise variance, in place of z itself. A point is an outlier as
-a whole, whichever way the coordinates are turned. Near the model rho(z) = z.
+A row of a table has two residuals, real and imaginary part or ln gain and phase; it counts as
+rho(z), with z the sum of their squares over the noise variance, in place of z itself. A point is an
+outlier as a whole, whichever way the coordinates are turned. A sample of a record has one. Near the
+model rho(z) = z.
 
 - ``huber``: z up to 1.345^2, then growing with |y|;
 - ``soft_l1``: 2 (sqrt(1 + z) - 1), a smooth relative of it;
-- ``student_t``: 6 ln(1 + z/4), the likelihood of Student's t with 4 degrees of freedom; distant
-  points lose their influence altogether.
+- ``student_t``: (4 + p) ln(1 + z/4), for p residuals a row: the likelihood of Student's t with 4
+  degrees of freedom; distant points lose their influence altogether.
 
 **Scale.** Where the noise's scale s is unknown it has to be robust as well: mean chi(z) = E[chi(z)]
-with E taken for Gaussian noise and z in units of s^2 (2 n - P)/(2 n), so that s^2 is the noise's
+with E taken for Gaussian noise and z in units of s^2 (p n - P)/(p n), so that s^2 is the noise's
 variance when there are no outliers. chi = psi^2 = rho'(z)^2 z is Huber's proposal 2; for student_t,
 whose psi^2 falls again, chi = rho'(z) z, the scale equation of its likelihood.
 
@@ -23,10 +24,11 @@ Statistics, 1981, section 7.6).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy import special
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError, choices
@@ -47,6 +49,8 @@ class Loss:
     curvature: Callable[[FloatArray], FloatArray]
     power: int
     """Of rho' in chi."""
+    parts: int = 2
+    """Residuals of a row."""
 
     def __call__(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return rho and its first two derivatives."""
@@ -58,27 +62,30 @@ class Loss:
 
     @cached_property
     def gaussian_chi(self) -> float:
-        """The expectation of chi for Gaussian noise, where z/2 is exponential."""
-        nodes, weights = np.polynomial.laguerre.laggauss(100)
-        return float(weights @ self.chi(2.0 * nodes))
+        """The expectation of chi for Gaussian noise, where z/2 has a gamma distribution."""
+        nodes, weights = special.roots_genlaguerre(100, 0.5 * self.parts - 1.0)
+        return float(weights @ self.chi(2.0 * nodes) / weights.sum())
 
     def rescaled(self, z: FloatArray, dof: int) -> float:
         """Return s_new^2/s^2, for squares `z` in units of s^2."""
-        return float(np.mean(self.chi(z * (2.0 * z.size / dof))) / self.gaussian_chi)
+        return float(np.mean(self.chi(z * (self.parts * z.size / dof))) / self.gaussian_chi)
 
     @cached_property
     def log_area(self) -> float:
-        """Logarithm of the integral of exp(-rho/2) over the plane, less a Gaussian's."""
+        """Logarithm of the integral of exp(-rho/2) over the residuals, less a Gaussian's."""
         from scipy.integrate import quad
 
-        area, _ = quad(lambda z: float(np.exp(-0.5 * self.rho(np.asarray(z)))), 0.0, np.inf)
-        return float(np.log(0.5 * area))
+        def density(y: float) -> float:
+            return float(y ** (self.parts - 1) * np.exp(-0.5 * self.rho(np.asarray(y**2))))
+
+        gaussian = 2.0 ** (0.5 * self.parts - 1.0) * special.gamma(0.5 * self.parts)
+        return float(np.log(quad(density, 0.0, np.inf)[0] / gaussian))
 
     def likeliest(self, z: FloatArray, least: float) -> float:
         """Return s^2 at which squares s^2 `z` are likeliest under exp(-rho/2), from `least` on."""
         s2 = 1.0
         for _ in range(_SCALINGS):
-            factor = 0.5 * float(np.mean(self.slope(z / s2) * z / s2))
+            factor = float(np.mean(self.slope(z / s2) * z / s2)) / self.parts
             s2 = max(s2 * factor, least)
             if s2 == least or abs(factor - 1.0) < _SAME_SCALE:
                 break
@@ -89,7 +96,11 @@ class Loss:
         if dof <= 0:
             return np.inf
         psi2 = (self.slope(z) ** 2 * z).sum() / dof
-        return float(psi2 / np.mean(self.slope(z) + self.curvature(z) * z) ** 2)
+        return float(psi2 / self.mean_slope(z) ** 2)
+
+    def mean_slope(self, z: FloatArray) -> float:
+        """Return the mean derivative of psi with respect to the residuals."""
+        return float(np.mean(self.slope(z) + 2.0 / self.parts * self.curvature(z) * z))
 
 
 def _huber(z: FloatArray) -> FloatArray:
@@ -104,6 +115,17 @@ def _huber_curvature(z: FloatArray) -> FloatArray:
     return np.where(z <= KNEE**2, 0.0, -0.5 * KNEE * np.maximum(z, KNEE**2) ** -1.5)
 
 
+def _student_t(parts: int) -> Loss:
+    power = TAIL_DOF + parts
+    return Loss(
+        "student_t",
+        lambda z: power * np.log1p(z / TAIL_DOF),
+        lambda z: power / (TAIL_DOF + z),
+        lambda z: -power / (TAIL_DOF + z) ** 2,
+        power=1,
+    )
+
+
 LOSSES = {
     "huber": Loss("huber", _huber, _huber_slope, _huber_curvature, power=2),
     "soft_l1": Loss(
@@ -113,20 +135,15 @@ LOSSES = {
         lambda z: -0.5 * (1.0 + z) ** -1.5,
         power=2,
     ),
-    "student_t": Loss(
-        "student_t",
-        lambda z: (TAIL_DOF + 2.0) * np.log1p(z / TAIL_DOF),
-        lambda z: (TAIL_DOF + 2.0) / (TAIL_DOF + z),
-        lambda z: -(TAIL_DOF + 2.0) / (TAIL_DOF + z) ** 2,
-        power=1,
-    ),
+    "student_t": _student_t(2),
 }
 
 
-def loss_named(name: str) -> Loss | None:
-    """Return the loss called `name`, None for "linear"."""
+def loss_named(name: str, parts: int = 2) -> Loss | None:
+    """Return the loss called `name` for rows of so many residuals, None for "linear"."""
     if name == "linear":
         return None
     if name not in LOSSES:
         raise ValidationError(f"loss is {name!r}; expected {choices(['linear', *LOSSES], name)}")
-    return LOSSES[name]
+    loss = _student_t(parts) if name == "student_t" else LOSSES[name]
+    return replace(loss, parts=parts)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
@@ -15,8 +15,11 @@ from scipy import special
 from dahl_ident.arrays import FloatArray
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.status import Status
-from dahl_ident.problem import Problem
+from dahl_ident.problem import BaseProblem
 
+_RESCALINGS = 100  # of the noise's scale; a handful is the rule
+_SAME_SCALE = 1e-9  # change of ln scale that ends them
+_LONGEST_SECANT = 20.0  # plain steps in one: where they shrink slowly, not where noise is all
 _AT_BOUND = 1e-8  # relative distance from a bound that is none
 _NULL = 1e-13  # eigenvalue of the scaled information below which a direction is undetermined
 _NOTHING = 1e-100  # information on a parameter, as its root, that is none
@@ -66,7 +69,7 @@ class Optimum:
 
     Attributes
     ----------
-    problem : Problem
+    problem : BaseProblem
         What was solved; its `names` order every array here.
     theta : ndarray, shape (P,)
         Search coordinates. Where the optimum lies at infinity, a finite point so far out that
@@ -101,7 +104,7 @@ class Optimum:
         What constraints cost; None where there are none, or the loss is robust.
     """
 
-    problem: Problem
+    problem: Any
     theta: FloatArray
     values: FloatArray
     covariance: FloatArray
@@ -123,6 +126,11 @@ class Optimum:
         return self.status.found_optimum
 
     @property
+    def converged(self) -> bool:
+        """Whether the search ended at an optimum, finite or not."""
+        return self.status is not Status.NOT_CONVERGED
+
+    @property
     def is_exact(self) -> bool:
         """Whether the model fits the data to rounding, so that residuals carry no information."""
         return _is_rounding(self.problem, self.scale)
@@ -130,7 +138,7 @@ class Optimum:
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the free parameters."""
-        return self.problem.names
+        return tuple(self.problem.names)
 
     @property
     def residuals(self) -> FloatArray:
@@ -154,18 +162,16 @@ class Optimum:
 
         With a robust loss, that of the density proportional to exp(-rho/2).
         """
-        loss, problem = loss_named(self.loss), self.problem
+        problem = self.problem
+        loss = loss_named(self.loss, problem.parts)
         if loss is None:
             return float(problem.log_likelihood(self.theta))
-        y, _ = problem.whitened(self.theta, derivatives=False, tails=False)
-        z = y.real**2 + y.imag**2
-        scale = None
+        z, scale = problem.squares(self.theta, tails=False), None
         if not self.scale_known:
             least = float(problem.rounding) / self.scale
             scale = self.scale * float(np.sqrt(loss.likeliest(z / self.scale**2, least**2)))
             z = z / scale**2
-        counted, _ = problem.whitened(self.theta, derivatives=False)
-        squares = np.abs(counted) ** 2 / (1.0 if scale is None else scale) ** 2
+        squares = problem.squares(self.theta) / (1.0 if scale is None else scale) ** 2
         gaussian = float(problem.log_likelihood(self.theta, scale))
         return gaussian + 0.5 * float((squares - loss.rho(z) - 2.0 * loss.log_area).sum())
 
@@ -181,7 +187,7 @@ class Optimum:
 
     @property
     def _counted(self) -> int:
-        determined = self.problem.n_numbers + self.problem.n_priors - self.dof
+        determined: int = self.problem.n_numbers + self.problem.n_priors - self.dof
         return determined + (not self.scale_known)
 
     @property
@@ -203,7 +209,7 @@ class OptimumBatch(Sequence[Optimum]):
     Arrays are those of the optima, led by S.
     """
 
-    problem: Problem
+    problem: BaseProblem
     theta: FloatArray
     values: FloatArray
     covariance: FloatArray
@@ -269,10 +275,10 @@ class OptimumBatch(Sequence[Optimum]):
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the free parameters."""
-        return self.problem.names
+        return tuple(self.problem.names)
 
     @classmethod
-    def joined(cls, problem: Problem, parts: Sequence[OptimumBatch]) -> OptimumBatch:
+    def joined(cls, problem: BaseProblem, parts: Sequence[OptimumBatch]) -> OptimumBatch:
         """Return the optima of all parts, one after the other, as those of `problem`."""
 
         def side_by_side(name: str) -> Any:
@@ -330,7 +336,7 @@ class OptimumBatch(Sequence[Optimum]):
         return " ".join(parts)
 
 
-def at_bound(problem: Problem, theta: FloatArray) -> NDArray[np.bool_]:
+def at_bound(problem: BaseProblem, theta: FloatArray) -> NDArray[np.bool_]:
     """Return which parameters lie at a bound."""
     low, high = problem.bounds()
     with np.errstate(invalid="ignore"):
@@ -338,7 +344,9 @@ def at_bound(problem: Problem, theta: FloatArray) -> NDArray[np.bool_]:
         return np.asarray((theta - low <= near) | (high - theta <= near))
 
 
-def estimated_scale(problem: Problem, cost: ArrayLike, dof: int | NDArray[np.intp]) -> FloatArray:
+def estimated_scale(
+    problem: BaseProblem, cost: ArrayLike, dof: int | NDArray[np.intp]
+) -> FloatArray:
     """Return the standard deviation of residuals whose half sum of squares is `cost`.
 
     It is what rounding makes it where the residuals are smaller, and NaN without freedom.
@@ -348,7 +356,7 @@ def estimated_scale(problem: Problem, cost: ArrayLike, dof: int | NDArray[np.int
 
 
 def scale_ratio(
-    problem: Problem, theta: FloatArray, scale: float, loss: Loss | None, dof: int
+    problem: BaseProblem, theta: FloatArray, scale: float, loss: Loss | None, dof: int
 ) -> float:
     """Return the scale that the residuals at `theta` have, over the `scale` that was assumed.
 
@@ -356,18 +364,34 @@ def scale_ratio(
     """
     if dof <= 0:
         return 1.0
-    y, _ = problem.whitened(theta, derivatives=False, tails=loss is None)
-    z = (y.real**2 + y.imag**2) / scale**2
+    z = problem.squares(theta, tails=loss is None) / scale**2
     variance = float(z.sum()) / dof if loss is None else loss.rescaled(z, dof)
     return max(float(np.sqrt(variance)), float(problem.rounding) / scale)
 
 
-def _is_rounding(problem: Problem, scale: float) -> bool:
+def agreed_scale(excess: Callable[[float], float], scale: float) -> float:
+    """Return the noise's scale on which a search and its residuals agree.
+
+    `excess` searches with a scale and returns ln of the scale of what is left over it.
+    """
+    step, last = 0.0, 0.0
+    for _ in range(_RESCALINGS):
+        now = excess(scale)
+        if abs(now) < _SAME_SCALE or not np.isfinite(now):
+            break
+        # the secant's step where it goes the same way, else the plain one
+        factor = step / (last - now) if last != now else 1.0
+        step = now * (factor if 0.0 < factor < _LONGEST_SECANT else 1.0)
+        last, scale = now, scale * float(np.exp(step))
+    return scale
+
+
+def _is_rounding(problem: BaseProblem, scale: float) -> bool:
     return not problem.scale_known and bool(scale < _BARELY * problem.rounding)
 
 
 def robust_information(
-    problem: Problem,
+    problem: BaseProblem,
     theta: FloatArray,
     scale: float,
     loss: Loss,
@@ -381,7 +405,7 @@ def robust_information(
     m = problem.n_residuals
     kappa = 1.0
     if not _is_rounding(problem, scale):
-        kappa = loss.inflation(r[:m:2] ** 2 + r[1:m:2] ** 2, dof)
+        kappa = loss.inflation((r[:m] ** 2).reshape(-1, problem.parts).sum(axis=1), dof)
     return np.asarray(J[:m].T @ J[:m] / kappa + J[m:].T @ J[m:])
 
 

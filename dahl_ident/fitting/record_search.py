@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
+from scipy.signal import lfilter
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.behaviour import Behaviour
 from dahl_ident.errors import FitError, FitInterrupted, ModelError, choices
+from dahl_ident.fitting.convergence import Ends, optima
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
+from dahl_ident.fitting.losses import Loss, loss_named
+from dahl_ident.fitting.optimum import Optimum, agreed_scale, scale_ratio
 from dahl_ident.fitting.record_start import MORE_STARTS, STARTS, record_starts, started_at
+from dahl_ident.fitting.scipy_least_squares import minimise_by_scipy
 from dahl_ident.problem import Quadratic
 from dahl_ident.problem.record_noise import prediction_error_filter, share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
@@ -31,33 +36,13 @@ _REPEATS = 12  # a limit for weights that do not settle
 _SETTLED = 0.03  # step in standard errors that no longer matters
 _BANDS = 3  # dead bands tried: one, two and four times the noise that differences show
 _CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that is not chance
+_SETTLING = 2000  # samples after which simulated noise has forgotten its start
+_MEDIAN = 0.6745  # of the absolute value of a normal variable of unit variance
 _LOOSE = 1e4  # of the step at which a search of a long record has converged
 
 
 Tell = Callable[[int, float], None]
 """Takes the number of evaluations and the share of variance left."""
-
-
-@dataclass(frozen=True)
-class RecordOptimum:
-    """Where the search ended.
-
-    Attributes
-    ----------
-    problem : RecordProblem
-    values : ndarray, shape (P,)
-        Estimates of the problem's parameters.
-    cost : float
-        Half the sum of squared residuals over the output's variance.
-    converged : bool
-    evaluations : int
-    """
-
-    problem: RecordProblem
-    values: FloatArray
-    cost: float
-    converged: bool
-    evaluations: int
 
 
 class _Trace:
@@ -74,30 +59,33 @@ class _Trace:
         if self._tell is not None:
             self._tell(self._count, 2.0 * self._best[2] / problem.n_residuals)
 
-    def optimum(self, problem: RecordProblem) -> RecordOptimum | None:
+    def optimum(self, problem: RecordProblem) -> Optimum | None:
         """Return the best so far, None before the first evaluation."""
         if self._best is None:
             return None
-        part, theta, cost = self._best
-        values = part.values(theta)
+        part, theta, _ = self._best
         if part.records is not problem.records:  # of a shortened problem
-            values = started_at(problem, values[: len(problem.free)].tolist())
-            part = problem
-        return RecordOptimum(part, values, cost, False, self._count)
+            values = started_at(problem, part.to_values(theta)[: len(problem.free)].tolist())
+            part, theta = problem, problem.to_search(values)
+        return optimum_at(part, theta, converged=False, evaluations=self._count)
 
 
 def solve_records(
     problem: RecordProblem,
     *,
+    method: str = "lm",
+    loss: str = "linear",
     start: Mapping[str, float] | None = None,
     tell: Tell | None = None,
-) -> RecordOptimum:
+) -> Optimum:
     """Return the least-squares estimate.
 
     Parameters
     ----------
     problem : RecordProblem
         What to solve.
+    method, loss : str
+        As for :func:`~dahl_ident.fitting.search.solve`.
     start : mapping of str to float, optional
         Values that the search begins with; it then looks at no other start.
     tell : callable, optional
@@ -105,12 +93,12 @@ def solve_records(
 
     Returns
     -------
-    RecordOptimum
+    Optimum
 
     Raises
     ------
     FitInterrupted
-        If stopped from the keyboard; its `result` is the best RecordOptimum so far.
+        If stopped from the keyboard; its `result` is the best Optimum so far.
     FitError
         If there are fewer samples than parameters, or no start gives a finite motion.
     ModelError
@@ -127,12 +115,12 @@ def solve_records(
         )
     problem.watch = trace = _Trace(tell)
     try:
-        found = _solved(problem, start)
+        found = _Search(method, loss).solved(problem, start)
     except KeyboardInterrupt as stop:
+        problem.watch = None
         so_far = trace.optimum(problem)
         if so_far is None:
             raise
-        so_far.problem.watch = None
         raise FitInterrupted("the fit was stopped before it found a minimum", so_far) from stop
     finally:
         problem.watch = None
@@ -140,108 +128,267 @@ def solve_records(
     return found
 
 
-def _solved(problem: RecordProblem, start: Mapping[str, float] | None) -> RecordOptimum:
-    evaluations, steps = 0, _STEPS
-    if start is not None and all(p.name in start for p in problem.free):
-        begin = [start[p.name] for p in problem.free]
-    elif problem.n_residuals > 2 * _SHORT[problem.output]:
-        part = problem.shortened(_SHORT[problem.output])
-        first, evaluations = _searched(part, start)
-        hopeless = problem.output == "motion" and not first.converged[0]
-        steps = _ROUGH if hopeless else _STEPS
-        begin = part.values(first.theta[0])[: len(problem.free)].tolist()
-    else:
-        begin = None
-    if begin is None:
-        best, more = _searched(problem, start)
-    else:
-        starts = _changed(started_at(problem, begin)[None], problem, start)
-        best, more = _best(problem, starts, steps)
-    found = RecordOptimum(
-        problem,
-        problem.values(best.theta[0]),
-        float(best.cost[0]),
-        bool(best.converged[0]),
-        evaluations + more,
-    )
-    return _weighted(found) if problem.output == "motion" else _without_noise(found)
+def optimum_at(
+    problem: RecordProblem,
+    theta: FloatArray,
+    *,
+    converged: bool,
+    evaluations: int,
+    scale: float = 1.0,
+    method: str = "lm",
+    loss: str = "linear",
+) -> Optimum:
+    """Return the optimum at search coordinates where a search has ended."""
+    at = problem.quadratic(theta[None], scale, loss_named(loss, problem.parts))
+    end = Minima(theta[None], *at[::2], np.array([converged]), np.array([evaluations]))
+    return _optimum(problem, end, scale, method, loss)
 
 
-def _without_noise(plain: RecordOptimum) -> RecordOptimum:
-    """Return the estimate without the displacement's noise, where the residuals ask for it.
+def solve_repetitions(
+    optimum: Optimum, count: int, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return search coordinates and standard errors of simulated repetitions, (S, P) each.
 
-    Noise that counts as travel moves the friction where the device rests. The dead band doubles
-    as long as a Gauss-Newton step then leaves smaller residuals, to four times the estimate at
-    most: a correlated noise shows less in differences, but a wider band would be play.
+    Noise of the residuals' spectrum is added to the prediction. Standard errors are those of the
+    optimum, whose covariance counts that spectrum, times the size of what each repetition leaves.
     """
-    problem, least = plain.problem, plain.cost
-    noise = problem.estimated_noise
-    if not plain.converged or not problem.with_memory or noise == 0.0:
-        return plain
-    theta = problem.theta(plain.values)
-    best, evaluations = problem, plain.evaluations
-    for _ in range(_BANDS):
-        trial = problem.without_noise(noise)
-        found = trial.quadratic(theta)
-        evaluations += 1
-        left = float(found.cost) - 0.5 * float(
-            found.gradient @ np.linalg.pinv(found.hessian, hermitian=True) @ found.gradient
-        )
-        if not left < least:
-            break
-        best, least, noise = trial, left, 2.0 * noise
-    residuals = problem.split_residuals(plain.values)
-    slow = _correlation(residuals)
-    by_chance = _CONFIRMED * 2.0 * least / problem.n_residuals * (1.0 + slow) / (1.0 - slow)
-    if best is problem or 2.0 * (plain.cost - least) < by_chance:
-        return plain
-    end = _descend(best, theta, _STEPS)
-    if not end.converged[0] or not end.cost[0] < plain.cost:
-        return plain
-    values = best.values(end.theta[0])
-    return RecordOptimum(
-        best, values, float(end.cost[0]), True, evaluations + int(end.evaluations[0])
-    )
+    problem: RecordProblem = optimum.problem
+    values, search = optimum.values, _Search("lm", "linear")
+    outputs, residuals = problem.outputs(values), problem.split_residuals(values)
+    noise = prediction_error_filter(residuals)
+    white = [lfilter(noise, [1.0], e)[noise.size - 1 :] for e in residuals]
+    size = float(np.std(np.concatenate(white)))
+    theta = np.full((count, values.size), np.nan)
+    scales = np.full((count, 1), np.nan)
+    for row in range(count):
+        drawn = [size * rng.standard_normal(y.size + _SETTLING) for y in outputs]
+        errors = [lfilter([1.0], noise, e)[_SETTLING:] for e in drawn]
+        again = problem.measuring([y + e for y, e in zip(outputs, errors, strict=True)])
+        end = search.descend(again, optimum.theta, _STEPS)
+        if end.converged[0]:
+            theta[row] = end.theta[0]
+            scales[row] = (2.0 * end.cost[0] / again.n_residuals) ** 0.5
+    own = (2.0 * optimum.cost / problem.n_residuals) ** 0.5
+    return theta, np.sqrt(np.diagonal(optimum.covariance)) * scales / own
+
+
+def _optimum(problem: RecordProblem, end: Minima, scale: float, method: str, loss: str) -> Optimum:
+    rho = loss_named(loss, problem.parts)
+    return optima(problem, Ends(end), scale, rho, method, end.evaluations)[0]
+
+
+class _Search:
+    """One search: how it steps, what it minimises, and the evaluations until now."""
+
+    def __init__(self, method: str, loss: str) -> None:
+        self.method, self.loss = method, loss
+        self.evaluations, self.scale = 0, 1.0
+        self.rho: Loss | None = None
+
+    def solved(self, problem: RecordProblem, start: Mapping[str, float] | None) -> Optimum:
+        """Return the optimum of a problem."""
+        steps, begin = _STEPS, None
+        if start is not None and all(p.name in start for p in problem.free):
+            begin = [start[p.name] for p in problem.free]
+        elif problem.n_residuals > 2 * _SHORT[problem.output]:
+            part = problem.shortened(_SHORT[problem.output])
+            first = self.searched(part, start)
+            hopeless = problem.output == "motion" and not first.converged[0]
+            steps = _ROUGH if hopeless else _STEPS
+            begin = part.to_values(first.theta[0])[: len(problem.free)].tolist()
+        if begin is None:
+            end = self.searched(problem, start)
+        else:
+            starts = _changed(started_at(problem, begin)[None], problem, start)
+            end = self.best(problem, starts, steps)
+        if problem.output == "force":
+            problem, end = self.without_noise(problem, end)
+        elif self.loss == "linear":
+            problem, end = self.weighted(problem, end)
+        if self.loss != "linear":
+            end = self.robust(problem, end)
+        end = replace(end, evaluations=np.array([self.evaluations]))
+        return _optimum(problem, end, self.scale, self.method, self.loss)
+
+    def robust(self, problem: RecordProblem, plain: Minima) -> Minima:
+        """Return the end of searches with a robust loss, the noise's scale estimated with it."""
+        self.rho, end = loss_named(self.loss, problem.parts), plain
+        dof = problem.n_residuals - plain.theta.shape[1]
+
+        def excess(scale: float) -> float:
+            nonlocal end
+            self.scale = scale
+            end = self.descend(problem, end.theta[0], _STEPS)
+            return float(np.log(scale_ratio(problem, end.theta[0], scale, self.rho, dof)))
+
+        typical = float(np.median(problem.squares(plain.theta[0]))) ** 0.5 / _MEDIAN
+        agreed_scale(excess, max(typical, float(problem.rounding)))
+        return end
+
+    def without_noise(self, problem: RecordProblem, plain: Minima) -> tuple[RecordProblem, Minima]:
+        """Return the estimate without the displacement's noise, where the residuals ask for it.
+
+        Noise that counts as travel moves the friction where the device rests. The dead band doubles
+        as long as a Gauss-Newton step then leaves smaller residuals, to four times the estimate at
+        most: a correlated noise shows less in differences, but a wider band would be play.
+        """
+        theta, least = plain.theta[0], float(plain.cost[0])
+        noise, before = problem.estimated_noise, least
+        if not plain.converged[0] or not problem.with_memory or noise == 0.0:
+            return problem, plain
+        best = problem
+        for _ in range(_BANDS):
+            trial = problem.without_noise(noise)
+            at = trial.quadratic(theta)
+            self.evaluations += 1
+            left = float(at.cost) - 0.5 * float(
+                at.gradient @ np.linalg.pinv(at.hessian, hermitian=True) @ at.gradient
+            )
+            if not left < least:
+                break
+            best, least, noise = trial, left, 2.0 * noise
+        slow = _correlation(problem.split_residuals(problem.to_values(theta)))
+        by_chance = _CONFIRMED * 2.0 * least / problem.n_residuals * (1.0 + slow) / (1.0 - slow)
+        if best is problem or 2.0 * (before - least) < by_chance:
+            return problem, plain
+        end = self.descend(best, theta, _STEPS)
+        if not end.converged[0] or not end.cost[0] < before:
+            return problem, plain
+        return best, end
+
+    def weighted(self, problem: RecordProblem, plain: Minima) -> tuple[RecordProblem, Minima]:
+        """Return the estimate with residuals weighted by their spectrum, where they are slow.
+
+        Noise in the measured drive makes the plant wander, and plain least squares then takes up
+        the wandering by stiffness. The residuals' spectrum is estimated and the search repeated
+        until both agree. Kept only if it describes the motion at the drive's frequencies no worse:
+        slow residuals may also come from a wrong model, of which plain least squares leaves less.
+        """
+        residuals = problem.split_residuals(problem.to_values(plain.theta[0]))
+        share = 2.0 * float(plain.cost[0]) / problem.n_residuals
+        if (
+            not plain.converged[0]
+            or _correlation(residuals) < _SLOW
+            or not _EXACT < share < _DESCRIBED
+        ):
+            return problem, plain
+        drives = [record.force_samples for record in problem.records]
+        before = share_in_band(drives, problem.measured, residuals)
+        white, end = problem, plain
+        for _ in range(_REPEATS):
+            white = white.weighted(prediction_error_filter(residuals))
+            theta = end.theta
+            end = self.minimise(white, theta, _WORTHLESS * share, _STEPS)
+            if not end.converged[0]:
+                return problem, plain
+            change = end.theta[0] - theta[0]
+            residuals = white.split_residuals(white.to_values(end.theta[0]))
+            noise = 2.0 * float(end.cost[0]) / problem.n_residuals
+            if change @ end.hessian[0] @ change < _SETTLED**2 * noise:
+                break
+        if share_in_band(drives, problem.measured, residuals) > before:
+            return problem, plain
+        return white, end
+
+    def searched(self, problem: RecordProblem, start: Mapping[str, float] | None) -> Minima:
+        """Return the best end of searches from automatic starts, some of their values given."""
+        try:
+            best = self.best(problem, _changed(record_starts(problem, 2 * STARTS), problem, start))
+        except FitError:
+            more = record_starts(problem, MORE_STARTS)[2 * STARTS :]
+            if not len(more):
+                raise
+            best = self.best(problem, _changed(more, problem, start))
+        near = 2.0 * best.cost[0] < _GOOD * problem.n_residuals
+        if near and (_slips_at_first(problem, best.theta[0]) or _structured(problem, best)):
+            end = self.descend(problem, _first_states_again(problem, best.theta[0]), _STEPS)
+            best = end if end.cost[0] < best.cost[0] else best
+        return best
+
+    def best(self, problem: RecordProblem, starts: FloatArray, steps: int = _STEPS) -> Minima:
+        """Return the best end of searches from the starts, in their order; few where one is good.
+
+        A driven motion is expensive where nothing fits: its starts are compared after a few steps,
+        and the best one alone is followed to its end. Where one fits nearly, but leaves residuals
+        that are not noise, the search goes on until two starts lead to the same end.
+        """
+        finite, best, again = 0, None, False
+        driven = problem.output == "motion" and len(starts) > 1
+        for one in starts:
+            theta = problem.to_search(one)
+            end = self.minimise(problem, theta[None], 0.0, _COMPARED) if driven else None
+            if end is None or 2.0 * end.cost[0] < _GOOD * problem.n_residuals:
+                end = self.descend(problem, theta if end is None else end.theta[0], steps)
+            finite += bool(np.isfinite(end.cost[0]))
+            if best is not None:
+                again |= bool(abs(end.cost[0] - best.cost[0]) < _SAME * best.cost[0])
+            if np.isfinite(end.cost[0]) and (best is None or end.cost[0] < best.cost[0]):
+                again &= best is None or bool(end.cost[0] > (1.0 - _SAME) * best.cost[0])
+                best = end
+            near = best is not None and 2.0 * best.cost[0] < _GOOD * problem.n_residuals
+            if best is not None and near:
+                if again or len(starts) == 1 or not _structured(problem, best):
+                    break
+            elif driven and finite == STARTS:
+                break
+        if best is None:
+            imposed = ", or, if the exciter imposes the motion, fit the force: output='force'"
+            raise FitError(
+                "from no start does the model give a finite motion; give start=, or check the units"
+                + (imposed if problem.output == "motion" else "")
+            )
+        if driven and not best.converged[0]:
+            end = self.descend(problem, best.theta[0], _STEPS)
+            best = end if end.cost[0] <= best.cost[0] else best
+        return best
+
+    def descend(self, problem: RecordProblem, theta: FloatArray, steps: int) -> Minima:
+        """Return the minimum near a start; first roughly, then to a small part of the noise."""
+        end = self.minimise(problem, theta[None], 0.0, _ROUGH)
+        if bool(end.converged[0]) or not np.isfinite(end.cost[0]) or steps == _ROUGH:
+            return end
+        noise = 2.0 * float(end.cost[0]) / problem.n_residuals
+        for _ in range(0, steps, _ROUGH):
+            before = float(end.cost[0])
+            end = self.minimise(problem, end.theta, _WORTHLESS * noise, _ROUGH)
+            if bool(end.converged[0]):
+                return end
+            if problem.output == "motion" and end.cost[0] > (1.0 - _STAGNANT) * before:
+                break
+        # where a motion comes to rest, errors of its integration hide the last falls of the cost
+        with np.errstate(all="ignore"):
+            at = problem.quadratic(end.theta[0], self.scale, self.rho)
+            if not np.isfinite(at.cost):
+                return end
+            size = np.sqrt(at.hessian.diagonal())
+            size[size == 0.0] = 1.0  # what vanishes, such as a damper that these data do not need
+            slope = at.gradient / size
+            left = slope @ np.linalg.pinv(at.hessian / np.outer(size, size), hermitian=True) @ slope
+        return replace(end, converged=np.array([bool(left < _SETTLED**2 * noise)]))
+
+    def minimise(
+        self, problem: RecordProblem, begin: FloatArray, enough: float, most: int
+    ) -> Minima:
+        """Return the minimum near a start, shape (1, P), after so many steps at most."""
+        if self.method == "scipy":
+            end = minimise_by_scipy(problem, begin[0], self.scale, self.rho)
+        else:
+            end = minimise(
+                lambda at, _which: problem.quadratic(at, self.scale, self.rho),
+                begin,
+                problem.space.relative,
+                problem.n_residuals,
+                tolerance_factor=_LOOSE,
+                enough=enough,
+                steps=most,
+            )
+        self.evaluations += int(end.evaluations[0])
+        return end
 
 
 def _correlation(residuals: Sequence[FloatArray]) -> float:
     """Return the correlation of residuals with those one sample later."""
     return sum(float(e[1:] @ e[:-1]) for e in residuals) / sum(float(e @ e) for e in residuals)
-
-
-def _weighted(plain: RecordOptimum) -> RecordOptimum:
-    """Return the estimate with residuals weighted by their spectrum, where they are slow.
-
-    Noise in the measured drive makes the plant wander, and plain least squares then takes up the
-    wandering by stiffness. The residuals' spectrum is estimated and the search repeated until
-    both agree. Kept only if it describes the motion at the drive's frequencies no worse: slow
-    residuals may also come from a wrong model, of which plain least squares leaves less.
-    """
-    problem = plain.problem
-    residuals = problem.split_residuals(plain.values)
-    slow = _correlation(residuals)
-    share = 2.0 * plain.cost / problem.n_residuals
-    if not plain.converged or slow < _SLOW or not _EXACT < share < _DESCRIBED:
-        return plain
-    drives = [record.force_samples for record in problem.records]
-    before = share_in_band(drives, problem.measured, residuals)
-    theta, evaluations = problem.theta(plain.values)[None], plain.evaluations
-    for _ in range(_REPEATS):
-        problem = problem.weighted(prediction_error_filter(residuals))
-        end = _minimise(problem, theta, _WORTHLESS * share, _STEPS)
-        evaluations += int(end.evaluations[0])
-        if not end.converged[0]:
-            return plain
-        change = end.theta[0] - theta[0]
-        theta = end.theta
-        values = problem.values(theta[0])
-        residuals = problem.split_residuals(values)
-        noise = 2.0 * float(end.cost[0]) / problem.n_residuals
-        if change @ end.hessian[0] @ change < _SETTLED**2 * noise:
-            break
-    if share_in_band(drives, problem.measured, residuals) > before:
-        return plain
-    return RecordOptimum(problem, values, float(end.cost[0]), True, evaluations)
 
 
 def hold_model(problem: RecordProblem, values: FloatArray) -> FloatArray:
@@ -264,7 +411,7 @@ def hold_model(problem: RecordProblem, values: FloatArray) -> FloatArray:
     """
     full = started_at(problem, values.tolist())
     held = values.size
-    theta = problem.theta(full)
+    theta = problem.to_search(full)
 
     def evaluate(at: FloatArray, _which: object) -> Quadratic:
         whole = np.column_stack([np.tile(theta[:held], (len(at), 1)), at])
@@ -296,31 +443,12 @@ def _changed(
     return starts
 
 
-def _searched(problem: RecordProblem, start: Mapping[str, float] | None) -> tuple[Minima, int]:
-    """Return the best end of searches from automatic starts, some of their values given."""
-    try:
-        best, evaluations = _best(
-            problem, _changed(record_starts(problem, 2 * STARTS), problem, start)
-        )
-    except FitError:
-        more = record_starts(problem, MORE_STARTS)[2 * STARTS :]
-        if not len(more):
-            raise
-        best, evaluations = _best(problem, _changed(more, problem, start))
-    near = 2.0 * best.cost[0] < _GOOD * problem.n_residuals
-    if near and (_slips_at_first(problem, best.theta[0]) or _structured(problem, best)):
-        found = _descend(problem, _first_states_again(problem, best.theta[0]), _STEPS)
-        evaluations += int(found.evaluations[0])
-        best = found if found.cost[0] < best.cost[0] else best
-    return best, evaluations
-
-
 def _slips_at_first(problem: RecordProblem, theta: FloatArray) -> bool:
     """Return whether a friction force at a first sample is beyond that of full slip.
 
     There it has no effect, so that a search cannot come back.
     """
-    values = problem.values(theta)
+    values = problem.to_values(theta)
     limits = {
         e.start[0] if e.name is None else f"{e.name}_{e.start[0]}": float(e.force_bounds(own)[1])
         for e, own in problem.model.of([np.asarray(v) for v in problem.full_values(values)])
@@ -334,90 +462,13 @@ def _slips_at_first(problem: RecordProblem, theta: FloatArray) -> bool:
 
 def _first_states_again(problem: RecordProblem, theta: FloatArray) -> FloatArray:
     """Return a point with first states as at a start."""
-    values = problem.values(theta)
+    values = problem.to_values(theta)
     again = started_at(problem, values[: len(problem.free)].tolist())
-    return problem.theta(again)
-
-
-def _best(problem: RecordProblem, starts: FloatArray, steps: int = _STEPS) -> tuple[Minima, int]:
-    """Return the best end of searches from the starts, in their order; few where one is good.
-
-    A driven motion is expensive where nothing fits: its starts are compared after a few steps, and
-    the best one alone is followed to its end. Where one fits nearly, but leaves residuals that are
-    not noise, the search goes on until two starts lead to the same end.
-    """
-    evaluations, finite, best, again = 0, 0, None, False
-    driven = problem.output == "motion" and len(starts) > 1
-    for one in starts:
-        theta = problem.theta(one)
-        found = _minimise(problem, theta[None], 0.0, _COMPARED) if driven else None
-        if found is None or 2.0 * found.cost[0] < _GOOD * problem.n_residuals:
-            found = _descend(problem, theta if found is None else found.theta[0], steps)
-        evaluations += int(found.evaluations[0])
-        finite += bool(np.isfinite(found.cost[0]))
-        if best is not None:
-            again |= bool(abs(found.cost[0] - best.cost[0]) < _SAME * best.cost[0])
-        if np.isfinite(found.cost[0]) and (best is None or found.cost[0] < best.cost[0]):
-            again &= best is None or bool(found.cost[0] > (1.0 - _SAME) * best.cost[0])
-            best = found
-        near = best is not None and 2.0 * best.cost[0] < _GOOD * problem.n_residuals
-        if best is not None and near:
-            if again or len(starts) == 1 or not _structured(problem, best):
-                break
-        elif driven and finite == STARTS:
-            break
-    if best is None:
-        imposed = ", or, if the exciter imposes the motion, fit the force: output='force'"
-        raise FitError(
-            "from no start does the model give a finite motion; give start=, or check the units"
-            + (imposed if problem.output == "motion" else "")
-        )
-    if driven and not best.converged[0]:
-        found = _descend(problem, best.theta[0], _STEPS)
-        evaluations += int(found.evaluations[0])
-        best = found if found.cost[0] <= best.cost[0] else best
-    return best, evaluations
+    return problem.to_search(again)
 
 
 def _structured(problem: RecordProblem, end: Minima) -> bool:
     """Return whether a search has left residuals that follow each other as noise seldom does."""
     if 2.0 * end.cost[0] < _EXACT * problem.n_residuals:
         return False
-    return _correlation(problem.split_residuals(problem.values(end.theta[0]))) > _SLOW
-
-
-def _descend(problem: RecordProblem, theta: FloatArray, steps: int) -> Minima:
-    """Return the minimum near a start; first roughly, then to a small part of the noise."""
-    found = _minimise(problem, theta[None], 0.0, _ROUGH)
-    if bool(found.converged[0]) or not np.isfinite(found.cost[0]) or steps == _ROUGH:
-        return found
-    noise = 2.0 * float(found.cost[0]) / problem.n_residuals
-    for _ in range(0, steps, _ROUGH):
-        before = float(found.cost[0])
-        found = _minimise(problem, found.theta, _WORTHLESS * noise, _ROUGH)
-        if bool(found.converged[0]):
-            return found
-        if problem.output == "motion" and found.cost[0] > (1.0 - _STAGNANT) * before:
-            break
-    # where a motion comes to rest, errors of its integration hide the last small falls of the cost
-    with np.errstate(all="ignore"):
-        end = problem.quadratic(found.theta[0])
-        if not np.isfinite(end.cost):
-            return found
-        size = np.sqrt(end.hessian.diagonal())
-        size[size == 0.0] = 1.0  # what vanishes, such as a damper that these data do not need
-        slope = end.gradient / size
-        left = slope @ np.linalg.pinv(end.hessian / np.outer(size, size), hermitian=True) @ slope
-    return replace(found, converged=np.array([bool(left < _SETTLED**2 * noise)]))
-
-
-def _minimise(problem: RecordProblem, begin: FloatArray, enough: float, most: int) -> Minima:
-    return minimise(
-        lambda at, _which: problem.quadratic(at),
-        begin,
-        problem.relative,
-        problem.n_residuals,
-        tolerance_factor=_LOOSE,
-        enough=enough,
-        steps=most,
-    )
+    return _correlation(problem.split_residuals(problem.to_values(end.theta[0]))) > _SLOW

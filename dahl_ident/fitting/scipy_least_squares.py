@@ -9,14 +9,14 @@ from dahl_ident.fitting.asymptotes import Chart
 from dahl_ident.fitting.levenberg_marquardt import Minima
 from dahl_ident.fitting.losses import Loss
 from dahl_ident.noise import bend
-from dahl_ident.problem import Problem
+from dahl_ident.problem import BaseProblem
 
 _COST, _STEP, _SLOPE = 1e-13, 1e-10, 1e-14  # relative changes that end a search
 _EVALUATIONS = 300  # a limit for searches that do not end
 
 
 def minimise_by_scipy(
-    problem: Problem,
+    problem: BaseProblem,
     start: FloatArray,
     scale: float,
     loss: Loss | None,
@@ -55,10 +55,10 @@ class _Rows:
     """Residuals and Jacobian by separate calls, as scipy wants them, evaluated together."""
 
     def __init__(
-        self, problem: Problem, scale: float, loss: Loss | None, chart: Chart | None
+        self, problem: BaseProblem, scale: float, loss: Loss | None, chart: Chart | None
     ) -> None:
         self._problem, self._scale, self._loss, self._chart = problem, scale, loss, chart
-        self._logarithmic = [p.transform == "log" for p in problem.parameters]
+        self._logarithmic = problem.space.positive
         self._theta = np.full(len(problem.parameters), np.nan)
         self._pair: tuple[FloatArray, FloatArray] = (self._theta, self._theta)
 
@@ -94,9 +94,9 @@ class _Rows:
         if self._loss is None:
             return r, J
         m = self._problem.n_residuals
-        y = np.ascontiguousarray(r[:m]).view(np.complex128)
-        changes = [np.ascontiguousarray(column).view(np.complex128) for column in J[:m].T]
-        y, changes = bend(y, changes, self._loss)
-        r[:m] = y.view(np.float64)
-        J[:m] = np.array(changes).view(np.float64).T
+        rows = np.column_stack([r[:m], J[:m]]).T  # of two residuals a row, or of one
+        pairs = rows[:, ::2] + 1j * rows[:, 1::2] if self._problem.parts == 2 else rows + 0j
+        y, changes = bend(pairs[0], list(pairs[1:]), self._loss)
+        bent = np.array([y, *changes]).view(np.float64)[:, :: 3 - self._problem.parts]
+        r[:m], J[:m] = bent[0], bent[1:].T
         return r, J

@@ -42,14 +42,13 @@ from dahl_ident.fitting.levenberg_marquardt import (
     minimise,
 )
 from dahl_ident.fitting.losses import Loss, loss_named
-from dahl_ident.fitting.optimum import Optimum, OptimumBatch, scale_ratio
+from dahl_ident.fitting.optimum import Optimum, OptimumBatch, agreed_scale, scale_ratio
+from dahl_ident.fitting.record_search import Tell, solve_records
 from dahl_ident.fitting.scipy_least_squares import minimise_by_scipy
-from dahl_ident.problem import Problem, ProblemBatch, Quadratic
+from dahl_ident.problem import BaseProblem, Problem, ProblemBatch, Quadratic
+from dahl_ident.problem.record_problem import RecordProblem
 
 DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm: limits may be as good
-_RESCALINGS = 100  # of the noise's scale; a handful is the rule
-_SAME_SCALE = 1e-9  # change of ln scale that ends them
-_LONGEST_SECANT = 20.0  # plain steps in one: where they shrink slowly, not where noise is all
 _STEPS = 80  # of a search; ten are the rule
 _BRIEF = 30  # steps where no limit counts
 _FIRST_LOOK, _HOPELESS = 15, 3.0  # steps at a limit, and how much higher it may then still be
@@ -63,19 +62,20 @@ _CURVES_AT_ONCE = 2**20  # rows of data times nodes of the grid where starts are
 
 
 def solve(
-    problem: Problem,
+    problem: BaseProblem,
     *,
     method: str = "lm",
     loss: str = "linear",
     start: Mapping[str, float] | None = None,
     limits: bool = True,
+    tell: Tell | None = None,
 ) -> Optimum:
     """Return the minimum of a problem's sum of squares, wherever it lies.
 
     Parameters
     ----------
-    problem : Problem
-        What to solve.
+    problem : BaseProblem
+        A table or records.
     method : {"lm", "scipy"}, default "lm"
         Levenberg and Marquardt's method from all starts together, or
         `scipy.optimize.least_squares` on the same residuals and Jacobian from each of them.
@@ -85,7 +85,9 @@ def solve(
         One more start: values of some or all free parameters; the others are completed.
     limits : bool, default True
         Whether to go on to limits at infinity, and by other ways where nothing has converged.
-        Without, values that all free parameters have are the only start.
+        Without, values that all free parameters have are the only start. Of tables.
+    tell : callable, optional
+        Takes the number of evaluations and the share of variance left, of records.
 
     Returns
     -------
@@ -116,7 +118,10 @@ def solve(
     """
     if method not in ("lm", "scipy"):
         raise ValidationError(f"method is {method!r}; expected lm or scipy")
-    search = _Search(problem, loss_named(loss), method=method, limits=limits)
+    if isinstance(problem, RecordProblem):
+        return solve_records(problem, method=method, loss=loss, start=start, tell=tell)
+    assert isinstance(problem, Problem)
+    search = _Search(problem, loss_named(loss, problem.parts), method=method, limits=limits)
     own = [p.value for p in problem.parameters if p.value is not None]
     if not limits and len(own) == len(problem.parameters):
         return search.run(Starts(np.zeros(1, np.intp), problem.to_search(own)[None]))[0]
@@ -231,7 +236,7 @@ class _Search:
                 f"{problem.n_residuals // 2} rows give {self.m} numbers, fewer than the {P} free "
                 f"parameters ({', '.join(problem.names)}); measure more points, or fix some"
             )
-        self.logarithmic = np.array([p.transform == "log" for p in problem.parameters])
+        self.logarithmic = problem.space.positive
         self.friction = problem.friction_columns
         self.low, self.high = problem.bounds()
         self.bounded = problem.is_bounded
@@ -250,25 +255,26 @@ class _Search:
         if self.bounded:
             begin = Starts(begin.table, np.clip(begin.theta, self.low, self.high))
         if self.rescales:
-            y, _ = self.problem.whitened(begin.theta, derivatives=False)
-            size = float(np.median(np.abs(y), axis=-1).min()) / np.sqrt(np.log(4.0))
+            squares = self.problem.squares(begin.theta)
+            size = float(np.sqrt(np.median(squares, axis=-1).min() / np.log(4.0)))
             scale = max(size, float(np.max(self.problem.rounding)))
-        ends = self._search(begin, scale)
-        evaluations = ends.minima.evaluations
-        step, last = 0.0, 0.0
-        for _ in range(_RESCALINGS if self.rescales else 0):
-            dof = self.m - ends.determined(0)
-            one = self.problem.table(0)
-            excess = np.log(scale_ratio(one, ends.minima.theta[0], scale, self.loss, dof))
-            if abs(excess) < _SAME_SCALE or not np.isfinite(excess):
-                break
-            # the secant's step where it goes the same way, else the plain one
-            factor = step / (last - excess) if last != excess else 1.0
-            step = excess * (factor if 0.0 < factor < _LONGEST_SECANT else 1.0)
-            last, scale = excess, scale * float(np.exp(step))
-            ends = self._search(Starts(np.zeros(1, np.intp), ends.minima.theta), scale)
-            evaluations = evaluations + ends.minima.evaluations
-        return optima(self.problem, ends, scale, self.loss, self.method, evaluations)
+        starts = begin
+        ends: list[Ends] = []
+        evaluations = np.zeros(self.problem.n_tables, dtype=np.intp)
+
+        def excess(scale: float) -> float:
+            nonlocal starts, evaluations
+            ends.append(self._search(starts, scale))
+            end = ends[-1].minima
+            evaluations = evaluations + end.evaluations
+            if not self.rescales:
+                return 0.0
+            starts = Starts(np.zeros(1, np.intp), end.theta)
+            dof, one = self.m - ends[-1].determined(0), self.problem.table(0)
+            return float(np.log(scale_ratio(one, end.theta[0], scale, self.loss, dof)))
+
+        scale = agreed_scale(excess, scale)
+        return optima(self.problem, ends[-1], scale, self.loss, self.method, evaluations)
 
     def _search(self, begin: Starts, scale: float) -> Ends:
         if not self.limits:

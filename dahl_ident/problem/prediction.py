@@ -33,7 +33,7 @@ from dahl_ident.data.quantities import DEFINITIONS, power_of_s
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Model, Parameter
 from dahl_ident.errors import DataError
-from dahl_ident.problem.coordinates import Coordinates
+from dahl_ident.problem.space import Space
 from dahl_ident.problem.steady_rows import SteadyRows
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import Sensors, measured_stiffness_factor
@@ -126,16 +126,16 @@ class Predictor:
         self,
         model: Model,
         sensors: Sensors,
-        coordinates: Coordinates,
+        space: Space,
         rows: Rows,
         shooting: Shooting | None = None,
         orbits: dict[int, FloatArray] | None = None,
     ) -> None:
-        self._model, self._sensors, self._coordinates = model, sensors, coordinates
+        self._model, self._sensors, self._space = model, sensors, space
         self._shooting = shooting
         self._orbits = {} if orbits is None else orbits
         self._neutral = sensors.are_exact
-        names = coordinates.names
+        names = space.names
         self._slots = [_slot(p, names) for p in (*model.parameters, *sensors.parameters)]
         self._set_rows(rows)
 
@@ -211,7 +211,7 @@ class Predictor:
         `amplitude_error` is the error of ln A, or of ln of the drive where that is controlled:
         the true one is the measured one over its exponential.
         """
-        columns = self._coordinates.to_values(theta)[..., None]
+        columns = self._space.to_values(theta)[..., None]
         values = [
             constant if index is None else columns[..., index, :] for index, constant in self._slots
         ]
@@ -285,7 +285,7 @@ class Predictor:
         for (index, _), value, d in zip(self._slots, own, by_parameter, strict=False):
             if index is None:
                 continue
-            change = d * value if self._coordinates.positive[index] else d
+            change = d * value if self._space.positive[index] else d
             if stretch is not None:
                 change = change - by_ln_amplitude * ((change / Z).real * stretch)
             changes.append(slope * change)
@@ -316,7 +316,7 @@ class Predictor:
         slope = -self._exponent * response / motion.displacement
         changes = []
         for place, i in enumerate(free):
-            positive = self._coordinates.positive[self._slots[i][0]]
+            positive = self._space.positive[self._slots[i][0]]
             change = motion.by_parameter[..., place]
             changes.append(slope * (change * own[i] if positive else change))
         by_level = slope * drive * motion.by_drive + self._exponent * response

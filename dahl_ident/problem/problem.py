@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple, Self, TypeVar
+from typing import Self, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -16,16 +16,13 @@ from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.rows import Rows
 from dahl_ident.data.tabular import assumes_frequency
-from dahl_ident.elements import Element, Model, Parameter
+from dahl_ident.elements import Element, Model
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import DataError, ModelError, ValidationError
 from dahl_ident.noise import ROUNDING, Measured, Rho, bend, correct_amplitude, noise_for
-from dahl_ident.problem.coordinates import (
-    Coordinates,
-    Interchangeable,
-    with_changes,
-)
+from dahl_ident.problem.base import EXPLICIT, BaseProblem, Quadratic
 from dahl_ident.problem.prediction import Nearby, Prediction, Predictor
+from dahl_ident.problem.space import Interchangeable, Space, with_changes
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import EXACT, Prior, Sensors
 from dahl_ident.steady_state import ACCURACY, STEADY, Shooting, Steady, obstacle
@@ -36,23 +33,12 @@ _ORBITS: WeakKeyDictionary[FrequencyResponse, dict[int, FloatArray]] = WeakKeyDi
 
 _Kind = TypeVar("_Kind", bound="Problem")
 
-EXPLICIT = 1e-13
-"""Relative error of predictions in closed form or by roots."""
-
 _LOST = 2e-6
 """Noise of the data's mean over that of a calibration, below which its part of the information
 (1e-12 of it, as a square) is near rounding."""
 
 
-class Quadratic(NamedTuple):
-    """Half the sum of squares (or of losses), its gradient, and its Gauss-Newton Hessian."""
-
-    cost: FloatArray
-    gradient: FloatArray
-    hessian: FloatArray
-
-
-class Problem:
+class Problem(BaseProblem):
     """Data, model, noise and sensors: residuals, Jacobian and likelihood of one estimate.
 
     Parameters
@@ -84,18 +70,6 @@ class Problem:
     parameters : tuple of Parameter
         The free ones, the model's first, then the sensors', in units of the data's motion. P is
         their number.
-    names : tuple of str
-        Their names.
-    priors : dict of str to Prior
-        The priors of sensor parameters that are free.
-    ranges : dict of str to (float, float)
-        Mean and standard deviation of the search coordinates of assumed parameters.
-    scale_known : bool
-        Whether the residuals have unit variance as they are.
-    gaussian : bool
-        Whether residuals are Gaussian; not where a covariance has few degrees of freedom.
-    n_residuals : int
-        Residuals of the data, two a row; those of priors come on top.
     n_numbers : int
         Residuals that can differ from zero: one in a row of the mean force, which is real.
 
@@ -159,13 +133,13 @@ class Problem:
     ) -> None:
         one_of(self.steady, "steady", STEADY)
         model, sensors = with_changes(as_model(model), sensors or EXACT, free, fixed or {})
-        self.model, self.sensors = model, sensors
+        self.model, self.sensors, self.motion = model, sensors, motion
         parameters = [p for p in (*model.parameters, *sensors.parameters) if p.free]
         if motion == "rotation":
             parameters = [replace(p, unit=shown_unit(p.unit, motion)) for p in parameters]
         if not parameters:
             raise ModelError(f"{model!r} has no free parameter; leave one out, or name it in free=")
-        self._coordinates = Coordinates(parameters)
+        self.space = Space(parameters)
         self._orbits = {}
         self._alike = Interchangeable(model, self.names)
         self.priors: dict[str, Prior] = sensors.priors
@@ -265,9 +239,7 @@ class Problem:
 
     def _predicting(self, *, exact: bool) -> Predictor:
         shooting = self._shooting if exact else None
-        return Predictor(
-            self.model, self.sensors, self._coordinates, self._rows, shooting, self._orbits
-        )
+        return Predictor(self.model, self.sensors, self.space, self._rows, shooting, self._orbits)
 
     def like(
         self,
@@ -303,26 +275,6 @@ class Problem:
         other.ranges = {n: (float(np.log(values[n])), std) for n, std in spread.items()}
         return other
 
-    @property
-    def n_priors(self) -> int:
-        """The number of priors, those of assumed parameters included."""
-        return len(self.priors) + len(self.ranges)
-
-    # Tables
-
-    @property
-    def n_tables(self) -> int:
-        """The number of tables: one."""
-        return 1
-
-    def take(self, tables: NDArray[np.intp] | slice) -> Problem:
-        """Return this problem: one table stands for as many as are asked for."""
-        return self
-
-    def table(self, index: int) -> Problem:
-        """Return this problem."""
-        return self
-
     # Coordinates
 
     @cached_property
@@ -331,60 +283,13 @@ class Problem:
         names = {p.name for e in self.model.elements if not e.is_linear for p in e.parameters}
         return np.flatnonzero([name in names for name in self.names])
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """The free parameters, the model's first, then the sensors'."""
-        return self._coordinates.parameters
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the free parameters."""
-        return self._coordinates.names
-
-    def to_search(self, values: ArrayLike) -> FloatArray:
-        """Return the search coordinates of parameter values, in the order of `names`.
-
-        Parameters
-        ----------
-        values : array_like, shape (P,) or (S, P)
-            In SI units.
-
-        Returns
-        -------
-        ndarray of the same shape
-            Logarithms of positive parameters, the values of the others.
-
-        Raises
-        ------
-        ValidationError
-            If the shape is wrong or a positive parameter is not above zero.
-        """
-        return self._coordinates.to_search(values)
-
-    def to_values(self, theta: ArrayLike) -> FloatArray:
-        """Return the parameter values at search coordinates, shape (P,) or (S, P)."""
-        return self._coordinates.to_values(self._coordinates.checked(theta))
-
-    def value_slopes(self, theta: ArrayLike) -> FloatArray:
-        """Return d value / d theta: the value itself for positive parameters, 1 for others."""
-        return self._coordinates.slopes(self.to_values(theta))
-
-    def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Return the parameters' lower and upper bounds in search coordinates."""
-        return self._coordinates.bounds
-
-    @property
-    def is_bounded(self) -> bool:
-        """Whether any parameter has a finite bound in search coordinates."""
-        return self._coordinates.is_bounded
-
     def in_order(self, theta: ArrayLike) -> FloatArray:
         """Return theta with interchangeable elements ordered by rising knee, Dahl's by x_c.
 
         Elements are interchangeable where they follow one law, with the same parameters free and
         the others alike; without an order their labels could switch.
         """
-        return self._alike.in_order(self._coordinates.checked(theta), self._coordinates)
+        return self._alike.in_order(self.space.checked(theta), self.space)
 
     # Predictions
 
@@ -401,7 +306,7 @@ class Problem:
         ndarray of complex, shape (n,) or (S, n)
             Sensors included; NaN where a driven plant has no steady amplitude.
         """
-        theta = self._coordinates.checked(theta)
+        theta = self.space.checked(theta)
         found = self._prediction(theta, derivatives=False)
         return np.array(np.broadcast_to(found.value, self._shape(theta)))
 
@@ -426,7 +331,7 @@ class Problem:
 
     def prediction_and_jacobian(self, theta: ArrayLike) -> tuple[ComplexArray, ComplexArray]:
         """Return R, shape (n,) or (S, n), and dR/dtheta, (n, P) or (S, n, P)."""
-        theta = self._coordinates.checked(theta)
+        theta = self.space.checked(theta)
         found, shape = self._prediction(theta, derivatives=True), self._shape(theta)
         changes = [np.broadcast_to(d, shape) for d in found.changes]
         return np.array(np.broadcast_to(found.value, shape)), np.stack(changes, axis=-1)
@@ -474,7 +379,7 @@ class Problem:
             Two numbers a row of data, in its order, then one for each prior:
             (value - mean)/std.
         """
-        theta = self._coordinates.checked(theta)
+        theta = self.space.checked(theta)
         y, _ = self.whitened(theta, derivatives=False)
         return self._with_priors(theta, y, [], scale)[..., 0, :]
 
@@ -492,7 +397,7 @@ class Problem:
         With noise in the amplitude the residuals are defined up to a rotation of each pair. The
         Jacobian leaves that out, so that J' r is the exact gradient of half the sum of squares.
         """
-        theta = self._coordinates.checked(theta)
+        theta = self.space.checked(theta)
         rows = self._with_priors(theta, *self.whitened(theta, tails=tails), scale)
         return rows[..., 0, :], rows[..., 1:, :].swapaxes(-1, -2)
 
@@ -503,14 +408,7 @@ class Problem:
         rho: Rho | None = None,
         chart: FloatArray | None = None,
     ) -> Quadratic:
-        """Return half the sum of squares with its gradient and Hessian, unchecked.
-
-        Derivatives are by theta, or with `chart` = dtheta/dphi, (P, Q) or (S, P, Q), by phi.
-
-        Cost of shape () or (S,), infinite where there is no prediction. Where rows count as
-        rho(z), the gradient is exact and the Hessian is that of rho at a linear model,
-        rho' d' d + 2 rho'' (y' d)(y' d)', as far as that is positive.
-        """
+        """Return half the sum of squares with its gradient and Hessian, see ``BaseProblem``."""
         rho = rho or self._tail
         rows = self._with_priors(theta, *self.whitened(theta, tails=False), scale)
         if chart is not None:
@@ -560,6 +458,11 @@ class Problem:
         by = self._predictor(theta, amplitude_error=error).changes if derivatives else []
         return y, [-whiten(d) for d in by]
 
+    def squares(self, theta: FloatArray, *, tails: bool = True) -> FloatArray:
+        """Return |y|^2 of every row, (..., n), without priors, unchecked."""
+        y, _ = self.whitened(theta, derivatives=False, tails=tails)
+        return np.asarray(y.real**2 + y.imag**2)
+
     def residual_change(self, theta: FloatArray, change: ComplexArray) -> FloatArray:
         """Return how the data's residuals change where predictions change, unchecked.
 
@@ -606,7 +509,7 @@ class Problem:
             Responses in the data's quantity. An error of the measured amplitudes appears, to
             first order, in the responses, so that amplitudes stay as they were measured.
         """
-        theta = self._coordinates.checked(theta)
+        theta = self.space.checked(theta)
         shape, noise = (size, self._rows.n), self._noise
         pairs = rng.standard_normal((2, *shape))
         pairs[1][..., self._rows.harmonic == 0] = 0.0  # a mean force is real
@@ -636,8 +539,8 @@ class Problem:
             rows /= np.asarray(scale)[..., None, None]
         if extra:
             rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], extra))], axis=-1)
-            values = self._coordinates.to_values(theta)
-            slopes = self._coordinates.slopes(values)
+            values = self.space.to_values(theta)
+            slopes = self.space.slopes(values)
             for place, (name, prior) in enumerate(self.priors.items(), start=m):
                 index = self.names.index(name)
                 mean, std = _normal_moments(name, prior)
@@ -678,13 +581,12 @@ class Problem:
         ValidationError
             If `scale` is given where it is known.
         """
-        theta = self._coordinates.checked(theta)
+        theta = self.space.checked(theta)
         if self.scale_known and scale is not None:
             raise ValidationError(
                 f"scale is given, but {self.noise} noise has a known scale; leave it out"
             )
-        y, _ = self.whitened(theta, derivatives=False)
-        total = np.sum(y.real**2 + y.imag**2, axis=-1)
+        total = self.squares(theta).sum(axis=-1)
         n = self._rows.n
         s2 = np.asarray(1.0 if scale is None else scale) ** 2
         if scale is None and not self.scale_known:
@@ -701,7 +603,7 @@ class Problem:
         J' J of the whitened residuals; rows whose covariance was estimated count as
         :mod:`dahl_ident.noise` says. With `chart` = dtheta/dphi, (P, Q), the information of phi.
         """
-        theta = self._coordinates.checked(theta)
+        theta = self.space.checked(theta)
         rows = self._with_priors(theta, *self.whitened(theta, tails=False), scale)
         counted = rows
         if self._tail is not None:

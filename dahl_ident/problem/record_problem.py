@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
@@ -26,8 +26,10 @@ from dahl_ident.elements.behaviour import Behaviour, HistoryGradient
 from dahl_ident.elements.element import as_model
 from dahl_ident.elements.equations import FirstState, plant_equations
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
+from dahl_ident.noise import Rho
+from dahl_ident.problem.base import BaseProblem, Quadratic
 from dahl_ident.problem.displacement_noise import LEADS, noise_of, travelled
-from dahl_ident.problem.problem import Quadratic
+from dahl_ident.problem.space import Space
 
 if TYPE_CHECKING:
     from dahl_ident.elements.equations import Excitation
@@ -37,8 +39,8 @@ Output = Literal["force", "motion"]
 _SHORTEST = 16  # samples from which noise can be estimated
 _PER_CYCLE = 100.0  # samples that a slow cycle keeps where a record is too long
 _SMALL = 0.1  # of the motion's inverse size: rates below are searched as numbers
-_INSIDE = 1.0 - 1e-9  # of the way to a bound: on it, a search would see no slope and stay
 _PLAY_STEP = 1e-6  # of the motion's range, for derivatives with respect to the place in a gap
+_LEAST = 1e-300  # of a positive value that has vanished
 _VANISHED = 1e4  # times below what would change the residuals: held, or all steps shrink with it
 
 
@@ -62,8 +64,11 @@ Watch = Callable[["RecordProblem", FloatArray, float], None]
 """Takes a problem, search coordinates and the cost there."""
 
 
-class RecordProblem:
+class RecordProblem(BaseProblem):
     """Records of one device and a model: residuals, Jacobian and cost.
+
+    Residuals are measured minus predicted samples over the standard deviation of the output, so
+    that their scale is unknown.
 
     Parameters
     ----------
@@ -93,8 +98,11 @@ class RecordProblem:
     >>> force = Dahl(1.0, 3.0).force(x)
     >>> problem = RecordProblem([Record(np.arange(40.0), displacement=x, force=force)], Dahl())
     >>> problem.names
-    ['f_max', 'sigma', 'initial_force', 'offset', 'drift']
+    ('f_max', 'sigma', 'initial_force', 'offset', 'drift')
     """
+
+    parts = 1
+    settled = False
 
     def __init__(
         self,
@@ -139,15 +147,10 @@ class RecordProblem:
             self.records = tuple(at_even_times(record) for record in self.records)
         for number, record in enumerate(self.records, 1):
             self._check(record, f"record {number}" if len(self.records) > 1 else "the record")
+        self.motion = self.records[0].motion
         self._check_scale()
-        self.parameters = (*self.free, *self._nuisance())
-        self.names = [p.name for p in self.parameters]
-        low, high = (np.array([getattr(p, b) for p in self.parameters]) for b in ("lower", "upper"))
-        self._between = np.isfinite(low) & np.isfinite(high)
-        low, high = (np.where(self._between, b, side) for b, side in ((low, -1.0), (high, 1.0)))
-        self._middle, self._reach = 0.5 * (low + high), 0.5 * (high - low)
-        self.logarithmic = ~self._between & [p.transform == "log" for p in self.parameters]
-        self._bend = self._bends()
+        parameters = (*self.free, *self._nuisance())
+        self.space = Space(parameters, self._bends(parameters), inside=True)
         self.whitening = np.ones(1)
         """Filter of the residuals; see :func:`~.record_noise.prediction_error_filter`."""
         self.displacement_noise = 0.0
@@ -208,7 +211,7 @@ class RecordProblem:
                 found.append(Parameter(f"offset{tail}", unit, "constant in the measured motion"))
         return found
 
-    def _bends(self) -> FloatArray:
+    def _bends(self, parameters: Sequence[Parameter]) -> FloatArray:
         """Return below which size a parameter is searched as a number, and not as a logarithm.
 
         Rates such as those of Bouc-Wen may have either sign, but beyond a tenth of the motion's
@@ -224,7 +227,7 @@ class RecordProblem:
                 self.records[0].motion_channel
             )
             length = float(np.std(wave)) * time**order
-        found = np.zeros(len(self.parameters))
+        found = np.zeros(len(parameters))
         for i, p in enumerate(self.free):
             if p.transform == "linear" and not np.isfinite([p.lower, p.upper]).any():
                 force, by_length, by_time = p.dimension
@@ -265,6 +268,13 @@ class RecordProblem:
         """Return the same problem with filtered residuals."""
         other = copy(self)
         other.whitening = whitening
+        return other
+
+    def measuring(self, outputs: Sequence[FloatArray]) -> RecordProblem:
+        """Return the same problem with other measured outputs, in the same unit."""
+        other = copy(self)
+        other.sizes = self.sizes
+        other.measured = tuple(outputs)
         return other
 
     def with_fixed(self, values: Mapping[str, float]) -> RecordProblem:
@@ -308,9 +318,26 @@ class RecordProblem:
         return (len(self.parameters) - len(self.free)) // len(self.records)
 
     @property
-    def n_residuals(self) -> int:
+    def n_reported(self) -> int:
+        """How many parameters are the model's; states, offsets and drifts follow."""
+        return len(self.free)
+
+    @property
+    def every_parameter(self) -> tuple[Parameter, ...]:
+        """The model's parameters, fixed ones included, and what each record adds."""
+        return (*self.model.parameters, *self.parameters[self.n_reported :])
+
+    @property
+    def n_samples(self) -> int:
         """Samples of all records."""
         return sum(len(record) for record in self.records)
+
+    @property
+    def n_residuals(self) -> int:  # type: ignore[override]
+        """Residuals: all samples, but those that the filter takes to begin."""
+        return self.n_samples - len(self.records) * (self.whitening.size - 1)
+
+    n_numbers = n_residuals
 
     @cached_property
     def measured(self) -> tuple[FloatArray, ...]:
@@ -379,36 +406,10 @@ class RecordProblem:
             for r in self.records
         )
 
-    def values(self, theta: FloatArray) -> FloatArray:
-        """Return the parameters' values from search coordinates.
-
-        A value between two bounds is a sine, so that no step leaves them.
-        """
-        values = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, theta, 0.0)), theta)
-        values = np.where(self._between, self._middle + self._reach * np.sin(theta), values)
-        bent = self._bend > 0.0
-        return np.where(bent, self._bend * np.sinh(np.where(bent, theta, 0.0)), values)
-
-    def theta(self, values: FloatArray) -> FloatArray:
-        """Return search coordinates from the parameters' values."""
-        safe = np.where(self.logarithmic, np.maximum(values, 1e-300), 1.0)
-        bend = np.where(self._bend > 0.0, self._bend, 1.0)
-        bent = np.where(self._bend > 0.0, np.arcsinh(values / bend), values)
-        part = np.where(self._between, (values - self._middle) / self._reach, 0.0)
-        angle = np.arcsin(np.clip(part, -_INSIDE, _INSIDE))
-        return np.where(self._between, angle, np.where(self.logarithmic, np.log(safe), bent))
-
-    @property
-    def relative(self) -> NDArray[np.bool_]:
-        """Coordinates whose steps are relative changes of the values."""
-        return np.asarray(self.logarithmic | (self._bend > 0.0))
-
-    def slopes(self, values: FloatArray) -> FloatArray:
-        """Return the derivatives of the parameters' values by their search coordinates."""
-        bent = np.where(self._bend > 0.0, np.hypot(values, self._bend), 1.0)
-        part = np.where(self._between, (values - self._middle) / self._reach, 0.0)
-        sides = self._reach * np.sqrt(np.maximum(1.0 - part**2, 0.0))
-        return np.where(self._between, sides, np.where(self.logarithmic, values, bent))
+    def to_search(self, values: ArrayLike) -> FloatArray:
+        """Return search coordinates; values that have vanished are as small as numbers can be."""
+        array = np.asarray(values, dtype=np.float64)
+        return self.space.to_search(np.where(self.space.positive & (array == 0.0), _LEAST, array))
 
     def full_values(self, values: FloatArray) -> list[float]:
         """Return the value of every parameter of the model, fixed ones included."""
@@ -508,40 +509,88 @@ class RecordProblem:
         """Return measured minus predicted output of each record."""
         return [y - p for y, p in zip(self.measured, self.outputs(values), strict=True)]
 
-    def quadratic(self, theta: FloatArray) -> Quadratic:
+    def quadratic(
+        self,
+        theta: FloatArray,
+        scale: ArrayLike = 1.0,
+        rho: Rho | None = None,
+        chart: FloatArray | None = None,
+    ) -> Quadratic:
         """Return cost, gradient and Hessian at search coordinates, (S, P) or (P,).
 
-        The cost is half the sum of squared residuals over the measured output's variance; where
-        the motion cannot be found it is infinite.
+        Where the motion cannot be found the cost is infinite.
         """
         if theta.ndim == 2:
-            parts = [self.quadratic(row) for row in theta]
+            parts = [self.quadratic(row, scale, rho, chart) for row in theta]
             return Quadratic(*(np.stack(column) for column in zip(*parts, strict=True)))
-        P = theta.size
+        P, size = theta.size, float(np.asarray(scale))
         cost, gradient, hessian = 0.0, np.zeros(P), np.zeros((P, P))
-        values = self.values(theta)
-        chain = self.slopes(values)
-        if not np.isfinite(values).all():
-            return Quadratic(np.asarray(np.inf), gradient, np.eye(P))
-        for number, (y, size) in enumerate(zip(self.measured, self.sizes, strict=True)):
+        nowhere = Quadratic(np.asarray(np.inf), gradient.copy(), np.eye(P))
+        if not np.isfinite(self.space.to_values(theta)).all():
+            return nowhere
+        for number in range(len(self.records)):
             try:
-                found = self.predict(values, number)
+                residual, jacobian = self._rows(theta, number)
             except FitError:
-                return Quadratic(np.asarray(np.inf), gradient, np.eye(P))
-            residual = self.filtered((y - found.output) / size)
-            jacobian = self.filtered(found.by * (chain / size))
-            cost += 0.5 * float(residual @ residual)
-            gradient -= jacobian.T @ residual
-            hessian += jacobian.T @ jacobian
+                return nowhere
+            residual, jacobian = residual / size, jacobian / size
+            if rho is None:
+                cost += 0.5 * float(residual @ residual)
+                gradient += jacobian.T @ residual
+                hessian += jacobian.T @ jacobian
+            else:
+                z = residual**2
+                loss, slope, curvature = rho(z)
+                cost += 0.5 * float(loss.sum())
+                gradient += jacobian.T @ (slope * residual)
+                weight = np.maximum(slope + 2.0 * curvature * z, 0.0)
+                hessian += jacobian.T @ (weight[:, None] * jacobian)
         if not (np.isfinite(cost) and np.isfinite(hessian).all()):  # a motion beyond all bounds
-            return Quadratic(np.asarray(np.inf), np.zeros(P), np.eye(P))
+            return nowhere
         far = _VANISHED * hessian.diagonal()
-        gone = self.logarithmic & (gradient >= far) | self._between & (np.abs(gradient) >= far)
-        gradient[gone], hessian[gone], hessian[:, gone] = 0.0, 0.0, 0.0
-        hessian[gone, gone] = 1.0
+        vanished = self.space.positive & (gradient >= far)
+        vanished |= self.space.angular & (np.abs(gradient) >= far)
+        gradient[vanished], hessian[vanished], hessian[:, vanished] = 0.0, 0.0, 0.0
+        hessian[vanished, vanished] = 1.0
         if self.watch is not None:
             self.watch(self, theta, cost)
+        if chart is not None:
+            gradient, hessian = chart.T @ gradient, chart.T @ hessian @ chart
         return Quadratic(np.asarray(cost), gradient, hessian)
+
+    def _rows(
+        self, theta: FloatArray, number: int, *, derivatives: bool = True
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the filtered residuals of a record, and their derivatives."""
+        values, size = self.space.to_values(theta), self.sizes[number]
+        predicted = self.predict(values, number, derivatives=derivatives)
+        residual = self.filtered((self.measured[number] - predicted.output) / size)
+        if not derivatives:
+            return residual, predicted.by
+        return residual, self.filtered(predicted.by * (self.space.slopes(values) / -size))
+
+    def residuals_and_jacobian(
+        self, theta: ArrayLike, scale: ArrayLike = 1.0, *, tails: bool = True
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return residuals, (m,), and Jacobian, (m, P), of all records at theta, (P,)."""
+        at = self.space.checked(theta)
+        try:
+            rows = [self._rows(at, number) for number in range(len(self.records))]
+        except FitError:
+            return np.full(self.n_residuals, np.nan), np.full((self.n_residuals, at.size), np.nan)
+        residuals, jacobians = zip(*rows, strict=True)
+        size = float(np.asarray(scale))
+        return np.concatenate(residuals) / size, np.concatenate(jacobians) / size
+
+    def squares(self, theta: FloatArray, *, tails: bool = True) -> FloatArray:
+        """Return the squared residuals of all samples at theta, (P,)."""
+        places = range(len(self.records))
+        return np.concatenate([self._rows(theta, i, derivatives=False)[0] ** 2 for i in places])
+
+    @property
+    def rounding(self) -> FloatArray:
+        """Size of residuals that may be rounding errors alone."""
+        return np.asarray(self.accuracy)
 
     @cached_property
     def sizes(self) -> tuple[float, ...]:

@@ -101,7 +101,7 @@ def record_document(
     name = files[0]["file"] if files else count
     header = given.lines | {
         "Model": tuple(in_words(first.problem.model)),
-        "Data": (f"{count}, {first.problem.n_residuals} samples", *named),
+        "Data": (f"{count}, {first.problem.n_samples} samples", *named),
         "Date of report": (provenance.today(),),
         "Software": (f"dahl_ident {__version__}",),
     }
@@ -156,7 +156,7 @@ def _changes(fits: Sequence[RecordFit]) -> list[Change]:
 
 
 def _answer(fit: RecordFit) -> Table:
-    limits = fit.conf_interval()
+    limits = fit.conf_interval().at(CONFIDENCE)
     unusable = not fit.status.usable
     rows = []
     for parameter in fit.problem.free:
@@ -167,7 +167,7 @@ def _answer(fit: RecordFit) -> Table:
                 Cell(found.name),
                 Cell(value, found.value, unusable),
                 Cell(error, found.stderr, unusable),
-                Cell(interval(*limits[found.name], ""), struck=unusable),
+                Cell(interval(*limits[found.name][1:], ""), struck=unusable),
                 Cell(found.unit or "-"),
                 Cell(found.description),
             )
@@ -223,7 +223,7 @@ def _drawn(fit: RecordFit, kind: str, record: int) -> Figure:
 
 
 def _facts(fit: RecordFit) -> dict[str, Any]:
-    limits = fit.conf_interval()
+    limits = fit.conf_interval().at(CONFIDENCE)
     return {
         "model": repr(fit.problem.model),
         "equations": list(in_words(fit.problem.model)),
@@ -232,7 +232,7 @@ def _facts(fit: RecordFit) -> dict[str, Any]:
         "verdict": fit.verdict,
         "findings": [finding.to_dict() for finding in fit.findings],
         "records": len(fit.records),
-        "samples": fit.problem.n_residuals,
+        "samples": fit.problem.n_samples,
         "share_of_variance_left": fit.goodness.share_left,
         "parameters": {
             name: {
@@ -240,7 +240,7 @@ def _facts(fit: RecordFit) -> dict[str, Any]:
                 "stderr": e.stderr,
                 "unit": e.unit,
                 "fixed": not e.vary,
-                "interval_95.45": list(limits[name]) if e.vary else None,
+                "interval_95.45": list(limits[name][1:]) if e.vary else None,
             }
             for name, e in fit.params.items()
         },

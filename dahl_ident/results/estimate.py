@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -18,7 +18,12 @@ from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import PriorLike, joint_prior
 from dahl_ident.bayes.record_density import RecordDensity, record_prior
 from dahl_ident.bayes.sample import ChainSample, Start, sample_chain, sample_points
-from dahl_ident.bayes.walker_start import optimum_of, scattered, starting_points
+from dahl_ident.bayes.walker_start import (
+    centre_and_covariance,
+    optimum_of,
+    scattered,
+    starting_points,
+)
 from dahl_ident.data import FrequencyResponse, Record, read_frequency_response
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.rows import row_names
@@ -28,12 +33,14 @@ from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting import Optimum, solve, solve_many
-from dahl_ident.problem import Problem, ProblemBatch
+from dahl_ident.fitting.record_search import Tell
+from dahl_ident.problem import BaseProblem, Problem, ProblemBatch
+from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_result import Posterior
 from dahl_ident.results.progress import progress_bar
-from dahl_ident.results.record_fit import RecordFit, fit_records
+from dahl_ident.results.record_fit import RecordFit, solved
 from dahl_ident.results.record_posterior import RecordPosterior
 from dahl_ident.sensors import Sensors
 from dahl_ident.steady_state import Steady
@@ -72,9 +79,12 @@ def fit(
     data: Record | Sequence[Record],
     model: Element,
     *,
+    method: str = ...,
     free: Iterable[str] = ...,
     fixed: Mapping[str, float] | None = ...,
     sensors: Sensors | None = ...,
+    loss: str = ...,
+    constraints: Constraints | None = ...,
     start: Mapping[str, float] | None = ...,
     output: Output | None = ...,
     excitation: Excitation = ...,
@@ -121,7 +131,7 @@ def fit(
     fixed : mapping of str to float, optional
         Parameters to hold at a value.
     noise : {"measured", "relative", "absolute"}, optional
-        Default: "measured" where the data have a covariance, else "relative".
+        Of tables: by default "measured" where the data have a covariance, else "relative".
     sensors : Sensors, optional
         Gains and delay of the channels; left out, they are taken as exact. Of records: priors
         about 1 and 0 alone, whose standard deviations count in the uncertainty.
@@ -181,51 +191,46 @@ def fit(
     """
     if hasattr(data, "iloc"):  # a table in memory, without the import of pandas
         data = read_frequency_response(cast("pd.DataFrame", data))
-    if not isinstance(data, FrequencyResponse):
-        taken = {
-            "noise": noise, "constraints": constraints,
-            "drive_std": drive_std, "drive_covariance": drive_covariance,
-            "loss": None if loss == "linear" else loss,
-            "method": None if method == "lm" else method,
-            "steady": None if steady == "exact" else steady,
-        }  # fmt: skip
-        refused = [name for name, value in taken.items() if value is not None]
-        if refused:
-            raise ValidationError(f"{' and '.join(refused)} given; a fit of records takes none")
-        records = [data] if isinstance(data, Record) else list(data)
-        bound = as_model(model).with_free(free).with_fixed(fixed or {})
-        return fit_records(
-            records, bound, start=start, output=output, excitation=excitation,
-            calibration=(sensors or Sensors()).stated_uncertainties(),
-            throw=throw, progress=progress,
-        )  # fmt: skip
-    problem = Problem(
-        data, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady
-    )
-    of_ipopt = {
+    kind = "a fit of tables" if isinstance(data, FrequencyResponse) else "a fit of records"
+    _refuse_options(fit, kind, locals())
+    if method not in ("lm", "scipy", "ipopt"):
+        raise ValidationError(f"method is {method!r}; expected lm, scipy or ipopt")
+    by_ipopt = {
         "constraints": constraints, "drive_std": drive_std, "drive_covariance": drive_covariance
     }  # fmt: skip
-    beyond = [name for name, value in of_ipopt.items() if value is not None]
-    if method == "ipopt":
+    given = [name for name, value in by_ipopt.items() if value is not None]
+    if given and method != "ipopt":
+        raise ValidationError(f"{' and '.join(given)} given; only method='ipopt' takes that")
+
+    def optimum_of(problem: BaseProblem, tell: Tell | None = None) -> Optimum:
+        if method != "ipopt":
+            return solve(problem, method=method, loss=loss, start=start, tell=tell)
         from dahl_ident.fitting.ipopt import solve_ipopt
 
-        optimum = solve_ipopt(
-            problem,
-            constraints=constraints,
-            start=start,
-            loss=loss,
-            drive_std=drive_std,
-            drive_covariance=drive_covariance,
+        return solve_ipopt(
+            problem, start=start, loss=loss, tell=tell, constraints=constraints,
+            drive_std=drive_std, drive_covariance=drive_covariance,
+        )  # fmt: skip
+
+    first_order = constraints is not None
+    if not isinstance(data, FrequencyResponse):
+        records = RecordProblem(
+            [data] if isinstance(data, Record) else list(data),
+            as_model(model).with_free(free).with_fixed(fixed or {}),
+            output=output,
+            excitation=excitation,
+            calibration=(sensors or Sensors()).stated_uncertainties(),
         )
-    elif method not in ("lm", "scipy"):
-        raise ValidationError(f"method is {method!r}; expected lm, scipy or ipopt")
-    elif beyond:
-        raise ValidationError(f"{' and '.join(beyond)} given; only method='ipopt' takes that")
-    else:
-        optimum = solve(problem, method=method, loss=loss, start=start)
+        return solved(
+            partial(optimum_of, records), first_order=first_order, throw=throw,
+            progress=progress,
+        )  # fmt: skip
+    optimum = optimum_of(
+        Problem(data, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady)
+    )
     if not np.isfinite(optimum.residuals).all():
         raise FitError(_no_prediction(optimum))
-    result = FitResult(optimum, first_order=constraints is not None)
+    result = FitResult(optimum, first_order=first_order)
     if throw and not result.success:
         cause = result.goodness.cause
         raise FitError(f"{cause} {result.message}" if cause else result.message, result)
@@ -412,7 +417,9 @@ def posterior(
     options = {**locals()}
     one_of(method, "method", METHODS)
     of_records = not isinstance(data, FrequencyResponse | FitResult)
-    _refuse_options("a posterior of records" if of_records else f"method={method!r}", options)
+    if of_records:
+        _refuse_options(posterior, "a posterior of records", options)
+    _refuse_options(posterior, f"method={method!r}", options)
     if pool is not None and not callable(getattr(pool, "map", None)):
         raise ValidationError(f"pool is {pool!r}; expected an object with map, such as a Pool")
     one_of(uncertainty, "uncertainty", UNCERTAINTIES)
@@ -436,15 +443,15 @@ def posterior(
             else fit(data, _checked(model), free=free, fixed=fixed, throw=False)
         )
         of_motion = _record_density(recorded, priors)
+        if method == "grid":
+            around = of_motion.centre, of_motion.root @ of_motion.root.T
+            points = sample_points(of_motion, lambda: around, recorded.problem.names, tolerance)
+            return RecordPosterior(recorded, of_motion, points)
         start = partial(scattered, of_motion, of_motion.centre, of_motion.root)
         result: Posterior = RecordPosterior(recorded, of_motion, chain(of_motion, start))
         result.chain.check(result.names, result)
         return result
     fitted = data if isinstance(data, FitResult) else None
-    if fitted is not None and fitted.first_order:
-        raise ValidationError(
-            "the fit had constraints, which a posterior does not take; pass the data instead"
-        )
     if isinstance(data, FrequencyResponse):
         problem = Problem(
             data, _checked(model), noise=noise, sensors=sensors, free=free, fixed=fixed,
@@ -458,7 +465,8 @@ def posterior(
         uncertainty = "noise"
     density, optimum = _density(problem, fitted, priors, likelihood, uncertainty)
     if method == "grid":
-        points = sample_points(density, optimum, problem.names, tolerance)
+        begin = partial(centre_and_covariance, density, optimum, np.random.default_rng(0))
+        points = sample_points(density, begin, problem.names, tolerance)
         return Posterior(density, points, fitted, uncertainty)
     drawn = chain(density, partial(starting_points, density, optimum))
     result = Posterior(density, drawn, fitted, uncertainty)
@@ -467,17 +475,19 @@ def posterior(
 
 
 _CHAIN_ONLY = ("steps", "max_steps", "ess", "walkers", "ensembles", "resume", "pool")
-_TABLES_ONLY = ("method", "noise", "sensors", "steady", "likelihood", "uncertainty")
+_TABLES_ONLY = ("noise", "sensors", "steady", "likelihood", "uncertainty")
 _REFUSED = {
-    "a posterior of records": (*_TABLES_ONLY, "pool", "tolerance"),
+    "a fit of tables": ("output", "excitation"),
+    "a fit of records": ("noise", "drive_std", "drive_covariance", "steady"),
+    "a posterior of records": (*_TABLES_ONLY, "pool"),
     "method='mcmc'": ("tolerance",),
     "method='grid'": _CHAIN_ONLY,
 }
 
 
-def _refuse_options(kind: str, options: Mapping[str, Any]) -> None:
-    """Refuse options that a kind of posterior does not have, unless they are left as they are."""
-    defaults = signature(posterior).parameters
+def _refuse_options(of: Callable[..., Any], kind: str, options: Mapping[str, Any]) -> None:
+    """Refuse options that a kind of estimate does not have, unless they are left as they are."""
+    defaults = signature(of).parameters
     given = [name for name in _REFUSED[kind] if options[name] != defaults[name].default]
     if given:
         raise ValidationError(
@@ -496,6 +506,15 @@ def _refuse_with_a_fit(data: object, options: Mapping[str, Any]) -> None:
         raise ValidationError(
             f"{', '.join(given)} is given together with a {type(data).__name__}, which has its "
             "own; pass the data instead"
+        )
+    if data.first_order:
+        raise ValidationError(
+            "the fit had constraints, which a posterior does not take; pass the data instead"
+        )
+    if isinstance(data, RecordFit) and data.optimum.loss != "linear":
+        raise ValidationError(
+            "the fit of records had a robust loss, which a posterior does not take; pass the "
+            "records instead"
         )
 
 

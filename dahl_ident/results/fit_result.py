@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -22,41 +21,34 @@ from dahl_ident.diagnostics.bands import (
     predicted_backbone,
     response_band,
 )
-from dahl_ident.diagnostics.bootstrap import REPLICATES, bootstrap_intervals
 from dahl_ident.diagnostics.budget import Budget, ParameterBudget, budget
 from dahl_ident.diagnostics.checks import judgement
-from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
+from dahl_ident.diagnostics.confidence_levels import LEVELS
 from dahl_ident.diagnostics.cross_validation import CrossValidation, cross_validation
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.error_sources import NOISE
 from dahl_ident.diagnostics.goodness import Goodness, goodness
 from dahl_ident.diagnostics.intervals import (
-    METHODS,
     ConfidenceIntervals,
-    IntervalComparison,
     Method,
     combined_intervals,
-    compare,
-    profile_intervals,
-    wald_intervals,
 )
 from dahl_ident.diagnostics.judgement import Judgement
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
 from dahl_ident.elements import Model
-from dahl_ident.errors import FitError, ValidationError, choices
+from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.fitting.optimum import DeterminedCombination, Optimum, propagated
 from dahl_ident.problem import Problem
 from dahl_ident.results import fit_report, fit_storage
-from dahl_ident.results.result import Parameters, Result, part
+from dahl_ident.results.fit_base import Fit
+from dahl_ident.results.result import Parameters, part
 from dahl_ident.units import Quantity
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from dahl_ident.plots import Axes
 
 
-class FitResult(Result):
+class FitResult(Fit):
     """The result of a fit: estimates, their errors, and whether to trust them.
 
     Made by :func:`dahl_ident.fit`. Names follow lmfit's ``ModelResult`` where both have the same
@@ -71,27 +63,12 @@ class FitResult(Result):
     (True, 0.1)
     """
 
-    _called = "a fit"
-
-    def __init__(self, optimum: Optimum, *, first_order: bool = False) -> None:
-        self.optimum = optimum  #: The solver's plain result.
-        #: Whether errors are of first order alone: with constraints.
-        self.first_order = first_order
-        self._intervals: dict[tuple[Any, ...], ConfidenceIntervals] = {}
-
-    problem: Problem = part("optimum.problem", "Data, model, noise, sensors as they were fitted.")
+    problem: Problem = part("optimum.problem", "Data, model, noise, sensors as fitted.")
     data: FrequencyResponse = part("problem.data", "The data that were fitted.")
-    method: str = part("optimum.method", "The solver.")
     noise: str = part("problem.noise", "The noise model.")
-    success: bool = part("optimum.success", "Whether a finite optimum was found.")
-    message: str = part("optimum.message", "How the search ended, in words.")
     combinations: tuple[DeterminedCombination, ...] = part(
         "optimum.combinations", "What the data determine where single parameters run away."
     )
-    scale_known: bool = part("optimum.scale_known", "Whether the noise's scale was known before.")
-    ndata: int = part("problem.n_numbers", "Real numbers: two a row, one that of a mean force.")
-    nfree: int = part("optimum.dof", "Degrees of freedom.")
-    nfev: int = part("optimum.nfev", "Evaluations of the residuals.")
     log_likelihood: float = part(
         "optimum.log_likelihood",
         "Log-density of the data at the optimum, at the likeliest scale where unknown; with a "
@@ -143,11 +120,6 @@ class FitResult(Result):
             stderr |= {name: by_name[name] for name in stderr if errors.holds(name)}
         return stderr
 
-    @property
-    def var_names(self) -> list[str]:
-        """Names of the free parameters."""
-        return list(self.problem.names)
-
     @cached_property
     def covar(self) -> FloatArray:
         """Combined covariance of the free values, by every source of error, first order."""
@@ -160,52 +132,16 @@ class FitResult(Result):
         return np.asarray(whole[np.ix_(free, free)])
 
     @cached_property
-    def correl(self) -> Mapping[str, Mapping[str, float]]:
-        """Correlation of each pair of free parameters, by both names."""
-        std = np.sqrt(np.diagonal(self.covar))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            matrix = self.covar / np.outer(std, std)
-        names = self.var_names
-        return {
-            a: {b: float(matrix[i, j]) for j, b in enumerate(names) if j != i}
-            for i, a in enumerate(names)
-        }
-
-    @cached_property
     def _estimate(self) -> Optimum:
         """The estimate, as an optimum; the search's where nothing else is estimated."""
         errors = self.errors_of_combinations
         return self.optimum if errors is None else errors.at_estimate
 
-    @property
-    def residual(self) -> FloatArray:
-        """Whitened residuals at the estimate."""
-        return self._estimate.residuals
-
-    @property
-    def chisqr(self) -> float:
-        """Sum of squared residuals."""
-        return float(self.residual @ self.residual)
-
-    @property
-    def redchi(self) -> float:
-        """`chisqr` over `nfree`; the squared scale where that was estimated."""
-        return self.chisqr / self.nfree if self.nfree > 0 else math.nan
-
-    @property
-    def scale(self) -> float:
-        """Standard deviation of the residuals: 1 where known beforehand."""
-        return self._estimate.scale
-
-    @property
-    def nvarys(self) -> int:
-        """Number of free parameters."""
-        return len(self.problem.names)
-
     @cached_property
     def best_fit(self) -> ComplexArray:
         """Predicted response at the estimate, shape (n,)."""
-        return self._estimate.problem.predict(self._estimate.theta)
+        predicted: ComplexArray = self._estimate.problem.predict(self._estimate.theta)
+        return predicted
 
     @cached_property
     def model(self) -> Model:
@@ -220,105 +156,13 @@ class FitResult(Result):
 
     # Judging
 
-    def conf_interval(
-        self,
-        method: Method = "combined",
-        levels: Sequence[float] | float = LEVELS,
-        *,
-        replicates: int = REPLICATES,
-        seed: int = 0,
-    ) -> ConfidenceIntervals:
-        """Return confidence intervals of every free parameter.
-
-        Parameters
-        ----------
-        method : {"combined", "profile", "wald", "bootstrap"}, default "combined"
-            "combined" counts every source of the budget, the others noise alone; see
-            :mod:`dahl_ident.diagnostics.intervals`, which says what to use when.
-        levels : float or sequence of float, default 0.6827, 0.9545, 0.9973
-            Confidence levels.
-        replicates, seed : int
-            Of the bootstrap.
-
-        Returns
-        -------
-        ConfidenceIntervals
-            A mapping from the parameter's name to its intervals; a side on which the data set no
-            limit is open. Profiles never raise, however badly a parameter is determined. Where
-            the fit had constraints, "combined" gives Wald's, and says so.
-
-        Raises
-        ------
-        ValidationError
-            If `method` is unknown, a level is not between 0 and 1, or repetitions of a fit with
-            a robust loss, or profiles or repetitions of one with constraints, are wanted.
-        FitError
-            If there is no optimum to repeat.
-        """
-        if method not in METHODS:
-            raise ValidationError(
-                f"method is {method!r}; expected one of {choices(METHODS, method)}"
-            )
-        levels = tuple(checked_levels(levels).tolist())
-        key = (method, levels, replicates, seed)
-        if key not in self._intervals:
-            self._intervals[key] = self._new_intervals(method, levels, replicates, seed)
-        return self._intervals[key]
-
-    def intervals_run(self, level: float) -> list[ConfidenceIntervals]:
-        """Return the intervals at a level of every method that has been asked for until now."""
-        run = (one for one in self._intervals.values() if np.isclose(one.levels, level).any())
-        return list({one.method: one for one in run}.values())
-
-    def _new_intervals(
-        self, method: Method, levels: Sequence[float], replicates: int, seed: int
-    ) -> ConfidenceIntervals:
-        if self.first_order:
-            if method in ("profile", "bootstrap"):
-                raise ValidationError(
-                    f"method is {method!r}, but the fit had constraints, which profiles and "
-                    "repetitions do not keep; use method='wald', whose covariance is that on the "
-                    "constraints"
-                )
-            note = "first order, noise alone: the fit had constraints"
-            return wald_intervals(self.optimum, levels).noted(note)
-        if method == "combined":
-            errors = self.errors_of_combinations
-            if errors is None:
-                return replace(self.conf_interval("profile", levels), method="combined")
-            return combined_intervals(
-                self.optimum, errors, levels, lambda: self.conf_interval("profile", levels)
-            )
-        if method == "bootstrap":
-            return bootstrap_intervals(self.optimum, levels, replicates, seed)
-        quick = wald_intervals if method == "wald" else profile_intervals
-        return quick(self.optimum, levels)
-
-    def compare_intervals(
-        self,
-        methods: Sequence[Method] = ("wald", "bootstrap", "profile"),
-        levels: Sequence[float] | float = LEVELS,
-    ) -> IntervalComparison:
-        """Return the intervals of several methods side by side, and where they disagree.
-
-        Parameters
-        ----------
-        methods : sequence of str, default ("wald", "bootstrap", "profile")
-            The last is the most trusted; each of the others is compared with it.
-        levels : float or sequence of float, default 0.6827, 0.9545, 0.9973
-            Confidence levels.
-
-        Returns
-        -------
-        IntervalComparison
-            Printed, a table with the disagreements.
-
-        Raises
-        ------
-        ValidationError
-            If there are fewer than two methods, one is unknown, or a level is impossible.
-        """
-        return compare(self.optimum, [self.conf_interval(method, levels) for method in methods])
+    def _combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
+        errors = self.errors_of_combinations
+        if errors is None:
+            return replace(self.conf_interval("profile", levels), method="combined")
+        return combined_intervals(
+            self.optimum, errors, levels, lambda: self.conf_interval("profile", levels)
+        )
 
     @cached_property
     def identifiability(self) -> Identifiability:
@@ -369,14 +213,6 @@ class FitResult(Result):
             share; then the combined and the expanded uncertainty.
         """
         return self._budget
-
-    @cached_property
-    def stated_budget(self) -> Budget | None:
-        """The uncertainty budget; None where there is nothing to state."""
-        try:
-            return self._budget
-        except FitError:
-            return None
 
     # What follows from the estimate
 
@@ -500,35 +336,8 @@ class FitResult(Result):
         """
         return fit_report.fit_report(self, self._reported(method, level), details=details)
 
-    def _reported(self, method: Method, level: float) -> ConfidenceIntervals:
-        if level in LEVELS:
-            return self.conf_interval(method).only(level)
-        return self.conf_interval(method, (level,))
-
-    def __str__(self) -> str:
-        return self.fit_report()
-
     def _repr_html_(self) -> str:
         return fit_report.as_html(self, self._reported("combined", LEVELS[1]))
-
-    def summary(self) -> pd.DataFrame:
-        """Return a table, one row a parameter, with its combined 95.45 % interval.
-
-        Returns
-        -------
-        pandas.DataFrame
-            Columns ``value, stderr, lower, upper, unit, vary, description, init_value, min, max``.
-        """
-        import pandas as pd
-
-        limits = self.conf_interval().at(LEVELS[1])
-        rows = {}
-        for name, p in self.params.items():
-            known = {"lower": limits[name].lower, "upper": limits[name].upper} if p.vary else {}
-            rows[name] = {**asdict(p), **known}
-        table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("parameter")
-        columns = ["value", "stderr", "lower", "upper", "unit", "vary", "description"]
-        return table.reindex(columns=[*columns, "init_value", "min", "max"])
 
     def plot(self, kind: str | None = None, ax: Any = None) -> Any:
         """Draw the fit.

@@ -23,7 +23,7 @@ from dahl_ident.elements.law_files import describe_laws, require_laws
 from dahl_ident.errors import DataError
 from dahl_ident.fitting.optimum import ConstraintCost, DeterminedCombination, Optimum
 from dahl_ident.fitting.status import Status
-from dahl_ident.problem import Problem
+from dahl_ident.problem import BaseProblem, Problem
 from dahl_ident.sensors import EXACT, Sensors
 from dahl_ident.version import __version__
 
@@ -56,28 +56,7 @@ def to_dict(optimum: Optimum, first_order: bool) -> dict[str, Any]:
         "noise": problem.noise,
         "steady": problem.steady,
         "sensors": {name: _describe_channel(getattr(problem.sensors, name)) for name in _SENSORS},
-        "optimum": {
-            "names": list(problem.names),
-            "theta": optimum.theta,
-            "values": optimum.values,
-            "covariance": optimum.covariance,
-            "scale": optimum.scale,
-            "dof": optimum.dof,
-            "cost": optimum.cost,
-            "nfev": optimum.nfev,
-            "status": optimum.status.name,
-            "message": optimum.message,
-            "method": optimum.method,
-            "loss": optimum.loss,
-            "first_order": first_order,
-            "combinations": [
-                {"expression": c.expression, "value": c.value, "stderr": c.stderr}
-                for c in optimum.combinations
-            ],
-            "constraint_cost": None
-            if optimum.constraint_cost is None
-            else asdict(optimum.constraint_cost),
-        },
+        "optimum": describe_optimum(optimum) | {"first_order": first_order},
     }
     return sealed(plain_data(facts, not_finite=str))
 
@@ -184,7 +163,24 @@ def _optimum(content: Mapping[str, Any]) -> Optimum:
         sensors=EXACT if known.are_exact else known,
         steady=content.get("steady", "describing function"),
     )
-    stored = content["optimum"]
+    return optimum_from(problem, content["optimum"])
+
+
+def describe_optimum(optimum: Optimum) -> dict[str, Any]:
+    """Return an optimum as data, its problem left out."""
+    numbers = ("theta", "values", "covariance", "scale", "dof", "cost", "nfev")
+    cost = optimum.constraint_cost
+    return {
+        "names": list(optimum.names),
+        **{name: getattr(optimum, name) for name in (*numbers, "message", "method", "loss")},
+        "status": optimum.status.name,
+        "combinations": [asdict(c) for c in optimum.combinations],
+        "constraint_cost": None if cost is None else asdict(cost),
+    }
+
+
+def optimum_from(problem: BaseProblem, stored: Mapping[str, Any]) -> Optimum:
+    """Return the optimum of a problem that :func:`describe_optimum` described."""
     if list(problem.names) != stored["names"]:
         raise KeyError(f"the free parameters {stored['names']}, found {list(problem.names)}")
     return Optimum(

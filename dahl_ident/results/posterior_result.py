@@ -295,7 +295,7 @@ class Posterior(Result):
         return self.sample
 
     log_evidence: float = part(
-        "_points.integral.log_evidence",
+        "_points.log_evidence",
         "Logarithm of the data's density under model and prior; differences between models of the "
         "same data are logarithms of Bayes factors, in which the scale's prior 1/s cancels.",
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,23 +12,24 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from scipy import special
 
 from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.data import Record
 from dahl_ident.data.record import cut
-from dahl_ident.data.storage import read_text
+from dahl_ident.data.storage import plain_data, read_text
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget, coverage_factor
-from dahl_ident.diagnostics.checks import doubted
-from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, percent
+from dahl_ident.diagnostics.checks import contradicted, doubted
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, checked_levels, percent
 from dahl_ident.diagnostics.doubtful_elements import below_zero, is_single, slight
 from dahl_ident.diagnostics.formatting import interval, rounded, table
+from dahl_ident.diagnostics.intervals import ConfidenceIntervals, around
 from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
 from dahl_ident.diagnostics.record_errors import (
     MODEL,
     NOISE,
     RecordErrors,
+    errors_on_constraints,
     record_assumptions,
     record_budget,
     record_derived,
@@ -37,17 +38,26 @@ from dahl_ident.diagnostics.record_errors import (
 )
 from dahl_ident.diagnostics.record_goodness import RecordGoodness, record_goodness
 from dahl_ident.diagnostics.record_identifiability import undetermined
-from dahl_ident.elements import Element, Model
+from dahl_ident.elements import Model
 from dahl_ident.elements.description import describe_model, model_from_description
 from dahl_ident.elements.law_files import describe_laws, require_laws
 from dahl_ident.errors import DataError, FitError, FitInterrupted, ModelError, ValidationError
-from dahl_ident.fitting.record_search import RecordOptimum, hold_model, solve_records
+from dahl_ident.fitting.losses import loss_named
+from dahl_ident.fitting.optimum import Optimum
+from dahl_ident.fitting.record_search import Tell, hold_model, optimum_at, solve_records
 from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
-from dahl_ident.results.fit_storage import check_digest, check_schema, sealed
+from dahl_ident.results.fit_base import Fit
+from dahl_ident.results.fit_storage import (
+    check_digest,
+    check_schema,
+    describe_optimum,
+    optimum_from,
+    sealed,
+)
 from dahl_ident.results.hold_out import HeldOutPart, HoldOut
 from dahl_ident.results.progress import fit_progress
-from dahl_ident.results.result import Estimate, Parameters, Result
+from dahl_ident.results.result import Parameters
 from dahl_ident.units import shown_unit, si_unit
 from dahl_ident.version import __version__
 
@@ -55,7 +65,7 @@ if TYPE_CHECKING:
     from dahl_ident.plots import Axes
 
 SCHEMA = "dahl_ident.record_fit"
-_SCHEMA_VERSION = 1  # of the layout; later ones are refused
+_SCHEMA_VERSION = 2  # of the layout; the first is read as well, later ones are refused
 _CHANNELS = ("displacement", "velocity", "acceleration", "force", "drive")
 _WELL = 1e-3  # share of variance left at which structure in the residuals does not matter
 _FAIRLY = 0.1  # share of variance left beyond which the model does not describe the records
@@ -75,7 +85,7 @@ class RecordBand:
     stderr : ndarray, shape (n,)
         Standard uncertainty from the parameters.
     lower, upper : ndarray, shape (n,)
-        95 % band of what would be measured, the residuals' scatter included.
+        95.45 % band of what would be measured, the residuals' scatter included.
     measured : ndarray, shape (n,)
         What the record holds.
     """
@@ -98,7 +108,7 @@ class RecordBand:
         return self.rms_error / float(np.std(self.measured))
 
 
-class RecordFit(Result):
+class RecordFit(Fit):
     """Result of a fit to records; made by :func:`dahl_ident.fit`.
 
     Attributes
@@ -120,23 +130,14 @@ class RecordFit(Result):
     (True, 0.1)
     """
 
-    _called = "a fit"
-
-    def __init__(self, optimum: RecordOptimum) -> None:
-        self._optimum = optimum
-
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self).from_json, (self.to_json(),)  # the plant's functions cannot be copied
 
     @property
-    def optimum(self) -> RecordOptimum:
-        """The search's plain result."""
-        return self._optimum
-
-    @property
     def problem(self) -> RecordProblem:
         """Records and model as they were fitted."""
-        return self._optimum.problem
+        problem: RecordProblem = self.optimum.problem
+        return problem
 
     @property
     def records(self) -> tuple[Record, ...]:
@@ -144,34 +145,19 @@ class RecordFit(Result):
         return self.problem.records
 
     @property
-    def var_names(self) -> list[str]:
-        """Names of the free parameters; they order `covar`."""
-        return list(self.problem.names)
-
-    @property
-    def nfev(self) -> int:
-        """Evaluations of the search."""
-        return self._optimum.evaluations
-
-    @property
     def success(self) -> bool:
-        """Whether the search converged."""
-        return self._optimum.converged
-
-    @property
-    def message(self) -> str:
-        """How the search ended, in words."""
-        return "Converged." if self.success else "Not converged: the numbers are not an optimum."
+        """Whether the search converged, also where the records leave a parameter undetermined."""
+        return self.optimum.converged
 
     @cached_property
     def model(self) -> Model:
         """The model with the estimates put in, fixed."""
-        found = dict(zip(self.var_names, self._optimum.values.tolist(), strict=True))
+        found = dict(zip(self.var_names, self.optimum.values.tolist(), strict=True))
         return self.problem.model.with_fixed({p.name: found[p.name] for p in self.problem.free})
 
     @cached_property
     def _evaluated(self) -> tuple[list[FloatArray], list[FloatArray]]:
-        found = [self.problem.predict(self._optimum.values, i) for i in range(len(self.records))]
+        found = [self.problem.predict(self.optimum.values, i) for i in range(len(self.records))]
         residuals = [y - p.output for y, p in zip(self.problem.measured, found, strict=True)]
         return [p.by for p in found], residuals
 
@@ -183,7 +169,16 @@ class RecordFit(Result):
     @cached_property
     def errors(self) -> RecordErrors:
         """The estimate's uncertainty, source by source."""
-        return record_errors(self.problem, self._optimum.values, *self._evaluated)
+        jacobians, residuals = self._evaluated
+        loss = loss_named(self.optimum.loss, self.problem.parts)
+        if loss is not None:  # to first order, least squares of these residuals
+            units = [size * self.optimum.scale for size in self.problem.sizes]
+            z = [(e / unit) ** 2 for e, unit in zip(residuals, units, strict=True)]
+            mean = loss.mean_slope(np.concatenate(z))
+            residuals = [e * loss.slope(each) / mean for e, each in zip(residuals, z, strict=True)]
+        if self.first_order:
+            return errors_on_constraints(self.optimum, jacobians, residuals)
+        return record_errors(self.problem, self.optimum.values, jacobians, residuals)
 
     @property
     def covar(self) -> FloatArray:
@@ -202,7 +197,7 @@ class RecordFit(Result):
 
     def budget(self) -> Budget:
         """Return the uncertainty budget: each parameter's sources, combined and expanded."""
-        found = record_budget(self.problem, self._optimum.values, self.errors)
+        found = record_budget(self.problem, self.optimum.values, self.errors)
         own = tuple(replace(p, unit=self._shown(p.unit)) for p in found.parameters)
         return replace(found, parameters=own)
 
@@ -219,20 +214,9 @@ class RecordFit(Result):
     @cached_property
     def params(self) -> Parameters:
         """Every parameter by name."""
-        stderr = dict(zip(self.var_names, np.sqrt(np.diagonal(self.covar)), strict=True))
-        found = dict(zip(self.var_names, self._optimum.values.tolist(), strict=True))
-        fixed = [p for p in self.problem.model.parameters if not p.free]
-        return Parameters(
-            {
-                p.name: Estimate(
-                    p.name, self._shown(p.unit), p.description,
-                    float(found.get(p.name, p.value or 0.0)),
-                    float(stderr[p.name]) if p.name in stderr else None,
-                    p.value, p.lower, p.upper, p.name in stderr,
-                )
-                for p in (*self.problem.free, *fixed, *self.problem.parameters)
-            }
-        )  # fmt: skip
+        stderr = dict(zip(self.var_names, np.sqrt(np.diagonal(self.covar)).tolist(), strict=True))
+        values = dict(zip(self.var_names, self.optimum.values.tolist(), strict=True))
+        return Parameters.of(self.problem, values, stderr)
 
     @cached_property
     def goodness(self) -> RecordGoodness:
@@ -251,8 +235,24 @@ class RecordFit(Result):
     def judgement(self) -> Judgement:
         """Every finding about the fit, and the status that follows from them."""
         return Judgement(
-            (*self._described, *self._undetermined, *self._doubts, *self._slight, *self._notes)
+            (
+                *self._constraints,
+                *self._described,
+                *self._undetermined,
+                *self._doubts,
+                *self._slight,
+                *self._notes,
+            )
         )
+
+    @property
+    def _constraints(self) -> Iterator[Finding]:
+        """Yield the constraints that the records contradict; correlated samples count as few."""
+        cost = self.optimum.constraint_cost
+        if cost is not None:
+            share = self.effective_samples / self.problem.n_samples
+            cost = replace(cost, rise=cost.rise * share, dof=cost.dof * share)
+        yield from contradicted(cost)
 
     @property
     def _described(self) -> Iterator[Finding]:
@@ -285,7 +285,7 @@ class RecordFit(Result):
     def _doubts(self) -> Iterator[Finding]:
         """Yield what speaks against the estimates physically, or against an assumption."""
         question, doubtful = Question.DESCRIBED, VerdictStatus.APPROXIMATE
-        values = dict(zip(self.var_names, self._optimum.values.tolist(), strict=True))
+        values = dict(zip(self.var_names, self.optimum.values.tolist(), strict=True))
         stderr = {p.name: self.params[p.name].stderr or 0.0 for p in self.problem.free}
         single = [e for e in self.problem.model.elements if is_single(e) and e.parameters[0].free]
         yield from below_zero([e.parameters[0] for e in single], values, stderr)
@@ -340,7 +340,7 @@ class RecordFit(Result):
             }
             yield Finding(question, note, "displacement_noise", noise)
         yield from doubted(*(record.provenance for record in self.records))
-        samples = {"effective": self.effective_samples, "samples": self.problem.n_residuals}
+        samples = {"effective": self.effective_samples, "samples": self.problem.n_samples}
         yield Finding(question, note, "effective_samples", samples)
         yield record_assumptions(self.problem, self.errors)
 
@@ -352,33 +352,29 @@ class RecordFit(Result):
 
     @cached_property
     def coverage_factor(self) -> float:
-        """Half-width of a 95 % interval in standard errors: Student's t, effective samples."""
-        return float(special.stdtrit(self.errors.dof, 0.975))
+        """Half-width of a 95.45 % interval in standard errors: Student's t, effective samples."""
+        return coverage_factor(self.errors.dof)
 
-    def conf_interval(self) -> Mapping[str, tuple[float, float]]:
-        """Return the 95.45 % interval of every free parameter: value -+ k u, as in the budget."""
-        found = {}
-        for place, name in enumerate(self.var_names):
-            p = self.params[name]
-            half = coverage_factor(self.errors.dof_for(place)) * (p.stderr or 0.0)
-            found[name] = (p.value - half, p.value + half)
-        return MappingProxyType(found)
+    @cached_property
+    def _by_noise(self) -> Optimum:
+        slopes = self.problem.value_slopes(self.optimum.theta)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            covariance = self.errors.contributions[NOISE] / np.outer(slopes, slopes)
+        return replace(
+            self.optimum,
+            covariance=np.where(np.isnan(covariance), np.inf, covariance),
+            dof=int(self.errors.dof_of(NOISE)),
+        )
 
-    def summary(self) -> Any:
-        """Return a pandas table: one row a parameter."""
-        import pandas as pd
-
-        within = self.conf_interval()
-        rows = []
-        for p in self.params.values():
-            lower, upper = within.get(p.name, (None, None))
-            rows.append(
-                {
-                    "name": p.name, "value": p.value, "stderr": p.stderr, "unit": p.unit,
-                    "lower": lower, "upper": upper, "free": p.vary,
-                }
-            )  # fmt: skip
-        return pd.DataFrame(rows).set_index("name")
+    def _combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
+        array, values = checked_levels(levels), self.optimum.values
+        dof = [self.errors.dof_for(place) for place in range(values.size)]
+        k = np.array([[coverage_factor(nu, level) for nu in dof] for level in array.tolist()])
+        u = np.sqrt(np.diagonal(self.covar))
+        lower, upper = around(self.problem.space, values, u, k)
+        note = f"every source of the budget, {self.effective_samples:.3g} effective samples"
+        names, units = self.problem.names, tuple(p.unit for p in self.problem.parameters)
+        return ConfidenceIntervals("combined", array, names, units, values, lower, upper, note)
 
     def fit_report(self, *, details: bool = True) -> str:
         """Return the report as text, the verdict first.
@@ -394,13 +390,13 @@ class RecordFit(Result):
         """
         own = {p.name for p in self.problem.model.parameters}
         assumed = {one.name for one in self.errors.exponents}
-        limits = self.conf_interval()
+        limits = self.conf_interval().at(CONFIDENCE)
         rows = [["", "value", "stderr", "unit", f"{percent(CONFIDENCE)}", ""]]
         for name, p in self.params.items():
             if not details and name not in own:
                 continue
             if p.vary:
-                within = interval(*limits[name], "")
+                within = interval(*limits[name][1:], "")
                 rows.append([name, *rounded(p.value, p.stderr), p.unit, within, ""])
             else:
                 word = "assumed" if name in assumed else "fixed"
@@ -413,9 +409,6 @@ class RecordFit(Result):
         return "\n".join(
             f"{title}\n" + "\n".join(f"    {line}" for line in lines) for title, lines in parts
         )
-
-    def __str__(self) -> str:
-        return self.fit_report()
 
     def __repr__(self) -> str:
         estimates = ", ".join(str(self.params[p.name]) for p in self.problem.free)
@@ -455,7 +448,7 @@ class RecordFit(Result):
                 "fit.model.dynamic_stiffness(amplitude, frequency_hz)"
             )
         count = len(self.problem.free)
-        problem, full = self.started(record, self._optimum.values[:count], initial)
+        problem, full = self.started(record, self.optimum.values[:count], initial)
         found = problem.predict(full, 0)
         by = found.by[:, :count]
         variance = variances(by, self.covar[:count, :count])
@@ -496,10 +489,8 @@ class RecordFit(Result):
         found = []
         for k, (number, piece) in enumerate(pieces):
             rest = [other for i, (_, other) in enumerate(pieces) if i != k]
-            fit = fit_records(
-                rest, own.model, start=start, throw=False, output=own.output,
-                excitation=own.excitation,
-            )  # fmt: skip
+            problem = RecordProblem(rest, own.model, output=own.output, excitation=own.excitation)
+            fit = RecordFit(solve_records(problem, loss=self.optimum.loss, start=start))
             band = fit.predict(piece)
             inside = np.mean((band.measured >= band.lower) & (band.measured <= band.upper))
             first, last = float(piece.time[0]), float(piece.time[-1])
@@ -542,7 +533,7 @@ class RecordFit(Result):
         self, amplitudes: Sequence[float] = (), frequency_hz: float | None = None
     ) -> tuple[DerivedQuantity, ...]:
         """Return x_c, energy per cycle, equivalent stiffness and damping, with their errors."""
-        values = self._optimum.values
+        values = self.optimum.values
         found = record_derived(self.problem, values, self.covar, amplitudes, frequency_hz)
         return tuple(replace(quantity, unit=self._shown(quantity.unit)) for quantity in found)
 
@@ -598,11 +589,8 @@ class RecordFit(Result):
                     "calibration": problem.calibration,
                     "whitening": problem.whitening.tolist(),
                     "displacement_noise": problem.displacement_noise,
-                    "names": self.var_names,
-                    "values": self._optimum.values.tolist(),
-                    "cost": self._optimum.cost,
-                    "converged": self._optimum.converged,
-                    "evaluations": self._optimum.evaluations,
+                    "optimum": plain_data(describe_optimum(self.optimum), not_finite=str),
+                    "first_order": self.first_order,
                 }
             )
         )
@@ -631,10 +619,12 @@ class RecordFit(Result):
             problem.runs = tuple(held.get("runs", problem.runs))
             problem = problem.weighted(np.asarray(held["whitening"], dtype=np.float64))
             problem = problem.without_noise(held.get("displacement_noise", 0.0))
-            values = np.asarray(held["values"], dtype=np.float64)
-            return cls(
-                RecordOptimum(problem, values, held["cost"], held["converged"], held["evaluations"])
-            )
+            if "optimum" in held:
+                optimum = optimum_from(problem, held["optimum"])
+                return cls(optimum, first_order=held["first_order"])
+            theta = problem.to_search(held["values"])
+            converged, evaluations = held["converged"], held["evaluations"]
+            return cls(optimum_at(problem, theta, converged=converged, evaluations=evaluations))
         except ModelError:
             raise
         except (KeyError, TypeError, ValueError) as exc:
@@ -646,48 +636,26 @@ class RecordFit(Result):
         return cls.from_json(read_text(path))
 
 
-def fit_records(
-    records: Sequence[Record],
-    model: Element,
+def solved(
+    solve: Callable[[Tell | None], Optimum],
     *,
-    throw: bool = True,
-    progress: bool = False,
-    **how: Any,
+    first_order: bool,
+    throw: bool,
+    progress: bool,
 ) -> RecordFit:
-    """Return the fit of a model to records of any motion; see :func:`dahl_ident.fit`.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        Each a run of one device.
-    model : Element
-        One element or a sum.
-    throw : bool, default True
-        Raise where the search does not converge.
-    progress : bool, default False
-        Show on the terminal how it goes, once it has taken two seconds.
-    **how
-        `start`; and `output`, `excitation` and `calibration` of
-        :class:`dahl_ident.problem.record_problem.RecordProblem`.
-
-    Returns
-    -------
-    RecordFit
-    """
-    start = how.pop("start", None)
-    problem = RecordProblem(records, model, **how)
+    """Return the fit of records by a search that tells how it goes; see :func:`dahl_ident.fit`."""
     try:
         with fit_progress() if progress else nullcontext() as tell:
-            optimum = solve_records(problem, start=start, tell=tell)
+            fit = RecordFit(solve(tell), first_order=first_order)
     except FitInterrupted as stop:
         raise FitInterrupted(
             f"{stop}; this exception's `result` holds the best values so far",
             RecordFit(stop.result),
         ) from stop
-    if throw and not optimum.converged:
+    if throw and not fit.success:
         raise FitError(
             "not converged: the search stopped before it found a minimum; give start=, or fix a "
             "parameter",
-            RecordFit(optimum),
+            fit,
         )
-    return RecordFit(optimum)
+    return fit

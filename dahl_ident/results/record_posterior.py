@@ -18,7 +18,7 @@ from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.record_errors import record_assumptions, record_derived
 from dahl_ident.results.posterior_result import Posterior, doubts_of
 from dahl_ident.results.record_fit import RecordBand, RecordFit
-from dahl_ident.results.result import Estimate, Parameters
+from dahl_ident.results.result import Parameters
 
 
 class RecordPosterior(Posterior):
@@ -56,17 +56,8 @@ class RecordPosterior(Posterior):
         """Every parameter of the model, posterior mean and standard deviation."""
         mean = dict(zip(self.names, self.mean().tolist(), strict=True))
         std = dict(zip(self.names, self.std().tolist(), strict=True))
-        fitted = self.fit.params
-        return Parameters(
-            {
-                p.name: Estimate(
-                    p.name, fitted[p.name].unit, p.description,
-                    float(mean.get(p.name, p.value or 0.0)),
-                    std.get(p.name), p.value, p.lower, p.upper, p.name in std,
-                )
-                for p in self.fit.problem.model.parameters
-            }
-        )  # fmt: skip
+        every = Parameters.of(self.fit.problem, mean, std)
+        return Parameters({p.name: every[p.name] for p in self.fit.problem.model.parameters})
 
     @property
     def _provenances(self) -> tuple[Mapping[str, Any] | None, ...]:

@@ -18,7 +18,7 @@ from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.formatting import rounded, with_unit
 from dahl_ident.diagnostics.judgement import Finding, Judgement, VerdictStatus
 from dahl_ident.diagnostics.markup import html_table, pair, symbol, tabular, unit
-from dahl_ident.problem import Problem
+from dahl_ident.problem import BaseProblem
 from dahl_ident.units import Quantity, shown_unit
 
 if TYPE_CHECKING:
@@ -81,16 +81,15 @@ class Parameters(Mapping[str, Estimate]):
 
     @classmethod
     def of(
-        cls, problem: Problem, values: Mapping[str, float], stderr: Mapping[str, float]
+        cls, problem: BaseProblem, values: Mapping[str, float], stderr: Mapping[str, float]
     ) -> Parameters:
-        """Return all parameters of model and sensors, with the values that were estimated."""
-        sensors = () if problem.sensors.are_exact else problem.sensors.parameters
+        """Return every parameter of a problem, with the values that were estimated."""
         estimates = {}
-        for p in (*problem.model.parameters, *sensors):
+        for p in problem.every_parameter:
             value = values.get(p.name, p.value)
             estimates[p.name] = Estimate(
                 name=p.name,
-                unit=shown_unit(p.unit, problem.data.motion),
+                unit=shown_unit(p.unit, problem.motion),
                 description=p.description,
                 value=math.nan if value is None else value,
                 stderr=stderr.get(p.name),

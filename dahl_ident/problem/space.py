@@ -1,12 +1,10 @@
-"""Which parameters are free, and the coordinates in which they are searched for.
-
-The logarithm of positive parameters, the number itself for the others.
-"""
+"""Which parameters are free, and the coordinates in which they are searched for."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,14 +14,56 @@ from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.sensors import Sensors
 
+_INSIDE = 1.0 - 1e-9  # of the way to a bound: on it, a search would see no slope and stay
 
-class Coordinates:
-    """The free parameters of a problem and their search coordinates theta, (P,) or (S, P)."""
 
-    def __init__(self, parameters: Sequence[Parameter]) -> None:
+class Space:
+    """The free parameters of a problem and their search coordinates theta, (P,) or (S, P).
+
+    Coordinates are the logarithms of positive parameters and the values of the others. On request
+    a parameter of either sign is searched by the inverse hyperbolic sine of its value over a size,
+    and one between two finite bounds by an angle, so that no step leaves the bounds.
+
+    Parameters
+    ----------
+    parameters : sequence of Parameter
+        The P free ones.
+    bends : ndarray, shape (P,), optional
+        The sizes; 0 for parameters that are searched otherwise.
+    inside : bool, default False
+        Whether parameters between two finite bounds are searched by angles.
+
+    Attributes
+    ----------
+    positive : ndarray of bool, shape (P,)
+        Which coordinates are logarithms.
+    angular : ndarray of bool, shape (P,)
+        Which coordinates are angles.
+    relative : ndarray of bool, shape (P,)
+        Which coordinates change by relative changes of the values, logarithms included.
+    """
+
+    def __init__(
+        self,
+        parameters: Sequence[Parameter],
+        bends: FloatArray | None = None,
+        *,
+        inside: bool = False,
+    ) -> None:
         self.parameters = tuple(parameters)
         self.names = tuple(p.name for p in self.parameters)
-        self.positive = np.array([p.transform == "log" for p in self.parameters])
+        self._lower = np.array([p.lower for p in self.parameters])
+        self._upper = np.array([p.upper for p in self.parameters])
+        self.angular = between = inside & np.isfinite(self._lower) & np.isfinite(self._upper)
+        self._angles = np.flatnonzero(between)
+        low, high = self._lower[between], self._upper[between]
+        self._middle, self._reach = 0.5 * (low + high), 0.5 * (high - low)
+        bends = np.zeros(len(self.parameters)) if bends is None else bends
+        self._bent = np.flatnonzero(bends > 0.0)
+        self._size = bends[self._bent]
+        self._curved = bool(self._angles.size or self._bent.size)
+        self.positive = ~between & np.array([p.transform == "log" for p in self.parameters])
+        self.relative = self.positive | (bends > 0.0)
         self._all_positive = bool(self.positive.all())
 
     def checked(self, theta: ArrayLike, name: str = "theta") -> FloatArray:
@@ -42,35 +82,60 @@ class Coordinates:
         array = self.checked(values, "values")
         for index in np.flatnonzero(self.positive):
             positive_array(array[..., index], self.names[index])
-        return np.where(self.positive, np.log(np.where(self.positive, array, 1.0)), array)
+        theta = np.where(self.positive, np.log(np.where(self.positive, array, 1.0)), array)
+        if self._curved:
+            part = (array[..., self._angles] - self._middle) / self._reach
+            theta[..., self._angles] = np.arcsin(np.clip(part, -_INSIDE, _INSIDE))
+            theta[..., self._bent] = np.arcsinh(array[..., self._bent] / self._size)
+        return theta
 
     def to_values(self, theta: FloatArray) -> FloatArray:
         """Return the parameter values, unchecked."""
         with np.errstate(over="ignore", under="ignore"):
             if self._all_positive:
                 return np.exp(theta)
-            return np.where(self.positive, np.exp(np.where(self.positive, theta, 0.0)), theta)
+            values = np.where(self.positive, np.exp(np.where(self.positive, theta, 0.0)), theta)
+            if self._curved:
+                values[..., self._angles] = self._middle + self._reach * np.sin(
+                    theta[..., self._angles]
+                )
+                values[..., self._bent] = self._size * np.sinh(theta[..., self._bent])
+        return values
+
+    def value(self, index: int, coordinate: Any, math: Any) -> Any:
+        """Return one value from its coordinate, with the functions of another library."""
+        if self.positive[index]:
+            return math.exp(coordinate)
+        if self.angular[index]:
+            place = self._angles.tolist().index(index)
+            return self._middle[place] + self._reach[place] * math.sin(coordinate)
+        if self.relative[index]:
+            return self._size[self._bent.tolist().index(index)] * math.sinh(coordinate)
+        return coordinate
 
     def slopes(self, values: FloatArray) -> FloatArray:
-        """Return d value / d theta: the value itself for positive parameters, 1 for others."""
-        return np.where(self.positive, values, 1.0)
+        """Return d value / d theta at parameter values."""
+        slopes = np.where(self.positive, values, 1.0)
+        if self._curved:
+            aside = values[..., self._angles] - self._middle
+            slopes[..., self._angles] = np.sqrt(np.maximum(self._reach**2 - aside**2, 0.0))
+            slopes[..., self._bent] = np.hypot(values[..., self._bent], self._size)
+        return slopes
 
     @cached_property
     def is_bounded(self) -> bool:
         """Whether any parameter has a finite bound in search coordinates."""
-        return any(
-            p.upper < np.inf or p.lower > (0.0 if p.transform == "log" else -np.inf)
-            for p in self.parameters
-        )
+        return bool(np.isfinite(self.bounds).any())
 
     @cached_property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """The parameters' lower and upper bounds in search coordinates."""
-        lower = np.array([p.lower for p in self.parameters])
-        upper = np.array([p.upper for p in self.parameters])
         with np.errstate(divide="ignore"):
-            low = np.log(np.maximum(lower, 0.0), out=lower.copy(), where=self.positive)
-            high = np.log(upper, out=upper.copy(), where=self.positive)
+            low = np.log(np.maximum(self._lower, 0.0), out=self._lower.copy(), where=self.positive)
+            high = np.log(self._upper, out=self._upper.copy(), where=self.positive)
+        low[self._angles], high[self._angles] = -0.5 * np.pi, 0.5 * np.pi
+        low[self._bent] = np.arcsinh(low[self._bent] / self._size)
+        high[self._bent] = np.arcsinh(high[self._bent] / self._size)
         return low, high
 
 
@@ -101,13 +166,13 @@ class Interchangeable:
             if parts and all(p.free for part in parts for p in part):
                 self._parts.append(np.array([[names.index(p.name) for p in q] for q in parts]))
 
-    def in_order(self, theta: FloatArray, coordinates: Coordinates) -> FloatArray:
+    def in_order(self, theta: FloatArray, space: Space) -> FloatArray:
         """Return `theta` with the columns of like elements exchanged until the knees rise."""
         array = theta.copy() if self._sets or self._parts else theta
         for columns in self._parts:
             _exchange(array, columns, array[..., columns[:, 0]])
         for elements, columns in zip(self._sets, self._columns, strict=True):
-            values = coordinates.to_values(array)
+            values = space.to_values(array)
             knees = []
             for element, own in zip(elements, columns, strict=True):
                 free = iter(values[..., column] for column in own)

@@ -1,0 +1,210 @@
+"""What every search, sampler and judge sees of a problem, of tables and of records alike."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements import Model, Parameter
+from dahl_ident.noise import Rho
+from dahl_ident.problem.space import Space
+from dahl_ident.sensors import EXACT, Prior, Sensors
+from dahl_ident.units import Motion
+
+EXPLICIT = 1e-13
+"""Relative error of predictions in closed form or by roots."""
+
+
+class Quadratic(NamedTuple):
+    """Half the sum of squares (or of losses), its gradient, and its Gauss-Newton Hessian."""
+
+    cost: FloatArray
+    gradient: FloatArray
+    hessian: FloatArray
+
+
+class BaseProblem(ABC):
+    """Residuals as functions of search coordinates, and what is known of their noise.
+
+    Attributes
+    ----------
+    model : Model
+        Free and fixed parameters put in.
+    sensors : Sensors
+        Gains and delay, where they are parameters.
+    space : Space
+        The search coordinates.
+    motion : {"translation", "rotation"}
+        Of the data.
+    parts : int
+        Residuals of each row, which count in a robust loss as one.
+    priors : mapping of str to Prior
+        The priors of sensor parameters that are free.
+    ranges : mapping of str to (float, float)
+        Mean and standard deviation of the search coordinates of assumed parameters.
+    scale_known : bool
+        Whether the residuals have unit variance as they are.
+    gaussian : bool
+        Whether residuals are Gaussian; not where a covariance has few degrees of freedom.
+    settled : bool
+        Whether the data are settled sines, in tables; else records of any motion.
+    n_residuals : int
+        Residuals of the data; those of priors come on top.
+    n_numbers : int
+        Residuals that can differ from zero.
+    """
+
+    model: Model
+    space: Space
+    motion: Motion
+    n_residuals: int
+    n_numbers: int
+    sensors: Sensors = EXACT
+    parts: int = 2
+    priors: Mapping[str, Prior] = {}
+    ranges: Mapping[str, tuple[float, float]] = {}
+    scale_known: bool = False
+    gaussian: bool = True
+    settled: bool = True
+
+    @property
+    def n_reported(self) -> int:
+        """How many parameters, the first ones, are those of the device."""
+        return len(self.names)
+
+    @property
+    def n_priors(self) -> int:
+        """The number of priors, those of assumed parameters included."""
+        return len(self.priors) + len(self.ranges)
+
+    # Tables
+
+    @property
+    def n_tables(self) -> int:
+        """The number of tables: one."""
+        return 1
+
+    def take(self, tables: NDArray[np.intp] | slice) -> Self:
+        """Return this problem: one table stands for as many as are asked for."""
+        return self
+
+    def table(self, index: int) -> Any:
+        """Return this problem."""
+        return self
+
+    # Coordinates
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The free parameters, the model's first."""
+        return self.space.parameters
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the free parameters."""
+        return self.space.names
+
+    @property
+    def every_parameter(self) -> tuple[Parameter, ...]:
+        """The parameters of model and sensors, fixed ones included."""
+        sensors = () if self.sensors.are_exact else self.sensors.parameters
+        return (*self.model.parameters, *sensors)
+
+    def to_search(self, values: ArrayLike) -> FloatArray:
+        """Return the search coordinates of parameter values, in the order of `names`.
+
+        Parameters
+        ----------
+        values : array_like, shape (P,) or (S, P)
+            In SI units.
+
+        Returns
+        -------
+        ndarray of the same shape
+            Logarithms of positive parameters, the values of most others; see ``Space``.
+
+        Raises
+        ------
+        ValidationError
+            If the shape is wrong or a positive parameter is not above zero.
+        """
+        return self.space.to_search(values)
+
+    def to_values(self, theta: ArrayLike) -> FloatArray:
+        """Return the parameter values at search coordinates, shape (P,) or (S, P)."""
+        return self.space.to_values(self.space.checked(theta))
+
+    def value_slopes(self, theta: ArrayLike) -> FloatArray:
+        """Return d value / d theta: the value itself for positive parameters, 1 for most others."""
+        return self.space.slopes(self.to_values(theta))
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Return the parameters' lower and upper bounds in search coordinates."""
+        return self.space.bounds
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether any parameter has a finite bound in search coordinates."""
+        return self.space.is_bounded
+
+    def near(self, theta: FloatArray) -> BaseProblem:
+        """Return a problem that predicts as this one does near theta, where one is faster."""
+        return self
+
+    def in_order(self, theta: ArrayLike) -> FloatArray:
+        """Return theta with interchangeable elements in order, where there are some."""
+        return self.space.checked(theta)
+
+    # Residuals
+
+    @property
+    @abstractmethod
+    def rounding(self) -> FloatArray:
+        """Size of residuals that may be rounding errors alone; no estimated scale is smaller."""
+
+    @property
+    def accuracy(self) -> float:
+        """Relative error of predictions."""
+        return EXPLICIT
+
+    @abstractmethod
+    def quadratic(
+        self,
+        theta: FloatArray,
+        scale: ArrayLike = 1.0,
+        rho: Rho | None = None,
+        chart: FloatArray | None = None,
+    ) -> Quadratic:
+        """Return half the sum of squares with its gradient and Hessian, unchecked.
+
+        Derivatives are with respect to theta, or with `chart` = dtheta/dphi, (P, Q) or (S, P, Q),
+        with respect to phi.
+
+        Cost of shape () or (S,), infinite where there is no prediction. Where rows count as
+        rho(z), the gradient is exact and the Hessian is that of rho at a linear model,
+        rho' d' d + 2 rho'' (y' d)(y' d)', as far as that is positive.
+        """
+
+    @abstractmethod
+    def residuals_and_jacobian(
+        self, theta: ArrayLike, scale: ArrayLike = 1.0, *, tails: bool = True
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return residuals and Jacobian, for the price of the Jacobian.
+
+        Without `tails`, a covariance of few degrees of freedom counts as if it were known.
+        """
+
+    @abstractmethod
+    def squares(self, theta: FloatArray, *, tails: bool = True) -> FloatArray:
+        """Return the sum of squared residuals of every row, (..., n), without priors, unchecked."""
+
+    def information(
+        self, theta: ArrayLike, scale: ArrayLike = 1.0, chart: FloatArray | None = None
+    ) -> FloatArray:
+        """Return the Fisher information of theta, shape (P, P) or (S, P, P), priors included."""
+        return self.quadratic(self.space.checked(theta), scale, chart=chart).hessian

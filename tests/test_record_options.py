@@ -1,0 +1,124 @@
+"""Options of a fit that tables and records share, on records."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+import dahl_ident as di
+from dahl_ident.errors import ValidationError
+
+RNG = np.random.default_rng(0)
+X = 1e-3 * np.cumsum(RNG.standard_normal(2000))
+TRUE = di.Dahl(0.1, 30.0).force(X)
+NOISE = 1e-3 * RNG.standard_normal(2000)
+MODEL = di.Dahl(alpha=1.0)
+
+
+def record(force: np.ndarray) -> di.Record:
+    return di.Record(np.arange(2000) / 100.0, displacement=X, force=force)
+
+
+@pytest.fixture(scope="module")
+def fit() -> di.RecordFit:
+    return di.fit(record(TRUE + NOISE), MODEL)
+
+
+@pytest.mark.parametrize("method", ["scipy", "ipopt"])
+def test_every_method_finds_the_same_optimum(method: str, fit: di.RecordFit) -> None:
+    other = di.fit(record(TRUE + NOISE), MODEL, method=method)
+    assert other.method == method
+    np.testing.assert_allclose(other.optimum.values[:2], fit.optimum.values[:2], rtol=1e-5)
+
+
+@pytest.mark.parametrize("loss", ["huber", "soft_l1", "student_t"])
+@pytest.mark.parametrize("method", ["lm", "scipy"])
+def test_robust_losses_ignore_outliers(loss: str, method: str, fit: di.RecordFit) -> None:
+    hit = TRUE + NOISE
+    hit[::50] += 0.2
+    robust = di.fit(record(hit), MODEL, loss=loss, method=method)
+    plain = di.fit(record(hit), MODEL)
+    u = fit.stderr_noise["f_max"]
+    assert abs(robust.params["f_max"].value - 0.1) < 3.0 * u
+    assert abs(plain.params["f_max"].value - 0.1) > 5.0 * u
+    assert 0.8 * u < robust.stderr_noise["f_max"] < 1.5 * u
+    again = di.RecordFit.from_json(robust.to_json())
+    assert again.stderr_noise["f_max"] == pytest.approx(robust.stderr_noise["f_max"])
+
+
+@pytest.mark.parametrize("method", ["profile", "bootstrap"])
+def test_intervals_by_noise_agree_where_the_problem_is_linear(
+    method: Literal["profile", "bootstrap"], fit: di.RecordFit
+) -> None:
+    comparison = fit.compare_intervals(("wald", method), levels=0.9545)
+    for ours, theirs in zip(
+        *(one.at(0.9545).items() for one in comparison.intervals), strict=False
+    ):
+        half = 0.5 * (ours[1].upper - ours[1].lower)
+        assert ours[0] == theirs[0]
+        assert abs(ours[1].lower - theirs[1].lower) < 0.35 * half
+        assert abs(ours[1].upper - theirs[1].upper) < 0.35 * half
+
+
+def test_profile_counts_correlated_noise() -> None:
+    slow = np.convolve(RNG.standard_normal(2100), np.ones(30), "valid")[:2000] * 3e-4
+    fit = di.fit(record(TRUE + slow), MODEL)
+    (wald,) = (fit.conf_interval("wald", 0.9545)[name][0] for name in ("f_max",))
+    (profile,) = (fit.conf_interval("profile", 0.9545)[name][0] for name in ("f_max",))
+    white = 4.0 * fit.optimum.stderr["f_max"]
+    assert profile.upper - profile.lower == pytest.approx(wald.upper - wald.lower, rel=0.1)
+    assert profile.upper - profile.lower > 1.5 * white
+
+
+def test_a_posterior_by_points_has_the_covariance_of_the_fit() -> None:
+    part = slice(300)
+    short = di.Record(np.arange(300) / 100.0, displacement=X[part], force=(TRUE + NOISE)[part])
+    fit = di.fit(short, MODEL)
+    posterior = di.posterior(fit, method="grid", tolerance=0.03)
+    assert posterior.converged, posterior.message
+    for place, name in enumerate(("f_max", "sigma")):
+        estimate = fit.params[name]
+        assert abs(posterior.mean()[place] - estimate.value) < 0.1 * (estimate.stderr or 0.0)
+        assert posterior.std()[place] == pytest.approx(estimate.stderr, rel=0.05)
+    with pytest.raises(ValidationError, match="no evidence"):
+        _ = posterior.log_evidence
+    assert "log_evidence" not in posterior.to_dict()
+
+
+def test_constraints() -> None:
+    measured = record(TRUE + NOISE)
+
+    def tied(ratio: float) -> di.RecordFit:
+        def constraints(p: Any) -> list[Any]:
+            return [p["sigma"] == ratio * p["f_max"]]
+
+        return di.fit(measured, MODEL, method="ipopt", constraints=constraints)
+
+    right, wrong = tied(300.0), tied(310.0)
+    for fit, ratio in ((right, 300.0), (wrong, 310.0)):
+        sigma, f_max = fit.params["sigma"], fit.params["f_max"]
+        assert sigma.value == pytest.approx(ratio * f_max.value)
+        assert sigma.stderr == pytest.approx(ratio * (f_max.stderr or 0.0))
+        again = di.RecordFit.from_json(fit.to_json())
+        assert again.params["sigma"].stderr == pytest.approx(sigma.stderr)
+        assert str(again.status) == str(fit.status)
+    assert right.trusted
+    assert any(finding.code == "constraint" for finding in wrong.findings)
+    assert not wrong.trusted
+
+
+@pytest.mark.parametrize(
+    ("data", "option"),
+    [
+        (record(TRUE), {"noise": "relative"}),
+        (record(TRUE), {"steady": "describing function"}),
+        (record(TRUE), {"drive_std": 0.1}),
+        (di.load_dataset("noisy"), {"output": "force"}),
+        (di.load_dataset("noisy"), {"excitation": "base"}),
+    ],
+)
+def test_options_of_the_other_kind_are_refused(data: object, option: dict[str, object]) -> None:
+    with pytest.raises(ValidationError, match=r"given with a fit of (records|tables), which has"):
+        di.fit(data, MODEL, **option)  # type: ignore[call-overload]
