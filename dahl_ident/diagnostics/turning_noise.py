@@ -55,17 +55,18 @@ def noise_at_turns(
     excess, strength, scatter = 0.0, 0.0, 0.0
     moved = np.zeros((values.size, values.size))
     for number, (J, e) in enumerate(zip(jacobians, residuals, strict=True)):
-        patterns, turns = _patterns(problem, values, number)
-        change = inverse @ (J / size).T @ patterns
-        left = patterns - J / size @ change
+        left, turns = _patterns(problem, values, number)
+        change = inverse @ ((left @ J) / size).T
+        left -= (change.T / size) @ J.T
         m = fft.next_fast_len(2 * e.size, real=True)
         spectrum = spectrum_of(autoregression(e, J[:, (J != 0.0).any(axis=0)]), m)
-        coloured = fft.irfft(fft.rfft(left, m, axis=0) * spectrum[:, None], m, axis=0)[: e.size]
-        explained = left.T @ coloured
-        excess += float(((left.T @ e) ** 2).sum() - explained.trace())
-        strength += float(((left.T @ left) ** 2).sum())
+        explained = np.empty((len(left), len(left)))
+        for i, row in enumerate(left):  # one at a time: all transforms would fill the memory
+            explained[i] = left @ fft.irfft(fft.rfft(row, m) * spectrum, m)[: e.size]
+        excess += float(((left @ e) ** 2).sum() - explained.trace())
+        strength += float(((left @ left.T) ** 2).sum())
         scatter += 2.0 * float((explained**2).sum())
-        moved += change @ change.T * (turns / max(patterns.shape[1], 1))
+        moved += change @ change.T * (turns / max(len(left), 1))
     if strength == 0.0 or scatter == 0.0:
         return moved * 0.0
     error = scatter**0.5
@@ -76,13 +77,13 @@ def noise_at_turns(
 
 
 def _patterns(problem: RecordProblem, values: FloatArray, number: int) -> tuple[FloatArray, int]:
-    """Return derivatives of the force by the displacement at some turns, and how many there are."""
+    """Return derivatives of the force with respect to k turns, (k, n), and the number of turns."""
     x, v, a = problem.motions[number]
     samples = stretches(x).samples
     turns = (np.cumsum(samples) - samples)[1:]
     chosen = turns[np.unique(np.linspace(0, turns.size - 1, min(_MOST, turns.size)).astype(int))]
     step = _STEP * float(np.ptp(x))
-    other, found = copy(problem), np.empty((x.size, chosen.size))
+    other, found = copy(problem), np.empty((chosen.size, x.size))
     for i, turn in enumerate(chosen):
         ends = []
         for sign in (1.0, -1.0):
@@ -92,5 +93,6 @@ def _patterns(problem: RecordProblem, values: FloatArray, number: int) -> tuple[
             motions[number] = path, v, a
             other.motions = tuple(motions)
             ends.append(other.predict(values, number, derivatives=False).output)
-        found[:, i] = (ends[0] - ends[1]) / (2.0 * step)
+        np.subtract(ends[0], ends[1], out=found[i])
+        found[i] /= 2.0 * step
     return found, int(turns.size)

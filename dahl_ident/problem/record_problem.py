@@ -340,6 +340,10 @@ class RecordProblem(BaseProblem):
     n_numbers = n_residuals
 
     @cached_property
+    def _rates(self) -> tuple[float, ...]:
+        return tuple(record.sample_rate for record in self.records)
+
+    @cached_property
     def measured(self) -> tuple[FloatArray, ...]:
         """The output of each record."""
         if self.output == "force":
@@ -438,7 +442,7 @@ class RecordProblem(BaseProblem):
         by = np.zeros((x.size, len(self.parameters) if derivatives else 0))
         start, column = 0, 0
         first = len(self.free) + number * self.per_record
-        model = self.model.sampled(1.0 / record.sample_rate)
+        model = self.model.sampled(1.0 / self._rates[number])
         for element, at in model.of(self.full_values(values)):
             state, moved = (states[start], path) if element.has_memory else (0.0, x)
             in_gap = element.has_memory and element.start is not Behaviour.start
