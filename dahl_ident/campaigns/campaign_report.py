@@ -34,7 +34,7 @@ _LISTED = 200
 
 def write_campaign_report(
     table: pd.DataFrame,
-    found: Population | None,
+    evaluated: Population | None,
     path: str | Path,
     *,
     title: str = "Campaign",
@@ -48,30 +48,30 @@ def write_campaign_report(
 
     place = place_of(path, "a campaign's report", FORMATS)
     folder = "" if reports is None else os.path.relpath(reports, place.parent)
-    document = campaign_document(table, found, title, Path(folder).as_posix())
+    document = campaign_document(table, evaluated, title, Path(folder).as_posix())
     content = html(document) if place.suffix.lower() == ".html" else pdf(document)
     write_whole(place, content, overwrite=overwrite)
     return place
 
 
 def campaign_document(
-    table: pd.DataFrame, found: Population | None, title: str, reports: str = "reports"
+    table: pd.DataFrame, evaluated: Population | None, title: str, reports: str = "reports"
 ) -> Document:
     """Return the report's content; `reports` is the folder of the fits' reports, for links."""
     statuses = table["status"].value_counts()
     counted = ", ".join(f"{count} {status}" for status, count in statuses.items())
     verdict = [f"{len(table)} fits of {table['device'].nunique()} devices: {counted}."]
     sections = []
-    if found is not None:
-        verdict += [_sentence(p) for p in found.parameters.values()]
+    if evaluated is not None:
+        verdict += [_sentence(p) for p in evaluated.parameters.values()]
         sections = [Section(f"Population: {p.name}", tuple(_blocks(p))) for p in
-                    found.parameters.values()]  # fmt: skip
+                    evaluated.parameters.values()]  # fmt: skip
     else:
         verdict.append("Fewer than three devices have usable results: there is no population.")
     sections.append(Section("Fits that cannot be used", (_unusable(table),)))
     sections.append(Section("All fits", tuple(_all(table, reports))))
     status = "not determined"
-    if found is not None:
+    if evaluated is not None:
         status = "trusted" if (table["status"] == "trusted").all() else "approximate"
     facts = {"statuses": {str(k): int(v) for k, v in statuses.items()}}
     return Document(title, status, tuple(verdict), tuple(sections), facts=facts)

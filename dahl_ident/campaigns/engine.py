@@ -189,14 +189,14 @@ class Scheduler(Place):
                 return "no dahl_ident"
             return f"dahl_ident {version}"
 
-        own = f"dahl_ident {__version__}"
-        other = {w: v for w, v in self._client.run(installed).items() if v != own}
+        here = f"dahl_ident {__version__}"
+        other = {w: v for w, v in self._client.run(installed).items() if v != here}
         if other:
             where, version = next(iter(other.items()))
             self._client.close()
             raise ValidationError(
                 f"scheduler {self._address}: {len(other)} workers differ from this process, which "
-                f"has {own}: {where} has {version}; install the same version everywhere"
+                f"has {here}: {where} has {version}; install the same version everywhere"
             )
 
     def submit(self, job: Job, seconds: float, memory: float | None) -> Future[Row]:

@@ -148,8 +148,8 @@ class PopulationParameter:
     >>> f_max = 0.1 * np.exp(0.05 * np.array([-1.2, -0.3, 0.1, 0.4, 1.0]))
     >>> table = pd.DataFrame({"device": list("abcde"), "status": "trusted",
     ...     "f_max": f_max, "u_f_max": 0.001})
-    >>> found = population(table)["f_max"]
-    >>> found.outlying, found.out_of_control
+    >>> statistics = population(table)["f_max"]
+    >>> statistics.outlying, statistics.out_of_control
     ((), ())
     """
 
@@ -308,8 +308,8 @@ def population(
     >>> f_max = np.exp(rng.normal(np.log(0.1), 0.05, 40))
     >>> table = pd.DataFrame({"device": [f"d{i}" for i in range(40)], "status": "trusted",
     ...     "f_max": f_max * np.exp(rng.normal(0, 0.01, 40)), "u_f_max": 0.01 * f_max})
-    >>> found = population(table)["f_max"]
-    >>> round(found.mean[0], 2), round(found.between_devices[0], 2)
+    >>> statistics = population(table)["f_max"]
+    >>> round(statistics.mean[0], 2), round(statistics.between_devices[0], 2)
     (0.1, 0.05)
     """
     names = _parameters(table, parameters)

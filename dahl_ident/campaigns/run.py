@@ -118,10 +118,10 @@ class Campaign:
 
         table = self.table
         enough = table.loc[table["status"].isin(USABLE), "device"].nunique() >= 3
-        found = population(table, covariates=covariates, order=order) if enough else None
+        evaluated = population(table, covariates=covariates, order=order) if enough else None
         reports = self.folder / "reports"
         return write_campaign_report(
-            table, found, path, title=title, reports=reports, overwrite=overwrite
+            table, evaluated, path, title=title, reports=reports, overwrite=overwrite
         )
 
     def __str__(self) -> str:

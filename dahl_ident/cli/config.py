@@ -31,13 +31,13 @@ def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
         raise DataError(f"{path}: no TOML file of options: {exc}") from exc
     tables = {k: v for k, v in given.items() if isinstance(v, dict)}
     shared = _named({k: v for k, v in given.items() if k not in tables})
-    own = _named(tables.get(ctx.info_name or "", {}))
+    of_command = _named(tables.get(ctx.info_name or "", {}))
     commands = _options_of_commands(ctx)
     known = commands.get(ctx.info_name or "", set())
     _refuse_unknown(path, "no command is called", tables, commands.keys())
-    _refuse_unknown(path, f"{ctx.info_name} has no option", own, known)
+    _refuse_unknown(path, f"{ctx.info_name} has no option", of_command, known)
     _refuse_unknown(path, "no command has the option", shared, set().union(*commands.values()))
-    chosen = {k: v for k, v in shared.items() if k in known} | own
+    chosen = {k: v for k, v in shared.items() if k in known} | of_command
     several = {p.name for p in ctx.command.params if getattr(p, "multiple", False)}
     several |= {p.name for p in ctx.command.params if p.nargs != 1}
     ctx.default_map = {k: _repeated(v) if k in several else _joined(v) for k, v in chosen.items()}

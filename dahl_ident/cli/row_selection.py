@@ -79,10 +79,10 @@ class _Condition:
         import numpy as np
 
         try:
-            found = self._value(ast.parse(self._text, mode="eval").body)
+            value = self._value(ast.parse(self._text, mode="eval").body)
         except SyntaxError as exc:
             raise self._refused(str(exc.msg)) from exc
-        rows = np.asarray(found)
+        rows = np.asarray(value)
         if rows.dtype != np.bool_ or rows.shape != (self._n,):
             raise self._refused("it contains no comparison")
         return rows

@@ -63,8 +63,8 @@ class Plant:
         """Return the plant."""
         from dahl_ident.elements import Dahl
 
-        own = {name: getattr(self, name) for name in ("f_max", "sigma", "alpha")}
-        given = {name: value for name, value in own.items() if value is not None}
+        names = ("f_max", "sigma", "alpha")
+        given = {n: value for n in names if (value := getattr(self, n)) is not None}
         others = {n: value for n in OTHERS if (value := getattr(self, n)) is not None}
         if self.element:
             refuse_with_elements(given)

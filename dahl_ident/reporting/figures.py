@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dahl_ident import plots
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import curves
+from dahl_ident.diagnostics.bands import ENERGY
 from dahl_ident.diagnostics.confidence_levels import LEVELS, percent, thresholds
+from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import shares
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.elements import Friction, UniversalCurve
 from dahl_ident.plots.style import new_axes
 from dahl_ident.reporting.document import Picture, figure_of
-from dahl_ident.reporting.hysteresis_loops import loops
 from dahl_ident.results.fit_plots import standardized_residuals
 from dahl_ident.units import engineering, si_unit
 
@@ -30,6 +31,8 @@ _MARKED_BETA = (0.3, 1.0, 2.2, 5.0, 20.0)  # spread over the curve from stick to
 _LEVELS, _POINTS = 5, 160  # of the plant's response over levels
 _APART = 1.2  # of the largest frequency over the smallest
 _STRAIGHT = 1.5  # log of a profile's range beyond which its axis is logarithmic
+_WIDE = 20.0  # of amplitudes beyond which loops are drawn over displacement / amplitude
+_LOOP_POINTS = 73  # of a measured loop, every 5 degrees; one in six of the model's
 
 
 def pictures_of_fit(fit: FitResult) -> Iterator[Picture]:
@@ -44,7 +47,7 @@ def pictures_of_fit(fit: FitResult) -> Iterator[Picture]:
         if universal is not None:
             yield _universal(fit, universal)
     if len(friction) == 1 and friction[0].rate_independent and _all_finite(fit):
-        yield loops(fit, friction[0])
+        yield _loops(fit, friction[0])
     if fit.success:
         yield _profiles(fit)
     if fit.nvarys > 1 and np.isfinite(fit.covar).all():
@@ -52,11 +55,11 @@ def pictures_of_fit(fit: FitResult) -> Iterator[Picture]:
     yield _information(fit)
 
 
-def budget_picture(found: Budget) -> Picture:
+def budget_picture(budget: Budget) -> Picture:
     """Return the shares of the sources in each parameter's variance."""
-    rows = [(p.name, row.source, row.share) for p in found.parameters for row in p.rows]
+    rows = [(p.name, row.source, row.share) for p in budget.parameters for row in p.rows]
     largest = (
-        f"{p.name}: {p.rows[0].source}, {100.0 * p.rows[0].share:.0f} %" for p in found.parameters
+        f"{p.name}: {p.rows[0].source}, {100.0 * p.rows[0].share:.0f} %" for p in budget.parameters
     )
     return Picture(
         "budget",
@@ -272,3 +275,94 @@ def _all_finite(fit: FitResult) -> bool:
 
 def _with_unit(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit else name
+
+
+def _loops(fit: FitResult, friction: Friction) -> Picture:
+    """Return the picture of the loops at the smallest, a middle and the largest amplitude."""
+    sizes, measured = _chosen(fit, friction)
+    unit, force_unit = (si_unit(kind, fit.data.motion) for kind in ("displacement", "force"))
+    losses = [q for q in fit.derived(sizes.tolist()) if q.name == ENERGY]
+    drawn = [friction.loop(float(A), 6 * (_LOOP_POINTS - 1) + 1) for A in sizes]
+    over_amplitude = bool(sizes[-1] > _WIDE * sizes[0])
+
+    def draw() -> Figure:
+        scale = sizes if over_amplitude else np.ones_like(sizes)
+        model = [
+            (x / by, force, engineering(A, unit))
+            for A, by, (x, force) in zip(sizes, scale, drawn, strict=True)
+        ]
+        dots = [(x / by, force) for by, (x, force) in zip(scale, measured, strict=False)]
+        x_label = "displacement over amplitude" if over_amplitude else f"displacement [{unit}]"
+        return figure_of(
+            plots.plot_loops(
+                model,
+                measured=dots,
+                displacement_label=x_label,
+                force_label=f"friction [{force_unit}]",
+            )
+        )
+
+    lines = "Lines: friction of the fitted element at three amplitudes of the data."
+    dots = (
+        "Dots: the sum of the measured harmonics, less the force of the other elements."
+        if measured
+        else "The data hold no higher harmonics of the force, so there is no measured loop."
+    )
+    finding = (
+        f"A cycle loses {with_unit(losses[0].value, losses[0].stderr, 'J')} at {sizes[0]:.3g} "
+        f"{unit} and {with_unit(losses[-1].value, losses[-1].stderr, 'J')} at {sizes[-1]:.3g} "
+        f"{unit} (standard uncertainties)."
+    )
+    if measured:
+        finding += f" {_distance(drawn, measured)}"
+    return Picture("loops", f"{lines} {dots}", finding, draw)
+
+
+def _measured_loop(
+    amplitude: float, harmonics: Sequence[int], stiffness: ComplexArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return displacement and force of one cycle from F_k/X_1, X_1 taken as real."""
+    theta = np.linspace(0.0, 2.0 * np.pi, _LOOP_POINTS)
+    turning = np.exp(1j * np.outer(harmonics, theta))
+    return amplitude * np.cos(theta), amplitude * (stiffness @ turning).real
+
+
+def _chosen(
+    fit: FitResult, friction: Friction
+) -> tuple[FloatArray, list[tuple[FloatArray, FloatArray]]]:
+    """Return three amplitudes and their measured loops, where harmonics were measured."""
+    data = fit.data
+    fundamental = data.harmonic == 1
+    if (data.harmonic != 1).any() and fit.problem.sensors.are_exact:
+        assert data.amplitude is not None  # harmonics belong to a displacement
+        run = np.zeros(data.n) if data.run is None else np.unique(data.run, return_inverse=True)[1]
+        points = np.stack([data.frequency_hz, data.amplitude, run])
+        rows_of = [np.flatnonzero((points[:, i] == points.T).all(axis=1)) for i in range(data.n)]
+        full = [i for i in np.flatnonzero(fundamental) if rows_of[i].size > 1]
+        rank = [full[i] for i in np.argsort(data.amplitude[full])]
+        three = [rank[0], rank[len(rank) // 2], rank[-1]]
+        others = fit.best_fit - friction.dynamic_stiffness(
+            data.amplitude, 2.0 * np.pi * data.frequency_hz
+        )
+        friction_alone = np.where(fundamental, data.response - others, data.response)
+        cycles = [
+            _measured_loop(
+                data.amplitude[i], data.harmonic[rows_of[i]].tolist(), friction_alone[rows_of[i]]
+            )
+            for i in three
+        ]
+        return data.amplitude[three], cycles
+    amplitude = fit.problem.stiffness_data.amplitude[fundamental]
+    return np.geomspace(amplitude.min(), amplitude.max(), 3), []
+
+
+def _distance(
+    drawn: Sequence[tuple[FloatArray, FloatArray]],
+    measured: Sequence[tuple[FloatArray, FloatArray]],
+) -> str:
+    """Return a sentence on the distance of the measured loops from those of the model."""
+    away = []
+    for (_, model), (_, force) in zip(drawn, measured, strict=True):
+        same = model[:: (model.size - 1) // (force.size - 1)]
+        away.append(np.sqrt(np.mean((force - same) ** 2)) / np.abs(force).max())
+    return f"The measured loops are within {100.0 * max(away):.2g} % rms of the model's."

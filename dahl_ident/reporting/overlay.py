@@ -58,24 +58,24 @@ def overlay(
         raise ValidationError(f"the fits measure in different units: {', '.join(sorted(units))}")
     names = _names(fits)
     given = metadata or Metadata()
-    found = changes(dict(zip(names, fits, strict=True)))
+    changed = changes(dict(zip(names, fits, strict=True)))
     verdicts = tuple(f"{name}: {fit.verdict}" for name, fit in zip(names, fits, strict=True))
     sections = (
         Section("Parameters side by side", (_table(names, fits),)),
-        changes_section(found),
+        changes_section(changed),
         Section("Pictures", (_picture(names, fits),), details=True),
         Section("Verdicts", (Bullets(verdicts),), details=True),
     )
     return Document(
         title=title or given.title or f"Comparison of {', '.join(names)}",
         status=worst_status(fits),
-        verdict=tuple(headline(found)),
+        verdict=tuple(headline(changed)),
         header=_header(fits, names, given),
         sections=sections,
         facts={
             "fits": [{"name": n} | fit_facts(fit) for n, fit in zip(names, fits, strict=True)],
             "posteriors": [],
-            "changes": [change.to_dict() for change in found],
+            "changes": [change.to_dict() for change in changed],
             "metadata": given.facts(),
             **origin_facts(fits[0].data),
             "files": [file for fit in fits for file in origin_facts(fit.data)["files"]],
@@ -106,10 +106,10 @@ def _header(
     fits: Sequence[FitResult], names: Sequence[str], given: Metadata
 ) -> tuple[tuple[str, tuple[str, ...]], ...]:
     rows = dict(header(fits[0], given))
-    own = [dict(header(fit, given)) for fit in fits]
-    rows["Model"] = tuple(dict.fromkeys(line for one in own for line in one["Model"]))
+    headers = [dict(header(fit, given)) for fit in fits]
+    rows["Model"] = tuple(dict.fromkeys(line for one in headers for line in one["Model"]))
     rows["Data"] = tuple(
-        f"{name}: {'; '.join(one['Data'])}" for name, one in zip(names, own, strict=True)
+        f"{name}: {'; '.join(one['Data'])}" for name, one in zip(names, headers, strict=True)
     )
     return tuple(rows.items())
 
@@ -141,10 +141,10 @@ def _estimate(fit: FitResult, name: str) -> Cell:
     return Cell(f"{value} \u00b1 {error}", estimate.value, struck=not is_usable(fit, name))
 
 
-def changes_section(found: Sequence[Change]) -> Section:
+def changes_section(changed: Sequence[Change]) -> Section:
     """Return the table of changes, and how it is made."""
     rows = []
-    for c in found:
+    for c in changed:
         value, error = rounded(c.change, c.u)
         usable = math.isfinite(c.p)
         rows.append(

@@ -42,7 +42,7 @@ def notes(data: FrequencyResponse) -> list[str]:
 
 def options(data: FrequencyResponse) -> list[tuple[str, str]]:
     """Return how the data were made, key by key, if stated and not the default."""
-    found: dict[str, str] = {}
+    stated: dict[str, str] = {}
     for part in (one for whole in parts(data) for one in _with_origins(whole)):
         given_keys = {k: v for k, v in part.items() if k not in _LISTED_ELSEWHERE}
         for name in ("options", "extraction"):
@@ -51,14 +51,14 @@ def options(data: FrequencyResponse) -> list[tuple[str, str]]:
             given_keys |= {f"{name} {key}".strip(): value for key, value in given.items()}
         for key, value in given_keys.items():
             if not isinstance(value, Mapping) and value not in (None, [], ()):
-                found.setdefault(key, str(value))
-    return list(found.items())
+                stated.setdefault(key, str(value))
+    return list(stated.items())
 
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, of this package and of those that it computes with."""
-    found = {"dahl_ident": __version__, "python": platform.python_version()}
-    return found | {name: importlib.metadata.version(name) for name in _PACKAGES}
+    python = {"dahl_ident": __version__, "python": platform.python_version()}
+    return python | {name: importlib.metadata.version(name) for name in _PACKAGES}
 
 
 def listed_versions() -> str:

@@ -225,18 +225,18 @@ def _answer(fit: FitResult, of: str) -> Iterator[Section]:
 
 def _budget(fit: FitResult) -> Iterator[Block]:
     """Yield the combined uncertainties; nothing if none can be stated."""
-    found = fit.stated_budget
-    if fit.status != VerdictStatus.NOT_DESCRIBED and found is not None:
-        yield tables.uncertainty(found)
+    stated = fit.stated_budget
+    if fit.status != VerdictStatus.NOT_DESCRIBED and stated is not None:
+        yield tables.uncertainty(stated)
         yield Paragraph(COVERAGE)
 
 
 def _sources(fit: FitResult) -> Iterator[Block]:
     """Yield every source of uncertainty of every parameter."""
-    found = fit.stated_budget
-    if fit.status != VerdictStatus.NOT_DESCRIBED and found is not None:
-        yield tables.budget(found)
-        yield budget_picture(found)
+    stated = fit.stated_budget
+    if fit.status != VerdictStatus.NOT_DESCRIBED and stated is not None:
+        yield tables.budget(stated)
+        yield budget_picture(stated)
 
 
 def _assumed(fit: FitResult) -> Iterator[Block]:
@@ -294,8 +294,8 @@ def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
     intervals = fit.intervals_run(CONFIDENCE)
     yield tables.parameters(fit, intervals, drawn)
     by_note: dict[str, list[str]] = {}
-    for found in intervals:
-        by_note.setdefault(found.note, []).append(tables.method_name(found))
+    for one in intervals:
+        by_note.setdefault(one.note, []).append(tables.method_name(one))
     notes = [f"Intervals by {listed(names)}: {note}" for note, names in by_note.items()]
     derived = fit.derived() if fit.status is not VerdictStatus.NOT_DESCRIBED else ()
     yield Bullets((*notes, *(f"Derived: {quantity}" for quantity in derived)))

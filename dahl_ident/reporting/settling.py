@@ -57,14 +57,14 @@ def cycle_by_cycle(
     edges = start + np.arange(np.floor((end - start) * frequency_hz + 0.5) + 1.0) / frequency_hz
     bounds = np.searchsorted(record.time, edges)
     channels = np.stack([record.motion_samples, record.force_samples], axis=-1)
-    found = []
+    cycles = []
     for rows in itertools.starmap(slice, itertools.pairwise(bounds)):
         angle = omega * (record.time[rows] - start)
         design = np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=-1)
         offset, cosine, sine = np.linalg.lstsq(design, channels[rows], rcond=None)[0]
         motion, force = cosine - 1j * sine
-        found.append((force / motion, offset[1]))
-    ratio, mean = (np.array(column) for column in zip(*found, strict=True))
+        cycles.append((force / motion, offset[1]))
+    ratio, mean = (np.array(column) for column in zip(*cycles, strict=True))
     return ratio * (1j * omega) ** _INTEGRATIONS[record.motion_channel], mean.real
 
 

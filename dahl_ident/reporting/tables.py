@@ -44,8 +44,8 @@ def answer(fit: FitResult, *, described: bool) -> Table:
         value, error = rounded(estimate.value, estimate.stderr)
         lost = judged.verdict in (Verdict.WEAK, Verdict.NOT_IDENTIFIED)
         struck = lost or not described
-        found = limits[name]
-        closed = lost and bool(np.isfinite([found.lower, found.upper]).all())  # a bound holds
+        limit = limits[name]
+        closed = lost and bool(np.isfinite([limit.lower, limit.upper]).all())  # a bound holds
         reason = judged.reason if lost else judged.verdict.value
         if not described and not lost:
             reason = "the model does not describe the data: the interval is not valid"
@@ -58,7 +58,7 @@ def answer(fit: FitResult, *, described: bool) -> Table:
                 if np.isfinite(estimate.value)
                 else Cell("none finite"),
                 Cell(error, _finite(estimate.stderr), struck),
-                Cell(interval(found.lower, found.upper, ""), struck=not described or closed),
+                Cell(interval(limit.lower, limit.upper, ""), struck=not described or closed),
                 Cell(estimate.unit or "-"),
                 Cell(estimate.description),
                 Cell(reason),
@@ -80,10 +80,10 @@ def assumed(fit: FitResult, name: str) -> tuple[str, str] | None:
     return rounded(fit.errors.values[name], fit.errors.stderr[name])
 
 
-def uncertainty(found: Budget) -> Table:
+def uncertainty(stated: Budget) -> Table:
     """Return the combined uncertainty of every parameter with its largest sources."""
     rows = []
-    for p in found.parameters:
+    for p in stated.parameters:
         shares = [(row.source, 100.0 * row.share) for row in p.rows[:_LARGEST] if row.u > 0.0]
         sources = [f"{source} {share:.0f} %" for source, share in shares if share >= 0.5]
         rows.append(
@@ -101,10 +101,10 @@ def uncertainty(found: Budget) -> Table:
     )
 
 
-def budget(found: Budget) -> Table:
+def budget(stated: Budget) -> Table:
     """Return every source of uncertainty of every parameter; the combined one comes first."""
     rows = []
-    for p in found.parameters:
+    for p in stated.parameters:
         unit = p.unit or "-"
         rows.append(
             (
@@ -193,8 +193,8 @@ def parameters(
         ]
         if (stated := assumed(fit, name)) is not None:
             row[1:3] = words(stated[0], f"{stated[1]}, assumed")
-        for found in at:
-            limits = found.get(name)
+        for method in at:
+            limits = method.get(name)
             shown = interval(limits.lower, limits.upper, "") if limits else "-"
             row.append(Cell(shown, struck=bool(limits) and lost))
         row += [Cell(credible_interval(posterior, name)) for posterior in drawn]
