@@ -90,7 +90,8 @@ def _sentence(p: PopulationParameter) -> str:
     if p.outlying:
         text += f"; outside the population and not in these numbers: {', '.join(p.outlying)}"
     if p.out_of_control:
-        text += f"; {len(p.out_of_control)} fits outside the control limits"
+        fits = "1 fit" if len(p.out_of_control) == 1 else f"{len(p.out_of_control)} fits"
+        text += f"; {fits} outside the control limits"
     return text + "."
 
 

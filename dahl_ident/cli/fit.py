@@ -255,7 +255,6 @@ def report(
     Example: dahl-ident datasets noisy -o - | dahl-ident report - -o report.html
     """
     from dahl_ident.data import read_record
-    from dahl_ident.reporting.joint import disagreements
     from dahl_ident.results import RecordFit
 
     laws.run()
@@ -295,6 +294,8 @@ def report(
         console.write_json(places)
     elif STANDARD not in places:
         console.write("\n".join(places))
+    from dahl_ident.reporting.joint import disagreements
+
     contradictions = disagreements(fits)
     console.finish(not contradictions, " ".join(contradictions))
     finish(worst(fits))
