@@ -7,11 +7,9 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 from dahl_ident.cli.console import STANDARD
-
-_T = TypeVar("_T")
 
 
 class Saved(Protocol):
