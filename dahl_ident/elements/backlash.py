@@ -211,6 +211,10 @@ class Backlash(Friction):
         """Return the force, and the place in the gap: in contact, or in the middle."""
         return force, 0.5 * float(values[-1]) * float(np.sign(force))
 
+    def states_by_parameter(self, force: float) -> dict[int, tuple[int, float]]:
+        """Return that the place in the gap is at its end, where the motion starts in contact."""
+        return {len(self.parameters) - 1: (1, 0.5 * float(np.sign(force)))}
+
     def force_history_gradient(
         self,
         values: Sequence[FloatArray | float],

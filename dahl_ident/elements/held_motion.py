@@ -92,6 +92,9 @@ def force_along(
         if chosen is not None:
             by_state = found.by_first[:, 2]
             by[list(chosen)] = found.by_parameter.T
+            for i, (place, slope) in law.states_by_parameter(state).items():
+                if i in chosen:
+                    by[i] += slope * found.by_first[:, 2 + place]
     if velocity is not None and not law.rate_independent:
         own = [np.asarray(v) for v in values]
         slope = law.slope(force, np.where(velocity < 0.0, -1.0, 1.0), velocity, own)

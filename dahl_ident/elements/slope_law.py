@@ -341,6 +341,10 @@ class SlopeLaw(Element):
         """Return the states from which a held motion starts with a force."""
         return (force,)
 
+    def states_by_parameter(self, force: float) -> dict[int, tuple[int, float]]:
+        """Return, by parameter, the one of these states that changes with it, and its slope."""
+        return {}
+
     def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Return the forces of full slip in both directions, N; inf if there is none."""
         values, _, shape, _ = _flat(values, np.zeros(()), np.zeros(()))
