@@ -27,9 +27,18 @@ from dahl_ident.diagnostics.error_sources import (
     RUNS,
     TESTS,
 )
-from dahl_ident.diagnostics.formatting import degrees_text, listed, rounded, table
+from dahl_ident.diagnostics.formatting import (
+    degrees_text,
+    html_table,
+    listed,
+    pair,
+    rounded,
+    symbol,
+    table,
+    tabular,
+    unit,
+)
 from dahl_ident.diagnostics.information import Information
-from dahl_ident.diagnostics.markup import html_table, pair, symbol, tabular, unit
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 

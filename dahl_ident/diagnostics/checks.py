@@ -14,13 +14,13 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.tabular import doubts
 from dahl_ident.diagnostics.budget import taken_as_exact
-from dahl_ident.diagnostics.cross_validation import CrossValidation
-from dahl_ident.diagnostics.doubtful_elements import below_zero, is_single, slight
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.goodness import Goodness
+from dahl_ident.diagnostics.held_out import CrossValidation
 from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.parameters import parameter_values
+from dahl_ident.diagnostics.physics import below_zero, is_single, slight
 from dahl_ident.diagnostics.steady_motion import steady_findings
 from dahl_ident.diagnostics.verdicts import Identifiability
 from dahl_ident.elements import Model

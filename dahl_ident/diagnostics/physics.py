@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from scipy import special
@@ -10,18 +10,32 @@ from scipy import special
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.rows import row_names
 from dahl_ident.diagnostics.formatting import percent, with_unit
+from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.parameters import parameter_values
-from dahl_ident.diagnostics.plausible_units import implausible_units
 from dahl_ident.diagnostics.steady_motion import steady_difference
 from dahl_ident.diagnostics.third_harmonic import third_harmonic_share
-from dahl_ident.elements import Element
+from dahl_ident.elements import Element, Parameter
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.status import Status
-from dahl_ident.units import shown_unit
+from dahl_ident.units import Motion, engineering, shown_unit
 
 _LEVEL = 1e-3  # false-alarm rate, low: such a fit is called physically impossible
 _OFF = 0.02  # relative error of a prediction: as large as a good measurement's
 _HARMONIC_SHARE = 0.1  # of the fundamental; describing functions assume a pure sine
+_CLEARLY = 2.0  # standard uncertainties below zero
+_FALLING = "fit a law whose force falls with speed (LuGre)"
+_INSTEAD = {
+    (1, -1, 2): "a mass: leave it out, or give its value",
+    (1, -1, 1): f"a damper: {_FALLING}, leave the damper out, or give its value",
+    (1, -1, 0): "a spring, except a buckled one: leave it out, or give its value",
+}
+_TYPICAL = {"x_c": (1e-9, 0.1), "force limit": (1e-9, 1e8), "contact stiffness": (1e-2, 1e12)}
+_TYPICAL_ROTATION = {
+    "x_c": (1e-7, 1.0), "force limit": (1e-10, 1e8), "contact stiffness": (1e-4, 1e12)
+}  # fmt: skip
+_DIMENSIONS = {(1, 0, 0): "force limit", (1, -1, 0): "contact stiffness"}
+_RATIOS = {2.0: "peak-to-peak", 2.0**-0.5: "root-mean-square"}
+_ALIKE = 0.05  # relative difference from such a ratio, and spread
 
 
 def physical_warnings(optimum: Optimum, scatter: float = 0.0) -> Iterator[str]:
@@ -153,3 +167,131 @@ def _sensed(optimum: Optimum) -> ComplexArray:
     gain /= start["force_gain"] / start["displacement_gain"]
     lag = values["delay"] - start["delay"]
     return np.asarray(np.exp(-1j * view.harmonic * view.omega * lag) / gain)
+
+
+def is_single(element: Element) -> bool:
+    """Return whether an element is a mass, a damper or a spring."""
+    return bool(
+        element.is_linear
+        and element.linear_parameters
+        and len(element.parameters) == 1
+        and element.parameters[0].dimension in _INSTEAD
+    )
+
+
+def below_zero(
+    parameters: Sequence[Parameter],
+    values: Mapping[str, float],
+    stderr: Mapping[str, float],
+    motion: Motion = "translation",
+) -> Iterator[Finding]:
+    """Yield a finding for every estimate clearly below zero, with what to do.
+
+    Parameters
+    ----------
+    parameters : sequence of Parameter
+        Of masses, dampers and springs; those that are not free were given, and are left out.
+    values, stderr : mapping of str to float
+    motion : {"translation", "rotation"}
+
+    Yields
+    ------
+    Finding
+    """
+    for parameter in parameters:
+        value, error = values[parameter.name], stderr.get(parameter.name, 0.0)
+        if parameter.free and np.isfinite(value) and value < -_CLEARLY * error:
+            given = {
+                "name": parameter.name,
+                "value": value,
+                "stderr": error,
+                "unit": shown_unit(parameter.unit, motion),
+                "instead": _INSTEAD[parameter.dimension],
+            }
+            yield Finding(Question.DESCRIBED, VerdictStatus.APPROXIMATE, "negative", given)
+
+
+def slight(
+    parameter: Parameter, value: float, error: float, share: float, misfit: float
+) -> Iterator[Finding]:
+    """Yield a finding where an element carries less force than the model misses.
+
+    Parameters
+    ----------
+    parameter : Parameter
+        Of a mass, damper or spring.
+    value, error : float
+        Estimate and standard uncertainty.
+    share, misfit : float
+        Rms of its force and of the misfit, over that of the measured force.
+
+    Yields
+    ------
+    Finding
+    """
+    if parameter.free and share < misfit and value >= -_CLEARLY * error:
+        values = {
+            "name": parameter.name,
+            "value": value,
+            "stderr": error,
+            "unit": parameter.unit,
+            "share": share,
+            "misfit": misfit,
+        }
+        yield Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "slight", values)
+
+
+# Ranges in SI units within which mechanisms lie, from micromachines to bridge bearings.
+
+
+def implausible_units(optimum: Optimum) -> Iterator[str]:
+    """Yield a sentence for every number that another unit would explain."""
+    yield from _sizes(optimum)
+    yield from _levels(optimum)
+
+
+def _sizes(optimum: Optimum) -> Iterator[str]:
+    if not optimum.success:
+        return
+    motion, values = optimum.problem.data.motion, parameter_values(optimum)
+    typical = _TYPICAL if motion == "translation" else _TYPICAL_ROTATION
+    for element in optimum.problem.model.elements:
+        if not element.has_memory:
+            continue
+        own = [float(values[p.name]) for p in element.parameters]
+        sizes = [
+            (p.name, p.unit, _DIMENSIONS[p.dimension], value)
+            for p, value in zip(element.parameters, own, strict=True)
+            if p.free and p.dimension in _DIMENSIONS
+        ]
+        low, high = element.knee([np.asarray(v) for v in own])
+        if sizes and low == high:
+            sizes.append(("x_c", "m", "x_c", float(low)))
+        for name, unit, kind, value in sizes:
+            least, most = typical[kind]
+            if np.isfinite(value) and not least <= value <= most:
+                shown = shown_unit(unit, motion)
+                yield (
+                    f"{name} is {engineering(value, shown)}, where mechanisms have "
+                    f"{engineering(least, shown)} to {engineering(most, shown)}: check the units "
+                    "of displacement and force"
+                )
+
+
+def _levels(optimum: Optimum) -> Iterator[str]:
+    """Yield that amplitudes are not zero-to-peak, where nominal levels say what they should be."""
+    data = optimum.problem.data
+    driven = bool((data.controlled == "force").all())
+    size = data.drive if driven else data.amplitude
+    if size is None or data.level is None or data.level.dtype.kind not in "if":
+        return
+    level = np.asarray(data.level, dtype=np.float64)
+    if not (level > 0.0).all() or np.ptp(level) == 0.0:
+        return
+    ratio = size / level
+    for wrong, name in _RATIOS.items():
+        if np.all(np.abs(ratio / wrong - 1.0) < _ALIKE):
+            yield (
+                f"every {'drive' if driven else 'amplitude'} is {np.median(ratio):.3g} times its "
+                f"nominal level: {name} values, where zero-to-peak is meant?"
+            )

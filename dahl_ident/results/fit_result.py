@@ -24,10 +24,10 @@ from dahl_ident.diagnostics.bands import (
 from dahl_ident.diagnostics.budget import Budget, ParameterBudget, budget
 from dahl_ident.diagnostics.checks import judgement
 from dahl_ident.diagnostics.confidence_levels import LEVELS
-from dahl_ident.diagnostics.cross_validation import CrossValidation, cross_validation
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.error_sources import NOISE
 from dahl_ident.diagnostics.goodness import Goodness, goodness
+from dahl_ident.diagnostics.held_out import CrossValidation, cross_validation
 from dahl_ident.diagnostics.intervals import (
     ConfidenceIntervals,
     Method,

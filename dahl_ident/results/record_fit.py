@@ -21,10 +21,10 @@ from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget, coverage_factor
 from dahl_ident.diagnostics.checks import contradicted, doubted
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, checked_levels, percent
-from dahl_ident.diagnostics.doubtful_elements import below_zero, is_single, slight
 from dahl_ident.diagnostics.formatting import interval, rounded, table
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, around
 from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
+from dahl_ident.diagnostics.physics import below_zero, is_single, slight
 from dahl_ident.diagnostics.record_errors import (
     MODEL,
     NOISE,

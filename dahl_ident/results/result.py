@@ -15,9 +15,16 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.data.storage import place_of, write_whole
 from dahl_ident.diagnostics.bands import DerivedQuantity
-from dahl_ident.diagnostics.formatting import rounded, with_unit
+from dahl_ident.diagnostics.formatting import (
+    html_table,
+    pair,
+    rounded,
+    symbol,
+    tabular,
+    unit,
+    with_unit,
+)
 from dahl_ident.diagnostics.judgement import Finding, Judgement, VerdictStatus
-from dahl_ident.diagnostics.markup import html_table, pair, symbol, tabular, unit
 from dahl_ident.problem import BaseProblem
 from dahl_ident.units import Quantity, shown_unit
 

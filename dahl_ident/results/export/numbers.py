@@ -11,7 +11,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.data.storage import inert, library, place_of
 from dahl_ident.diagnostics.budget import ParameterBudget
-from dahl_ident.diagnostics.markup import pair, symbol, tabular, unit
+from dahl_ident.diagnostics.formatting import pair, symbol, tabular, unit
 from dahl_ident.errors import FitError
 
 _WIDE = 0.2  # relative uncertainty beyond which a positive parameter is drawn in its logarithm
