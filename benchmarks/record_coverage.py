@@ -17,6 +17,7 @@ from scipy.signal import lfilter
 
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
 from dahl_ident.elements import Element
 from tests.motions import Driven
 
@@ -103,13 +104,13 @@ def scenarios() -> list[Scenario]:
 
 
 def coverage(scenario: Scenario, records: int) -> dict[str, float]:
-    """Return the share of records whose 95 % interval holds the truth, by parameter."""
+    """Return the share of records whose 95.45 % interval holds the truth, by parameter."""
     inside = dict.fromkeys(scenario.truth, 0)
     for seed in range(records):
         fit = di.fit(scenario.record(seed), scenario.model, start=scenario.truth, throw=False)
-        within = fit.conf_interval()
+        within = fit.conf_interval(levels=CONFIDENCE).at(CONFIDENCE)
         for name, value in scenario.truth.items():
-            inside[name] += within[name][0] < value < within[name][1]
+            inside[name] += within[name].lower < value < within[name].upper
     return {name: count / records for name, count in inside.items()}
 
 
@@ -120,7 +121,7 @@ def main() -> None:
         "# Coverage of the intervals of fits to records",
         "",
         f"Made by `python -m benchmarks.record_coverage {forces} {motions}`. Each record has its",
-        "own motion and noise; every record counts. Coverage of 95 % intervals in percent; values",
+        "own motion and noise; every record counts. Coverage of 95.45 % intervals in percent; values",
         f"outside {100 * LOWEST:.0f} to {100 * HIGHEST:.0f} are marked (!).",
         "",
         "The displacement moves 10 mm to either side, and the force's noise is 1e-3 N; with a",

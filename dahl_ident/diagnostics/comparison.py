@@ -495,4 +495,5 @@ def _force(optimum: Optimum) -> float:
     """Return a tenth of the typical force, where a damper starts."""
     view = optimum.problem.stiffness_data
     rows = view.harmonic == 1
-    return 0.1 * float(np.median(np.abs(view.stiffness[rows]) * view.amplitude[rows]))
+    force = np.abs(view.stiffness[rows]) * view.amplitude[rows]
+    return 0.1 * float(np.sqrt(np.mean(force**2)))  # not the median, which may be zero
