@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import lfilter
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.behaviour import Behaviour
@@ -152,6 +151,8 @@ def solve_repetitions(
     Noise of the residuals' spectrum is added to the prediction. Standard errors are those of the
     optimum, whose covariance counts that spectrum, times the size of what each repetition leaves.
     """
+    from scipy.signal import lfilter  # slow to import, and for repetitions alone
+
     problem: RecordProblem = optimum.problem
     values, search = optimum.values, _Search("lm", "linear")
     outputs, residuals = problem.outputs(values), problem.split_residuals(values)
