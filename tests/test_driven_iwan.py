@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements import Model, iwan
+from dahl_ident.elements import Model
 from tests.motions import Driven, differences, slopes
 from tests.test_forced_motion import RATE, multisine
 from tests.test_record_laws import assert_recovered
@@ -118,7 +118,7 @@ def test_motion_converges_to_that_of_the_exact_law(monkeypatch: pytest.MonkeyPat
     assert np.abs(truth).max() > 5.0 * LAW.onset
     errors = []
     for n in (30, 120):
-        monkeypatch.setattr(iwan, "_SLIDERS", n)
+        monkeypatch.setattr(di.Iwan, "_count", n)
         errors.append(float(np.abs(motion(wave) - truth).max() / np.abs(truth).max()))
     assert errors[0] < 1e-4
     assert errors[1] < errors[0] / 12.0

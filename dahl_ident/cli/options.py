@@ -18,7 +18,7 @@ import typer
 from dahl_ident.cli import console
 from dahl_ident.cli.config import take_options
 from dahl_ident.cli.console import STANDARD
-from dahl_ident.errors import DataError, ModelError, UnitError, ValidationError
+from dahl_ident.errors import DataError, ModelError, UnitError, ValidationError, choices
 
 
 def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
@@ -60,7 +60,8 @@ def one_of(help_text: str, panel: str | None, values: str) -> Any:
     names = values.split("|")
 
     def check(value: str | None) -> str | None:
-        """Refuse outputs that would destroy files, before any work is done."""
+        if value is not None and value not in names:
+            raise typer.BadParameter(f"{value!r} is not one of {choices(names, value)}")
         return value
 
     return typer.Option(
@@ -79,15 +80,6 @@ def steady_option(panel: str) -> Any:
         "Response to a force that is held: exact, or 'describing function' (a sine assumed).",
         panel,
         "exact|describing function",
-    )
-
-
-def noise_option(panel: str) -> Any:
-    """Return the option of the noise of the rows."""
-    return one_of(
-        "measured, relative or absolute; by default measured if a covariance is known.",
-        panel,
-        "measured|relative|absolute",
     )
 
 

@@ -406,14 +406,17 @@ def _candidates(
     if not any(is_spring(e) for e in model.elements):
         added["spring added"] = Spring()
     kinds = {e.kind for e in model.elements}
-    rated: tuple[Element, ...] = (PowerDamper().started((_force(optimum), 0.5, 1.0)),)
-    if f.max() > _RATES * f.min():  # at one frequency a mass is a spring
+    rated: tuple[Element, ...] = ()
+    several = f.max() > _RATES * f.min()
+    if several or optimum.loss == "linear":  # else outliers at large amplitudes look like a damper
+        rated = (PowerDamper().started((_force(optimum), 0.5, 1.0)),)
+    if several:  # at one frequency a mass is a spring
         rated = (Mass(), Damper(), *rated)
     for element in rated:
         if element.kind not in kinds:
             added[f"{element.kind.replace('_', ' ')} added"] = element
     span = f"{misfit}; frequencies from {f.min():.3g} to {f.max():.3g} Hz"
-    if not f.max() > _RATES * f.min():
+    if not several:
         span = f"{misfit}; one frequency, so only the amplitude can tell"
     base = [e.started([values[p.name] for p in e.parameters]) for e in model.elements]
     for name, element in added.items():

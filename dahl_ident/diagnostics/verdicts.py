@@ -56,10 +56,6 @@ _MOST_EXCHANGED = 6  # parameters, in pairs
 _VECTOR_PART = 0.05  # component of the undetermined direction worth naming
 
 
-Spread = Callable[[FloatArray], FloatArray]
-"""Standard deviation of directions . theta, shape (...), for directions (..., P)."""
-
-
 class Verdict(Enum):
     """How well a parameter is determined."""
 
@@ -295,10 +291,7 @@ def judged(
             verdicts[name] = Verdict.BY_PRIOR
     lost = frozenset(n for n, v in verdicts.items() if v is Verdict.NOT_IDENTIFIED)
     loose = lost | {n for n, v in verdicts.items() if v is Verdict.WEAK}
-    if errors is None or errors.basis is not None:
-        determined = _determined(optimum, information.std, lost, loose)
-    else:  # the estimate has every source of error, and assumed exponents among its parameters
-        determined = _determined(errors.at_estimate, errors.std, lost, loose)
+    determined = _determined(optimum, information, lost, loose, errors)
     parameters = {}
     for i, (name, parameter) in enumerate(zip(problem.names, problem.parameters, strict=True)):
         unit = parameter.unit
@@ -468,9 +461,15 @@ def _shown(limits: Sequence[Interval], verdict: Verdict) -> Interval:
 
 
 def _determined(
-    optimum: Optimum, std_of: Spread, lost: frozenset[str], loose: frozenset[str]
+    optimum: Optimum,
+    information: Information,
+    lost: frozenset[str],
+    loose: frozenset[str],
+    errors: ErrorModel | None,
 ) -> tuple[DeterminedCombination, ...]:
     """Return the combinations of parameters that are not identified, but are together.
+
+    Noise says which; a combination that other sources of error leave vague is not determined.
 
     Of `loose` parameters, short of identified, a product needs two: with known ones it says no
     more than its one unknown member, which has a verdict of its own.
@@ -496,24 +495,28 @@ def _determined(
         enough = bool(members & lost) and len(members & loose) > 1
         if not (members <= lost if candidate.is_sum else enough):
             continue
-        std = float(std_of(candidate.direction))
-        if candidate.is_sum and std > float(std_of(_split(candidate)).min()):
+        std = float(information.std(candidate.direction))
+        if candidate.is_sum and std > float(information.std(_split(candidate)).min()):
             continue  # one of its parts alone is known better
+        if std < IDENTIFIED_BELOW and errors is not None and errors.basis is None:
+            direction = np.zeros(len(errors.names))
+            direction[[errors.names.index(name) for name in optimum.names]] = candidate.direction
+            std = float(errors.std(direction))
         if std < IDENTIFIED_BELOW:
             size = abs(candidate.value) * std
             found.append(
                 DeterminedCombination(candidate.expression, candidate.unit, candidate.value, size)
             )
-    return tuple(found) if found else _stiffness_seen(optimum, std_of, loose)
+    return tuple(found) if found else _stiffness_seen(optimum, information, loose)
 
 
 def _stiffness_seen(
-    optimum: Optimum, std_of: Spread, loose: frozenset[str]
+    optimum: Optimum, information: Information, loose: frozenset[str]
 ) -> tuple[DeterminedCombination, ...]:
     seen = stiffness_seen(optimum)
     if seen is None or not seen.members <= loose or not np.isfinite(seen.value):
         return ()
-    std = float(std_of(seen.direction))
+    std = float(information.std(seen.direction))
     if not std < IDENTIFIED_BELOW:
         return ()
     return (DeterminedCombination(seen.expression, seen.unit, seen.value, abs(seen.value) * std),)

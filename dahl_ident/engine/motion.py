@@ -6,11 +6,11 @@ import hashlib
 import os
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +108,8 @@ def settled(
     plain = (1 if system.held else _CYCLES) if starts is None else 0
     plain = plain if cycles is None else cycles
     first = np.zeros((rows, system.order)) if starts is None else starts
-    found, result, first, maps = kernels("cycle").cycles(
+    found, result, first, maps = _run(
+        kernels("cycle").cycles,
         system.function, system.sizes, system.solved, system.followers, system.odd,
         _numbers(amplitude), _numbers(omega), _numbers(parameters), _numbers(first),
         np.asarray(chosen, dtype=np.int64), np.asarray(harmonics, dtype=np.float64), plain,
@@ -157,7 +158,8 @@ def march(
     FitError
         If the motion grows beyond all bounds.
     """
-    found, output, by, states, last = kernels("samples").march(
+    found, output, by, states, last = _run(
+        kernels("samples").march,
         system.function, system.sizes, system.solved, system.followers, _numbers(knots),
         _numbers(coefficients), _numbers(samples), _numbers(first), _numbers(parameters),
         np.asarray(chosen, dtype=np.int64), int(derivatives), _SAMPLED / finer,
@@ -168,6 +170,19 @@ def march(
         )
     n = system.order
     return Motion(output, by[:, :n], by[:, n + 1 :], states, last[:, :n])
+
+
+def _run(kernel: Callable[..., Any], *arguments: Any) -> Any:
+    """Return what a kernel returns; an interrupt of compiled code is an interrupt."""
+    try:
+        return kernel(*arguments)
+    except SystemError as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, KeyboardInterrupt):
+            cause = cause.__cause__
+        if cause is not None:
+            raise KeyboardInterrupt from None
+        raise
 
 
 def _numbers(array: FloatArray) -> FloatArray:
