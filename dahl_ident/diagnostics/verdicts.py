@@ -498,25 +498,37 @@ def _determined(
         std = float(information.std(candidate.direction))
         if candidate.is_sum and std > float(information.std(_split(candidate)).min()):
             continue  # one of its parts alone is known better
-        if std < IDENTIFIED_BELOW and errors is not None and errors.basis is None:
-            direction = np.zeros(len(errors.names))
-            direction[[errors.names.index(name) for name in optimum.names]] = candidate.direction
-            std = float(errors.std(direction))
+        if std < IDENTIFIED_BELOW:
+            std = _combined_std(candidate, optimum, errors, std)
         if std < IDENTIFIED_BELOW:
             size = abs(candidate.value) * std
             found.append(
                 DeterminedCombination(candidate.expression, candidate.unit, candidate.value, size)
             )
-    return tuple(found) if found else _stiffness_seen(optimum, information, loose)
+    return tuple(found) if found else _stiffness_seen(optimum, information, loose, errors)
+
+
+def _combined_std(
+    candidate: Candidate, optimum: Optimum, errors: ErrorModel | None, by_noise: float
+) -> float:
+    """Return the relative standard uncertainty of a combination from every source known."""
+    if errors is None or errors.basis is not None:
+        return by_noise
+    direction = np.zeros(len(errors.names))
+    direction[[errors.names.index(name) for name in optimum.names]] = candidate.direction
+    return float(errors.std(direction))
 
 
 def _stiffness_seen(
-    optimum: Optimum, information: Information, loose: frozenset[str]
+    optimum: Optimum,
+    information: Information,
+    loose: frozenset[str],
+    errors: ErrorModel | None,
 ) -> tuple[DeterminedCombination, ...]:
     seen = stiffness_seen(optimum)
     if seen is None or not seen.members <= loose or not np.isfinite(seen.value):
         return ()
-    std = float(information.std(seen.direction))
+    std = _combined_std(seen, optimum, errors, float(information.std(seen.direction)))
     if not std < IDENTIFIED_BELOW:
         return ()
     return (DeterminedCombination(seen.expression, seen.unit, seen.value, abs(seen.value) * std),)
