@@ -459,7 +459,7 @@ class Problem(BaseProblem):
         return y, [-whiten(d) for d in by]
 
     def squares(self, theta: FloatArray, *, tails: bool = True) -> FloatArray:
-        """Return |y|^2 of every row, (..., n), without priors, unchecked."""
+        """Return the sum of squared residuals of every row, (..., n), without priors."""
         y, _ = self.whitened(theta, derivatives=False, tails=tails)
         return np.asarray(y.real**2 + y.imag**2)
 
