@@ -564,7 +564,7 @@ class LinearEquation(LinearSystem):
         return rows[..., 0], rows[..., 1:]
 
     def _with_slopes(self, vector: list[float]) -> FloatArray:
-        """Return the coefficients and their derivatives by each parameter, (Q, 1 + P)."""
+        """Return coefficients and their derivatives with respect to each parameter, (Q, 1 + P)."""
         columns = [self._at(vector)]
         for i, (parameter, value) in enumerate(zip(self._origin.parameters, vector, strict=True)):
             if value == 0.0:
