@@ -482,7 +482,7 @@ def test_command_line(
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code in (0, None)
-    assert (tmp_path / "a_pictures" / "record_loop_1.png").exists()
+    assert (tmp_path / "a_pictures" / "record_loop.png").exists()
     assert "Trusted." in capsys.readouterr().out
     saved, again = str(tmp_path / "fit.json"), str(tmp_path / "again.md")
     for command in (

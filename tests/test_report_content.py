@@ -463,3 +463,11 @@ def test_a_table_and_waveforms_of_one_test_are_compared(f_max: float, tmp_path: 
     text = report(fits, tmp_path / "both.md").read_text("utf-8")
     assert text.index("## Table and waveforms") < text.index("## Result")
     assert text.count("## Result") == 2
+
+
+def test_pictures_of_two_fits_are_files_of_their_own(fit: di.FitResult, tmp_path: Path) -> None:
+    other = di.fit(fit.data, di.BoucWen())
+    text = report([fit, other], tmp_path / "both.md").read_text("utf-8")
+    named = re.findall(r"<(both_pictures/\S+)>", text)
+    assert len(named) == len(set(named)) > 8
+    assert all((tmp_path / name).exists() for name in named)

@@ -294,7 +294,7 @@ def report(
         console.write_json(places)
     elif STANDARD not in places:
         console.write("\n".join(places))
-    from dahl_ident.reporting.joint import disagreements
+    from dahl_ident.reporting.comparison import disagreements
 
     contradictions = disagreements(fits)
     console.finish(not contradictions, " ".join(contradictions))

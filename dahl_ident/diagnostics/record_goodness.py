@@ -50,7 +50,7 @@ class RecordGoodness:
         )
 
     @property
-    def lines(self) -> list[str]:
+    def details(self) -> list[str]:
         """The numbers as text."""
         return [
             f"unexplained share of variance {self.share_left:.3g} "
@@ -79,7 +79,7 @@ def record_goodness(
     --------
     >>> t = np.arange(100.0)
     >>> record = Record(t, displacement=t, force=np.sin(t))
-    >>> print(record_goodness([record], [np.sin(t)], [0.1 * np.sin(t)]).lines[0])
+    >>> print(record_goodness([record], [np.sin(t)], [0.1 * np.sin(t)]).details[0])
     unexplained share of variance 0.01 (10 % rms)
     """
     variance = sum(float(np.sum((y - y.mean()) ** 2)) for y in measured)

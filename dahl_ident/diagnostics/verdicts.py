@@ -64,6 +64,11 @@ class Verdict(Enum):
     WEAK = "weakly identified"
     NOT_IDENTIFIED = "not identified"
 
+    @property
+    def known(self) -> bool:
+        """Whether the estimate can be used."""
+        return self in (Verdict.IDENTIFIED, Verdict.BY_PRIOR)
+
 
 class Fit(Protocol):
     """An optimum with its intervals."""

@@ -57,6 +57,8 @@ class BaseProblem(ABC):
         Residuals of the data; those of priors come on top.
     n_numbers : int
         Residuals that can differ from zero.
+    runs : tuple
+        Runs, each named as often as it occurs.
     """
 
     model: Model
@@ -64,6 +66,7 @@ class BaseProblem(ABC):
     motion: Motion
     n_residuals: int
     n_numbers: int
+    runs: tuple[Any, ...]
     sensors: Sensors = EXACT
     parts: int = 2
     priors: Mapping[str, Prior] = {}
@@ -71,6 +74,11 @@ class BaseProblem(ABC):
     scale_known: bool = False
     gaussian: bool = True
     settled: bool = True
+
+    @property
+    @abstractmethod
+    def extent(self) -> str:
+        """How much was measured, in words."""
 
     @property
     def n_reported(self) -> int:

@@ -184,6 +184,16 @@ class Problem(BaseProblem):
         return Shooting(self.model)
 
     @property
+    def extent(self) -> str:
+        """How much was measured, in words."""
+        return f"{self.data.n} rows"
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """The runs of the data; none where they name none."""
+        return tuple(self.data.runs or ())
+
+    @property
     def is_exact(self) -> bool:
         """Whether rows are predicted by the exact steady motion."""
         return (

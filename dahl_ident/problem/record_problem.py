@@ -328,6 +328,12 @@ class RecordProblem(BaseProblem):
         return (*self.model.parameters, *self.parameters[self.n_reported :])
 
     @property
+    def extent(self) -> str:
+        """How much was measured, in words."""
+        n = len(self.records)
+        return f"{n} record{'s' if n > 1 else ''}, {self.n_samples} samples"
+
+    @property
     def n_samples(self) -> int:
         """Samples of all records."""
         return sum(len(record) for record in self.records)

@@ -161,14 +161,21 @@ class Document:
         return MARKS[self.status]
 
     def numbered(self) -> Document:
-        """Return the document with numbers before the captions of figures and tables."""
+        """Return the document with numbers before the captions of figures and tables.
+
+        Pictures of one name, such as those of two fits, get numbers after it too.
+        """
         counts = {"Figure": 0, "Table": 0}
+        names: dict[str, int] = {}
 
         def numbered(block: Block) -> Block:
             if not isinstance(block, Table | Picture):
                 return block
             kind = "Figure" if isinstance(block, Picture) else "Table"
             counts[kind] += 1
+            if isinstance(block, Picture):
+                names[block.name] = same = names.get(block.name, 0) + 1
+                block = replace(block, name=f"{block.name}_{same}") if same > 1 else block
             return replace(block, caption=f"{kind} {counts[kind]}. {block.caption}")
 
         sections = (

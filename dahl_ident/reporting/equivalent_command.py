@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from dahl_ident.elements.law_checks import is_of_package
 from dahl_ident.elements.law_files import own_laws, source_path
+from dahl_ident.problem import Problem
 from dahl_ident.reporting.provenance import parts
 from dahl_ident.reporting.tables import prior_text
 from dahl_ident.results import FitResult, Posterior
@@ -15,7 +16,7 @@ from dahl_ident.results import FitResult, Posterior
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
     from dahl_ident.elements import Element, Parameter
-    from dahl_ident.problem import Problem
+    from dahl_ident.results.fit_base import Fit
 
 _USUAL = {
     "f_max": None, "sigma": None, "alpha": 1.0,
@@ -26,15 +27,22 @@ _OPTIONS = {"f_max", "sigma", "alpha", "mass", "damping", "stiffness"}
 """Parameters with an option of their own; other elements are written with --element."""
 
 
-def equivalent_command(results: Sequence[FitResult | Posterior]) -> str | None:
+def equivalent_command(results: Sequence[Fit | Posterior]) -> str | None:
     """Return the commands, one per line; None if no options describe data or model."""
-    source = _source(results[0].data)
-    elements = (e for result in results for e in result.problem.model.elements)
+    of_tables = [
+        result
+        for result in results
+        if isinstance(result, FitResult | Posterior) and isinstance(result.problem, Problem)
+    ]
+    if len(of_tables) < len(results):
+        return None
+    source = _source(of_tables[0].data)
+    elements = (e for result in of_tables for e in result.problem.model.elements)
     if source is None or not all(_has_text(element) for element in elements):
         return None
     before, files = source
     lines = []
-    for result in results:
+    for result in of_tables:
         words = _fit(result) if isinstance(result, FitResult) else _sample(result)
         lines.append(
             " | ".join([*before, shlex.join(["dahl-ident", words[0], *files, *words[1:]])])
@@ -44,7 +52,7 @@ def equivalent_command(results: Sequence[FitResult | Posterior]) -> str | None:
 
 def _source(data: FrequencyResponse) -> tuple[list[str], list[str]] | None:
     """Return the preceding commands, and the files with the options for reading them."""
-    all_parts = parts(data)
+    all_parts = parts([data.provenance])
     first = all_parts[0]
     options, made = _options_of(first), _extraction_of(first)
     alike = all((_options_of(p), _extraction_of(p)) == (options, made) for p in all_parts)

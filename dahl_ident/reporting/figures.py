@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +13,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import curves
 from dahl_ident.diagnostics.bands import ENERGY
 from dahl_ident.diagnostics.confidence_levels import LEVELS, percent, thresholds
+from dahl_ident.diagnostics.formatting import percent as of_size
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import shares
 from dahl_ident.diagnostics.profile import Profiler
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from dahl_ident.diagnostics.budget import Budget
-    from dahl_ident.results import FitResult
+    from dahl_ident.results import FitResult, RecordFit
 
 _MARKED_BETA = (0.3, 1.0, 2.2, 5.0, 20.0)  # spread over the curve from stick to slip
 _LEVELS, _POINTS = 5, 160  # of the plant's response over levels
@@ -35,8 +37,8 @@ _WIDE = 20.0  # of amplitudes beyond which loops are drawn over displacement / a
 _LOOP_POINTS = 73  # of a measured loop, every 5 degrees; one in six of the model's
 
 
-def pictures_of_fit(fit: FitResult) -> Iterator[Picture]:
-    """Yield the figures of a fit."""
+def of_table(fit: FitResult) -> Iterator[Picture]:
+    """Yield the figures of a fit of a table."""
     yield _response(fit)
     if fit.success and _is_plant_over_amplitude(fit):
         yield _over_levels(fit)
@@ -53,6 +55,31 @@ def pictures_of_fit(fit: FitResult) -> Iterator[Picture]:
     if fit.nvarys > 1 and np.isfinite(fit.covar).all():
         yield _correlation(fit)
     yield _information(fit)
+
+
+def of_records(fit: RecordFit) -> Iterator[Picture]:
+    """Yield the figures of the record that a fit describes worst."""
+    worst = fit.goodness.worst_record - 1
+    of = f" of record {worst + 1}, which is described worst" if len(fit.records) > 1 else ""
+    share = of_size(fit.goodness.share_left**0.5)
+    shown = {
+        "time": f"Measured and fitted {fit.problem.output}",
+        "residuals": "Residuals over time",
+    }
+    if fit.records[worst].displacement is not None:
+        shown["loop"] = "Force over displacement"
+        shown["residuals_displacement"] = "Residuals over displacement"
+    for kind, caption in shown.items():
+        yield Picture(
+            f"record_{kind}",
+            f"{caption}{of}.",
+            f"{caption}{of}: the residuals are {share} rms of the measured signal.",
+            partial(_of_record, fit, kind, worst),
+        )
+
+
+def _of_record(fit: RecordFit, kind: str, record: int) -> Figure:
+    return figure_of(fit.plot(kind, record=record))
 
 
 def budget_picture(budget: Budget) -> Picture:

@@ -13,34 +13,28 @@ from dahl_ident import plots
 from dahl_ident.data.laboratory import Metadata
 from dahl_ident.diagnostics.formatting import rounded
 from dahl_ident.errors import ValidationError
+from dahl_ident.reporting.comparison import changes_section, numbered
 from dahl_ident.reporting.document import (
     Bullets,
     Cell,
     Document,
-    Paragraph,
     Picture,
     Section,
     Table,
     figure_of,
 )
 from dahl_ident.reporting.provenance import parts
-from dahl_ident.reporting.sections import (
-    Result,
-    fit_facts,
-    header,
-    origin_facts,
-    signed,
-    worst_status,
-)
-from dahl_ident.results import FitResult
-from dahl_ident.results.changes import SIGNIFICANT, Change, changes, headline, is_usable
+from dahl_ident.reporting.sections import RANK, fit_facts, header, origin_facts, signed
+from dahl_ident.results import FitResult, Posterior
+from dahl_ident.results.changes import changes, headline, is_usable
+from dahl_ident.results.fit_base import Fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 def overlay(
-    results: Sequence[Result],
+    results: Sequence[Fit | Posterior],
     *,
     title: str | None = None,
     command: str | None = None,
@@ -68,7 +62,7 @@ def overlay(
     )
     return Document(
         title=title or given.title or f"Comparison of {', '.join(names)}",
-        status=worst_status(fits),
+        status=max((str(fit.status) for fit in fits), key=RANK),
         verdict=tuple(headline(changed)),
         header=_header(fits, names, given),
         sections=sections,
@@ -77,36 +71,27 @@ def overlay(
             "posteriors": [],
             "changes": [change.to_dict() for change in changed],
             "metadata": given.facts(),
-            **origin_facts(fits[0].data),
-            "files": [file for fit in fits for file in origin_facts(fit.data)["files"]],
+            **origin_facts(fits),
             "command": command,
         },
-        **signed(given, fits[0].data),
+        **signed(given, fits[0]),
     )
-
-
-_HOW = (
-    "A change is the difference of two estimates. Its standard uncertainty u combines both "
-    "budgets; for a fit of a single run, the scatter between runs that the other fit shows is "
-    "added. p is the two-sided probability of a change this large if there is no real change; "
-    f"below {SIGNIFICANT:g} it is called significant, unless no fit shows scatter between runs."
-)
 
 
 def _names(fits: Sequence[FitResult]) -> list[str]:
     """Return a name for each fit: its file, with a number if several have the same name."""
     named = []
     for i, fit in enumerate(fits, 1):
-        files = [Path(str(part["file"])).stem for part in parts(fit.data) if "file" in part]
+        files = [Path(str(part["file"])).stem for part in parts(fit.provenances) if "file" in part]
         named.append(files[0] if len(files) == 1 else f"measurement {i}")
-    return [n if named.count(n) == 1 else f"{n} ({i})" for i, n in enumerate(named, 1)]
+    return numbered(named)
 
 
 def _header(
     fits: Sequence[FitResult], names: Sequence[str], given: Metadata
 ) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    rows = dict(header(fits[0], given))
-    headers = [dict(header(fit, given)) for fit in fits]
+    rows = dict(header(fits[:1], given))
+    headers = [dict(header([fit], given)) for fit in fits]
     rows["Model"] = tuple(dict.fromkeys(line for one in headers for line in one["Model"]))
     rows["Data"] = tuple(
         f"{name}: {'; '.join(one['Data'])}" for name, one in zip(names, headers, strict=True)
@@ -139,30 +124,6 @@ def _estimate(fit: FitResult, name: str) -> Cell:
         return Cell("none finite")
     value, error = rounded(estimate.value, estimate.stderr)
     return Cell(f"{value} \u00b1 {error}", estimate.value, struck=not is_usable(fit, name))
-
-
-def changes_section(changed: Sequence[Change]) -> Section:
-    """Return the table of changes, and how it is made."""
-    rows = []
-    for c in changed:
-        value, error = rounded(c.change, c.u)
-        usable = math.isfinite(c.p)
-        rows.append(
-            (
-                Cell(c.parameter),
-                Cell(f"{c.before} to {c.after}"),
-                Cell(value, c.change, struck=not usable),
-                Cell(error, c.u if math.isfinite(c.u) else None, struck=not usable),
-                Cell(c.unit or "-"),
-                Cell(c.p_text.removeprefix("p = ").removeprefix("p "), c.p if usable else None),
-                Cell(c.significance),
-            )
-        )
-    header = (
-        "parameter", "between", "change", "standard uncertainty u", "unit", "p", "significance"
-    )  # fmt: skip
-    table = Table("Changes from each measurement to the next", header, tuple(rows))
-    return Section("Changes", (table, Paragraph(_HOW)))
 
 
 def _picture(names: Sequence[str], fits: Sequence[FitResult]) -> Picture:

@@ -5,15 +5,14 @@ from __future__ import annotations
 import datetime
 import importlib.metadata
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from dahl_ident.version import __version__
 
-if TYPE_CHECKING:
-    from dahl_ident.data import FrequencyResponse
-
+Provenances = Iterable[Mapping[str, Any] | None]
+"""Of a table, or of each record."""
 _PACKAGES = ("numpy", "scipy", "casadi", "emcee", "pandas", "matplotlib", "pint")
 _LISTED_ELSEWHERE = {"parts", "file", "sha256", "notes", "warnings"}
 
@@ -27,23 +26,25 @@ class SourceFile:
     read: bool
 
 
-def sources(data: FrequencyResponse) -> Iterator[SourceFile]:
+def sources(provenances: Provenances) -> Iterator[SourceFile]:
     """Yield every file that was read, each followed by its originals."""
-    for part in parts(data):
+    for part in parts(provenances):
         for i, one in enumerate(_with_origins(part)):
             if "file" in one:
                 yield SourceFile(str(one["file"]), str(one.get("sha256", "")), read=i == 0)
 
 
-def notes(data: FrequencyResponse) -> list[str]:
+def notes(provenances: Provenances) -> list[str]:
     """Return the assumptions made when reading."""
-    return list(dict.fromkeys(str(note) for part in parts(data) for note in part.get("notes", [])))
+    return list(
+        dict.fromkeys(str(note) for part in parts(provenances) for note in part.get("notes", []))
+    )
 
 
-def options(data: FrequencyResponse) -> list[tuple[str, str]]:
+def options(provenances: Provenances) -> list[tuple[str, str]]:
     """Return how the data were made, key by key, if stated and not the default."""
     stated: dict[str, str] = {}
-    for part in (one for whole in parts(data) for one in _with_origins(whole)):
+    for part in (one for whole in parts(provenances) for one in _with_origins(whole)):
         given_keys = {k: v for k, v in part.items() if k not in _LISTED_ELSEWHERE}
         for name in ("options", "extraction"):
             inner = given_keys.pop(name, None)
@@ -71,10 +72,9 @@ def today() -> str:
     return datetime.datetime.now().astimezone().isoformat(" ", timespec="minutes")
 
 
-def parts(data: FrequencyResponse) -> list[Mapping[str, Any]]:
-    """Return the provenance of each table that was joined."""
-    provenance = data.provenance or {}
-    return list(provenance.get("parts", [provenance]))
+def parts(provenances: Provenances) -> list[Mapping[str, Any]]:
+    """Return the provenance of each record, and of each table that was joined."""
+    return [part for one in provenances for part in (one or {}).get("parts", [one or {}])]
 
 
 def _with_origins(part: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:

@@ -17,26 +17,25 @@ from dahl_ident.data import Record
 from dahl_ident.data.laboratory import Metadata, metadata_of
 from dahl_ident.data.storage import place_of, plain_data, refuse_existing, write_whole
 from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.reporting.document import Block, Document, Picture
 from dahl_ident.reporting.html import html
-from dahl_ident.reporting.joint import joint
 from dahl_ident.reporting.markdown import markdown
 from dahl_ident.reporting.overlay import overlay
-from dahl_ident.reporting.record_report import record_document
 from dahl_ident.reporting.sections import Result, document
-from dahl_ident.results import FitResult, Posterior, RecordFit, RecordPosterior
+from dahl_ident.results import Posterior
+from dahl_ident.results.fit_base import Fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCHEMA = 2  # of the JSON report: it rises when readers have to change
 _LONGEST_TITLE = 200  # characters
-RecordResult = RecordFit | RecordPosterior
 FORMATS = (".html", ".pdf", ".md", ".json")
 
 
 def report(
-    results: Result | RecordResult | Sequence[Result | RecordResult],
+    results: Result | Sequence[Result],
     path: str | Path,
     *,
     title: str | None = None,
@@ -110,29 +109,20 @@ def report(
     _check(given)
     _check_calibrations(given, known)
     how: dict[str, Any] = {"title": title, "command": command, "metadata": known}
-    of_records = [one for one in given if isinstance(one, (RecordFit, RecordPosterior))]
-    of_tables = [
-        one
-        for one in given
-        if isinstance(one, (FitResult, Posterior)) and not isinstance(one, RecordPosterior)
-    ]
-    if not of_tables:
-        if record is not None:
-            raise ValidationError(
-                "record= is given, the waveforms of a table, but no result on a table; leave it out"
-            )
-        whole = record_document(of_records, **how)
-    elif not _on_one_table(of_tables):
-        if of_records:
-            raise ValidationError(
-                "fits of several tables are reported together with no fit of records; give those "
-                "of one table, or write a report for each"
-            )
-        whole = overlay(of_tables, **how)
+    of_tables = [one for one in given if one.problem.settled]
+    if record is not None and not of_tables:
+        raise ValidationError(
+            "record= is given, the waveforms of a table, but no result on a table; leave it out"
+        )
+    if _on_one_table(of_tables):
+        whole = document(given, record=record, **how)
+    elif len(of_tables) < len(given):
+        raise ValidationError(
+            "fits of several tables are reported together with no fit of records; give those of "
+            "one table, or write a report for each"
+        )
     else:
-        whole = document(of_tables, record=record, **how)
-        if of_records:
-            whole = joint(whole, record_document(of_records, **how), given)
+        whole = overlay(given, **how)
     whole = replace(whole.numbered(), title=_one_line(whole.title))
     if progress is not None:
         whole = _counted(whole, progress)
@@ -172,14 +162,14 @@ def _check(results: Sequence[object]) -> None:
     if not results:
         raise ValidationError("there is no result to report on; expected at least one")
     for i, result in enumerate(results):
-        if not isinstance(result, (FitResult, Posterior, RecordFit, RecordPosterior)):
+        if not isinstance(result, Fit | Posterior):
             raise ValidationError(
                 f"result {i} is a {type(result).__name__}; expected a FitResult, a RecordFit or a "
                 "Posterior"
             )
 
 
-def _check_calibrations(results: Sequence[Result | RecordResult], known: Metadata) -> None:
+def _check_calibrations(results: Sequence[Result], known: Metadata) -> None:
     """Refuse results that do not count what the instruments state."""
     for name, u in known.calibrations().items():
         for result in results:
@@ -193,11 +183,9 @@ def _check_calibrations(results: Sequence[Result | RecordResult], known: Metadat
                 )
 
 
-def _counted_calibration(result: Result | RecordResult, name: str) -> float:
+def _counted_calibration(result: Result, name: str) -> float:
     """Return the standard uncertainty of a channel's gain or delay that a result counts."""
-    if isinstance(result, RecordPosterior):
-        return _counted_calibration(result.fit, name)
-    if isinstance(result, RecordFit):
+    if isinstance(result.problem, RecordProblem):
         return result.problem.calibration.get(name, 0.0)
     prior = result.problem.priors.get(name)
     return 0.0 if prior is None else float(prior.std())
@@ -209,9 +197,8 @@ def _one_line(title: str) -> str:
     return whole if len(whole) <= _LONGEST_TITLE else f"{whole[:_LONGEST_TITLE]}..."
 
 
-def _on_one_table(results: Sequence[Result]) -> bool:
-    first = results[0].data.response
-    return all(np.array_equal(result.data.response, first) for result in results)
+def _on_one_table(results: Sequence[Any]) -> bool:
+    return all(np.array_equal(one.data.response, results[0].data.response) for one in results)
 
 
 def _content(whole: Document, kind: str) -> bytes:

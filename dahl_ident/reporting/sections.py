@@ -8,14 +8,16 @@ from typing import Any
 
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.laboratory import Metadata
-from dahl_ident.diagnostics.budget import taken_as_exact
+from dahl_ident.diagnostics.budget import Budget, taken_as_exact
 from dahl_ident.diagnostics.comparison import compare_models
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, percent
 from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
+from dahl_ident.problem import Problem
 from dahl_ident.reporting import posterior_sections, provenance, tables
+from dahl_ident.reporting.comparison import comparison_of
 from dahl_ident.reporting.document import (
     MARKS,
     Block,
@@ -23,18 +25,18 @@ from dahl_ident.reporting.document import (
     Document,
     Listing,
     Paragraph,
-    Picture,
     Section,
     Table,
     words,
 )
 from dahl_ident.reporting.equivalent_command import equivalent_command
-from dahl_ident.reporting.figures import budget_picture, pictures_of_fit
+from dahl_ident.reporting.figures import budget_picture, of_records, of_table
 from dahl_ident.reporting.settling import settling
-from dahl_ident.results import FitResult, Posterior
+from dahl_ident.results import FitResult, Posterior, RecordFit, RecordPosterior
+from dahl_ident.results.fit_base import Fit
 from dahl_ident.version import __version__
 
-Result = FitResult | Posterior
+Result = Fit | Posterior
 
 NOISE = {
     "measured": "The covariance of every point is known from the measurement; residuals are in "
@@ -50,7 +52,11 @@ COVERAGE = (
     f"k, for a coverage of about {percent(CONFIDENCE)}."
 )
 _MOST_FILES = 4  # lines of them before the signature
-_FRONT = ("response", "residuals")  # pictures before the details
+_FRONT = ("response", "residuals", "record")  # how names of the pictures before the details begin
+_OUTPUTS = {
+    "force": "The force is computed from the measured displacement, sample by sample.",
+    "motion": "The equation of motion is integrated under the measured drive.",
+}
 
 
 def document(
@@ -61,89 +67,102 @@ def document(
     record: Record | None = None,
     metadata: Metadata | None = None,
 ) -> Document:
-    """Return the report on fits and posteriors of the same data."""
-    fits = [result for result in results if isinstance(result, FitResult)]
+    """Return the report on fits and posteriors of one table, of records, or of both."""
     drawn = [result for result in results if isinstance(result, Posterior)]
-    data = results[0].data
-    given = metadata or Metadata()
+    around = [one.fit for one in drawn if isinstance(one, RecordPosterior)]
+    fits = list(dict.fromkeys([*(r for r in results if isinstance(r, Fit)), *around]))
+    tables_first = sorted(results, key=lambda result: not result.problem.settled)
+    first, given = tables_first[0], metadata or Metadata()
     repeated = command or equivalent_command(results)
-    front, details = [], []
+    compared = comparison_of(fits)
+    front: list[Section] = []
+    details: list[Section] = []
     for fit in fits:
-        of = f": {fit.problem.model!r}" if len(fits) > 1 else ""
-        pictures = list(pictures_of_fit(fit))
-        front += list(_answer(fit, of))
+        of = _of(fit, fits)
+        front += [*_answer(fit, of)]
         front.append(Section(f"Expanded uncertainty{of}", tuple(_budget(fit))))
-        front.append(Section(f"What was assumed{of}", tuple(_assumed(fit))))
-        shown = tuple(picture for picture in pictures if picture.name in _FRONT)
-        details.append(Section(f"Pictures{of}", shown, details=True))
-        details += list(_details(fit, drawn, pictures, of))
-    if not fits:
-        front += [Section("Result", tuple(posterior_sections.answer(one))) for one in drawn]
-    details += [section for one in drawn for section in posterior_sections.sections(one)]
+        front.append(Section(f"What was assumed{of}", (Bullets(tuple(_assumed(fit))),)))
+        details += _details(fit, drawn, of)
+    for one in drawn:
+        if not fits or not one.problem.settled:
+            front.append(Section("Posterior", tuple(posterior_sections.answer(one))))
+        details += posterior_sections.sections(one)
+    data = first.problem.data if isinstance(first.problem, Problem) else None
     return Document(
-        title=title or given.title or title_of(data),
-        status=worst_status(results),
+        title=title or given.title or title_of(first),
+        status=max((*(str(r.status) for r in (*fits, *drawn)), *compared.status), key=RANK),
         verdict=(
-            *(line for fit in fits for line in _verdict(fit, len(fits) > 1)),
+            *compared.verdict,
+            *(line for fit in fits for line in _verdict(fit, fits)),
             *(line for one in drawn for line in posterior_sections.verdict(one)),
         ),
-        header=header(results[0], given),
+        header=header(tables_first, given),
         sections=(
+            *compared.sections,
             *(section for section in front if section.blocks),
             *(section for section in details if section.blocks),
-            *_extraction(data, record),
-            Section("Data", tuple(_data(data)), details=True),
+            *([] if data is None else [*_extraction(data, record), _data(data)]),
             Section(
-                "Origin", tuple(_origin(data, repeated, typed=command is not None)), details=True
+                "Origin",
+                tuple(_origin(tables_first, repeated, typed=command is not None)),
+                details=True,
             ),
         ),
         facts={
-            "fits": [fit_facts(fit) for fit in fits],
+            "fits": [fit_facts(fit) for fit in fits if fit.problem.settled],
+            "record_fits": [fit_facts(fit) for fit in fits if not fit.problem.settled],
             "posteriors": [one.to_dict() for one in drawn],
             "metadata": given.facts(),
-            **origin_facts(data),
+            **compared.facts,
+            **origin_facts(tables_first),
             "command": repeated,
         },
-        **signed(given, data),
+        **signed(given, first),
     )
 
 
-def signed(given: Metadata, data: FrequencyResponse | None) -> dict[str, Any]:
+def _of(fit: Fit, fits: Sequence[Fit]) -> str:
+    """Return what distinguishes a fit from the others of a report, for headings."""
+    alike = [other for other in fits if other.problem.settled == fit.problem.settled]
+    parts = [repr(fit.problem.model)] if len(alike) > 1 else []
+    if len(alike) < len(fits) and not fit.problem.settled:
+        parts.append("waveforms")
+    return f": {', '.join(parts)}" if parts else ""
+
+
+def signed(given: Metadata, result: Result) -> dict[str, Any]:
     """Return what identifies the report on every page, and who signs it."""
-    files = [] if data is None else [s for s in provenance.sources(data) if s.read and s.sha256]
-    return {
-        "identity": identity(given, [(source.file, source.sha256) for source in files]),
-        "signatory": given.signatory,
-    }
-
-
-def identity(given: Metadata, files: Sequence[tuple[str, str]]) -> str:
-    """Return the number of a report and the hash of its first file, for every page."""
+    files = [s for s in provenance.sources(result.provenances) if s.read and s.sha256]
     parts = [f"Report {given.number}"] if given.number else []
     if files:
         more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-        name, sha256 = files[0]
-        parts.append(f"{Path(name).name}, SHA-256 {short(sha256)}{more}")
-    return " \u00b7 ".join(parts)
+        parts.append(f"{Path(files[0].file).name}, SHA-256 {_short(files[0].sha256)}{more}")
+    return {"identity": " \u00b7 ".join(parts), "signatory": given.signatory}
 
 
-def short(sha256: str) -> str:
+def _short(sha256: str) -> str:
     """Return the beginning of a hash; the whole one stands under the origin."""
     return f"{sha256[:12]}..." if sha256 else "unknown"
 
 
-def origin_facts(data: FrequencyResponse) -> dict[str, Any]:
+def origin_facts(results: Sequence[Result]) -> dict[str, Any]:
     """Return files, versions and date for machines."""
     return {
-        "files": [vars(source) for source in provenance.sources(data)],
+        "files": [vars(source) for source in _files(results)],
         "versions": provenance.versions(),
         "date": provenance.today(),
     }
 
 
-def title_of(data: FrequencyResponse) -> str:
+def _files(results: Sequence[Result]) -> list[provenance.SourceFile]:
+    """Return every file once, in the order of the results."""
+    every = (source for one in results for source in provenance.sources(one.provenances))
+    return list(dict.fromkeys(every))
+
+
+def title_of(result: Result) -> str:
     """Return a title that names the file, where there is one."""
-    files = [str(part["file"]) for part in provenance.parts(data) if "file" in part]
+    files = [str(p["file"]) for p in provenance.parts(result.provenances) if "file" in p]
     return (
         f"Friction identified from {Path(files[0]).name}"
         if len(files) == 1
@@ -151,15 +170,12 @@ def title_of(data: FrequencyResponse) -> str:
     )
 
 
-def worst_status(results: Sequence[Result]) -> str:
-    """Return the worst status of the results."""
-    order = list(MARKS)
-    return max((str(result.status) for result in results), key=order.index)
+RANK = list(MARKS).index
+"""The place of a status in the order from good to bad."""
 
 
-def header(result: Result, given: Metadata) -> tuple[tuple[str, tuple[str, ...]], ...]:
+def header(results: Sequence[Result], given: Metadata) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """Return specimen, model, data, instruments, operator, dates and software."""
-    data = result.data
     of_laboratory = given.lines
     specimen = {"Specimen": of_laboratory.pop("Specimen")}
     first = {
@@ -168,15 +184,15 @@ def header(result: Result, given: Metadata) -> tuple[tuple[str, tuple[str, ...]]
         if name in of_laboratory
     }
     files = []
-    for source in provenance.sources(data):
+    for source in _files(results):
         before = "" if source.read else "made from "
-        files.append(f"{before}{source.file}, SHA-256 {short(source.sha256)}")
+        files.append(f"{before}{source.file}, SHA-256 {_short(source.sha256)}")
     if len(files) > _MOST_FILES:
         more = len(files) - _MOST_FILES + 1
         files[_MOST_FILES - 1 :] = [f"and {more} more files, listed under Origin"]
     made_of = {
-        "Model": tuple(in_words(result.problem.model)),
-        "Data": (f"{data.n} rows", *files),
+        "Model": tuple(in_words(results[0].problem.model)),
+        "Data": (*dict.fromkeys(result.problem.extent for result in results), *files),
     }
     software = {
         "Date of report": (provenance.today(),),
@@ -200,99 +216,108 @@ def in_words(model: Element) -> Iterator[str]:
             yield f"{name}: {element.equation}"
 
 
-def _verdict(fit: FitResult, several: bool) -> list[str]:
-    """Return a fit's statements; if there are several fits, model and status come first."""
-    warnings = [f"Warning: {text}" for text in fit.goodness.warnings]
-    if not several:
-        return [*map(str, fit.judgement.told), *warnings]
-    first, *others = fit.statements
-    return [f"{fit.problem.model!r}: {first}", *others, *warnings]
+def _verdict(fit: Fit, fits: Sequence[Fit]) -> Iterator[str]:
+    """Yield a fit's statements; where there are several fits, model and status come first."""
+    kinds = {other.problem.settled for other in fits}
+    before = "" if len(kinds) < 2 else "Table: " if fit.problem.settled else "Waveforms: "
+    alike = sum(other.problem.settled == fit.problem.settled for other in fits)
+    if alike > 1:
+        first, *others = fit.statements
+        lines = [f"{fit.problem.model!r}: {first}", *others]
+    else:
+        lines = [*map(str, fit.judgement.told)]
+    warned = fit.goodness.warnings if isinstance(fit, FitResult) else ()
+    warnings = (f"Warning: {text}" for text in warned)
+    yield from (f"{before}{line}" for line in (*lines, *warnings))
 
 
-def _answer(fit: FitResult, of: str) -> Iterator[Section]:
-    known = fit.identifiability
-    described = fit.status.usable or fit.goodness.acceptable
-    determined = tuple(f"Determined: {c}" for c in known.combinations)
+def _answer(fit: Fit, of: str) -> Iterator[Section]:
+    combinations = fit.identifiability.combinations if isinstance(fit, FitResult) else ()
     yield Section(
         f"Result{of}",
         (
-            tables.answer(fit, described=described),
-            Bullets(determined),
+            tables.answer(fit),
+            Bullets(tuple(f"Determined: {c}" for c in combinations)),
             Paragraph(RELATES),
         ),
     )
 
 
-def _budget(fit: FitResult) -> Iterator[Block]:
+def _stated(fit: Fit) -> Budget | None:
+    """Return the uncertainty budget; None where no uncertainty can be stated."""
+    lost = fit.status is VerdictStatus.NOT_DESCRIBED
+    return None if lost else fit.stated_budget
+
+
+def _budget(fit: Fit) -> Iterator[Block]:
     """Yield the combined uncertainties; nothing if none can be stated."""
-    stated = fit.stated_budget
-    if fit.status != VerdictStatus.NOT_DESCRIBED and stated is not None:
+    if (stated := _stated(fit)) is not None:
         yield tables.uncertainty(stated)
         yield Paragraph(COVERAGE)
 
 
-def _sources(fit: FitResult) -> Iterator[Block]:
-    """Yield every source of uncertainty of every parameter."""
-    stated = fit.stated_budget
-    if fit.status != VerdictStatus.NOT_DESCRIBED and stated is not None:
-        yield tables.budget(stated)
-        yield budget_picture(stated)
-
-
-def _assumed(fit: FitResult) -> Iterator[Block]:
+def _assumed(fit: Fit) -> Iterator[str]:
     """Yield the assumptions of the result that these data do not test."""
-    errors = fit.errors
-    counted = () if errors is None else errors.assumed
     sensors = [p.name for p in fit.problem.sensors.parameters]
-    held = [p for p in fit.params.values() if not p.vary and p.name not in (*counted, *sensors)]
-    fixed = [_value(p.name, p.value, p.unit) for p in held]
-    exact = taken_as_exact(fit.optimum)
-    lines = [f"Held fixed: {listed(fixed)}."] if fixed else []
-    if errors is not None:
-        lines += [
-            f"Not given, so that the uncertainty counts it: {name}, here "
-            f"{with_unit(errors.values[name], errors.stderr[name], fit.params[name].unit)}."
-            for name in counted
-        ]
-    if exact:
-        lines.append(f"Taken as exact: {listed(exact)}.")
-    lines += [f"Prior of {name}: {given}." for name, given in tables.priors_in_words(fit)]
-    lines.append(NOISE[fit.noise])
-    lines += [f"{note[0].upper()}{note[1:]}." for note in provenance.notes(fit.data)]
-    lines.append(f"Search: {fit.method}, loss {fit.optimum.loss}.")
-    yield Bullets(tuple(lines))
+    held = [p for p in fit.params.values() if not p.vary and p.name not in (*fit.assumed, *sensors)]
+    fixed = [f"{p.name} = {p.value:g} {p.unit}".rstrip() for p in held]
+    if isinstance(fit, RecordFit):
+        yield _OUTPUTS[fit.problem.output]
+    if fixed:
+        yield f"Held fixed: {listed(fixed)}."
+    if isinstance(fit, RecordFit):
+        for one in fit.errors.exponents:
+            yield f"Not given: {one}; its range counts in the uncertainty."
+        yield f"Taken as exact: {listed(fit.errors.exact)}."
+        if fit.weighted:
+            yield "Residuals are weighted by their spectrum, because slow noise dominates them."
+        return
+    assert isinstance(fit, FitResult)
+    for p in (fit.params[name] for name in fit.assumed):
+        here = with_unit(p.value, p.stderr, p.unit)
+        yield f"Not given, so that the uncertainty counts it: {p.name}, here {here}."
+    if exact := taken_as_exact(fit.optimum):
+        yield f"Taken as exact: {listed(exact)}."
+    yield from (f"Prior of {name}: {given}." for name, given in tables.priors_in_words(fit))
+    yield NOISE[fit.noise]
+    for note in provenance.notes(fit.provenances):
+        yield f"{note[0].upper()}{note[1:]}."
+    yield f"Search: {fit.method}, loss {fit.optimum.loss}."
 
 
-def _value(name: str, value: float, unit: str) -> str:
-    return f"{name} = {value:g} {unit}".rstrip()
+def _details(fit: Fit, drawn: Sequence[Posterior], of: str) -> Iterator[Section]:
+    """Yield what follows the signature."""
+
+    def section(title: str, *blocks: Block) -> Section:
+        return Section(f"{title}{of}", blocks, details=True)
+
+    pictures = [
+        *(of_table(fit) if isinstance(fit, FitResult) else ()),
+        *(of_records(fit) if isinstance(fit, RecordFit) else ()),
+    ]
+    yield section("Pictures", *(p for p in pictures if p.name.startswith(_FRONT)))
+    if (stated := _stated(fit)) is not None:
+        yield section("Sources of uncertainty", tables.budget(stated), budget_picture(stated))
+    yield section("Parameters", *_parameters(fit, drawn))
+    if isinstance(fit, FitResult):
+        known = fit.identifiability
+        texts = Bullets(tuple(p.text for p in known.parameters.values()))
+        yield section("What the data determine", Paragraph(known.headline), texts)
+    yield section("Noise and goodness of fit", *_goodness(fit))
+    if isinstance(fit, FitResult):
+        linearization = tables.linearization(fit)
+        blocks = [] if linearization is None else [linearization]
+        yield section("Stiffness and damping over amplitude", *blocks)
+    yield section("More pictures", *(p for p in pictures if not p.name.startswith(_FRONT)))
 
 
-def _details(
-    fit: FitResult, drawn: Sequence[Posterior], pictures: Sequence[Picture], of: str
-) -> Iterator[Section]:
-    if sources := tuple(_sources(fit)):
-        yield Section(f"Sources of uncertainty{of}", sources, details=True)
-    yield Section(f"Parameters{of}", tuple(_parameters(fit, drawn)), details=True)
-    known = fit.identifiability
-    yield Section(
-        f"What the data determine{of}",
-        (Paragraph(known.headline), Bullets(tuple(p.text for p in known.parameters.values()))),
-        details=True,
-    )
-    yield Section(f"Noise and goodness of fit{of}", tuple(_goodness(fit)), details=True)
-    linearization = tables.linearization(fit)
-    if linearization is not None:
-        yield Section(f"Stiffness and damping over amplitude{of}", (linearization,), details=True)
-    others = tuple(picture for picture in pictures if picture.name not in _FRONT)
-    yield Section(f"More pictures{of}", others, details=True)
-
-
-def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
+def _parameters(fit: Fit, drawn: Sequence[Posterior]) -> Iterator[Block]:
     fit.conf_interval("wald")
-    if not fit.first_order:
+    if fit.problem.settled and not fit.first_order:  # profiles of records take minutes
         fit.conf_interval("profile")
     intervals = fit.intervals_run(CONFIDENCE)
-    yield tables.parameters(fit, intervals, drawn)
+    alike = [one for one in drawn if one.problem.settled == fit.problem.settled]
+    yield tables.parameters(fit, intervals, alike)
     by_note: dict[str, list[str]] = {}
     for one in intervals:
         by_note.setdefault(one.note, []).append(tables.method_name(one))
@@ -301,11 +326,12 @@ def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
     yield Bullets((*notes, *(f"Derived: {quantity}" for quantity in derived)))
 
 
-def _goodness(fit: FitResult) -> Iterator[Block]:
-    left = fit.goodness
-    yield Bullets(tuple(left.details))
+def _goodness(fit: Fit) -> Iterator[Block]:
+    yield Bullets(tuple(fit.goodness.details))
+    if not isinstance(fit, FitResult):
+        return
     yield tables.goodness(fit)
-    if not left.acceptable:
+    if not fit.goodness.acceptable:
         compared = compare_models(fit)
         yield Paragraph(f"Other models, for comparison. {compared.headline}")
         yield tables.comparison(compared)
@@ -335,20 +361,19 @@ def _extraction(data: FrequencyResponse, record: Record | None) -> Iterator[Sect
     )
 
 
-def _data(data: FrequencyResponse) -> Iterator[Block]:
-    yield tables.measured(data)
+def _data(data: FrequencyResponse) -> Section:
+    return Section("Data", (tables.measured(data),), details=True)
 
 
-def _origin(data: FrequencyResponse, command: str | None, *, typed: bool) -> Iterator[Block]:
-    files = list(provenance.sources(data))
-    if files:
+def _origin(results: Sequence[Result], command: str | None, *, typed: bool) -> Iterator[Block]:
+    if files := _files(results):
         rows = tuple(
             words(s.file, "read" if s.read else "origin of the file above", s.sha256) for s in files
         )
         yield Table("Files", ("file", "what it is", "SHA-256"), rows)
-    made = provenance.options(data)
+    made = dict(pair for one in results for pair in provenance.options(one.provenances))
     if made:
-        yield Table("Options", ("option", "value"), tuple(words(*pair) for pair in made))
+        yield Table("Options", ("option", "value"), tuple(words(*pair) for pair in made.items()))
     yield Paragraph(f"Versions: {provenance.listed_versions()}.")
     when = f"Made on {provenance.today()}"
     if command is None:
@@ -363,21 +388,16 @@ def _origin(data: FrequencyResponse, command: str | None, *, typed: bool) -> Ite
     yield Listing(command)
 
 
-def fit_facts(fit: FitResult) -> dict[str, Any]:
+def fit_facts(fit: Fit) -> dict[str, Any]:
     """Return a fit for machines."""
-    known, left = fit.identifiability, fit.goodness
     intervals = fit.conf_interval().at(CONFIDENCE)
-    return {
+    facts = {
         "model": repr(fit.problem.model),
         "equations": list(in_words(fit.problem.model)),
         "status": str(fit.status),
         "trusted": fit.trusted,
         "verdict": fit.verdict,
         "findings": [finding.to_dict() for finding in fit.findings],
-        "search": fit.optimum.status.name.lower().replace("_", " "),
-        "noise": fit.noise,
-        "scale": fit.scale,
-        "scale_known": fit.scale_known,
         "parameters": {
             name: {
                 "value": e.value,
@@ -385,16 +405,29 @@ def fit_facts(fit: FitResult) -> dict[str, Any]:
                 "unit": e.unit,
                 "fixed": not e.vary,
                 "interval_95.45": list(intervals[name][1:]) if e.vary else None,
-                "verdict": known.parameters[name].verdict.value if e.vary else None,
+                "verdict": fit.verdict_on(name)[0].value if e.vary else None,
             }
             for name, e in fit.params.items()
         },
         "budget": None if fit.stated_budget is None else fit.stated_budget.to_dict(),
+    }
+    if isinstance(fit, RecordFit):
+        return facts | {
+            "records": len(fit.records),
+            "samples": fit.problem.n_samples,
+            "share_of_variance_left": fit.goodness.share_left,
+        }
+    assert isinstance(fit, FitResult)
+    return facts | {
+        "search": fit.optimum.status.name.lower().replace("_", " "),
+        "noise": fit.noise,
+        "scale": fit.scale,
+        "scale_known": fit.scale_known,
         "priors": tables.priors(fit),
-        "determined": [str(c) for c in known.combinations],
-        "suspicious": [str(point) for point in left.suspicious],
-        "warnings": list(left.warnings),
-        "rms_misfit": left.rms_misfit,
+        "determined": [str(c) for c in fit.identifiability.combinations],
+        "suspicious": [str(point) for point in fit.goodness.suspicious],
+        "warnings": list(fit.goodness.warnings),
+        "rms_misfit": fit.goodness.rms_misfit,
         "redchi": fit.redchi,
         "aic": fit.aic,
         "bic": fit.bic,

@@ -70,8 +70,12 @@ def cycle_by_cycle(
 
 def _check_origin(data: FrequencyResponse, record: Record) -> None:
     digest = dict(record.provenance or {}).get("sha256")
-    known = [source.sha256 for source in sources(data) if source.sha256]
-    if "start_time" not in data.quality or len(parts(data)) > 1 or digest not in (*known, None):
+    known = [source.sha256 for source in sources([data.provenance]) if source.sha256]
+    if (
+        "start_time" not in data.quality
+        or len(parts([data.provenance])) > 1
+        or digest not in (*known, None)
+    ):
         raise ValidationError(
             "the data were not extracted from this record alone; give the one that they were "
             "extracted from, or none"

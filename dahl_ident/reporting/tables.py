@@ -10,7 +10,6 @@ import numpy as np
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, percent
 from dahl_ident.diagnostics.formatting import degrees_text, interval, rounded, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
-from dahl_ident.diagnostics.verdicts import Verdict
 from dahl_ident.reporting.document import Cell, Table, number, words
 from dahl_ident.results.changes import is_usable
 from dahl_ident.units import prefix, si_unit
@@ -23,44 +22,46 @@ if TYPE_CHECKING:
     from dahl_ident.diagnostics.budget import Budget
     from dahl_ident.diagnostics.comparison import ModelComparison
     from dahl_ident.results import FitResult, Posterior
+    from dahl_ident.results.fit_base import Fit
 
 _LARGEST = 3  # sources of uncertainty on the first page
+_ASSUMED = "assumed; u counts it"
 _NO_PART = 1e-6  # share of the variance that the details leave out: a thousandth of u
 _LINEARIZATION_ROWS = 9  # few enough to read, from the smallest amplitude to the largest
 
 
-def answer(fit: FitResult, *, described: bool) -> Table:
+def answer(fit: Fit) -> Table:
     """Return every free parameter with its interval; unusable numbers are struck."""
     limits = fit.conf_interval().at(CONFIDENCE)
+    described = fit.status is not VerdictStatus.NOT_DESCRIBED
+    of_device = fit.var_names[: fit.problem.n_reported]
     rows = []
     for name, p in fit.params.items():
-        if (stated := assumed(fit, name)) is not None:
-            numbers = (Cell(text, struck=not described) for text in (*stated, "-"))
-            notes = words(p.unit or "-", p.description, "assumed; u counts it")
-            rows.append((Cell(name), *numbers, *notes))
-        if not p.vary:
+        if name in fit.assumed and p.stderr is not None:
+            stated = (*rounded(p.value, p.stderr), "-")
+            numbers = (Cell(text, struck=not described) for text in stated)
+            rows.append((Cell(name), *numbers, *words(p.unit or "-", p.description, _ASSUMED)))
+        if name not in of_device:
             continue
-        estimate, judged = fit.params[name], fit.identifiability.parameters[name]
-        value, error = rounded(estimate.value, estimate.stderr)
-        lost = judged.verdict in (Verdict.WEAK, Verdict.NOT_IDENTIFIED)
+        verdict, reason = fit.verdict_on(name)
+        value, error = rounded(p.value, p.stderr)
+        lost, limit = not verdict.known, limits[name]
         struck = lost or not described
-        limit = limits[name]
         closed = lost and bool(np.isfinite([limit.lower, limit.upper]).all())  # a bound holds
-        reason = judged.reason if lost else judged.verdict.value
-        if not described and not lost:
-            reason = "the model does not describe the data: the interval is not valid"
-        if fit.status == VerdictStatus.APPROXIMATE and not lost:
-            reason += "; u includes the misfit"
+        if not lost:
+            reason = verdict.value
+            if not described:
+                reason = "the model does not describe the data: the interval is not valid"
+            elif fit.status == VerdictStatus.APPROXIMATE:
+                reason += "; u includes the misfit"
         rows.append(
             (
                 Cell(name),
-                Cell(value, estimate.value, struck)
-                if np.isfinite(estimate.value)
-                else Cell("none finite"),
-                Cell(error, _finite(estimate.stderr), struck),
+                Cell(value, p.value, struck) if np.isfinite(p.value) else Cell("none finite"),
+                Cell(error, _finite(p.stderr), struck),
                 Cell(interval(limit.lower, limit.upper, ""), struck=not described or closed),
-                Cell(estimate.unit or "-"),
-                Cell(estimate.description),
+                Cell(p.unit or "-"),
+                Cell(p.description),
                 Cell(reason),
             )
         )
@@ -71,13 +72,6 @@ def answer(fit: FitResult, *, described: bool) -> Table:
     crossed = any(cell.struck for row in rows for cell in row)
     hint = ". Numbers that are crossed out must not be used" if crossed else ""
     return Table(f"Estimates with their standard uncertainties{hint}", header, tuple(rows))
-
-
-def assumed(fit: FitResult, name: str) -> tuple[str, str] | None:
-    """Return value and uncertainty of a parameter that was not given, such as an exponent."""
-    if fit.errors is None or name not in fit.errors.assumed:
-        return None
-    return rounded(fit.errors.values[name], fit.errors.stderr[name])
 
 
 def uncertainty(stated: Budget) -> Table:
@@ -174,7 +168,7 @@ def prior_text(given: Any) -> str:
 
 
 def parameters(
-    fit: FitResult, intervals: Sequence[ConfidenceIntervals], drawn: Sequence[Posterior]
+    fit: Fit, intervals: Sequence[ConfidenceIntervals], drawn: Sequence[Posterior]
 ) -> Table:
     """Return every parameter with its intervals, one column a method."""
     at = [one.at(CONFIDENCE) for one in intervals]
@@ -191,8 +185,8 @@ def parameters(
             Cell(error if estimate.vary else "fixed", _finite(estimate.stderr), bad),
             Cell(estimate.unit or "-"),
         ]
-        if (stated := assumed(fit, name)) is not None:
-            row[1:3] = words(stated[0], f"{stated[1]}, assumed")
+        if name in fit.assumed:
+            row[1:3] = words(value, f"{error}, assumed")
         for method in at:
             limits = method.get(name)
             shown = interval(limits.lower, limits.upper, "") if limits else "-"

@@ -15,6 +15,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.bootstrap import bootstrap_intervals
 from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
+from dahl_ident.diagnostics.goodness import Goodness
 from dahl_ident.diagnostics.intervals import (
     METHODS,
     ConfidenceIntervals,
@@ -24,6 +25,9 @@ from dahl_ident.diagnostics.intervals import (
     profile_intervals,
     wald_intervals,
 )
+from dahl_ident.diagnostics.record_goodness import RecordGoodness
+from dahl_ident.diagnostics.verdicts import Verdict
+from dahl_ident.elements import Model
 from dahl_ident.errors import FitError, ValidationError, choices
 from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.results.result import Parameters, Result, part
@@ -64,6 +68,25 @@ class Fit(Result):
     @abstractmethod
     def covar(self) -> FloatArray:
         """Combined covariance of the free values, by every source of error, first order."""
+
+    @property
+    @abstractmethod
+    def assumed(self) -> tuple[str, ...]:
+        """Names of parameters that were not given; the uncertainty counts their ranges."""
+
+    @property
+    @abstractmethod
+    def model(self) -> Model:
+        """The model with the estimates put in."""
+
+    @abstractmethod
+    def verdict_on(self, name: str) -> tuple[Verdict, str]:
+        """Return whether the data determine a parameter, and what they say of it."""
+
+    @property
+    @abstractmethod
+    def goodness(self) -> Goodness | RecordGoodness:
+        """Statistics of the residuals."""
 
     @property
     def _estimate(self) -> Optimum:

@@ -34,7 +34,7 @@ from dahl_ident.diagnostics.intervals import (
     combined_intervals,
 )
 from dahl_ident.diagnostics.judgement import Judgement
-from dahl_ident.diagnostics.verdicts import Identifiability, judged
+from dahl_ident.diagnostics.verdicts import Identifiability, Verdict, judged
 from dahl_ident.elements import Model
 from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.fitting.optimum import DeterminedCombination, Optimum, propagated
@@ -177,6 +177,21 @@ class FitResult(Fit):
             for c in verdicts.combinations
         )
         return replace(verdicts, combinations=combinations)
+
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """Names of parameters that were not given; the uncertainty counts their ranges."""
+        return () if self.errors is None else tuple(self.errors.assumed)
+
+    def verdict_on(self, name: str) -> tuple[Verdict, str]:
+        """Return whether the data determine a parameter, and what they say of it."""
+        known = self.identifiability.parameters[name]
+        return known.verdict, known.reason
+
+    @property
+    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
+        """Where the table comes from."""
+        return (self.data.provenance,)
 
     @cached_property
     def goodness(self) -> Goodness:

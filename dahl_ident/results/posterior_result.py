@@ -90,11 +90,11 @@ class Posterior(Result):
     ) -> None:
         self._density: LogDensity = density
         self.sample = sample  #: The weighted draws, search coordinates.
-        self.problem = density.problem  #: Data, model, noise and sensors.
         self._fit = fit
         #: What is counted: every source of the fit's budget, "combined", or "noise" alone.
         self.uncertainty = uncertainty
 
+    problem: Problem = part("_density.problem", "Data, model, noise and sensors.")
     names: tuple[str, ...] = part(
         "_density.names", "Names of the parameters, the model's first, an unknown noise scale last."
     )
@@ -391,7 +391,7 @@ class Posterior(Result):
         Not determined where it has not converged, or a prior that nobody gave sets a parameter;
         not described where data or prior object; approximate where the fit's numbers are.
         """
-        return Judgement((*self._objections, *self._notes, *doubted(*self._provenances)))
+        return Judgement((*self._objections, *self._notes, *doubted(*self.provenances)))
 
     @cached_property
     def prior_influences(self) -> tuple[PriorInfluence, ...]:
@@ -429,7 +429,7 @@ class Posterior(Result):
             yield from (f for f in fit.findings if f.severity is VerdictStatus.APPROXIMATE)
 
     @property
-    def _provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
+    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
         """Where the data come from."""
         return (self.data.provenance,)
 

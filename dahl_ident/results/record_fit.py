@@ -38,13 +38,14 @@ from dahl_ident.diagnostics.record_errors import (
 )
 from dahl_ident.diagnostics.record_goodness import RecordGoodness, record_goodness
 from dahl_ident.diagnostics.record_identifiability import undetermined
+from dahl_ident.diagnostics.verdicts import Verdict
 from dahl_ident.elements import Model
 from dahl_ident.elements.description import describe_model, model_from_description
 from dahl_ident.elements.law_files import describe_laws, require_laws
 from dahl_ident.errors import DataError, FitError, FitInterrupted, ModelError, ValidationError
 from dahl_ident.fitting.losses import loss_named
 from dahl_ident.fitting.optimum import Optimum
-from dahl_ident.fitting.record_search import Tell, hold_model, optimum_at, solve_records
+from dahl_ident.fitting.record_search import Tell, hold_model, solve_records
 from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.results.fit_base import Fit
@@ -65,7 +66,7 @@ if TYPE_CHECKING:
     from dahl_ident.plots import Axes
 
 SCHEMA = "dahl_ident.record_fit"
-_SCHEMA_VERSION = 2  # of the layout; the first is read as well, later ones are refused
+_SCHEMA_VERSION = 2  # of the layout; others are refused
 _CHANNELS = ("displacement", "velocity", "acceleration", "force", "drive")
 _WELL = 1e-3  # share of variance left at which structure in the residuals does not matter
 _FAIRLY = 0.1  # share of variance left beyond which the model does not describe the records
@@ -143,6 +144,22 @@ class RecordFit(Fit):
     def records(self) -> tuple[Record, ...]:
         """The records that were fitted."""
         return self.problem.records
+
+    @property
+    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
+        """Where each record comes from."""
+        return tuple(record.provenance for record in self.records)
+
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """Names of parameters that were not given; the uncertainty counts their ranges."""
+        return tuple(one.name for one in self.errors.exponents)
+
+    def verdict_on(self, name: str) -> tuple[Verdict, str]:
+        """Return whether the records determine a parameter, and what they say of it."""
+        lost = [str(f) for f in self._undetermined if f.values["name"] == name]
+        verdict = Verdict.NOT_IDENTIFIED if lost else Verdict.IDENTIFIED
+        return verdict, lost[0] if lost else verdict.value
 
     @property
     def success(self) -> bool:
@@ -269,7 +286,7 @@ class RecordFit(Fit):
         if self.misses and not far:
             yield Finding(question, VerdictStatus.APPROXIMATE, "records_misfit")
 
-    @property
+    @cached_property
     def _undetermined(self) -> tuple[Finding, ...]:
         """Which parameters are not determined, with the reasons."""
         stderr = {p.name: self.params[p.name].stderr or 0.0 for p in self.problem.free}
@@ -339,7 +356,7 @@ class RecordFit(Fit):
                 "travel": self.problem.noise_travel,
             }
             yield Finding(question, note, "displacement_noise", noise)
-        yield from doubted(*(record.provenance for record in self.records))
+        yield from doubted(*self.provenances)
         samples = {"effective": self.effective_samples, "samples": self.problem.n_samples}
         yield Finding(question, note, "effective_samples", samples)
         yield record_assumptions(self.problem, self.errors)
@@ -389,7 +406,6 @@ class RecordFit(Fit):
         str
         """
         own = {p.name for p in self.problem.model.parameters}
-        assumed = {one.name for one in self.errors.exponents}
         limits = self.conf_interval().at(CONFIDENCE)
         rows = [["", "value", "stderr", "unit", f"{percent(CONFIDENCE)}", ""]]
         for name, p in self.params.items():
@@ -399,13 +415,13 @@ class RecordFit(Fit):
                 within = interval(*limits[name][1:], "")
                 rows.append([name, *rounded(p.value, p.stderr), p.unit, within, ""])
             else:
-                word = "assumed" if name in assumed else "fixed"
+                word = "assumed" if name in self.assumed else "fixed"
                 rows.append([name, f"{p.value:g}", "", p.unit, "", word])
         shown = table(rows, (0, 3, 4, 5)).splitlines()
         parts = [("Verdict", self.statements), ("Parameters", shown)]
         if details:
             parts.append(("Uncertainty budget", str(self.budget()).splitlines()))
-            parts.append(("Goodness of fit", self.goodness.lines))
+            parts.append(("Goodness of fit", self.goodness.details))
         return "\n".join(
             f"{title}\n" + "\n".join(f"    {line}" for line in lines) for title, lines in parts
         )
@@ -610,21 +626,17 @@ class RecordFit(Fit):
             held = json.loads(text)
             check_schema(held, "the text", SCHEMA, _SCHEMA_VERSION)
             check_digest(held, "the text")
-            require_laws(held.get("laws", ()), "the text")
+            require_laws(held["laws"], "the text")
             records = [Record(r.pop("time"), **r) for r in held["records"]]
             problem = RecordProblem(
                 records, model_from_description(held["model"]), output=held["output"],
-                excitation=held["excitation"], calibration=held.get("calibration"),
+                excitation=held["excitation"], calibration=held["calibration"],
             )  # fmt: skip
-            problem.runs = tuple(held.get("runs", problem.runs))
+            problem.runs = tuple(held["runs"])
             problem = problem.weighted(np.asarray(held["whitening"], dtype=np.float64))
-            problem = problem.without_noise(held.get("displacement_noise", 0.0))
-            if "optimum" in held:
-                optimum = optimum_from(problem, held["optimum"])
-                return cls(optimum, first_order=held["first_order"])
-            theta = problem.to_search(held["values"])
-            converged, evaluations = held["converged"], held["evaluations"]
-            return cls(optimum_at(problem, theta, converged=converged, evaluations=evaluations))
+            problem = problem.without_noise(held["displacement_noise"])
+            optimum = optimum_from(problem, held["optimum"])
+            return cls(optimum, first_order=held["first_order"])
         except ModelError:
             raise
         except (KeyError, TypeError, ValueError) as exc:

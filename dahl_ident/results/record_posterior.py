@@ -60,8 +60,9 @@ class RecordPosterior(Posterior):
         return Parameters({p.name: every[p.name] for p in self.fit.problem.model.parameters})
 
     @property
-    def _provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
-        return tuple(record.provenance for record in self.fit.records)
+    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
+        """Where each record comes from."""
+        return self.fit.provenances
 
     @property
     def _counted_fit(self) -> RecordFit:  # type: ignore[override]

@@ -199,6 +199,16 @@ class Result(ABC):
     def params(self) -> Mapping[str, Estimate]:
         """Every parameter by name, fixed ones included."""
 
+    @property
+    @abstractmethod
+    def problem(self) -> BaseProblem:
+        """Data, model, noise and sensors."""
+
+    @property
+    @abstractmethod
+    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
+        """Where the data come from: one for the table, or one for each record."""
+
     @abstractmethod
     def summary(self) -> pd.DataFrame:
         """Return a table, one row a parameter."""

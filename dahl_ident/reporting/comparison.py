@@ -1,0 +1,180 @@
+"""Parameters of several measurements compared: changes, or a table with its waveforms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dahl_ident.diagnostics.formatting import rounded, with_unit
+from dahl_ident.diagnostics.judgement import VerdictStatus
+from dahl_ident.reporting.document import Cell, Paragraph, Section, Table
+from dahl_ident.results import FitResult, RecordFit
+from dahl_ident.results.changes import SIGNIFICANT, Change, changes, headline
+from dahl_ident.results.fit_base import Fit
+
+_HOW_BOTH = (
+    "The same parameters, estimated from the table and sample by sample from the waveforms. The "
+    "standard uncertainty u of the difference combines both budgets as if they had no error in "
+    "common; p is the two-sided probability of a difference this large if there is none. A "
+    f"difference is called a disagreement where p times the number of rows is below {SIGNIFICANT}."
+)
+
+
+_HOW = (
+    "A change is the difference of two estimates. Its standard uncertainty u combines both "
+    "budgets; for a fit of a single run, the scatter between runs that the other fit shows is "
+    "added. p is the two-sided probability of a change this large if there is no real change; "
+    f"below {SIGNIFICANT:g} it is called significant, unless no fit shows scatter between runs."
+)
+
+
+@dataclass(frozen=True)
+class Compared:
+    """What a report says of fits of different measurements, compared with each other."""
+
+    status: tuple[str, ...] = ()
+    verdict: tuple[str, ...] = ()
+    sections: tuple[Section, ...] = ()
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+
+def comparison_of(fits: Sequence[Fit]) -> Compared:
+    """Return what changed between fits of records, or between a table and its waveforms."""
+    if len({fit.problem.settled for fit in fits}) > 1:
+        return _of_both(fits)
+    changed = _between_records([fit for fit in fits if isinstance(fit, RecordFit)])
+    if not changed:
+        return Compared()
+    facts = {"changes": [change.to_dict() for change in changed]}
+    return Compared((), tuple(headline(changed)), (changes_section(changed),), facts)
+
+
+def _between_records(fits: Sequence[RecordFit]) -> list[Change]:
+    """Return the changes between fits to different records; none between models of the same."""
+    firsts = [fit.records[0] for fit in fits]
+    channels = ("time", "displacement", "velocity", "acceleration", "force", "drive")
+    for a, b in pairwise(firsts):
+        if all(np.array_equal(getattr(a, name), getattr(b, name)) for name in channels):
+            return []
+    named = [Path(str((r.provenance or {}).get("file", "measurement"))).stem for r in firsts]
+    return changes(dict(zip(numbered(named), fits, strict=True)))
+
+
+def numbered(names: Sequence[str]) -> list[str]:
+    """Return names with a number where several are the same."""
+    return [n if names.count(n) == 1 else f"{n} ({i})" for i, n in enumerate(names, 1)]
+
+
+def _of_both(fits: Sequence[Fit]) -> Compared:
+    differences = list(_differences(fits))
+    disagree = [c.parameter for c, *_ in differences if _disagree(c, differences)]
+    # one model, with its uncertainties, then does not describe both
+    status = (str(VerdictStatus.NOT_DESCRIBED),) if disagree else ()
+    return Compared(
+        status,
+        tuple(_comparison_in_words(fits)),
+        (_comparison(differences),) if differences else (),
+        {"changes": [change.to_dict() for change, *_ in differences], "disagree": disagree},
+    )
+
+
+_Difference = tuple[Change, FitResult, RecordFit]
+
+
+def _differences(results: Sequence[object]) -> Iterator[_Difference]:
+    """Yield the differences of the parameters that a table and waveforms both determine."""
+    tables = [one for one in results if isinstance(one, FitResult)]
+    records = [one for one in results if isinstance(one, RecordFit)]
+    for fit, other in product(tables, records):
+        for change in changes({"table": fit, "waveforms": other}):
+            yield change, fit, other
+
+
+def _disagree(change: Change, differences: Sequence[_Difference]) -> bool:
+    return change.p * sum(math.isfinite(c.p) for c, _, _ in differences) < SIGNIFICANT
+
+
+def disagreements(results: Sequence[object]) -> list[str]:
+    """Return a sentence for each parameter that a table and waveforms give differently."""
+    differences = list(_differences(results))
+    sentences = []
+    for change, *fits in differences:
+        if _disagree(change, differences):
+            name = change.parameter
+            estimates = (fit.params[name] for fit in fits)
+            one, two = (with_unit(e.value, e.stderr or 0.0, change.unit) for e in estimates)
+            sentences.append(
+                f"Table and waveforms disagree: {name} is {one} from the table and {two} from the "
+                f"waveforms ({change.p_text}). At least one has an error that its uncertainty does "
+                "not hold."
+            )
+    return sentences
+
+
+def _comparison_in_words(results: Sequence[object]) -> list[str]:
+    if sentences := disagreements(results):
+        return sentences
+    if any(math.isfinite(change.p) for change, _, _ in _differences(results)):
+        return ["Table and waveforms agree within their uncertainties."]
+    return ["Table and waveforms cannot be compared: they have no usable estimate in common."]
+
+
+def _comparison(differences: Sequence[_Difference]) -> Section:
+    rows = []
+    for change, *fits in differences:
+        estimates = []
+        for fit in fits:
+            estimate = fit.params[change.parameter]
+            value, error = rounded(estimate.value, estimate.stderr or 0.0)
+            estimates.append(Cell(f"{value} \u00b1 {error}", estimate.value))
+        value, error = rounded(change.change, change.u)
+        usable = math.isfinite(change.p)
+        says = "disagree" if _disagree(change, differences) else "agree"
+        rows.append(
+            (
+                Cell(change.parameter),
+                *estimates,
+                Cell(value, change.change, struck=not usable),
+                Cell(error, change.u if math.isfinite(change.u) else None, struck=not usable),
+                Cell(change.unit or "-"),
+                Cell(change.p_text, change.p if usable else None),
+                Cell(says if usable else "cannot be compared"),
+            )
+        )
+    header = (
+        "parameter", "table", "waveforms", "difference", "standard uncertainty u", "unit", "p",
+        "finding",
+    )  # fmt: skip
+    caption = "Parameters from the table and from the waveforms, with standard uncertainties"
+    table = Table(caption, header, tuple(rows))
+    return Section("Table and waveforms", (table, Paragraph(_HOW_BOTH)))
+
+
+def changes_section(changed: Sequence[Change]) -> Section:
+    """Return the table of changes, and how it is made."""
+    rows = []
+    for c in changed:
+        value, error = rounded(c.change, c.u)
+        usable = math.isfinite(c.p)
+        rows.append(
+            (
+                Cell(c.parameter),
+                Cell(f"{c.before} to {c.after}"),
+                Cell(value, c.change, struck=not usable),
+                Cell(error, c.u if math.isfinite(c.u) else None, struck=not usable),
+                Cell(c.unit or "-"),
+                Cell(c.p_text.removeprefix("p = ").removeprefix("p "), c.p if usable else None),
+                Cell(c.significance),
+            )
+        )
+    header = (
+        "parameter", "between", "change", "standard uncertainty u", "unit", "p", "significance"
+    )  # fmt: skip
+    table = Table("Changes from each measurement to the next", header, tuple(rows))
+    return Section("Changes", (table, Paragraph(_HOW)))
