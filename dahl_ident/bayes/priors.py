@@ -80,7 +80,7 @@ class ParameterPrior:
     @property
     def logarithmic(self) -> bool:
         """Whether the search coordinate theta is the logarithm of the value."""
-        return self.parameter.transform == "log"
+        return self.parameter.positive
 
     @cached_property
     def distribution(self) -> Distribution | None:
@@ -267,8 +267,8 @@ def _checked_prior(parameter: Parameter, given: Any) -> PriorLike:
             "(low, high)"
         )
     low, high = finite_array(given, f"prior of {parameter.name}").tolist()
-    if not low < high or (parameter.transform == "log" and low <= 0.0):
-        positive = "0 < " if parameter.transform == "log" else ""
+    if not low < high or (parameter.positive and low <= 0.0):
+        positive = "0 < " if parameter.positive else ""
         raise ValidationError(
             f"the prior of {parameter.name} has the bounds {low:g} and {high:g}; expected "
             f"{positive}low < high"
@@ -319,7 +319,7 @@ def default_bounds(
         low, high = _widened(parameter, *parameter.prior)
     elif not any(parameter.dimension):
         raise _without_default(parameter)
-    elif parameter.transform == "log":
+    elif parameter.positive:
         sizes = sizes_of()
         seen = sizes[sizes > 0.0]
         if not seen.size:
@@ -338,7 +338,7 @@ def default_bounds(
 
 def _widened(parameter: Parameter, low: float, high: float) -> tuple[float, float]:
     """Return bounds well beyond a declared range of 95 % probability."""
-    if parameter.transform == "log":
+    if parameter.positive:
         return low / _BEYOND, high * _BEYOND
     return low - _BEYOND * (high - low), high + _BEYOND * (high - low)
 

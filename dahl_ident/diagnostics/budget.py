@@ -320,7 +320,7 @@ def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
         direction = np.eye(len(names))[i]
         if _noticed(errors, direction):
             yield name, units[name], errors.values[name], direction * abs(float(slopes[i]))
-            positive = problem.parameters[i].transform == "log"
+            positive = problem.parameters[i].positive
             if positive and errors.covariance[i, i] ** 0.5 > _DETERMINED:
                 lost |= {name}
         else:

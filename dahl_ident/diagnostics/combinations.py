@@ -102,7 +102,7 @@ def stiffness_seen(optimum: Optimum) -> Candidate | None:
 
 def runaway(optimum: Optimum) -> frozenset[str]:
     """Return the names of the parameters whose optimum lies at infinity, or at a positive zero."""
-    positive = np.array([p.transform == "log" for p in optimum.problem.parameters])
+    positive = np.array([p.positive for p in optimum.problem.parameters])
     gone = ~np.isfinite(optimum.values) | (positive & (optimum.values == 0.0))
     return frozenset(np.array(optimum.names)[gone].tolist())
 

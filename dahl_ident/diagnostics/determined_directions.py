@@ -88,7 +88,7 @@ def chart_of_limit(optimum: Optimum, problem: Problem) -> Chart | None:
     gone = {
         p.name: value
         for p, value in zip(optimum.problem.parameters, optimum.values.tolist(), strict=True)
-        if np.isinf(value) or (value == 0.0 and p.transform == "log")
+        if np.isinf(value) or (value == 0.0 and p.positive)
     }
     if not gone:
         return None

@@ -533,7 +533,7 @@ def _exponent(
 
 def _is_exponent(parameter: Parameter) -> bool:
     """Return whether a parameter is a positive pure number whose usual range is known."""
-    pure = not any(parameter.dimension) and parameter.transform == "log"
+    pure = not any(parameter.dimension) and parameter.positive
     return pure and parameter.prior is not None
 
 

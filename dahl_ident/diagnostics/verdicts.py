@@ -353,7 +353,7 @@ def _signs_unseen(optimum: Optimum) -> dict[str, str]:
         parameter, turned = problem.parameters[i], optimum.theta.copy()
         turned[i] = -turned[i]
         error = optimum.stderr[parameter.name]
-        if parameter.transform == "log" or not abs(turned[i]) > error:
+        if parameter.positive or not abs(turned[i]) > error:
             continue
         y, other = problem.residuals(np.array([optimum.theta, turned]), optimum.scale or 1.0)
         if abs(float(other @ other - y @ y)) < _NO_DIFFERENCE:
@@ -427,7 +427,7 @@ def natural_sizes(optimum: Optimum) -> FloatArray:
     with np.errstate(divide="ignore", invalid="ignore"):
         whole = 1.0 / np.nanmax(slope / response, axis=0)
     size = np.maximum(np.abs(optimum.theta), _SIZE_THAT_MATTERS * whole)
-    positive = np.array([p.transform == "log" for p in problem.parameters])
+    positive = np.array([p.positive for p in problem.parameters])
     return np.where(positive | ~np.isfinite(size) | (size == 0.0), 1.0, size)
 
 
@@ -436,7 +436,7 @@ def _profile_std(
 ) -> FloatArray:
     """Return half the width of the 95.45 % interval over its threshold, in natural sizes."""
     (q,) = thresholds(optimum, np.array([LEVELS[1]]))
-    positive = np.array([p.transform == "log" for p in optimum.problem.parameters])
+    positive = np.array([p.positive for p in optimum.problem.parameters])
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = [
             np.where(positive, np.log(np.where(positive, values, 1.0)), values)

@@ -88,7 +88,7 @@ def check_declarations(law: type[Element]) -> None:
             raise ValidationError(
                 f"{name}: the transform of {p.name} is {p.transform!r}; expected 'log' or 'linear'"
             )
-        if p.transform == "log" and not p.upper > 0.0:
+        if p.positive and not p.upper > 0.0:
             raise ValidationError(
                 f"{name}: {p.name} is searched by its logarithm, but its upper bound is "
                 f'{p.upper:g}; expected one above 0, or transform="linear"'
@@ -392,7 +392,7 @@ def _tried(parameter: Parameter, rng: np.random.Generator, count: int) -> FloatA
     spread = 10.0 ** rng.uniform(-_SPREAD, _SPREAD, count)
     if math.isfinite(low) and math.isfinite(high):
         share = rng.uniform(0.05, 0.95, count)
-        if parameter.transform == "log" and low > 0.0:
+        if parameter.positive and low > 0.0:
             return np.asarray(low * (high / low) ** share)
         return np.asarray(low + share * (high - low))
     if parameter.value is not None:

@@ -83,7 +83,7 @@ class Parameter:
 
     def __post_init__(self) -> None:
         if self.value is not None:
-            number = positive_number if self.transform == "log" else finite_number
+            number = positive_number if self.positive else finite_number
             value = number(self.value, self.name)
             if not self.lower <= value <= self.upper:
                 high = "" if np.isinf(self.upper) else f" and <= {self.upper:g}"
@@ -95,6 +95,11 @@ class Parameter:
             object.__setattr__(self, "free", self.value is None)
         elif not self.free and self.value is None:
             raise ValidationError(f"{self.name} is fixed but has no value; give one, or free it")
+
+    @property
+    def positive(self) -> bool:
+        """Whether it is above zero, and searched by its logarithm."""
+        return self.transform == "log"
 
     @property
     def is_mechanical(self) -> bool:

@@ -269,7 +269,7 @@ class SlopeLaw(Element):
         digit.
         """
         powers = [p.dimension[:2] if p.is_mechanical else (0, 0) for p in self.parameters]
-        positive = [i for i, p in enumerate(self.parameters) if p.transform == "log"]
+        positive = [i for i, p in enumerate(self.parameters) if p.positive]
         pairs = [
             (i, j)
             for i, j in combinations(positive, 2)

@@ -181,7 +181,7 @@ class Reach:
                 continue
             own = directions(element)
             for direction in own.nonlinear:
-                if direction.parameter.transform != "log":
+                if not direction.parameter.positive:
                     continue
                 row, rest = direction.row(problem)
                 if direction.is_number:
@@ -197,7 +197,7 @@ class Reach:
                     high = size.max(axis=-1) + np.log(edges[1])
                 rows += [row, -row]
                 least += [np.asarray(low - rest), np.asarray(rest - high)]
-            if own.is_free and own.reference is not None and own.reference.transform == "log":
+            if own.is_free and own.reference is not None and own.reference.positive:
                 scale = Direction(own.reference, None, own.reference.dimension)
                 (row, rest), softest = scale.row(problem), scale.sizes(view)
                 rows.append(row)
@@ -360,7 +360,7 @@ def _microslip(
 def _vanishing(problem: Problem, own: Directions) -> list[Limit]:
     """Return the limit in which the law has no force: its free scale parameters go to zero."""
     view = problem.stiffness_data
-    scale = [p for p in (*own.scale, *own.linear) if p.free and p.transform == "log"]
+    scale = [p for p in (*own.scale, *own.linear) if p.free and p.positive]
     if not scale:
         return []
     pins: dict[str, FloatArray | float] = {}
@@ -380,7 +380,7 @@ def _undeclared(problem: Problem, own: Directions) -> list[Limit]:
     view = problem.stiffness_data
     found = []
     for direction in own.nonlinear:
-        if direction.is_number or direction.parameter.transform != "log":
+        if direction.is_number or not direction.parameter.positive:
             continue
         p, over = direction.parameter, direction.over
         size = direction.sizes(view)
@@ -443,8 +443,8 @@ def _middle(problem: Problem, direction: Direction) -> FloatArray | float:
     p = direction.parameter
     if direction.is_number:
         plain = min(p.scan or (1.0,), key=lambda v: abs(np.log(v)) if v > 0.0 else np.inf)
-        return float(np.log(plain)) if p.transform == "log" else 0.0
-    if p.transform != "log":
+        return float(np.log(plain)) if p.positive else 0.0
+    if not p.positive:
         return 0.0
     return np.asarray(direction.sizes(problem.stiffness_data).mean(axis=-1))
 
@@ -456,7 +456,7 @@ def _pins(element: Element, asymptote: Asymptote) -> dict[str, FloatArray | floa
         p = element.parameter(label)
         if not p.free:
             return None
-        pins[p.name] = np.log(np.asarray(value)) if p.transform == "log" else value
+        pins[p.name] = np.log(np.asarray(value)) if p.positive else value
     return pins
 
 

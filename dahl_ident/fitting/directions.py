@@ -140,7 +140,7 @@ def directions(element: Element) -> Directions:
 
 def is_positive(parameter: Parameter) -> bool:
     """Return whether a parameter takes values above zero only."""
-    return parameter.transform == "log" or parameter.lower >= 0.0
+    return parameter.positive or parameter.lower >= 0.0
 
 
 def _reference(scale: tuple[Parameter, ...]) -> Parameter | None:

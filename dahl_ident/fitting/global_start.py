@@ -281,7 +281,7 @@ class _Grid:
         for index, parameter in enumerate(self.problem.parameters):
             value = found.get(parameter.name, parameter.value)
             assert value is not None
-            if parameter.transform == "log":
+            if parameter.positive:
                 value = np.log(np.maximum(np.abs(value), 1e-300))
             theta[..., index] = value
         return theta
@@ -429,7 +429,7 @@ def _numbers(direction: Direction) -> FloatArray:
     """Return the values of a pure number that are tried."""
     p = direction.parameter
     values = np.array(p.scan or _NUMBERS[p.transform])
-    if not p.scan and np.isfinite([p.lower, p.upper]).all() and p.transform == "linear":
+    if not p.scan and np.isfinite([p.lower, p.upper]).all() and not p.positive:
         values = p.lower + (p.upper - p.lower) * np.linspace(0.1, 0.9, 5)
     inside = values[(values >= p.lower) & (values <= p.upper)]
     return np.asarray(inside if inside.size else np.clip(values[:1], p.lower, p.upper))

@@ -317,7 +317,7 @@ class OptimumBatch(Sequence[Optimum]):
             gone = [
                 f"{p.name} {ends[value]}"
                 for p, value in zip(problem.parameters, values.tolist(), strict=True)
-                if np.isinf(value) or (value == 0.0 and p.transform == "log")
+                if np.isinf(value) or (value == 0.0 and p.positive)
             ]
             parts.append(f"Here: {', '.join(gone)}.")
             left = [

@@ -374,8 +374,8 @@ def larger_rows(
                 "give it a value there"
             )
         one = drawn.get(p.name, np.full(len(knowledge.theta), p.value))
-        columns.append(np.log(one) if p.transform == "log" else one)
-    theta = np.stack(columns, axis=-1)
+        columns.append(one)
+    theta = problem.to_search(np.stack(columns, axis=-1))
     fundamental = problem.predict(theta)
     orders = [1]
     if candidates.controlled == "displacement" and any(e.answers(2) for e in larger.elements):

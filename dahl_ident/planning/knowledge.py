@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError, choices
 from dahl_ident.problem import Problem
 from dahl_ident.problem.record_problem import RecordProblem
+from dahl_ident.problem.space import Space
 from dahl_ident.sensors import Sensors
 from dahl_ident.steady_state import Steady
 from dahl_ident.units import Motion
@@ -91,10 +93,15 @@ class Knowledge:
         """Names of the free parameters."""
         return tuple(p.name for p in self.parameters)
 
+    @cached_property
+    def space(self) -> Space:
+        """The search coordinates."""
+        return Space(self.parameters)
+
     @property
     def values(self) -> FloatArray:
         """Draws of the values, shape (S, P)."""
-        return to_values(self.theta, self.parameters)
+        return self.space.to_values(self.theta)
 
     def only(self, draws: NDArray[np.intp]) -> Knowledge:
         """Return the knowledge restricted to some of the draws."""
@@ -133,24 +140,18 @@ class Knowledge:
         ]
 
 
-def to_values(theta: FloatArray, parameters: Sequence[Parameter]) -> FloatArray:
-    """Return values at search coordinates (..., P)."""
-    positive = np.array([p.transform == "log" for p in parameters])
-    return np.where(positive, np.exp(np.where(positive, theta, 0.0)), theta)
-
-
 def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowledge:
     """Return the knowledge from a model with ranges, a fit or a posterior."""
     rng = np.random.default_rng(seed)
     if isinstance(source, Element):
         return _of_model(as_model(source), ranges or {}, draws, rng)
-    if hasattr(source, "draws") and hasattr(source, "problem"):
+    problem, sampled = getattr(source, "problem", None), hasattr(source, "draws")
+    if isinstance(problem, RecordProblem):
+        fit, values = (source.fit, source.draws(_MANY, seed)) if sampled else (source, None)
+        return _of_record_fit(fit, ranges or {}, draws, rng, values)
+    if isinstance(problem, Problem) and sampled:
         return _of_posterior(source, ranges or {}, draws, seed)
-    if hasattr(source, "draws") and hasattr(source, "fit"):
-        return _of_record_fit(source.fit, ranges or {}, draws, rng, source.draws(_MANY, seed))
-    if hasattr(source, "optimum") and hasattr(source.optimum, "problem"):
-        if isinstance(source.optimum.problem, RecordProblem):
-            return _of_record_fit(source, ranges or {}, draws, rng)
+    if isinstance(problem, Problem) and hasattr(source, "optimum"):
         return _of_fit(source, ranges or {}, draws, rng)
     raise ValidationError(
         f"plan: got a {type(source).__name__}; expected a model such as Dahl(), a fit, or a "
@@ -232,11 +233,11 @@ def _of_record_fit(
             "responses, and of records whose force was predicted: give the model with ranges="
         )
     P, parameters = len(problem.free), tuple(problem.free)
-    positive = np.array([p.transform == "log" for p in parameters])
+    space = Space(parameters)
     values = np.asarray(fit.optimum.values)[:P] if sampled is None else sampled[:, :P]
-    theta = np.where(positive, np.log(np.where(positive, values, 1.0)), values)
+    theta = space.to_search(values)
     if sampled is None:
-        slope = np.where(positive, values, 1.0)
+        slope = space.slopes(values)
         covariance = np.asarray(fit.covar)[:P, :P] / np.outer(slope, slope)
         if not np.isfinite(covariance).all():
             raise ValidationError("plan: the fit does not determine its parameters; give the model")
@@ -330,10 +331,7 @@ def _of_assumed(names: Sequence[str], assumed: Mapping[str, float]) -> FloatArra
 
 def _leaned_on(parameters: Sequence[Parameter], centre: FloatArray, std: FloatArray) -> FloatArray:
     """Return the information of ranges, none taken as narrower than `_LEANED_ON`."""
-    least = [
-        _LEANED_ON * (1.0 if p.transform == "log" else abs(c))
-        for p, c in zip(parameters, centre, strict=True)
-    ]
+    least = _LEANED_ON * np.where(Space(parameters).positive, 1.0, np.abs(centre))
     return np.asarray(1.0 / np.maximum(std, least) ** 2)
 
 
@@ -351,26 +349,19 @@ def _moments(parameters: Sequence[Parameter], ranges: Ranges) -> tuple[FloatArra
         if given is None:
             continue
         ends = finite_array(given, f"ranges[{p.name!r}]")
-        if ends.shape != (2,) or not ends[0] < ends[1] or (p.transform == "log" and ends[0] <= 0):
-            above = " above zero" if p.transform == "log" else ""
+        if ends.shape != (2,) or not ends[0] < ends[1] or (p.positive and ends[0] <= 0):
+            above = " above zero" if p.positive else ""
             raise ValidationError(
                 f"ranges[{p.name!r}] is {given!r}; expected two rising numbers{above}"
             )
-        low, high = np.log(ends) if p.transform == "log" else ends
+        low, high = Space([p]).to_search(ends[:, None])[:, 0]
         centre[i], std[i] = 0.5 * (low + high), (high - low) / _NORMAL_RANGE
     return centre, std
 
 
 def _within(theta: FloatArray, parameters: Sequence[Parameter]) -> FloatArray:
     """Return draws moved into the parameters' bounds."""
-    with np.errstate(divide="ignore"):
-        ends = [
-            (np.log(max(p.lower, 0.0)), np.log(p.upper)) if p.transform == "log"
-            else (p.lower, p.upper)
-            for p in parameters
-        ]  # fmt: skip
-    low, high = np.array(ends).T
-    return np.clip(theta, low, high)
+    return np.clip(theta, *Space(parameters).bounds)
 
 
 def _row_noise(problem: Problem, scale: float) -> tuple[float, float]:

@@ -97,8 +97,7 @@ def _sums(knowledge: Knowledge, motion: PlannedMotion, rate: float) -> _RepeatSu
     for values in knowledge.values:
         whole = np.concatenate([values, np.zeros(n - P)])
         predicted = problem.predict(whole, 0)
-        chain = np.where([p.transform == "log" for p in knowledge.parameters], values, 1.0)
-        by = predicted.by * np.concatenate([chain, np.ones(n - P)])
+        by = predicted.by * np.concatenate([knowledge.space.slopes(values), np.ones(n - P)])
         by[:, -1] = np.mod(time + 0.5 * time[1], motion.period)  # drift, within its repeat
         blocks = by.reshape(_SIMULATED, m, n)
         found.append(blocks.swapaxes(1, 2) @ blocks)

@@ -27,9 +27,7 @@ def sizes(parameters: Any, theta: FloatArray) -> FloatArray:
     spread = np.median(np.abs(theta), axis=0)
     spread = np.where(spread > 0.0, spread, np.maximum(theta.std(axis=0), 1e-300))
     spread = np.where(spread > 1e-290, spread, 1.0)
-    return np.array(
-        [1.0 if p.transform == "log" else s for p, s in zip(parameters, spread, strict=True)]
-    )
+    return np.where([p.positive for p in parameters], 1.0, spread)
 
 
 def direction(expression: str, parameters: Any, values: FloatArray) -> FloatArray:
@@ -43,7 +41,7 @@ def direction(expression: str, parameters: Any, values: FloatArray) -> FloatArra
                 f"{choices(names, name)}"
             )
         i = names.index(name)
-        size = 1.0 if parameters[i].transform == "log" else values[:, i]
+        size = 1.0 if parameters[i].positive else values[:, i]
         result[:, i] += power / size
     return result
 

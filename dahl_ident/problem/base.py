@@ -58,7 +58,7 @@ class BaseProblem(ABC):
     n_numbers : int
         Residuals that can differ from zero.
     runs : tuple
-        Runs, each named as often as it occurs.
+        The runs, of which one may be named several times.
     """
 
     model: Model

@@ -120,6 +120,7 @@ class Problem(BaseProblem):
                 "give it when the table is read: frequency=1.0 (Hz)"
             )
         self.data = as_response(table, self.model)
+        self.runs = tuple(self.data.runs or ())
         self._orbits = _ORBITS.setdefault(self.data, {})
         self._set_rows(Rows.of(self.data), noise)
 
@@ -187,11 +188,6 @@ class Problem(BaseProblem):
     def extent(self) -> str:
         """How much was measured, in words."""
         return f"{self.data.n} rows"
-
-    @property
-    def runs(self) -> tuple[str, ...]:
-        """The runs of the data; none where they name none."""
-        return tuple(self.data.runs or ())
 
     @property
     def is_exact(self) -> bool:

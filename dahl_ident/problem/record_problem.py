@@ -229,7 +229,7 @@ class RecordProblem(BaseProblem):
             length = float(np.std(wave)) * time**order
         found = np.zeros(len(parameters))
         for i, p in enumerate(self.free):
-            if p.transform == "linear" and not np.isfinite([p.lower, p.upper]).any():
+            if not p.positive and not np.isfinite([p.lower, p.upper]).any():
                 force, by_length, by_time = p.dimension
                 if not force and (by_length or by_time):
                     found[i] = _SMALL * length**by_length * time**by_time

@@ -62,7 +62,7 @@ class Space:
         self._bent = np.flatnonzero(bends > 0.0)
         self._size = bends[self._bent]
         self._curved = bool(self._angles.size or self._bent.size)
-        self.positive = ~between & np.array([p.transform == "log" for p in self.parameters])
+        self.positive = ~between & np.array([p.positive for p in self.parameters])
         self.relative = self.positive | (bends > 0.0)
         self._all_positive = bool(self.positive.all())
 

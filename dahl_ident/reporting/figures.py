@@ -224,7 +224,7 @@ def _draw_profile(fit: FitResult, index: int, axis: plots.Axes) -> None:
     profiler = Profiler(fit.optimum)
     q = thresholds(fit.optimum, np.array(LEVELS))
     coordinate = _profile_range(fit, index, profiler, q)
-    logarithmic = parameter.transform == "log"
+    logarithmic = parameter.positive
     plots.plot_profile(
         np.exp(coordinate) if logarithmic else coordinate,
         profiler.curve(index, coordinate),
@@ -242,7 +242,7 @@ def _profile_range(
     """Return search coordinates out to the widest limit; three decades if it is open."""
     lower, upper = (side[-1, index] for side in profiler.limits(q))
     best = float(fit.optimum.theta[index])
-    reach = np.log(1e3) if fit.problem.parameters[index].transform == "log" else abs(best) + 1.0
+    reach = np.log(1e3) if fit.problem.parameters[index].positive else abs(best) + 1.0
     low = lower if np.isfinite(lower) else best - reach
     high = upper if np.isfinite(upper) else best + reach
     return np.linspace(low, high, points)
