@@ -406,26 +406,15 @@ def _relative(rows: Rows) -> Relative:
 
 def _fundamental(rows: Rows, size: FloatArray) -> FloatArray:
     """Return |R_1| of the same point in rows of harmonics, 0 elsewhere."""
-    table = np.arange(size[..., 0].size).reshape(*size.shape[:-1], 1)
-    amplitude = 0.0 if rows.amplitude is None else rows.amplitude
-    keys = [np.broadcast_to(k, size.shape).ravel() for k in (amplitude, rows.omega, table)]
-    order = np.lexsort(keys)
-    other = np.any([np.diff(key[order]) != 0.0 for key in keys], axis=0)
-    point = np.empty(size.size, dtype=np.intp)
-    point[order] = np.concatenate([[0], np.cumsum(other)])
     harmonic = np.broadcast_to(rows.harmonic != 1, size.shape)
-    own = np.flatnonzero(~harmonic)[::-1]
-    first = np.full(size.size, -1)
-    first[point[own]] = own  # of several the first
-    partner = first[point].reshape(size.shape)
-    lost = harmonic & (partner < 0)
+    lost = harmonic & np.broadcast_to(rows.fundamental < 0, size.shape)
     if lost.any():
         raise DataError(
             f"row {_first(lost)} is a harmonic, but no row holds the fundamental of the same "
             "frequency and amplitude, to which relative noise refers; add it, or use "
             "noise='absolute'"
         )
-    return np.where(harmonic, size.ravel()[partner], 0.0)
+    return np.where(harmonic, rows.of_fundamental(size), 0.0)
 
 
 def _measured(rows: Rows) -> Measured:

@@ -8,7 +8,9 @@ channel lags the other. With F and X the true phasors,
 
 so the measured dynamic stiffness of harmonic k is
 ``(force_gain / displacement_gain) exp(+j k omega delay) Z_k``, because the phase of F_k is
-referred to k times the displacement's phase. All six quantities follow from it. A gain also affects
+referred to k times the displacement's phase. The measured X_k/F_1 of a driven plant is
+``(displacement_gain / force_gain) exp(-j k omega delay)`` times the true one, its phase referred to
+k times the force's. All six quantities follow from it. A gain also affects
 the amplitudes of a table: the true amplitude is the measured one divided by `displacement_gain`,
 and the true drive is the measured one divided by `force_gain`. For friction alone, an unknown force
 gain therefore leaves only x_c determined, and an unknown displacement gain only f_max.

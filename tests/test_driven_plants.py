@@ -99,5 +99,36 @@ def test_points_without_a_stable_motion_are_named() -> None:
     law = di.Backlash(di.Dahl(0.1, 30.0, 1.0), 0.01)
     plant = law + di.Mass(0.3) + di.Damper(0.3) + di.Spring(8.0)
     steady = di.response(plant, [0.4, 0.58, 2.6], [0.05, 0.05, 0.6])
-    assert steady.stable.tolist() == [False, False, True]
+    assert steady.found.tolist() == steady.stable.tolist() == [False, False, True]
+    assert np.isfinite(steady.amplitude).tolist() == [False, False, True]
     assert steady.message.startswith("2 of 3 points: no stable motion of the drive's period")
+
+
+def test_a_response_follows_its_sweep_to_the_jump() -> None:
+    law = di.Backlash(di.Dahl(2.0, 60.0, 1.0), gap=0.02)
+    plant = law + di.Mass(0.3) + di.Spring(3.0) + di.Damper(0.12)
+    frequency = np.linspace(0.8, 1.5, 9)
+    every = di.response(plant, frequency, 0.06, all_roots=True)
+    amplitude = np.where(every.stable, every.amplitude, np.nan)
+    for order, last in ((slice(None), np.nanmax), (slice(None, None, -1), np.nanmin)):
+        with pytest.warns(di.errors.MultipleSolutionsWarning, match="that a sweep in their order"):
+            one = di.response(plant, frequency[order], 0.06)
+        assert one.stable.all()
+        np.testing.assert_allclose(one.amplitude, last(amplitude, axis=1)[order], rtol=1e-6)
+
+
+def test_rows_without_a_stable_motion_are_named_and_do_not_stop_the_search() -> None:
+    law = di.Backlash(di.Dahl(0.1, 30.0, 1.0), 0.01)
+    known = di.Mass(0.3) + di.Spring(8.0)
+    f, u = np.tile(np.linspace(0.4, 2.6, 8), 2), np.repeat([0.05, 0.6], 8)
+    steady = di.response(law + known + di.Damper(0.3), f, u)
+    assert not steady.found[0]
+    X = np.where(steady.found, steady.displacement, 0.0061 - 0.0012j)
+    random = np.random.default_rng(0).standard_normal((2, f.size))
+    R = X / u * np.exp(0.003 * (random[0] + 1j * random[1]))
+    data = di.FrequencyResponse(f, R, drive=u, controlled="force", quantity="receptance")
+    fit = di.fit(data, di.Backlash(di.Dahl(0.1, 30.0, alpha=1.0)) + known + di.Damper())
+    assert fit.params["gap"].value == pytest.approx(0.01, rel=0.1)
+    assert fit.params["damping"].value == pytest.approx(0.3, rel=0.1)
+    assert "The predicted motion is not stable at 0.4 Hz, 50 mN" in fit.verdict
+    assert not fit.trusted

@@ -57,7 +57,8 @@ class FrequencyResponse(Tabular):
     response : (n,) array_like of complex
         The `quantity` at each point, SI units. A row with harmonic k other than 1 holds
         F_k/X_1, its phase referred to k times the displacement's phase; for k = 0 that is the
-        mean force over the displacement amplitude, a real number.
+        mean force over the displacement amplitude, a real number. Where the force was controlled
+        it holds X_k/F_1, in a table of receptance, with the phase referred to k times the force's.
     amplitude : (n,) array_like, optional
         Zero-to-peak displacement amplitude abs(X_1), m or rad.
     drive : (n,) array_like, optional
@@ -85,7 +86,7 @@ class FrequencyResponse(Tabular):
     controlled : {"displacement", "force"} or (n,) array_like of them
         The controlled quantity.
     harmonic : int or (n,) array_like of int
-        0 for the mean force, 1 for the fundamental, 2, 3, ... above it.
+        0 for the mean force (or displacement), 1 for the fundamental, 2, 3, ... above it.
     quantity : str
         One of the six standard quantities; or "backbone", see :meth:`backbone`.
     motion : {"translation", "rotation"}
@@ -191,18 +192,22 @@ class FrequencyResponse(Tabular):
                 raise ValidationError(f"{name} is given without {' and '.join(absent)}")
         if self.quantity == "backbone":
             self._check_backbone()
-        if self.quantity != "dynamic_stiffness" and (self.harmonic != 1).any():
-            row = int(np.argmax(self.harmonic != 1))
+        held = {"dynamic_stiffness": "displacement", "receptance": "force"}.get(self.quantity)
+        alone = (self.harmonic != 1) & (self.controlled != held)
+        if alone.any() and self.quantity != "dynamic_stiffness":  # of which extraction tells
+            row = int(np.argmax(alone))
             raise ValidationError(
-                f"harmonic[{row}] is {self.harmonic[row]} in a table of {self.quantity}; "
-                "only dynamic stiffness has rows for harmonics"
+                f"harmonic[{row}] is {self.harmonic[row]} in a table of {self.quantity}, "
+                f"{self.controlled[row]} controlled; harmonics of the force are rows of dynamic "
+                "stiffness, F_k/X_1, those of the displacement rows of receptance, X_k/F_1, with "
+                "the force controlled"
             )
         mean = self.harmonic == 0
         if (self.response.imag[mean] != 0.0).any():
             row = int(np.argmax(mean & (self.response.imag != 0.0)))
             raise ValidationError(
                 f"response[{row}] is {self.response[row]}; expected a real number, as a row with "
-                "harmonic 0 holds the mean force over the displacement amplitude"
+                "harmonic 0 holds a mean over the amplitude of what was controlled"
             )
         if self.covariance is not None:
             check_mean_covariance(self.covariance, self.amplitude_covariance, mean)
@@ -395,8 +400,8 @@ class FrequencyResponse(Tabular):
         Raises
         ------
         ValidationError
-            If a response of zero would have to be inverted, or rows hold harmonics, which are
-            dynamic stiffness only.
+            If a response of zero would have to be inverted, or rows hold harmonics, which belong
+            to their quantity.
 
         Examples
         --------
@@ -414,7 +419,7 @@ class FrequencyResponse(Tabular):
         if (self.harmonic != 1).any():
             raise ValidationError(
                 f"rows with harmonics {listed(np.unique(self.harmonic))} cannot become "
-                f"{quantity}; only dynamic stiffness has harmonics. Use select(harmonic=1) first"
+                f"{quantity}; take select(harmonic=1) first"
             )
         response, derivative = converted(self.response, self.omega, self.quantity, quantity)
         J = jacobian(derivative)

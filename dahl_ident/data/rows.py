@@ -49,6 +49,36 @@ class Rows:
         """The harmonics that occur."""
         return tuple(np.unique(self.harmonic).tolist())
 
+    @cached_property
+    def fundamental(self) -> NDArray[np.intp]:
+        """The row of each row's fundamental in its table, of several the first; -1 for none."""
+        shape = self.response.shape
+        none = np.zeros(())
+        drive, amplitude = (none if c is None else c for c in (self.drive, self.amplitude))
+        table = np.arange(self.response[..., 0].size).reshape(*shape[:-1], 1)
+        held = np.where(self.forced, drive, amplitude)
+        keys = [np.broadcast_to(k, shape).ravel() for k in (held, self.forced, self.omega, table)]
+        order = np.lexsort(keys)
+        other = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
+        point = np.empty(self.response.size, dtype=np.intp)
+        point[order] = np.concatenate([[0], np.cumsum(other)])
+        own = np.flatnonzero(np.broadcast_to(self.harmonic == 1, shape))[::-1]
+        first = np.full(point.size, -1)
+        first[point[own]] = own
+        row = np.where(first < 0, -1, first % self.n)[point].reshape(shape)
+        first_table = row.reshape(-1, self.n)[0]
+        return first_table if (row == first_table).all() else row
+
+    def of_fundamental(self, values: FloatArray | ComplexArray) -> NDArray[Any]:
+        """Return the values, (..., n), at the row of each row's fundamental."""
+        row = np.broadcast_to(self.fundamental, values.shape)
+        return np.take_along_axis(values, row, axis=-1)
+
+    @property
+    def of_displacement(self) -> NDArray[np.bool_]:
+        """Which rows are harmonics of the displacement, under a force that is a sine, (n,)."""
+        return np.asarray(self.forced & (self.harmonic != 1))
+
     @classmethod
     def of(cls, data: FrequencyResponse) -> Rows:
         """Return the columns of one table."""

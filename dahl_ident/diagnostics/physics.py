@@ -130,8 +130,10 @@ def friction_force(optimum: Optimum) -> tuple[FloatArray, FloatArray]:
     """
     N, scale = friction_stiffness(optimum), optimum.scale
     view = optimum.problem.stiffness_data
-    error = np.sqrt(2.0) * scale / view.weights * view.amplitude
-    force = np.where(view.harmonic == 1, np.abs(N) * view.amplitude, np.nan)
+    counted = (view.harmonic == 1) & (view.weights > 0.0)
+    weights = np.where(view.weights > 0.0, view.weights, np.nan)
+    error = np.sqrt(2.0) * scale / weights * view.amplitude
+    force = np.where(counted, np.abs(N) * view.amplitude, np.nan)
     return force, error
 
 

@@ -25,7 +25,7 @@ def steady_difference(optimum: Optimum) -> tuple[int, float] | None:
     Relative to the exact one; None where no row has both.
     """
     problem = optimum.problem
-    forced = problem.data.controlled == "force"
+    forced = (problem.data.controlled == "force") & (problem.data.harmonic == 1)
     if problem.obstacle_to_exact or not np.isfinite(optimum.values).all():
         return None
     exact, sine = (
@@ -57,6 +57,10 @@ def steady_findings(optimum: Optimum, model: Model) -> Iterator[Finding]:
         yield Finding(described, note, "steady", values)
         yield from _distorted(problem.data)
         yield from _jumps(problem.data, model)
+        unstable = problem.unstable_rows(optimum.theta)
+        if unstable:
+            names = tuple(row_names(problem.data, unstable))
+            yield Finding(described, VerdictStatus.APPROXIMATE, "unstable_rows", {"rows": names})
         return
     why = problem.obstacle_to_exact
     if not why and not problem.takes_energy(optimum.theta):

@@ -247,6 +247,15 @@ def _jump(places: Sequence[tuple[float, float, float]], unit: str) -> str:
     )
 
 
+def _unstable_rows(rows: Sequence[str]) -> str:
+    one = len(rows) == 1
+    return (
+        f"The predicted motion is not stable at {listed(rows)}: the device moves otherwise there, "
+        f"and the steady response cannot describe {'it' if one else 'them'}; leave "
+        f"{'this row' if one else 'these rows'} out."
+    )
+
+
 def _distorted_force(row: str, distortion: float, files: Sequence[str]) -> str:
     plant = ("--mass", "free", "--damping", "free", "--stiffness", "free")
     command = shlex.join(["dahl-ident", "fit", "--record", *(files or ["FILE"]), *plant])
@@ -310,6 +319,7 @@ _TEXT: Mapping[str, Callable[..., str]] = {
     "slight": _slight,
     "steady": _steady,
     "jump": _jump,
+    "unstable_rows": _unstable_rows,
     "distorted_force": _distorted_force,
     "no_steady_motion": lambda: (
         "The force was held, but the describing function predicts the motion: the plant would "

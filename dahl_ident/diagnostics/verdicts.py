@@ -38,6 +38,7 @@ from dahl_ident.diagnostics.information import Information, shares
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval, wald_intervals
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.fitting import Optimum, Status
+from dahl_ident.problem import Problem
 
 IDENTIFIED_BELOW = 0.25  # u of a logarithm: 95 % within a factor of 1.6
 NOT_IDENTIFIED_ABOVE = 1.0  # the same: a factor of 7, hardly an order of magnitude
@@ -346,9 +347,9 @@ def _lost_beyond_noise(
 def _signs_unseen(optimum: Optimum) -> dict[str, str]:
     """Return what is said of friction parameters whose sign the data do not show, by name.
 
-    Where a mirrored law is the same to a sine, it is to the exact motion.
+    Where a mirrored law is the same to a sine, it is to the exact motion's fundamental.
     """
-    problem, found = optimum.problem.with_steady("describing function"), {}
+    problem, found = _to_a_sine(optimum.problem), dict[str, str]()
     for i in problem.friction_columns.tolist():
         parameter, turned = problem.parameters[i], optimum.theta.copy()
         turned[i] = -turned[i]
@@ -365,13 +366,21 @@ def _signs_unseen(optimum: Optimum) -> dict[str, str]:
     return found
 
 
+def _to_a_sine(problem: Problem) -> Problem:
+    """Return the problem with the describing function, unless harmonics of motions are known."""
+    driven = problem.data.controlled == "force"
+    if (problem.data.harmonic[driven] != 1).any():
+        return problem
+    return problem.with_steady("describing function")
+
+
 def _order_unseen(optimum: Optimum) -> dict[str, str]:
     """Return what is said of parameters that could be exchanged without a difference, by name.
 
     Such as exponents of pulling and pushing, whose fundamental is that of the mirrored law. All
     that is exchanged must be like in kind; a move that should have cost something costs nothing.
     """
-    problem, found = optimum.problem.with_steady("describing function"), dict[str, str]()
+    problem, found = _to_a_sine(optimum.problem), dict[str, str]()
     scale = optimum.scale or 1.0
     for order in _exchanges(optimum):
         move = optimum.theta[order] - optimum.theta

@@ -68,6 +68,7 @@ class ProblemBatch(Problem):
         self._set_model(model, sensors, free, fixed, tables[0].motion)
         tables = [as_response(table, self.model) for table in tables]
         self._set_rows(Rows.stack(tables), noise)
+        self._check_harmonics()
         self.tables = tuple(tables)
 
     @classmethod

@@ -55,19 +55,22 @@ class Nearby:
 
     The logarithm of the ratio of both is taken as linear in the search coordinates and in the
     logarithm of the drive. The error is of second order in the distance, and small, because
-    only the correction is linearized. It costs as much as the describing function.
+    only the correction is linearized. It costs as much as the describing function. Harmonics of
+    the displacement, which that has not, are linear themselves.
     """
 
     def __init__(self, exact: Predictor, approximate: Predictor, theta: FloatArray) -> None:
         self._approximate, self._theta = approximate, theta
         at, near = exact(theta), approximate(theta)
-        self._ratio = np.log(at.value / near.value)
+        self._alone = alone = exact.of_displacement
+        self._correction = np.where(alone, at.value, np.log(at.value / near.value))
         self._slopes = [
-            a / at.value - b / near.value for a, b in zip(at.changes, near.changes, strict=True)
+            np.where(alone, a, a / at.value - b / near.value)
+            for a, b in zip(at.changes, near.changes, strict=True)
         ]
-        forced = exact.forced
         level = at.by_ln_amplitude / at.value - near.by_ln_amplitude / near.value
-        self._by_level = np.where(forced, level, 0.0)
+        level = np.where(alone, at.by_ln_amplitude, level)
+        self._by_level = np.where(exact.forced, level, 0.0)
 
     def __call__(
         self,
@@ -78,19 +81,22 @@ class Nearby:
     ) -> Prediction:
         """Return what a predictor returns."""
         found = self._approximate(theta, derivatives=derivatives, amplitude_error=amplitude_error)
-        change = self._ratio
+        alone, change = self._alone, self._correction
         for place, slope in enumerate(self._slopes):
             change = change + slope * (theta[..., place, None] - self._theta[place])
         if amplitude_error is not None:
             change = change - self._by_level * amplitude_error
         with np.errstate(over="ignore", invalid="ignore"):
             factor = np.exp(change)
-            value = found.value * factor
+            value = np.where(alone, change, found.value * factor)
+            size = np.where(alone, 1.0, value)
             changes = [
-                d * factor + value * slope
+                np.where(alone, 0.0, d * factor) + size * slope
                 for d, slope in zip(found.changes, self._slopes, strict=False)
             ]
-            level = found.by_ln_amplitude * factor + (value * self._by_level if derivatives else 0)
+            level = found.by_ln_amplitude
+            if derivatives:
+                level = np.where(alone, 0.0, level * factor) + size * self._by_level
         return Prediction(value, changes, level)
 
     def as_stiffness(
@@ -102,10 +108,13 @@ class Nearby:
 
 @dataclass(frozen=True)
 class _Group:
-    """Rows that are computed together; `operator` is (j omega)^p."""
+    """Rows that are computed together; `operator` is (j omega)^p.
+
+    Harmonics of the force are apart, those of the displacement are not.
+    """
 
     rows: slice | NDArray[np.intp]
-    harmonic: int
+    harmonic: NDArray[np.int64]
     forced: bool
     omega: FloatArray
     operator: ComplexArray
@@ -148,7 +157,7 @@ class Predictor:
         self._groups = [
             _Group(
                 part,
-                harmonic,
+                rows.harmonic[part],
                 forced,
                 rows.omega[..., part],
                 self._operator[..., part],
@@ -156,7 +165,7 @@ class Predictor:
                 None if rows.drive is None else rows.drive[..., part],
                 self._steady_rows(part) if forced else None,
             )
-            for part, harmonic, forced in _parts(rows)
+            for part, forced in _parts(rows)
         ]
 
     @property
@@ -164,17 +173,37 @@ class Predictor:
         """Which rows are force-controlled."""
         return self._rows.forced
 
+    @property
+    def of_displacement(self) -> NDArray[np.bool_]:
+        """Which rows are harmonics of the displacement."""
+        return self._rows.of_displacement
+
+    def unstable_rows(self, theta: FloatArray) -> list[int]:
+        """Return the rows whose predicted steady motion is not stable, at theta of shape (P,)."""
+        found: list[int] = []
+        values = [
+            constant if index is None else self._space.to_values(theta)[index]
+            for index, constant in self._slots
+        ]
+        for group in self._groups:
+            if group.steady is not None and not group.steady.is_linear(values[:-3]).any():
+                drive = self._true_drive(group, values[-3:], None)
+                stable = group.steady.at(values[:-3], drive, []).stable
+                found += np.arange(self._rows.n)[group.rows][~stable].tolist()
+        return found
+
     def _steady_rows(self, part: slice | NDArray[np.intp]) -> SteadyRows | None:
         rows = self._rows
         if self._shooting is None or rows.drive is None:
             return None
-        ratio = rows.response / self._operator
+        ratio = _fundamental(rows, rows.response) / self._operator
         with np.errstate(divide="ignore", invalid="ignore"):
             measured = rows.drive * (ratio if self._exponent == -1 else 1.0 / ratio)
         drive, omega = np.broadcast_arrays(rows.drive, rows.omega)
+        first = np.where(rows.of_displacement, rows.fundamental, np.arange(rows.n))
         return SteadyRows(
             self._model, self._shooting, drive[..., part], omega[..., part], measured[..., part],
-            self._orbits,
+            rows.harmonic[part], np.atleast_2d(first)[0][part], self._orbits,
         )  # fmt: skip
 
     def as_stiffness(
@@ -183,9 +212,12 @@ class Predictor:
         """Return the data as dynamic stiffness; `weights` are those of the response.
 
         With `predicted` responses in place of the measured ones, driven amplitudes are theirs too.
+        A harmonic of the displacement stands for its fundamental, without a weight.
         """
         rows = self._rows
-        response = rows.response if predicted is None else predicted
+        response = _fundamental(rows, rows.response if predicted is None else predicted)
+        harmonic = np.where(rows.of_displacement, 1, rows.harmonic)
+        weights = np.where(rows.of_displacement, 0.0, weights)
         ratio = response / self._operator
         Z = ratio if self._exponent == 1 else 1.0 / ratio
         amplitude = self._guess
@@ -193,11 +225,12 @@ class Predictor:
             amplitude = np.where(rows.forced, rows.drive / np.abs(Z), amplitude)
         if not self._neutral:
             starts = [np.asarray(p.value) for p in self._sensors.parameters]
-            Z = Z / measured_stiffness_factor(starts, rows.omega, rows.harmonic)
+            Z = Z / measured_stiffness_factor(starts, rows.omega, harmonic)
             amplitude = amplitude / starts[1]
         if rows.quantity != "dynamic_stiffness":
             weights = weights * np.abs(response / Z)
-        return StiffnessData(Z, amplitude, rows.omega, rows.harmonic, rows.orders, weights)
+        orders = tuple(np.unique(harmonic).tolist())
+        return StiffnessData(Z, amplitude, rows.omega, harmonic, orders, weights)
 
     def __call__(
         self,
@@ -263,18 +296,19 @@ class Predictor:
         derivatives: bool,
         amplitude_error: FloatArray | None,
     ) -> Prediction:
-        """Return the response by the describing function."""
+        """Return the response by the describing function; it has no harmonics of the motion."""
         own, sensed = values[:-3], values[-3:]
         amplitude, found = self._amplitude(group, own, sensed, amplitude_error)
-        factor = group.operator
+        harmonic = 1 if group.forced else int(group.harmonic[0])
+        factor = group.operator * (group.harmonic == harmonic)
         if not self._neutral:
             sensor = measured_stiffness_factor(sensed, group.omega, group.harmonic)
             factor = factor * sensor**self._exponent
         if not derivatives:
-            Z = self._model.stiffness(own, amplitude, group.omega, group.harmonic)
+            Z = self._model.stiffness(own, amplitude, group.omega, harmonic)
             return Prediction(factor * _where(found, Z) ** self._exponent, [], _NONE)
         Z, by_amplitude, by_parameter = self._model.stiffness_gradient(
-            own, amplitude, group.omega, group.harmonic
+            own, amplitude, group.omega, harmonic
         )
         Z = _where(found, Z)
         by_ln_amplitude = amplitude * by_amplitude
@@ -302,7 +336,7 @@ class Predictor:
         derivatives: bool,
         error: FloatArray | None,
     ) -> Prediction:
-        """Return the response of the exact steady motion: R = (j omega)^p (g u_0/X)^q."""
+        """Return the response of the exact steady motion: R = (j omega)^p (g u_0/X_k)^q."""
         own, sensed = values[:-3], values[-3:]
         factor, drive = group.operator, self._true_drive(group, sensed, error)
         if not self._neutral:
@@ -313,7 +347,7 @@ class Predictor:
         response = factor * (motion.displacement / drive) ** -self._exponent
         if not derivatives:
             return Prediction(response, [], _NONE)
-        slope = -self._exponent * response / motion.displacement
+        slope = factor / drive if self._exponent == -1 else -response / motion.displacement
         changes = []
         for place, i in enumerate(free):
             positive = self._space.positive[self._slots[i][0]]
@@ -384,24 +418,37 @@ def _check(rows: Rows, model: Model) -> None:
             f"the rows hold the harmonics {', '.join(map(str, rows.orders))}, and no element of "
             f"{model!r} has any of them; give odd ones as well, or use a law that is asymmetric"
         )
-    bad = rows.forced & (rows.harmonic != 1)
-    if rows.orders != (1,) and bad.any():
+    bad = rows.of_displacement
+    if bad.any() and rows.quantity != "receptance":
         row = int(np.argmax(bad))
         raise DataError(
-            f"row {row} is force-controlled and holds harmonic {rows.harmonic[row]}; the steady "
-            "state of a driven plant is solved for its fundamental only: leave such rows out, or "
-            "say controlled='displacement' if the measured amplitude is to be used"
+            f"row {row} is force-controlled and holds harmonic {rows.harmonic[row]} of the force, "
+            "which is a sine there: give harmonics of the displacement, X_k/F_1, in a table of "
+            "receptance, leave such rows out, or say controlled='displacement' if the measured "
+            "amplitude is to be used"
+        )
+    lost = bad & (np.atleast_2d(rows.fundamental) < 0).any(axis=0)
+    if lost.any():
+        row = int(np.argmax(lost))
+        raise DataError(
+            f"row {row} is harmonic {rows.harmonic[row]} of the displacement, but no row holds the "
+            "fundamental of the same frequency and drive; add it"
         )
 
 
-def _parts(rows: Rows) -> Iterator[tuple[slice | NDArray[np.intp], int, bool]]:
-    """Yield rows, harmonic and whether force-controlled for each kind of row."""
-    forced = int(rows.forced.sum())
-    if len(rows.orders) == 1 and forced in (0, rows.n):
-        yield slice(None), rows.orders[0], forced > 0
-        return
-    for k, force in sorted({*zip(rows.harmonic.tolist(), rows.forced.tolist(), strict=True)}):
-        yield np.flatnonzero((rows.harmonic == k) & (rows.forced == force)), k, force
+def _fundamental(rows: Rows, response: ComplexArray) -> ComplexArray:
+    """Return the responses, with those of the fundamental in rows of the displacement's others."""
+    if not rows.of_displacement.any():
+        return response
+    return np.where(rows.of_displacement, rows.of_fundamental(response), response)
+
+
+def _parts(rows: Rows) -> Iterator[tuple[slice | NDArray[np.intp], bool]]:
+    """Yield rows, and whether force-controlled, for each kind of row."""
+    kind = np.where(rows.forced, -1, rows.harmonic)
+    kinds = np.unique(kind).tolist()
+    for k in kinds:
+        yield slice(None) if len(kinds) == 1 else np.flatnonzero(kind == k), k < 0
 
 
 def _require(rows: NDArray[np.bool_], controlled: str, name: str) -> None:
@@ -418,4 +465,5 @@ def _measured_amplitude(rows: Rows, operator: ComplexArray, exponent: int) -> Fl
         return rows.amplitude
     assert rows.drive is not None
     with np.errstate(divide="ignore"):
-        return np.asarray(rows.drive / np.abs(rows.response / operator) ** exponent)
+        response = _fundamental(rows, rows.response)
+        return np.asarray(rows.drive / np.abs(response / operator) ** exponent)

@@ -123,6 +123,7 @@ class Problem(BaseProblem):
         self.runs = tuple(self.data.runs or ())
         self._orbits = _ORBITS.setdefault(self.data, {})
         self._set_rows(Rows.of(self.data), noise)
+        self._check_harmonics()
 
     def _set_model(
         self,
@@ -195,6 +196,22 @@ class Problem(BaseProblem):
         return (
             self.steady == "exact" and bool(self._rows.forced.any()) and not self.obstacle_to_exact
         )
+
+    def _check_harmonics(self) -> None:
+        """Refuse harmonics of the displacement where it is taken for a sine."""
+        if self._rows.of_displacement.any() and not self.is_exact:
+            raise DataError(
+                "the rows hold harmonics of the displacement, and the describing function takes "
+                f"that for a sine ({self.obstacle_to_exact or 'as asked for'}): leave them out "
+                "with select(harmonic=1)"
+            )
+
+    def unstable_rows(self, theta: ArrayLike) -> list[int]:
+        """Return the rows whose predicted steady motion is not stable, for want of one that is."""
+        if not isinstance(self._predictor, Predictor):
+            return []
+        with np.errstate(all="ignore"):
+            return self._predictor.unstable_rows(self.space.checked(theta))
 
     def with_steady(self, steady: Steady) -> Self:
         """Return the same problem, or batch, with another way to predict driven rows."""

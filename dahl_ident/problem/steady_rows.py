@@ -4,7 +4,9 @@ Shooting starts from the orbit that the row had at the parameters before, of whi
 depends by far less than any noise: where no friction law and no damper feeds energy in, the motion
 is unique. Elsewhere there may be several, and the rows are followed as a sweep is measured: in
 the order of the rows, at one level each from the orbit of the row before. An orbit that is no
-longer stable is left for a stable one, which is the jump of the response.
+longer stable is left for a stable one, which is the jump of the response. Where there is no stable
+one, as at a row that should not be in the table, the other stands for it, so that a search can go
+on; a verdict names such rows.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Model
 from dahl_ident.steady_state import Shooting
+from dahl_ident.steady_state.shooting import NEUTRAL
 
 _LEVEL = 0.1  # of ln of the drive: a held level varies by less, and two levels differ by more
 _MICROSLIP = 1e3  # knees over the largest displacement: a third harmonic of 1e-3, off by 1e-6
@@ -27,11 +30,21 @@ _ELSEWHERE = 0.2  # relative difference from the measured displacement: perhaps 
 
 
 class RowMotion(NamedTuple):
-    """The fundamental X of the displacement, its derivatives with respect to drive, parameters."""
+    """The harmonic X_k of each row, its derivatives with respect to drive and parameters."""
 
     displacement: ComplexArray
     by_drive: ComplexArray
     by_parameter: ComplexArray
+    stable: NDArray[np.bool_]
+
+
+class _Solution(NamedTuple):
+    """Of some rows: X_k with its derivatives, the orbits, the fundamentals X_1, multipliers."""
+
+    X: ComplexArray
+    orbits: FloatArray
+    fundamental: ComplexArray
+    multiplier: FloatArray
 
 
 class SteadyRows:
@@ -45,7 +58,9 @@ class SteadyRows:
     drive, omega : ndarray, shape (n,) or (S, n)
         As measured; levels are told apart by the drive.
     measured : ndarray of complex, shape (n,) or (S, n)
-        Displacement phasor, which chooses among several motions.
+        Fundamental of the displacement, which chooses among several motions.
+    harmonic, fundamental : ndarray of int, shape (n,)
+        Harmonic k that each row holds, and the row that holds its fundamental.
     orbits : dict of int to ndarray
         The orbits last found, (n, order), by their order; kept up to date.
     """
@@ -57,12 +72,17 @@ class SteadyRows:
         drive: FloatArray,
         omega: FloatArray,
         measured: ComplexArray,
+        harmonic: NDArray[np.int64],
+        fundamental: NDArray[np.intp],
         orbits: dict[int, FloatArray],
     ) -> None:
         self._model, self._shooting = model, shooting
         self._omega, self._measured = omega, measured
         self._unique_laws = all(e.is_linear or e.unique_response for e in model.elements)
-        self._order = levels(np.atleast_2d(drive)[0])
+        self._harmonics = (1, *sorted(set(harmonic.tolist()) - {1}))
+        self._place = np.array([self._harmonics.index(k) for k in harmonic.tolist()])
+        sweep = np.argsort(fundamental, kind="stable")
+        self._order = [sweep[rows] for rows in levels(np.atleast_2d(drive)[0][sweep])]
         self._orbits = orbits
 
     def at(self, values: Sequence[FloatArray], drive: FloatArray, chosen: list[int]) -> RowMotion:
@@ -79,23 +99,26 @@ class SteadyRows:
         u, w = (np.broadcast_to(v, shape).ravel() for v in (drive, self._omega))
         several = ~self._is_unique(values, shape).reshape(-1, n).all(axis=1)
         X = np.full((u.size, 2 + len(chosen)), np.nan, dtype=np.complex128)
+        stable = np.ones(u.size, dtype=np.bool_)
         alone = np.flatnonzero(np.repeat(~several, n))
         if alone.size:
             last = self._orbits.get(self._shooting.system.order)
             starts = None if last is None else last[alone % n]
-            X[alone], found = self._solve(
-                p[alone], w[alone], u[alone], chosen, starts, stable=False
+            found = self._solve(
+                alone % n, p[alone], w[alone], u[alone], chosen, starts, stable=False
             )
-            first = found[:n]
+            X[alone], first = found.X, found.orbits[:n]
             if last is not None:
                 first = np.where(np.isfinite(first), first, last)
             self._orbits[self._shooting.system.order] = first
         measured = np.broadcast_to(self._measured, shape).ravel()
         for table in np.flatnonzero(several):
             rows = slice(table * n, (table + 1) * n)
-            X[rows] = self._followed(p[rows], w[rows], u[rows], measured[rows], chosen)
+            X[rows], stable[rows] = self._followed(
+                p[rows], w[rows], u[rows], measured[rows], chosen
+            )
         X = X.reshape(*shape, -1)
-        return RowMotion(X[..., 0], X[..., 1], X[..., 2:])
+        return RowMotion(X[..., 0], X[..., 1], X[..., 2:], stable.reshape(shape))
 
     def is_linear(self, values: Sequence[FloatArray]) -> NDArray[np.bool_]:
         """Return whether friction is hardly more than a spring at every row, () or (S,).
@@ -139,6 +162,7 @@ class SteadyRows:
 
     def _solve(
         self,
+        rows: NDArray[np.intp],
         values: FloatArray,
         omega: FloatArray,
         drive: FloatArray,
@@ -147,13 +171,17 @@ class SteadyRows:
         *,
         again: bool = True,
         stable: bool = True,
-    ) -> tuple[ComplexArray, FloatArray]:
-        """Return X, its derivatives with respect to drive and parameters, and the orbits."""
+    ) -> _Solution:
+        """Return the motions of rows of one or more tables."""
         found = self._shooting(
-            values, omega, drive, chosen=chosen, starts=starts, again=again, stable=stable
+            values, omega, drive, chosen=chosen, harmonics=self._harmonics, starts=starts,
+            again=again, stable=stable,
+        )  # fmt: skip
+        own = np.arange(rows.size), self._place[rows]
+        X = [found.harmonics[own][:, None], found.by_drive[own][:, None], found.by_parameter[own]]
+        return _Solution(
+            np.concatenate(X, axis=1), found.starts, found.harmonics[:, 0], found.multiplier
         )
-        X = [found.harmonics, found.by_drive, found.by_parameter[:, 0]]
-        return np.concatenate(X, axis=1), found.starts
 
     def _followed(
         self,
@@ -162,35 +190,47 @@ class SteadyRows:
         drive: FloatArray,
         measured: ComplexArray,
         chosen: list[int],
-    ) -> ComplexArray:
-        """Return the motions of one table, each level followed in the order of its rows.
+    ) -> tuple[ComplexArray, NDArray[np.bool_]]:
+        """Return the motions of one table, and which are stable.
 
-        With derivatives, as far as there are any: a search needs all rows, or none.
+        Each level is followed in the order of its rows; with derivatives as far as there are
+        motions: a search needs all rows, or none.
         """
+        stable = np.ones(drive.size, dtype=np.bool_)
         result = np.full((drive.size, 2 + len(chosen)), np.nan, dtype=np.complex128)
         order = self._shooting.system.order
         orbits = np.full((len(self._order), order), np.nan)
         for place in range(max(map(len, self._order))):
             sweeps = [i for i, sweep in enumerate(self._order) if place < len(sweep)]
             rows = np.array([self._order[i][place] for i in sweeps])
-            X, own = self._solve(values[rows], omega[rows], drive[rows], chosen, orbits[sweeps])
-            apart = np.abs(X[:, 0] - measured[rows])
+            X, own, first, _ = self._solve(
+                rows, values[rows], omega[rows], drive[rows], chosen, orbits[sweeps]
+            )
+            apart = np.abs(first - measured[rows])
             far = np.flatnonzero(~(apart < _ELSEWHERE * np.abs(measured[rows])))
             if far.size:  # the row may have been measured on another branch
                 begin = np.zeros((far.size, order))
                 at = measured[rows[far]]
                 begin[:, 0], begin[:, 1] = at.real, -omega[rows[far]] * at.imag
                 there = rows[far]
-                other, orbit = self._solve(
-                    values[there], omega[there], drive[there], chosen, begin, again=False
+                other, orbit, first, _ = self._solve(
+                    there, values[there], omega[there], drive[there], chosen, begin, again=False
                 )
-                nearer = ~(apart[far] <= np.abs(other[:, 0] - at)) & np.isfinite(other[:, 0])
+                nearer = ~(apart[far] <= np.abs(first - at)) & np.isfinite(first)
                 X[far[nearer]], own[far[nearer]] = other[nearer], orbit[nearer]
+            lost = np.flatnonzero(np.isnan(X[:, 0]))
+            if lost.size:
+                there = rows[lost]
+                X[lost], own[lost], _, multiplier = self._solve(
+                    there, values[there], omega[there], drive[there], chosen, orbits[sweeps][lost],
+                    stable=False,
+                )  # fmt: skip
+                stable[there] = ~(multiplier > 1.0 + NEUTRAL)
             result[rows] = X
             if chosen and np.isnan(X).any():
                 break  # of no use to a search
             orbits[sweeps] = own
-        return result
+        return result, stable
 
 
 def levels(drive: FloatArray) -> list[NDArray[np.intp]]:

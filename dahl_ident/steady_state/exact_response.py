@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.element import Model
-from dahl_ident.steady_state.plant import BoolArray
+from dahl_ident.steady_state.plant import BoolArray, IntArray
 from dahl_ident.steady_state.shooting import NEUTRAL, Shooting, SteadyMotion
 
-_HARMONICS = (1, 0, *range(2, 10))
+HARMONICS = tuple(range(10))
+"""Of a motion, that are returned."""
 _SAME = 1e-6  # relative difference of two motions that are one
 _CYCLES = 3  # that an estimate goes through, so that memory of its own start fades
 _STEP = 0.005  # of ln of drive and frequency together, in which motions are followed
@@ -24,60 +25,70 @@ _MOST_STEPS = 40  # between two points: what lies far apart is not one sweep
 
 
 class ExactMotions(NamedTuple):
-    """Fundamentals X of every motion of every point, (points, most), NaN beyond the last.
+    """Every motion of every point, (points, most), NaN beyond the last, by rising size.
 
-    By rising size; `share` is the root sum of squares of the mean and the harmonics 2 to 9 over the
-    fundamental, `multiplier` the largest modulus of the multipliers of a cycle.
+    `harmonics` are X_k, k from 0 to 9, (points, most, 10); `multiplier` is the largest modulus of
+    the multipliers of a cycle. `followed` is the place of the stable motion of each point that a
+    sweep follows, -1 where there is none.
     """
 
-    displacement: ComplexArray
-    share: FloatArray
+    harmonics: ComplexArray
     multiplier: FloatArray
+    followed: IntArray
+
+
+class _Motion(NamedTuple):
+    harmonics: ComplexArray
+    multiplier: float
+
+    @property
+    def fundamental(self) -> complex:
+        return complex(self.harmonics[1])
+
+    @property
+    def stable(self) -> bool:
+        return self.multiplier < 1.0 + NEUTRAL
 
 
 def exact_motions(
-    model: Model,
-    omega: FloatArray,
-    drive: FloatArray,
-    near: ComplexArray,
-    unique: BoolArray,
-    *,
-    every: bool,
+    model: Model, omega: FloatArray, drive: FloatArray, near: ComplexArray, unique: BoolArray
 ) -> ExactMotions:
     """Return the exact motions of points, (n,), near estimates of their fundamentals, (n, most).
 
     Where the estimate is `unique`, so is the motion, and it is sought from rest. Elsewhere each
     estimate is a start, and so is each motion of the point before and after, followed in small
-    steps. Stable motions come first unless `every` one is wanted, by rising size.
+    steps.
     """
     shooting = Shooting(model)
     place = np.log([omega, drive])
-    steps = np.ceil(np.abs(np.diff(place)).sum(axis=0) / _STEP).clip(1, _MOST_STEPS)
+    steps = np.ceil(np.abs(np.diff(place)).sum(axis=0) / _STEP)
+    apart = np.append(True, steps > _MOST_STEPS)
+    steps = steps.clip(1, _MOST_STEPS)
     steps[unique[1:] & unique[:-1]] = 1.0
     points = np.append(0, np.cumsum(steps)).astype(np.intp)  # the others lie between
     along = np.interp(np.arange(points[-1] + 1), points, np.arange(points.size))
     omega, drive = (np.exp(np.interp(along, np.arange(points.size), one)) for one in place)
-    given, near = near, np.full((along.size, near.shape[1]), np.nan, dtype=np.complex128)
+    estimates, near = near, np.full((along.size, near.shape[1]), np.nan, dtype=np.complex128)
     alike, unique = unique, np.zeros(along.size, dtype=np.bool_)
-    near[points], unique[points] = given, alike
+    near[points], unique[points] = estimates, alike
     values = np.array([float(v) for v in model.known_values()])
-    motions: list[list[tuple[complex, float, float]]] = [[] for _ in omega]
+    motions: list[list[_Motion]] = [[] for _ in omega]
 
     def solved(rows: NDArray[np.intp], starts: FloatArray | None, **how: Any) -> SteadyMotion:
         return shooting(
-            np.tile(values, (rows.size, 1)), omega[rows], drive[rows], harmonics=_HARMONICS,
+            np.tile(values, (rows.size, 1)), omega[rows], drive[rows], harmonics=HARMONICS,
             starts=starts, stable=False, **how,
         )  # fmt: skip
 
-    def kept(rows: NDArray[np.intp], found: SteadyMotion) -> NDArray[np.intp]:
+    def kept(rows: NDArray[np.intp], solution: SteadyMotion) -> NDArray[np.intp]:
         """Keep the motions that are new; return their places."""
         new = []
-        for place in np.flatnonzero(found.found & np.isfinite(found.multiplier)).tolist():
-            known, harmonics = motions[rows[place]], found.harmonics[place]
-            X = complex(harmonics[0])
-            if all(abs(X - other) >= _SAME * abs(X) for other, _, _ in known):
-                rest = float(np.sqrt((np.abs(harmonics[1:]) ** 2).sum()))
-                known.append((X, rest / abs(X), float(found.multiplier[place])))
+        for place in np.flatnonzero(solution.found & np.isfinite(solution.multiplier)).tolist():
+            known = motions[rows[place]]
+            motion = _Motion(solution.harmonics[place], float(solution.multiplier[place]))
+            X = motion.fundamental
+            if all(abs(X - other.fundamental) >= _SAME * abs(X) for other in known):
+                known.append(motion)
                 new.append(place)
         return np.array(new, dtype=np.intp)
 
@@ -95,16 +106,38 @@ def exact_motions(
         rows, starts, how = fronts.pop(0)
         if not rows.size:
             continue
-        found = solved(rows, starts, **how)
-        new = kept(rows, found)
+        solution = solved(rows, starts, **how)
+        new = kept(rows, solution)
         nearby = np.concatenate([rows[new] - 1, rows[new] + 1])
         inside = (nearby >= 0) & (nearby < omega.size)
         inside[inside] &= ~unique[nearby[inside]]
-        fronts.append((nearby[inside], np.tile(found.starts[new], (2, 1))[inside], directly))
-    wanted = [motions[point] for point in points]
-    most = max(near.shape[1], *map(len, wanted))
-    arrays = np.full((len(wanted), most, 3), np.nan, dtype=np.complex128)
-    for point, own in enumerate(wanted):
-        own.sort(key=lambda one: (not every and not one[2] < 1.0 + NEUTRAL, abs(one[0])))
-        arrays[point, : len(own)] = np.reshape(own, (-1, 3))
-    return ExactMotions(arrays[..., 0], arrays[..., 1].real, arrays[..., 2].real)
+        fronts.append((nearby[inside], np.tile(solution.starts[new], (2, 1))[inside], directly))
+    for one in motions:
+        one.sort(key=lambda motion: abs(motion.fundamental))
+    begins = np.zeros(along.size, dtype=np.bool_)
+    begins[points] = apart
+    followed = _followed(motions, begins)[points]
+    most = max(near.shape[1], *(len(motions[point]) for point in points))
+    harmonics = np.full((points.size, most, len(HARMONICS)), np.nan, dtype=np.complex128)
+    multiplier = np.full((points.size, most), np.nan)
+    for row, point in enumerate(points.tolist()):
+        for order, motion in enumerate(motions[point]):
+            harmonics[row, order], multiplier[row, order] = motion
+    return ExactMotions(harmonics, multiplier, followed)
+
+
+def _followed(motions: list[list[_Motion]], begins: BoolArray) -> IntArray:
+    """Return the stable motion of every point that a sweep follows: the nearest to the last.
+
+    The smallest where a sweep begins.
+    """
+    result = np.full(len(motions), -1, dtype=np.intp)
+    last: complex | None = None
+    for point, (every, first) in enumerate(zip(motions, begins.tolist(), strict=True)):
+        stable = [place for place, motion in enumerate(every) if motion.stable]
+        last = None if first else last
+        if stable:
+            own = [every[place].fundamental for place in stable]
+            nearest = 0 if last is None else int(np.argmin(np.abs(np.array(own) - last)))
+            result[point], last = stable[nearest], own[nearest]
+    return result

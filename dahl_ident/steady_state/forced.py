@@ -7,7 +7,7 @@ each is then made exact.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
@@ -21,14 +21,16 @@ from dahl_ident.arrays import (
     positive_array,
 )
 from dahl_ident.data.columns import one_of
-from dahl_ident.elements.element import Element, as_model
+from dahl_ident.elements.element import Element, Model, as_model
 from dahl_ident.errors import MultipleSolutionsWarning, ValidationError
-from dahl_ident.steady_state.exact_response import exact_motions
+from dahl_ident.steady_state.exact_response import HARMONICS, exact_motions
 from dahl_ident.steady_state.plant import BoolArray, IntArray, flatten
 from dahl_ident.steady_state.roots import find_roots
 from dahl_ident.steady_state.shooting import LINEAR, NEUTRAL, STEADY, Steady, obstacle
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
+_DISTORTED = 0.02  # third harmonic over the fundamental: its error is as large as a measurement's
+_LOOKED_AT = 1000  # points of many: neighbours hardly differ
 _REACH = (1e-290, 1e290)  # numbers end at 1e-308 and 1e308; squares of ratios stay inside
 
 
@@ -55,10 +57,12 @@ class SteadyResponse:
         How many amplitudes the point has; shape of frequency and drive.
     message : str
         Empty where every point has exactly one amplitude, and it is stable; else which have none,
-        several, or none that is stable, and why.
-    harmonic_share : ndarray
-        Mean displacement and harmonics 2 to 9, root sum of squares, over the fundamental; zero for
-        the describing function, which has none.
+        several, or none that is stable, and why; of the describing function, where the motion is
+        not the sine for which it takes it.
+    harmonics : ndarray of complex
+        X_k of the mean displacement, the fundamental and the harmonics 2 to 9, along one more axis;
+        x(t) is the sum of Re X_k exp(j k omega t). The describing function has the fundamental
+        alone.
     multiplier : ndarray
         Largest modulus of Floquet's multipliers: a small change of the motion grows by this factor
         each cycle. NaN for the describing function.
@@ -81,7 +85,7 @@ class SteadyResponse:
     found: BoolArray
     number_of_solutions: IntArray
     message: str
-    harmonic_share: FloatArray
+    harmonics: ComplexArray = field(repr=False)
     multiplier: FloatArray
     steady: str
 
@@ -90,6 +94,14 @@ class SteadyResponse:
         """Whether a motion nearby comes back; False where there is none, or it is not known."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self.multiplier < 1.0 + NEUTRAL)[()]
+
+    @property
+    def harmonic_share(self) -> FloatArray:
+        """Mean displacement and harmonics 2 to 9, root sum of squares, over the fundamental."""
+        size = np.abs(self.harmonics)
+        others = np.concatenate([size[..., :1], size[..., 2:]], axis=-1)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.linalg.norm(others, axis=-1) / size[..., 1])[()]
 
     @property
     def phase(self) -> FloatArray:
@@ -129,9 +141,10 @@ def response(
         Zero-to-peak force u_0, N, > 0; for levels against frequencies give it the shape
         (levels, 1).
     all_roots : bool, default False
-        Return every amplitude of each point along a last axis, rising, filled up with NaN.
-        Otherwise the smallest alone, a stable one if there is any. Only plants with negative
-        damping, or with laws such as Backlash, have several.
+        Return every amplitude of each point along a last axis, rising, filled up with NaN, stable
+        or not. Otherwise one: the stable motion that a sweep through the points in their order
+        follows, up to where it jumps; of the describing function the smallest. Only plants with
+        negative damping, or with laws such as Backlash, have several.
     steady : {"exact", "describing function"}, default "exact"
         "exact" is the periodic solution of Eqn. 2 with all harmonics, its fundamental given. The
         describing function takes the displacement for a sine, A abs(Z(A, omega)) = u_0 (Eqn. 53);
@@ -160,7 +173,9 @@ def response(
     -----
     Exact motions are known to 1e-8. They start from those of the describing function, and each is
     followed through the neighbouring points, in their order, as far as it goes: give the points of
-    a sweep in the order of the sweep. For the describing function
+    a sweep in the order of the sweep. A sweep begins with the smallest stable motion, and so does
+    every point more than 20 % in frequency and drive from the one before. For the describing
+    function
 
     ``A |Z| = u_0`` holds within 1e-12 max(1, kappa/4), kappa = (abs(L) + abs(N))/abs(Z): near a
     sharp resonance L and N nearly cancel. Two of several amplitudes may be missed where A abs(Z)
@@ -190,51 +205,76 @@ def response(
         _check_reach(amplitude)
     with np.errstate(invalid="ignore"):  # NaN where there is no amplitude
         X = amplitude * (force.conj() / np.abs(force))
-    share, multiplier = np.zeros(X.shape), np.full(X.shape, np.nan)
+    harmonics = np.where(np.array(HARMONICS) == 1, X[..., None], 0.0)
+    multiplier = np.full(X.shape, np.nan)
+    chosen = np.zeros(X.shape[0], dtype=np.intp)
     why = "" if steady == "describing function" else obstacle(plant)
     moving = np.broadcast_to(f, shape).ravel() > 0.0
     exact = moving if steady == "exact" and not why else np.zeros(moving.shape, dtype=np.bool_)
     if exact.any():
         omega, u = (np.broadcast_to(v, shape).ravel()[exact] for v in (2.0 * np.pi * f, u0))
         unique = points.friction.unique & (points.linear.imag[exact] >= 0.0)
-        motions = exact_motions(plant, omega, u, X[exact], unique, every=all_roots)
-        more = ((0, 0), (0, motions.displacement.shape[1] - X.shape[1]))
-        X, share, multiplier = (
-            np.pad(v, more, constant_values=np.nan) for v in (X, share, multiplier)
-        )
-        X[exact], share[exact], multiplier[exact] = motions
-        amplitude = np.abs(X)
-    found = ~np.isnan(amplitude)
+        motions = exact_motions(plant, omega, u, X[exact], unique)
+        more = ((0, 0), (0, motions.multiplier.shape[1] - X.shape[1]))
+        multiplier = np.pad(multiplier, more, constant_values=np.nan)
+        harmonics = np.pad(harmonics, (*more, (0, 0)), constant_values=np.nan)
+        harmonics[exact], multiplier[exact], chosen[exact] = motions
+    found = np.isfinite(harmonics[..., 1])
     count = found.sum(axis=1).reshape(shape)
-    with np.errstate(invalid="ignore"):
-        unstable = exact & found.any(axis=1) & ~(multiplier < 1.0 + NEUTRAL).any(axis=1)
     active = points.linear.imag < 0.0
     message = _message(
-        count, active.reshape(shape), unstable.reshape(shape), np.broadcast_to(f, shape),
-        np.broadcast_to(u0, shape),
+        count, active.reshape(shape), ((chosen < 0) & found.any(axis=1)).reshape(shape),
+        np.broadcast_to(f, shape), np.broadcast_to(u0, shape),
     )  # fmt: skip
     if steady == "exact" and not exact.all() and why != LINEAR:
         taken = f"the describing function stands for the exact motion ({why or 'at 0 Hz'})"
         message = "; ".join(filter(None, (message, taken)))
+    if steady == "describing function" and not obstacle(plant):
+        at = np.flatnonzero(moving & (count.ravel() == 1))
+        at = at[:: 1 + at.size // _LOOKED_AT]
+        omega, u = (np.broadcast_to(v, shape).ravel()[at] for v in (2.0 * np.pi * f, u0))
+        message = "; ".join(filter(None, (message, _not_a_sine(plant, omega, u, amplitude[at, 0]))))
     if all_roots:
-        f, u0, shape = f[..., None], u0[..., None], (*shape, X.shape[1])
+        f, u0, shape = f[..., None], u0[..., None], (*shape, found.shape[1])
     else:
         if np.any(count > 1):
-            text = f"{message}; the smallest is returned, all of them with all_roots=True"
+            one = "the one that a sweep in their order follows" if exact.any() else "the smallest"
+            text = f"{message}; {one} is returned, all of them with all_roots=True"
             warnings.warn(text, MultipleSolutionsWarning, stacklevel=2)
-        amplitude, X, found = amplitude[:, :1], X[:, :1], found[:, :1]
-        share, multiplier = share[:, :1], multiplier[:, :1]
+        rows = np.arange(chosen.size)
+        harmonics, multiplier = harmonics[rows, chosen], multiplier[rows, chosen]
+        harmonics[chosen < 0], multiplier[chosen < 0] = np.nan, np.nan
+    harmonics = harmonics.reshape(*shape, len(HARMONICS))
+    X = harmonics[..., 1]
     return SteadyResponse(
         frequency_hz=_read_only(np.broadcast_to(f, shape)),
         drive=_read_only(np.broadcast_to(u0, shape)),
-        amplitude=_read_only(amplitude.reshape(shape)),
-        displacement=_read_only(X.reshape(shape)),
-        found=_read_only(found.reshape(shape)),
+        amplitude=_read_only(np.abs(X)),
+        displacement=_read_only(X),
+        found=_read_only(np.isfinite(X)),
         number_of_solutions=_read_only(count),
         message=message,
-        harmonic_share=_read_only(np.where(found, share, np.nan).reshape(shape)),
+        harmonics=_read_only(harmonics),
         multiplier=_read_only(multiplier.reshape(shape)),
         steady="exact" if exact.any() else "describing function",
+    )
+
+
+def _not_a_sine(plant: Model, omega: FloatArray, drive: FloatArray, A: FloatArray) -> str:
+    """Return where the motion is farthest from a sine, by its third harmonic to first order."""
+    values = plant.known_values()
+    with np.errstate(all="ignore"):
+        third = np.abs(
+            plant.stiffness(values, A, omega, 3) / plant.stiffness(values, A, 3.0 * omega)
+        )
+    if not (third > _DISTORTED).any():
+        return ""
+    row = int(np.nanargmax(third))
+    return (
+        "the motion is not the sine for which the describing function takes it: the third harmonic "
+        f"is about {100.0 * third[row]:.2g} % at {omega[row] / (2.0 * np.pi):g} Hz, drive "
+        f"{drive[row]:g}, and the fundamental may be off by several times as much; steady='exact' "
+        "has no such error"
     )
 
 
@@ -253,6 +293,7 @@ def _check_reach(amplitude: FloatArray) -> None:
 
 def _read_only(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
     """Return the array, read-only, or its scalar."""
+    array = np.asarray(array)
     array.flags.writeable = False
     return array[()]
 

@@ -120,7 +120,7 @@ def _record(
 def _table(experiment: Experiment, steps: Steps, table: Table, draws: Draws) -> FrequencyResponse:
     """Return the table of a stepped sine: the true phasors, as measured by the sensors."""
     if experiment.excitation.controlled == "force":
-        phasors = _forced_phasors(experiment, *steps)
+        phasors = _forced_phasors(experiment, *steps, np.array(table.harmonics))
         return receptance_table(phasors, table, draws)
     phasors = _held_phasors(experiment, *steps, np.array(table.harmonics))
     return stiffness_table(phasors, table, draws)
@@ -144,30 +144,30 @@ def _held_phasors(
         f, A, k, step,
         displacement=A * sensors.displacement.response(omega),
         force=force * sensors.force.response(k * omega),
+        displacement_size=A * np.abs(sensors.displacement.response(omega)),
         force_size=fundamental * np.abs(sensors.force.response(omega)),
     )  # fmt: skip
 
 
-def _forced_phasors(experiment: Experiment, drive: FloatArray, frequency_hz: FloatArray) -> Phasors:
-    """Return a row for every step, with controlled force."""
+def _forced_phasors(
+    experiment: Experiment, drive: FloatArray, frequency_hz: FloatArray, harmonics: IntArray
+) -> Phasors:
+    """Return a row for every step and harmonic, with controlled force."""
     assert experiment.table is not None
     how = experiment.table.steady
     steady = response(experiment.plant, frequency_hz, drive, steady=how)
     if not steady.found.all():
         raise ModelError(steady.message)
-    loose = np.flatnonzero(~steady.stable & (steady.steady == "exact"))
-    if loose.size:
-        raise ModelError(
-            f"{loose.size} of {drive.size} steps have no stable steady motion, the first at "
-            f"{frequency_hz[loose[0]]:g} Hz, drive {drive[loose[0]]:g}: the plant would leave it; "
-            "give it a spring and damping"
-        )
-    omega = 2.0 * np.pi * frequency_hz
+    step, k = (g.ravel() for g in np.meshgrid(np.arange(drive.size), harmonics, indexing="ij"))
+    f, omega = frequency_hz[step], 2.0 * np.pi * frequency_hz[step]
     sensors = experiment.acquisition
-    force = drive * sensors.force.response(omega)
+    X = np.asarray(steady.harmonics)[step]
+    force = drive[step] * sensors.force.response(omega)
+    motion = sensors.displacement.response
     return Phasors(
-        frequency_hz, drive, np.ones(drive.size, dtype=np.int64), np.arange(drive.size),
-        displacement=steady.displacement * sensors.displacement.response(omega),
+        f, drive[step], k, step,
+        displacement=X[np.arange(step.size), k] * motion(k * omega),
         force=force,
+        displacement_size=np.abs(X[:, 1] * motion(omega)),
         force_size=np.abs(force),
     )  # fmt: skip

@@ -30,9 +30,10 @@ class Table:
     ----------
     displacement_std, force_std : float, default 0
         Relative standard deviation of the real and of the imaginary part of each phasor; of
-        the fundamental's size for higher harmonics of the force.
+        the fundamental's size for higher harmonics.
     harmonics : sequence of int, default (1,)
-        Harmonics of the force that get a row, where displacement is controlled.
+        Harmonics that get a row: of the force where displacement is controlled, of the
+        displacement, up to 9, where the force is.
     outlier_fraction : float, default 0
         Share of the rows, chosen at random, with a gross error.
     outlier_size : float, default 0.5
@@ -79,7 +80,7 @@ class Table:
 
 
 class Phasors(NamedTuple):
-    """The measured phasors of each row, without noise; F_k is referred to t = 0."""
+    """The measured phasors of each row, without noise; F_k, or X_k, is referred to t = 0."""
 
     frequency_hz: FloatArray
     level: FloatArray
@@ -87,16 +88,18 @@ class Phasors(NamedTuple):
     step: NDArray[np.int64]
     displacement: ComplexArray
     force: ComplexArray
+    displacement_size: FloatArray
     force_size: FloatArray
 
 
 def stiffness_table(phasors: Phasors, table: Table, draws: Draws) -> FrequencyResponse:
     """Return F_k/X_1, its phase referred to k times the displacement's (displacement held)."""
     k = phasors.harmonic
-    X, F = _with_errors(phasors, table, draws)
-    response = _stiffness(F, X, k)
+    X = _shared_error("displacement", phasors.displacement, table.displacement_std, phasors, draws)
+    F = _own_error("force", phasors.force, table.force_std * phasors.force_size, draws)
+    response = _referred(F, X, k)
     # of the true response: a covariance that followed each row's error would bias every fit
-    true = _stiffness(phasors.force, phasors.displacement, k)
+    true = _referred(phasors.force, phasors.displacement, k)
     along, across = true, 1j * k * true  # changes with |X| and with its phase
     force_part = (table.force_std * phasors.force_size / np.abs(phasors.displacement)) ** 2
     covariance = table.displacement_std**2 * (_outer(along) + _outer(across)) + force_part[
@@ -110,35 +113,49 @@ def stiffness_table(phasors: Phasors, table: Table, draws: Draws) -> FrequencyRe
 
 
 def receptance_table(phasors: Phasors, table: Table, draws: Draws) -> FrequencyResponse:
-    """Return X/F (force held)."""
-    X, F = _with_errors(phasors, table, draws)
-    response = X / F
-    true = phasors.displacement / phasors.force
-    relative = table.displacement_std**2 + table.force_std**2
-    covariance = relative * np.abs(true)[:, None, None] ** 2 * np.eye(2)
+    """Return X_k/F_1, its phase referred to k times the force's (force held)."""
+    k = phasors.harmonic
+    X = _own_error(
+        "displacement", phasors.displacement, table.displacement_std * phasors.displacement_size,
+        draws,
+    )  # fmt: skip
+    F = _shared_error("force", phasors.force, table.force_std, phasors, draws)
+    amplitude = np.abs(X)[np.flatnonzero(k == 1)[phasors.step]]
+    response = _referred(X, F, k)
+    # of the true response: a covariance that followed each row's error would bias every fit
+    true = _referred(phasors.displacement, phasors.force, k)
+    along, across = true, 1j * k * true  # changes with |F| and with its phase
+    own = (table.displacement_std * phasors.displacement_size / np.abs(phasors.force)) ** 2
+    covariance = table.force_std**2 * (_outer(along) + _outer(across)) + own[
+        :, None, None
+    ] * np.eye(2)
     data = FrequencyResponse(
-        phasors.frequency_hz, response, np.abs(X), np.abs(F), level=phasors.level,
+        phasors.frequency_hz, response, amplitude, np.abs(F), level=phasors.level, harmonic=k,
         controlled="force", quantity="receptance",
     )  # fmt: skip
-    return _finished(data, covariance, true, np.abs(phasors.displacement), table, draws)
+    shared = np.where(k == 1, true, 0.0)
+    return _finished(data, covariance, shared, phasors.displacement_size, table, draws)
 
 
-def _stiffness(
-    force: ComplexArray, displacement: ComplexArray, k: NDArray[np.int64]
+def _referred(answer: ComplexArray, held: ComplexArray, k: NDArray[np.int64]) -> ComplexArray:
+    """Return a harmonic over the size of what was held, turned by k times its phase."""
+    return np.asarray(answer / np.abs(held) * np.exp(-1j * k * np.angle(held)))
+
+
+def _shared_error(
+    name: str, held: ComplexArray, std: float, phasors: Phasors, draws: Draws
 ) -> ComplexArray:
-    return np.asarray(force / np.abs(displacement) * np.exp(-1j * k * np.angle(displacement)))
-
-
-def _with_errors(phasors: Phasors, table: Table, draws: Draws) -> tuple[ComplexArray, ComplexArray]:
-    """Return X and F_k with their noise; the rows of one step share the displacement's."""
+    """Return the phasors with one relative error for all rows of a step."""
     steps, which = np.unique(phasors.step, return_inverse=True)
-    e_x = _complex_normal("displacement phasor", steps.size, draws)[which]
-    e_f = _complex_normal("force phasor", phasors.force.size, draws)
-    turned = np.exp(1j * np.angle(phasors.force))
-    return (
-        phasors.displacement * (1.0 + table.displacement_std * e_x),
-        phasors.force + table.force_std * phasors.force_size * turned * e_f,
+    return np.asarray(
+        held * (1.0 + std * _complex_normal(f"{name} phasor", steps.size, draws)[which])
     )
+
+
+def _own_error(name: str, answer: ComplexArray, std: FloatArray, draws: Draws) -> ComplexArray:
+    """Return the phasors with an error for every row."""
+    turned = np.exp(1j * np.angle(answer))
+    return np.asarray(answer + std * turned * _complex_normal(f"{name} phasor", answer.size, draws))
 
 
 def _finished(
