@@ -124,8 +124,8 @@ def as_python(work: Mapping[str, Any], folder: Path, *, metadata: bool) -> str:
     data = f"di.extract({data})" if kind == "extract" else data
     law = class_named(model["law"])
     name = law.__name__ if law is not None else model["law"]
-    own = law is None or not law.__module__.startswith("dahl_ident.")
-    element = f"{'' if own else 'di.'}{name}({model['known'].strip()})"
+    of_user = law is None or not law.__module__.startswith("dahl_ident.")
+    element = f"{'' if of_user else 'di.'}{name}({model['known'].strip()})"
     element = f"di.Backlash({element})" if model["play"] else element
     for option, value in _linear(model):
         element += f" + di.{LINEAR[option].__name__}({_in_si(value, option)})"

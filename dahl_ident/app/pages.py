@@ -77,17 +77,17 @@ def _plain(text: str) -> str:
 
 def laws(files: Sequence[str]) -> list[dict[str, str]]:
     """Return the laws that can be chosen, those of the user's files included."""
-    found = [
+    known = [
         {"kind": kind, "name": _NAMES[kind], "use": _USES[kind], "drawn": "yes"} for kind in _NAMES
     ]
     for file in files:
         load_laws(Path(file))
-    own = [cls for cls in KINDS.values() if issubclass(cls, Friction)]
-    own = [cls for cls in own if not cls.__module__.startswith("dahl_ident.")]
-    for cls in own if files else ():
+    of_user = [cls for cls in KINDS.values() if issubclass(cls, Friction)]
+    of_user = [cls for cls in of_user if not cls.__module__.startswith("dahl_ident.")]
+    for cls in of_user if files else ():
         use = (cls.__doc__ or "").strip().partition("\n")[0]
-        found.append({"kind": cls.kind, "name": cls.__name__, "use": use, "drawn": ""})
-    return found
+        known.append({"kind": cls.kind, "name": cls.__name__, "use": use, "drawn": ""})
+    return known
 
 
 @cache

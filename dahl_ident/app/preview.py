@@ -35,62 +35,62 @@ _SHOWN = 300  # points of a picture
 
 def preview(state: dict[str, Any]) -> dict[str, Any]:
     """Return channels of the first file, what could be read, and what could not."""
-    found: dict[str, Any] = dict(NOTHING_FOUND, channels=[], notes=[], curves=[])
+    shown: dict[str, Any] = dict(NOTHING_FOUND, channels=[], notes=[], curves=[])
     files = [str(file["stored"]) for file in state["files"]]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            _describe(files[0], found)
-            _read(files, state["reading"], found)
+            _describe(files[0], shown)
+            _read(files, state["reading"], shown)
         except (DahlIdentError, ValueError, OSError) as exc:
-            found["error"] = str(exc)
-    found["notes"] += list(dict.fromkeys(str(one.message) for one in caught))
-    return found
+            shown["error"] = str(exc)
+    shown["notes"] += list(dict.fromkeys(str(one.message) for one in caught))
+    return shown
 
 
-def _describe(file: str, found: dict[str, Any]) -> None:
+def _describe(file: str, shown: dict[str, Any]) -> None:
     source = open_source(file)
     summary = contents(source)
     place = Path("columns.toml")
     text = place.read_text("utf-8") if place.exists() else summary.column_map
     roles: dict[str, Any] = tomllib.loads(text)
     by_column = {e["column"]: (r, e) for r, e in roles.items() if isinstance(e, dict)}
-    found["format"], found["sampling"] = summary.format, summary.sampling
-    found["notes"] += [*summary.gaps, *summary.notes]
+    shown["format"], shown["sampling"] = summary.format, summary.sampling
+    shown["notes"] += [*summary.gaps, *summary.notes]
     for channel, line in zip(source.channels, summary.channels, strict=True):
         role, entry = by_column.get(channel.name, ("", {}))
         curve = _thumbnail(channel.values) if channel.kind in "fiu" else []
-        found["channels"].append(
+        shown["channels"].append(
             {**asdict(line), "role": role, "curve": curve, "sign": entry.get("sign", 1),
              "unit": entry.get("unit") or channel.unit or ""}
         )  # fmt: skip
 
 
-def _read(files: Sequence[str], reading: dict[str, str], found: dict[str, Any]) -> None:
+def _read(files: Sequence[str], reading: dict[str, str], shown: dict[str, Any]) -> None:
     """Read the files as the commands will, and add what they show."""
     how: dict[str, Any] = {n: reading[n] for n in OF_BOTH if reading.get(n)}
     if Path("columns.toml").exists():
         how["columns"] = "columns.toml"
     kind = reading.get("kind", "")
     if kind in ("", "table"):
-        own: dict[str, Any] = {n: reading[n] for n in OF_TABLES if reading.get(n)}
-        if "frequency" in own:
-            own["frequency"] = _hertz(own["frequency"], "frequency")
+        options: dict[str, Any] = {n: reading[n] for n in OF_TABLES if reading.get(n)}
+        if "frequency" in options:
+            options["frequency"] = _hertz(options["frequency"], "frequency")
         try:
-            table = read_frequency_response(list(files), **how, **own)
+            table = read_frequency_response(list(files), **how, **options)
         except WaveformsError:
             if kind == "table":
                 raise
         else:
-            found |= {"kind": "table", "summary": repr(table), "curves": _points(table)}
+            shown |= {"kind": "table", "summary": repr(table), "curves": _points(table)}
             return
     if reading.get("sample_rate"):
         how["sample_rate"] = _hertz(reading["sample_rate"], "sample_rate")
     records = [read_record(file, **how) for file in files]
-    found |= {"kind": kind or "record", "summary": "\n".join(map(repr, records))}
+    shown |= {"kind": kind or "record", "summary": "\n".join(map(repr, records))}
     for record in records:
         x, y = record.motion_samples, record.force_samples
-        found["curves"].append(_curve(x, y, record.motion_channel, "force or drive", line=True))
+        shown["curves"].append(_curve(x, y, record.motion_channel, "force or drive", line=True))
 
 
 def _hertz(text: str, what: str) -> float:

@@ -38,8 +38,8 @@ class Work:
     @classmethod
     def all(cls, root: Path) -> list[Work]:
         """Return what is in a folder, the newest first."""
-        found = [path for path in root.iterdir() if (path / "work.json").is_file()]
-        return [cls(path) for path in sorted(found, key=lambda p: -p.stat().st_mtime)]
+        folders = [path for path in root.iterdir() if (path / "work.json").is_file()]
+        return [cls(path) for path in sorted(folders, key=lambda p: -p.stat().st_mtime)]
 
     @classmethod
     def named(cls, root: Path, name: str) -> Work | None:
@@ -72,8 +72,8 @@ class Work:
     @property
     def state(self) -> dict[str, Any]:
         """What ``work.json`` holds."""
-        found: dict[str, Any] = json.loads((self.folder / "work.json").read_text("utf-8"))
-        return found
+        stored: dict[str, Any] = json.loads((self.folder / "work.json").read_text("utf-8"))
+        return stored
 
     def save(self, **changes: Any) -> None:
         """Write changes of the state."""
@@ -122,13 +122,13 @@ class Work:
         """Return a text of a command with the files' names as they were uploaded."""
         shown = {Path(file["stored"]).name: str(file["name"]) for file in self.state["files"]}
         names = "|".join(re.escape(name) for name in sorted(shown, key=len, reverse=True))
-        found = rf"(?<![\w./-])(?:data/)?({names})(?!\w)"
-        return re.sub(found, lambda match: shown[match[1]], text) if names else text
+        pattern = rf"(?<![\w./-])(?:data/)?({names})(?!\w)"
+        return re.sub(pattern, lambda match: shown[match[1]], text) if names else text
 
     def runs(self) -> list[Path]:
         """Return the folders of the runs, the last one first."""
-        found = [path for path in self.folder.glob("run-*") if (path / "job.json").is_file()]
-        return sorted(found, key=lambda path: -int(path.name[4:]))
+        runs = [path for path in self.folder.glob("run-*") if (path / "job.json").is_file()]
+        return sorted(runs, key=lambda path: -int(path.name[4:]))
 
     def new_run(self) -> Path:
         """Make the folder of the next run."""

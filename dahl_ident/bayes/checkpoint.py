@@ -57,8 +57,8 @@ def identity(density: Density | RecordDensity, walkers: int, ensembles: int) -> 
         model = repr(elements)
     if isinstance(density, RecordDensity):
         samples = [(r.time, r.motion_samples, r.force_samples) for r in density.problem.records]
-        own = {"data": _digest(*(part for record in samples for part in record))}
-        own["estimate"] = _digest(density.values)
+        facts = {"data": _digest(*(part for record in samples for part in record))}
+        facts["estimate"] = _digest(density.values)
     else:
         problem = density.problem
         data = [
@@ -70,15 +70,15 @@ def identity(density: Density | RecordDensity, walkers: int, ensembles: int) -> 
             )
         ]  # fmt: skip
         fixed = [(p.name, p.value) for p in problem.sensors.parameters if not p.free]
-        own = {"data": _digest(*data), "noise": problem.noise, "sensors": repr(fixed)}
+        facts = {"data": _digest(*data), "noise": problem.noise, "sensors": repr(fixed)}
         errors = density.errors
-        own["errors other than noise"] = (
+        facts["errors other than noise"] = (
             "none"
             if errors is None
             else _digest(errors.turn, errors.shared, errors.offset, errors.sizes)
         )
     return {
-        **own,
+        **facts,
         "model": model,
         "likelihood": density.likelihood,
         "parameters": ", ".join(density.names),
@@ -104,8 +104,8 @@ class ChainFile:
         """Return the chain in the file, None where there is no file yet."""
         if not self.path.exists():
             return None
-        stored, found = _read(self.path)
-        differing = [k for k, v in self._identity.items() if found.get(k) != v]
+        stored, stored_identity = _read(self.path)
+        differing = [k for k, v in self._identity.items() if stored_identity.get(k) != v]
         if differing:
             raise SamplingError(
                 f"{self.path} holds a chain of another run: it differs in "
@@ -201,12 +201,12 @@ def _read(path: Path) -> tuple[StoredChain, dict[str, str]]:
 
 
 def _check_format(path: Path, attributes: Mapping[str, Any]) -> None:
-    found = (attributes.get("format"), attributes.get("version"))
+    stated = (attributes.get("format"), attributes.get("version"))
     missing = {"identity", "seed", "digest"} - set(attributes)
-    if found != (FORMAT, VERSION) or missing:
+    if stated != (FORMAT, VERSION) or missing:
         raise SamplingError(
             f"{path} is an HDF5 file, but not a chain that this version can resume: format and "
-            f"version are {found}, expected {(FORMAT, VERSION)}. Give another file; this one is "
+            f"version are {stated}, expected {(FORMAT, VERSION)}. Give another file; this one is "
             "left as it is"
         )
 

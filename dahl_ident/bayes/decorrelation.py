@@ -70,10 +70,12 @@ class Decorrelation:
         names, view = self.problem.names, self.problem.stiffness_data
         values = self.problem.to_values(x[:, : len(names)])
         by_name = dict(zip(names, values.T, strict=True))
-        own = [
+        values_of = [
             [by_name.get(p.name, np.asarray(p.value)) for p in e.parameters] for e in self.friction
         ]
-        parts = (view.of(e, v, at_nodes=True) for e, v in zip(self.friction, own, strict=True))
+        parts = (
+            view.of(e, v, at_nodes=True) for e, v in zip(self.friction, values_of, strict=True)
+        )
         return np.asarray(sum(parts))
 
 

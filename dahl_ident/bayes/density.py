@@ -216,8 +216,8 @@ class Density(LogDensity):
         y, _ = self.tabulated.whitened(held, derivatives=False, tails=False)
         parts = np.broadcast_to(y, (len(theta), y.shape[-1])).copy().view(np.float64)
         with np.errstate(invalid="ignore", over="ignore"):
-            found = self.errors.squares(parts + self.errors.moved(theta))
-        return np.where(np.isnan(found), np.inf, found)
+            squares = self.errors.squares(parts + self.errors.moved(theta))
+        return np.where(np.isnan(squares), np.inf, squares)
 
     def probabilities(self, sums: FloatArray) -> FloatArray:
         """Return how probable each size of shared errors is, (S, M), given sums of squares."""

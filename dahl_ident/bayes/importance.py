@@ -239,8 +239,8 @@ def _split(phi: FloatArray, weights: FloatArray) -> _Mixture:
 
 def _halves(part: Rows, x: FloatArray, weights: FloatArray) -> tuple[Rows, Rows]:
     """Return the points on both sides of the median along the longest axis."""
-    own = weights[part]
-    covariance = np.atleast_2d(np.cov(x[part], rowvar=False, aweights=own, ddof=0))
+    part_weights = weights[part]
+    covariance = np.atleast_2d(np.cov(x[part], rowvar=False, aweights=part_weights, ddof=0))
     order = part[np.argsort(x[part] @ np.linalg.eigh(covariance)[1][:, -1])]
     below = np.cumsum(weights[order])
     middle = int(np.clip(np.searchsorted(below, 0.5 * below[-1]), 1, len(part) - 1))

@@ -57,8 +57,8 @@ class RecordDensity(LogDensity):
     @property
     def centre(self) -> FloatArray:
         """Coordinates of the estimate."""
-        own = self.values[: len(self.names)]
-        return np.where(self.logarithmic, np.log(np.where(self.logarithmic, own, 1.0)), own)
+        values = self.values[: len(self.names)]
+        return np.where(self.logarithmic, np.log(np.where(self.logarithmic, values, 1.0)), values)
 
     @cached_property
     def root(self) -> FloatArray:
@@ -79,14 +79,14 @@ class RecordDensity(LogDensity):
         """Orthonormal derivatives by states and offsets, and those by theta, of each record."""
         count = len(self.names)
         chain = np.where(self.logarithmic, self.values[:count], 1.0)
-        found = []
+        parts = []
         for number in range(len(self.problem.records)):
             by = self.problem.filtered(self.problem.predict(self.values, number).by)
             first = count + number * self.problem.per_record
-            own = by[:, first : first + self.problem.per_record]
-            basis = np.linalg.qr(own / np.linalg.norm(own, axis=0))[0]
-            found.append((basis, by[:, :count] * chain))
-        return found
+            columns = by[:, first : first + self.problem.per_record]
+            basis = np.linalg.qr(columns / np.linalg.norm(columns, axis=0))[0]
+            parts.append((basis, by[:, :count] * chain))
+        return parts
 
     @cached_property
     def _least(self) -> float:
@@ -123,8 +123,8 @@ class RecordDensity(LogDensity):
         total = 0.0
         try:
             for number, y in enumerate(self.problem.measured):
-                found = self.problem.predict(full, number, derivatives=False)
-                e = self.problem.filtered(y - found.output)
+                predicted = self.problem.predict(full, number, derivatives=False)
+                e = self.problem.filtered(y - predicted.output)
                 basis = self._nuisance[number][0]
                 total += float(e @ e) - float(np.sum((basis.T @ e) ** 2))
         except FitError:  # the motion grows beyond all bounds
@@ -157,7 +157,7 @@ def record_prior(
 
 def _sizes(problem: RecordProblem, powers: tuple[int, int, int]) -> FloatArray:
     """Return the size in each record of a unit, by powers of force, displacement and time."""
-    found = []
+    sizes = []
     for number, record in enumerate(problem.records):
         if problem.output == "force":
             x = np.asarray(record.displacement)
@@ -167,5 +167,5 @@ def _sizes(problem: RecordProblem, powers: tuple[int, int, int]) -> FloatArray:
         length, time = np.std(x), np.std(x) / np.std(v)
         push = record.force_samples
         force = np.std(push if push.any() else v / time)  # a free decay: of unit mass
-        found.append(force ** powers[0] * length ** powers[1] * time ** powers[2])
-    return np.asarray(found)
+        sizes.append(force ** powers[0] * length ** powers[1] * time ** powers[2])
+    return np.asarray(sizes)

@@ -140,12 +140,12 @@ class RowErrors:
         """
         y, by = y * self.weight + self.offset, by * self.weight[:, None]
         turn = self.turn / np.sqrt(1.0 + self.shared)[:, None]
-        found = y @ turn.T, turn @ by
+        turned = y @ turn.T, turn @ by
         if self.inside is None:
-            return found
+            return turned
         size = self.outside**0.5
         rest = y - (y @ self.inside) @ self.inside.T, by - self.inside @ (self.inside.T @ by)
         return (
-            np.concatenate([found[0], rest[0] / size], axis=-1),
-            np.concatenate([found[1], rest[1] / size], axis=-2),
+            np.concatenate([turned[0], rest[0] / size], axis=-1),
+            np.concatenate([turned[1], rest[1] / size], axis=-2),
         )

@@ -321,13 +321,13 @@ def _widths(page: FPDF, table: Table) -> list[float]:
     """Return the widths of columns: no word is broken where all words of a row fit on the page."""
     texts = [tuple(cell.text for cell in row) for row in table.rows]
     least, wanted = [], []
-    for name, *own in zip(table.header, *texts, strict=True):
+    for name, *column in zip(table.header, *texts, strict=True):
         page.set_font(_FONT, "B", 7.5)
         widest = max((page.get_string_width(word) for word in name.split()), default=0.0)
         page.set_font(_FONT, "", 7.5)
-        words_of = {word for text in own for word in text.split()}
+        words_of = {word for text in column for word in text.split()}
         longest = max((page.get_string_width(word) for word in words_of), default=0.0)
-        whole = max(map(page.get_string_width, own), default=0.0)
+        whole = max(map(page.get_string_width, column), default=0.0)
         least.append(min(max(widest, longest), _WIDEST) + _PADDING)
         wanted.append(max(widest, longest, min(whole, _WIDEST)) + _PADDING)
     room, more = page.epw - sum(least), sum(wanted) - sum(least)

@@ -96,12 +96,12 @@ def changes(fits: Mapping[str, Fit]) -> list[Change]:
     ]
 
 
-def headline(found: list[Change]) -> list[str]:
+def headline(changed: list[Change]) -> list[str]:
     """Return what changed in sentences, and what the comparison leaves open."""
-    told = [f"{c}." for c in found if math.isfinite(c.p) and c.p < SIGNIFICANT]
+    told = [f"{c}." for c in changed if math.isfinite(c.p) and c.p < SIGNIFICANT]
     if not told:
         return ["No parameter changes significantly between the measurements."]
-    if not all(c.runs_known for c in found):
+    if not all(c.runs_known for c in changed):
         told.append(
             "Each fit is of a single run, so scatter between runs (a new mounting, another day) "
             "may be the reason: repeat runs, and fit them together."

@@ -186,8 +186,8 @@ class Fit(Result):
 
     def intervals_run(self, level: float) -> list[ConfidenceIntervals]:
         """Return the intervals at a level of every method that has been asked for until now."""
-        found = (one for one in self._intervals.values() if np.isclose(one.levels, level).any())
-        return list({one.method: one for one in found}.values())
+        matching = (one for one in self._intervals.values() if np.isclose(one.levels, level).any())
+        return list({one.method: one for one in matching}.values())
 
     def _new_intervals(
         self, method: Method, levels: Sequence[float], replicates: int | None, seed: int
@@ -266,9 +266,9 @@ class Fit(Result):
         for name, p in self.params.items():
             known = {"lower": limits[name].lower, "upper": limits[name].upper} if p.vary else {}
             rows[name] = {**asdict(p), **known}
-        found = pd.DataFrame.from_dict(rows, orient="index").rename_axis("parameter")
+        frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("parameter")
         columns = ["value", "stderr", "lower", "upper", "unit", "vary", "description"]
-        return found.reindex(columns=[*columns, "init_value", "min", "max"])
+        return frame.reindex(columns=[*columns, "init_value", "min", "max"])
 
     def _reported(self, method: Method, level: float) -> ConfidenceIntervals:
         if level in LEVELS:

@@ -80,15 +80,18 @@ def derived_at_draws(
     motion = problem.data.motion
     friction = [e for e in problem.model.elements if e.has_memory]
     values = [_own_values(e, by_name) for e in friction]
-    for element, own in zip(friction, values, strict=True):
-        low, high = (np.broadcast_to(k, len(theta)) for k in element.knee(own))
+    for element, p in zip(friction, values, strict=True):
+        low, high = (np.broadcast_to(k, len(theta)) for k in element.knee(p))
         if np.array_equal(low, high):
             label = "x_c" if element.name is None else f"{element.name}_x_c"
             yield _quantity(label, shown_unit("m", motion), None, low)
     omega = 2.0 * np.pi * float(positive_array(1.0 if frequency_hz is None else frequency_hz, "f"))
     for A in positive_array(amplitudes, "amplitudes").ravel().tolist():
         at = np.full(len(theta), A), np.full(len(theta), omega)
-        N = np.sum([e.stiffness(own, *at) for e, own in zip(friction, values, strict=True)], axis=0)
+        N = np.sum(
+            [e.stiffness(p, *at) for e, p in zip(friction, values, strict=True)],
+            axis=0,
+        )
         yield _quantity(ENERGY, "J", A, np.pi * A**2 * N.imag)
         yield _quantity("equivalent stiffness", shown_unit("N/m", motion), A, N.real)
         if frequency_hz is not None:

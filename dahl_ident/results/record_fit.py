@@ -169,14 +169,16 @@ class RecordFit(Fit):
     @cached_property
     def model(self) -> Model:
         """The model with the estimates put in, fixed."""
-        found = dict(zip(self.var_names, self.optimum.values.tolist(), strict=True))
-        return self.problem.model.with_fixed({p.name: found[p.name] for p in self.problem.free})
+        values = dict(zip(self.var_names, self.optimum.values.tolist(), strict=True))
+        return self.problem.model.with_fixed({p.name: values[p.name] for p in self.problem.free})
 
     @cached_property
     def _evaluated(self) -> tuple[list[FloatArray], list[FloatArray]]:
-        found = [self.problem.predict(self.optimum.values, i) for i in range(len(self.records))]
-        residuals = [y - p.output for y, p in zip(self.problem.measured, found, strict=True)]
-        return [p.by for p in found], residuals
+        predictions = [
+            self.problem.predict(self.optimum.values, i) for i in range(len(self.records))
+        ]
+        residuals = [y - p.output for y, p in zip(self.problem.measured, predictions, strict=True)]
+        return [p.by for p in predictions], residuals
 
     @property
     def residuals(self) -> tuple[FloatArray, ...]:
@@ -214,9 +216,9 @@ class RecordFit(Fit):
 
     def budget(self) -> Budget:
         """Return the uncertainty budget: each parameter's sources, combined and expanded."""
-        found = record_budget(self.problem, self.optimum.values, self.errors)
-        own = tuple(replace(p, unit=self._shown(p.unit)) for p in found.parameters)
-        return replace(found, parameters=own)
+        stated = record_budget(self.problem, self.optimum.values, self.errors)
+        parameters = tuple(replace(p, unit=self._shown(p.unit)) for p in stated.parameters)
+        return replace(stated, parameters=parameters)
 
     @property
     def effective_samples(self) -> float:
@@ -405,11 +407,11 @@ class RecordFit(Fit):
         -------
         str
         """
-        own = {p.name for p in self.problem.model.parameters}
+        of_model = {p.name for p in self.problem.model.parameters}
         limits = self.conf_interval().at(CONFIDENCE)
         rows = [["", "value", "stderr", "unit", f"{percent(CONFIDENCE)}", ""]]
         for name, p in self.params.items():
-            if not details and name not in own:
+            if not details and name not in of_model:
                 continue
             if p.vary:
                 within = interval(*limits[name][1:], "")
@@ -465,10 +467,10 @@ class RecordFit(Fit):
             )
         count = len(self.problem.free)
         problem, full = self.started(record, self.optimum.values[:count], initial)
-        found = problem.predict(full, 0)
-        by = found.by[:, :count]
+        predicted = problem.predict(full, 0)
+        by = predicted.by[:, :count]
         variance = variances(by, self.covar[:count, :count])
-        return self.band(problem, found.output, variance)
+        return self.band(problem, predicted.output, variance)
 
     def hold_out(self, parts: int | None = None) -> HoldOut:
         """Return how well parts of the records are predicted by fits to the rest.
@@ -500,20 +502,22 @@ class RecordFit(Fit):
             for number, record in enumerate(self.records, 1)
             for rows in np.array_split(np.arange(len(record)), parts)
         ]
-        own = self.problem
-        start = {p.name: self.params[p.name].value for p in own.free}
-        found = []
+        problem = self.problem
+        start = {p.name: self.params[p.name].value for p in problem.free}
+        parts_left_out = []
         for k, (number, piece) in enumerate(pieces):
             rest = [other for i, (_, other) in enumerate(pieces) if i != k]
-            problem = RecordProblem(rest, own.model, output=own.output, excitation=own.excitation)
-            fit = RecordFit(solve_records(problem, loss=self.optimum.loss, start=start))
+            remaining = RecordProblem(
+                rest, problem.model, output=problem.output, excitation=problem.excitation
+            )
+            fit = RecordFit(solve_records(remaining, loss=self.optimum.loss, start=start))
             band = fit.predict(piece)
             inside = np.mean((band.measured >= band.lower) & (band.measured <= band.upper))
             first, last = float(piece.time[0]), float(piece.time[-1])
-            found.append(
+            parts_left_out.append(
                 HeldOutPart(number, first, last, len(piece), band.rms_share, float(inside))
             )
-        return HoldOut(tuple(found))
+        return HoldOut(tuple(parts_left_out))
 
     def started(
         self, record: Record, values: FloatArray, initial: Literal["fitted", "rest"]
@@ -550,8 +554,8 @@ class RecordFit(Fit):
     ) -> tuple[DerivedQuantity, ...]:
         """Return x_c, energy per cycle, equivalent stiffness and damping, with their errors."""
         values = self.optimum.values
-        found = record_derived(self.problem, values, self.covar, amplitudes, frequency_hz)
-        return tuple(replace(quantity, unit=self._shown(quantity.unit)) for quantity in found)
+        quantities = record_derived(self.problem, values, self.covar, amplitudes, frequency_hz)
+        return tuple(replace(quantity, unit=self._shown(quantity.unit)) for quantity in quantities)
 
     def plot(self, kind: str | None = None, ax: Any = None, *, record: int = 0) -> Axes:
         """Draw measured and predicted samples, the loop, or the residuals of one record.

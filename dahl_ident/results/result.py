@@ -157,11 +157,11 @@ class Result(ABC):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs, without what follows from it."""
-        own = type(self)
+        kind = type(self)
         return {
             name: value
             for name, value in vars(self).items()
-            if not isinstance(getattr(own, name, None), cached_property)
+            if not isinstance(getattr(kind, name, None), cached_property)
         }
 
     @property

@@ -99,19 +99,19 @@ _LINES: dict[str, Callable[[Law, str], list[str]]] = {
 
 def c_header(result: Any) -> str:
     """Return the header; the mass is a macro, its force is not in the function."""
-    found = device(result, "c", dict.fromkeys((*_LINES, *LUMPED), ""))
+    parts = device(result, "c", dict.fromkeys((*_LINES, *LUMPED), ""))
     states, body, needed = 0, [], set()
-    for law in found.laws:
+    for law in parts.laws:
         body += [f"    {line}" for line in _LINES[law.kind](law, f"s->f[{states}]")]
         states += {"maxwell_slip": len(law.values) // 2, "power_damper": 0}.get(law.kind, 1)
         needed.add("dahl" if law.kind == "lugre" else law.kind)
     body += [
         f"    force += {size!r} * {moved};"
-        for size, moved in ((found.damping, "v"), (found.stiffness, "x"))
+        for size, moved in ((parts.damping, "v"), (parts.stiffness, "x"))
         if size
     ]
-    level = ["    double level;"] if any(law.kind == "lugre" for law in found.laws) else []
-    notes = "".join(f" * {note}\n" for note in found.notes)
+    level = ["    double level;"] if any(law.kind == "lugre" for law in parts.laws) else []
+    notes = "".join(f" * {note}\n" for note in parts.notes)
     return f"""\
 /*
 {notes} */
@@ -120,11 +120,11 @@ def c_header(result: Any) -> str:
 
 #include <math.h>
 
-#define FRICTION_MASS {found.mass!r}  /* its force is not in friction_force */
+#define FRICTION_MASS {parts.mass!r}  /* its force is not in friction_force */
 
 typedef struct {{
-    double x, v;  /* last displacement and velocity, {"rad" if found.rotation else "m"} */
-    double f[{max(states, 1)}];  /* forces with a memory, {"N m" if found.rotation else "N"} */
+    double x, v;  /* last displacement and velocity, {"rad" if parts.rotation else "m"} */
+    double f[{max(states, 1)}];  /* forces with a memory, {"N m" if parts.rotation else "N"} */
 }} friction_state;
 
 {"".join(text for kind, text in _STEPS.items() if kind in needed)}

@@ -20,14 +20,14 @@ _WIDE = 0.2  # relative uncertainty beyond which a positive parameter is drawn i
 def uncertain(result: Any) -> tuple[dict[str, ParameterBudget], FloatArray]:
     """Return the budgets of the model's free parameters, and the covariance of their values."""
     budget = result.budget()
-    own = {p.name for p in result.model.parameters if result.params[p.name].vary}
-    places = [i for i, name in enumerate(budget) if name in own]
-    found = {name: part for name, part in budget.items() if name in own}
+    free = {p.name for p in result.model.parameters if result.params[p.name].vary}
+    places = [i for i, name in enumerate(budget) if name in free]
+    stated = {name: part for name, part in budget.items() if name in free}
     covariance = np.asarray(budget.covariance)[np.ix_(places, places)]
-    if set(found) != own or not np.all(np.isfinite(covariance)):
-        lost = sorted(own - set(found)) or sorted(own)
+    if set(stated) != free or not np.all(np.isfinite(covariance)):
+        lost = sorted(free - set(stated)) or sorted(free)
         raise FitError(f"{', '.join(lost)} has no finite uncertainty to export; see the verdict")
-    return found, covariance
+    return stated, covariance
 
 
 def gtc_archive(result: Any) -> str:
@@ -46,13 +46,13 @@ def gtc_archive(result: Any) -> str:
     shared = u.T @ u
     totals = [budget[name].value for name in names]
     for source, sizes in zip(_sources(parts), u, strict=True):
-        own = [i for i, size in enumerate(sizes) if size > 0.0]
-        dof = min(parts[names[i]][source].dof for i in own)
-        labels = [f"{names[i]}: {source}" for i in own]
-        made = gtc.multiple_ureal([0.0] * len(own), sizes[own].tolist(), dof, labels)
-        for a, i in enumerate(own):
+        nonzero = [i for i, size in enumerate(sizes) if size > 0.0]
+        dof = min(parts[names[i]][source].dof for i in nonzero)
+        labels = [f"{names[i]}: {source}" for i in nonzero]
+        made = gtc.multiple_ureal([0.0] * len(nonzero), sizes[nonzero].tolist(), dof, labels)
+        for a, i in enumerate(nonzero):
             for b in range(a):
-                r = covariance[i, own[b]] / shared[i, own[b]]
+                r = covariance[i, nonzero[b]] / shared[i, nonzero[b]]
                 gtc.set_correlation(float(np.clip(r, -1.0, 1.0)), made[a], made[b])
             totals[i] = totals[i] + made[a]
     archive = persistence.Archive()

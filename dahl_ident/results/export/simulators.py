@@ -17,9 +17,9 @@ _COULOMB = {
 
 def mujoco(result: Any) -> str:
     """Return a joint with a passive motor whose LuGre friction is that of the fit."""
-    found = device(result, "mujoco", {"dahl": "", "lugre": "", **dict.fromkeys(LUMPED, "")})
-    notes, motors, damping = list(found.notes), [], found.damping
-    for number, law in enumerate(found.laws, start=1):
+    parts = device(result, "mujoco", {"dahl": "", "lugre": "", **dict.fromkeys(LUMPED, "")})
+    notes, motors, damping = list(parts.notes), [], parts.damping
+    for number, law in enumerate(parts.laws, start=1):
         f_max = static = law["f_max"]
         micro, speed = 0.0, 1.0  # of no effect where both limits are equal
         if law.kind == "dahl":
@@ -34,32 +34,32 @@ def mujoco(result: Any) -> str:
         )
     actuators = ["  <actuator>", *motors, "  </actuator>"] if motors else []
     notes.append("lugre: stiffness, damping, Coulomb, static, Stribeck; MuJoCo 4 or later")
-    return _mjcf(found, notes, damping, 0.0, actuators)
+    return _mjcf(parts, notes, damping, 0.0, actuators)
 
 
 def frictionloss(result: Any) -> str:
     """Return a joint whose friction has a limit alone, for any release of MuJoCo."""
-    found = device(result, "mujoco-frictionloss", _COULOMB)
-    limit = sum(_limit(law, "mujoco-frictionloss") for law in found.laws)
-    return _mjcf(found, found.notes, found.damping, limit, ())
+    parts = device(result, "mujoco-frictionloss", _COULOMB)
+    limit = sum(_limit(law, "mujoco-frictionloss") for law in parts.laws)
+    return _mjcf(parts, parts.notes, parts.damping, limit, ())
 
 
 def _mjcf(
-    found: Device, notes: Sequence[str], damping: float, limit: float, actuators: Sequence[str]
+    parts: Device, notes: Sequence[str], damping: float, limit: float, actuators: Sequence[str]
 ) -> str:
     given = {
-        "armature": found.mass, "damping": damping, "stiffness": found.stiffness,
+        "armature": parts.mass, "damping": damping, "stiffness": parts.stiffness,
         "frictionloss": limit,
     }  # fmt: skip
     fields = "".join(f' {name}="{value!r}"' for name, value in given.items() if value)
-    kind = "hinge" if found.rotation else "slide"
-    body = "1e-9" if found.mass else "1"
-    own = "the fit has no mass; the body's is 1, to be replaced"
-    if found.mass:
-        own = "the mass, or inertia, of the fit is the armature; the body's own is next to nothing"
+    kind = "hinge" if parts.rotation else "slide"
+    body = "1e-9" if parts.mass else "1"
+    remark = "the fit has no mass; the body's is 1, to be replaced"
+    if parts.mass:
+        remark = "the mass, or inertia, of the fit is the armature; that of the body is negligible"
     lines = [
         "<!--", *(f"  {note.replace('--', '-')}" for note in notes),
-        f"  {own}",
+        f"  {remark}",
         "-->", '<mujoco model="identified">',
         '  <option timestep="0.0001" integrator="implicitfast" gravity="0 0 0"/>', "  <worldbody>",
         '    <body name="body">',
@@ -75,14 +75,14 @@ def urdf(result: Any) -> str:
     """Return the dynamics of a joint, to be put into the joint of a robot."""
     carried = {**_COULOMB, "mass": "belongs to the inertial element of the link"}
     carried.pop("spring")
-    found = device(result, "urdf", carried)
-    limit = sum(_limit(law, "urdf") for law in found.laws)
-    kind = "revolute" if found.rotation else "prismatic"
-    comment = "\n".join(f"  {note.replace('--', '-')}" for note in found.notes)
-    mass = f'<!-- <inertial><mass value="{found.mass!r}"/></inertial> -->\n' if found.mass else ""
+    parts = device(result, "urdf", carried)
+    limit = sum(_limit(law, "urdf") for law in parts.laws)
+    kind = "revolute" if parts.rotation else "prismatic"
+    comment = "\n".join(f"  {note.replace('--', '-')}" for note in parts.notes)
+    mass = f'<!-- <inertial><mass value="{parts.mass!r}"/></inertial> -->\n' if parts.mass else ""
     return (
         f"<!--\n{comment}\n  put it into the {kind} joint\n-->\n{mass}"
-        f'<dynamics damping="{found.damping!r}" friction="{limit!r}"/>\n'
+        f'<dynamics damping="{parts.damping!r}" friction="{limit!r}"/>\n'
     )
 
 
@@ -95,22 +95,22 @@ def _limit(law: Law, form: str) -> float:
 def modelica(result: Any) -> str:
     """Return a compliant component between two flanges; the mass is a constant in it."""
     kinds = ("dahl", "bouc_wen", "lugre", "power_damper", *LUMPED)
-    found = device(result, "modelica", {**dict.fromkeys(kinds, ""), "mass": "a constant alone"})
+    parts = device(result, "modelica", {**dict.fromkeys(kinds, ""), "mass": "a constant alone"})
     base, s, v, out = (
         ("Rotational", "phi_rel", "w_rel", "tau")
-        if found.rotation
+        if parts.rotation
         else ("Translational", "s_rel", "v_rel", "f")
     )
     declared, equations, total = [], [], [f"damping*{v}", f"stiffness*{s}"]
-    for i, law in enumerate(found.laws, start=1):
+    for i, law in enumerate(parts.laws, start=1):
         declared += [f"  parameter Real {name}{i}={x!r};" for name, x in law.values.items()]
         if law.kind != "power_damper":
             declared.append(f'  Real z{i}(start=0, fixed=true) "state of {law.kind}";')
             equations.append(f"  der(z{i}) = {v}*({_slope(law, i, v)});")
         total.append(_force(law, i, v))
-    declared += [f"  constant Real {name}={getattr(found, name)!r};" for name in LUMPED.values()]
+    declared += [f"  constant Real {name}={getattr(parts, name)!r};" for name in LUMPED.values()]
     lines = [
-        *(f"// {note}" for note in found.notes), 'model Friction "identified friction"',
+        *(f"// {note}" for note in parts.notes), 'model Friction "identified friction"',
         f"  extends Modelica.Mechanics.{base}.Interfaces.PartialCompliantWithRelativeStates;",
         *declared, "equation", *equations, f"  {out} = {' + '.join(total)};", "end Friction;",
     ]  # fmt: skip
