@@ -30,6 +30,7 @@ from dahl_ident import (
     FrequencyResponse,
     Friction,
     Mass,
+    MaxwellSlip,
     Record,
     Spring,
     extract,
@@ -40,6 +41,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 
 F_MAX, SIGMA = 0.1, 30.0
 X_C = F_MAX / SIGMA
+TWO_JENKINS = MaxwellSlip([1e-3, 8e-3], [20.0, 10.0])  # of the same limit and stiffness
 SEED = 2027  # of the page; what was found wrong was mended on tables of other seeds
 TABLES = 500
 FEW = 100  # tables, below which chance may move a share by two standard errors
@@ -267,6 +269,38 @@ def of_another_law(law: Friction) -> Draw:
     return lambda rng: _of(N * _noise(rng, ROWS, NOISE, NOISE), A)
 
 
+def with_harmonics(law: Element, orders: Sequence[int] = (1, 3)) -> Draw:
+    """Return tables of another law's harmonics, each known to 1 %, no better than its loop."""
+    A = _amplitudes(0.1, 10.0)
+    own = [np.asarray(p.value) for p in law.parameters]
+    exact = np.concatenate([law.stiffness(own, A, np.zeros(()), k) for k in orders])
+    harmonic = np.repeat(orders, ROWS)
+    least = 1e-2 * np.abs(np.tile(exact[:ROWS], len(orders)))  # a loop that does not slip has none
+    size = NOISE * np.maximum(np.abs(exact), least)
+    C = size[:, None, None] ** 2 * np.eye(2)
+
+    def draw(rng: np.random.Generator) -> Table:
+        N = exact + size * (rng.standard_normal((len(exact), 2)) @ np.array([1.0, 1.0j]))
+        data = FrequencyResponse(
+            np.ones(len(N)), N, np.tile(A, len(orders)), harmonic=harmonic, covariance=C
+        )
+        return data, (F_MAX, SIGMA)
+
+    return draw
+
+
+def cubic(rng: np.random.Generator, A: FloatArray, N: ComplexArray) -> Table:
+    """Return a table with a cubic spring in parallel, 5 % of the force at the largest amplitude."""
+    spring = 0.05 * np.abs(N[-1]) * (A / A[-1]) ** 2
+    return _of((N + spring) * _noise(rng, ROWS, NOISE, NOISE), A)
+
+
+def large_ones_noisy(rng: np.random.Generator, A: FloatArray, N: ComplexArray) -> Table:
+    """Return a table whose four largest amplitudes are ten times noisier."""
+    size = np.where(np.arange(ROWS) < ROWS - 4, 0.5 * NOISE, 5.0 * NOISE)
+    return _of(N * np.exp(size * (rng.standard_normal((ROWS, 2)) @ np.array([1.0, 1.0j]))), A)
+
+
 def growing(power: float) -> Draw:
     """Return tables at three frequencies whose f_max grows with a power of the peak speed."""
     f = np.tile([0.5, 1.0, 2.0], ROWS // 3)
@@ -370,6 +404,13 @@ def cells() -> list[Cell]:
         Cell(f"{part} worth {100 * share:g} % of sigma", unmodelled(part, share))
         for part in ("mass", "damper")
         for share in (0.003, 0.01)
+    ]
+    found += [
+        Cell("cubic spring, 5 % of the force", altered(cubic)),
+        Cell("four large amplitudes ten times noisier", altered(large_ones_noisy)),
+        Cell("harmonics 1 and 3, the model is right", with_harmonics(Dahl(F_MAX, SIGMA))),
+        Cell("harmonics 1 and 3, exponent 0.8", with_harmonics(Dahl(F_MAX, SIGMA, 0.8))),
+        Cell("harmonics 1 and 3, two Jenkins elements", with_harmonics(TWO_JENKINS)),
     ]
     return found
 

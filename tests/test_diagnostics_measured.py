@@ -33,11 +33,18 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.fixture(scope="module")
-def damper() -> FrequencyResponse:
-    """Ten steady levels of the banded rotary friction damper at 30 lbf."""
+def tests() -> list[FrequencyResponse]:
+    """Ten steady levels of the banded rotary friction damper at 30 lbf, harmonics 1 and 3."""
     files = sorted((FOLDER / "brfd").glob("band30lb_*.csv"))
     records = [read_record(f, displacement="displacement", force="friction force") for f in files]
-    return FrequencyResponse.concatenate([extract(r, harmonics=[1]) for r in records])
+    return [extract(r, harmonics=[1, 3]) for r in records]
+
+
+@pytest.fixture(scope="module")
+def damper(tests: list[FrequencyResponse]) -> FrequencyResponse:
+    """Their fundamentals."""
+    data = FrequencyResponse.concatenate(tests)
+    return data.select(rows=data.harmonic == 1)
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +88,34 @@ class TestDamper:
         names = [model.name for model in compare_models(found).models]
         assert names[:3] == ["as fitted", "exponent free", "two Dahl elements"]
         assert all(name in report for name in names)
+
+
+class TestStill:
+    """Estimates do not move by more than they state when a test is left out, or rows are added."""
+
+    @staticmethod
+    def of(tests: list[FrequencyResponse], harmonics: int) -> FitResult:
+        data = FrequencyResponse.concatenate(tests)
+        return fit(data.select(rows=data.harmonic <= harmonics), Dahl())
+
+    @pytest.mark.parametrize("harmonics", [1, 3])
+    def test_when_a_test_is_left_out(self, tests: list[FrequencyResponse], harmonics: int) -> None:
+        whole = self.of(tests, harmonics)
+        others = [self.of([*tests[:i], *tests[i + 1 :]], harmonics) for i in range(len(tests))]
+        for name in ("f_max", "sigma"):
+            value, u = whole.params[name].value, whole.params[name].stderr
+            assert u is not None
+            estimates = np.array([found.params[name].value for found in others])
+            assert np.abs(estimates - value).max() < 3.0 * u
+            jackknife = float(np.sqrt((len(tests) - 1) * np.var(estimates)))
+            assert 0.5 * jackknife < u < 3.0 * jackknife
+
+    def test_when_harmonics_are_added(self, tests: list[FrequencyResponse]) -> None:
+        fundamentals, both = self.of(tests, 1), self.of(tests, 3)
+        for name in ("f_max", "sigma"):
+            u = fundamentals.params[name].stderr
+            assert u is not None
+            assert both.params[name].value == pytest.approx(fundamentals.params[name].value, abs=u)
 
 
 class TestBeam:

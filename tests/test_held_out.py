@@ -8,9 +8,9 @@ from scipy import stats
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit
 from dahl_ident.diagnostics import ErrorModel, error_model
-from dahl_ident.diagnostics.error_sources import NOISE, rows_of_tests
+from dahl_ident.diagnostics.error_sources import NOISE
 from dahl_ident.diagnostics.held_out import band_factor, held_out
-from dahl_ident.diagnostics.variance_components import block_diagonal
+from dahl_ident.diagnostics.table_groups import rows_of_tests
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
 
 
@@ -92,20 +92,17 @@ class TestLeftOut:
 
     @pytest.mark.parametrize("n", [32, 160])
     def test_is_the_prediction_from_the_others(self, n: int) -> None:
-        """Universal kriging by its definition, for small tables and for compressed ones."""
+        """Universal kriging by its definition."""
         errors = self.errors(n)
         found = held_out(errors)
         assert found is not None
-        m, extra = 2 * n, len(errors.linear.y) - len(errors.rows.weighted)
-        Z = [s.columns if s.columns.ndim < 3 else block_diagonal(s.columns) for s in errors.sources]
-        parts = zip(Z, errors.variances, strict=True)
-        V = sum(v * (np.diag(z**2) if z.ndim == 1 else z @ z.T) for z, v in parts)
-        J, y = errors.jacobian, errors.near.y
-        own = errors.jacobian[m:]
-        prior = own.T @ own
-        y_prior = own.T @ errors.linear.y[len(errors.linear.y) - len(own) :]
-        assert extra or len(own)
-        units = errors.relative_units()
+        m, V = 2 * n, float(errors.noises[0]) * np.eye(2 * n)
+        for source, variance in zip(errors.sources, errors.variances.tolist(), strict=True):
+            V += variance * source.columns[:m] @ source.columns[:m].T
+        J, y = errors.estimate.jacobian, errors.estimate.y
+        assert len(J) > m
+        prior, y_prior = J[m:].T @ J[m:], J[m:].T @ y[m:]
+        units = errors.estimate.relative_units
         for test in (0, 3):
             rows = found.rows[found.test == test]
             b = (2 * rows[:, None] + np.arange(2)).ravel()
@@ -129,15 +126,13 @@ class TestLeftOut:
         """The degrees of freedom come from these derivatives; against differences."""
         errors = self.errors(n)
         rows, step = np.array([0, 1, 6, 7]), 1e-5
-        found = errors.rows.falls(rows)
-        for k, variance in enumerate(errors.variances.tolist()):
+        _, found = errors.state.block(rows)
+        for k, variance in enumerate(errors.state.variances.tolist()):
             blocks = []
             for sign in (-1.0, 1.0):
-                moved = errors.variances.copy()
+                moved = errors.state.variances.copy()
                 moved[k] = variance * (1.0 + sign * step)
-                projection = type(errors.projection)(errors.linear, moved)
-                own = type(errors.rows)(errors.linear, projection, moved, errors.near.y)
-                blocks.append(own.block(rows))
+                blocks.append(errors.state.model.at(moved).block(rows)[0])
             slope = (blocks[1] - blocks[0]) / (2.0 * step * variance)
             np.testing.assert_allclose(found[k], -slope, rtol=1e-4, atol=1e-6 * np.abs(slope).max())
 
@@ -166,13 +161,8 @@ class TestTestsThatScatter:
             data = scattering(100 + seed, n=40, tails=1e6)
             errors = error_model(fit(data, Dahl()).optimum)
             assert errors is not None
-            share = sum(
-                v * s.mean_square
-                for s, v in zip(errors.sources, errors.variances.tolist(), strict=True)
-                if s.name == NOISE
-            )
-            found.append(share)
-        assert np.sqrt(np.mean(found)) == pytest.approx(0.04, rel=0.2)
+            found.append(errors.rms(NOISE))
+        assert np.sqrt(np.mean(np.square(found))) == pytest.approx(0.04, rel=0.2)
 
 
 class TestAtInfinity:

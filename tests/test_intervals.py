@@ -359,3 +359,55 @@ class TestTable:
         assert result.nfree == 0
         for interval in result.conf_interval()["sigma"]:
             assert (interval.lower, interval.upper) == (0.0, np.inf)
+
+
+class TestOneInterval:
+    """Whatever states an estimate states one point, and one uncertainty."""
+
+    @staticmethod
+    def fitted(case: str) -> FitResult:
+        if case == "described":
+            return fit(table(n=12, noise=0.01, seed=3), Dahl())
+        if case == "misfit":  # a spring in parallel that the model does not have
+            data = table(n=12, noise=0.01, seed=4)
+            return fit(replace(data, response=data.response + 0.6), Dahl(), throw=False)
+        few = table(beta=(0.3, 3.0), n=4, noise=0.1, seed=4)
+        return fit(few, Dahl(), throw=False)
+
+    @pytest.mark.parametrize("case", ["described", "misfit", "few and noisy"])
+    def test_of_every_parameter(self, case: str) -> None:
+        found = self.fitted(case)
+        intervals, summary = found.conf_interval().at(LEVELS[1]), found.summary()
+        again = FitResult.from_json(found.to_json())
+        for i, name in enumerate(found.var_names):
+            p, row, interval = found.params[name], found.budget()[name], intervals[name]
+            assert p.stderr is not None
+            assert row.value == pytest.approx(p.value, rel=1e-12)
+            assert row.u == pytest.approx(p.stderr, rel=1e-9)
+            assert found.covar[i, i] ** 0.5 == pytest.approx(p.stderr, rel=1e-9)
+            assert sum(part.u**2 for part in row.rows) == pytest.approx(row.u**2, rel=1e-6)
+            half = row.k * row.u
+            ends = (p.value - half, p.value + half)
+            if row.u > 0.2 * p.value:
+                ends = (p.value * np.exp(-half / p.value), p.value * np.exp(half / p.value))
+            assert (interval.lower, interval.upper) == pytest.approx(ends, rel=1e-6)
+            assert tuple(summary.loc[name, ["value", "lower", "upper"]]) == pytest.approx(
+                (p.value, *ends), rel=1e-6
+            )
+            shown = found.identifiability.parameters[name].interval
+            assert shown.lower <= p.value <= shown.upper
+            assert found.stderr_noise[name] <= p.stderr * (1.0 + 1e-9)
+            assert again.params[name].value == pytest.approx(p.value, rel=1e-9)
+            assert again.params[name].stderr == pytest.approx(p.stderr, rel=1e-6)
+
+    @pytest.mark.parametrize("case", ["described", "misfit", "few and noisy"])
+    def test_of_every_response(self, case: str) -> None:
+        found = self.fitted(case)
+        law = Dahl(*(found.params[name].value for name in ("f_max", "sigma", "alpha")))
+        A = amplitudes(found.data)
+        assert {p.name: p.value for p in found.model.parameters} == {
+            name: p.value for name, p in found.params.items()
+        }
+        predicted = found.predict(1.0, amplitude=A), found.describing_function(A)
+        for response in (found.best_fit, *(band.response for band in predicted)):
+            np.testing.assert_allclose(response, law.describing_function(A), rtol=1e-9)

@@ -15,9 +15,8 @@ import dahl_ident as di
 from benchmarks import planning
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.diagnostics import departures, error_sources
+from dahl_ident.diagnostics import error_sources, prediction_error
 from dahl_ident.diagnostics.bands import problem_at
-from dahl_ident.diagnostics.prediction_error import prediction_error
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import solve_many
 from dahl_ident.planning import Plan, forecast
@@ -115,26 +114,28 @@ class TestModelError:
                       LINEAR)  # fmt: skip
 
     def test_departures_predict_what_kriging_does(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(departures, "_NEGLIGIBLE", 1e-9)
+        monkeypatch.setattr(prediction_error, "_NEGLIGIBLE", 1e-9)
         monkeypatch.setattr(error_sources, "_SMOOTH", 1e-9)
         errors = self._fit().errors
         A, omega = np.geomspace(0.3, 4.0, 4) * X_C, np.full(4, 2.0 * np.pi)
         there = problem_at(errors.problem, omega / (2.0 * np.pi), A, None, None)
         R = there.predict(errors.theta)
         slopes = there.prediction_jacobian(errors.theta) / R[:, None]
-        found = departures.departures(errors, slopes, A, omega, R)
+        found = prediction_error.departures(errors, slopes, A, omega, R)
         assert found is not None
         assert not found.assumed
         lever = np.concatenate([np.stack([slopes.real, slopes.imag], 1), found.columns], axis=-1)
         covariance = lever @ np.linalg.inv(found.information) @ lever.swapaxes(1, 2)
-        expected = prediction_error(errors, slopes, A, omega, R, of_a_test=False).covariance
+        expected = prediction_error.prediction_error(
+            errors, slopes, A, omega, R, of_a_test=False
+        ).covariance
         # shapes of one process, cut off at different places
         assert np.trace(covariance, axis1=1, axis2=2) == pytest.approx(
             np.trace(expected, axis1=1, axis2=2), rel=0.02
         )
         own = np.linalg.inv(found.information)[:2, :2]
         # a plan weighs by all errors, a fit by noise and misfit
-        assert own == pytest.approx(errors.projection.covariance(), rel=0.02)
+        assert own == pytest.approx(errors.generalised, rel=0.02)
 
     def test_levels_are_spread_by_the_model_error(self) -> None:
         fit, limits = self._fit(), {**KNEE, "time": 60}
@@ -143,7 +144,7 @@ class TestModelError:
         assert len(plan.steps) > len(alone.steps) + 1
         assert "the model errs as the earlier data show" in str(plan)
         told = plan.expected["f_max"]
-        weighed = float(fit.errors.projection.covariance()[0, 0]) ** 0.5
+        weighed = float(fit.errors.generalised[0, 0]) ** 0.5
         # the fit cuts the shapes off by its own rows
         assert told.before == pytest.approx(weighed, rel=0.15)
         assert told.after > 2.0 * alone.expected["f_max"].after

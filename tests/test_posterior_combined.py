@@ -35,22 +35,16 @@ def test_the_likelihood_is_that_of_the_covariance_by_source(rows: int) -> None:
     density = Density(fit.problem, joint_prior(fit.problem), errors=found)
     theta = errors.theta + np.array([[0.0, 0.0], [0.01, -0.002], [-0.03, 0.001]])
     m = fit.problem.n_residuals
-    noise, shared = np.zeros((2, m, m))
+    noise, shared = float(errors.noises[0]) * np.eye(m), np.zeros((m, m))
     for source, variance in zip(errors.sources, errors.variances.tolist(), strict=True):
-        columns = source.columns
-        if columns.ndim == 3:
-            wide = np.zeros((m, m // 2))
-            for i, block in enumerate(columns):
-                wide[2 * i : 2 * i + 2, i] = block[:, 0]
-            columns = wide
-        own = np.diag(columns**2) if columns.ndim == 1 else columns @ columns.T
-        (noise if source.name == NOISE else shared)[:] += variance * own
+        columns = source.columns[:m]
+        (noise if source.name == NOISE else shared)[:] += variance * columns @ columns.T
     sums, log_weights = density.sums(theta), found.log_weights
     # f_max differs from day to day: residuals are linear in it
     move = theta - errors.theta
     other = fit.problem.residuals(errors.theta + move * [0.0, 1.0])
-    y = errors.near.y + move[:, :1] * errors.near.J[:, 0]
-    y = y + other - fit.problem.residuals(errors.theta)
+    by = fit.problem.jacobian(errors.theta)[:, 0]
+    y = other + move[:, :1] * by
     ratios = []
     for k in (0, len(found.sizes) // 2, len(found.sizes) - 1):
         V = noise + found.sizes[k] * shared
@@ -152,5 +146,5 @@ def test_what_rows_share_may_be_all_there_is() -> None:
     grid = di.posterior(fit, method="grid", tolerance=1e-2)
     assert np.isfinite(grid.std()[:2]).all()
     assert fit.errors is not None
-    weighed = float(fit.errors.projection.covariance()[1, 1]) ** 0.5
+    weighed = float(fit.errors.generalised[1, 1]) ** 0.5
     assert grid.std()[1] > 0.1 * weighed * fit.params["sigma"].value

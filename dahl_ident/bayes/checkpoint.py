@@ -75,7 +75,7 @@ def identity(density: Density | RecordDensity, walkers: int, ensembles: int) -> 
         facts["errors other than noise"] = (
             "none"
             if errors is None
-            else _digest(errors.turn, errors.shared, errors.offset, errors.sizes)
+            else _digest(errors.turn, errors.shared, errors.factors, errors.sizes)
         )
     return {
         **facts,

@@ -44,14 +44,14 @@ class RowErrors:
         mu: variance of what rows share there; that of noise is 1.
     log_volume : float
         ln of the determinant of W.
-    offset, weight : ndarray, shape (m,)
-        Residuals are taken as ``weight * y + offset``.
+    factors : ndarray, shape (n, 2, 2)
+        What takes each row's residuals to those with a noise of unit variance.
     dof, share : float
         nu and p.
     jacobian : ndarray, shape (m, P)
-        Derivatives with respect to what the data determine, weights included, near the estimate.
+        Derivatives of weighted residuals with respect to what the data determine.
     residuals : ndarray, shape (m,)
-        There, weights and offset included.
+        Weighted residuals at the estimate.
     scale_known : bool
         Whether s is 1.
     centre : ndarray, shape (P,)
@@ -60,16 +60,13 @@ class RowErrors:
         Derivatives of the residuals by them, 0 for others.
     inside : ndarray, shape (m, k), or None
         Orthonormal directions of residuals beyond which rows share nothing, where rows are many.
-    outside : float
-        Variance of the residuals there.
     """
 
     counted: tuple[str, ...]
     turn: FloatArray
     shared: FloatArray
     log_volume: float
-    offset: FloatArray
-    weight: FloatArray
+    factors: FloatArray
     dof: float
     share: float
     jacobian: FloatArray
@@ -78,7 +75,6 @@ class RowErrors:
     centre: FloatArray
     slopes: FloatArray
     inside: FloatArray | None = None
-    outside: float = 1.0
 
     @cached_property
     def sizes(self) -> FloatArray:
@@ -110,7 +106,7 @@ class RowErrors:
         size = -float(np.log(np.abs(np.diagonal(R))).sum())
         if self.scale_known:
             return size - 0.5 * left
-        return size - 0.5 * (len(self.offset) - len(R)) * float(np.log(left))
+        return size - 0.5 * (len(self.residuals) - len(R)) * float(np.log(left))
 
     def held(self, theta: FloatArray) -> FloatArray:
         """Return theta, (S, P), with parameters that differ from run to run at their centre."""
@@ -122,30 +118,35 @@ class RowErrors:
 
     def squares(self, y: FloatArray) -> FloatArray:
         """Return the sum of squares of residuals, (S, m) -> (S, M)."""
-        y = y * self.weight + self.offset
+        y = self._weighted(y)
         turned = y @ self.turn.T
         return np.asarray(turned**2 @ (1.0 / self._variances) + self._beyond(y)[..., None])
+
+    def _weighted(self, y: FloatArray) -> FloatArray:
+        """Return residuals (..., m) with their weights."""
+        pairs = y.reshape(*y.shape[:-1], -1, 1, 2)
+        return np.asarray(np.sum(pairs * self.factors, axis=-1).reshape(y.shape))
 
     def _beyond(self, y: FloatArray) -> FloatArray:
         """Return the sum of squares of residuals (..., m) where rows share nothing."""
         if self.inside is None:
             return np.zeros(y.shape[:-1])
         rest = np.sum(y**2, axis=-1) - np.sum((y @ self.inside) ** 2, axis=-1)
-        return np.asarray(np.maximum(rest, 0.0) / self.outside)
+        return np.asarray(np.maximum(rest, 0.0))
 
     def independent(self, y: FloatArray, by: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return independent residuals, (S, k), and derivatives, (S, k, P), of (S, m[, P]).
 
         Their sum of squares is that of lambda = 1.
         """
-        y, by = y * self.weight + self.offset, by * self.weight[:, None]
+        y = self._weighted(y)
+        by = self._weighted(by.swapaxes(-1, -2)).swapaxes(-1, -2)
         turn = self.turn / np.sqrt(1.0 + self.shared)[:, None]
         turned = y @ turn.T, turn @ by
         if self.inside is None:
             return turned
-        size = self.outside**0.5
         rest = y - (y @ self.inside) @ self.inside.T, by - self.inside @ (self.inside.T @ by)
         return (
-            np.concatenate([turned[0], rest[0] / size], axis=-1),
-            np.concatenate([turned[1], rest[1] / size], axis=-2),
+            np.concatenate([turned[0], rest[0]], axis=-1),
+            np.concatenate([turned[1], rest[1]], axis=-2),
         )

@@ -24,7 +24,7 @@ from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.held_out import band_factor, held_out
 from dahl_ident.diagnostics.information import Information
 from dahl_ident.diagnostics.parameters import values_at
-from dahl_ident.diagnostics.prediction_error import noise_near, prediction_error
+from dahl_ident.diagnostics.prediction_error import prediction_error, stated_noise
 from dahl_ident.elements import Element, Model
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.fitting import Optimum
@@ -135,7 +135,7 @@ def response_band(
     if errors is None:
         own = np.zeros((R.size, 2, 2))
         if of_a_test:
-            own[known] = optimum.scale**2 * noise_near(problem, theta, seen.amplitude, seen.omega)
+            own[known] = optimum.scale**2 * stated_noise(problem, theta, seen.amplitude, seen.omega)
         return _noise_band(optimum, R, by, own)
     return _combined_band(
         errors, R, by, known, seen.amplitude, seen.omega, seen.stiffness, of_a_test

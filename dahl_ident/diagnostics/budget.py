@@ -19,7 +19,6 @@ from dahl_ident.diagnostics.combinations import candidates, runaway
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, MANY
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.error_sources import (
-    APART,
     HARMONICS,
     LEVELS,
     MODEL_ERROR,
@@ -45,7 +44,7 @@ from dahl_ident.fitting import Optimum
 _DETERMINED, _HARDLY = 0.25, 1.0  # u of a logarithm
 # What rounding leaves where a source has no part: variances relative to the combined one.
 _ROUNDING = 1e-12
-_TYPE_A = (NOISE, MODEL_ERROR, HARMONICS, RUNS, LEVELS, APART, TESTS)
+_TYPE_A = (NOISE, MODEL_ERROR, HARMONICS, RUNS, LEVELS, TESTS)
 _CHANNELS = {
     "force_gain": "force calibration",
     "displacement_gain": "displacement calibration",
@@ -351,7 +350,7 @@ def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
 
 def _noticed(errors: ErrorModel, direction: FloatArray) -> bool:
     """Return whether the data determine a direction at all."""
-    return errors.basis is None or bool(errors.basis.holds(direction))
+    return errors.estimate.basis is None or bool(errors.estimate.basis.holds(direction))
 
 
 def coverage_factor(dof: float, confidence: float = CONFIDENCE) -> float:

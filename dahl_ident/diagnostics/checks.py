@@ -165,7 +165,7 @@ def _misfit_within_runs(errors: ErrorModel) -> float:
     addition to the model and a change with speed do not count, as bands are centred on them.
     A smooth departure from the law does: parameters of another law have no uncertainty.
     """
-    fitted = (errors.near.fitted, errors.parallel_to_the_law)
+    fitted = (errors.within_runs, errors.parallel_to_the_law)
     return min(rms_misfit_of(errors.problem, each) for each in fitted)
 
 
@@ -203,7 +203,7 @@ def _slight(fit: Judged) -> Iterator[Finding]:
     values, stderr = _estimates(fit)
     misfit, errors = fit.goodness.rms_misfit, fit.errors
     if errors is not None:  # what an exponent explains is not missed
-        misfit = rms_misfit_of(errors.problem, errors.near.fitted)
+        misfit = rms_misfit_of(errors.problem, errors.within_runs)
     view = fit.optimum.problem.stiffness_data
     rows = view.harmonic == 1
     for element in fit.optimum.problem.model.elements:

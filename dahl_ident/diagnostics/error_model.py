@@ -1,18 +1,17 @@
-r"""The estimate, and its covariance by source of error.
+r"""The covariance of the estimate by source of error.
 
 Write each row's log response as
 
     ln R_i = ln R(A_i, omega_i; theta) + run_i + level_i + d(ln A_i, ln omega_i) + e_i
 
 with noise e, scatter between runs and between repeats of a level, and a smooth model error d
-(:mod:`dahl_ident.diagnostics.error_sources`). Exponents that were assumed, not given, and
-calibrations with a stated uncertainty are parameters with a prior. The estimate is weighted least
-squares with one misfit for all rows (:mod:`dahl_ident.diagnostics.misfit_share`), W its weights.
-Variances follow from restricted maximum likelihood at the estimate
-(:mod:`dahl_ident.diagnostics.variance_components`). With V_k the covariance of source k, priors
-included as rows of unit variance, and
+(:mod:`dahl_ident.diagnostics.error_sources`). The estimate is weighted least squares
+(:mod:`dahl_ident.diagnostics.estimate`), residuals y of unit variance, and exponents that were
+assumed and calibrations with a stated uncertainty are parameters with a prior, one more residual
+each. Variances follow from restricted maximum likelihood
+(:mod:`dahl_ident.diagnostics.mixed_model`). With V_k the covariance of source k and
 
-    G = (J' W J)^-1 J' W,
+    G = (J'J)^-1 J',
 
 the covariance of the estimate is the sum of G V_k G' over the sources: the rows of an uncertainty
 budget (JCGM 100:2008). Sources widen the estimate and never move it. From five tests on no
@@ -28,69 +27,47 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.diagnostics.determined_directions import Basis, chart_of_limit
 from dahl_ident.diagnostics.error_sources import (
     HARMONICS,
     MODEL_ERROR,
     NOISE,
+    RUNS,
     TESTS,
     Source,
-    StructuredSources,
-    noise_of,
+    error_sources,
     own_errors,
-    rows_of_tests,
-    run_deviations,
+)
+from dahl_ident.diagnostics.estimate import (
+    EXPONENT,
+    GAIN,
+    Assumption,
+    WeightedEstimate,
+    weighted_estimate,
+    with_assumed,
 )
 from dahl_ident.diagnostics.misfit_explanations import at_an_end, neighbourhood
-from dahl_ident.diagnostics.misfit_share import WeightedEstimate, weighted_estimate
+from dahl_ident.diagnostics.mixed_model import MixedModel, State, shares
 from dahl_ident.diagnostics.outliers import suspicious_points
 from dahl_ident.diagnostics.residual_space import ResidualSpace
-from dahl_ident.diagnostics.run_deviations import (
-    Linearization,
-    RunDeviations,
-    alike,
-    linearization,
-)
-from dahl_ident.diagnostics.variance_components import (
-    Likelihood,
-    LinearModel,
-    Projection,
-    RowProjection,
-    VarianceComponents,
-    block_diagonal,
-    variance_components,
-)
+from dahl_ident.diagnostics.run_deviations import RunDeviations, linearization
+from dahl_ident.diagnostics.table_groups import rows_of_tests
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
 
-EXPONENT = "exponent"
-DRIVE = "drive factor"
-_GAIN = "force_gain"
-_STEPS = 6  # expansions about the runs at most; the last counts, settled or not
-_TRIED = 2  # sources of which one may leave, at a time
+_BY_CHANCE = 2.0  # standard deviations
 _FEWEST_TESTS = 5  # of which each is left out in turn
 _TESTS_THAT_LIMIT = 8  # fewer may agree by chance although the model errs
-_BY_CHANCE = 2.0  # standard deviations
 _SHARED_BY = 4.0  # tests at most that a smooth model error moves alike, of its length
 _LEAST_DOF = 4  # residuals beyond the parameters, below which there is noise alone
-_FEW_ROWS = 100  # with more, rows are compressed to directions that the sources affect
 _CALIBRATIONS = {
     "force_gain": "force calibration",
     "displacement_gain": "displacement calibration",
     "delay": "delay",
 }
-
-
-class Assumption(NamedTuple):
-    """A parameter held at a value that has an uncertainty: its source, and that of its log."""
-
-    source: str
-    std: float
 
 
 @dataclass(frozen=True)
@@ -101,16 +78,12 @@ class ErrorModel:
     ----------
     optimum : Optimum
         The least-squares fit that it started from.
-    problem : Problem
-        The same with the assumed exponents free; its `names` order every array here.
-    theta : ndarray, shape (Q,)
-        Weighted least squares, search coordinates.
     estimate : WeightedEstimate
-        The same with its weights.
+        Weighted least squares.
     sources : tuple of Source
-        Random errors of the rows, K of them.
-    variances : ndarray, shape (K,)
-        Of the sources.
+        Random errors that rows share, those that the residuals show.
+    state : State
+        The mixed model of the residuals at the variances of noise and sources.
     contributions : mapping of str to ndarray, shape (Q, Q)
         Covariance of theta by source, type A first.
     tests : int
@@ -120,31 +93,24 @@ class ErrorModel:
     """
 
     optimum: Optimum
-    problem: Problem
-    theta: FloatArray
     estimate: WeightedEstimate
     sources: tuple[Source, ...]
-    components: VarianceComponents
+    state: State
     contributions: Mapping[str, FloatArray]
     tests: int
     assumed: tuple[str, ...]
-    linear: LinearModel
-    projection: Projection
-    given: FloatArray
-    """G where the assumed exponents are taken as given, shape (Q, m)."""
-    jacobian: FloatArray
-    """Derivatives of the residuals of data and priors by theta, shape (M, Q)."""
-    near: Linearization
-    """Residuals at the estimate, each run's at its own parameters."""
-    runs: RunDeviations | None = None
-    """How runs deviate from the estimate; None where they are alike."""
-    basis: Basis | None = None
-    """Changes of theta that the data determine at all; None where that is every one."""
+    limit: FloatArray
+    """Factor of each parameter's uncertainty by the model error: tests left out limit it."""
 
     @property
-    def variances(self) -> FloatArray:
-        """Variance of each source."""
-        return self.components.variances
+    def problem(self) -> Problem:
+        """The problem with the assumed exponents free; its `names` order every array here."""
+        return self.estimate.problem
+
+    @property
+    def theta(self) -> FloatArray:
+        """The estimate, search coordinates, (Q,)."""
+        return self.estimate.theta
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -152,9 +118,19 @@ class ErrorModel:
         return self.problem.names
 
     @property
+    def variances(self) -> FloatArray:
+        """Variance of each source."""
+        return self.state.variances[self.state.model.noises :]
+
+    @property
+    def noises(self) -> FloatArray:
+        """Variance of the noise over that by which rows count: fundamentals, then harmonics."""
+        return 1.0 / self.state.weights[: self.state.model.noises]
+
+    @property
     def distinguishes_noise(self) -> bool:
         """Whether there are enough residuals to tell a model error from noise."""
-        return _tells(self.problem, self.assumed)
+        return _distinguishes_noise(self.problem, self.assumed)
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -162,18 +138,14 @@ class ErrorModel:
         return np.asarray(sum(self.contributions.values()))
 
     @cached_property
-    def inverse(self) -> FloatArray:
-        """G, shape (Q, m)."""
-        assert self.linear.lever is not None
-        return self._of_theta(self.linear.lever)
-
-    @cached_property
     def generalised(self) -> FloatArray:
-        """The same of generalised least squares, which predicts what the device departs by."""
-        return self._of_theta(self.projection.generalised_inverse())
+        """Covariance of generalised least squares, by which the device's response is predicted."""
+        r = self.state.model.parameters
+        return self._of_theta(self._of_theta(self.state.K[:r, :r]).T)
 
     def _of_theta(self, changes: FloatArray) -> FloatArray:
-        return changes if self.basis is None else self.basis.matrix @ changes
+        basis = self.estimate.basis
+        return changes if basis is None else basis.matrix @ changes
 
     @cached_property
     def values(self) -> Mapping[str, float]:
@@ -194,12 +166,24 @@ class ErrorModel:
 
     def holds(self, name: str) -> bool:
         """Return whether a parameter is determined, where the data leave some directions open."""
-        if self.basis is None:
+        basis = self.estimate.basis
+        if basis is None:
             return True
         if not np.isfinite(self.optimum.stderr.get(name, 0.0)):
             return False  # at the limit at which the optimum lies
-        direction = np.eye(len(self.names))[self.names.index(name)]
-        return bool(self.basis.holds(direction))
+        return bool(basis.holds(np.eye(len(self.names))[self.names.index(name)]))
+
+    @cached_property
+    def _levers(self) -> tuple[FloatArray, FloatArray]:
+        """What each variance adds to the covariance of theta at 1, (count, Q, Q).
+
+        Also where assumed exponents are taken as given.
+        """
+        every, given = (
+            _limited_shares(self.sources, self.state, one, self.limit)[0]
+            for one in _levers(self.estimate, self.assumed)
+        )
+        return every, given
 
     def dof(self, direction: FloatArray, sources: Sequence[str] | None = None) -> float:
         """Return the effective degrees of freedom of the uncertainty of direction . theta.
@@ -207,22 +191,21 @@ class ErrorModel:
         Satterthwaite's: 2 u^4 over the variance of u^2 that the variances' own errors make, no
         less than 1. `sources` leaves only these; infinite where all variances are known.
         """
-        lever = direction @ (self.inverse if sources is None else self.given)
-        length = float(np.abs(lever).max()) or 1.0  # any length of the direction will do
-        direction, lever = direction / length, lever / length
-        shares = np.zeros(len(self.sources))
-        for k, (source, part) in enumerate(zip(self.sources, self.linear.Z, strict=True)):
-            if sources is None or source.name in sources:
-                moved = lever * part if part.ndim == 1 else lever @ part
-                shares[k] = moved @ moved
-        spread = float(shares @ self.components.covariance @ shares)
-        counted = self.contributions if sources is None else sources
-        parts = {n: float(direction @ self.contributions[n] @ direction) for n in counted}
-        if TESTS in parts:
-            spread += 2.0 * parts[TESTS] ** 2 / (self.tests - 1)
+        direction = direction / (float(np.abs(direction).max()) or 1.0)  # any length will do
+        every = self._levers[0 if sources is None else 1]
+        names = [NOISE] * self.state.model.noises + [s.name for s in self.sources]
+        counted = np.array([sources is None or name in sources for name in names], dtype=bool)
+        slopes = np.einsum("i,kij,j->k", direction, every, direction) * counted
+        spread = float(slopes @ self.state.variances_covariance @ slopes)
+        total = 0.0
+        for name in self.contributions if sources is None else sources:
+            own = float(direction @ self.contributions[name] @ direction)
+            total += own
+            if name == TESTS:
+                spread += 2.0 * own**2 / (self.tests - 1)
         if not spread > 0.0:
             return np.inf
-        return max(1.0, 2.0 * sum(parts.values()) ** 2 / spread)
+        return max(1.0, 2.0 * total**2 / spread)
 
     @cached_property
     def at_estimate(self) -> Optimum:
@@ -251,35 +234,56 @@ class ErrorModel:
         )  # fmt: skip
 
     @cached_property
+    def runs(self) -> RunDeviations | None:
+        """How runs deviate from the estimate, of highest likelihood; None where none scatters."""
+        shown = [k for k, source in enumerate(self.sources) if source.name == RUNS]
+        if not shown:
+            return None
+        labels, predicted = np.unique(np.asarray(self.problem.data.run)), self.state.predicted
+        mean = -self._of_theta(predicted[: self.state.model.parameters])
+        places = [*self.names, "gain", "phase"]
+        effects = np.tile([*mean, 0.0, 0.0], (len(labels), 1))
+        for k in shown:
+            effects[:, places.index(self.sources[k].own)] += predicted[self.state.model.columns(k)]
+        return RunDeviations(labels, effects[:, :-2], effects[:, -2], effects[:, -1])
+
+    @cached_property
+    def within_runs(self) -> ComplexArray:
+        """Responses (n,), each run's by its own parameters, gain and phase."""
+        return linearization(self.problem, self.theta, self.runs).fitted
+
+    @cached_property
     def parallel_to_the_law(self) -> ComplexArray:
         """Responses (n,) by generalised least squares, parallel forces and rates included.
 
         Without the smooth departure from the law itself, which its parameters do not describe.
         """
-        moved = self.near.J @ (self.generalised @ self.linear.y)
-        for source, effect in zip(self.sources, self.projection.effects(), strict=True):
-            parallel = source.shapes is None or source.shapes.parallel
-            if source.name == MODEL_ERROR and parallel:
-                moved += source.columns @ effect
-        relative = np.einsum("nij,nj->ni", self.relative_units(), moved.reshape(-1, 2))
-        return np.asarray(self.near.fitted * np.exp(relative @ np.array([1.0, 1.0j])))
+        model, effects = self.state.model, self.state.predicted.copy()
+        for k, source in enumerate(self.sources):
+            counts = source.name == MODEL_ERROR and (source.shapes is None or source.parallel)
+            effects[model.columns(k)] *= counts
+        moved = (model.U @ effects)[: self.problem.n_residuals].reshape(-1, 2)
+        relative = np.einsum("nij,nj->ni", self.estimate.relative_units, moved)
+        return np.asarray(self.estimate.predicted * np.exp(relative @ np.array([1.0, 1.0j])))
+
+    def rms(self, name: str) -> float:
+        """Return the rms of ln gain and phase that noise beyond a stated one, or a source, makes.
+
+        Of what runs have of their own, their gain and phase count.
+        """
+        named = [s.name == name and s.own not in self.names for s in self.sources]
+        squares = np.array([source.mean_square for source in self.sources])
+        total = float(self.variances[named] @ squares[named])
+        if name == NOISE:
+            total += float(self.state.variances[0]) * self.noise_square
+        return float(np.sqrt(total))
 
     @cached_property
-    def rows(self) -> RowProjection:
-        """P and what the variances do to it, for the residuals of the data."""
-        y = self.near.y * row_weights(self.problem)
-        return RowProjection(self.linear, self.projection, self.variances, y)
-
-    def relative_units(self) -> FloatArray:
-        """Return what takes each row's residuals to ln gain and phase, shape (n, 2, 2)."""
-        return relative_units(self.problem, self.theta)
-
-
-def relative_units(problem: Problem, theta: FloatArray) -> FloatArray:
-    """Return what takes each row's residuals to ln gain and phase, shape (n, 2, 2)."""
-    predicted = problem.predict(theta)
-    parts = [-problem.residual_change(theta, f * predicted) for f in (1.0, 1j)]
-    return np.linalg.pinv(np.stack([part.reshape(-1, 2) for part in parts], axis=-1))
+    def noise_square(self) -> float:
+        """Mean square of ln gain and phase of the fundamentals, by residuals of unit variance."""
+        first = self.problem.data.harmonic == 1
+        units = self.estimate.relative_units[first if first.any() else slice(None)]
+        return 0.5 * float(np.mean(np.sum(units**2, axis=(1, 2))))
 
 
 def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorModel | None:
@@ -310,178 +314,144 @@ def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorMode
     if problem.n_numbers - len(optimum.names) <= 0:
         return None
     try:
-        return _estimated(optimum, problem, assumed, determined)
+        estimate = weighted_estimate(optimum, problem, determined=determined)
+        return _with_sources(optimum, estimate, assumed)
     except np.linalg.LinAlgError:
         return None
 
 
-def with_assumed(given: Problem) -> tuple[Problem, dict[str, Assumption]]:
-    """Return the problem with what was assumed free: exponents, and the factor of the drive."""
-    assumed = {
-        p.name: Assumption(EXPONENT, float(np.log(p.prior[1] / p.prior[0]) / np.sqrt(12.0)))
-        for p in given.model.parameters
-        if p.assumed and not p.free and p.prior is not None
-    }
-    u = given.data.drive_factor_uncertainty
-    gain = next(p for p in given.sensors.parameters if p.name == _GAIN)
-    if u and not gain.free:
-        assumed[gain.name] = Assumption(DRIVE, float(u))
-    if not assumed:
-        return given, {}
-    return given.assuming({name: one.std for name, one in assumed.items()}), assumed
-
-
-class _Rows:
-    """Residuals and Jacobian at a point, counted as the optimum counts them."""
-
-    def __init__(self, optimum: Optimum, problem: Problem) -> None:
-        self._problem = problem
-        known = dict(zip(optimum.names, optimum.theta, strict=True))
-        self.start = np.array(
-            [known.get(p.name, np.log(p.value or 1.0)) for p in problem.parameters]
-        )
-        self.m = problem.n_residuals
-
-    def at(self, theta: FloatArray, near: Linearization) -> tuple[FloatArray, FloatArray]:
-        """Return residuals and Jacobian: data, then priors."""
-        y, J = near.y, near.J
-        if self._problem.n_priors:
-            own, by = self._problem.residuals_and_jacobian(theta, tails=False)
-            y, J = np.concatenate([y, own[self.m :]]), np.vstack([J, by[self.m :]])
-        weight = np.concatenate([row_weights(self._problem), np.ones(len(y) - self.m)])
-        return y * weight, J * weight[:, None]
-
-
-def row_weights(problem: Problem) -> FloatArray:
-    """Return the root of what an estimated covariance counts each residual for, (m,)."""
-    weight, dof = np.ones(problem.n_residuals), problem.data.dof
-    if not problem.gaussian and dof is not None:
-        nu = np.minimum(dof, 1e12)  # a covariance of few dof: the variance of Student's t
-        weight = np.repeat(np.sqrt((nu - 2.0) / nu), 2)
-    return weight
-
-
-def _estimated(
-    optimum: Optimum, problem: Problem, assumed: Mapping[str, Assumption], determined: bool
+def _with_sources(
+    optimum: Optimum, estimate: WeightedEstimate, assumed: Mapping[str, Assumption]
 ) -> ErrorModel:
-    rows = _Rows(optimum, problem)
-    m = rows.m
-    basis = None
-    if not determined:
-        chart = chart_of_limit(optimum, problem)
-        first = rows.at(rows.start, linearization(problem, rows.start))
-        basis = Basis.of(first[1], rows.start, chart)
-    dof = problem.n_numbers - len(problem.names)
-    estimate = weighted_estimate(
-        problem,
-        lambda theta: rows.at(theta, linearization(problem, theta)),
-        rows.start,
-        dof + problem.n_priors * problem.scale_known,
-        basis,
-    )
-    theta = estimate.theta
-    if basis is not None:
-        basis = basis.at(theta)
-    shared = StructuredSources(problem, theta) if _tells(problem, assumed) else None
-    apart = own_errors(problem, _standing_apart(optimum))
-    runs: RunDeviations | None = None
-    found: VarianceComponents | None = None
-    for _ in range(_STEPS):
-        near = linearization(problem, theta, runs)
-        y, whole = rows.at(theta, near)
-        if not np.isfinite(y).all():
-            raise np.linalg.LinAlgError("a drive beyond the force limit has no steady response")
-        J = whole if basis is None else whole @ basis.matrix
-        noise = noise_of(problem, theta, few=m <= 2 * _FEW_ROWS and shared is not None)
-        sources = noise if shared is None else (*noise, *apart, *shared.at(theta, near))
-        linear, contrasts = linear_model(problem, y, J, sources, estimate.lever(J))
-        level = 0.0 if problem.scale_known else float(y[:m] @ y[:m]) / max(dof, 1)
-        floor = np.array([level * (s.columns.ndim == 1) for s in sources])
-        if found is None:
-            found = _asked_for(contrasts, sources, floor)
-        else:  # about other runs: what was not asked for before is not asked for again
-            found = variance_components(contrasts, found.variances, found.largest)
-        projection = Projection(linear, found.variances)
-        before, runs = runs, run_deviations(problem, sources, projection.effects())
-        if runs is not None:  # these are about the estimate that V weighs
-            move = projection.generalised_inverse() @ linear.y
-            move = move if basis is None else basis.matrix @ move
-            runs = runs.about(move, range(len(theta)))
-        if alike(before, runs):
-            break
-    assert found is not None
-    always = [s.name == NOISE and not s.price for s in sources]
-    kept = np.flatnonzero((found.variances > 0.0) | always).tolist()
+    problem = estimate.problem
+    sources: tuple[Source, ...] = ()
+    if _distinguishes_noise(problem, assumed):
+        sources = (*error_sources(estimate), *own_errors(estimate, _standing_apart(optimum)))
+    state = _mixed(estimate, sources).reml(np.array([source.chance for source in sources]))
+    noises = state.model.noises
+    kept = np.flatnonzero(state.variances[noises:] > 0.0)
     sources = tuple(sources[k] for k in kept)
-    linear = replace(linear, Z=[linear.Z[k] for k in kept])
-    found = found.only(kept)
-    projection = Projection(linear, found.variances)
-    assert linear.lever is not None
-    G = given = linear.lever if basis is None else basis.matrix @ linear.lever
-    contributions = _by_source(problem, assumed, sources, linear, found, G)
-    tests = rows_of_tests(problem.data)
-    if basis is None:
-        by_tests = estimate.jackknife(whole, y, tests, problem.bounds())
-        wide = np.ones(len(theta))
-        if len(tests) >= _TESTS_THAT_LIMIT and MODEL_ERROR in contributions:
-            wide = _at_most(contributions[MODEL_ERROR], _SHARED_BY * by_tests)
-            contributions[MODEL_ERROR] *= np.outer(wide, wide)
-        ranged = [i for i, n in enumerate(problem.names) if n in assumed and n != _GAIN]
-        if ranged:
-            kept = [i for i in range(len(theta)) if i not in ranged]
-            given = np.zeros(G.shape)
-            given[kept] = linear.turned(estimate.lever(whole[:, kept]))
-            others = _by_source(problem, assumed, sources, linear, found, given)
-            if MODEL_ERROR in others:
-                others[MODEL_ERROR] *= np.outer(wide, wide)
-            contributions = _with_exponents(contributions, others)
-        moved = _by_harmonics(problem, estimate, y, whole)
-        if moved.any():
-            contributions[HARMONICS] = np.outer(moved, moved)
-        if len(tests) >= _FEWEST_TESTS:
-            by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
-            contributions = _at_least(contributions, by_chance**2 * by_tests)
-    return ErrorModel(
-        optimum, problem, theta, estimate, sources, found, contributions, len(tests),
-        tuple(assumed), linear, projection, given, whole, near, runs, basis,
-    )  # fmt: skip
+    state = _mixed(estimate, sources).at(state.variances[[*range(noises), *(noises + kept)]])
+    levers, tests = _levers(estimate, assumed), rows_of_tests(problem.data)
+    by_tests = None if estimate.basis is not None else estimate.jackknife(tests)
+    limit = np.ones(len(problem.names))
+    if by_tests is not None and len(tests) >= _TESTS_THAT_LIMIT:
+        limit = _limit_of_model_error(sources, state, levers[0], by_tests)
+    every, given = (_by_source(estimate, assumed, sources, state, one, limit) for one in levers)
+    ranged = any(one.source == EXPONENT for one in assumed.values())
+    if estimate.basis is None and ranged:
+        whole, others = (np.asarray(sum(parts.values())) for parts in (every, given))
+        every = {**given, EXPONENT: given.get(EXPONENT, 0.0) + _positive(whole - others)}
+    moved = _by_harmonics(estimate)
+    if moved.any():
+        every[HARMONICS] = np.outer(moved, moved)
+    if by_tests is not None and len(tests) >= _FEWEST_TESTS:
+        by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
+        every = _at_least(every, by_chance**2 * by_tests)
+    return ErrorModel(optimum, estimate, sources, state, every, len(tests), tuple(assumed), limit)
 
 
-def _with_exponents(
-    contributions: dict[str, FloatArray], given: dict[str, FloatArray]
+def _standing_apart(optimum: Optimum) -> list[int]:
+    """Return the rows that stand apart.
+
+    Neighbours, or a row at an end of the table, may be where the model fails.
+    """
+    rows = sorted(p.row for p in suspicious_points(optimum, ResidualSpace(optimum)))
+    return [] if at_an_end(optimum, rows) or neighbourhood(optimum, rows) else rows
+
+
+def _mixed(estimate: WeightedEstimate, sources: Sequence[Source]) -> MixedModel:
+    """Return the mixed model of the estimate's residuals.
+
+    A stated noise is the least that fundamentals have, and harmonics in addition to their own
+    misfit: that is not an error of the fundamental.
+    """
+    problem, m = estimate.problem, estimate.problem.n_residuals
+    harmonics = np.repeat(problem.data.harmonic != 1, 2) & problem.scale_known
+    both = bool(harmonics.any() and not harmonics.all())
+    group = np.concatenate([harmonics & both, np.full(problem.n_priors, 1 + both)]).astype(np.intp)
+    part = 0.5 * np.sum(estimate.factors**2, axis=(1, 2)) * problem.scale_known
+    known = [float(part[group[:m:2] == g].mean()) for g in range(1 + both)]
+    known += [1.0] * bool(problem.n_priors)
+    Z, most = [s.columns for s in sources], np.array([s.largest for s in sources])
+    return MixedModel(estimate.y, estimate.columns, Z, group, np.array(known), 1 + both, most)
+
+
+def _levers(estimate: WeightedEstimate, assumed: Collection[str]) -> tuple[FloatArray, FloatArray]:
+    """Return what the estimate makes of the residuals, (Q, M), exponents estimated and given."""
+    G = estimate.lever()
+    if estimate.basis is not None:
+        G = estimate.basis.matrix @ G
+        return G, G
+    ranged = [name in assumed and name != GAIN for name in estimate.problem.names]
+    if not any(ranged):
+        return G, G
+    given, kept = np.zeros(G.shape), np.flatnonzero(~np.array(ranged))
+    given[kept] = estimate.lever(estimate.jacobian[:, kept])
+    return G, given
+
+
+def _by_source(
+    estimate: WeightedEstimate,
+    assumed: Mapping[str, Assumption],
+    sources: Sequence[Source],
+    state: State,
+    lever: FloatArray,
+    limit: FloatArray,
 ) -> dict[str, FloatArray]:
-    """Return what each source does at given exponents, and what they do that are not given."""
-    whole, others = (np.asarray(sum(parts.values())) for parts in (contributions, given))
-    return {**given, EXPONENT: given.get(EXPONENT, 0.0) + _positive(whole - others)}
+    """Return the covariance of theta that each source makes by the lever (Q, M) of residuals."""
+    problem, noises = estimate.problem, state.model.noises
+    each, known = _limited_shares(sources, state, lever, limit)
+    found = {NOISE: known[:noises].sum(axis=0)}
+    names = [NOISE] * noises + [source.name for source in sources]
+    for name, part, variance in zip(names, each, state.variances.tolist(), strict=True):
+        found[name] = found.get(name, 0.0) + variance * part
+    priors = [_CALIBRATIONS.get(name, name) for name in problem.priors]
+    priors += [one.source for one in assumed.values()]
+    for row, name in enumerate(priors, start=problem.n_residuals):
+        found[name] = found.get(name, 0.0) + np.outer(lever[:, row], lever[:, row])
+    return found
+
+
+def _by_harmonics(estimate: WeightedEstimate) -> FloatArray:
+    """Return how far harmonics move theta from the fundamentals' estimate, beyond chance, (Q,)."""
+    problem, y = estimate.problem, estimate.y
+    kept = np.pad(
+        np.repeat(problem.data.harmonic == 1, 2), (0, problem.n_priors), constant_values=True
+    )
+    few = 2 * (problem.data.harmonic == 1).sum() <= len(problem.names)
+    if estimate.basis is not None or kept.all() or few:
+        return np.zeros(len(problem.names))
+    fundamentals = estimate.lever(kept=kept)
+    moved, chance = fundamentals @ y, np.linalg.norm(fundamentals - estimate.lever(), axis=1)
+    return np.where(np.abs(moved) > _BY_CHANCE * chance, moved, 0.0)
+
+
+def _limited_shares(
+    sources: Sequence[Source], state: State, lever: FloatArray, limit: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return shares of the covariance, those of the model error by its `limit` of parameters."""
+    each, known = shares(state, lever)
+    model = [k for k, s in enumerate(sources, state.model.noises) if s.name == MODEL_ERROR]
+    each[model] *= np.outer(limit, limit)
+    return each, known
+
+
+def _limit_of_model_error(
+    sources: Sequence[Source], state: State, lever: FloatArray, by_tests: FloatArray
+) -> FloatArray:
+    """Return the factors, (Q,), that bring the model error to what tests left out make likely."""
+    each, _ = shares(state, lever)
+    model = [k for k, s in enumerate(sources, state.model.noises) if s.name == MODEL_ERROR]
+    size = np.einsum("kii,k->i", each[model], state.variances[model])
+    most = _SHARED_BY * np.diagonal(by_tests)
+    return np.asarray(np.sqrt(np.divide(most, size, out=np.ones(len(size)), where=size > most)))
 
 
 def _positive(C: FloatArray) -> FloatArray:
     """Return the part of a symmetric matrix that is a covariance."""
     values, vectors = np.linalg.eigh(C)
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
-
-
-def _at_most(C: FloatArray, most: FloatArray) -> FloatArray:
-    """Return the factors of parameters' uncertainties that bring C to `most` where it is more."""
-    own, most = np.diagonal(C), np.diagonal(most)
-    return np.sqrt(np.divide(most, own, out=np.ones(len(own)), where=own > most))
-
-
-def _by_harmonics(
-    problem: Problem, estimate: WeightedEstimate, y: FloatArray, J: FloatArray
-) -> FloatArray:
-    """Return how far harmonics move theta from the fundamentals' estimate, beyond chance, (Q,)."""
-    m = problem.n_residuals
-    kept = np.concatenate([np.repeat(problem.data.harmonic == 1, 2), np.ones(len(y) - m, bool)])
-    if kept.all() or 2 * (problem.data.harmonic == 1).sum() <= len(problem.names):
-        return np.zeros(J.shape[1])
-    own = estimate.lever(J, kept)
-    lever = own - estimate.lever(J)
-    noise = np.ones(len(y))
-    if not problem.scale_known:
-        noise[:m] /= estimate.factors[0, 0, 0]
-    moved, chance = own @ y, np.linalg.norm(lever * noise, axis=1)
-    return np.where(np.abs(moved) > _BY_CHANCE * chance, moved, 0.0)
 
 
 def _at_least(contributions: dict[str, FloatArray], least: FloatArray) -> dict[str, FloatArray]:
@@ -495,93 +465,5 @@ def _at_least(contributions: dict[str, FloatArray], least: FloatArray) -> dict[s
     return {**contributions, TESTS: _positive(C * np.outer(wider, wider) - C)}
 
 
-def _standing_apart(optimum: Optimum) -> list[int]:
-    """Return the rows that stand apart.
-
-    Neighbours, or a row at an end of the table, may be where the model fails.
-    """
-    rows = sorted(p.row for p in suspicious_points(optimum, ResidualSpace(optimum)))
-    return [] if at_an_end(optimum, rows) or neighbourhood(optimum, rows) else rows
-
-
-def _tells(problem: Problem, assumed: Collection[str]) -> bool:
+def _distinguishes_noise(problem: Problem, assumed: Collection[str]) -> bool:
     return problem.n_numbers - len(problem.names) + len(assumed) >= _LEAST_DOF
-
-
-def _asked_for(
-    contrasts: Likelihood, sources: Sequence[Source], floor: FloatArray
-) -> VarianceComponents:
-    """Return the variances; sources that raise the likelihood by less than their price have none.
-
-    A source that has none once all others are in is never missed; of the rest, that which costs
-    the likelihood least leaves first, of a few that cost least by the information on their
-    variances. `floor` has variances at which the covariance is not singular.
-    """
-    most = np.array([s.largest for s in sources])
-    price = np.array([s.price for s in sources])
-    found = variance_components(contrasts, np.minimum(floor, most), most)
-    while True:
-        most = np.where((price > 0.0) & (found.variances == 0.0), 0.0, most)
-        open_ = np.flatnonzero((price > 0.0) & (most > 0.0))
-        about = 0.5 * found.variances[open_] ** 2 / np.diagonal(found.covariance)[open_]
-        for k in open_[np.argsort(about - price[open_])[:_TRIED]].tolist():
-            fewer = most.copy()
-            fewer[k] = 0.0
-            begin = np.where(found.variances > 0.0, found.variances, floor)
-            trial = variance_components(contrasts, np.minimum(begin, fewer), fewer)
-            if found.log_likelihood - trial.log_likelihood < price[k]:
-                found = trial
-                break
-        else:
-            return found
-
-
-def linear_model(
-    problem: Problem,
-    y: FloatArray,
-    J: FloatArray,
-    sources: tuple[Source, ...],
-    lever: FloatArray | None = None,
-) -> tuple[LinearModel, Likelihood]:
-    """Return residuals of data and priors with the sources' columns, compressed if many.
-
-    Also their likelihood.
-    """
-    m, extra = problem.n_residuals, len(y) - problem.n_residuals
-    known = np.concatenate([np.full(m, float(problem.scale_known)), np.ones(extra)])
-    weight = row_weights(problem)
-    Z = [s.columns if s.columns.ndim < 3 else block_diagonal(s.columns) for s in sources]
-    # an error of the response is one of its weighted residual; noise of one scale is that of these
-    Z = [z if z.ndim == 1 else weight[:, None] * z for z in Z]
-    Z = [np.concatenate([z, np.zeros((extra, *z.shape[1:]))]) for z in Z]
-    linear = LinearModel(y, J, known, Z, lever)
-    fewer = linear.compressed(m) if m > 2 * _FEW_ROWS else linear
-    return fewer, Likelihood(fewer)
-
-
-def _by_source(
-    problem: Problem,
-    assumed: Mapping[str, Assumption],
-    sources: tuple[Source, ...],
-    linear: LinearModel,
-    found: VarianceComponents,
-    lever: FloatArray,
-) -> dict[str, FloatArray]:
-    """Return the covariance of theta that each source makes by the lever (Q, m) of residuals."""
-    result = {}
-    priors = [_CALIBRATIONS.get(name, name) for name in problem.priors]
-    known = [*priors, *(one.source for one in assumed.values())]
-    m = len(linear.y) - len(known)
-    if problem.scale_known:
-        result[NOISE] = _squared(lever[:, :m])
-    for source, part, variance in zip(sources, linear.Z, found.variances.tolist(), strict=True):
-        own = variance * _squared(lever * part if part.ndim == 1 else lever @ part)
-        result[source.name] = result[source.name] + own if source.name in result else own
-    for row, name in enumerate(known, start=m):
-        own = _squared(lever[:, row : row + 1])
-        result[name] = result[name] + own if name in result else own
-    return result
-
-
-def _squared(lever: FloatArray) -> FloatArray:
-    return np.asarray(lever @ lever.T)

@@ -1,4 +1,4 @@
-r"""Sources of correlated or uneven residuals: noise, scatter and model error.
+r"""Sources of error that several rows share: scatter, model error, errors of the levels.
 
 Each source is a set of columns: its errors are the columns times independent numbers of one
 variance. Departures are relative changes of the response, so that the same source serves every
@@ -20,37 +20,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.quantities import COMPLIANCES
-from dahl_ident.diagnostics.run_deviations import Linearization, RunDeviations
+from dahl_ident.diagnostics.estimate import WeightedEstimate
+from dahl_ident.diagnostics.table_groups import (
+    FEWEST_TESTS,
+    repeated_levels,
+    repeats,
+    rows_of_levels,
+)
 from dahl_ident.problem import Problem
 
 NOISE = "noise"
 MODEL_ERROR = "model error"
 RUNS = "scatter between runs"
 LEVELS = "scatter between repeated levels"
+HARMONICS = "model error of harmonics"
 APART = "suspicious points"
 TESTS = "jackknife over tests"
-HARMONICS = "model error of harmonics"
 
-_PRICE = 0.4  # rise of the log-likelihood that a model error, or noise of levels, takes
-_PRICE_OF_RATE = 0.1  # the same for a force limit that changes with speed
-_PRICE_OF_LEVELS = 3.0  # the same for what a level has in common: 1 % of the tables, by chance
-_PRICE_OF_A_ROW = 2.0  # the same for an error of one row, which some row seems to have by chance
+_OFTEN = 0.15  # of tables in which noise alone may look like a model error or noisy levels
+_SELDOM = 0.01  # the same for what a level has in common
 _LENGTH = 1.0  # of the model error, in ln A and ln omega
 _MOST_PLACES = 200  # of shapes, chosen evenly where rows are more
 _MOST_NOISY = 100  # levels with a noise of their own: the cost is cubic in their number
 _SMOOTH = 1e-3  # eigenvalue of the correlation, over the largest, that is negligible
 _MOST_SHAPES = 24  # of its eigenvectors; a decade of both amplitude and frequency takes 15
-_SAME_LEVEL = 0.02  # of ln A and ln f, beyond which the response is another
-_MOST_LEVELS = 50  # with an error each: the cost is cubic in their number
-_EQUAL = 1e-9  # of the same: one number, stored twice
-_BY_CHANCE = 0.01  # tables without repeats in which some seem to be
 _MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it leaves
 _LEAST_RATE_RANGE = np.log(2.0)  # of frequency, that tells speed from amplitude
 _MOST_LEVEL_NOISE = 0.05  # of ln A: sensors scatter less; more of it would hide a wrong model
-_MOST_UNDERSTATED = 3.0  # true standard deviation over the stated one
-_FEWEST_TESTS = 3  # runs, or labelled levels, that count as tests
 _FEWEST = 2  # runs, or repeated levels, that show a scatter
 
 
@@ -62,9 +59,8 @@ class Source:
     ----------
     name : str
         As a budget lists it; several sources may share one.
-    columns : ndarray, shape (m, q), (m,) or (n, 2, 1)
-        Residuals at unit variance; one dimension stands for a diagonal matrix, three for a column
-        of each row's own.
+    columns : ndarray, shape (M, q)
+        Residuals of unit variance that the source makes at unit variance.
     mean_square : float
         Of ln gain and phase over the rows, at unit variance.
     shapes : Shapes or None
@@ -79,6 +75,9 @@ class Source:
     rate_of : (str, float) or None
         Parameter that changes as a power of the peak speed, and ln of the speed where it is its
         estimate.
+    chance : float
+        Share of tables in which noise alone may make the source appear; 1 where it is always
+        counted.
     """
 
     name: str
@@ -89,7 +88,46 @@ class Source:
     largest: float = np.inf
     absorbed: FloatArray | None = None
     rate_of: tuple[str, float] | None = None
-    price: float = 0.0
+    chance: float = 1.0
+
+    @property
+    def parallel(self) -> bool:
+        """Whether it is a force in parallel with the model."""
+        return self.shapes is not None and self.shapes.parallel
+
+    def changes(
+        self,
+        names: Sequence[str],
+        slopes: ComplexArray,
+        where: FloatArray,
+        stiffness: ComplexArray | None,
+    ) -> FloatArray | None:
+        """Return ln gain and phase that the source makes at other places, (n, 2, q), if it does.
+
+        `slopes` (n, Q) are the derivatives of ln R with respect to theta there, and `stiffness`
+        the dynamic stiffness; None leaves out forces in parallel with the model.
+        """
+        if self.rate_of is not None:
+            name, centre = self.rate_of
+            away = (where.sum(axis=1) - centre)[:, None, None]
+            return np.asarray(parts(slopes[:, [names.index(name)]]) * away)
+        if self.shapes is None or (self.parallel and stiffness is None):
+            return None
+        ratio = np.ones(len(slopes), dtype=np.complex128) if stiffness is None else stiffness
+        made = parts(self.shapes.changes(where, ratio).T)
+        return made if self.absorbed is None else made - parts(slopes) @ self.absorbed
+
+    def drawn(self, names: Sequence[str], slopes: ComplexArray) -> FloatArray:
+        """Return the covariance of ln gain and phase by a test's own draw at unit variance."""
+        if self.own in names:
+            part = parts(slopes[:, [names.index(self.own)]])
+            return np.asarray(part @ part.swapaxes(1, 2))
+        return np.diag([float(self.own not in ("", "phase")), float(self.own not in ("", "gain"))])
+
+
+def parts(relative: ComplexArray) -> FloatArray:
+    """Return ln gain and phase of relative changes (n, q), shape (n, 2, q)."""
+    return np.stack([relative.real, relative.imag], axis=1)
 
 
 @dataclass(frozen=True)
@@ -142,178 +180,128 @@ def places(amplitude: FloatArray, omega: FloatArray) -> FloatArray:
     return np.asarray(np.log(np.column_stack(np.broadcast_arrays(amplitude, omega))))
 
 
-def noise_of(problem: Problem, theta: FloatArray, *, few: bool) -> tuple[Source, ...]:
-    """Return the noise that each row has of its own.
+def error_sources(
+    estimate: WeightedEstimate, further: FloatArray | None = None
+) -> tuple[Source, ...]:
+    """Return the sources that several rows share, and noise of the levels.
 
-    Of unknown size, or beyond that of the data's covariance: far more than was stated is another
-    error, and no larger where a covariance is. Then, of `few` rows, gain and phase have a scatter
-    too. Harmonics have noise of their own: a misfit in them is not an error of the fundamental.
+    Their shapes are those of the model at the estimate. In measured ones the noise itself would be
+    a shape, and explain itself. `further`, (k, 2), are further places where shapes are needed.
     """
-    n, unit = problem.n_residuals // 2, unit_noise(problem)
-    if not (few and problem.scale_known):
-        return (Source(NOISE, np.ones(2 * n), unit),)
-    predicted, first = problem.predict(theta), problem.data.harmonic == 1
-    parts = [-problem.residual_change(theta, f * predicted).reshape(n, 2) for f in (1.0, 1j)]
-    blocks = np.zeros((n, 2, n, 2))
-    blocks[np.arange(n), :, np.arange(n), :] = np.stack(parts, axis=-1)
-    found = []
-    for own in (first, ~first):
-        if own.any():
-            share, most = float(own.mean()), _MOST_UNDERSTATED**2 - 1.0
-            found.append(Source(NOISE, np.repeat(1.0 * own, 2), share * unit, largest=most))
-            found.append(Source(NOISE, blocks[:, :, own].reshape(2 * n, -1), share))
-    return tuple(found)
+    return tuple(
+        source
+        for sources in (
+            _model_error(estimate, further), _changes_with_speed(estimate), _harmonics(estimate),
+            _runs(estimate), _levels(estimate),
+        )
+        for source in sources
+    )  # fmt: skip
 
 
-def own_errors(problem: Problem, rows: Sequence[int]) -> tuple[Source, ...]:
-    """Return an error of each of some rows, in addition to the noise, that no other row shares."""
-    found = []
-    for row in rows:
-        columns = np.zeros((problem.n_residuals, 2))
-        columns[2 * row : 2 * row + 2] = np.eye(2)
-        share = unit_noise(problem) / problem.data.n
-        found.append(Source(APART, columns, share, price=_PRICE_OF_A_ROW))
-    return tuple(found)
+def _model_error(estimate: WeightedEstimate, further: FloatArray | None) -> Iterator[Source]:
+    """Yield the smooth departure from the model, and a force in parallel with it."""
+    problem = estimate.problem
+    view = estimate.view
+    first = view.harmonic == 1
+    there = places(view.amplitude, view.omega)
+    unit = float(np.abs(view.stiffness[first]).max(initial=0.0)) or 1.0
+    every = there if further is None else np.vstack([there, further])
+    size = _sizes(problem, estimate.predicted)
+    some = first & (size != 0.0)  # a gap that is not crossed has no response
+    missed = problem.data.response[some] / size[some] - 1.0
+    left = float(np.mean(np.abs(missed) ** 2)) if some.any() else 0.0
+    stiffness = np.where(first, view.stiffness, np.inf)
+    for shape in (Shapes.of(every, parallel=False), Shapes.of(every, parallel=True, unit=unit)):
+        changes, absorbed = shape.changes(there, stiffness), None
+        square, made = _mean_square(changes), estimate.changed(changes * size)
+        if shape.parallel:
+            absorbed = _absorbed(problem, estimate.jacobian, made)
+            made = made + estimate.jacobian @ absorbed
+        most = 0.5 * _MOST_DEPARTURE**2 * left / square
+        yield Source(
+            MODEL_ERROR, made, square, shape, largest=most, absorbed=absorbed, chance=_OFTEN
+        )
 
 
-class StructuredSources:
-    """The sources that several rows share, and noise of the amplitudes.
+def _changes_with_speed(estimate: WeightedEstimate) -> Iterator[Source]:
+    """Yield a power of the peak speed for each parameter of friction that may scatter."""
+    view = estimate.view
+    speed, first = places(view.amplitude, view.omega).sum(axis=1), view.harmonic == 1
+    if not (first.any() and np.ptp(np.log(view.omega)) > _LEAST_RATE_RANGE):
+        return
+    centre = float(speed[first].mean())
+    change = np.pad(np.repeat(speed - centre, 2), (0, estimate.problem.n_priors))
+    for i in _scattering_parameters(estimate.problem):
+        column = -(estimate.jacobian[:, i] * change)[:, None]
+        rate_of = (estimate.problem.names[i], centre)
+        yield Source(MODEL_ERROR, column, 0.0, rate_of=rate_of, chance=_OFTEN)
 
-    Their shapes are those of the model at `theta`. In measured ones the noise itself would be a
-    shape, and explain itself. `further`, (k, 2), are further places where they are needed.
+
+def _harmonics(estimate: WeightedEstimate) -> Iterator[Source]:
+    """Yield gain and phase of each harmonic: a misfit in them is not one of the fundamental."""
+    orders = np.unique(estimate.problem.data.harmonic)
+    orders = orders[orders != 1]
+    if len(orders) > 0 and (estimate.problem.data.harmonic == 1).any():
+        share = (estimate.problem.data.harmonic == orders[:, None]) * estimate.predicted
+        columns = estimate.changed(np.concatenate([share, 1j * share]))
+        yield Source(HARMONICS, columns, 0.0)
+
+
+def _runs(estimate: WeightedEstimate) -> Iterator[Source]:
+    """Yield what differs from run to run: gain, phase, and parameters of friction."""
+    problem = estimate.problem
+    if problem.data.run is None or len(problem.data.runs or ()) < _FEWEST:
+        return
+    runs = _indicators(np.asarray(problem.data.run))
+    share = runs * estimate.predicted
+    turned = 1j * problem.data.harmonic * share
+    yield Source(RUNS, estimate.changed(share), 0.5, own="gain")
+    yield Source(RUNS, estimate.changed(turned), 0.5, own="phase")
+    each = np.pad(np.repeat(runs, 2, axis=1).T, ((0, problem.n_priors), (0, 0)))
+    for i in _scattering_parameters(problem):
+        yield Source(RUNS, -each * estimate.jacobian[:, i : i + 1], 0.0, own=problem.names[i])
+
+
+def _levels(estimate: WeightedEstimate) -> Iterator[Source]:
+    """Yield errors of the levels: of each row, of a level in common, of each repeated level.
+
+    The level itself may be wrong, and a level that the response was divided by: a stiffness is
+    then off by as much in microslip, and right in slip. All rows of a level may share these, and
+    a gain.
     """
-
-    def __init__(
-        self, problem: Problem, theta: FloatArray, further: FloatArray | None = None
-    ) -> None:
-        self._problem = problem
-        compliance = problem.data.quantity in COMPLIANCES
-        self._divided = np.where((problem.data.controlled == "force") == compliance, 1.0, -1.0)
-        view, data = problem.predicted_stiffness(theta), problem.data
-        self._places = places(view.amplitude, view.omega)
-        self._fundamental = view.harmonic == 1
-        self._repeats = _repeats(repeated_levels(data), self._fundamental)
-        self._runs = (
-            np.empty((0, data.n)) if data.run is None else _indicators(np.asarray(data.run))
-        )
-        unit = float(np.abs(view.stiffness[self._fundamental]).max(initial=0.0)) or 1.0
-        every = self._places if further is None else np.vstack([self._places, further])
-        self._shapes = (
-            Shapes.of(every, parallel=False),
-            Shapes.of(every, parallel=True, unit=unit),
-        )
-        stiffness = np.where(self._fundamental, view.stiffness, np.inf)
-        self._changes = [shape.changes(self._places, stiffness) for shape in self._shapes]
-        self._speed = self._places.sum(axis=1)
-        self._rates = bool(np.ptp(self._places[:, 1]) > _LEAST_RATE_RANGE)
-        self._levels = _scattering_levels(problem)
-        self._in_common = _rows_of_levels(data)
-
-    def at(self, theta: FloatArray, near: Linearization) -> tuple[Source, ...]:
-        """Return the sources at theta, their columns linearised where `near` is."""
-        problem, predicted, J = self._problem, near.predicted, near.J
-        size = _sizes(problem, predicted)
-
-        def columns(changes: ComplexArray) -> FloatArray:
-            """Return residuals for relative changes (k, n), shape (m, k)."""
-            return near.change(changes * size).T
-
-        own = self._fundamental & (size != 0.0)  # a gap that is not crossed has no response
-        missed = problem.data.response[own] / size[own] - 1.0
-        left = float(np.mean(np.abs(missed) ** 2)) if own.any() else 0.0
-        found = []
-        for shape, changes in zip(self._shapes, self._changes, strict=True):
-            square, made, absorbed = _mean_square(changes), columns(changes), None
-            if shape.parallel:
-                absorbed = _absorbed(problem, J, made)
-                made = made + J @ absorbed
-            most = 0.5 * _MOST_DEPARTURE**2 * left / square
-            found.append(
-                Source(
-                    MODEL_ERROR, made, square, shape,
-                    largest=most, absorbed=absorbed, price=_PRICE,
-                )
-            )  # fmt: skip
-        centre = float(self._speed[self._fundamental].mean()) if self._fundamental.any() else 0.0
-        change = np.repeat(self._speed - centre, 2)[:, None]
-        found += [
-            Source(
-                MODEL_ERROR,
-                J[:, i : i + 1] * change,
-                float(np.mean((J[:, i] * change[:, 0]) ** 2)) * unit_noise(problem),
-                rate_of=(problem.names[i], centre),
-                price=_PRICE_OF_RATE,
-            )
-            for i in _scattering_parameters(problem)
-            if self._rates
-        ]
-        if len(self._runs) >= _FEWEST:
-            share = self._runs * predicted
-            turned = 1j * problem.data.harmonic * share
-            found.append(Source(RUNS, near.change(share).T, 0.5, own="gain"))
-            found.append(Source(RUNS, near.change(turned).T, 0.5, own="phase"))
-            each = np.repeat(self._runs, 2, axis=1).T
-            found += [
-                Source(RUNS, each * J[:, i : i + 1], 0.0, own=problem.names[i])
-                for i in _scattering_parameters(problem)
-            ]
-        if self._levels:
-            found += self._noise_of_levels(theta)
-        if len(self._in_common) >= _FEWEST_TESTS:
-            found += self._errors_of_levels(theta, near)
-        if len(self._repeats) >= _FEWEST:
-            shared = np.concatenate([self._repeats, 1j * self._repeats])
-            found.append(Source(LEVELS, columns(shared), 1.0, own="both"))
-        return tuple(found)
-
-    def _errors_of_levels(self, theta: FloatArray, near: Linearization) -> Iterator[Source]:
-        """Yield what all rows of one level share: a gain, and an error of the level itself.
-
-        An amplifier's gain makes both where the responses were divided by the level.
-        """
-        by_level = self._problem.level_slope(theta)
-        for change in (near.predicted, by_level, by_level + self._divided * near.predicted):
-            columns = near.change(self._in_common * change).T
-            yield Source(LEVELS, columns, 0.5, own="gain", price=_PRICE_OF_LEVELS)
-
-    def _noise_of_levels(self, theta: FloatArray) -> Iterator[Source]:
-        """Yield noise of the amplitudes, or drives, at which responses were measured.
-
-        The first counts in slip, where the response changes with amplitude, and not in microslip.
-        The second is that of a level which the response was made with: divided by a measured
-        amplitude, a stiffness is off by as much in microslip, and right in slip.
-        """
-        predicted = self._problem.predict(theta)
-        by_level = self._problem.level_slope(theta)
-        by_both = by_level + self._divided * predicted
+    problem, data = estimate.problem, estimate.problem.data
+    predicted = estimate.predicted
+    by_level = problem.level_slope(estimate.theta)
+    compliance = data.quantity in COMPLIANCES
+    divided = np.where((data.controlled == "force") == compliance, 1.0, -1.0)
+    by_both = by_level + divided * predicted
+    stated = problem.scale_known or problem.noise != "relative"
+    if data.n <= _MOST_NOISY and not (stated and (data.controlled != "force").all()):
         for change, most in ((by_level, np.inf), (by_both, _MOST_LEVEL_NOISE)):
-            columns = -self._problem.residual_change(theta, change).reshape(-1, 2, 1)
             share = np.divide(change, predicted, out=np.zeros_like(change), where=predicted != 0.0)
             square = 0.5 * float(np.mean(np.abs(share) ** 2))
-            yield Source(NOISE, columns, square, largest=most**2, price=_PRICE)
+            columns = estimate.changed(np.diag(change))
+            yield Source(NOISE, columns, square, largest=most**2, chance=_OFTEN)
+    in_common = rows_of_levels(data)
+    if len(in_common) >= FEWEST_TESTS:
+        kinds = (predicted, by_level, by_both)
+        for change in kinds:
+            columns = estimate.changed(in_common * change)
+            yield Source(LEVELS, columns, 0.5, own="gain", chance=_SELDOM / len(kinds))
+    repeated = repeats(repeated_levels(data), data.harmonic == 1)
+    if len(repeated) >= _FEWEST:
+        shared = np.concatenate([repeated, 1j * repeated])
+        columns = estimate.changed(shared * _sizes(problem, predicted))
+        yield Source(LEVELS, columns, 1.0, own="both")
 
 
-def run_deviations(
-    problem: Problem, sources: Sequence[Source], effects: Sequence[FloatArray]
-) -> RunDeviations | None:
-    """Return how runs deviate, from the effects of each source; None where none scatters."""
-    shared = [(s.own, u) for s, u in zip(sources, effects, strict=True) if s.name == RUNS]
-    if not any(u.any() for _, u in shared):
-        return None
-    found = RunDeviations.none(np.asarray(problem.data.run), len(problem.names))
-    for own, u in shared:
-        if own in problem.names:
-            found.theta[:, problem.names.index(own)] = -u  # columns there are those of J
-        else:
-            (found.gain if own == "gain" else found.phase)[:] = u
-    return found
-
-
-def _scattering_levels(problem: Problem) -> bool:
-    """Return whether levels may be noisy; not where noise is known or rows are many."""
-    data = problem.data
-    stated = problem.scale_known or problem.noise != "relative"
-    return data.n <= _MOST_NOISY and not (stated and (data.controlled != "force").all())
+def own_errors(estimate: WeightedEstimate, rows: Sequence[int]) -> Iterator[Source]:
+    """Yield one error of all rows that stand apart, beyond those that they share with others."""
+    if len(rows) > 0:
+        changes = np.zeros((len(rows), estimate.problem.data.n), dtype=np.complex128)
+        changes[np.arange(len(rows)), rows] = estimate.predicted[rows]
+        columns = estimate.changed(np.concatenate([changes, 1j * changes]))
+        yield Source(APART, columns, 0.0, chance=_SELDOM)
 
 
 def _sizes(problem: Problem, predicted: ComplexArray) -> ComplexArray:
@@ -337,10 +325,10 @@ def _sizes(problem: Problem, predicted: ComplexArray) -> ComplexArray:
 def _absorbed(problem: Problem, J: FloatArray, columns: FloatArray) -> FloatArray:
     """Return what the model's linear parts take of forces in parallel, as changes of theta."""
     names = {p.name for e in problem.model.elements if e.is_linear for p in e.parameters}
-    own = [i for i, name in enumerate(problem.names) if name in names]
+    linear = [i for i, name in enumerate(problem.names) if name in names]
     found = np.zeros((J.shape[1], columns.shape[1]))
-    if own:
-        found[own] = -np.linalg.lstsq(J[:, own], columns, rcond=None)[0]
+    if linear:
+        found[linear] = -np.linalg.lstsq(J[:, linear], columns, rcond=None)[0]
     return found
 
 
@@ -354,95 +342,6 @@ def _scattering_parameters(problem: Problem) -> list[int]:
             name = element.parameter(label).name
             if name in problem.names:
                 found.append(problem.names.index(name))
-    return found
-
-
-def _rows_of_levels(data: FrequencyResponse) -> FloatArray:
-    """Return which rows belong to each drive or amplitude held at several frequencies, (L, n)."""
-    held = _agreeing(np.log(_held(data)), (data.controlled == "force").astype(np.intp))
-    rows = held == np.arange(held.max() + 1)[:, None]
-    count = rows.sum(axis=1)
-    if len(rows) > _MOST_LEVELS or not (count > 1).all():
-        return np.empty((0, data.n))
-    return np.asarray(rows, dtype=np.float64)
-
-
-def _held(data: FrequencyResponse) -> FloatArray:
-    """Return the drive or amplitude that was held in each row, (n,)."""
-    driven, held = data.controlled == "force", np.ones(data.n)
-    for rows, column in ((driven, data.drive), (~driven, data.amplitude)):
-        if column is not None:
-            held[rows] = column[rows]
-    return held
-
-
-def _repeats(level: NDArray[np.intp], fundamental: NDArray[np.bool_]) -> FloatArray:
-    """Return which rows belong to each level that was measured more than once, (levels, n).
-
-    Of very many levels, neighbours share what is then the scatter of their mean.
-    """
-    repeated = np.flatnonzero(np.bincount(level[fundamental], minlength=level.max() + 1) > 1)
-    groups = min(len(repeated), _MOST_LEVELS)
-    own = np.full(level.max() + 1, -1)
-    own[repeated] = np.arange(len(repeated)) * groups // max(len(repeated), 1)
-    return np.asarray((np.arange(groups)[:, None] == own[level]) & fundamental, dtype=np.float64)
-
-
-def repeated_levels(data: FrequencyResponse) -> NDArray[np.intp]:
-    """Return the number of each row's level, shape (n,).
-
-    Rows are of one level where the frequency and what was held, drive or amplitude, agree as
-    closely as repeats do; not where a sweep is dense.
-    """
-    driven = data.controlled == "force"
-    frequency = _agreeing(np.log(data.frequency_hz), np.zeros(data.n, dtype=np.intp))
-    return _agreeing(np.log(_held(data)), 2 * frequency + driven)
-
-
-def rows_of_tests(data: FrequencyResponse) -> list[NDArray[np.intp]]:
-    """Return the rows of each test: runs, else labelled levels, else repeats of one level."""
-    for labels in (data.run, data.level):
-        if labels is not None:
-            names, which = np.unique(labels, return_inverse=True)
-            if _FEWEST_TESTS <= len(names) < data.n:
-                return _rows_of(which)
-    return _rows_of(repeated_levels(data))
-
-
-def _rows_of(which: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    return np.split(np.argsort(which, kind="stable"), np.cumsum(np.bincount(which))[:-1])
-
-
-def _agreeing(x: FloatArray, groups: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return a label for each value: one for values of a group that repeat one another.
-
-    Gaps between values without repeats are taken as exponential, with the mean that the larger of
-    them have; that all of the k smallest are below some size then has a probability. Gaps up to
-    the least likely such size are between repeats, if chance made it in one of a hundred tables.
-    """
-    order = np.lexsort((x, groups))
-    apart = np.diff(x[order])
-    joined = np.diff(groups[order]) == 0
-    gaps = np.sort(apart[joined & (apart > _EQUAL)])
-    small = gaps[gaps < _SAME_LEVEL]
-    k = np.arange(1, len(small) + 1)
-    larger = np.append(gaps, np.maximum(gaps[-1:], _SAME_LEVEL))  # a last one that ends the table
-    mean = np.maximum(np.cumsum(larger[::-1])[::-1][k] / (len(larger) - k) - small, _EQUAL)
-    unlikely = k * np.log(np.expm1(-larger[k] / mean) / np.expm1(-small / mean))
-    apart_at_most = _EQUAL
-    if unlikely.max(initial=0.0) > np.log(max(len(gaps), 1) / _BY_CHANCE):
-        apart_at_most = float(small[np.argmax(unlikely)])
-
-    def labelled(breaks: NDArray[np.bool_]) -> NDArray[np.intp]:
-        return np.concatenate([[0], np.cumsum(breaks)])
-
-    breaks = ~(joined & (apart <= apart_at_most))
-    label = labelled(breaks)
-    starts = np.flatnonzero(np.concatenate([[True], breaks]))
-    ends = np.append(starts[1:], len(x)) - 1
-    wide = (x[order][ends] - x[order][starts] > _SAME_LEVEL)[label[1:]]
-    found = np.empty(len(x), dtype=np.intp)
-    found[order] = labelled(breaks | (wide & (apart > _EQUAL)))
     return found
 
 
@@ -461,9 +360,3 @@ def _correlation(one: FloatArray, other: FloatArray, parallel: bool) -> FloatArr
 def _mean_square(changes: ComplexArray) -> float:
     """Return the mean square of ln gain and phase that changes of unit variance make."""
     return 0.5 * float(np.sum(np.abs(changes) ** 2, axis=0).mean())
-
-
-def unit_noise(problem: Problem) -> float:
-    """Return the mean square of ln gain and phase that residuals of unit variance are."""
-    weights = problem.stiffness_data.weights * np.abs(problem.stiffness_data.stiffness)
-    return float(np.mean(1.0 / np.maximum(weights, 1e-150) ** 2))

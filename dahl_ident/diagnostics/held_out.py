@@ -5,7 +5,7 @@ from all others, parameters estimated without them, misses by
 
     e_b = (P_bb)^-1 (P y)_b,    with the covariance (P_bb)^-1,
 
-P as in :mod:`dahl_ident.diagnostics.variance_components`; nothing is fitted again. The variances
+P as in :mod:`dahl_ident.diagnostics.mixed_model`; nothing is fitted again. The variances
 s_k are estimates, and with D = (P_bb)^-1 the covariance moves by dD/ds_k = D (P V_k P)_bb D, which
 gives its degrees of freedom. Source: Dubrule, *Cross validation of kriging in a unique
 neighborhood*, Mathematical Geology 15 (1983) 687.
@@ -32,11 +32,10 @@ from numpy.typing import NDArray
 from scipy import special
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.error_model import ErrorModel, row_weights
-from dahl_ident.diagnostics.error_sources import rows_of_tests
+from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
+from dahl_ident.diagnostics.table_groups import FEWEST_TESTS, rows_of_tests
 
-FEWEST_TESTS = 3  # two leave one from which to predict, which shows no scatter
 _MOST_TESTS = 500  # left out one at a time: the share inside is then known to 1 %
 _PRIOR_SCORES = 10.0  # values that Student's t counts for: a table's own 5 % are known from more
 _NORMAL = 1e12  # degrees of freedom beyond which Student's t is the normal distribution
@@ -113,43 +112,33 @@ def band_factor(scores: FloatArray, dof: FloatArray, level: float) -> FloatArray
 
 def held_out(errors: ErrorModel) -> HeldOut | None:
     """Return the tests left out in turn; None with fewer than three."""
-    data = errors.problem.data
-    tests = rows_of_tests(data)
+    tests = rows_of_tests(errors.problem.data)
     if len(tests) < FEWEST_TESTS:
         return None
     chosen = np.linspace(0, len(tests) - 1, min(len(tests), _MOST_TESTS)).round().astype(int)
-    units = errors.relative_units() / row_weights(errors.problem)[::2, None, None]
-    W = errors.components.covariance
-    parts, owner = [], []
+    W, found = errors.state.variances_covariance, []
     for number, rows in enumerate(tests[i] for i in chosen):
         index = (2 * rows[:, None] + np.arange(2)).ravel()
+        P, falls = errors.state.block(index)
         try:
-            D = np.asarray(np.linalg.inv(errors.rows.block(index)), dtype=np.float64)
+            D = np.linalg.inv(P)
         except np.linalg.LinAlgError:
             continue
-        turn = units[rows]
-
-        def own(matrix: FloatArray, turn: FloatArray = turn) -> FloatArray:
-            """Return the variances of ln gain and phase, (r, 2)."""
-            r = len(turn)
-            blocks = matrix.reshape(r, 2, r, 2)[np.arange(r), :, np.arange(r)]
-            return np.asarray(np.einsum("rai,rij,raj->ra", turn, blocks, turn))
-
-        missed = (D @ errors.rows.weighted[index]).reshape(-1, 2, 1)
-        variance = np.maximum(own(D), 0.0)
-        moves = np.array([own(np.asarray(D @ part @ D)) for part in errors.rows.falls(index)])
-        spread = np.einsum("kra,kl,lra->ra", moves, W, moves)
+        turn, r = errors.estimate.relative_units[rows], np.arange(len(rows))
+        blocks = np.concatenate([D[None], D @ falls @ D]).reshape(-1, len(r), 2, len(r), 2)
+        own = np.einsum("rai,rkij,raj->kra", turn, blocks[:, r, :, r], turn)
+        missed = turn @ (D @ errors.state.weighted[index]).reshape(-1, 2, 1)
+        variance = np.maximum(own[0], 0.0)
+        spread = np.einsum("kra,kl,lra->ra", own[1:], W, own[1:])
         with np.errstate(divide="ignore", invalid="ignore"):
             dof = np.where(spread > 0.0, np.maximum(2.0 * variance**2 / spread, 1.0), np.inf)
         std = np.sqrt(variance)
         std = np.where((std > 0.0) & (std < _WIDEST), std, np.nan)
-        parts.append((rows, (turn @ missed)[..., 0], std, dof))
-        owner.append(np.full(len(rows), number))
-    if not parts:
+        found.append((rows, np.full(len(rows), number), missed[..., 0], std, dof))
+    if not found:
         return None
-    found = (np.concatenate(column) for column in zip(*parts, strict=True))
-    rows, deviation, std, dof = found
-    return HeldOut(rows, np.concatenate(owner), deviation, std, dof, len(tests))
+    rows, test, deviation, std, dof = (np.concatenate(one) for one in zip(*found, strict=True))
+    return HeldOut(rows, test, deviation, std, dof, len(tests))
 
 
 @dataclass(frozen=True)

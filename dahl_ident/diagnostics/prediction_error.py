@@ -1,32 +1,41 @@
 r"""Error of a prediction of a measurement: parameters, model error, scatter, noise.
 
-At an operating point where the model's relative slopes by the parameters are j, ln gain and phase
-of the device are j delta + sum_k C_k u_k in addition to the model's, u_k the sources of
-:mod:`dahl_ident.diagnostics.error_model` and C_k what they do at that point. Their best linear
-prediction from the residuals y is lambda' y,
+At an operating point where the model's relative slopes with respect to the parameters are j, ln
+gain and phase of the device are -j delta + sum_k C_k u_k in addition to the model's, delta and u_k
+those of :mod:`dahl_ident.diagnostics.mixed_model` and C_k what a source does at that point. Their
+best linear prediction is how far the device is expected to depart from the model there, and with
+x = [-j, C_1, ...] its error has the covariance x K x'. Another test has a scatter and a noise of
+its own. Source: universal kriging, see Rasmussen and Williams, *Gaussian Processes*, 2006, section
+2.7.
 
-    lambda' = c' P - j G,    c' = sum_k s_k C_k Z_k',
-
-and misses by sum_k (lambda' Z_k - C_k) u_k: the model error goes on smoothly from the measured
-points, another test has a scatter and a noise of its own. The prediction lambda' y is how far the
-device is expected to depart from the model there. Source: universal kriging, see
-Rasmussen and Williams, *Gaussian Processes*, 2006, section 2.7.
+The model error also follows earlier data into later ones: C u, independent u of unit variance, are
+further parameters of measurements to come, and K^-1 is what earlier data say of all of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.diagnostics.error_model import ErrorModel, relative_units, row_weights
-from dahl_ident.diagnostics.error_sources import APART, NOISE, TESTS, Source, places
+from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.error_sources import (
+    MODEL_ERROR,
+    NOISE,
+    TESTS,
+    Source,
+    error_sources,
+    parts,
+    places,
+)
+from dahl_ident.diagnostics.estimate import row_weights
+from dahl_ident.diagnostics.mixed_model import MixedModel
 from dahl_ident.problem import Problem
 
 _LEAST_DOF = 1.0  # with fewer, quantiles of Student's t are beyond all use
+_NEGLIGIBLE = 0.1  # variance of the shapes left out over that of a row's noise
 
 
 class PredictionError(NamedTuple):
@@ -53,7 +62,7 @@ def prediction_error(
     errors : ErrorModel
         Of the fit.
     slopes : ndarray of complex, shape (n, Q)
-        Derivatives of the logarithm of what is predicted by theta.
+        Derivatives of the logarithm of what is predicted with respect to theta.
     amplitude, omega : ndarray, shape (n,)
         Where.
     stiffness : ndarray of complex, shape (n,) or None
@@ -65,110 +74,62 @@ def prediction_error(
     -------
     PredictionError
     """
-    n = len(slopes)
-    where = places(amplitude, omega)
-    here: list[FloatArray | None] = []
-    c = np.zeros((n, 2, len(errors.linear.y)))
-    for source, part, variance in zip(
-        errors.sources, errors.linear.Z, errors.variances.tolist(), strict=True
-    ):
-        changes = changes_there(source, errors.names, slopes, where, stiffness)
-        here.append(changes)
-        if changes is not None:
-            c += variance * changes @ part.T
-    lever = c @ errors.projection.P - _parts(slopes) @ errors.generalised  # (n, 2, m)
-    covariance = (lever * errors.linear.known) @ lever.swapaxes(1, 2)
-    squares = np.zeros((len(errors.sources), n))
-    for k, (source, part, changed) in enumerate(
-        zip(errors.sources, errors.linear.Z, here, strict=True)
-    ):
-        moved = lever * part if part.ndim == 1 else lever @ part
-        if changed is not None:
-            moved = moved - changed
-        own = moved @ moved.swapaxes(1, 2)
-        if of_a_test and source.own:
-            own = own + _own(source, errors, slopes)
-        squares[k] = np.trace(own, axis1=1, axis2=2)
-        covariance += errors.variances[k] * own
+    state, names = errors.state, errors.names
+    model, basis = state.model, errors.estimate.basis
+    where, own = places(amplitude, omega), parts(slopes)
+    X = np.zeros((len(slopes), 2, model.U.shape[1]))
+    X[..., : model.parameters] = -own if basis is None else -own @ basis.matrix
+    for k, source in enumerate(errors.sources):
+        made = source.changes(names, slopes, where, stiffness)
+        if made is not None:
+            X[..., model.columns(k)] = made
+    covariance, trace_slopes = state.prediction_variance(X)
     if TESTS in errors.contributions:
-        parts = _parts(slopes)
-        covariance += parts @ errors.contributions[TESTS] @ parts.swapaxes(1, 2)
-    total = np.trace(covariance, axis1=1, axis2=2)
+        covariance = covariance + own @ errors.contributions[TESTS] @ own.swapaxes(1, 2)
     if of_a_test:
-        near = _nearest(errors.problem, amplitude, omega)
-        first = errors.problem.data.harmonic == 1
         for k, source in enumerate(errors.sources):
-            if source.name in (NOISE, APART):
-                own = _noise(errors, source)
-                # a gross error may befall any test, once in as many as there are fundamentals
-                own = own[near] if source.name == NOISE else own[first].mean(axis=0)[None]
-                squares[k] += np.trace(own, axis1=1, axis2=2)
-                covariance += errors.variances[k] * own
-        if errors.problem.scale_known:
-            covariance += noise_near(errors.problem, errors.theta, amplitude, omega)
-        total = np.trace(covariance, axis1=1, axis2=2)
-    spread = np.einsum("kn,kl,ln->n", squares, errors.components.covariance, squares)
+            if source.own:
+                drawn = np.broadcast_to(source.drawn(names, slopes), covariance.shape)
+                covariance = covariance + errors.variances[k] * drawn
+                trace_slopes[model.noises + k] += np.trace(drawn, axis1=1, axis2=2)
+        near = _nearest(errors.problem, amplitude, omega)
+        noise = _row_noise(errors.estimate.relative_units[near])
+        covariance = covariance + errors.noises[0] * noise
+        trace_slopes[0] += np.trace(noise, axis1=1, axis2=2)
+        for k, source in enumerate(errors.sources):
+            if source.name == NOISE:
+                rows = source.columns[: errors.problem.n_residuals].reshape(
+                    -1, 2, errors.problem.data.n
+                )
+                drawn = _row_noise(errors.estimate.relative_units[near] @ rows[near])
+                covariance = covariance + errors.variances[k] * drawn
+                trace_slopes[model.noises + k] += np.trace(drawn, axis1=1, axis2=2)
+    total = np.trace(covariance, axis1=1, axis2=2)
+    spread = np.einsum("kn,kl,ln->n", trace_slopes, state.variances_covariance, trace_slopes)
     with np.errstate(divide="ignore", invalid="ignore"):
         dof = np.where(spread > 0.0, 2.0 * total**2 / spread, np.inf)
-    if errors.basis is not None:
-        covariance[~errors.basis.holds(_parts(slopes)).all(axis=1)] = np.inf
-    return PredictionError(lever @ errors.linear.y, covariance, np.maximum(dof, _LEAST_DOF))
+    if basis is not None:
+        covariance[~basis.holds(own).all(axis=1)] = np.inf
+    return PredictionError(X @ state.predicted, covariance, np.maximum(dof, _LEAST_DOF))
 
 
-def changes_there(
-    source: Source,
-    names: Sequence[str],
-    slopes: ComplexArray,
-    where: FloatArray,
-    stiffness: ComplexArray | None,
-) -> FloatArray | None:
-    """Return ln gain and phase that a source makes at other places, (n, 2, q), if it does."""
-    shapes, n = source.shapes, len(slopes)
-    if source.rate_of is not None:
-        name, centre = source.rate_of
-        away = (where.sum(axis=1) - centre)[:, None, None]
-        return np.asarray(_parts(slopes[:, [names.index(name)]]) * away)
-    if shapes is None or (shapes.parallel and stiffness is None):
-        return None
-    ratio = np.ones(n, dtype=np.complex128) if stiffness is None else stiffness
-    changes = _parts(shapes.changes(where, ratio).T)
-    return changes if source.absorbed is None else changes - _parts(slopes) @ source.absorbed
-
-
-def _parts(relative: ComplexArray) -> FloatArray:
-    """Return ln gain and phase of relative changes (n, q), shape (n, 2, q)."""
-    return np.stack([relative.real, relative.imag], axis=1)
-
-
-def _own(source: Source, errors: ErrorModel, slopes: ComplexArray) -> FloatArray:
-    """Return the covariance that a test's own draw of a scatter has at unit variance."""
-    if source.own in errors.names:
-        part = _parts(slopes[:, [errors.names.index(source.own)]])
-        return np.asarray(part @ part.swapaxes(1, 2))
-    return np.diag([float(source.own != "phase"), float(source.own != "gain")])
-
-
-def _noise(errors: ErrorModel, source: Source) -> FloatArray:
-    """Return the covariance of ln gain and phase of each row by a noise of unit variance."""
-    n, units = errors.problem.n_residuals // 2, errors.relative_units()
-    if source.columns.ndim == 1:
-        columns = source.columns / row_weights(errors.problem)  # of weighted residuals
-        units = units * columns.reshape(n, 1, 2)
-    else:
-        units = units @ source.columns.reshape(n, 2, -1)
+def _row_noise(units: FloatArray) -> FloatArray:
+    """Return the covariance of ln gain and phase by noise of unit variance, (n, 2, 2)."""
     return np.asarray(units @ units.swapaxes(1, 2))
 
 
-def noise_near(
+def stated_noise(
     problem: Problem, theta: FloatArray, amplitude: FloatArray, omega: FloatArray
 ) -> FloatArray:
     """Return the covariance of ln gain and phase that residuals of unit variance are, (n, 2, 2).
 
     That of the row which was measured nearest to each point.
     """
-    units = relative_units(problem, theta) / row_weights(problem)[::2, None, None]
-    units = units[_nearest(problem, amplitude, omega)]
-    return np.asarray(units @ units.swapaxes(1, 2))
+    predicted = problem.predict(theta)
+    sides = [-problem.residual_change(theta, f * predicted) for f in (1.0, 1j)]
+    weight = row_weights(problem)[::2, None, None]
+    units = np.linalg.pinv(np.stack([one.reshape(-1, 2) for one in sides], axis=-1)) / weight
+    return _row_noise(units[_nearest(problem, amplitude, omega)])
 
 
 def _nearest(problem: Problem, amplitude: FloatArray, omega: FloatArray) -> NDArray[np.intp]:
@@ -178,3 +139,91 @@ def _nearest(problem: Problem, amplitude: FloatArray, omega: FloatArray) -> NDAr
     there = places(view.amplitude, view.omega)[rows]
     apart = np.sum((places(amplitude, omega)[:, None] - there) ** 2, axis=-1)
     return np.asarray(rows[np.argmin(apart, axis=1)])
+
+
+class Departures(NamedTuple):
+    """Model error at places to come, and what earlier data say of it.
+
+    Attributes
+    ----------
+    columns : ndarray, shape (K, 2, W)
+        Changes of ln gain and phase at each place, at unit variance.
+    information : ndarray, shape (Q + W, Q + W)
+        Of theta and of the departures: earlier data, their priors, and the unit variances.
+    assumed : bool
+        Whether its variance is assumed, because residuals are too few to tell it from noise.
+    """
+
+    columns: FloatArray
+    information: FloatArray
+    assumed: bool
+
+
+def departures(
+    errors: ErrorModel,
+    slopes: ComplexArray,
+    amplitude: FloatArray,
+    omega: FloatArray,
+    stiffness: ComplexArray,
+) -> Departures | None:
+    """Return the model error of a fit at other places; None where it has none.
+
+    Where residuals are too few to tell it from noise, it is taken to be as large as the noise.
+
+    Parameters
+    ----------
+    errors : ErrorModel
+        Of the fit.
+    slopes : ndarray of complex, shape (K, Q)
+        Derivatives of ln R with respect to theta at the places.
+    amplitude, omega : ndarray, shape (K,)
+        The places.
+    stiffness : ndarray of complex, shape (K,)
+        Dynamic stiffness there.
+
+    Returns
+    -------
+    Departures or None
+    """
+    sized = {
+        _kind(source): variance
+        for source, variance in zip(errors.sources, errors.variances.tolist(), strict=True)
+        if source.name == MODEL_ERROR
+    }
+    assumed = not errors.distinguishes_noise
+    if assumed:
+        sized = {(False, ""): errors.rms(NOISE) ** 2}
+    if not any(sized.values()):
+        return None
+    where, estimate = places(amplitude, omega), errors.estimate
+    wider = [
+        (source, sized[_kind(source)] ** 0.5)
+        for source in error_sources(estimate, where)
+        if source.name == MODEL_ERROR and sized.get(_kind(source))
+    ]
+    made = [(s.changes(errors.names, slopes, where, stiffness), v) for s, v in wider]
+    there = np.concatenate([v * c for c, v in made if c is not None], axis=-1)
+    missed = np.concatenate([v * source.columns for source, v in wider], axis=-1)
+    n = errors.problem.n_residuals // 2
+    rows = estimate.relative_units @ missed[: 2 * n].reshape(n, 2, -1)
+    every = np.concatenate([rows, there]).reshape(-1, there.shape[-1])
+    _, singular, turned = np.linalg.svd(every, full_matrices=False)
+    noise = float(errors.noises[0]) * errors.noise_square
+    left = np.cumsum(singular[::-1] ** 2)[::-1] / len(every)
+    turned = turned[left > _NEGLIGIBLE * noise].T
+    others = [k for k, source in enumerate(errors.sources) if source.name != MODEL_ERROR]
+    model, noises = errors.state.model, errors.state.model.noises
+    Z = [errors.sources[k].columns for k in others]
+    # residuals fall where a prediction rises
+    X = np.hstack([-estimate.jacobian, missed @ turned])
+    most = np.array([errors.sources[k].largest for k in others])
+    joint = MixedModel(estimate.y, X, Z, model.group, model.known, noises, most)
+    kept = errors.state.variances[[*range(noises), *(noises + np.array(others, dtype=np.intp))]]
+    prior = np.repeat([0.0, 1.0], [len(errors.names), turned.shape[1]])
+    return Departures(
+        there @ turned, joint.information_of_parameters(kept) + np.diag(prior), assumed
+    )
+
+
+def _kind(source: Source) -> tuple[bool, str]:
+    return source.parallel, "" if source.rate_of is None else source.rate_of[0]

@@ -13,8 +13,8 @@ from dahl_ident.arrays import FloatArray, positive_array
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget, BudgetRow, ParameterBudget, coverage_factor
 from dahl_ident.diagnostics.correlated_residuals import sandwich
-from dahl_ident.diagnostics.error_model import EXPONENT
 from dahl_ident.diagnostics.error_sources import RUNS
+from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.formatting import listed
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.record_sources import (

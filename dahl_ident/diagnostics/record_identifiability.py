@@ -9,8 +9,8 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
-from dahl_ident.diagnostics.error_model import EXPONENT
 from dahl_ident.diagnostics.error_sources import RUNS
+from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.record_errors import MODEL
 from dahl_ident.elements import Model

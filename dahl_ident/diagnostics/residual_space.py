@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.diagnostics.misfit_share import WeightedEstimate
+from dahl_ident.diagnostics.estimate import WeightedEstimate
 from dahl_ident.diagnostics.run_deviations import Linearization, RunDeviations, linearization
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import loss_named

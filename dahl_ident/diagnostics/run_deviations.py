@@ -1,13 +1,7 @@
-r"""Residuals linearised where each run is: the deviations of runs may exceed what is linear.
+"""Residuals of each run at its own parameters.
 
 A force limit that differs by 5 % from day to day bends the response by second-order terms of
-0.1 %, more than a quiet sensor's noise. So run i has a deviation b_i of the parameters, gain and
-phase that scatter, and its residuals are expanded there,
-
-    y_i(theta) ~ r_i(theta + b_i) - (dr_i/db) b_i,
-
-with b_i the best linear predictions of the last expansion. Source: Lindstrom and Bates, *Nonlinear
-mixed effects models for repeated measures data*, Biometrics 46 (1990) 673.
+0.1 %, more than a quiet sensor's noise: residuals within runs are those at the run's parameters.
 """
 
 from __future__ import annotations
@@ -20,8 +14,6 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.problem import Problem
-
-_CLOSE = 1e-3  # of a deviation b: the expansion leaves out b times this, 1e-4 where b is 10 %
 
 
 @dataclass(frozen=True)
@@ -43,24 +35,6 @@ class RunDeviations:
     gain: FloatArray
     phase: FloatArray
 
-    @classmethod
-    def none(cls, labels: NDArray[np.str_], parameters: int) -> RunDeviations:
-        """Return those of runs that are all alike."""
-        runs = np.unique(labels)
-        return cls(runs, np.zeros((len(runs), parameters)), *np.zeros((2, len(runs))))
-
-    def about(self, moved: FloatArray, columns: Sequence[int]) -> RunDeviations:
-        """Return the same runs as deviations from a theta moved so far, in some of its columns."""
-        return replace(self, theta=self.theta[:, columns] - moved)
-
-
-def alike(one: RunDeviations | None, other: RunDeviations | None) -> bool:
-    """Return whether the residuals' expansion about one holds for the other."""
-    if one is None or other is None:
-        return one is other
-    first, second = (np.column_stack([r.theta, r.gain, r.phase]) for r in (one, other))
-    return bool(np.abs(second - first).max() <= _CLOSE * np.abs(second).max())
-
 
 @dataclass(frozen=True)
 class Linearization:
@@ -70,8 +44,6 @@ class Linearization:
     ----------
     residuals : ndarray, shape (m,)
         Residuals of each run at its own parameters.
-    y : ndarray, shape (m,)
-        The same, taken linearly to theta.
     J : ndarray, shape (m, Q)
         Their derivatives with respect to theta.
     predicted : ndarray of complex, shape (n,)
@@ -83,7 +55,6 @@ class Linearization:
     """
 
     residuals: FloatArray
-    y: FloatArray
     J: FloatArray
     predicted: ComplexArray
     fitted: ComplexArray
@@ -106,8 +77,8 @@ def linearization(
         y, J = problem.residuals_and_jacobian(theta, tails=False)
         every = np.ones(m // 2, dtype=bool)
         R = problem.predict(theta)
-        return Linearization(y[:m], y[:m], J[:m], R, R, [(problem, every, theta)])
-    residuals, y = np.zeros((2, m))
+        return Linearization(y[:m], J[:m], R, R, [(problem, every, theta)])
+    residuals = np.zeros(m)
     J = np.zeros((m, len(theta)))
     predicted, fitted = np.zeros((2, m // 2), dtype=np.complex128)
     labels, parts = np.asarray(problem.data.run), []
@@ -124,7 +95,6 @@ def linearization(
         at, by = at[: 2 * own.n], by[: 2 * own.n]
         predicted[rows] = part.predict(there)
         fitted[rows] = predicted[rows] * np.exp(deviation)
-        moved = part.residual_change(there, predicted[rows] * deviation)
-        residuals[both], y[both], J[both] = at, at - by @ shift - moved, by
+        residuals[both], J[both] = at, by
         parts.append((part, rows, there))
-    return Linearization(residuals, y, J, predicted, fitted, parts)
+    return Linearization(residuals, J, predicted, fitted, parts)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from dahl_ident.bayes.row_errors import RowErrors
-from dahl_ident.diagnostics.error_model import ErrorModel, row_weights
+from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.error_sources import NOISE, RUNS
+from dahl_ident.diagnostics.estimate import row_weights
 
-_LEAST_NOISE = 1e-8  # of the mean variance: what is shared may explain all that residuals show
+_SAME = 1e-6  # of the noise's variance: as stated
 
 
 def row_errors(errors: ErrorModel) -> RowErrors | None:
@@ -24,52 +25,56 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
     RowErrors or None
         None where noise of one scale is the only source.
     """
-    problem, linear = errors.problem, errors.linear
-    counted = tuple(dict.fromkeys((NOISE, *(s.name for s in errors.sources))))
-    sizes = errors.variances.tolist()
-    given = [k for k, variance in enumerate(sizes) if variance > 0.0]
-    plain = all(errors.sources[k].columns.ndim == 1 for k in given)
-    alike = plain and len(given) == 1 and np.ptp(errors.sources[given[0]].columns) == 0.0
-    if alike != problem.scale_known and len(given) == int(alike):
+    problem, estimate, m = errors.problem, errors.estimate, errors.problem.n_residuals
+    as_stated = estimate.misfit == 0.0 and (errors.noises < 1.0 + _SAME).all()
+    if not errors.sources and (as_stated or not problem.scale_known):
         return None
-    m, rotation = problem.n_residuals, linear.rotation
-    r = m if rotation is None else rotation.shape[1]
-    noise, shared = np.diag(linear.known[:r]), np.zeros((r, r))
-    for k in given:
-        part = linear.Z[k][:r]
-        own = np.diag(part**2) if part.ndim == 1 else part @ part.T
-        target = noise if errors.sources[k].name == NOISE else shared
-        target += sizes[k] * own
-    whole = float(np.diagonal(noise + shared).mean())
-    noise[np.diag_indices(r)] += _LEAST_NOISE * whole
-    unit = 1.0 if problem.scale_known else float(np.diagonal(noise).mean())
-    L = np.linalg.cholesky(noise / unit)
-    half = np.linalg.solve(L, shared / unit)
+    counted = tuple(dict.fromkeys((NOISE, *(s.name for s in errors.sources))))
+    # residuals in units of the noise that each row has of its own, or of an unknown scale
+    known = problem.scale_known
+    unit, size = (1.0, 1.0) if known else (errors.noises[0], 1.0 / estimate.factors[0, 0, 0])
+    root = np.sqrt(unit * errors.state.weights[errors.state.model.group[:m]])
+    jacobian = size * root[:, None] * estimate.columns[:m]
+    columns = [
+        v**0.5 * root[:, None] * s.columns[:m]
+        for v, s in zip(errors.variances.tolist(), errors.sources, strict=True)
+    ]
+    inside = None
+    every = np.hstack([jacobian, *columns])
+    if m > 2 * every.shape[1]:
+        inside, _ = np.linalg.qr(every)
+        columns = [inside.T @ one for one in columns]
+    r = m if inside is None else inside.shape[1]
+    noise, shared = np.eye(r), np.zeros((r, r))
+    for source, part in zip(errors.sources, columns, strict=True):
+        target = noise if source.name == NOISE else shared
+        target += part @ part.T / unit
+    L = np.linalg.cholesky(noise)
+    half = np.linalg.solve(L, shared)
     ratios, vectors = np.linalg.eigh(np.linalg.solve(L, half.T))
     turn = np.linalg.solve(L, np.eye(r)).T @ vectors
-    turn = turn.T if rotation is None else turn.T @ rotation.T
-    outside = linear.outside_variance(errors.variances) / unit if linear.outside[1] else 1.0
-    volume = -float(np.log(np.diagonal(L)).sum()) - 0.5 * linear.outside[1] * np.log(outside)
-    weight = row_weights(problem)
-    differing = {errors.sources[k].own for k in given if errors.sources[k].name == RUNS}
+    turn = turn.T if inside is None else turn.T @ inside.T
+    volume = -float(np.log(np.diagonal(L)).sum())
+    differing = {s.own for s in errors.sources if s.name == RUNS}
     scatters = np.array([name in differing for name in errors.names])
-    plain_y, _ = problem.residuals_and_jacobian(errors.theta, tails=False)
-    jacobian = errors.jacobian[:m]
+    factors = (
+        size * root.reshape(-1, 2, 1) * estimate.factors * row_weights(problem).reshape(-1, 1, 2)
+    )
+    volume += float(np.log(np.abs(np.linalg.det(factors))).sum())
+    _, slopes = problem.residuals_and_jacobian(errors.theta, tails=False)
     return RowErrors(
         counted,
         turn,
         np.maximum(ratios, 0.0),
         volume,
-        weight * (errors.near.y - plain_y[:m]),
-        weight,
+        factors,
         *_dof_and_share(errors),
-        jacobian if errors.basis is None else jacobian @ errors.basis.matrix,
-        weight * errors.near.y,
-        problem.scale_known,
+        jacobian,
+        size * root * estimate.y[:m],
+        known,
         np.where(scatters, errors.theta, np.nan),
-        np.where(scatters, errors.near.J, 0.0),
-        rotation if linear.outside[1] else None,
-        outside,
+        np.where(scatters, slopes[:m], 0.0),
+        inside,
     )
 
 

@@ -30,8 +30,9 @@ from dahl_ident.diagnostics.advice import advice
 from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.combinations import Candidate, candidates, runaway, stiffness_seen
 from dahl_ident.diagnostics.confidence_levels import LEVELS, percent, thresholds
-from dahl_ident.diagnostics.error_model import EXPONENT, ErrorModel
+from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.error_sources import RUNS
+from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.formatting import interval as interval_text
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import Information, shares
@@ -526,7 +527,7 @@ def _combined_std(
     candidate: Candidate, optimum: Optimum, errors: ErrorModel | None, by_noise: float
 ) -> float:
     """Return the relative standard uncertainty of a combination from every source known."""
-    if errors is None or errors.basis is not None:
+    if errors is None or errors.estimate.basis is not None:
         return by_noise
     direction = np.zeros(len(errors.names))
     direction[[errors.names.index(name) for name in optimum.names]] = candidate.direction

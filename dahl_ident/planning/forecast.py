@@ -1,6 +1,6 @@
 """What measurements at candidates would determine, in addition to what earlier data did.
 
-The model error of an earlier fit (:mod:`dahl_ident.diagnostics.departures`) enters as W further
+The model error of an earlier fit (:mod:`dahl_ident.diagnostics.prediction_error`) enters as W more
 parameters, shared by earlier and later levels: a level close to a measured one then teaches
 little, however long it is measured.
 """
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.quantities import DEFINITIONS
 from dahl_ident.diagnostics.budget import coverage_factor
-from dahl_ident.diagnostics.departures import Departures, departures
+from dahl_ident.diagnostics.prediction_error import Departures, departures
 from dahl_ident.planning.candidates import Candidates
 from dahl_ident.planning.criteria import NOTHING, Term
 from dahl_ident.planning.knowledge import Knowledge

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray, finite_array
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.diagnostics.departures import noise_of_rows, scatter_of_runs
 from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.error_sources import NOISE, RUNS
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError, choices
@@ -272,8 +272,8 @@ def _of_errors(
     return Knowledge(
         model, given.sensors, given.data.motion, parameters, _within(drawn, parameters),
         np.broadcast_to(known, (draws, *known.shape)), np.diag(prior), tuple(assumed),
-        float(np.hypot(stated, noise_of_rows(errors))), cycles, errors.problem,
-        scatter_of_runs(errors), errors, steady=given.steady,
+        float(np.hypot(stated, errors.rms(NOISE))), cycles, errors.problem,
+        errors.rms(RUNS), errors, steady=given.steady,
     )  # fmt: skip
 
 

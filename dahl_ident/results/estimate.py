@@ -27,7 +27,7 @@ from dahl_ident.bayes.walker_start import (
 from dahl_ident.data import FrequencyResponse, Record, read_frequency_response
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.rows import row_names
-from dahl_ident.diagnostics.error_model import EXPONENT, with_assumed
+from dahl_ident.diagnostics.estimate import EXPONENT, with_assumed
 from dahl_ident.diagnostics.shared_errors import row_errors
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model

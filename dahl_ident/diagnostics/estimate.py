@@ -13,17 +13,24 @@ Journal of Research of the National Bureau of Standards 87 (1982) 377.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.diagnostics.determined_directions import Basis
+from dahl_ident.diagnostics.determined_directions import Basis, chart_of_limit
+from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
+from dahl_ident.problem.stiffness import StiffnessData
 
+EXPONENT = "exponent"
+DRIVE = "drive factor"
+GAIN = "force_gain"
 _STEPS = 60  # Gauss-Newton steps; five are the rule
 _SETTLED = 1e-5  # of a standard deviation that a step still moves the estimate
 _LONGEST_STEP = 0.7  # of a logarithm, in one step: the model is linearised
@@ -32,8 +39,28 @@ _ROOT_STEPS = 200  # Newton's, from below, for the misfit: it doubles where it i
 _LEAST_LEFT = 1e-3  # of a test, that the others do not determine
 _SAME = 1e-9  # relative change of the misfit's square that no longer counts
 
-Rows = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""Residuals (M,) and their derivatives (M, Q) at theta: data first, then priors of unit variance"""
+
+class Assumption(NamedTuple):
+    """A parameter held at a value that has an uncertainty: its source, and that of its log."""
+
+    source: str
+    std: float
+
+
+def with_assumed(problem: Problem) -> tuple[Problem, dict[str, Assumption]]:
+    """Return the problem with what was assumed free: exponents, and the factor of the drive."""
+    assumed = {
+        p.name: Assumption(EXPONENT, float(np.log(p.prior[1] / p.prior[0]) / np.sqrt(12.0)))
+        for p in problem.model.parameters
+        if p.assumed and not p.free and p.prior is not None
+    }
+    u = problem.data.drive_factor_uncertainty
+    gain = next(p for p in problem.sensors.parameters if p.name == GAIN)
+    if u and not gain.free:
+        assumed[gain.name] = Assumption(DRIVE, float(u))
+    if not assumed:
+        return problem, {}
+    return problem.assuming({name: one.std for name, one in assumed.items()}), assumed
 
 
 @dataclass(frozen=True)
@@ -42,89 +69,114 @@ class WeightedEstimate:
 
     Attributes
     ----------
+    problem : Problem
+        The assumed exponents free.
     theta : ndarray, shape (Q,)
         The estimate, search coordinates.
     misfit : float
         Share s of the fundamental force of a row's test.
     factors : ndarray, shape (n, 2, 2)
         What takes each row's residuals to unit variance.
+    y : ndarray, shape (M,)
+        Residuals of data, then of priors, of unit variance.
+    jacobian : ndarray, shape (M, Q)
+        Their derivatives.
+    basis : Basis or None
+        Changes of theta that the data determine at all; None where that is every one.
     """
 
+    problem: Problem
     theta: FloatArray
     misfit: float
     factors: FloatArray
+    y: FloatArray
+    jacobian: FloatArray
+    basis: Basis | None = None
+
+    @property
+    def columns(self) -> FloatArray:
+        """Derivatives with respect to what the data determine, (M, r)."""
+        return self.jacobian if self.basis is None else self.jacobian @ self.basis.matrix
 
     def weighted(self, rows: FloatArray) -> FloatArray:
-        """Return residuals (M,), or columns (M, q), with their weights."""
+        """Return residuals (M,), or columns (M, q), as of unit variance."""
         return _weighted(self.factors, rows)
 
-    def lever(self, J: FloatArray, kept: NDArray[np.bool_] | None = None) -> FloatArray:
-        """Return G = (J' W J)^-1 J' W, shape (q, M), for columns J (M, q), of the rows `kept`."""
-        own = self.weighted(J)
-        if kept is not None:
-            own = own * kept[:, None]
-        Q, R = np.linalg.qr(own)
-        found = np.linalg.solve(R, Q.T)
-        return _weighted(self.factors.swapaxes(1, 2), found.T).T
+    def changed(self, changes: ComplexArray) -> FloatArray:
+        """Return what changes (k, n) of the measured responses add to `y`, (M, k)."""
+        weight = row_weights(self.problem)[:, None]
+        columns = -self.problem.residual_change(self.theta, changes).T * weight
+        return np.pad(self.weighted(columns), ((0, self.problem.n_priors), (0, 0)))
 
-    def jackknife(
-        self,
-        J: FloatArray,
-        y: FloatArray,
-        tests: Sequence[NDArray[np.intp]],
-        bounds: tuple[FloatArray, FloatArray],
+    @cached_property
+    def predicted(self) -> ComplexArray:
+        """Predicted responses, (n,)."""
+        return self.problem.predict(self.theta)
+
+    @cached_property
+    def view(self) -> StiffnessData:
+        """Amplitude, frequency and dynamic stiffness of the predicted rows."""
+        return self.problem.predicted_stiffness(self.theta)
+
+    @cached_property
+    def relative_units(self) -> FloatArray:
+        """What takes each row of `y` to ln gain and phase, shape (n, 2, 2)."""
+        both = self.changed(np.array([1.0, 1.0j])[:, None] * self.predicted)
+        units = np.linalg.pinv(both[: self.problem.n_residuals].reshape(-1, 2, 2))
+        return np.asarray(units, dtype=np.float64)
+
+    def lever(
+        self, columns: FloatArray | None = None, kept: NDArray[np.bool_] | None = None
     ) -> FloatArray:
+        """Return G = (J'J)^-1 J' (r, M), for other columns or of some rows."""
+        J = self.columns if columns is None else columns
+        Q, R = np.linalg.qr(J if kept is None else J * kept[:, None])
+        return np.linalg.solve(R, Q.T)
+
+    def jackknife(self, tests: Sequence[NDArray[np.intp]]) -> FloatArray:
         """Return the covariance of theta by leaving out each test, (Q, Q), to first order.
 
         Each counts with the root of its leverage, so that the sum is without bias where the
         weights are right. Source: Wu, Annals of Statistics 14 (1986) 1261.
         """
-        J, y = self.weighted(J), self.weighted(y)
-        Q, R = np.linalg.qr(J)
+        Q, R = np.linalg.qr(self.jacobian)
         moves = []
         for size in {len(rows) for rows in tests}:
             rows = np.array([rows for rows in tests if len(rows) == size])
             own = (2 * rows[:, :, None] + np.arange(2)).reshape(len(rows), -1)
             left, turn = np.linalg.eigh(np.eye(2 * size) - Q[own] @ Q[own].swapaxes(1, 2))
-            along = np.einsum("bij,bi->bj", turn, y[own]) / np.sqrt(np.maximum(left, _LEAST_LEFT))
+            along = np.einsum("bij,bi->bj", turn, self.y[own])
+            along = along / np.sqrt(np.maximum(left, _LEAST_LEFT))
             moves.append(np.einsum("biq,bij,bj->bq", Q[own], turn, along))
         each = np.linalg.solve(R, np.concatenate(moves).T).T
-        low, high = (bound - self.theta for bound in bounds)
-        each = np.clip(each, low, high)
+        each = np.clip(each, *(bound - self.theta for bound in self.problem.bounds()))
         return np.asarray(each.T @ each)
 
 
-def weighted_estimate(
-    problem: Problem,
-    rows: Rows,
-    theta: FloatArray,
-    dof: int,
-    basis: Basis | None = None,
-) -> WeightedEstimate:
-    """Return the estimate, searched from theta.
+def weighted_estimate(optimum: Optimum, problem: Problem, *, determined: bool) -> WeightedEstimate:
+    """Return the estimate, searched from an optimum.
 
     Parameters
     ----------
+    optimum : Optimum
+        Of the search.
     problem : Problem
-        Its noise is that of the rows.
-    rows : callable
-        Returns residuals and derivatives.
-    theta : ndarray, shape (Q,)
-        Where to start.
-    dof : int
-        Degrees of freedom: of the data where their scale is unknown, else those of priors too.
-    basis : Basis, optional
-        Directions that the data determine, where these are not all.
-
-    Returns
-    -------
-    WeightedEstimate
+        The same with the assumed exponents free.
+    determined : bool
+        Whether the optimum is finite and every parameter determined.
     """
-    m = problem.n_residuals
-    y, J = rows(theta)
+    known = dict(zip(optimum.names, optimum.theta, strict=True))
+    theta = np.array([known.get(p.name, np.log(p.value or 1.0)) for p in problem.parameters])
+    m, dof = problem.n_residuals, problem.n_numbers - len(problem.names)
+    y, J = _rows(problem, theta)
+    basis = None
+    if not determined:
+        basis = Basis.of(J, theta, chart_of_limit(optimum, problem))
+    last: FloatArray | None = None
     for _ in range(_STEPS):
         misfit, factors = _weights(problem, theta, y, m, dof)
-        columns = J if basis is None else J @ basis.at(theta).matrix
+        basis = None if basis is None else basis.at(theta)
+        columns = J if basis is None else J @ basis.matrix
         weighted, residuals = _weighted(factors, columns), _weighted(factors, y)
         step = np.linalg.lstsq(weighted, -residuals, rcond=1e-13)[0]
         size = np.linalg.norm(weighted @ step)
@@ -132,10 +184,13 @@ def weighted_estimate(
             raise np.linalg.LinAlgError("no finite step from the estimate")
         if size < _SETTLED:
             break
+        moved = weighted @ step
+        further = _further(moved, last)
+        step, last = further * step, moved if further == 1.0 else None
         cost, length = float(residuals @ residuals), 1.0
         for _ in range(_HALVINGS):
             trial = _moved(problem, theta, np.asarray(length * step), basis)
-            other, by = rows(trial)
+            other, by = _rows(problem, trial)
             value = _weighted(factors, other)
             if np.isfinite(value).all() and value @ value < cost:
                 break
@@ -143,7 +198,34 @@ def weighted_estimate(
         else:
             break
         theta, y, J = trial, other, by
-    return WeightedEstimate(theta, misfit, factors)
+    if not np.isfinite(y).all():
+        raise np.linalg.LinAlgError("a drive beyond the force limit has no steady response")
+    return WeightedEstimate(
+        problem, theta, misfit, factors, _weighted(factors, y), _weighted(factors, J),
+        None if basis is None else basis.at(theta),
+    )  # fmt: skip
+
+
+def _further(moved: FloatArray, last: FloatArray | None) -> float:
+    """Return the factor of a step that the one before says is one of a geometric series."""
+    ratio = 0.0 if last is None else float(moved @ last) / max(float(last @ last), TINY)
+    return 1.0 / (1.0 - ratio) if 0.0 < ratio <= 0.5 else 1.0
+
+
+def _rows(problem: Problem, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return residuals and derivatives: data, then priors."""
+    y, J = problem.residuals_and_jacobian(theta, tails=False)
+    weight = np.concatenate([row_weights(problem), np.ones(problem.n_priors)])
+    return y * weight, J * weight[:, None]
+
+
+def row_weights(problem: Problem) -> FloatArray:
+    """Return the root of what an estimated covariance counts each residual for, (m,)."""
+    weight, dof = np.ones(problem.n_residuals), problem.data.dof
+    if not problem.gaussian and dof is not None:
+        nu = np.minimum(dof, 1e12)  # a covariance of few dof: the variance of Student's t
+        weight = np.repeat(np.sqrt((nu - 2.0) / nu), 2)
+    return weight
 
 
 def fundamental_size(data: FrequencyResponse) -> FloatArray:
@@ -164,6 +246,7 @@ def _weights(
 ) -> tuple[float, FloatArray]:
     """Return the misfit, and the factors of the weights."""
     n = m // 2
+    dof = dof + problem.n_priors * problem.scale_known
     if not problem.scale_known:
         scale = max(float(np.sqrt(y[:m] @ y[:m] / max(dof, 1))), float(problem.rounding), 1e-300)
         return 0.0, np.broadcast_to(np.eye(2) / scale, (n, 2, 2))

@@ -1,0 +1,329 @@
+r"""Linear mixed models: variances of several sources of error, and what follows from them.
+
+Residuals y = J delta + sum_k Z_k u_k + e: parameters delta, independent numbers u_k of the variance
+s_k for each source, and noise e of known and estimated variance in each group of rows. The
+variances maximise the restricted likelihood (REML). All that it needs follows from Henderson's
+equations,
+
+    K = (U' D^-1 U + diag(0, 1/s))^-1,    U = [J Z],    P = D^-1 - D^-1 U K U' D^-1,
+
+D the variance of e: K is the covariance of the errors of delta by generalised least squares and of
+the predicted u. U enters by its cross-products in each group, so many rows cost as much as few.
+With V_k = Z_k Z_k',
+
+    gradient_k = (y'P V_k P y - tr P V_k)/2,    information_kl = tr(P V_k P V_l)/2,
+
+and a scoring step solves information s = gradient + information s_last for s >= 0. Source:
+Henderson, Biometrics 31 (1975) 423; Searle, Casella and McCulloch, *Variance Components*, 1992.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, optimize, special
+
+from dahl_ident.arrays import TINY, FloatArray
+
+_STEPS = 40  # at most; the likelihood rises in each, so the last is the best
+_LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.02)  # of a scoring step, until the likelihood rises
+_CLOSE = 1e-3  # rise of the log-likelihood that no longer matters
+_LEAST_NOISE = 1e-8  # of the mean square of the residuals: K stays finite
+_UNSEEN = 1e-100  # root of the information on a variance of which nothing is known
+_ALIKE = 1e-9  # added to correlations of one: sources that do the same share a variance
+
+
+class MixedModel:
+    """Residuals, and the columns of parameters and sources.
+
+    Parameters
+    ----------
+    y : ndarray, shape (m,)
+        Residuals.
+    J : ndarray, shape (m, P)
+        Their derivatives with respect to the parameters.
+    Z : sequence of ndarray, shape (m, q)
+        Columns of each of K sources.
+    group : ndarray of int, shape (m,)
+        Group of each row, numbered from 0: G of noise to be estimated, then any of known noise.
+    known : ndarray
+        Known variance of the noise in every group.
+    groups : int
+        G.
+    most : ndarray, shape (K,)
+        Largest variance of each source.
+    """
+
+    def __init__(
+        self,
+        y: FloatArray,
+        J: FloatArray,
+        Z: Sequence[FloatArray],
+        group: NDArray[np.intp],
+        known: FloatArray,
+        groups: int,
+        most: FloatArray,
+    ) -> None:
+        self.most = np.concatenate([np.full(groups, np.inf), most])
+        self.y, self.U, self.group, self.known = y, np.hstack([J, *Z]), group, known
+        self.parameters, self.noises = J.shape[1], groups
+        sizes = [z.shape[1] for z in Z]
+        self.starts = (self.parameters + np.cumsum([0, *sizes]))[:-1].astype(np.intp)
+        self.source = np.repeat(np.arange(len(Z)), sizes)
+        self.counts = np.bincount(group, minlength=len(known)).astype(np.float64)
+        every = np.column_stack([self.U, y])
+        rows = [every[group == g] for g in range(len(known))]
+        self.grams = np.array([part.T @ part for part in rows])
+
+    @property
+    def count(self) -> int:
+        """Number of variances: of G noises, then of K sources."""
+        return self.noises + len(self.starts)
+
+    def columns(self, k: int) -> slice:
+        """Return the columns of U that are source k's."""
+        ends = [*self.starts.tolist(), self.U.shape[1]]
+        return slice(ends[k], ends[k + 1])
+
+    def at(self, variances: FloatArray) -> State:
+        """Return the model at these variances."""
+        return State(self, variances)
+
+    def information_of_parameters(self, variances: FloatArray) -> FloatArray:
+        """Return J' V^-1 J, (P, P), where the parameters need not be determined."""
+        P, G, noise = self.parameters, self.noises, self.known.copy()
+        noise[:G] += variances[:G]
+        M = np.tensordot(1.0 / noise, self.grams, 1)[:-1, :-1]
+        root = np.sqrt(variances[G:])[self.source]
+        Z = M[:, P:] * root
+        inner = np.eye(len(root)) + root[:, None] * Z[P:]
+        return np.asarray(M[:P, :P] - Z[:P] @ np.linalg.solve(inner, Z[:P].T))
+
+    def reml(self, chance: FloatArray) -> State:
+        """Return the state of the highest restricted likelihood.
+
+        Parameters
+        ----------
+        chance : ndarray, shape (K,)
+            Share of tables in which noise alone may make each source appear. A source stays out
+            unless its score, all others counted, exceeds what so many tables of noise make.
+        """
+        G = self.noises
+        free = np.where(np.concatenate([np.ones(G), chance]) < 1.0, 0.0, self.most)
+        total = max(float(self.y @ self.y) / max(len(self.y) - self.parameters, 1), TINY)
+        start = np.zeros(self.count)
+        start[:G] = total
+        least = np.zeros(self.count)
+        least[:G] = _LEAST_NOISE * total
+        state = self._highest(start, least, free, np.zeros(self.count))
+        doubtful = np.flatnonzero(np.concatenate([np.zeros(G), chance < 1.0]))
+        if not len(doubtful):
+            return state
+        F, sure = state.information, np.flatnonzero(state.variances > 0.0)
+        shared = np.linalg.lstsq(F[np.ix_(sure, sure)], F[np.ix_(sure, doubtful)], rcond=1e-12)[0]
+        own = np.diagonal(F)[doubtful] - np.sum(F[np.ix_(sure, doubtful)] * shared, axis=0)
+        price = np.zeros(self.count)
+        q = state.degrees[doubtful - G]  # a score is distributed nearly as chi-square of q
+        beyond = (special.chdtri(q, chance[doubtful - G]) - q) / np.sqrt(2.0 * q)
+        price[doubtful] = beyond * np.sqrt(np.maximum(own, 0.0))
+        free = self.most.copy()
+        asked = self._highest(state.variances, least, free, price)
+        free[doubtful] = np.where(asked.variances[doubtful] > 0.0, free[doubtful], 0.0)
+        return self._highest(asked.variances, least, free, np.zeros(self.count))
+
+    def _highest(
+        self, s: FloatArray, least: FloatArray, most: FloatArray, price: FloatArray
+    ) -> State:
+        """Return the state of the highest likelihood less price . s, from s on."""
+        state = self.at(s)
+        for _ in range(_STEPS):
+            before = state.log_likelihood - price @ s
+            aim = np.clip(state.scored(price, most > least), least, most)
+            if (state.gradient - price) @ (aim - s) < _CLOSE:
+                break
+            for length in _LENGTHS:
+                trial = self.at(s + length * (aim - s))
+                rise = trial.log_likelihood - price @ trial.variances - before
+                if rise > 0.0:
+                    break
+            else:
+                break
+            s, state = trial.variances, trial
+            if rise < _CLOSE:
+                break
+        return state
+
+
+class State:
+    """A mixed model at given variances."""
+
+    def __init__(self, model: MixedModel, variances: FloatArray) -> None:
+        self.model, G = model, model.noises
+        self.variances = variances
+        noise = model.known.copy()
+        noise[:G] += self.variances[:G]
+        self.weights = 1.0 / noise
+        M = np.tensordot(self.weights, model.grams, 1)
+        P, c = model.parameters, len(M) - 1
+        units = np.ones(c)
+        units[:P] = 1.0 / np.sqrt(np.maximum(np.diagonal(M)[:P], TINY))
+        units[P:] = np.sqrt(self.variances[G:])[model.source]
+        C = units[:, None] * M[:c, :c] * units
+        C[range(P, c), range(P, c)] += 1.0
+        L, singular = linalg.lapack.dpotrf(C, lower=1)
+        if singular or not np.isfinite(C).all():
+            raise np.linalg.LinAlgError("a parameter has no effect on the residuals")
+        inverse = linalg.lapack.dpotri(L, lower=1)[0]
+        inverse = inverse + inverse.T  # the other triangle is zero
+        inverse[range(c), range(c)] *= 0.5
+        self.K = units[:, None] * inverse * units
+        """Covariance of the errors of delta by generalised least squares, and of u, (c, c)."""
+        self._left = np.eye(c + 1)
+        self._left[:c] -= self.K @ M[:c]
+        self._left[:, :P] = 0.0  # exact: P J is zero, and I - K M is K diag(0, 1/s)
+        shown = P + np.flatnonzero(units[P:] > 0.0)
+        self._left[:c, shown] = self.K[:, shown] / units[shown] ** 2
+        self._Q = M @ self._left  # [U y]' P [U y]
+        self.log_likelihood = 0.5 * float(
+            model.counts @ np.log(self.weights) - self._Q[-1, -1]
+        ) - float(np.log(np.diagonal(L)).sum() - np.log(units[:P]).sum())
+
+    @cached_property
+    def _by_noise(self) -> list[tuple[FloatArray, FloatArray]]:
+        """For each noise, K A and the diagonal of [U y]' P P [U y] over its rows."""
+        found = []
+        for A in self.model.grams[: self.model.noises]:
+            AE = A @ self._left
+            found.append((self.K @ A[:-1, :-1], np.sum(self._left * AE, axis=0)))
+        return found
+
+    @cached_property
+    def gradient(self) -> FloatArray:
+        """Derivatives of the log-likelihood."""
+        model, w = self.model, self.weights
+        noise = [
+            w[g] ** 2 * (square[-1] + np.trace(KA)) - w[g] * model.counts[g]
+            for g, (KA, square) in enumerate(self._by_noise)
+        ]
+        part = self._Q[-1, model.parameters : -1] ** 2 - np.diagonal(self._Q)[model.parameters : -1]
+        return 0.5 * np.concatenate([noise, self._sums(part)])
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """Expected information on the variances."""
+        model, w, P = self.model, self.weights, self.model.parameters
+        G, found = model.noises, np.zeros((model.count, model.count))
+        found[G:, G:] = self._sums(self._sums(self._Q[P:-1, P:-1] ** 2).T)
+        for g, (KA, square) in enumerate(self._by_noise):
+            found[g, G:] = found[G:, g] = w[g] ** 2 * self._sums(square[P:-1])
+            for h, (other, _) in enumerate(self._by_noise):
+                found[g, h] = (w[g] * w[h]) ** 2 * float(np.sum(KA * other.T))
+            found[g, g] += w[g] ** 2 * model.counts[g] - 2.0 * w[g] ** 3 * float(np.trace(KA))
+        return 0.5 * found
+
+    @property
+    def degrees(self) -> FloatArray:
+        """Effective number of independent columns of each source, (tr P V)^2/tr P V P V."""
+        P, G = self.model.parameters, self.model.noises
+        traces = self._sums(np.diagonal(self._Q)[P:-1])
+        return np.maximum(
+            traces**2 / np.maximum(2.0 * np.diagonal(self.information)[G:], TINY), 1.0
+        )
+
+    def _sums(self, columns: FloatArray) -> FloatArray:
+        """Return sums over each source's columns, along the first axis."""
+        first = self.model.starts - self.model.parameters
+        return np.add.reduceat(columns, first, axis=0) if len(first) else columns[:0]
+
+    def scored(self, price: FloatArray, free: NDArray[np.bool_]) -> FloatArray:
+        """Return the variances >= 0 to which a scoring step leads, of the free ones."""
+        F = self.information
+        size = np.sqrt(np.maximum(np.diagonal(F), 0.0))
+        part = np.flatnonzero(free & (size > TINY))
+        units, s = 1.0 / size[part], self.variances.copy()
+        scaled = units[:, None] * F[np.ix_(part, part)] * units
+        R = np.linalg.cholesky(scaled + _ALIKE * np.eye(len(part))).T
+        rise = units * (self.gradient - price)[part]
+        aim = R @ (s[part] / units) + linalg.solve_triangular(R, rise, trans=1)
+        s[part] = units * optimize.nnls(R, aim)[0]
+        return s
+
+    @cached_property
+    def variances_covariance(self) -> FloatArray:
+        """Covariance of the variances, zero for those at zero.
+
+        No number between 0 and its bound has a standard deviation above half the bound (Popoviciu).
+        """
+        found = np.zeros_like(self.information)
+        every = np.sqrt(np.maximum(np.diagonal(self.information), 0.0))
+        kept = np.flatnonzero((self.variances > 0.0) & (every > _UNSEEN))
+        part, size = np.ix_(kept, kept), every[kept]
+        units = np.outer(size, size)
+        inverse = np.linalg.pinv(self.information[part] / units, hermitian=True) / units
+        std = np.sqrt(np.maximum(np.diagonal(inverse), TINY))
+        least = np.minimum(1.0, 0.5 * self.model.most[kept] / std)
+        found[part] = inverse * np.outer(least, least)
+        return found
+
+    @cached_property
+    def predicted(self) -> FloatArray:
+        """Delta by generalised least squares, and the best linear predictions of u, (c,)."""
+        return np.asarray(self.K @ np.tensordot(self.weights, self.model.grams[:, :-1, -1], 1))
+
+    @cached_property
+    def weighted(self) -> FloatArray:
+        """P y, (m,)."""
+        rows = self.weights[self.model.group]
+        return np.asarray(rows * (self.model.y - self.model.U @ self.predicted))
+
+    def block(self, rows: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+        """Return P of some rows, (r, r), and by how much it falls with each variance, (., r, r)."""
+        model, w = self.model, self.weights[self.model.group[rows]]
+        UK = w[:, None] * (model.U[rows] @ self.K)
+        P = np.diag(w) - UK @ (w[:, None] * model.U[rows]).T
+        falls = []
+        for g in range(model.noises):
+            A, same = model.grams[g][:-1, :-1], (model.group[rows] == g) * self.weights[g]
+            H = np.diag(w) - P
+            falls.append(
+                np.diag(same**2) - same[:, None] * H - H * same
+                + self.weights[g] ** 2 * UK @ A @ UK.T
+            )  # fmt: skip
+        PU = w[:, None] * (model.U[rows] @ self._left[:-1, :-1])
+        for k in range(len(model.starts)):
+            part = PU[:, model.columns(k)]
+            falls.append(part @ part.T)
+        return P, np.array(falls)
+
+    def prediction_variance(self, X: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the covariance of the errors of X [delta, u], and its derivatives.
+
+        For X (n, r, c): (n, r, r), and the derivatives of the trace with respect to each variance,
+        (count, n).
+        """
+        model, XK = self.model, X @ self.K
+        slopes = np.zeros((model.count, len(X)))
+        for g in range(model.noises):
+            A = model.grams[g][:-1, :-1]
+            slopes[g] = self.weights[g] ** 2 * np.sum((XK @ A) * XK, axis=(1, 2))
+        for k, s in enumerate(self.variances[model.noises :].tolist()):
+            if s > 0.0:
+                slopes[model.noises + k] = np.sum(XK[..., model.columns(k)] ** 2, (1, 2)) / s**2
+        return XK @ X.swapaxes(1, 2), slopes
+
+
+def shares(state: State, lever: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return what each variance adds to the covariance of lever . y at 1, and known noise as it is.
+
+    For a lever (P, m): (count, P, P), and (groups, P, P).
+    """
+    model = state.model
+    parts = [lever[:, model.group == g] for g in range(len(model.known))]
+    squares = np.array([part @ part.T for part in parts])
+    moved = lever @ model.U
+    sources = [moved[:, model.columns(k)] for k in range(len(model.starts))]
+    each = [*squares[: model.noises], *(part @ part.T for part in sources)]
+    return np.array(each), model.known[:, None, None] * squares
