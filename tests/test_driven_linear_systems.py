@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements import Element, Model
+from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.errors import ModelError, ValidationError
 from tests.motions import Driven, differences, slopes
 from tests.test_forced_motion import RATE, multisine
@@ -181,13 +181,49 @@ def test_systems_without_an_equation_of_motion(system: object, quantity: str, te
     assert "LinearSystem" in str(refusal.value)
 
 
+def hung(damping: float, stiffness: float) -> control.TransferFunction:
+    link = damping * S + stiffness
+    return M2 * S**2 * link / (M2 * S**2 + link)
+
+
+def test_free_parameters_are_found_from_their_starts() -> None:
+    x = driven(MODELS[0], 2).motion(first_state(MODELS[0])).output
+    x = x + 1e-3 * x.std() * np.random.default_rng(0).standard_normal(x.size)
+    wave = np.tile(multisine(SAMPLES)[0], 2)
+    record = di.Record(np.arange(x.size) / RATE, displacement=x, force=wave)
+    starts = {
+        name: Parameter(name, "", "of the absorber", value, free=True)
+        for name, value in (("damping", 9.0), ("stiffness", 1.6e4))
+    }
+    absorber = di.LinearSystem(hung, quantity="dynamic_stiffness", parameters=starts, name="hung")
+    fit = di.fit(record, di.Dahl(alpha=1.0) + LUMPED + absorber)
+    for name, truth in (("hung_damping", C2), ("hung_stiffness", K2), ("f_max", F_MAX)):
+        found = fit.params[name]
+        assert found.stderr is not None
+        assert abs(found.value - truth) < 4.0 * found.stderr, name
+        assert found.stderr < 0.1 * truth
+    problem = fit.problem
+    values = np.array([F_MAX, SIGMA, 5.0, 1.9e4, PLACE, 0.01, 3.0, 2e-4, -1e-4, 0.0])
+    exact = problem.predict(values, 0).by
+    for i in range(values.size):
+        step = 1e-5 * (abs(values[i]) or 1e-3)
+        high, low = (
+            problem.predict(values + s * np.eye(values.size)[i], 0, derivatives=False).output
+            for s in (step, -step)
+        )
+        error = np.abs(exact[:, i] - (high - low) / (2.0 * step)).max()
+        assert error < 1e-4 * np.abs(exact[:, i]).max(), problem.names[i]
+
+
 def test_free_parameters_and_a_moving_base_are_refused() -> None:
     record = di.Record(np.arange(64) / RATE, displacement=np.sin(np.arange(64)), force=np.ones(64))
     free = di.LinearSystem(
         lambda k: control.tf([1.0], [k]), quantity="receptance", parameters={"k": None}
     )
-    with pytest.raises(ModelError, match="leaves k free, and only a fixed system"):
-        di.fit(record, di.Dahl() + di.Mass() + free)
+    with pytest.raises(ModelError, match="free parameters moves with a plant"):
+        di.fit(record, di.Dahl() + free, output="force")
+    with pytest.raises(ModelError, match="k is an argument of a linear system, and has no value"):
+        di.fit(record, di.Dahl() + di.Mass(1.0) + free)
     with pytest.raises(ModelError, match="inertia inside"):
         di.fit(record, di.Dahl() + di.Mass() + ABSORBER, excitation="base")
 

@@ -69,8 +69,8 @@ class LinearSystem(Element):
     -----
     A continuous system has an equation of motion: its Z(s) is a stiffness, a damper, a mass, and
     poles. So a receptance with inertia is driven by a force without `Mass`; an absorber needs one
-    in parallel. In records only a fixed system has one, and the states of its poles at the first
-    sample are unknowns of the fit.
+    in parallel. In records the states of its poles at the first sample are unknowns of the fit;
+    where the force is fitted, only a system without free parameters has one over time.
 
     Evaluating outside the frequencies of an FRD, above half a sampling rate, or where the
     response determines no stiffness, raises ValidationError. Derivatives by the arguments
@@ -165,16 +165,22 @@ class LinearSystem(Element):
         if free:
             raise ModelError(
                 f"{self!r} leaves {', '.join(free)} free, and only a fixed system has a force over "
-                "time in a record; fix it, or build what is unknown from Mass, Damper and Spring"
+                "time; fix it, fit the motion, or build what is unknown from Mass, Damper and "
+                "Spring"
             )
-        at = tuple(float(v) for v in self.known_values())
+        return self._at_values(self.known_values())
+
+    def _at_values(
+        self, values: Sequence[FloatArray | float]
+    ) -> tuple[tuple[float, float, float], StateSpace]:
+        at = tuple(float(v) for v in values)
         if self._parts is None or self._parts[0] != at:
-            self._parts = at, self._split()
+            self._parts = at, self._split(at)
         return self._parts[1]
 
-    def _split(self) -> tuple[tuple[float, float, float], StateSpace]:
+    def _split(self, values: tuple[float, ...]) -> tuple[tuple[float, float, float], StateSpace]:
         control = importlib.import_module("control")
-        Z = Rational(*self.rational_stiffness()).without_common_zeros_at_0().trimmed()
+        Z = Rational(*self.rational_stiffness(values)).without_common_zeros_at_0().trimmed()
         lean = control.tf(Z.numerator, Z.denominator).minreal()
         if lean.den[0][0].size < Z.denominator.size:
             Z = Rational(lean.num[0][0], lean.den[0][0])
@@ -195,12 +201,18 @@ class LinearSystem(Element):
     @property
     def n_states(self) -> int:
         """Poles of the dynamic stiffness."""
-        return self._over_time[1].order
+        equation = self._equation
+        return self._over_time[1].order if equation is None else equation.n_states
 
     @property
     def has_inertia(self) -> bool:
         """Whether Z(s) grows as s^2."""
-        return self._over_time[0][2] != 0.0
+        equation = self._equation
+        return self._over_time[0][2] != 0.0 if equation is None else equation.has_inertia
+
+    @property
+    def _equation(self) -> LinearEquation | None:
+        return LinearEquation(self) if any(p.free for p in self.parameters) else None
 
     def mechanics(
         self,
@@ -256,7 +268,7 @@ class LinearSystem(Element):
         acceleration: FloatArray | None = None,
     ) -> FloatArray:
         """Return the force, from rest; between samples the motion is a polynomial of degree 5."""
-        (k, c, m), rest = self._over_time
+        (k, c, m), rest = self._at_values(values)
         v, a = np.zeros((2, *displacement.shape))
         if c or m or rest.order:
             v = motion(velocity, "velocity", displacement, self)
@@ -283,6 +295,7 @@ class LinearSystem(Element):
         acceleration: FloatArray | None = None,
     ) -> HistoryGradient:
         """Return the force, which fixed parameters do not change."""
+        _ = self._over_time
         force = self.force_history(values, displacement, velocity, acceleration=acceleration)
         zero = np.zeros(force.shape)
         return HistoryGradient(force, zero, (zero,) * len(self.parameters))

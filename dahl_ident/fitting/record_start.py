@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements import Element
+from dahl_ident.elements import Element, LinearSystem
+from dahl_ident.errors import ModelError
 from dahl_ident.problem.record_problem import RecordProblem
 
 _LENGTHS = np.geomspace(1e-3, 10.0, 13)  # of the largest displacement
@@ -144,6 +145,11 @@ class _Scan:
                 scaled = True
             elif fixed:
                 grids.append(fixed)
+            elif isinstance(element, LinearSystem):
+                raise ModelError(
+                    f"{parameter.name} is an argument of a linear system, and has no value to "
+                    "start from: give start=, or a Parameter with a value"
+                )
             elif parameter.scan:
                 grids.append(list(parameter.scan))
             else:

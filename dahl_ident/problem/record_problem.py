@@ -23,6 +23,7 @@ from dahl_ident.data.levels import one_run
 from dahl_ident.data.record import at_even_times, cut, unbroken
 from dahl_ident.elements import Element, Parameter
 from dahl_ident.elements.behaviour import Behaviour, HistoryGradient
+from dahl_ident.elements.coefficients import Coefficients
 from dahl_ident.elements.element import as_model
 from dahl_ident.elements.equations import FirstState, plant_equations
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
@@ -129,6 +130,11 @@ class RecordProblem(BaseProblem):
         self.output: Output = output or ("motion" if self.model.has_inertia else "force")
         if self.output not in ("force", "motion"):
             raise ValidationError(f"output is {output!r}; expected force or motion")
+        if self.output == "force" and not self._coefficients.are_values:
+            raise ModelError(
+                "a linear system with free parameters moves with a plant, but has no force over "
+                "time: fix it, fit the motion, or build it from Mass, Damper and Spring"
+            )
         self.free = [p for p in self.model.parameters if p.free]
         if not self.free:
             raise ModelError(f"nothing is free in {self.model!r}; leave a parameter out")
@@ -404,7 +410,7 @@ class RecordProblem(BaseProblem):
         from dahl_ident.engine import translate
 
         channel = self.records[0].motion_channel
-        return translate(plant_equations(self.model, self.excitation, channel))
+        return translate(plant_equations(self._coefficients.model, self.excitation, channel))
 
     @cached_property
     def _drives(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
@@ -487,16 +493,19 @@ class RecordProblem(BaseProblem):
 
         own, free = self.own(values, number), values[: len(self.free)]
         starts = own.size - 1
-        at = np.array(self.full_values(values))
+        at, slopes = (part[0] for part in self._coefficients(np.array([self.full_values(values)])))
+        slopes = slopes[:, self._chosen]
+        chosen = np.flatnonzero(slopes.any(axis=1)).tolist()
         first, by_start, by_value = self._first(own[:starts], at)
         time, drive = self._drives[number]
         found = march(
-            self._system, time, drive, time, first, at, chosen=self._chosen, derivatives=derivatives
+            self._system, time, drive, time, first, at, chosen=chosen, derivatives=derivatives
         )
         by = np.zeros((found.output.size, len(self.parameters) if derivatives else 0))
         if derivatives:
             column = free.size + number * self.per_record
-            by[:, : free.size] = found.by_parameter + found.by_first @ by_value[:, self._chosen]
+            by_number = found.by_parameter + found.by_first @ by_value[:, chosen]
+            by[:, : free.size] = by_number @ slopes[chosen]
             by[:, column : column + starts] = found.by_first @ by_start
             by[:, column + starts] = 1.0
         return Prediction(found.output + own[starts], by)
@@ -507,8 +516,12 @@ class RecordProblem(BaseProblem):
         return [i for i, p in enumerate(self.model.parameters) if p.free]
 
     @cached_property
+    def _coefficients(self) -> Coefficients:
+        return Coefficients(self.model)
+
+    @cached_property
     def _first(self) -> FirstState:
-        return FirstState(self.model)
+        return FirstState(self._coefficients.model)
 
     def outputs(self, values: FloatArray) -> list[FloatArray]:
         """Return the predicted output of each record."""

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.element import Element, Model, as_model
+from dahl_ident.elements.coefficients import Coefficients
+from dahl_ident.elements.element import Element, as_model
 from dahl_ident.elements.equations import plant_equations
-from dahl_ident.elements.linear_system import LinearEquation, LinearSystem
 from dahl_ident.errors import ModelError
 
 if TYPE_CHECKING:
@@ -76,25 +76,13 @@ def obstacle(model: Element) -> str:
     if all(element.is_linear for element in model.elements):
         return LINEAR
     try:
-        model = _in_coefficients(model)
+        model = Coefficients(model).model
         if not model.has_inertia:
             return "the model has no mass"
         plant_equations(model)
     except ModelError as error:
         return str(error).partition(";")[0].partition(", so")[0]
     return ""
-
-
-def _in_coefficients(model: Model) -> Model:
-    """Return the model with linear systems that have free parameters in their coefficients."""
-    elements = [
-        LinearEquation(element)
-        if isinstance(element, LinearSystem) and any(p.free for p in element.parameters)
-        else element
-        for element in model.elements
-    ]
-    same = all(new is old for new, old in zip(elements, model.elements, strict=True))
-    return model if same else Model(*elements)
 
 
 class Shooting:
@@ -118,7 +106,7 @@ class Shooting:
 
     def __init__(self, model: Element) -> None:
         self._model = as_model(model)
-        self._in_coefficients = _in_coefficients(self._model)
+        self._coefficients = Coefficients(self._model)
         self._system: System | None = None
 
     @property
@@ -127,7 +115,7 @@ class Shooting:
         if self._system is None:
             from dahl_ident.engine import translate
 
-            self._system = translate(plant_equations(self._in_coefficients))
+            self._system = translate(plant_equations(self._coefficients.model))
         return self._system
 
     def __call__(
@@ -164,9 +152,10 @@ class Shooting:
         stable : bool, default True
             Whether a motion that is not stable counts as none.
         """
-        values, slopes = self._coefficients(values)
-        wanted = tuple(chosen)
-        if slopes is not None:
+        slopes = None
+        if not self._coefficients.are_values:
+            wanted = tuple(chosen)
+            values, slopes = self._coefficients(values)
             slopes = slopes[:, :, wanted]
             chosen = np.flatnonzero(slopes.any(axis=(0, 2))).tolist()
         ask = _Ask(values, omega, drive, tuple(chosen), tuple(harmonics), stable)
@@ -184,25 +173,6 @@ class Shooting:
         if slopes is not None:
             result = result._replace(by_parameter=result.by_parameter @ slopes[:, chosen])
         return result
-
-    def _coefficients(self, values: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-        """Return the numbers in the equations, and their derivatives unless they are the values."""
-        pairs = list(zip(self._model.elements, self._in_coefficients.elements, strict=True))
-        if all(element is other for element, other in pairs):
-            return values, None
-        numbers, blocks, first = [], [], 0
-        for element, other in pairs:
-            own = values[:, first : first + len(element.parameters)]
-            block = np.zeros((len(values), len(other.parameters), values.shape[1]))
-            if isinstance(other, LinearEquation):
-                own, block[:, :, first : first + len(element.parameters)] = other.coefficients(own)
-            else:
-                place = np.arange(len(element.parameters))
-                block[:, place, first + place] = 1.0
-            numbers.append(own)
-            blocks.append(block)
-            first += len(element.parameters)
-        return np.concatenate(numbers, axis=1), np.concatenate(blocks, axis=1)
 
     def _solve(
         self,
