@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements import Element, Model
-from dahl_ident.elements.equations import Excitation, FirstState, plant_equations
+from dahl_ident.elements import Element, Excitation, FirstState, Model, plant_equations
 from dahl_ident.engine import Motion, band_limited, march, translate
 
 

@@ -12,23 +12,18 @@ from dahl_ident import (
     Backlash,
     BoucWen,
     Dahl,
-    Damper,
     Element,
     FrequencyResponse,
     Friction,
-    Mass,
     Model,
     PowerDamper,
     Spring,
     fit,
-    response,
 )
-from dahl_ident.arrays import ComplexArray
 from dahl_ident.cli.model import elements
-from dahl_ident.elements.description import describe_model, model_from_description
+from dahl_ident.elements import describe_model, model_from_description
 from dahl_ident.errors import ModelError
 from tests.test_generic_friction import Jenkins
-from tests.test_law_contract import all_amplitudes
 
 AT_REST = np.zeros(())
 
@@ -89,42 +84,12 @@ def test_a_closed_gap_is_none_and_a_wide_one_carries_no_force() -> None:
     assert wide.force([0.0, 0.9, -0.9, 0.9]).tolist() == [0.0, 0.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize(
-    "law",
-    [
-        Backlash(Dahl(1.0, 3.0), 0.5),
-        Backlash(Dahl(1.0, 3.0, 2.0, asymmetry=0.3), 0.5),
-        Backlash(Jenkins(3.0, 0.3), 0.5),
-    ],
-)
-def test_a_settled_force_has_the_harmonics(law: Backlash) -> None:
-    n, A = 4096, 1.0
-    theta = 2.0 * np.pi * np.arange(40 * n) / n
-    force = law.force(A * np.cos(theta))[-n:]
-    spectrum: ComplexArray = 2.0 / n * np.fft.rfft(force) / A
-    size = abs(complex(law.dynamic_stiffness(A)))
-    for k in range(6):
-        expected = complex(law.dynamic_stiffness(A, harmonic=k)) * (2.0 if k == 0 else 1.0)
-        assert abs(spectrum[k] - expected) < 2e-6 * size
-    _, loop = law.loop(A, points=n + 1)
-    np.testing.assert_allclose(loop[:-1], force, atol=1e-6)
-
-
 def test_the_force_steps_through_the_gap() -> None:
     law = Backlash(Jenkins(2.0, 0.5), 0.4)
     x = [0.0, 0.2, 0.5, 1.0, 0.9, 0.5, 0.2, 0.1, 0.0, 0.1, 0.4]
     # contact at 0.2; slip at 1 N; zero force at 0.5; the gap is crossed to 0.1
     expected = [0.0, 0.0, 0.6, 1.0, 0.8, 0.0, 0.0, 0.0, -0.2, 0.0, 0.0]
     np.testing.assert_allclose(law.force(x), expected, atol=1e-9)
-
-
-def test_derivatives_are_differences_of_the_values() -> None:
-    law = Model(Backlash(Dahl(1.0, 3.0), 0.8)).with_free(["f_max", "sigma", "gap"])
-    A, values = np.array([0.7, 2.0, 5.0]), law.known_values()
-    found = law.stiffness_gradient(values, A, AT_REST)
-    for i, b in ((3, 0.4),):
-        slope = [(by_path(1.0, 3.0, b + 5e-7, a, 1) - by_path(1.0, 3.0, b - 5e-7, a, 1)) for a in A]
-        np.testing.assert_allclose(found.by_parameter[i], np.array(slope) / 2e-6, rtol=1e-4)
 
 
 def test_derivatives_of_linear_dahl_are_exact() -> None:
@@ -146,15 +111,6 @@ def test_derivatives_of_linear_dahl_are_exact() -> None:
             assert abs(complex(slope) * float(at[j]) - weights @ values) < 1e-6 * size * (
                 A / (A - b)
             )
-
-
-def test_response_behind_a_gap() -> None:
-    plant = Backlash(Dahl(0.1, 30.0), 0.01) + Mass(0.3) + Damper(0.24) + Spring(3.0)
-    for drive in (0.005, 0.02, 0.1, 0.5):
-        ours = response(plant, 0.4, drive, all_roots=True, steady="describing function")
-        np.testing.assert_allclose(
-            np.ravel(ours.amplitude), all_amplitudes(plant, 0.4, drive), rtol=1e-7
-        )
 
 
 def test_description_and_refusals() -> None:

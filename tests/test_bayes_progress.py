@@ -3,33 +3,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.bayes.chain import ChainSettings
-from dahl_ident.bayes.convergence import Convergence
-from dahl_ident.results.progress import expected_steps
 from tests.bayes_cases import friction_table
-
-SETTINGS = ChainSettings(128, 4, 1, None, 20000, 2000.0)
-
-
-def verdict(tau: float, ess: float) -> Convergence:
-    return Convergence(300, 100, np.array([tau, 2.0]), np.array([ess, 1e6]), np.ones(2), 2000.0)
-
-
-def test_the_total_is_what_convergence_will_take() -> None:
-    assert expected_steps(SETTINGS, None) is None
-    assert expected_steps(replace(SETTINGS, steps=700), None) == 700
-    # 50 autocorrelation times after 100 of warm-up, or as many as 2000 draws take
-    assert expected_steps(SETTINGS, verdict(10.0, 1e5)) == 601
-    assert expected_steps(SETTINGS, verdict(1.0, 100.0)) == 4101
-    assert expected_steps(SETTINGS, verdict(1e4, 1.0)) == 20000
-    assert expected_steps(SETTINGS, verdict(np.nan, 1.0)) is None
 
 
 def test_a_chain_moves_the_bar_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,7 +29,6 @@ import pytest
 
 import dahl_ident as di
 from dahl_ident import population
-from dahl_ident.campaigns.campaign_report import write_campaign_report
 from dahl_ident.campaigns.definition import read_definition
 from dahl_ident.campaigns.engine import Limits, Local, run_jobs
 from dahl_ident.campaigns.run import _unless_refused
@@ -815,26 +814,6 @@ def test_charts_show_time_only_where_an_order_is_stated() -> None:
     )
 
 
-def test_population_matches_a_direct_likelihood() -> None:
-    """The sums per device give the restricted likelihood of the full covariance matrix."""
-    from dahl_ident.campaigns.population import _Sums
-
-    rng = np.random.default_rng(0)
-    device = np.array([0, 0, 1, 2, 2, 2, 3])
-    X = np.column_stack([np.ones(7), rng.normal(size=7)])
-    y, u2 = rng.normal(size=7), rng.uniform(0.1, 0.4, 7)
-    tau, omega = 0.7, 0.3
-    V = np.diag(u2 + omega**2) + tau**2 * (device[:, None] == device)
-    W = np.linalg.inv(V)
-    A, b = X.T @ W @ X, X.T @ W @ y
-    rest = y @ W @ y - b @ np.linalg.solve(A, b)
-    direct = -0.5 * (np.linalg.slogdet(V)[1] + np.linalg.slogdet(A)[1] + rest)
-    found = _Sums(y, u2, X, device, 4).at(tau, omega)
-    np.testing.assert_allclose(found.C @ A, np.eye(2), atol=1e-12)
-    np.testing.assert_allclose(A @ found.b, b, rtol=1e-12)
-    assert found.log_likelihood == pytest.approx(direct, rel=1e-12)
-
-
 def test_wrong_tables_are_named() -> None:
     table, _ = simulated(0, 5, 1, slope=0.0, tau=0.02, omega=0.0, u=0.01)
     cases: list[tuple[pd.DataFrame, dict[str, Any], type[DahlIdentError], str]] = [
@@ -849,21 +828,3 @@ def test_wrong_tables_are_named() -> None:
     for frame, how, error, message in cases:
         with pytest.raises(error, match=message):
             population(frame, **how)
-
-
-def test_report_of_a_campaign(tmp_path: Path) -> None:
-    table, _ = simulated(2, 10, 1, slope=0.1, tau=0.05, omega=0.0, u=0.01)
-    table.loc[3, "status"] = "not determined"
-    found = population(table, covariates=["t"])
-    table["report"] = table["device"] + ".html"
-    folder = tmp_path / "results" / "reports"
-    page = write_campaign_report(table, found, tmp_path / "c.html", reports=folder).read_text()
-    assert '<a href="results/reports/d002.html">d002</a>' in page
-    assert "Population: f_max" in page
-    assert "d003: not determined" in page
-    for one in (found, None):
-        place = write_campaign_report(table, one, tmp_path / "c.pdf", overwrite=True)
-        text = "".join(
-            page.extract_text() for page in import_module("pypdf").PdfReader(place).pages
-        )
-        assert ("Population: f_max" in text) == (one is not None)

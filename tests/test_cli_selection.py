@@ -13,7 +13,7 @@ import pytest
 import dahl_ident as di
 from dahl_ident.cli.model import elements
 from dahl_ident.cli.row_selection import selected
-from dahl_ident.elements.element import KINDS
+from dahl_ident.elements import KINDS
 from dahl_ident.errors import DahlIdentError, ValidationError
 from tests.command_line import Runner
 

@@ -13,8 +13,7 @@ import pytest
 
 from dahl_ident import FrequencyResponse, Record, response
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements import Model
-from dahl_ident.elements.description import model_from_description
+from dahl_ident.elements import Model, model_from_description
 from dahl_ident.errors import DataError
 from dahl_ident.synthetic import Experiment, load_dataset, shipped
 from dahl_ident.synthetic.regenerate import main, make, readme

@@ -9,8 +9,16 @@ import numpy as np
 import pytest
 
 from dahl_ident import LinearSystem
-from dahl_ident.elements import Dahl, Damper, Mass, Model, Parameter, Spring
-from dahl_ident.elements.description import describe_model, model_from_description
+from dahl_ident.elements import (
+    Dahl,
+    Damper,
+    Mass,
+    Model,
+    Parameter,
+    Spring,
+    describe_model,
+    model_from_description,
+)
 from dahl_ident.errors import ModelError
 
 OMEGA = np.array([1.0, 20.0, 300.0])

@@ -147,7 +147,7 @@ class TestMeasured:
         whole = fit(data, model)
         assert whole.status.usable
         inside, widths = [], []
-        for row in range(data.n):
+        for row in range(0, data.n, 2):
             others = fit(data.select(rows=np.arange(data.n) != row), model, throw=False)
             band = others.predict(data.frequency_hz[row], amplitude=amplitudes(data)[row])
             measured = data.response[row]

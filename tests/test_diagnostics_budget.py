@@ -11,7 +11,6 @@ from scipy import optimize, stats
 
 from dahl_ident import BoucWen, Dahl, FrequencyResponse, Sensors, Spring, fit, load_dataset
 from dahl_ident.diagnostics import ErrorModel, budget, error_model
-from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.mixed_model import MixedModel
 from dahl_ident.diagnostics.table_groups import repeated_levels
 from dahl_ident.errors import FitError
@@ -256,10 +255,6 @@ class TestBudget:
         for found in lost:
             with pytest.raises(FitError, match="no uncertainty budget"):
                 found.budget()
-
-    def test_coverage_factor(self) -> None:
-        assert coverage_factor(2.0, 0.95) == pytest.approx(stats.t(2).ppf(0.975))
-        assert coverage_factor(np.inf) == pytest.approx(2.0, abs=1e-3)
 
 
 class TestEstimate:

@@ -18,12 +18,7 @@ from dahl_ident import (
     fit,
     response,
 )
-from dahl_ident.diagnostics.goodness import Goodness, goodness
-from dahl_ident.diagnostics.outliers import suspicious_points
-from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, ResidualSpace
-from dahl_ident.diagnostics.steady_motion import steady_difference
-from dahl_ident.diagnostics.third_harmonic import third_harmonic_share
-from dahl_ident.diagnostics.trends import Trend
+from dahl_ident.diagnostics import Goodness
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Status
 from tests.friction_tables import (
@@ -38,7 +33,7 @@ from tests.friction_tables import (
 
 
 def judge(data: FrequencyResponse, **options: object) -> Goodness:
-    return goodness(fit(data, Dahl(), throw=False, **options).optimum)  # type: ignore[call-overload]  # passed on
+    return fit(data, Dahl(), throw=False, **options).goodness  # type: ignore[call-overload]  # passed on
 
 
 def swept_table(fall: float, noise: float = 0.01, seed: int = 1) -> FrequencyResponse:
@@ -120,12 +115,6 @@ class TestDepartures:
         assert len(alarmed) >= 12
         assert all("over frequency, from 0.25 to 2 Hz" in text for text in alarmed)
 
-    def test_a_slope_too_steep_to_be_a_size_has_a_direction_only(self) -> None:
-        steep = Trend(
-            "amplitude", 1e-3, 1.0, "m", Coefficient(-9.0, 1.0), Coefficient(1e4, 10.0), 0.3, 1e-9
-        )
-        assert "(friction's stiffness falls more than tenfold, friction's loss rises" in str(steep)
-
     def test_the_size_does_not_depend_on_the_claimed_noise(self) -> None:
         data = swept_table(0.28)
         C = (1e-3 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
@@ -142,7 +131,7 @@ class TestDepartures:
         assert found.exponent is not None
         assert found.exponent.wanted == pytest.approx(1.5, rel=0.15)
         assert "these data are not linear Dahl" in found.headline
-        free = goodness(fit(table(model=Dahl(0.1, 30.0, alpha=1.5)), Dahl(alpha=None)).optimum)
+        free = fit(table(model=Dahl(0.1, 30.0, alpha=1.5)), Dahl(alpha=None)).goodness
         assert free.acceptable
         assert free.exponent is None
 
@@ -210,21 +199,6 @@ class TestOutliers:
         assert first.deviation > 5.0
         assert "1 Hz, 1.01 mm, level run 7 lies" in str(first)
 
-    def test_deviation_is_that_of_the_fit_without_the_point(self) -> None:
-        """The mean-shift test is exact for a linear model: leave the point out and predict it."""
-        noise = np.random.default_rng(0).standard_normal((2, 12))
-        Z = 5.0 + 0.01 * (noise[0] + 1j * noise[1])
-        Z[4] += 0.08
-        data = FrequencyResponse(np.ones(12), Z, np.geomspace(1.0, 2.0, 12))
-        optimum = fit(data, Spring(), noise="absolute").optimum
-        (point,) = suspicious_points(optimum, ResidualSpace(optimum))
-        rest = fit(data.select(rows=np.arange(12) != 4), Spring(), noise="absolute")
-        away = Z[4] - rest.params["stiffness"].value
-        inflated = rest.scale * np.sqrt(1.0 + 1.0 / 11.0)
-        expected = np.hypot(away.real / inflated, away.imag / rest.scale)
-        assert point.row == 4
-        assert point.deviation == pytest.approx(expected, rel=1e-9)
-
     def test_robust_fits_list_them_too(self) -> None:
         data = table()
         R = data.response.copy()
@@ -236,34 +210,6 @@ class TestOutliers:
 
     def test_none_where_too_few_points(self) -> None:
         assert judge(table(n=3)).suspicious == ()
-
-
-class TestResidualSpace:
-    def test_an_added_column_is_what_a_fit_with_it_finds(self) -> None:
-        """Linear model: the score's coefficient is the estimate of a fit with one more element."""
-        A = np.geomspace(0.5, 2.0, 20)
-        f = np.geomspace(1.0, 4.0, 20)
-        noise = np.random.default_rng(0).standard_normal((2, 20))
-        Z = 5.0 + 0.2j * 2.0 * np.pi * f + 0.05 * (noise[0] + 1j * noise[1])
-        data = FrequencyResponse(f, Z, A)
-        small = fit(data, Spring(), noise="absolute")
-        large = fit(data, Spring() + Damper(), noise="absolute")
-        space = ResidualSpace(small.optimum)
-        change = 2j * np.pi * f / small.best_fit
-        found = space.coefficient(change)
-        assert found.value == pytest.approx(large.params["damping"].value, rel=1e-9)
-        t = large.params["damping"].value / (large.params["damping"].stderr or np.nan)
-        expected = 2.0 * stats.t(large.nfree).sf(abs(t))
-        assert space.p_value(change[None]) == pytest.approx(expected, rel=1e-9)
-
-    def test_what_parameters_explain_is_no_departure(self) -> None:
-        result = fit(table(), Dahl())
-        theta = result.optimum.theta
-        predicted = result.problem.predict(theta)
-        own = result.problem.prediction_jacobian(theta)[:, 0] / predicted
-        for space in (ResidualSpace(result.optimum), RelativeSpace(result.optimum)):
-            assert not space.columns(own[None]).any()
-        assert np.isinf(ResidualSpace(result.optimum).coefficient(own).stderr)
 
 
 class TestPhysics:
@@ -305,43 +251,6 @@ class TestPhysics:
         result = fit(table(model=FRICTION + Spring(1.0)), bounded)
         assert any("At its bound: f_max = 0.09" in w for w in result.goodness.warnings)
 
-    def test_the_third_harmonic_of_the_motion(self) -> None:
-        """Against the motion itself: the plant integrated in time until it is steady."""
-        data = plant_table(noise=0.0, steady="describing function")
-        model = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24) + Spring()
-        optimum = fit(data, model, steady="describing function").optimum
-        share = third_harmonic_share(optimum)
-        assert share.shape == (60,)
-        order = np.argsort(share)
-        assert data.level is not None
-        for row, tolerance in ((order[-1], 1.0), (order[50], 0.1), (order[30], 0.1)):
-            f, u = float(data.frequency_hz[row]), float(data.level[row])
-            assert share[row] == pytest.approx(simulated_share(f, u), rel=tolerance)
-
-    def test_the_row_of_a_crude_sine_is_the_table_s(self) -> None:
-        """Also where rows of controlled displacement stand before those of a drive."""
-        driven = plant_table(noise=0.001)
-        assert driven.drive is not None
-        A = np.geomspace(0.1, 10.0, 7) * X_C
-        f = np.concatenate([np.ones(7), driven.frequency_hz])
-        R = np.concatenate([1.0 / PLANT.dynamic_stiffness(A, 2.0 * np.pi), driven.response])
-        mixed = FrequencyResponse(
-            f,
-            R,
-            amplitude=np.concatenate([A, driven.gain * driven.drive]),
-            drive=np.concatenate([A / np.abs(R[:7]), driven.drive]),
-            controlled=["displacement"] * 7 + ["force"] * 60,
-            quantity="receptance",
-        )
-        model = Dahl(alpha=1.0) + Mass(0.3) + Damper(0.24) + Spring()
-        result = fit(mixed, model, steady="describing function")
-        found = steady_difference(result.optimum)
-        assert found is not None
-        assert found[0] >= 7
-        (text,) = result.goodness.warnings
-        where = f"{f[found[0]]:.4g} Hz, {1e3 * driven.drive[found[0] - 7]:.3g} mN"
-        assert f"off at {where}: fit with steady='exact'" in text
-
     def test_a_nearly_linear_plant_moves_in_a_sine(self) -> None:
         plant = FRICTION + Mass(0.3) + Damper(20.0) + Spring(300.0)
         f = np.tile(np.geomspace(0.1, 20.0, 12), 3)
@@ -349,34 +258,6 @@ class TestPhysics:
         R = response(plant, f, u).receptance * relative_noise(36, 0.001, 3)
         data = FrequencyResponse(f, R, drive=u, controlled="force", quantity="receptance")
         assert not fit(data, Dahl() + Mass() + Damper() + Spring()).goodness.warnings
-
-    def test_controlled_displacement_has_none(self) -> None:
-        assert third_harmonic_share(fit(table(), Dahl()).optimum).size == 0
-
-
-def simulated_share(frequency: float, drive: float, cycles: int = 20, steps: int = 1200) -> float:
-    """Return |X_3/X_1| of the steady motion of PLANT, by classical Runge-Kutta."""
-    m, c, k, f_max, sigma = 0.3, 0.24, 0.3, 0.1, 30.0
-    omega = 2.0 * np.pi * frequency
-    h = 1.0 / frequency / steps
-
-    def slope(
-        t: float, y: np.ndarray[tuple[int], np.dtype[np.float64]]
-    ) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        x, v, F = y
-        rate = sigma * (1.0 - np.sign(v) * F / f_max) * v
-        return np.array([v, (drive * np.cos(omega * t) - c * v - k * x - F) / m, rate])
-
-    y, motion = np.zeros(3), np.empty(steps)
-    for i in range(cycles * steps):
-        t = i * h
-        k1 = slope(t, y)
-        k2 = slope(t + h / 2, y + h / 2 * k1)
-        k3 = slope(t + h / 2, y + h / 2 * k2)
-        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + slope(t + h, y + h * k3))
-        motion[i % steps] = y[0]
-    X = np.fft.rfft(motion)
-    return float(abs(X[3]) / abs(X[1]))
 
 
 class TestComparison:

@@ -18,7 +18,6 @@ from dahl_ident import (
     fit,
 )
 from dahl_ident.diagnostics import Verdict, identifiability
-from dahl_ident.diagnostics.information import Information, shares
 from dahl_ident.results import FitResult
 from tests.friction_tables import F_MAX, FRICTION, SIGMA, X_C, plant_table, relative_noise, table
 
@@ -239,37 +238,3 @@ class TestTheory:
         found = identifiability(fit(table(beta=(0.01, 0.1)), Dahl()))
         assert found.parameters["f_max"].fisher_std == pytest.approx(0.09, rel=0.25)
         assert found.parameters["f_max"].profile_std == pytest.approx(0.09, rel=0.35)
-
-
-class TestInformation:
-    def test_variance_is_the_covariance_s(self) -> None:
-        optimum = fit(table(), Dahl()).optimum
-        information = Information(optimum)
-        np.testing.assert_allclose(
-            information.variance(np.eye(2)), np.diagonal(optimum.covariance), rtol=1e-12
-        )
-        both = optimum.covariance.sum()
-        assert information.variance(np.ones(2)) == pytest.approx(both, rel=1e-12)
-
-    def test_a_null_direction_is_infinite_and_what_is_orthogonal_is_not(self) -> None:
-        result = fit(table(), Dahl(), sensors=Sensors(force_gain=None), throw=False)
-        information = Information(result.optimum)
-        assert information.rank == 2
-        assert np.isinf(information.variance(np.array([1.0, 0.0, 0.0])))
-        known = fit(table(), Dahl()).optimum.covariance
-        difference = np.array([1.0, -1.0, 0.0])
-        expected = difference[:2] @ known @ difference[:2]
-        assert information.variance(difference) == pytest.approx(expected, rel=0.03)
-
-    def test_without_a_noise_scale_there_is_no_variance(self) -> None:
-        information = Information(fit(table(n=1, beta=(1.0, 1.0)), Dahl()).optimum)
-        assert np.isnan(information.std(np.eye(2))).all()
-        assert information.rank == 2
-
-    def test_shares_sum_to_one_and_lie_where_the_knee_is(self) -> None:
-        result = fit(table(beta=(1e-3, 1e3), n=40), Dahl())
-        share = shares(result.optimum)
-        np.testing.assert_allclose(share.sum(axis=1), 1.0)
-        beta = SIGMA * np.geomspace(1e-3, 1e3, 40) * X_C / F_MAX
-        assert share[0][beta > 1.0].sum() > 0.9
-        assert share[1][beta < 1.0].sum() > 0.7

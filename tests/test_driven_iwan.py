@@ -10,10 +10,8 @@ from scipy.integrate import solve_ivp
 
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements import Model
 from tests.motions import Driven, differences, slopes
 from tests.test_forced_motion import RATE, multisine
-from tests.test_record_laws import assert_recovered
 
 M, C, K = 2.0, 10.0, 3e4
 LINEAR = di.Mass(M) + di.Damper(C) + di.Spring(K)
@@ -131,20 +129,3 @@ def test_slopes_are_derivatives() -> None:
     for i, expected in enumerate(differences(plant, starts, values, 1e-4)):
         error = np.abs(found[:, i] - expected).max() / np.abs(expected).max()
         assert error < 2e-6, i
-
-
-def test_recovered_from_a_motion_of_the_exact_law() -> None:
-    wave, drive = multisine(384)
-    x = exact(384, drive)
-    x = x + 1e-3 * x.std() * np.random.default_rng(0).standard_normal(x.size)
-    record = di.Record(np.arange(x.size) / RATE, displacement=x, force=wave)
-    model = di.Iwan() + di.Mass() + di.Damper() + di.Spring()
-    near = dict(
-        zip(
-            [p.name for p in Model(model).parameters],
-            [1.2 * v for v in (*VALUES, M, C, K)],
-            strict=True,
-        )
-    )
-    fit = di.fit(record, model, start=near)
-    assert_recovered(fit, Model(LAW + LINEAR))

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.interpolate import CubicSpline
-from scipy.special import gamma
 
 import dahl_ident as di
 from benchmarks import engine_oracles as cases
@@ -30,7 +29,7 @@ from benchmarks.motion_oracles import (
 )
 from dahl_ident import Parameter
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.equations import law_equations, plant_equations
+from dahl_ident.elements import law_equations, plant_equations
 from dahl_ident.engine import band_limited, march, settled, translate
 from dahl_ident.errors import FitError
 
@@ -66,7 +65,7 @@ def test_random_motions_are_those_of_an_independent_integrator(
     assert case.error < (max(limit, sharp) if law in cases.KINKS else limit), case.note
 
 
-@pytest.mark.parametrize("beta", [1e-8, 1e-4, 0.3, 20.0, 1e4, 1e8])
+@pytest.mark.parametrize("beta", [1e-8, 0.3, 1e8])
 def test_dahl_loops_are_the_closed_forms(beta: float) -> None:
     law = di.Dahl(2.0, 500.0)
     A = beta * 2.0 / 500.0
@@ -84,8 +83,7 @@ def test_dahl_loops_are_the_closed_forms(beta: float) -> None:
     assert abs(result.by_amplitude[0, 0] - by_A) < 1e-6 * abs(N)
 
 
-@pytest.mark.parametrize("alpha", [0.7, 1.5])
-@pytest.mark.parametrize("beta", [0.01, 3.0, 1e4, 1e8])
+@pytest.mark.parametrize(("alpha", "beta"), [(0.7, 3.0), (1.5, 0.01), (1.5, 1e8)])
 def test_asymmetric_loops_of_any_exponent_are_sums_over_their_branches(
     alpha: float, beta: float
 ) -> None:
@@ -207,34 +205,6 @@ def test_even_harmonics_of_a_rate_dependent_law() -> None:
     assert np.max(np.abs(result.coefficients[0] - c)) < 1e-9 * np.max(np.abs(c))
 
 
-def test_jenkins_elements_are_their_closed_forms() -> None:
-    for A, expected in ((0.7, 3.0), (1.3, 2.4762675 + 0.6780566j), (5.0, 0.4271355 + 0.611155j)):
-        result = loop_of(di.MaxwellSlip(1), A, [3.0, 1.0])
-        assert abs(result.coefficients[0, 0] / A - expected) < 1e-6
-
-
-@pytest.mark.parametrize(
-    ("values", "A", "expected"),
-    [([1.0, 3.0, 0.8], 2.0, (0.3901538 + 0.4032069j, 0.0288864 - 0.0183396j)),
-     ([1.0, 1.0, 0.6], 1.0, (0.5368324 + 0.1217627j, 0.0781530 + 0.0417040j))],
-)  # fmt: skip
-def test_backlash_is_its_closed_form(values: Any, A: float, expected: Any) -> None:
-    element = di.Backlash(di.Dahl())
-    drawn = cases.Drawn(0, element, values, 1.0, 1.0)
-    result = loop_of(element, A, cases.all_values(drawn), harmonics=(1, 3))
-    assert np.max(np.abs(result.coefficients[0] / A - np.array(expected))) < 1e-6
-
-
-@pytest.mark.parametrize("exponent", [0.3, 0.5, 1.7])
-def test_power_dampers_are_their_closed_form(exponent: float) -> None:
-    A, omega = 0.4, 3.0
-    system = translate(law_equations(di.PowerDamper()))
-    result = settled(system, np.array([A]), np.array([omega]), np.array([[2.0, exponent, 1.0]]))
-    factor = 2.0 / np.sqrt(np.pi) * gamma(0.5 * exponent + 1.0) / gamma(0.5 * exponent + 1.5)
-    N = 2.0 / A * (A * omega) ** exponent * factor
-    assert abs(result.coefficients[0, 0] / A - 1j * N) < 1e-8 * N
-
-
 def test_derivatives_of_settled_motions_are_differences_of_oracles() -> None:
     """A plant with a gap: harmonics by drive and every parameter, through moving kinks."""
     values = np.array([1.0, 300.0, 1.0, 0.002, 0.1, 0.5, 200.0])
@@ -292,7 +262,7 @@ def test_derivatives_along_a_history_jump_at_kinks() -> None:
 
 def test_derivatives_of_driven_motions_are_differences_of_oracles() -> None:
     """Several Jenkins elements, by parameters and by the first state."""
-    n, interval = 300, 0.01
+    n, interval = 80, 0.01
     times: FloatArray = interval * np.arange(n, dtype=float)
     omega = 2.0 * np.pi * np.array([3.0, 5.0, 8.0]) / (n * interval)
 
@@ -315,7 +285,7 @@ def test_derivatives_of_driven_motions_are_differences_of_oracles() -> None:
 
     size = np.max(np.abs(motion.output))
     assert np.max(np.abs(oracle(values, first) - motion.output)) < 1e-8 * size
-    for i in range(7):
+    for i in (0, 3, 4, 5, 6):  # one stiffness and one limit of two; the plant's
         step = np.zeros(7)
         step[i] = 1e-5 * values[i]
         difference = (oracle(values + step, first) - oracle(values - step, first)) / 2e-5

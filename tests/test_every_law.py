@@ -21,8 +21,7 @@ from dahl_ident import (
     Record,
     simulate,
 )
-from dahl_ident.elements.description import describe_model, model_from_description
-from dahl_ident.elements.element import KINDS
+from dahl_ident.elements import KINDS, describe_model, model_from_description
 from dahl_ident.synthetic import SteppedSine
 from tests.test_generic_friction import Jenkins
 

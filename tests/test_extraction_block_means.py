@@ -10,8 +10,6 @@ from dahl_ident.data import Record
 from dahl_ident.elements import Dahl
 from dahl_ident.errors import ExtractionError
 from dahl_ident.extraction import extract
-from dahl_ident.extraction.block_means import Samples
-from dahl_ident.extraction.sine_fit import sine_fit, steady_segment
 
 RATE, FREQUENCY, CYCLES = 10_000.0, 5.0, 12
 FRICTION = Dahl(f_max=0.1, sigma=30.0)
@@ -23,26 +21,6 @@ def dense(noise: float = 0.0, seed: int = 0) -> tuple[FloatArray, FloatArray, Fl
     draws = noise * np.random.default_rng(seed).standard_normal((2, t.size))
     x = 4e-3 * np.sin(2.0 * np.pi * FREQUENCY * t)
     return t, x + 1e-3 * draws[0], FRICTION.force(x) + draws[1]
-
-
-def test_the_fit_of_block_means_is_exact_for_every_harmonic() -> None:
-    t, _, _ = dense()
-    theta = 2.0 * np.pi * FREQUENCY * t
-    true = [np.array([1.0 / k + 0.3j, 0.2 - 2.0j / k]) for k in range(1, 10)]
-    waves = sum(
-        np.real(y[:, None] * np.exp(1j * (k + 1) * (theta - theta[-1] / 2.0)))
-        for k, y in enumerate(true)
-    )
-    samples = Samples(t, *waves)
-    size = samples.block_size(FREQUENCY)
-    assert size == 7
-    segment = steady_segment(*samples.means(size), 2.0 * np.pi * FREQUENCY, size)
-    fit = sine_fit(segment)
-    turn = 2.0 * np.pi * FREQUENCY * (segment.centre - t[-1] / 2.0)
-    for k, y in enumerate(true):
-        np.testing.assert_allclose(
-            fit.phasors(k + 1), y * np.exp(1j * (k + 1) * turn), rtol=1e-9, atol=1e-10
-        )
 
 
 def test_points_are_those_of_least_squares_on_the_samples() -> None:
@@ -109,32 +87,3 @@ def test_a_look_at_some_samples_says_whether_noise_dithers(monkeypatch: pytest.M
         assert every is not None
         errors.append(every[0])
     assert errors[0] > 3.0 * errors[1]
-
-
-def test_uneven_samples_are_taken_as_they_are() -> None:
-    t, x, force = dense()
-    samples = Samples(t, x, force)
-    jitter = 0.2 / RATE * np.random.default_rng(0).standard_normal(t.size)
-    gap = np.delete(np.arange(t.size), slice(400, 700))
-    assert samples.block_size(30.0) == 1
-    assert Samples(t + jitter, x, force).block_size(FREQUENCY) == 1
-    assert Samples(t[gap], x[gap], force[gap]).block_size(FREQUENCY) == 1
-
-
-def test_a_segment_of_block_means_has_the_samples_it_was_made_of() -> None:
-    t, x, force = dense(1e-3)
-    samples = Samples(t, x, force)
-    means, channels = samples.means(7)
-    whole = steady_segment(means, channels, 2.0 * np.pi * FREQUENCY, 7)
-    part = whole.part(slice(3, 200))
-    own = samples.of(part)
-    np.testing.assert_array_equal(own.time, t[21:1400])
-    np.testing.assert_array_equal(own.force, force[21:1400])
-    blocks = np.stack([x, force])[:, 21:1400].reshape(2, -1, 7)
-    np.testing.assert_allclose(
-        samples.within_blocks(part), blocks.var(axis=2).mean(axis=1), rtol=1e-9
-    )
-    assert samples.means(2)[0].size == t.size // 2
-    single = steady_segment(t, np.stack([x, force]), 2.0 * np.pi * FREQUENCY)
-    assert samples.within_blocks(single).tolist() == [0.0, 0.0]
-    assert samples.of(single.part(slice(5, 9))).time.tolist() == t[5:9].tolist()

@@ -12,8 +12,6 @@ from dahl_ident.data import Record
 from dahl_ident.elements import Dahl
 from dahl_ident.errors import ExtractionError
 from dahl_ident.extraction import extract
-from dahl_ident.extraction.cycles import scattered
-from dahl_ident.extraction.segment_quality import sensor_step
 
 FRICTION = Dahl(f_max=20.0, sigma=2e4)
 RATE = 200.0
@@ -103,13 +101,3 @@ def test_times_in_messages_count_from_the_start_of_the_record() -> None:
     assert found is not None
     assert 30.0 < float(found[1]) < 40.0
     assert data.quality["start_time"][0] == pytest.approx(1.7e9, abs=2.0)
-
-
-@pytest.mark.parametrize("samples_a_cycle", [200, 400, 1000])
-def test_a_look_at_some_samples_sees_all_phases_of_a_period(samples_a_cycle: int) -> None:
-    """A plain stride of 50 would see 4, 8 and 20 phases, and take them for steps of a sensor."""
-    x = 1e-3 * np.sin(2.0 * np.pi * np.arange(1_000_000) / samples_a_cycle)
-    seen = scattered(x, 20_000)
-    assert seen.size == 20_000
-    assert np.unique(np.round(seen, 9)).size == np.unique(np.round(x, 9)).size
-    assert sensor_step(x) == 0.0

@@ -16,7 +16,6 @@ from benchmarks.extraction_validation import FRICTION, one_over_f, steady
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import Record
 from dahl_ident.extraction import extract
-from dahl_ident.extraction.asymmetry import asymmetry
 from dahl_ident.extraction.sine_fit import sine_fit, steady_segment
 from dahl_ident.extraction.transient import estimate_transient
 
@@ -126,25 +125,6 @@ def test_a_region_of_95_per_cent_holds_the_truth_so_often(
         statistic = 0.5 * np.einsum("ij,ijk,ik->i", e, np.linalg.inv(case.covariance[:, 0]), e)
         inside = int(np.sum(statistic < stats.f.ppf(0.95, 2, case.dof[:, 0])))
         assert stats.binomtest(inside, RUNS, 0.95).pvalue > 1e-3
-
-
-def test_noise_seems_asymmetric_as_seldom_as_said() -> None:
-    """At most once in 10,000 symmetric points, and not ten times less: binomial bounds."""
-    rng, points, hits = np.random.default_rng(3), 100_000, 0
-    orders, dof, none = np.array([2.0]), np.array([40.0]), np.zeros(1)
-    variance = 0.01 * rng.chisquare(dof, (points, 1)) / dof
-    force = 0.1 * np.sqrt(0.5) * (rng.standard_normal((points, 2)) @ [1.0, 1j])[:, None]
-    for f, v in zip(force, variance, strict=True):
-        hits += asymmetry(orders, f, v, dof, none) > 0.0
-    assert stats.binom.ppf(1e-3, points, 1e-4) <= hits <= stats.binom.ppf(0.999, points, 1e-4)
-    four = np.array([2.0, 4.0, 6.0, 8.0])
-    variance = 0.01 * rng.chisquare(24.0, (20_000, 4)) / 24.0
-    force = 0.1 * np.sqrt(0.5) * (rng.standard_normal((20_000, 4, 2)) @ [1.0, 1j])
-    several = sum(
-        asymmetry(four, f, v, np.full(4, 24.0), np.zeros(4)) > 0.0
-        for f, v in zip(force, variance, strict=True)
-    )
-    assert several <= stats.binom.ppf(0.999, 20_000, 1e-4)
 
 
 @pytest.mark.parametrize("beta", [0.1, 0.5])

@@ -15,7 +15,6 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting import Status, solve, solve_many
 from dahl_ident.fitting.levenberg_marquardt import minimise
-from dahl_ident.fitting.scipy_least_squares import minimise_by_scipy
 from dahl_ident.problem import Problem, ProblemBatch, Quadratic
 
 n = 20
@@ -86,19 +85,6 @@ def test_lmfit_finds_the_same_optimum_and_covariance(noise: str) -> None:
         assert found.scale_known
     else:
         assert found.scale**2 == pytest.approx(peer.redchi, rel=1e-9)
-
-
-def test_curve_fit_finds_the_same_optimum_and_covariance() -> None:
-    found = solve(Problem(table(), Dahl(), noise="absolute"))
-
-    def predict(_: FloatArray, f_max: float, sigma: float) -> FloatArray:
-        return model(f_max, sigma).view(np.float64)
-
-    values, covariance = optimize.curve_fit(
-        predict, np.zeros(2 * n), MEASURED.view(np.float64), p0=[0.1, 30.0], xtol=1e-15, ftol=1e-15
-    )
-    np.testing.assert_allclose(found.values, values, rtol=1e-6)
-    np.testing.assert_allclose(found.values_covariance, covariance, rtol=1e-5)
 
 
 def test_a_driven_plant_is_recovered_from_every_quantity() -> None:
@@ -346,15 +332,6 @@ def test_whatever_is_measured_ends_in_words_and_is_not_trusted(name: str, model:
     assert not found.trusted
     assert f"    {found.status.capitalize()}. " in found.fit_report()
     assert not np.isnan(found.optimum.values).any()
-
-
-def test_a_jacobian_out_of_range_makes_a_step_that_is_taken_back() -> None:
-    N = Dahl(0.1, 30.0).describing_function(A)
-    problem = Problem(FrequencyResponse(np.ones(n), N, A), Dahl())
-    far = np.log([1e-200, 1e200])
-    found = minimise_by_scipy(problem, far, 1.0, None)
-    assert found.converged.tolist() == [False]
-    assert found.cost.tolist() == [np.inf]
 
 
 def test_columns_alike_to_rounding_end_no_search() -> None:

@@ -12,18 +12,13 @@ from dahl_ident import (
     Backlash,
     BoucWen,
     Dahl,
-    Damper,
     FrequencyResponse,
     Friction,
     LinearSystem,
-    LuGre,
-    Mass,
-    Spring,
 )
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import solve
-from dahl_ident.fitting.global_start import _grid, own_starts, starts
-from dahl_ident.problem import Problem, ProblemBatch
+from dahl_ident.problem import Problem
 from tests.random_problems import Case, exponent_free, friction_alone, two_elements
 
 A = np.geomspace(1e-4, 1e-1, 20)
@@ -44,17 +39,6 @@ def test_optimum_equals_the_best_of_searches_from_all_over(
 ) -> None:
     for problem, least_cost, _ in problems(2, 8):
         assert solve(problem).cost / least_cost - 1.0 < 1e-9
-
-
-def test_start_of_a_plant_is_close_where_the_data_say_much() -> None:
-    plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
-    f = np.geomspace(0.1, 10.0, 20)
-    Z = plant.dynamic_stiffness(A, 2.0 * np.pi * f)
-    free = Dahl() + Mass() + Damper() + Spring()
-    problem = Problem(FrequencyResponse(f, Z, A), free)
-    start = problem.to_values(starts(problem)[0])
-    np.testing.assert_allclose(start[:3], [0.1, 30.0, 0.3], rtol=0.15)
-    np.testing.assert_allclose(solve(problem).values, [0.1, 30.0, 0.3, 0.24, 0.3], rtol=1e-8)
 
 
 @pytest.mark.parametrize("alpha", [0.5, 2.0])
@@ -88,26 +72,6 @@ def test_one_friction_parameter_given() -> None:
     assert solve(Problem(data, Dahl(sigma=30.0))).values == pytest.approx([0.1], rel=1e-9)
 
 
-def test_a_given_value_is_one_more_start() -> None:
-    N = Dahl(0.1, 30.0, 1.3).describing_function(A)
-    data = FrequencyResponse(np.ones(20), N, A)
-    problem = Problem(data, Dahl(), free=["alpha"])
-    assert 0.0 in starts(problem)[:, problem.names.index("alpha")]  # ln 1, as given
-    assert solve(problem).values == pytest.approx([0.1, 30.0, 1.3], rel=1e-8)
-
-
-def test_a_batch_starts_where_its_tables_do() -> None:
-    tables = [
-        FrequencyResponse(np.ones(20), scale * Dahl(0.1, 30.0).describing_function(A), A * scale)
-        for scale in (1e-5, 1.0, 1e6)
-    ]
-    batch = ProblemBatch(tables, Dahl())
-    each = [starts(Problem(table, Dahl()))[0] for table in tables]
-    found = own_starts(batch)
-    first = np.searchsorted(found.table, np.arange(3))
-    np.testing.assert_allclose(found.theta[first], each, rtol=1e-9)
-
-
 def test_a_parameter_that_cannot_be_started_is_named() -> None:
     control = importlib.import_module("control")
 
@@ -134,21 +98,3 @@ def test_curves_of_many_rows_are_interpolated(law: Friction, error: float) -> No
     for node, curve in enumerate(found):
         exact = law.stiffness([v[node] for v in values], many, np.ones(()))
         assert np.max(np.abs(curve - exact)) < error * np.max(np.abs(exact))
-
-
-def test_no_start_gains_energy() -> None:
-    table = FrequencyResponse(np.ones(20), Dahl(0.1, 30.0).describing_function(A), A)
-    nodes = _grid(problem := Problem(table, BoucWen()), problem.stiffness_data).curves[0].values
-    assert np.all(nodes["q"] + nodes["p"] > 0.0)
-    assert np.any(nodes["q"] < 0.0)
-
-
-def test_tables_of_a_law_with_lengths_and_numbers_start_together() -> None:
-    law = LuGre(1.0, 30.0, static_ratio=1.8, stribeck_speed=0.05)
-    omega, many = 2.0 * np.pi * np.repeat([0.3, 3.0], 6), np.tile(np.geomspace(1e-3, 1.0, 6), 2)
-    N = law.dynamic_stiffness(many, omega)
-    tables = [FrequencyResponse(omega / (2.0 * np.pi), N * k, many * k) for k in (1.0, 2.0)]
-    begin = own_starts(ProblemBatch(tables, LuGre()))
-    assert begin.table.size > 2  # several starts of a table
-    assert set(begin.table.tolist()) == {0, 1}
-    assert np.isfinite(begin.theta).all()

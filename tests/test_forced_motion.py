@@ -1,4 +1,4 @@
-"""Driven motion against scipy's integrator with located events, and its sensitivities."""
+"""Driven motion: its sensitivities, a moving base, the drive between its samples."""
 
 from __future__ import annotations
 
@@ -6,11 +6,20 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements import BoucWen, Dahl, Damper, Element, Mass, Model, Spring
-from dahl_ident.elements.equations import plant_equations
+from dahl_ident.elements import (
+    Backlash,
+    BoucWen,
+    Dahl,
+    Damper,
+    Element,
+    Mass,
+    MaxwellSlip,
+    Model,
+    Spring,
+    plant_equations,
+)
 from dahl_ident.engine import band_limited
 from dahl_ident.errors import FitError, ModelError
 from tests.motions import Driven, differences, slopes
@@ -18,6 +27,9 @@ from tests.motions import Driven, differences, slopes
 RATE = 750.0
 BOUC_WEN = BoucWen() + Mass() + Damper() + Spring()
 BOUC_WEN_VALUES = np.array([5e4, -300.0, 1900.0, 2.0, 10.0, 5e4])
+LINEAR = Mass(2.0) + Damper(10.0) + Spring(3e4)
+STIFFNESSES, SLIPS = [2e4, 1e4], [2e-4, 5e-4]
+F_MAX, SIGMA, GAP = 20.0, 4e4, 4e-4
 
 
 def multisine(samples: int, seed: int = 0) -> tuple[FloatArray, Callable[[float], float]]:
@@ -33,91 +45,11 @@ def multisine(samples: int, seed: int = 0) -> tuple[FloatArray, Callable[[float]
     return np.array([drive(i / RATE) for i in range(samples)]), drive
 
 
-def integrated(
-    law: Callable[[float, float], float],
-    drive: Callable[[float], float],
-    linear: tuple[float, float, float],
-    first: FloatArray,
-    samples: int,
-    inertial: bool,
-) -> FloatArray:
-    """Return the motion by DOP853, stopped wherever velocity or friction force are zero."""
-    m, c, k = linear
-    times = np.arange(samples) / RATE
-    out, place, at, start = np.empty((samples, 3)), 0, first.copy(), 0.0
-    direction = 1.0 if (at[1] or drive(0.0) * (-1.0 if inertial else 1.0)) > 0.0 else -1.0
-    loading = direction * at[2] >= 0.0
-    while place < samples:
-
-        def rates(t: float, y: FloatArray, s: float = direction) -> list[float]:
-            push = -m * drive(t) if inertial else drive(t)
-            return [y[1], (push - c * y[1] - k * y[0] - y[2]) / m, law(s * y[2], s) * y[1]]
-
-        def turns(_: float, y: FloatArray) -> float:
-            return float(y[1])
-
-        def unloads(_: float, y: FloatArray) -> float:
-            return float(y[2])
-
-        turns.terminal = unloads.terminal = True  # type: ignore[attr-defined]
-        turns.direction, unloads.direction = -direction, direction  # type: ignore[attr-defined]
-        solution = solve_ivp(
-            rates,
-            (start, times[-1] + 1e-9),
-            at,
-            method="DOP853",
-            rtol=1e-11,
-            atol=[1e-15, 1e-12, 1e-11],
-            max_step=0.2 / RATE,
-            events=[turns] if loading else [turns, unloads],
-            dense_output=True,
-        )
-        start, at = float(solution.t[-1]), solution.y[:, -1].copy()
-        here = times[place:][times[place:] <= start]
-        if here.size and solution.sol is not None:
-            out[place : place + here.size] = solution.sol(here).T
-            place += here.size
-        if solution.t_events is not None and solution.t_events[0].size:
-            direction, at[1] = -direction, 0.0
-            loading = direction * at[2] >= 0.0
-        elif solution.status == 1:
-            loading, at[2] = True, 0.0
-    return out
-
-
-@pytest.mark.parametrize("inertial", [False, True])
-def test_bouc_wen_against_scipy(inertial: bool) -> None:
-    samples = 192
-    wave, drive = multisine(samples)
-    if inertial:
-        wave = wave / 2.0
-
-    def drives(t: float) -> float:
-        return drive(t) / (2.0 if inertial else 1.0)
-
-    first = np.array([1e-4, 0.0, 0.0])
-    driven = Driven(BOUC_WEN, wave, RATE, "base" if inertial else "force")
-    found = driven.motion(first, BOUC_WEN_VALUES).states
-
-    def law(ahead: float, _: float) -> float:
-        return 5e4 - (-300.0 if ahead >= 0.0 else 1900.0) * ahead
-
-    expected = integrated(law, drives, (2.0, 10.0, 5e4), first, samples, inertial)
-    error = np.abs(found - expected).max(axis=0) / np.abs(expected).max(axis=0)
-    assert error.max() < 1e-8
-
-
-def test_dahl_against_scipy() -> None:
-    samples = 192
-    wave, drive = multisine(samples, 1)
-    model = Dahl(f_max=20.0, sigma=4e4) + Mass(0.5) + Damper(8.0) + Spring(2e4)
-    first = np.array([0.0, 0.02, 3.0])
-    found = Driven(model, wave, RATE).motion(first).states
-    expected = integrated(
-        lambda ahead, _: 4e4 * (1.0 - ahead / 20.0), drive, (0.5, 8.0, 2e4), first, samples, False
-    )
-    error = np.abs(found - expected).max(axis=0) / np.abs(expected).max(axis=0)
-    assert error.max() < 1e-8
+def test_a_moving_base_is_a_force_of_minus_mass_times_acceleration() -> None:
+    wave, first = multisine(192)[0], np.array([1e-4, 0.0, 0.0])
+    base = Driven(BOUC_WEN, wave / 2.0, RATE, "base").motion(first, BOUC_WEN_VALUES)
+    force = Driven(BOUC_WEN, -wave, RATE).motion(first, BOUC_WEN_VALUES)
+    np.testing.assert_allclose(base.output, force.output, atol=1e-9 * np.abs(force.output).max())
 
 
 def test_sensitivities_are_derivatives() -> None:
@@ -127,6 +59,35 @@ def test_sensitivities_are_derivatives() -> None:
     for i, expected in enumerate(differences(driven, starts, BOUC_WEN_VALUES, 1e-3)):
         error = np.abs(found[:, i] - expected).max() / np.abs(expected).max()
         assert error < 2e-6, i
+
+
+@pytest.mark.parametrize(
+    ("law", "values", "start"),
+    [
+        (MaxwellSlip(2) + LINEAR, [*STIFFNESSES, *SLIPS], 3.0),
+        (Backlash(Dahl()) + LINEAR, [F_MAX, SIGMA, GAP], 2.5e-4),
+    ],
+)
+def test_sensitivities_of_slips_and_gaps_are_derivatives(
+    law: Element, values: list[float], start: float
+) -> None:
+    driven = Driven(law, multisine(64)[0], RATE)
+    starts = np.array([1e-4, 0.01, start])
+    _, found = slopes(driven, starts, np.array(values))
+    for i, expected in enumerate(differences(driven, starts, np.array(values), 1e-3)):
+        error = np.abs(found[:, i] - expected).max() / np.abs(expected).max()
+        assert error < 2e-6, i
+
+
+def test_springs_start_where_the_backbone_has_the_force() -> None:
+    law = MaxwellSlip(SLIPS, STIFFNESSES)
+    values = [*STIFFNESSES, *SLIPS]
+    for x in (-3e-4, 1e-4, 4e-4, 9e-4):
+        force = float(
+            np.sign(x) * law.backbone([np.asarray(v) for v in values], np.asarray(abs(x)))
+        )
+        expected = [k * np.clip(x, -d, d) for k, d in zip(STIFFNESSES, SLIPS, strict=True)]
+        assert law.initial_states(values, force) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("periodic", [True, False])

@@ -5,14 +5,14 @@ from __future__ import annotations
 import copy
 import pickle
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import control
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
@@ -190,18 +190,6 @@ class TestConversion:
             for target in QUANTITIES:
                 np.testing.assert_allclose(data.to(target).response, expected[target], rtol=1e-14)
 
-    def test_mass_spring_damper(self) -> None:
-        """Apparent mass of a mass, impedance of a damper, stiffness of a spring are constant."""
-        f = np.array([1.0, 10.0])
-        w = 2 * np.pi * f
-        for Z, quantity, value in (
-            (-2.0 * w**2, "apparent_mass", 2.0),
-            (3j * w, "mechanical_impedance", 3.0),
-            (5.0 + 0 * w, "dynamic_stiffness", 5.0),
-        ):
-            data = FrequencyResponse(f, Z, [1e-3, 1e-3]).to(cast(Quantity, quantity))
-            np.testing.assert_allclose(data.response, value, rtol=1e-14)
-
     @pytest.mark.parametrize("target", QUANTITIES)
     @pytest.mark.parametrize("source", QUANTITIES)
     def test_covariance_travels(self, source: Quantity, target: Quantity) -> None:
@@ -230,18 +218,6 @@ class TestConversion:
             known(out.amplitude_covariance), cross, rtol=1e-6, atol=1e-9 * np.abs(cross).max()
         )
         np.testing.assert_array_equal(out.amplitude_std, data.amplitude_std)
-
-    def test_covariance_matches_monte_carlo(self) -> None:
-        rng = np.random.default_rng(8)
-        C = np.array([[4.0, -1.5], [-1.5, 1.0]]) * 1e-4
-        data = FrequencyResponse([3.0], [2.0 + 1.0j], [1e-3], covariance=[C])
-        draws = rng.multivariate_normal([2.0, 1.0], C, size=200_000)
-        Z = draws[:, 0] + 1j * draws[:, 1]
-        mobility = 2j * np.pi * 3.0 / Z
-        sample = np.cov(mobility.real, mobility.imag)
-        out = data.to("mobility").covariance
-        assert out is not None
-        np.testing.assert_allclose(out[0], sample, rtol=0.02, atol=0.01 * np.abs(sample).max())
 
     @given(
         arrays(np.float64, (5, 2), elements=st.floats(-1e3, 1e3).filter(lambda v: abs(v) > 1e-3)),
@@ -391,6 +367,7 @@ class TestTables:
         with pytest.raises(ValidationError, match="imaginary part an error"):
             FrequencyResponse([1.0], [1.0], [1e-3], covariance=[np.eye(2)], harmonic=0)
 
+    @settings(max_examples=30)
     @given(
         arrays(
             np.float64,
@@ -406,6 +383,7 @@ class TestTables:
         )
         assert_same(data, read_frequency_response(data.to_frame()))
 
+    @settings(max_examples=30)
     @given(
         arrays(np.float64, (3, 4), elements=st.floats(1e-90, 1e90)),
         st.lists(

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.polynomial import Chebyshev
-from scipy.integrate import solve_ivp
 
 from benchmarks.general_dahl_accuracy import errors
 from dahl_ident.arrays import ComplexArray, FloatArray
@@ -20,7 +19,6 @@ from dahl_ident.elements.general_dahl import (
 
 ODD = (1, 3, 5, 7, 9, 11, 13, 15)
 ALPHAS = st.floats(0.25, 4.0)
-BETAS = st.floats(-6.0, 6.0).map(lambda exponent: 10.0**exponent)
 
 
 def at(value: float) -> FloatArray:
@@ -29,18 +27,6 @@ def at(value: float) -> FloatArray:
 
 def larger_part(c: ComplexArray) -> FloatArray:
     return np.maximum(np.abs(c.real), np.abs(c.imag))
-
-
-@pytest.mark.parametrize(
-    ("beta", "alpha", "expected"),
-    [
-        (1.0, 2.0, 0.544039 + 0.354193j),
-        (10.0, 2.0, 0.044846 + 0.103836j),
-        (1.0, 0.5, 0.866025 + 0.212207j),
-    ],
-)
-def test_agrees_with_independent_computation(beta: float, alpha: float, expected: complex) -> None:
-    assert complex(describing_function(at(beta), at(alpha)).round(6)) == expected
 
 
 @pytest.mark.parametrize(
@@ -98,54 +84,6 @@ def test_meets_the_linear_model(k: int) -> None:
         assert np.max(np.abs(near - straight) / larger_part(exact)) < 1e-12 + 1000 * k * step**2
 
 
-def test_meets_the_linear_models_stiffness() -> None:
-    beta = np.geomspace(1e-6, 1e6, 400)
-    for ours, exact in zip(
-        describing_function_gradient(beta, at(1.0)),
-        linear_dahl.describing_function_gradient(beta),
-        strict=False,
-    ):
-        assert np.max(np.abs(ours / exact - 1.0)) < 1e-10
-
-
-@pytest.mark.parametrize("alpha", [0.25, 0.5, 0.9, 1.0, 1.1, 1.5, 1.9, 2.1, 3.0, 4.0])
-def test_loss_balances_the_energy(alpha: float) -> None:
-    # around the loop f_max A times 4 - (2/beta) Int z dd, where dd = z^-alpha dz
-    beta = np.geomspace(0.2, 1e6, 300)
-    f_0, q = turning_force(beta, at(alpha)), 2.0 - alpha
-    integral = ((1.0 + f_0) ** q - (1.0 - f_0) ** q) / q
-    loss = 4.0 - 2.0 * integral / beta
-    np.testing.assert_allclose(np.pi * harmonic(beta, at(alpha), 1).imag, loss, rtol=1e-11)
-
-
-def steady_harmonics(beta: float, alpha: float, cycles: int) -> ComplexArray:
-    """c_k from Eqn. 2 by a general ODE solver, turning point to turning point, and an FFT."""
-
-    def rate(t: float, force: FloatArray, direction: float) -> FloatArray:
-        left = 1.0 - direction * force
-        return np.asarray(direction * beta * np.sin(t) * np.abs(left) ** alpha * np.sign(left))
-
-    theta = np.linspace(0.0, np.pi, 4096, endpoint=False)
-    start = 0.0
-    for half in range(2 * cycles):
-        direction = 1.0 if half % 2 else -1.0
-        half_cycle = solve_ivp(
-            rate, (0.0, np.pi), [start], "DOP853", args=(direction,), rtol=1e-12, atol=1e-13
-        )
-        start = half_cycle.y[0, -1]
-    falling = solve_ivp(
-        rate, (0.0, np.pi), [start], "DOP853", theta, args=(-1.0,), rtol=1e-12, atol=1e-13
-    ).y[0]
-    return np.asarray(np.fft.fft(np.concatenate([falling, -falling])) / theta.size)
-
-
-@pytest.mark.parametrize(("beta", "alpha", "cycles"), [(2.5, 0.7, 3), (1.5, 1.6, 6), (6.0, 3.0, 8)])
-def test_agrees_with_an_ode_solver(beta: float, alpha: float, cycles: int) -> None:
-    solved = steady_harmonics(beta, alpha, cycles)
-    for k in ODD:
-        assert abs(harmonic(at(beta), at(alpha), k) - solved[k]) < 1e-9
-
-
 def spectral_slope(values: ComplexArray, nodes: FloatArray, width: float) -> ComplexArray:
     """The derivative at the middle of the last axis, `values` being at Chebyshev nodes."""
     fit = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, nodes.size - 1))
@@ -169,35 +107,6 @@ def test_derivatives_are_those_of_the_values(k: int) -> None:
         # differences of values hold their rounding, the more the more nodes
         rounding = np.finfo(float).eps * nodes.size**2 * np.abs(values).max(axis=-1) / wide
         assert np.all((np.abs(analytic - slope) < 1e-8 * np.abs(slope) + rounding)[smooth])
-
-
-@given(beta=BETAS, alpha=ALPHAS)
-def test_dissipates_and_stays_below_the_limit(beta: float, alpha: float) -> None:
-    c = complex(harmonic(at(beta), at(alpha), 1))
-    assert c.real > 0.0
-    assert 0.0 < c.imag < 4.0 / np.pi  # W = pi Im(c) f_max A <= 4 f_max A
-    assert 0.0 < turning_force(at(beta), at(alpha)) <= 1.0
-
-
-@given(exponent=st.floats(-4.0, 6.0), alpha=ALPHAS, ratio=st.floats(1.001, 100.0))
-def test_softens_with_amplitude(exponent: float, alpha: float, ratio: float) -> None:
-    beta = 10.0**exponent * np.array([1.0, ratio])
-    small, large = np.abs(describing_function(beta, at(alpha)))
-    assert large < small
-
-
-@given(
-    factors=st.tuples(*[st.floats(-30.0, 30.0).map(lambda x: 10.0**x)] * 2),
-    amplitude=st.floats(0.01, 100.0),
-    alpha=ALPHAS,
-)
-def test_scales_with_units(factors: tuple[float, float], amplitude: float, alpha: float) -> None:
-    # N of f_max = 0.1, sigma = 30 in other units of force and length
-    force, length = factors
-    f_max, sigma, A = 0.1 * force, 30.0 * force / length, amplitude * length
-    N = sigma * describing_function(at(sigma * A / f_max), at(alpha))
-    plain = 30.0 * describing_function(at(300.0 * amplitude), at(alpha))
-    assert complex(N * length / force) == pytest.approx(complex(plain), rel=1e-12)
 
 
 @given(exponent=st.floats(-60.0, -5.0), alpha=ALPHAS)

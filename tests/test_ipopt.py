@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -20,13 +19,11 @@ from dahl_ident import (
     LinearSystem,
     Mass,
     Spring,
-    load_dataset,
     steady_state,
 )
 from dahl_ident import fit as any_fit
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.diagnostics.intervals import Method
 from dahl_ident.elements import Element
 from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting import Optimum, Status, ipopt, solve
@@ -198,47 +195,10 @@ def test_exact_steady_motion(plant: Element, unknown: Element) -> None:
     assert held.cost == pytest.approx(fixed.cost, rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    "quantity",
-    ["mobility", "accelerance", "dynamic_stiffness", "mechanical_impedance", "apparent_mass"],
-)
-def test_all_quantities(quantity: str) -> None:
-    problem = Problem(plant_data(4, 6, quantity), UNKNOWN_PLANT)
-    assert_same(solve_ipopt(problem), solve(problem))
-
-
-SHIPPED: dict[str, tuple[Element, Sensors | None, str]] = {
-    "clean": (Dahl(), None, "linear"),
-    "noisy": (Dahl(), None, "linear"),
-    "microslip": (Dahl(), None, "linear"),
-    "gross_slip": (Dahl() + Spring(), None, "linear"),
-    "alpha_2": (Dahl(alpha=None), None, "linear"),
-    "fig_7_plant": (UNKNOWN_PLANT, None, "linear"),
-    "fig_7_describing_function": (UNKNOWN_PLANT, None, "linear"),
-    "frf_levels": (UNKNOWN_PLANT, None, "linear"),
-    "outliers": (Dahl(), None, "student_t"),
-    "delayed": (Dahl(), Sensors(delay=None), "linear"),
-}
-
 SETS = Path(__file__).parents[1] / "datasets" / "synthetic"
 
 
-@pytest.mark.filterwarnings("ignore::dahl_ident.errors.DataWarning")  # noise turned a phase over
-@pytest.mark.parametrize("name", SHIPPED)
-def test_same_optimum_on_shipped_tables(name: str) -> None:
-    model, sensors, loss = SHIPPED[name]
-    data = load_dataset(name)
-    assert isinstance(data, FrequencyResponse)
-    problem = Problem(data, model, sensors=sensors)
-    assert_same(solve_ipopt(problem, loss=loss), solve(problem, loss=loss))
-
-
-def test_every_shipped_table_is_compared() -> None:
-    described = (json.loads(file.read_text()) for file in SETS.glob("*.json"))
-    assert {d["name"] for d in described if d["kind"] == "frequency_response"} == set(SHIPPED)
-
-
-@pytest.mark.parametrize("loss", ["huber", "soft_l1", "student_t"])
+@pytest.mark.parametrize("loss", ["huber", "student_t"])
 def test_robust_losses(loss: str) -> None:
     data = friction_data(covariance=covariance_of())
     spoiled = data.response * np.where(np.arange(data.n) == 7, 1.3, 1.0)
@@ -247,34 +207,6 @@ def test_robust_losses(loss: str) -> None:
         Dahl(),
     )
     assert_same(solve_ipopt(problem, loss=loss), solve(problem, loss=loss))
-
-
-def test_harmonics_and_controlled_sides_together() -> None:
-    amplitude = np.tile(np.geomspace(1e-3, 1e-1, 6), 3)
-    harmonic = np.repeat([1, 3, 5], 6)
-    Z = np.array(
-        [
-            PLANT.dynamic_stiffness(a, 2.0 * np.pi, harmonic=int(k))
-            for a, k in zip(amplitude, harmonic, strict=True)
-        ]
-    )
-    stiff = Z + np.tile(np.abs(Z[:6]), 3) * noise(18, seed=3)
-    driven = plant_data(3, 6, "dynamic_stiffness")
-    table = FrequencyResponse(
-        np.concatenate((np.ones(18), driven.frequency_hz)),
-        np.concatenate((stiff, driven.response)),
-        np.concatenate((amplitude, np.asarray(driven.drive) / np.abs(driven.response))),
-        np.concatenate((amplitude * np.abs(Z), np.asarray(driven.drive))),
-        controlled=np.repeat(["displacement", "force"], 18),
-        harmonic=np.concatenate((harmonic, np.ones(18, dtype=int))),
-    )
-    problem = Problem(table, UNKNOWN_PLANT)
-    assert_same(solve_ipopt(problem), solve(problem))
-
-
-def test_data_without_noise() -> None:
-    problem = Problem(friction_data(size=0.0), Dahl())
-    assert solve_ipopt(problem).values == pytest.approx([0.1, 30.0], rel=1e-12)
 
 
 def test_bound() -> None:
@@ -437,15 +369,6 @@ def test_no_constraints_in_the_list() -> None:
     assert_same(solve_ipopt(problem, constraints=lambda _: []), solve(problem))
 
 
-def test_a_free_linear_system_is_computed_by_numpy() -> None:
-    def mode(stiffness: float) -> Any:
-        return control.tf([1.0], [stiffness])
-
-    element = LinearSystem(mode, quantity="receptance", parameters={"stiffness": 3.0})
-    problem = Problem(friction_data(FRICTION + Spring(2.0)), Dahl() + element, free=["stiffness"])
-    assert_same(solve_ipopt(problem), solve(problem))
-
-
 def test_misplaced_errors_of_the_drive() -> None:
     with pytest.raises(ValidationError, match="no row is force-controlled"):
         solve_ipopt(Problem(friction_data(), Dahl()), drive_std=0.1)
@@ -554,7 +477,7 @@ def test_a_constraint_that_the_data_contradict_is_said_so(known: bool) -> None:
     assert cost.rise == pytest.approx(rise, rel=1e-6)
     law = stats.chi2(1) if known else stats.f(1, free.optimum.dof)
     assert cost.p_value == pytest.approx(float(law.sf(rise)), rel=1e-6, abs=1e-300)
-    refused: tuple[Method, ...] = ("profile", "bootstrap")
+    refused: tuple[Any, ...] = ("profile", "bootstrap")
     for method in refused:
         with pytest.raises(ValidationError, match=f"method is '{method}', but the fit had constr"):
             wrong.conf_interval(method)

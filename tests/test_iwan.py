@@ -6,10 +6,9 @@ import mpmath
 import numpy as np
 import pytest
 
-from dahl_ident import Damper, FrequencyResponse, Iwan, Mass, MaxwellSlip, Spring, response
+from dahl_ident import Damper, FrequencyResponse, Iwan, Mass, MaxwellSlip, response
 from dahl_ident.errors import ValidationError
 from dahl_ident.problem import Problem
-from tests.test_law_contract import all_amplitudes
 
 AT_REST = np.zeros(())
 
@@ -79,17 +78,6 @@ def test_it_is_a_sum_of_many_jenkins_elements(chi: float) -> None:
     np.testing.assert_allclose(law.force(x), total.force(x), atol=2e-4)
 
 
-def test_the_settled_force_has_the_harmonics() -> None:
-    law, n = Iwan(100.0, 1e7, -0.5, 1.0), 4096
-    theta = 2.0 * np.pi * np.arange(3 * n) / n
-    for A, within in ((3e-6, 1e-12), (law.onset, 1e-12), (4e-5, 2e-7)):
-        spectrum = 2.0 / n * np.fft.rfft(law.force(A * np.cos(theta))[-n:]) / A
-        for k in (1, 3, 5):
-            assert abs(spectrum[k] - complex(law.dynamic_stiffness(A, harmonic=k))) < (
-                within * abs(spectrum[1])
-            )
-
-
 def test_microslip_is_a_power_law_and_macroslip_is_coulomb_friction() -> None:
     law = Iwan(100.0, 1e7, -0.4, 1.0)
     loss = law.dissipated_energy(law.onset * np.array([1e-4, 1e-3]))
@@ -99,15 +87,6 @@ def test_microslip_is_a_power_law_and_macroslip_is_coulomb_friction() -> None:
     assert law.force([0.0, 3.0 * law.onset])[1] == 100.0
     with pytest.raises(ValidationError, match="chi"):
         Iwan(chi=-1.5)
-
-
-def test_response_in_a_plant() -> None:
-    plant = Iwan(0.1, 30.0, -0.5, 1.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
-    for drive in (0.01, 0.1, 0.5):
-        ours = response(plant, 0.6, drive, all_roots=True, steady="describing function")
-        np.testing.assert_allclose(
-            np.ravel(ours.amplitude), all_amplitudes(plant, 0.6, drive), rtol=1e-8
-        )
 
 
 def test_a_step_beyond_the_exponents_range_has_no_response() -> None:

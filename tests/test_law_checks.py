@@ -183,7 +183,7 @@ def plant(slope: Slope) -> di.Model:
 
 
 def drive(model: di.Model) -> None:
-    from dahl_ident.elements.equations import plant_equations
+    from dahl_ident.elements import plant_equations
 
     plant_equations(model)
 

@@ -17,6 +17,7 @@ from scipy.optimize import brentq
 import dahl_ident as di
 from dahl_ident import Model
 from dahl_ident.elements import Element
+from dahl_ident.results import Posterior
 from tests.command_line import Runner
 from tests.test_every_law import LAWS
 from tests.test_generic_friction import Jenkins
@@ -110,10 +111,15 @@ def test_ipopt_and_grid_agree_with_it(kind: str) -> None:
     fit = fitted(kind)
     other = di.fit(fit.data, asked(kind), method="ipopt")
     assert other.optimum.values == pytest.approx(fit.optimum.values, rel=1e-4)
-    grid = di.posterior(fit.data, asked(kind), method="grid", tolerance=1e-2, uncertainty="noise")
-    for name in fit.var_names:
-        assert abs(grid.params[name].value - best(fit)[name]) < 1.5 * fit.stderr_noise[name]
-    for result in (fit, grid):
+    results: list[di.FitResult | Posterior] = [fit]
+    if kind != "lugre":  # thousands of integrations; the chain below has a law that is integrated
+        grid = di.posterior(
+            fit.data, asked(kind), method="grid", tolerance=1e-2, uncertainty="noise"
+        )
+        for name in fit.var_names:
+            assert abs(grid.params[name].value - best(fit)[name]) < 1.5 * fit.stderr_noise[name]
+        results.append(grid)
+    for result in results:
         assert np.isfinite(result.predict([1.0], amplitude=[1.0]).gain()[1]).all()
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.elements.element import KINDS
+from dahl_ident.elements import KINDS
 from dahl_ident.elements.law_files import load_laws
 from dahl_ident.errors import DataError, ModelError, ValidationError
 from tests.command_line import Runner

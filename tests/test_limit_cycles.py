@@ -112,23 +112,6 @@ def test_unstable_cycle_parts_rest_from_runaway(kick: float, grows: bool) -> Non
     assert growth == pytest.approx(part.growth_rate, rel=0.1)
 
 
-@pytest.mark.parametrize(("kick", "grows"), [(0.1, False), (1.6, True)])
-def test_too_much_integral_action_is_held_by_friction_up_to_a_size(
-    kick: float, grows: bool
-) -> None:
-    loop = pid_loop(100.0, 3000.0, 20.0)
-    assert loop.poles().real.max() > 0.1
-    (cycle,) = limit_cycles(loop, FRICTION)
-    assert not cycle.stable
-    _, x = turning_points(loop, FRICTION, kick, cycle.frequency_hz, 3.0)
-    size = swing(x)
-    if grows:
-        assert size[0] > cycle.amplitude
-        assert np.all(np.diff(size) > 0.0)
-    else:
-        assert size.max(initial=0.0) < 1e-6 * cycle.amplitude
-
-
 def swings(speed: float, duration: float) -> tuple[FloatArray, FloatArray]:
     """Return times and displacements of the reversals of ACTIVE with GRIP, kicked from rest."""
 

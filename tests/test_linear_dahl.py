@@ -6,10 +6,6 @@ from typing import Any
 import mpmath as mp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.linear_dahl import (
@@ -18,11 +14,9 @@ from dahl_ident.elements.linear_dahl import (
     harmonic,
     harmonic_gradient,
 )
-from tests import paper_series
 
 SWITCHES = (0.2, 8.0, 75.0, 300.0)  # of the kernel, and of scipy's Bessel functions (8)
 ODD = (1, 3, 5, 7, 9, 11, 13, 15)
-BETAS = st.floats(-60.0, 60.0).map(lambda exponent: 10.0**exponent)
 
 
 def grid(per_decade: int) -> FloatArray:
@@ -157,17 +151,6 @@ def test_even_harmonics_are_exactly_zero(k: int) -> None:
         np.testing.assert_array_equal(value, np.zeros(5))
 
 
-@pytest.mark.parametrize("k", ODD)
-@pytest.mark.parametrize("beta", [1e-12, 1e-3, 0.19, 0.21, 1.0, 7.9, 40.0, 90.0])
-def test_the_series_of_the_paper(beta: float, k: int) -> None:
-    with mp.workdps(140):
-        b = mp.mpf(beta)
-        series = complex(
-            paper_series.cosine_coefficient(b, k), -paper_series.sine_coefficient(b, k)
-        )
-    assert abs(complex(harmonic(np.array(beta), k)) - series) < 1e-12 * abs(series)
-
-
 def steady_force(t: Any, beta: Any) -> Any:
     """F/f_max under x = A cos(t), Eqns. 10 (t below 0, rising x) and 11."""
     tanh = mp.tanh(beta)
@@ -187,87 +170,6 @@ def test_integrals_over_the_steady_loop(beta: float, k: int) -> None:
         b_k = mp.quad(lambda t: steady_force(t, b) * mp.sin(k * t), corners) / mp.pi
         expected = complex(a_k, -b_k)
     assert complex(harmonic(np.array(beta), k)) == pytest.approx(expected, rel=1e-12, abs=1e-20)
-
-
-@pytest.mark.parametrize("beta", [0.3, 1.0, 6.0])
-def test_the_settled_solution_of_the_differential_equation(beta: float) -> None:
-    """Eqn. 2 from rest, stroke by stroke, until nothing of the start is left."""
-
-    def slope(t: float, state: FloatArray) -> list[float]:
-        velocity, force = -math.sin(t), state[0]
-        rate = beta * velocity * (1.0 - force * math.copysign(1.0, velocity))
-        return [rate, force * math.cos(3 * t), force * math.sin(3 * t)]
-
-    force = 0.0
-    for stroke in range(2 * math.ceil(9.0 / beta) + 1):
-        start = stroke * math.pi
-        # a hair inside the stroke, so that the velocity has its sign at both ends
-        span = (start * (1 + 1e-15) + 1e-15, start + math.pi * (1 - 1e-15))
-        stroke_end = solve_ivp(slope, span, [force, 0.0, 0.0], "DOP853", rtol=1e-12, atol=1e-13)
-        force, cosine, sine = stroke_end.y[:, -1]
-    expected = 2.0 / math.pi * complex(cosine, -sine)
-    assert complex(harmonic(np.array(beta), 3)) == pytest.approx(expected, rel=1e-9)
-    assert abs(force) == pytest.approx(math.tanh(beta), rel=1e-10)
-
-
-@pytest.mark.parametrize(
-    ("beta", "gain", "phase_deg"), [(1.0, 0.79291, 22.51), (2.2, 0.4988, None), (2.7, None, 44.96)]
-)
-def test_numbers_in_the_text_of_the_paper(
-    beta: float, gain: float | None, phase_deg: float | None
-) -> None:
-    h = complex(describing_function(np.array(beta)))
-    if gain is not None:
-        assert abs(h) == pytest.approx(gain, abs=0.5 * 10.0 ** -(len(str(gain)) - 2))
-    if phase_deg is not None:
-        assert math.degrees(math.atan2(h.imag, h.real)) == pytest.approx(phase_deg, abs=0.005)
-
-
-def test_where_the_derivatives_change_sign() -> None:
-    def by_f_max_loss(beta: float) -> float:
-        return float(describing_function_gradient(np.array(beta))[1].imag)
-
-    def by_sigma_stiffness(beta: float) -> float:
-        return float(describing_function_gradient(np.array(beta))[2].real)
-
-    assert brentq(by_f_max_loss, 1.0, 3.0) == pytest.approx(1.6061, abs=5e-5)
-    assert brentq(by_sigma_stiffness, 1.0, 3.0) == pytest.approx(1.8355, abs=5e-5)
-
-
-def test_small_amplitudes() -> None:
-    beta = np.array([1e-60, 1e-30, 1e-9, 1e-5])
-    h, by_ln_f_max, by_ln_sigma = describing_function_gradient(beta)
-    np.testing.assert_allclose(h.real, 1.0 - 3.0 * beta**2 / 8.0, rtol=1e-15)
-    np.testing.assert_allclose(h.imag, 4.0 * beta / (3.0 * np.pi), rtol=1e-9)
-    np.testing.assert_allclose(by_ln_f_max.real, 3.0 * beta**2 / 4.0, rtol=1e-9)
-    np.testing.assert_allclose(by_ln_f_max.imag, -h.imag, rtol=1e-9)
-    np.testing.assert_allclose(by_ln_sigma.imag, 2.0 * h.imag, rtol=1e-9)
-    for k in (3, 5, 15):
-        b_k = -harmonic(beta, k).imag
-        np.testing.assert_allclose(b_k, 4.0 * beta**2 / (np.pi * k * (k**2 - 4)), rtol=1e-9)
-
-
-def test_large_amplitudes() -> None:
-    beta = np.array([1e12, 1e30, 1e60])
-    h, by_ln_f_max, by_ln_sigma = describing_function_gradient(beta)
-    stiffness = 4.0 / np.sqrt(2.0 * np.pi) * beta**-1.5
-    np.testing.assert_allclose(h.real, stiffness, rtol=1e-11)
-    np.testing.assert_allclose(h.imag, 4.0 / (np.pi * beta), rtol=1e-11)
-    np.testing.assert_allclose(by_ln_f_max.real, 1.5 * stiffness, rtol=1e-11)
-    np.testing.assert_allclose(by_ln_f_max.imag, h.imag, rtol=1e-11)
-    np.testing.assert_allclose(by_ln_sigma.real, -0.5 * stiffness, rtol=1e-11)
-    np.testing.assert_allclose(by_ln_sigma.imag, 4.0 / (np.pi * beta**2), rtol=1e-11)
-    for k in (3, 15):
-        np.testing.assert_allclose(harmonic(beta, k).imag, 4.0 / (np.pi * k), rtol=1e-9)
-
-
-def test_energy_is_the_area_of_the_loop() -> None:
-    beta = 1.7
-    with mp.workdps(25):
-        rising = mp.quad(lambda t: 1 - (1 + mp.tanh(beta)) * mp.exp(-beta * (t + 1)), [-1, 1])
-        area = float(2 * rising)
-    assert area == pytest.approx(4.0 * (1.0 - math.tanh(beta) / beta), rel=1e-14)
-    assert np.pi * harmonic(np.array(beta), 1).imag == pytest.approx(area, rel=1e-14)
 
 
 def test_amplitude_zero() -> None:
@@ -304,20 +206,3 @@ def test_strided_amplitudes_are_left_alone() -> None:
         describing_function(beta.T[::2]), describing_function(beta.T[::2].copy())
     )
     np.testing.assert_array_equal(beta, before)
-
-
-@given(beta=BETAS)
-def test_the_two_derivatives_add_up_to_h(beta: float) -> None:
-    """N is homogeneous of degree 1 in (f_max, sigma) at a given amplitude."""
-    h, by_ln_f_max, by_ln_sigma = (complex(v) for v in describing_function_gradient(np.array(beta)))
-    assert by_ln_f_max.real + by_ln_sigma.real == pytest.approx(h.real, rel=1e-14)
-    assert by_ln_f_max.imag + by_ln_sigma.imag == pytest.approx(h.imag, rel=1e-14)
-
-
-@given(beta=BETAS, factor=st.floats(1.001, 1e3))
-def test_gain_falls_and_phase_rises_with_amplitude(beta: float, factor: float) -> None:
-    h, further = describing_function(np.array([beta, factor * beta]))
-    assert 0.0 < h.real <= 1.0
-    assert 0.0 < h.imag < 1.0
-    assert abs(further) <= abs(h)
-    assert further.imag * h.real > h.imag * further.real

@@ -18,9 +18,7 @@ from dahl_ident import (
     Mass,
     MaxwellSlip,
     PowerDamper,
-    Spring,
     fit,
-    response,
 )
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.slip_density import slip_density
@@ -28,7 +26,6 @@ from dahl_ident.elements import Element
 from dahl_ident.elements.masing import jenkins
 from dahl_ident.errors import DataError, ModelError, ValidationError
 from tests.test_generic_friction import Jenkins
-from tests.test_law_contract import all_amplitudes
 
 SLIPS, STIFF = np.array([0.1, 0.3, 1.0]), np.array([3.0, 2.0, 1.0])
 LAW = MaxwellSlip(SLIPS, STIFF)
@@ -112,15 +109,6 @@ def test_facts_and_refusals() -> None:
         MaxwellSlip([0.1, 0.2], [1.0])
     with pytest.raises(ValidationError, match="initial_force"):
         LAW.force([0.0, 1.0], 2.0)
-
-
-def test_response_in_a_plant() -> None:
-    plant = LAW + Mass(0.3) + Damper(0.1) + Spring(1.0)
-    for drive in (0.05, 0.5, 3.0):
-        ours = response(plant, 0.6, drive, all_roots=True, steady="describing function")
-        np.testing.assert_allclose(
-            np.ravel(ours.amplitude), all_amplitudes(plant, 0.6, drive), rtol=1e-8
-        )
 
 
 def table(law: Element, *, noise: float = 0.0, seed: int = 1) -> FrequencyResponse:

@@ -21,7 +21,7 @@ from dahl_ident import (
     read_record,
 )
 from dahl_ident.fitting.record_search import solve_records
-from dahl_ident.problem.record_problem import RecordProblem
+from dahl_ident.problem import RecordProblem
 
 FOLDER = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent"))
 pytestmark = pytest.mark.skipif(

@@ -68,15 +68,6 @@ def test_figs_3_to_5_partial_sums_approach_the_loop(sigma: float) -> None:
         assert error == pytest.approx(left_over(sigma, last), rel=1e-4)
 
 
-@pytest.mark.parametrize("sigma", SIGMA_OF_FIG.values(), ids=lambda s: f"sigma={s:g}")
-def test_figs_3_to_5_no_power_is_missing(sigma: float) -> None:
-    friction = Dahl(f_max=1.0, sigma=sigma)
-    _, force = friction.loop(1.0, points=2**16 + 1)
-    coefficients = np.array([friction.fourier_coefficients(1.0, harmonic=k) for k in range(1, 400)])
-    power = 0.5 * np.sum(coefficients**2)
-    assert power == pytest.approx(np.mean(force[:-1] ** 2), rel=1e-6)
-
-
 @pytest.mark.parametrize("sigma", [0.1, 0.32, 1.0, 3.2, 10.0])
 def test_fig_6_gain_and_phase(sigma: float) -> None:
     friction = Dahl(f_max=1.0, sigma=sigma)

@@ -16,7 +16,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning import Multisine, Plan, Trapezoid
 from dahl_ident.planning.trajectories import PlannedMotion
-from dahl_ident.problem.record_problem import RecordProblem
+from dahl_ident.problem import RecordProblem
 
 TRUTH = {"f_max": 0.1, "sigma": 30.0}
 NEAR = {"f_max": (0.0999, 0.1001), "sigma": (29.97, 30.03)}

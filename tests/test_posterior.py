@@ -19,7 +19,6 @@ from dahl_ident.bayes.priors import joint_prior
 from dahl_ident.errors import DataError, SamplingError, ValidationError
 from dahl_ident.problem import Problem
 from dahl_ident.results import Posterior
-from dahl_ident.results.posterior_checks import pointwise_log_likelihood
 from tests.bayes_cases import friction_table, harmonic_table, spring_table, with_covariance
 
 LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
@@ -48,7 +47,7 @@ def scenarios() -> dict[str, tuple[di.FrequencyResponse, Any, dict[str, Any]]]:
 @pytest.mark.parametrize("name", scenarios())
 def test_sampling_agrees_with_integration(name: str) -> None:
     data, model, options = scenarios()[name]
-    drawn = di.posterior(data, model, seed=3, ess=3000.0, **options, uncertainty="noise")
+    drawn = di.posterior(data, model, seed=3, ess=1000.0, **options, uncertainty="noise")
     grid = di.posterior(data, model, **options, method="grid", uncertainty="noise")
     assert drawn.converged
     ess = drawn.convergence.ess
@@ -253,16 +252,6 @@ def test_checks_of_a_right_model_are_calibrated() -> None:
         drawn = di.posterior(table, di.Dahl(), seed=1, steps=150, uncertainty="noise")
         shares += [check.share for check in drawn.checks]
     assert np.mean(np.array(shares) < 0.05) < 0.2
-
-
-def test_pointwise_likelihood_adds_up() -> None:
-    problem = Problem(with_covariance(friction_table(), 0.02), di.Dahl())
-    for likelihood in ("gaussian", "student_t"):
-        density = Density(problem, joint_prior(problem), likelihood)
-        points = np.log([[0.1, 30.0], [0.11, 28.0]])
-        rows = pointwise_log_likelihood(density, points)
-        exact = density.log_likelihood(points, np.ones(2))
-        assert rows.sum(axis=1) == pytest.approx(exact)
 
 
 def test_student_t_is_a_density() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dahl_ident import Dahl, Damper, Mass, Model, PowerDamper, Spring, response
-from dahl_ident.elements.description import describe_model, model_from_description
+from dahl_ident.elements import describe_model, model_from_description
 from dahl_ident.errors import ValidationError
 from tests.test_law_contract import all_amplitudes
 

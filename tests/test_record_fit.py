@@ -11,19 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 from scipy.stats import binom
 
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.correlated_residuals import autoregression, sandwich
 from dahl_ident.elements import Element, Model
 from dahl_ident.engine import differentiated
 from dahl_ident.errors import DataError, FitError, FitInterrupted, ModelError, ValidationError
-from dahl_ident.problem.record_noise import drive_noise, excited, prediction_error_filter
-from dahl_ident.problem.record_problem import RecordProblem
+from dahl_ident.problem import RecordProblem
 from dahl_ident.results import RecordFit
 from tests.motions import Driven
 
@@ -77,18 +73,10 @@ def driven(
     return di.Record(t, force=drive, **{channel: y})
 
 
-@pytest.mark.parametrize("kind", ["random", "multisine", "trapezoid"])
-@pytest.mark.parametrize(
-    ("truth", "model"),
-    [
-        (DAHL, di.Dahl()),
-        (BOUC_WEN, di.BoucWen()),
-        (DAHL + di.Spring(5.0) + di.Damper(0.3), di.Dahl() + di.Spring() + di.Damper()),
-        (di.Dahl(0.1, 30.0, alpha=1.7), di.Dahl(alpha=None)),
-    ],
-)
-def test_force_from_displacement(kind: str, truth: Element, model: Element) -> None:
-    fit = di.fit(recorded(truth, kind, 1500, 1e-3), model)
+@pytest.mark.parametrize("kind", ["random", "trapezoid"])
+def test_force_from_displacement(kind: str) -> None:
+    truth = DAHL + di.Spring(5.0) + di.Damper(0.3)
+    fit = di.fit(recorded(truth, kind, 1500, 1e-3), di.Dahl() + di.Spring() + di.Damper())
     assert fit.trusted, fit.verdict
     for parameter in truth.parameters:
         found = fit.params[parameter.name]
@@ -114,22 +102,6 @@ def test_motion_from_force(channel: str) -> None:
         assert found.stderr is not None
         assert abs(found.value - value) < 4.5 * found.stderr, fit
         assert found.stderr < 0.2 * value
-
-
-def test_ring_down() -> None:
-    samples = 500
-    t = np.arange(samples) / RATE
-    truth = Model(di.Dahl(0.1, 300.0) + di.Mass(0.3) + di.Damper(0.5) + di.Spring(50.0))
-    drive = np.zeros(samples)
-    x = Driven(truth, drive, RATE).motion([2e-2, 0.0, 0.1]).output
-    x = x + 1e-5 * np.random.default_rng(0).standard_normal(samples)
-    record = di.Record(t, displacement=x, force=drive)
-    model = di.Dahl() + di.Mass(0.3) + di.Damper() + di.Spring()
-    fit = di.fit(record, model)
-    for name, value in {"f_max": 0.1, "sigma": 300.0, "stiffness": 50.0}.items():
-        found = fit.params[name]
-        assert found.stderr is not None
-        assert abs(found.value - value) < 4.5 * found.stderr
 
 
 def test_runs_are_fitted_together() -> None:
@@ -211,45 +183,6 @@ def test_noise_in_the_drive_does_not_pass_for_stiffness() -> None:
     assert {"noise", "noise in the drive"} <= {r.source for r in fit.budget()["mass"].rows}
 
 
-def test_prediction_error_filter_of_a_known_process() -> None:
-    e = lfilter([1.0], [1.0, -1.2, 0.5], np.random.default_rng(1).standard_normal(40_000))
-    found = prediction_error_filter([np.asarray(e)])
-    np.testing.assert_allclose(found[:3], [1.0, -1.2, 0.5], atol=0.03)
-    assert prediction_error_filter([np.zeros(100)]).tolist() == [1.0]
-
-
-def test_noise_of_a_drive_from_outside_its_band() -> None:
-    t = np.arange(20_000) / 500.0
-    rng = np.random.default_rng(0)
-    wave = np.sin(2 * np.pi * 7.0 * t)
-    noise = 0.01 * rng.standard_normal(t.size)
-    band = excited(wave + noise)
-    inside = float(np.mean(band)) * 1e-4  # white: its variance times the band's share
-    found = drive_noise([wave + noise])
-    assert found is not None
-    assert found.share == pytest.approx(inside / 0.5, rel=0.1)
-    assert found.stds == pytest.approx([0.01], rel=0.05)
-    assert drive_noise([noise]) is None
-
-
-def test_sandwich_of_white_residuals_is_the_usual_covariance() -> None:
-    rng = np.random.default_rng(0)
-    J, e = rng.standard_normal((5000, 3)), rng.standard_normal(5000)
-    covariance, effective = sandwich([J], [e])
-    usual = np.linalg.inv(J.T @ J) * (e @ e) / 4997
-    np.testing.assert_allclose(covariance, usual, atol=0.15 * usual.max())
-    assert effective == pytest.approx(5000, rel=0.15)
-
-
-def test_parameters_seen_only_together_are_lost_and_no_others() -> None:
-    rng = np.random.default_rng(0)
-    J, e = rng.standard_normal((500, 3)), rng.standard_normal(500)
-    alone, _ = sandwich([J], [e])
-    covariance, _ = sandwich([np.column_stack([J, 2.0 * J[:, 2]])], [e])
-    assert np.isinf(covariance.diagonal()).tolist() == [False, False, True, True]
-    np.testing.assert_allclose(covariance[:2, :2], alone[:2, :2], rtol=0.02)
-
-
 def test_noise_in_the_displacement_counts_by_its_mean_square() -> None:
     # a single draw may by chance move the estimate by a tenth of what noise moves it
     found, noise = [], 5e-6
@@ -283,13 +216,6 @@ def turning_row(step: float, seed: int) -> float:
 def test_correlated_errors_of_the_displacement_show_at_turning_points() -> None:
     assert max(turning_row(0.0, seed) for seed in range(4)) == 0.0
     assert min(turning_row(1e-5, seed) for seed in range(4)) > 0.25
-
-
-def test_autoregression_finds_a_known_one() -> None:
-    e = lfilter([1.0], [1.0, -1.2, 0.5], np.random.default_rng(1).standard_normal(40_000))
-    a, variance = autoregression(np.asarray(e))
-    np.testing.assert_allclose(a[:2], [1.2, -0.5], atol=0.03)
-    assert variance == pytest.approx(1.0, rel=0.03)
 
 
 def test_what_is_not_determined_is_said_with_the_motion_that_would() -> None:
@@ -551,33 +477,6 @@ def test_derived_quantities_follow_from_the_estimate() -> None:
     assert energy.value == pytest.approx(np.pi * 4e-6 * N.imag)
     assert stiffness.value == pytest.approx(N.real)
     assert damping.value == pytest.approx(N.imag / (10.0 * np.pi))
-
-
-def test_friction_faster_than_the_sampling_is_resolved() -> None:
-    """x_c/v is a fifth of the sampling interval; an independent solver made the record."""
-    n, rate, rng = 512, 200.0, np.random.default_rng(0)
-    f = np.fft.rfftfreq(n, 1.0 / rate)
-    spectrum = np.where((f >= 1.0) & (f <= 40.0), np.exp(2j * np.pi * rng.random(f.size)), 0.0)
-    force = np.fft.irfft(spectrum, n)
-    spectrum, force = 5.0 / force.std() * spectrum, 5.0 / force.std() * force
-    fine = np.fft.irfft(np.pad(spectrum, (0, 31 * n // 2)), 32 * n) * 32.0  # the same band
-    drive = CubicSpline(np.arange(32 * n) / (32.0 * rate), fine)
-    t = np.arange(n) / rate
-
-    def motion(at: float, y: FloatArray) -> list[float]:
-        v = y[1]
-        pull = float(drive(at)) - v - 2000.0 * y[0] - y[2]
-        return [v, pull / 0.5, 3000.0 * v * (1.0 - np.sign(v) * y[2])]
-
-    x = solve_ivp(motion, (0.0, t[-1]), [0.0] * 3, t_eval=t, max_step=6e-4, rtol=1e-9, atol=1e-12)
-    record = di.Record(t, displacement=x.y[0] + 1e-6 * rng.standard_normal(n), force=force)
-    truth = {"f_max": 1.0, "sigma": 3000.0, "mass": 0.5, "damping": 1.0, "stiffness": 2000.0}
-    found = di.fit(record, di.Dahl() + di.Mass() + di.Damper() + di.Spring(), start=truth)
-    assert found.trusted
-    for name, value in truth.items():
-        p = found.params[name]
-        assert p.value == pytest.approx(value, abs=4.0 * (p.stderr or 0.0))
-    assert found.params["sigma"].stderr == pytest.approx(0.0, abs=3.0)
 
 
 def test_results_of_records_are_copied_and_pickled() -> None:

@@ -12,8 +12,7 @@ from scipy.signal import lfilter
 from scipy.stats import norm
 
 import dahl_ident as di
-from dahl_ident.bayes.record_density import RecordDensity, record_prior
-from tests.test_record_fit import DAHL, driven, recorded
+from tests.test_record_fit import DAHL, recorded
 
 
 def slow_noise(seed: int = 0) -> di.Record:
@@ -42,18 +41,6 @@ def _counted_as_independent(fit: di.RecordFit, name: str) -> float:
     J = fit.problem.predict(fit.optimum.values, 0).by
     covariance = np.linalg.inv(J.T @ J) * float(np.var(fit.residuals[0]))
     return float(covariance[number, number] ** 0.5)
-
-
-def test_density_of_a_driven_motion_is_the_expected_parabola() -> None:
-    model = di.Dahl(f_max=0.1) + di.Mass(0.3) + di.Damper() + di.Spring(50.0)
-    fit = di.fit(driven(1, 0.01, 512), model, start={"sigma": 300.0, "damping": 0.5})
-    values, covariance = fit.optimum.values, fit.covar[:2, :2]
-    density = RecordDensity(
-        fit.problem, values, covariance, 1e9, record_prior(fit.problem, None, values)
-    )
-    z = np.array([[1.0, 0.0], [0.0, -1.5], [1.0, 1.0]])
-    fall = density(density.centre + z @ density.root.T) - density(density.centre[None])
-    np.testing.assert_allclose(fall, -0.5 * (z**2).sum(axis=1), rtol=0.05)
 
 
 def test_priors_and_prediction() -> None:

@@ -18,7 +18,6 @@ from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.reporting.document import Cell, Document, Section, Table
 from dahl_ident.reporting.html import html
 from dahl_ident.reporting.pdf import pdf
-from dahl_ident.reporting.settling import cycle_by_cycle
 from dahl_ident.results import Posterior
 from tests.browser import CHROMIUM, Page, chromium
 
@@ -314,16 +313,6 @@ def plain_table() -> di.FrequencyResponse:
     noise = 0.01 * np.random.default_rng(1).standard_normal((2, 12))
     response = di.Dahl(0.1, 30.0).describing_function(amplitude) * np.exp(noise[0] + 1j * noise[1])
     return di.FrequencyResponse(np.ones(12), response, amplitude)
-
-
-def test_cycle_by_cycle_sees_what_changes() -> None:
-    t = np.arange(4000) / 400.0 + 7.0
-    stiffness, offset = 2.0 + 0.5 * np.floor(t - 7.0), 0.1 * np.floor(t - 7.0)
-    x = np.cos(2.0 * np.pi * (t - 7.0))
-    record = di.Record(t, velocity=np.gradient(x, t), force=stiffness * x + offset)
-    response, mean = cycle_by_cycle(record, 1.0, 8.0, 11.0)
-    np.testing.assert_allclose(response, [2.5, 3.0, 3.5], rtol=1e-3)
-    np.testing.assert_allclose(mean, [0.1, 0.2, 0.3], atol=1e-9)
 
 
 def test_the_bootstrap_stands_next_to_the_others_once_it_was_run(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 
 import dahl_ident as di
 from dahl_ident.cli import main
-from dahl_ident.data.levels import one_run
 from dahl_ident.synthetic import Acquisition, Channel, Experiment, FrequencySweep, SteppedSine
 
 PLANT = di.Dahl(0.1, 30.0) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
@@ -55,8 +54,6 @@ def test_sweeps_of_one_level_each_are_one_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sweeps = [sweep(level, seed) for seed, level in enumerate((0.05, 0.2, 1.0))]
-    assert one_run(sweeps)
-    assert not one_run([*sweeps, sweep(0.2, 9)])  # measured again: on another day
     for record, level in zip(sweeps, (50, 200, 1000), strict=True):
         record.save(tmp_path / f"sweep{level}mN.csv")
     words = ["fit", str(tmp_path / "sweep*.csv"), "--mass", "free", "--damping", "free"]
@@ -68,16 +65,6 @@ def test_sweeps_of_one_level_each_are_one_run(
     assert "Trusted." in told
     assert "a single run" in told
     assert "runs differ" not in told
-
-
-def test_motions_that_are_no_sines_are_runs() -> None:
-    t = np.arange(4000) / 100.0
-    rng = np.random.default_rng(1)
-    days = []
-    for size in (1.0, 1.5):
-        x = size * sum(np.sin(2.0 * np.pi * (f * t + rng.random())) for f in (0.3, 0.7, 1.1))
-        days.append(di.Record(t, displacement=x, force=di.Dahl(1.0, 10.0).force(np.asarray(x))))
-    assert not one_run(days)
 
 
 def test_a_table_of_stepped_sines_and_their_waveforms_agree() -> None:

@@ -419,7 +419,8 @@ def test_covariances_are_those_of_repeated_tables(
 ) -> None:
     level = 5e-3 if controlled == "displacement" else 0.1
     steps = SteppedSine((level,) * 5000, (1.0,), controlled=controlled)  # type: ignore[arg-type]
-    data = table(Experiment(PLANT, steps, table=Table(0.004, 0.006, harmonics)))
+    errors = Table(0.004, 0.006, harmonics, steady="describing function")
+    data = table(Experiment(PLANT, steps, table=errors))
     assert data.amplitude is not None
     assert data.covariance is not None
     assert data.amplitude_std is not None

@@ -210,16 +210,6 @@ def test_friction_under_a_held_displacement_is_the_exact_force(
     assert force == pytest.approx(expected, abs=1e-13 * 0.1)
 
 
-def test_a_held_displacement_has_exactly_the_describing_function() -> None:
-    wave = SteppedSine((0.01,), (2.0,), settling_periods=12, num_periods=1).waveform(seed=0)
-    force = Mechanism.of(PLANT).force_under(wave)
-    start = wave.windows[0].start
-    time = start + np.arange(2**14) / 2.0**14 / 2.0
-    k = np.exp(-4j * np.pi * time)
-    stiffness = np.mean(force(time) * k) / np.mean(wave.value(time) * k)
-    assert stiffness == pytest.approx(PLANT.dynamic_stiffness(0.01, 4.0 * np.pi), rel=1e-8)
-
-
 def steady(level: float, f: float) -> tuple[ComplexArray, Signal, float]:
     """Return harmonics 0 to 7 of the displacement, the motion, and the start of a period."""
     wave = SteppedSine((level,), (f,), controlled="force", settling_periods=60).waveform(seed=0)
@@ -252,24 +242,6 @@ def test_the_describing_function_errs_as_the_third_harmonic_says(f: float, level
     # with its third harmonic the motion balances the drive, as a pure sine does not
     assert left_over(1, 3) < 0.25 * left_over(1)
     assert left_over(1, 3, 5, 7) < 0.05 * left_over(1)
-
-
-def test_small_motion_is_linear_with_the_contact_stiffness() -> None:
-    harmonics, _, start = steady(1e-6, 0.5)
-    stiffness = 1e-6 * np.exp(-1j * np.pi * start) / 1j / harmonics[1]
-    linear = LINEAR.dynamic_stiffness(0.0, np.pi) + 30.0
-    assert stiffness == pytest.approx(linear, rel=1e-4)
-
-
-def test_large_motion_loses_the_loop_area_of_dry_friction() -> None:
-    wave = SteppedSine((20.0,), (0.5,), controlled="force", settling_periods=20).waveform(seed=0)
-    motion = Mechanism.of(PLANT).displacement_under(wave)
-    time = wave.windows[0].start + np.linspace(0.0, 2.0, 200_001)
-    x, u = motion(time), wave.value(time)
-    work = np.sum(0.5 * (u[1:] + u[:-1]) * np.diff(x))
-    A = 0.5 * np.ptp(x)
-    viscous = np.pi * 0.24 * np.pi * A**2
-    assert work - viscous == pytest.approx(4.0 * 0.1 * A, rel=0.02)
 
 
 def test_time_can_be_scaled() -> None:

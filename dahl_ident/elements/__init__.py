@@ -6,7 +6,9 @@ from dahl_ident.elements.backlash import Backlash
 from dahl_ident.elements.behaviour import Asymptote, Combination, UniversalCurve
 from dahl_ident.elements.bouc_wen import BoucWen
 from dahl_ident.elements.dahl import Dahl
-from dahl_ident.elements.element import Element, Model
+from dahl_ident.elements.description import describe_model, model_from_description
+from dahl_ident.elements.element import KINDS, Element, Model
+from dahl_ident.elements.equations import Excitation, FirstState, law_equations, plant_equations
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.iwan import Iwan
 from dahl_ident.elements.linear import Damper, Mass, Spring
@@ -17,6 +19,7 @@ from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.power_damper import PowerDamper
 
 __all__ = [
+    "KINDS",
     "Asymptote",
     "Backlash",
     "BoucWen",
@@ -24,6 +27,8 @@ __all__ = [
     "Dahl",
     "Damper",
     "Element",
+    "Excitation",
+    "FirstState",
     "Friction",
     "Iwan",
     "LinearSystem",
@@ -35,4 +40,8 @@ __all__ = [
     "PowerDamper",
     "Spring",
     "UniversalCurve",
+    "describe_model",
+    "law_equations",
+    "model_from_description",
+    "plant_equations",
 ]

@@ -3,7 +3,7 @@
 A :class:`BaseProblem` is the one source of predictions, residuals, derivatives and likelihood;
 every solver and sampler uses only this, so they all estimate the same quantities. It is a
 :class:`Problem` for a table, a :class:`ProblemBatch` for many tables of one shape at once, and a
-:class:`~dahl_ident.problem.record_problem.RecordProblem` for records of any motion.
+:class:`RecordProblem` for records of any motion.
 
 All work in **search coordinates** theta: the logarithm of positive parameters, the number itself
 for most others. Residuals are whitened by the noise model (see :mod:`dahl_ident.noise`), so that
@@ -15,5 +15,14 @@ from dahl_ident.problem.base import EXPLICIT, BaseProblem, Quadratic
 from dahl_ident.problem.batch import ProblemBatch
 from dahl_ident.problem.prediction import Prediction
 from dahl_ident.problem.problem import Problem
+from dahl_ident.problem.record_problem import RecordProblem
 
-__all__ = ["EXPLICIT", "BaseProblem", "Prediction", "Problem", "ProblemBatch", "Quadratic"]
+__all__ = [
+    "EXPLICIT",
+    "BaseProblem",
+    "Prediction",
+    "Problem",
+    "ProblemBatch",
+    "Quadratic",
+    "RecordProblem",
+]
