@@ -26,9 +26,9 @@ install: $(VENV)/.installed  ## the pinned environment in .venv
 demo: install  ## the whole chain on shipped data
 	$(BIN)/dahl-ident demo --overwrite
 
-# The kernels are compiled once, next to the type checker, and not by every process of pytest.
-test: lint rooms  ## every check that a change must pass
-	$(MAKE) --jobs $(JOBS) types kernels
+# The kernels are compiled once, in parallel with the checks, and not by every process of pytest.
+test: install  ## every check that a change must pass
+	$(MAKE) --jobs $(JOBS) --output-sync types lint rooms kernels
 	$(MAKE) unit
 
 lint: install  ## ruff, check and format
@@ -50,8 +50,8 @@ unit: install  ## tests and doctests, warnings as errors
 	$(BIN)/pytest -n $(JOBS) --dist worksteal
 
 # What depends on versions: one file or two for each library that the package stands on.
-LOWEST := package app engine law_checks readers_formats readers_text frequency_response units cli \
-	report_content export plots fitting ipopt bayes_priors posterior control_nonlinearity
+LOWEST := package app law_checks generic_friction readers_formats readers_text frequency_response \
+	units cli report_content export plots fitting ipopt bayes_priors posterior control_nonlinearity
 
 test-lowest: install  ## what depends on versions, on the lowest declared ones
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python .venv-lowest

@@ -286,7 +286,7 @@ def test_waveforms_with_content_sent_along_and_any_executor(tmp_path: Path) -> N
 
 
 def test_a_job_that_kills_its_process_is_a_row_and_costs_no_other(tmp_path: Path) -> None:
-    make_tables(tmp_path, 3)
+    make_tables(tmp_path, 2)
     tasks = read_definition(definition(tmp_path)).tasks
     options = read_definition(definition(tmp_path)).options
     jobs = [
@@ -434,7 +434,7 @@ def test_a_dask_scheduler_gives_the_serial_table(tmp_path: Path, run: Runner) ->
 @POSIX
 @pytest.mark.usefixtures("dask_leaks")
 def test_a_scheduler_that_dies_and_comes_back_loses_nothing(tmp_path: Path) -> None:
-    make_tables(tmp_path, 5)
+    make_tables(tmp_path, 3)
     with Cluster(tmp_path) as cluster:
 
         def restart(done: int, *_: Any) -> None:
@@ -443,16 +443,14 @@ def test_a_scheduler_that_dies_and_comes_back_loses_nothing(tmp_path: Path) -> N
                 cluster.start()
 
         done = di.campaign(definition(tmp_path), scheduler=cluster.address, progress=restart)
-    assert len(done.to_do) == 5
+    assert len(done.to_do) == 3
     equal(done.table, serial(tmp_path))
 
 
 @POSIX
 @pytest.mark.usefixtures("dask_leaks")
-def test_a_scheduler_that_stays_dead_ends_the_campaign_with_what_is_done(
-    tmp_path: Path, run: Runner
-) -> None:
-    make_tables(tmp_path, 5)
+def test_a_scheduler_that_stays_dead_ends_the_campaign_with_what_is_done(tmp_path: Path) -> None:
+    make_tables(tmp_path, 3)
     with Cluster(tmp_path) as cluster:
 
         def lose(done: int, *_: Any) -> None:
@@ -460,18 +458,15 @@ def test_a_scheduler_that_stays_dead_ends_the_campaign_with_what_is_done(
                 cluster.kill()
 
         began = time.monotonic()
-        with pytest.raises(DataError, match=r"not answered for 2 s; 2 of 5 fits are in .*others"):
+        with pytest.raises(DataError, match=r"not answered for 2 s; 2 of 3 fits are in .*others"):
             di.campaign(
                 definition(tmp_path), scheduler=cluster.address, patience=2.0, progress=lose
             )
     assert time.monotonic() - began < 60.0
     table = pd.read_csv(tmp_path / "results" / "results.csv")
     assert table["status"].tolist() == ["trusted"] * 2
-    refused = run("campaign", str(as_toml(tmp_path)), "--scheduler", cluster.address)
-    assert refused.status == 1
-    assert "no scheduler answers" in refused.err
     rest = di.campaign(definition(tmp_path), jobs=1)
-    assert len(rest.to_do) == 3
+    assert len(rest.to_do) == 1
     equal(rest.table, serial(tmp_path))
 
 

@@ -575,7 +575,7 @@ def test_overwrite_replaces(run: Runner) -> None:
     assert run("datasets", "noisy", "-o", "noisy.csv", "--overwrite").status == 0
     assert di.read_frequency_response("noisy.csv").n > 10
     for _ in range(2):
-        ended = run("fit", "noisy.csv", "--save", "f.json", "--report", "r.md", "--overwrite")
+        ended = run("fit", "noisy.csv", "--save", "f.json", "--report", "r.json", "--overwrite")
         assert ended.status == 0, ended.err
     assert di.FitResult.load("f.json").trusted
 
@@ -616,10 +616,9 @@ def test_bad_options_are_refused_before_anything_is_written(
 
 def test_a_report_goes_to_standard_output(run: Runner) -> None:
     table = run("datasets", "noisy", "-o", "-").out
-    for arguments in (("report", "-", "-o", "-"), ("fit", "-", "--report", "-")):
-        out = run(*arguments, stdin=table).out
-        assert out.startswith("<!doctype html>")
-        assert out.rstrip().endswith("</html>")
+    out = run("fit", "-", "--report", "-", stdin=table).out
+    assert out.startswith("<!doctype html>")
+    assert out.rstrip().endswith("</html>")
     assert list(Path().iterdir()) == []
 
 

@@ -46,6 +46,10 @@ def test_demo_recovers_the_plant_and_tells_machines_its_steps_on_standard_error(
     for name, truth in told["truth"].items():
         assert told["fit"]["params"][name]["value"] == pytest.approx(truth, rel=0.3)
     assert told["posterior"]["converged"]
+    for name, row in told["posterior"]["summary"].items():
+        if name in told["truth"]:  # twice the band: 99.99 %
+            low, high = row["2.5%"], row["97.5%"]
+            assert 1.5 * low - 0.5 * high < told["truth"][name] < 1.5 * high - 0.5 * low
     page = Path(said.rstrip().rsplit("report: ", 1)[1])
     assert page == Path(told["report"]) == tmp_path / "here" / "report.html"
     assert '<p class="mark">Trusted</p>' in page.read_text(encoding="utf-8")

@@ -104,20 +104,6 @@ def test_plant_of_figure_7() -> None:
     assert_recovered(fit, truth("fig_7_plant"), *fit.var_names)
 
 
-def test_plant_recording() -> None:
-    data = points("plant_recording", controlled="force")
-    good = data.select(rows=data.quality["verdict"] == "good")
-    fit = di.fit(good, PLANT)
-    assert fit.trusted, fit.verdict
-    assert_recovered(fit, truth("plant_recording"), *fit.var_names)
-    posterior = di.posterior(fit, seed=1)
-    assert posterior.converged
-    draws = posterior.get_chain(flat=True)
-    for name, column in zip(posterior.names, draws.T, strict=False):
-        low, high = np.quantile(column, [0.00135, 0.99865])
-        assert low <= truth("plant_recording")[name] <= high, name
-
-
 def test_levels_without_time_to_settle_are_caught() -> None:
     data = points("unsettled")
     assert "not settled" in " ".join(data.quality["verdict"])

@@ -42,7 +42,7 @@ class Jenkins(di.Friction):
 class NoKind{kind}(Jenkins):
     kind = ""
 '''
-DATA = ("--levels", "1e-3:3e-2:12", "--force-std", "0.01")
+DATA = ("--levels", "1e-3:3e-2:6", "--force-std", "0.01")
 
 
 @pytest.fixture
