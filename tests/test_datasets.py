@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dahl_ident import FrequencyResponse, Record, response
-from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements import Model, model_from_description
+from dahl_ident import FrequencyResponse, response
+from dahl_ident.arrays import ComplexArray
+from dahl_ident.elements import Model
 from dahl_ident.errors import DataError
 from dahl_ident.synthetic import Experiment, load_dataset, shipped
 from dahl_ident.synthetic.regenerate import main, make, readme
@@ -21,7 +21,8 @@ from dahl_ident.synthetic.regenerate import main, make, readme
 DATA_SETS = shipped.data_sets()
 FOLDER = Path(__file__).parents[1] / "datasets" / "synthetic"
 TABLES = [name for name, one in DATA_SETS.items() if one.kind == "frequency_response"]
-RECORDS = [name for name, one in DATA_SETS.items() if one.kind == "record"]
+
+
 COLUMNS = (
     "frequency_hz", "response", "amplitude", "drive", "covariance", "dof", "amplitude_std",
     "amplitude_covariance", "level", "harmonic", "time", "displacement", "force",
@@ -141,116 +142,4 @@ def predicted(data: FrequencyResponse, plant: Model, sensors: dict[str, float]) 
     return np.asarray(gain * np.exp(1j * data.omega * delay) * Z)
 
 
-def log_deviations(name: str, free: list[str]) -> dict[str, float]:
-    """Return the standard deviation of each free parameter's logarithm."""
-    data = loaded_table(name)
-    assert data.provenance is not None
-    assert data.covariance is not None
-    truth: dict[str, float] = data.provenance["truth"]
-    plant = model_from_description(data.provenance["experiment"]["plant"])
-    own = [p.name for p in plant.parameters]
-
-    def at(values: dict[str, float]) -> FloatArray:
-        moved = plant.with_values({k: v for k, v in values.items() if k in own})
-        R = predicted(data, moved, {k: v for k, v in values.items() if k not in own})
-        return np.stack([R.real, R.imag], axis=-1)
-
-    h = 1e-4
-    slopes = np.stack(
-        [
-            (at(truth | {k: truth[k] * (1 + h)}) - at(truth | {k: truth[k] * (1 - h)})) / (2 * h)
-            for k in free
-        ]
-    )
-    weight = np.linalg.inv(data.covariance)
-    information = np.einsum("pni,nij,qnj->pq", slopes, weight, slopes)
-    scale = np.sqrt(np.diag(information))
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T
-    return dict(zip(free, np.sqrt(np.diag(inverse)) / scale, strict=True))
-
-
-@pytest.mark.parametrize("name", [n for n in TABLES if n not in ("clean", "outliers")])
-def test_a_table_determines_what_its_description_says(name: str) -> None:
-    one = DATA_SETS[name]
-    deviation = log_deviations(name, [*one.identifiable, *one.not_identifiable])
-    for parameter in one.identifiable:
-        assert deviation[parameter] < 0.25, parameter
-    for parameter in one.not_identifiable:
-        assert deviation[parameter] > 1.0, parameter
-
-
-@pytest.mark.parametrize(("name", "number"), [("outliers", 3), ("noisy", 0)])
-def test_outliers_are_where_the_description_says(name: str, number: int) -> None:
-    data = loaded_table(name)
-    assert data.provenance is not None
-    plant = model_from_description(data.provenance["experiment"]["plant"])
-    error = np.abs(data.response / predicted(data, plant, {}) - 1.0)
-    assert np.flatnonzero(error > 0.1).tolist() == data.provenance["outlier_rows"]
-    assert len(data.provenance["outlier_rows"]) == number
-
-
 # --- what is wrong with the flawed sets is there
-
-
-def test_delayed_turns_with_frequency() -> None:
-    data = loaded_table("delayed")
-    plant = model_from_description(data.provenance["experiment"]["plant"])  # type: ignore[index]
-    ratio = data.response / predicted(data, plant, {})
-    for f in (1.0, 5.0, 20.0):
-        mean = np.mean(ratio[data.frequency_hz == f])
-        assert np.angle(mean) == pytest.approx(2.0 * np.pi * f * 2e-3, abs=0.01)
-        assert abs(mean) == pytest.approx(1.2, rel=0.02)
-
-
-def per_step(name: str) -> list[tuple[float, FloatArray, FloatArray, FloatArray]]:
-    """Return level, time, displacement and force of every measured window."""
-    data = load_dataset(name)
-    assert isinstance(data, Record)
-    assert data.provenance is not None
-    steps = []
-    for level, _, start, stop in data.provenance["windows"]:
-        inside = (data.time >= start - 1e-9) & (data.time < stop - 1e-9)
-        steps.append(
-            (level, data.time[inside], data.motion_samples[inside], data.force_samples[inside])
-        )
-    return steps
-
-
-def test_unsettled_small_levels_drift() -> None:
-    steps = per_step("unsettled")
-    levels = [level for level, *_ in steps]
-    assert levels[:4] == sorted(levels[:4], reverse=True)
-    drift = []
-    for _, _, _, force in steps[:4]:
-        periods = force.reshape(5, -1)
-        drift.append(abs(np.mean(periods[0]) - np.mean(periods[-1])) / np.ptp(force))
-    assert drift[0] < 1e-3
-    assert drift[-1] > 0.05
-
-
-def test_quantised_has_steps_that_small_levels_feel() -> None:
-    steps = per_step("quantised")
-    step = 1e-4
-    for _, _, x, _ in steps:
-        assert x / step == pytest.approx(np.round(x / step), abs=1e-6)
-    assert np.unique(np.round(steps[0][2] / step)).size <= 5
-    assert np.unique(np.round(steps[-1][2] / step)).size > 40
-
-
-def test_the_recording_holds_all_steps_of_the_plant() -> None:
-    data = load_dataset("plant_recording")
-    assert data.provenance is not None
-    plant = model_from_description(data.provenance["experiment"]["plant"])
-    windows = data.provenance["windows"]
-    assert len(windows) == 15
-    for (level, time, x, force), (_, f, _, _) in zip(
-        per_step("plant_recording"), windows, strict=True
-    ):
-        turn = 2.0 * np.pi * f * time
-        columns = np.column_stack([np.cos(turn), np.sin(turn), np.ones_like(turn)])
-        (a, b), (c, d) = (np.linalg.lstsq(columns, y, rcond=None)[0][:2] for y in (x, force))
-        receptance = (a - 1j * b) / (c - 1j * d)
-        # noise of the force sensor, and less than 1e-3 from harmonics and filters
-        expected = complex(response(plant, f, level).receptance)
-        assert receptance == pytest.approx(expected, rel=2e-3 + 2e-3 / level)

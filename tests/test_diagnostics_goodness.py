@@ -18,7 +18,7 @@ from dahl_ident import (
     fit,
     response,
 )
-from dahl_ident.diagnostics import Goodness
+from dahl_ident.diagnostics.goodness import Goodness, goodness
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Status
 from tests.friction_tables import (
@@ -33,7 +33,7 @@ from tests.friction_tables import (
 
 
 def judge(data: FrequencyResponse, **options: object) -> Goodness:
-    return fit(data, Dahl(), throw=False, **options).goodness  # type: ignore[call-overload]  # passed on
+    return goodness(fit(data, Dahl(), throw=False, **options).optimum)  # type: ignore[call-overload]  # passed on
 
 
 def swept_table(fall: float, noise: float = 0.01, seed: int = 1) -> FrequencyResponse:
@@ -131,7 +131,7 @@ class TestDepartures:
         assert found.exponent is not None
         assert found.exponent.wanted == pytest.approx(1.5, rel=0.15)
         assert "these data are not linear Dahl" in found.headline
-        free = fit(table(model=Dahl(0.1, 30.0, alpha=1.5)), Dahl(alpha=None)).goodness
+        free = goodness(fit(table(model=Dahl(0.1, 30.0, alpha=1.5)), Dahl(alpha=None)).optimum)
         assert free.acceptable
         assert free.exponent is None
 

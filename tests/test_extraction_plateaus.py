@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.extraction.cycles import cut_cycles, find_cycles
+from dahl_ident.extraction.cycles import find_cycles
 from dahl_ident.extraction.plateaus import Mode, Span, find_spans
 
 RATE = 500.0
@@ -83,49 +83,6 @@ def test_a_gap_in_the_sampling_does_not_end_a_stretch(cycles_of_gap: float) -> N
     assert span.frequency_hz == pytest.approx(5.0, rel=1e-4)
 
 
-def test_cycles_have_the_amplitude_and_frequency_of_a_sine_fit() -> None:
-    time, motion = pieces((2.0, 3.7, 60))
-    rng = np.random.default_rng(2)
-    (run,) = find_cycles(time, 5.0 + motion + 0.1 * rng.standard_normal(time.size))
-    per_cycle = RATE / 3.7
-    expected = 0.05 * np.sqrt(2.0 / per_cycle)
-    assert np.median(run.noise) == pytest.approx(expected, rel=0.1)
-    assert np.std(run.log_amplitude) == pytest.approx(expected, rel=0.3)
-    assert np.mean(run.log_amplitude) == pytest.approx(np.log(2.0), abs=0.003)
-    assert np.std(run.log_frequency) == pytest.approx(
-        np.sqrt(2.0) * expected / (2.0 * np.pi), rel=0.3
-    )
-
-
-def test_known_frequency_is_cut_through_noise_that_hides_the_crossings() -> None:
-    time, motion = pieces((1.0, 5.0, 80))
-    rng = np.random.default_rng(3)
-    noisy = motion + 0.6 * rng.standard_normal(time.size)
-    assert not spans(time, noisy, fewest=6)
-    (span,) = find_spans(cut_cycles(time, noisy, 5.0), "auto", 3, None)
-    assert span.stop - span.start > 15.0
-
-
-def test_amplitude_sweep_is_cut_into_windows() -> None:
-    time, motion = pieces((1.0, 10.0, 300))
-    found = spans(time, motion * np.exp(-time / 8.0))
-    assert len(found) > 20
-    assert all(s.sweep for s in found)
-    for span in found:
-        assert (span.stop - span.start) / 8.0 <= 0.11
-
-
-def test_frequency_sweep_is_cut_into_windows_of_the_wanted_length() -> None:
-    time = np.arange(20_000) / RATE
-    motion = np.sin(2.0 * np.pi * (2.0 * time + 0.1 * time**2))
-    found = find_spans(find_cycles(time, motion), "auto", 3, 6)
-    assert all(s.sweep for s in found)
-    for span in found:
-        middle = 0.5 * (span.start + span.stop)
-        assert span.frequency_hz == pytest.approx(2.0 + 0.2 * middle, rel=0.01)
-        assert (span.stop - span.start) * span.frequency_hz == pytest.approx(6, abs=0.3)
-
-
 def test_mode_overrules_what_there_is_more_of() -> None:
     time, motion = pieces((1.0, 10.0, 300))
     swept = motion * np.exp(-time / 8.0)
@@ -133,8 +90,3 @@ def test_mode_overrules_what_there_is_more_of() -> None:
     steps = pieces((1.0, 10.0, 20), (0.9, 10.0, 20), (0.8, 10.0, 20))
     assert len(spans(*steps)) == 3
     assert all(s.sweep for s in spans(*steps, mode="sweep"))
-
-
-@pytest.mark.parametrize("motion", [np.zeros(1000), np.ones(1000), np.arange(1000.0)])
-def test_a_record_that_does_not_oscillate_has_no_spans(motion: FloatArray) -> None:
-    assert spans(np.arange(1000) / RATE, motion) == []

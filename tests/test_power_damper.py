@@ -8,10 +8,9 @@ import mpmath
 import numpy as np
 import pytest
 
-from dahl_ident import Dahl, Damper, Mass, Model, PowerDamper, Spring, response
+from dahl_ident import Damper, Mass, Model, PowerDamper, Spring, response
 from dahl_ident.elements import describe_model, model_from_description
 from dahl_ident.errors import ValidationError
-from tests.test_law_contract import all_amplitudes
 
 
 def exactly(c: float, p: float, A: float, omega: float, k: int) -> complex:
@@ -62,17 +61,6 @@ def test_derivatives_against_high_precision(p: float, k: int) -> None:
     assert abs(complex(found.by_parameter[0]) - value / 2.0) < 1e-11 * size
     assert abs(complex(found.by_parameter[1]) - by_p) < 1e-7 * size
     assert abs(complex(found.by_parameter[2]) + p * value) < 1e-11 * size
-
-
-@pytest.mark.parametrize("p", [0.3, 0.7, 2.0])
-def test_response_in_parallel(p: float) -> None:
-    plant = PowerDamper(0.4, p) + Dahl(0.1, 30.0) + Mass(0.3) + Spring(3.0)
-    for frequency in (0.3, 0.5, 3.0):
-        for drive in (0.02, 0.2, 2.0):
-            ours = response(plant, frequency, drive, all_roots=True, steady="describing function")
-            np.testing.assert_allclose(
-                np.ravel(ours.amplitude), all_amplitudes(plant, frequency, drive), rtol=1e-8
-            )
 
 
 def test_force_description_and_refusals() -> None:

@@ -2,71 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import partial
-from typing import Any
-
 import control
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from dahl_ident import BoucWen, Dahl, Damper, LinearSystem, Mass, Model, Spring, response
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import ComplexArray
 from dahl_ident.elements import Element
 from dahl_ident.errors import ModelError
 from dahl_ident.synthetic import AmplitudeRamp, FrequencySweep, SteppedSine
 from dahl_ident.synthetic.mechanism import Mechanism, Signal
-from dahl_ident.synthetic.waveform import Waveform
 
 FRICTION = (0.1, 30.0)
 LINEAR = Mass(0.3) + Damper(0.24) + Spring(0.3)
 PLANT = Dahl(*FRICTION) + LINEAR
-
-
-def by_ode_solver(
-    mass: float, damping: float, stiffness: float, friction: Sequence[Dahl], force: Waveform
-) -> list[tuple[float, float, Signal]]:
-    """Eqn. 53 with Eqn. 2 as further states: DOP853, restarted at every reversal it finds."""
-    parameters = [[float(v) for v in dahl.known_values()] for dahl in friction]
-    state = np.zeros(2 + len(parameters))
-    direction = 1.0
-    pieces: list[tuple[float, float, Signal]] = []
-    for segment in force.segments:
-        t = segment.start
-        while t < segment.stop - 1e-12:
-            s = direction
-
-            def slope(
-                time: float, y: FloatArray, s: float = s, segment: object = segment
-            ) -> FloatArray:
-                u = float(force.value(np.array([time]))[0])
-                x, v, *forces = y
-                rates = []
-                for (f_max, sigma, alpha), F in zip(parameters, forces, strict=True):
-                    margin = 1.0 - s * F / f_max
-                    rates.append(sigma * abs(margin) ** alpha * np.sign(margin) * v)
-                a = (u - damping * v - stiffness * x - sum(forces)) / mass
-                return np.array([v, a, *rates])
-
-            def reversal(time: float, y: FloatArray) -> float:
-                return float(y[1])
-
-            reversal.terminal = True  # type: ignore[attr-defined]
-            reversal.direction = -s  # type: ignore[attr-defined]
-            run = solve_ivp(
-                slope, (t, segment.stop), state, method="DOP853", rtol=1e-11, atol=1e-18,
-                events=reversal, dense_output=True,
-            )  # fmt: skip
-            pieces.append((t, float(run.t[-1]), partial(_first_state, run.sol)))
-            t, state = float(run.t[-1]), run.y[:, -1].copy()
-            if run.status == 1:
-                state[1], direction = 0.0, -direction
-    return pieces
-
-
-def _first_state(solution: Any, time: FloatArray) -> FloatArray:
-    return np.asarray(solution(time)[0])
 
 
 @pytest.mark.parametrize("levels", [(0.02, 0.2), (0.5, 0.05)])
@@ -84,29 +33,6 @@ def phasor(signal: Signal, frequency_hz: float, start: float, periods: int, k: i
     """Return the k-th harmonic over whole periods, from 512 points in each."""
     time = start + np.arange(512 * periods) / (512.0 * frequency_hz)
     return complex(2.0 * np.mean(signal(time) * np.exp(-2j * np.pi * k * frequency_hz * time)))
-
-
-@pytest.mark.parametrize(
-    ("friction", "levels"),
-    [
-        ([Dahl(0.1, 30.0)], (0.02, 0.2)),
-        ([Dahl(0.1, 30.0)], (5.0, 0.05)),
-        ([Dahl(0.1, 30.0, 2.0)], (0.2, 0.02)),
-        ([Dahl(0.1, 30.0, 0.5)], (0.01, 0.05)),
-        ([Dahl(0.1, 30.0), Dahl(0.03, 90.0, 1.5, name="b")], (0.05, 0.3)),
-    ],
-    ids=["microslip up", "gross slip down", "alpha 2", "alpha 1/2", "two elements"],
-)
-def test_motion_agrees_with_an_ode_solver(friction: list[Dahl], levels: tuple[float, ...]) -> None:
-    steps = SteppedSine(levels, (0.7,), controlled="force", settling_periods=1, num_periods=1)
-    force = steps.waveform(seed=0)
-    motion = Mechanism.of(sum(friction[1:], start=friction[0] + LINEAR)).displacement_under(force)
-    worst = largest = 0.0
-    for start, stop, reference in by_ode_solver(0.3, 0.24, 0.3, friction, force):
-        time = np.linspace(start, stop, 15)
-        worst = max(worst, float(np.max(np.abs(motion(time) - reference(time)))))
-        largest = max(largest, float(np.max(np.abs(reference(time)))))
-    assert worst < 5e-10 * largest
 
 
 @pytest.mark.parametrize(
@@ -134,15 +60,6 @@ def test_forces_balance_at_every_instant(plant: Element, level: float) -> None:
     misfit = np.abs(total - force.value(time))[2:-2]
     assert np.quantile(misfit, 0.99) < 2e-4 * level
     assert np.max(misfit) < 5e-3 * level
-
-
-def test_without_friction_the_motion_is_the_linear_one() -> None:
-    force = SteppedSine((2.0,), (0.7,), controlled="force", settling_periods=3).waveform(seed=0)
-    motion = Mechanism.of(LINEAR).displacement_under(force)
-    system = control.ss(control.tf([1.0], [0.3, 0.24, 0.3]))
-    time = np.linspace(0.0, force.duration, 40_001)
-    expected = np.asarray(control.forced_response(system, time, force.value(time)).outputs)
-    assert motion(time) == pytest.approx(expected, abs=1e-6 * np.max(np.abs(expected)))
 
 
 @pytest.mark.parametrize("controlled", ["force", "displacement"])
