@@ -124,7 +124,6 @@ class TestBeam:
     @staticmethod
     def fitted(beam: FrequencyResponse, controlled: str) -> FitResult:
         data = beam.select(level=[label for label in beam.levels if controlled in label])
-        data = data.select(rows=np.arange(data.n) % 3 == 0)
         return fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
 
     @pytest.mark.parametrize(
