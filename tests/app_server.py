@@ -82,7 +82,7 @@ class Server:
         self.wait(run)
         return run
 
-    def wait(self, run: str, seconds: float = 60.0) -> None:
+    def wait(self, run: str, seconds: float = 240.0) -> None:
         """Wait until nothing runs."""
         end = time.monotonic() + seconds
         while '"busy":true' in self.page(f"{run}/state"):
