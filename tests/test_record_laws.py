@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -10,9 +10,7 @@ import pytest
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, Model
-from dahl_ident.elements.masing import Masing
 from dahl_ident.engine import differentiated
-from dahl_ident.errors import ModelError
 from tests.motions import Driven
 from tests.test_record_fit import RATE, trajectory
 
@@ -129,28 +127,6 @@ def test_trapezoids_that_are_hard_to_search(truth: Element, model: Element, nois
         if found.vary:
             error = abs(found.value - float(parameter.value or 0.0))
             assert error < 4.5 * float(found.stderr or 0.0), found
-
-
-class Parabola(Masing):
-    """A backbone curve alone."""
-
-    parameters = (di.Parameter("f_max", "N", "force limit", lower=0.0, transform="log"),)
-    scale_parameters = ("f_max",)
-
-    def backbone(self, values: Sequence[FloatArray], displacement: FloatArray) -> FloatArray:
-        """Return a parabola up to 1 m."""
-        x = np.minimum(displacement, 1.0)
-        return np.asarray(values[0] * x * (2.0 - x))
-
-    def rest_stiffness(self, values: Sequence[FloatArray]) -> FloatArray:
-        """Return the slope at zero."""
-        return 2.0 * np.asarray(values[0])
-
-
-def test_law_without_an_equation_of_motion_says_why() -> None:
-    record = driven("multisine", Model(_DAHL[0] + di.Mass(0.3) + di.Spring(50.0)), 64, 1e-3)
-    with pytest.raises(ModelError, match=r"Parabola.* add sliders\(\)"):
-        di.fit(record, Parabola() + di.Mass())
 
 
 def damped_record(damper: Callable[[FloatArray], FloatArray]) -> di.Record:
