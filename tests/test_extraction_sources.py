@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 
 from dahl_ident.data import Record, inspect, read_record
+from dahl_ident.data.readers import record_pieces
 from dahl_ident.elements import Dahl
 from dahl_ident.errors import DataError, DataWarning, ExtractionError, ValidationError
 from dahl_ident.extraction import extract, sources
@@ -110,7 +111,7 @@ def test_a_long_file_comes_in_pieces_that_make_up_the_whole(
     path = saved(tmp_path, with_time)
     reading = {} if with_time else {"sample_rate": RATE}
     whole = read_record(path, **reading)  # type: ignore[arg-type]
-    pieces = list(sources.record_pieces(path, 4000, **reading))  # type: ignore[arg-type]
+    pieces = list(record_pieces(path, 4000, **reading))  # type: ignore[arg-type]
     assert [len(piece) for piece in pieces] == [3000, 3000, 3000]
     for name in ("time", "displacement", "force"):
         joined = np.concatenate([getattr(piece, name) for piece in pieces])
@@ -167,7 +168,6 @@ def test_a_level_across_the_cuts_is_one_point(
     at_once = extract(whole)
     monkeypatch.setattr(sources, "_PIECE", 6000)
     seen: list[int] = []
-    record_pieces = sources.record_pieces
 
     def counted(*args: Any, **words: Any) -> Iterator[Record]:
         for piece in record_pieces(*args, **words):
