@@ -319,7 +319,7 @@ class TestOneInterval:
     @pytest.mark.parametrize("case", ["described", "misfit", "few and noisy"])
     def test_of_every_parameter(self, case: str) -> None:
         found = self.fitted(case)
-        intervals, summary = found.conf_interval().at(LEVELS[1]), found.summary()
+        intervals, summary = found.conf_interval().at(0.9545), found.summary()
         again = FitResult.from_json(found.to_json())
         for i, name in enumerate(found.var_names):
             p, row, interval = found.params[name], found.budget()[name], intervals[name]
