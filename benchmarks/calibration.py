@@ -154,6 +154,7 @@ def report(results: dict[str, tuple[FloatArray, int]], folder: Path) -> str:
         "Made by `python -m benchmarks.calibration`. For each parameter, the ranks of the true",
         "value among draws of the posterior must be uniform. For an exact sampler their empirical",
         f"distribution is inside the band for all parameters with probability {1.0 - LEVEL:.0%}.",
+        "The plant of the tables and of the posterior is predicted by its exact steady motion.",
         "",
         "| data | tables | not converged | parameter | extremity | critical | inside |",
         "|---|---|---|---|---|---|---|",

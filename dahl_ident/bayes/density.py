@@ -206,7 +206,8 @@ class Density(LogDensity):
     def squares(self, theta: FloatArray) -> FloatArray:
         """Return |y|^2 of every row, (S, n), the scale taken as 1."""
         y, _ = self.tabulated.whitened(theta, derivatives=False)
-        return np.asarray(y.real**2 + y.imag**2)
+        with np.errstate(over="ignore"):  # far off, a point has no chance
+            return np.asarray(y.real**2 + y.imag**2)
 
     def sums(self, theta: FloatArray) -> FloatArray:
         """Return sums of squares at theta, (S, P): (S, M), one for each size of shared errors."""
@@ -288,7 +289,8 @@ class Density(LogDensity):
         theta = self.prior.draw(np.random.default_rng(0), 64)
         ones = np.ones(len(theta)) if self.has_scale else None
         squares = self.squares(theta).sum(axis=-1)
-        constant = self.tabulated.log_likelihood(theta, ones) + 0.5 * squares
+        with np.errstate(invalid="ignore"):
+            constant = self.tabulated.log_likelihood(theta, ones) + 0.5 * squares
         if not np.isfinite(constant).any():
             raise SamplingError("the model predicts nothing anywhere in the prior; check both")
         return float(constant[np.nanargmin(np.where(np.isfinite(constant), squares, np.nan))])

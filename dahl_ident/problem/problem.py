@@ -484,7 +484,8 @@ class Problem(BaseProblem):
     def squares(self, theta: FloatArray, *, tails: bool = True) -> FloatArray:
         """Return the sum of squared residuals of every row, (..., n), without priors."""
         y, _ = self.whitened(theta, derivatives=False, tails=tails)
-        return np.asarray(y.real**2 + y.imag**2)
+        with np.errstate(over="ignore"):
+            return np.asarray(y.real**2 + y.imag**2)
 
     def residual_change(self, theta: FloatArray, change: ComplexArray) -> FloatArray:
         """Return how the data's residuals change where predictions change, unchecked.
