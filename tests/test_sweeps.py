@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,22 @@ def test_sweeps_of_one_level_each_are_one_run(
     assert "Trusted." in told
     assert "a single run" in told
     assert "runs differ" not in told
+
+
+def test_extraction_of_a_sweep_says_its_bias_and_the_command_for_waveforms(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sweep(0.3, 1).save(tmp_path / "sweep.csv")
+    words = ["extract", str(tmp_path / "sweep.csv"), "--controlled", "force"]
+    monkeypatch.setattr("sys.argv", ["dahl-ident", *words])
+    with pytest.raises(SystemExit):
+        main()
+    told = capsys.readouterr()
+    text = " ".join((told.out + told.err).split())
+    bias = re.findall(r"biased by about ([0-9.]+) % \(median\), at most ([0-9.]+) %", text)
+    ((median, most),) = bias
+    assert 0.1 < float(median) <= float(most) < 50.0
+    assert f"dahl-ident fit --record {tmp_path / 'sweep.csv'} --mass free" in text
 
 
 def test_a_table_of_stepped_sines_and_their_waveforms_agree() -> None:

@@ -118,19 +118,24 @@ def _tell_of_sweeps(
     data: FrequencyResponse, files: list[str], reading: RecordReading, controlled: str
 ) -> None:
     """Say how to fit waveforms that were swept too fast for a table."""
+    import numpy as np
+
     from dahl_ident.extraction.point import TOO_FAST
 
-    verdicts = _one_row_a_point(data).quality["verdict"]
-    fast = [str(verdict) for verdict in verdicts if TOO_FAST in str(verdict)]
-    if fast:
+    points = _one_row_a_point(data)
+    fast = np.array([TOO_FAST in str(verdict) for verdict in points.quality["verdict"]])
+    if fast.any():
+        bias = np.hypot(points.quality["bias_real"], points.quality["bias_imag"]) / points.gain
         named = changed(reading)
         words = [word for n in named for word in (option(n), str(getattr(reading, n)))]
         if controlled == "force":  # which moves a mass
             words += ["--mass", "free", "--damping", "free", "--stiffness", "free"]
         command = shlex.join(["dahl-ident", "fit", "--record", *files, *words])
         console.note(
-            f"{len(fast)} of {len(verdicts)} points are of a sweep that friction could not follow. "
-            f"Its waveforms can be fitted at once, without that error: {command}"
+            f"{fast.sum()} of {points.n} points are of a sweep that friction could not follow, and "
+            f"biased by about {100.0 * np.median(bias[fast]):.2g} % (median), at most "
+            f"{100.0 * bias[fast].max():.2g} %. Its waveforms can be fitted at once, without that "
+            f"error: {command}"
         )
 
 
