@@ -340,10 +340,12 @@ def judge(path: Path, name: str, kind: str) -> str:
                 continue
         outcome = "accepted"
         known = record.provenance or {}  # a file that is parsed once warns once
-        said = [*said, *known.get("warnings", ())]
+        # a file of an earlier case, closed late, is not a doubt about this one
+        told = [w for w in said if not issubclass(w.category, ResourceWarning)]
+        doubts = [*told, *known.get("warnings", ())]
         notes = [n for n in known.get("notes", ()) if "not used" not in n]
-        warned |= bool(said or notes)
-        if not said and not notes and _is_wrong(record, name, kind):
+        warned |= bool(doubts or notes)
+        if not doubts and not notes and _is_wrong(record, name, kind):
             return "silently wrong"
     with contextlib.suppress(DahlIdentError), warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -50,8 +50,11 @@ def work(server: Server) -> str:
 
 @pytest.fixture(scope="module")
 def fitted(server: Server, work: str) -> str:
-    """A fit of that table."""
-    return server.fitted(work)
+    """A fit of that table, with a known mass and a calibration."""
+    return server.fitted(
+        work, mass="known", mass_value="1 g", force_uncertainty="0.5 %", force_k="2",
+        meta_specimen="Pivot 12",
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -130,11 +133,8 @@ def test_a_bad_file_is_refused_in_the_reader_s_words(
     assert 'value="model" disabled' in page
 
 
-def test_the_program_gives_what_the_page_shows(server: Server, work: str) -> None:
-    run = server.fitted(
-        work, mass="known", mass_value="1 g", force_uncertainty="0.5 %", force_k="2",
-        meta_specimen="Pivot 12",
-    )  # fmt: skip
+def test_the_program_gives_what_the_page_shows(server: Server, work: str, fitted: str) -> None:
+    run = fitted
     page = unescape(server.page(run))
     assert "Trusted." in page
     assert "Pivot 12" in server.page(f"{run}/file/report.html")
