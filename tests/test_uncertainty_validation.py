@@ -35,6 +35,12 @@ def test_a_gap_is_not_taken_for_noise_of_the_amplitudes() -> None:
     assert uncertainty.judge(of("backlash of 0.05 x_c"), tables=8).failures == []
 
 
+def test_harmonics_do_not_hide_another_law() -> None:
+    """Two Jenkins elements: what their fundamentals show, harmonics may not cover."""
+    found = uncertainty.judge(of("harmonics 1 and 3, two Jenkins elements"), tables=8)
+    assert found.usable == 0.0
+
+
 def test_every_cell_draws_its_truth() -> None:
     cells = uncertainty.cells()
     assert len({cell.name for cell in cells}) == len(cells)

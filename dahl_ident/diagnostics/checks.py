@@ -68,6 +68,10 @@ class Judged(Protocol):
     def cross_validation(self) -> CrossValidation | None:
         """The check of the bands."""
 
+    @property
+    def fundamentals(self) -> Judged | None:
+        """The fit to the fundamentals alone; None where there are no other harmonics."""
+
 
 def judgement(fit: Judged) -> Judgement:
     """Return the findings of every check, and with them the status."""
@@ -144,16 +148,21 @@ def _bands(fit: Judged) -> Iterator[Finding]:
     speaks_against = (goodness.objections, goodness.flagged, *_reservations(fit))
     if goodness.sign or not any(speaks_against):
         return
-    check, errors = fit.cross_validation, fit.errors
+    check = fit.cross_validation
     if check is None:
         return
     enough = check.count >= _ENOUGH_HELD_OUT
-    if enough and errors is not None:
-        misfit = _misfit_within_runs(errors)
-        if check.width < _NARROWEST * misfit:
-            values = {"width": check.width, "misfit": misfit}
-            yield Finding(_DESCRIBED, _NOT_DESCRIBED, "narrow_bands", values)
-            return
+    # harmonics that the model misses widen the bands, which then cover any misfit of fundamentals
+    for part in (fit, fit.fundamentals):
+        own = None if part is None else part.cross_validation
+        if part is None or part.errors is None or own is None:
+            continue
+        if own.count >= _ENOUGH_HELD_OUT:
+            misfit = _misfit_within_runs(part.errors)
+            if own.width < _NARROWEST * misfit:
+                values = {"width": own.width, "misfit": misfit}
+                yield Finding(_DESCRIBED, _NOT_DESCRIBED, "narrow_bands", values)
+                return
     outside = enough and check.inside < _FEWEST_INSIDE * check.count
     yield check.finding(_NOT_DESCRIBED if outside else _TRUSTED)
 

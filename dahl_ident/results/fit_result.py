@@ -36,7 +36,8 @@ from dahl_ident.diagnostics.intervals import (
 from dahl_ident.diagnostics.judgement import Judgement
 from dahl_ident.diagnostics.verdicts import Identifiability, Verdict, judged
 from dahl_ident.elements import Model
-from dahl_ident.errors import FitError, ValidationError
+from dahl_ident.errors import DahlIdentError, FitError, ValidationError
+from dahl_ident.fitting import solve
 from dahl_ident.fitting.optimum import DeterminedCombination, Optimum, propagated
 from dahl_ident.problem import Problem
 from dahl_ident.results import fit_report, fit_storage
@@ -203,6 +204,18 @@ class FitResult(Fit):
         """Held-out tests against their bands; None without tests to hold out."""
         errors = self.errors_of_combinations
         return None if errors is None else cross_validation(errors)
+
+    @cached_property
+    def fundamentals(self) -> FitResult | None:
+        """The same fit to the fundamentals alone; None where there are no other harmonics."""
+        first = self.data.harmonic == 1
+        if first.all() or not first.any() or self.first_order:
+            return None
+        try:
+            problem = self.problem.like(data=self.data.select(rows=first))
+            return FitResult(solve(problem, loss=self.optimum.loss))
+        except DahlIdentError:
+            return None
 
     @cached_property
     def judgement(self) -> Judgement:
