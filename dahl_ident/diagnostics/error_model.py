@@ -53,7 +53,11 @@ from dahl_ident.diagnostics.misfit_explanations import at_an_end, neighbourhood
 from dahl_ident.diagnostics.mixed_model import MixedModel, State, shares
 from dahl_ident.diagnostics.outliers import suspicious_points
 from dahl_ident.diagnostics.residual_space import ResidualSpace
-from dahl_ident.diagnostics.run_deviations import RunDeviations, linearization
+from dahl_ident.diagnostics.run_deviations import (
+    RunDeviations,
+    linearization,
+    run_deviations,
+)
 from dahl_ident.diagnostics.table_groups import rows_of_tests
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
@@ -235,17 +239,20 @@ class ErrorModel:
 
     @cached_property
     def runs(self) -> RunDeviations | None:
-        """How runs deviate from the estimate, of highest likelihood; None where none scatters."""
+        """How runs deviate from the generalised estimate; None where none scatters."""
         shown = [k for k, source in enumerate(self.sources) if source.name == RUNS]
         if not shown:
             return None
-        labels, predicted = np.unique(np.asarray(self.problem.data.run)), self.state.predicted
-        mean = -self._of_theta(predicted[: self.state.model.parameters])
-        places = [*self.names, "gain", "phase"]
-        effects = np.tile([*mean, 0.0, 0.0], (len(labels), 1))
+        labels, Q = np.unique(np.asarray(self.problem.data.run)), len(self.names)
+        effects, spread = np.zeros((len(labels), Q + 2)), np.zeros(Q + 2)
+        predicted, places = self.state.predicted, [*self.names, "gain", "phase"]
         for k in shown:
-            effects[:, places.index(self.sources[k].own)] += predicted[self.state.model.columns(k)]
-        return RunDeviations(labels, effects[:, :-2], effects[:, -2], effects[:, -1])
+            place = places.index(self.sources[k].own)
+            effects[:, place] = predicted[self.state.model.columns(k)]
+            spread[place] = self.variances[k] ** 0.5
+        mean = -self._of_theta(predicted[: self.state.model.parameters])
+        noise = float(self.noises[0] ** 0.5 / self.estimate.factors[:, 0, 0].mean())
+        return run_deviations(self.problem, self.theta, mean, effects, spread, noise)
 
     @cached_property
     def within_runs(self) -> ComplexArray:
@@ -327,8 +334,12 @@ def _with_sources(
     sources: tuple[Source, ...] = ()
     if _distinguishes_noise(problem, assumed):
         sources = (*error_sources(estimate), *own_errors(estimate, _standing_apart(optimum)))
-    state = _mixed(estimate, sources).reml(np.array([source.chance for source in sources]))
+    state = _variances(estimate, sources)
     noises = state.model.noises
+    found = zip(sources, state.variances[noises:].tolist(), strict=True)
+    plausible = tuple(s for s, v in found if s.name != NOISE or v < s.largest)
+    if len(plausible) < len(sources):  # more noise than sensors have is a wrong model's misfit
+        sources, state = plausible, _variances(estimate, plausible)
     kept = np.flatnonzero(state.variances[noises:] > 0.0)
     sources = tuple(sources[k] for k in kept)
     state = _mixed(estimate, sources).at(state.variances[[*range(noises), *(noises + kept)]])
@@ -349,6 +360,10 @@ def _with_sources(
         by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
         every = _at_least(every, by_chance**2 * by_tests)
     return ErrorModel(optimum, estimate, sources, state, every, len(tests), tuple(assumed), limit)
+
+
+def _variances(estimate: WeightedEstimate, sources: Sequence[Source]) -> State:
+    return _mixed(estimate, sources).reml(np.array([source.chance for source in sources]))
 
 
 def _standing_apart(optimum: Optimum) -> list[int]:

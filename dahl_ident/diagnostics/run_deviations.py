@@ -98,3 +98,39 @@ def linearization(
         residuals[both], J[both] = at, by
         parts.append((part, rows, there))
     return Linearization(residuals, J, predicted, fitted, parts)
+
+
+def run_deviations(
+    problem: Problem, theta: FloatArray, mean: FloatArray, effects: FloatArray,
+    spread: FloatArray, noise: float,
+) -> RunDeviations:  # fmt: skip
+    """Return how runs deviate, where each run's residuals and deviations together are least.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its data have runs.
+    theta, mean : ndarray, shape (Q,)
+        Where residuals are known, and how far the mean of the runs is from there.
+    effects : ndarray, shape (R, Q + 2)
+        Deviations of parameters, gain and phase from the mean, to start from.
+    spread : ndarray, shape (Q + 2,)
+        Their standard deviations between runs, 0 where none scatters.
+    noise : float
+        Standard deviation of the residuals.
+    """
+    labels, scatters = np.unique(np.asarray(problem.data.run)), spread > 0.0
+    unit, b = spread[scatters], effects.copy()
+    for last in (False, False, True):
+        runs = RunDeviations(labels, mean + b[:, :-2], b[:, -2], b[:, -1])
+        if last:
+            break
+        near = linearization(problem, theta, runs)
+        for i, (_, rows, _) in enumerate(near.parts):
+            both, share = np.repeat(rows, 2), near.predicted * rows
+            turns = near.change(np.array([-share, -1j * problem.data.harmonic * share]))
+            columns = np.hstack([near.J[both], turns[:, both].T])[:, scatters] * unit
+            left = np.concatenate([near.residuals[both], noise * b[i, scatters] / unit])
+            every = np.vstack([columns, noise * np.eye(len(unit))])
+            b[i, scatters] -= unit * np.linalg.lstsq(every, left, rcond=None)[0]
+    return runs
