@@ -334,12 +334,8 @@ def _with_sources(
     sources: tuple[Source, ...] = ()
     if _distinguishes_noise(problem, assumed):
         sources = (*error_sources(estimate), *own_errors(estimate, _standing_apart(optimum)))
-    state = _variances(estimate, sources)
+    state = _mixed(estimate, sources).reml(np.array([source.chance for source in sources]))
     noises = state.model.noises
-    found = zip(sources, state.variances[noises:].tolist(), strict=True)
-    plausible = tuple(s for s, v in found if s.name != NOISE or v < s.largest)
-    if len(plausible) < len(sources):  # more noise than sensors have is a wrong model's misfit
-        sources, state = plausible, _variances(estimate, plausible)
     kept = np.flatnonzero(state.variances[noises:] > 0.0)
     sources = tuple(sources[k] for k in kept)
     state = _mixed(estimate, sources).at(state.variances[[*range(noises), *(noises + kept)]])
@@ -360,10 +356,6 @@ def _with_sources(
         by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
         every = _at_least(every, by_chance**2 * by_tests)
     return ErrorModel(optimum, estimate, sources, state, every, len(tests), tuple(assumed), limit)
-
-
-def _variances(estimate: WeightedEstimate, sources: Sequence[Source]) -> State:
-    return _mixed(estimate, sources).reml(np.array([source.chance for source in sources]))
 
 
 def _standing_apart(optimum: Optimum) -> list[int]:
