@@ -3,35 +3,32 @@ r"""A gap in the link to a friction element.
 The link carries no force while the gap is crossed. After a reversal the element unloads along its
 own curve to zero force, the gap is crossed there, then the curve goes on where it stopped. So the
 element moves with the amplitude A - gap/2, and the part of the path between two turning points at
-zero force is the gap. Harmonics are integrals over the force,
-
-    c_k = 1/(j k pi) * (closed integral of) exp(-j k theta) dF,
-
-in which only theta depends on the gap (:mod:`dahl_ident.elements.steady_loop`).
+zero force is the gap.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements import held_motion
 from dahl_ident.elements.behaviour import (
     Asymptote,
     Combination,
     HistoryGradient,
     Mechanics,
-    StiffnessGradient,
     clipped,
 )
 from dahl_ident.elements.element import KINDS, Element, class_named, prefixed
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
-from dahl_ident.elements.steady_loop import Branch, Loop, Rows
 from dahl_ident.errors import ModelError
+
+if TYPE_CHECKING:
+    from dahl_ident.engine import Loops
 
 _CLOSED = 1e-9  # gap over the smallest amplitude that counts as none
 _NARROWEST = 1e-9  # of the path: crossings of a narrower gap cannot be told apart in time
@@ -58,8 +55,7 @@ class Backlash(Friction):
     Notes
     -----
     At amplitudes up to gap/2 there is no force at all. A history starts in the middle of the gap,
-    or in contact where it starts with a force. Behind the gap, linear Dahl has exact derivatives;
-    those of other laws are differences over 0.2 %, not meant for amplitudes that near to gap/2.
+    or in contact where it starts with a force.
 
     Examples
     --------
@@ -130,63 +126,9 @@ class Backlash(Friction):
         play = clipped(start, half)
         return self.slope(0.0, 1.0, 0.0, values) * (start - play), play
 
-    def stiffness(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> ComplexArray:
-        """Return F_k/X_1 of the steady loop, 0 up to half the gap, unchecked."""
-        known = self._closed(values, amplitude, omega, harmonic, derivatives=False)
-        if known is not None:
-            return known.value
-        moves = np.asarray(amplitude > 0.5 * np.asarray(values[-1]) * (1.0 + 1e-14))
-        A = np.where(moves, amplitude, 0.0)
-        return np.where(moves, super().stiffness(values, A, omega, harmonic), 0.0)
-
-    def stiffness_gradient(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> StiffnessGradient:
-        """Return F_k/X_1 with its derivatives, exactly for linear Dahl, else by differences."""
-        known = self._closed(values, amplitude, omega, harmonic)
-        return known or super().stiffness_gradient(values, amplitude, omega, harmonic)
-
-    def stiffness_slope(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Return F/X of the fundamental and its derivative with respect to amplitude, unchecked."""
-        known = self._closed(values, amplitude, omega, 1)
-        if known is None:
-            return super().stiffness_slope(values, amplitude, omega)
-        return known.value, known.by_amplitude
-
-    def _closed(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int,
-        *,
-        derivatives: bool = True,
-    ) -> StiffnessGradient | None:
-        """Return the element's own integrals behind the gap, if it has any."""
-        A = np.asarray(amplitude, dtype=np.float64) + 0.0 * omega
-        return self.element.behind_gap(
-            values[:-1], A, values[-1], harmonic, derivatives=derivatives
-        )
-
-    def _loops(self, values: Sequence[FloatArray], A: FloatArray, rows: Rows, owner: Rows) -> Loop:
-        gap = values[-1][rows] if values[-1].ndim else np.full(rows.size, float(values[-1]))
-        moved = A.copy()
-        moved[rows] -= 0.5 * gap
-        loop = super()._loops(values, moved, rows, owner)
-        falling = None if loop.falling is None else _widened(loop.falling, gap)
-        return replace(loop, amplitude=A[rows], rising=_widened(loop.rising, gap), falling=falling)
+    def _loops(self, at: FloatArray, harmonic: int = 1, chosen: Sequence[int] = ()) -> Loops:
+        """Return settled loops at rows of amplitude, frequency and values."""
+        return held_motion.loops_of(self._element, at, harmonic, chosen, gap=True)
 
     def force_history(
         self,
@@ -198,11 +140,6 @@ class Backlash(Friction):
         acceleration: FloatArray | None = None,
     ) -> FloatArray:
         """Return the force at every sample, unchecked."""
-        known = self.element.history_behind_gap(
-            values[:-1], float(values[-1]), displacement, float(state), derivatives=False
-        )
-        if known is not None:
-            return known.value
         if self._is_narrow(values, displacement):
             return self._element.force_history(values[:-1], displacement, velocity, state)
         return super().force_history(values, displacement, velocity, state)
@@ -225,11 +162,6 @@ class Backlash(Friction):
         acceleration: FloatArray | None = None,
     ) -> HistoryGradient:
         """Return the force at every sample with its derivatives."""
-        known = self.element.history_behind_gap(
-            values[:-1], float(values[-1]), displacement, float(state)
-        )
-        if known is not None:
-            return known
         if self._is_narrow(values, displacement):
             found = self.element.force_history_gradient(values[:-1], displacement, velocity, state)
             return found._replace(by_parameter=(*found.by_parameter, np.zeros(displacement.shape)))
@@ -314,15 +246,3 @@ class Backlash(Friction):
         value = "free" if gap.value is None else f"{gap.value:g}"
         started = " free" if gap.free and gap.value is not None else ""
         return f"Backlash({self.element!r}, gap={value}{started})"
-
-
-def _widened(branch: Branch, gap: FloatArray) -> Branch:
-    """Return a branch with the gap crossed at zero force."""
-    beyond = branch.force > 0.0
-    wide = gap[:, None]
-    return replace(
-        branch,
-        travelled=branch.travelled + np.where(beyond, wide, 0.0),
-        left=branch.left + np.where(beyond, 0.0, wide),
-        path=branch.path + gap,
-    )

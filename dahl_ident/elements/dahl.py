@@ -24,10 +24,6 @@ from dahl_ident.arrays import (
     non_negative_array,
 )
 from dahl_ident.elements import (
-    asymmetric_backlash,
-    asymmetric_dahl,
-    dahl_backlash,
-    dahl_gap_history,
     general_dahl,
     general_dahl_table,
     hysteresis,
@@ -36,7 +32,6 @@ from dahl_ident.elements import (
 from dahl_ident.elements.backlash import Backlash
 from dahl_ident.elements.behaviour import (
     Asymptote,
-    Behaviour,
     Combination,
     HistoryGradient,
     StiffnessGradient,
@@ -239,14 +234,14 @@ class Dahl(Friction):
         *,
         acceleration: FloatArray | None = None,
     ) -> HistoryGradient:
-        """Return the force at every sample with its derivatives, unchecked; exact at alpha = 1.
+        """Return the force at every sample with its derivatives, unchecked.
 
         While alpha is fixed at 1 the derivative with respect to it is left at zero, as in
         :meth:`stiffness_gradient`.
         """
         f_max, sigma, alpha = (float(v) for v in values)
         if alpha != 1.0 or self.parameters[2].free:
-            return Behaviour.force_history_gradient(self, values, displacement, velocity, state)
+            return super().force_history_gradient(values, displacement, velocity, state)
         force, by_state, by = hysteresis.linear_history_gradient(displacement, f_max, sigma, state)
         return HistoryGradient(force, by_state, (*by.T, np.zeros(force.shape)))
 
@@ -474,56 +469,6 @@ class Dahl(Friction):
         f_max, sigma, alpha = values
         return f_max, sigma, (np.ones(()), np.ones(()), alpha)
 
-    def behind_gap(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        gap: FloatArray,
-        harmonic: int,
-        *,
-        derivatives: bool = True,
-    ) -> StiffnessGradient | None:
-        """Return F_k/X_1 behind a gap, with derivatives, the gap's last; None unless alpha = 1."""
-        f_max, sigma, alpha = values
-        by_alpha = derivatives and self.parameters[2].free
-        if by_alpha or not _is_linear(alpha) or harmonic > dahl_backlash.HIGHEST:
-            return None
-        beta, eta = np.broadcast_arrays(sigma * amplitude / f_max, 0.5 * sigma * gap / f_max)
-        parts = dahl_backlash.curve(beta.ravel(), eta.ravel(), harmonic, derivatives=derivatives)
-        h, by_beta, by_eta = (p.reshape(beta.shape) for p in parts)
-        both = beta * by_beta + eta * by_eta
-        by = (-sigma / f_max * both, h + both, np.zeros_like(h), 0.5 * sigma**2 / f_max * by_eta)
-        return StiffnessGradient(sigma * h, sigma**2 / f_max * by_beta, by)
-
-    def history_behind_gap(
-        self,
-        values: Sequence[FloatArray | float],
-        gap: float,
-        displacement: FloatArray,
-        state: float,
-        *,
-        derivatives: bool = True,
-    ) -> HistoryGradient | None:
-        """Return the force behind a gap over time; None unless alpha = 1, and fixed."""
-        f_max, sigma, alpha, *asymmetry = (float(v) for v in values)
-        if alpha != 1.0 or (derivatives and self.parameters[2].free):
-            return None
-        force, by_state, by = dahl_gap_history.force_history(
-            displacement,
-            f_max,
-            sigma,
-            sum(asymmetry),
-            gap,
-            float(state),
-            derivatives=derivatives,
-        )
-        if not derivatives:
-            return HistoryGradient(force, by_state, ())
-        by_asymmetry = by[2:3] if asymmetry else ()
-        return HistoryGradient(
-            force, by_state, (by[0], by[1], np.zeros(force.shape), *by_asymmetry, by[3])
-        )
-
     def _gradient(
         self,
         values: Sequence[FloatArray],
@@ -588,46 +533,6 @@ class _AsymmetricDahl(Dahl):
         limit = f_max * (1.0 + direction * asymmetry)
         return super().slope(force, direction, velocity, (limit, sigma, alpha))
 
-    def stiffness(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> ComplexArray:
-        """Return F_k/X_1, in closed form for alpha = 1."""
-        f_max, sigma, alpha, asymmetry = values
-        if not _is_linear(alpha) or harmonic > asymmetric_dahl.HIGHEST:
-            return Friction.stiffness(self, values, amplitude, omega, harmonic)
-        moving = np.maximum(amplitude, 1e-12 * f_max / sigma)  # rest, to every digit
-        Z = asymmetric_dahl.stiffness(moving, f_max, sigma, asymmetry, harmonic)
-        return np.asarray(Z + 0.0 * omega)
-
-    def stiffness_gradient(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> StiffnessGradient:
-        """Return F_k/X_1 with its derivatives, in closed form for alpha fixed at 1."""
-        f_max, sigma, alpha, asymmetry = values
-        general = self.parameters[2].free or not _is_linear(alpha)
-        if general or harmonic > asymmetric_dahl.HIGHEST:
-            return Friction.stiffness_gradient(self, values, amplitude, omega, harmonic)
-        moving = np.maximum(amplitude, 1e-12 * f_max / sigma) + 0.0 * omega
-        N, by_A, by = asymmetric_dahl.gradient(moving, f_max, sigma, asymmetry, harmonic)
-        return StiffnessGradient(N, by_A, (*by[:2], np.zeros_like(N), by[2]))
-
-    def stiffness_slope(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Return N and dN/dA, unchecked."""
-        if not _is_linear(values[2]):
-            return Friction.stiffness_slope(self, values, amplitude, omega)
-        found = self.stiffness_gradient(values, amplitude, omega)
-        return found.value, found.by_amplitude
-
     def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
         """Return those of one limit; in microslip the other has no effect."""
         pins = {"asymmetry": 0.0} if self.parameters[3].free else {}
@@ -643,55 +548,6 @@ class _AsymmetricDahl(Dahl):
         f_max, sigma, *shape = values
         return f_max, sigma, (np.ones(()), np.ones(()), *shape)
 
-    def force_history(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return the force at every sample, exactly for alpha = 1, unchecked."""
-        known = self.history_behind_gap(values, 0.0, displacement, state, derivatives=False)
-        if known is not None:
-            return known.value
-        return Friction.force_history(self, values, displacement, velocity, state)
-
-    def force_history_gradient(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-    ) -> HistoryGradient:
-        """Return the force at every sample with its derivatives, exactly for alpha fixed at 1."""
-        known = self.history_behind_gap(values, 0.0, displacement, state)
-        if known is not None:
-            return known._replace(by_parameter=known.by_parameter[:-1])
-        return Friction.force_history_gradient(self, values, displacement, velocity, state)
-
-    def behind_gap(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        gap: FloatArray,
-        harmonic: int,
-        *,
-        derivatives: bool = True,
-    ) -> StiffnessGradient | None:
-        """Return F_k/X_1 behind a gap, with derivatives, the gap's last; None unless alpha = 1."""
-        f_max, sigma, alpha, asymmetry = values
-        by_alpha = derivatives and self.parameters[2].free
-        if by_alpha or not _is_linear(alpha) or harmonic > asymmetric_backlash.HIGHEST:
-            return None
-        value, by_A, by = asymmetric_backlash.stiffness_gradient(
-            amplitude, f_max, sigma, asymmetry, gap, harmonic
-        )
-        return StiffnessGradient(value, by_A, (*by[:2], np.zeros_like(value), *by[2:]))
-
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return an objection to an almost vanishing limit."""
         if abs(values[3]) < _ONE_SIDED:
@@ -705,6 +561,11 @@ class _AsymmetricDahl(Dahl):
     def __repr__(self) -> str:
         return super().__repr__().replace(type(self).__name__, "Dahl", 1)
 
+    stiffness = Friction.stiffness
+    stiffness_gradient = Friction.stiffness_gradient
+    stiffness_slope = Friction.stiffness_slope
+    force_history = Friction.force_history
+    force_history_gradient = Friction.force_history_gradient
     force_bounds = Friction.force_bounds
     knee = Friction.knee
     transient_decay = Friction.transient_decay

@@ -19,12 +19,13 @@ from dahl_ident.elements.equations import law_equations
 
 if TYPE_CHECKING:
     from dahl_ident.elements.slope_law import SlopeLaw
-    from dahl_ident.engine import Motion, System
+    from dahl_ident.engine import Loops, Motion, System
 
 _SYSTEMS: dict[Hashable, System] = {}
 """Compiled equations by law; not kept on the laws, which are sent to other processes."""
 
 _SLOWEST = 1e-6  # of the largest speed
+_FINER = 10.0  # than a driven motion, where a step is not that across a narrow gap
 
 
 def system_of(
@@ -53,6 +54,27 @@ def _form(law: Element) -> Hashable:
         if name not in ("parameters", "_name")
     )
     return (type(law), tuple(c if c in (0.0, 1.0) else None for c in constants), others)
+
+
+def loops_of(
+    law: Element,
+    at: FloatArray,
+    harmonic: int,
+    chosen: Sequence[int],
+    *,
+    gap: bool = False,
+) -> Loops:
+    """Return the settled loops of a law at rows of amplitude, frequency and values.
+
+    If `gap`, a gap in the link to the law follows its values.
+    """
+    from dahl_ident.engine import loops
+
+    n = len(law.parameters)
+    system = system_of(law, list(at[:, 2 : 2 + n].T), [i for i in chosen if i < n])
+    return loops(
+        system, at[:, 0], at[:, 1], at[:, 2:], chosen=chosen, harmonics=(harmonic,), gap=gap
+    )
 
 
 def force_along(
@@ -119,6 +141,7 @@ def _along(
         system_of(law, values, chosen or ()), knots, np.stack([corners[:-1], np.diff(corners)]),
         samples, np.array([corners[0], 0.0, *states]), np.asarray(values, dtype=np.float64),
         chosen=chosen or (), derivatives=chosen is not None,
+        finer=_FINER if law.n_states == 1 else 1.0,
     )  # fmt: skip
     rows = back[1:]
     output, by_first, by_parameter, states = (part[rows] for part in found[:-1])

@@ -1,47 +1,36 @@
 """What follows from the slope dF/dx of a law: loops, harmonics, derivatives, force, limits.
 
-Settled loops by quadrature (:mod:`dahl_ident.elements.steady_loop`), forces along histories by the
-engine (:mod:`dahl_ident.elements.held_motion`).
+Settled loops and forces along histories are the engine's (:mod:`dahl_ident.elements.held_motion`).
 """
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import (
-    ComplexArray,
-    FloatArray,
-)
+from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import held_motion
 from dahl_ident.elements.behaviour import (
     SOFTENED,
-    STENCIL,
-    STEP,
     HistoryGradient,
     Mechanics,
     StiffnessGradient,
-    central_differences,
 )
 from dahl_ident.elements.element import Element, motion
-from dahl_ident.elements.rated_loop import RatedLoop, rated_loop
-from dahl_ident.elements.steady_loop import Loop, Rows, closed_loop, force_limit
 from dahl_ident.errors import ModelError, ValidationError
 
-_BLOCK = 200  # loops computed together: their scratch arrays stay in the processor's cache
-_AT_REST = 1e-150  # smaller amplitudes are rest
-_SMALLEST = 1e-30  # m; the same for a velocity-dependent law
-_RATED_BLOCK = 64  # velocity-dependent loops computed together: each solves a small linear system
+if TYPE_CHECKING:
+    from dahl_ident.engine import Loops
+
+_SMALLEST = 1e-100  # m; smaller amplitudes are rest
 _FARTHEST = 1e9  # m; a law that has not slipped fully there never does
+_SECTIONS = 16  # of a bracket, when the force is sought at which the slope vanishes
 _START = 60  # steps from rest to the start of a path: as fine as a cycle of 240
-_FORCE_UNIT, _LENGTH_UNIT = 32.0, 2.0**-7  # units in which a law should have the same form
 
 
 class SlopeLaw(Element):
@@ -119,102 +108,8 @@ class SlopeLaw(Element):
         omega: FloatArray,
         harmonic: int = 1,
     ) -> ComplexArray:
-        """Return F_k/X_1 of the steady loop, unchecked."""
-        if not self.rate_independent:
-            return self._rated_stiffness(values, amplitude, omega, harmonic)
-        values, A, shape, owner = _flat(values, amplitude, omega)
-        result = np.zeros(A.shape, dtype=np.complex128)
-        moving = np.flatnonzero(A > _AT_REST)
-        for start in range(0, moving.size, _BLOCK):
-            rows = moving[start : start + _BLOCK]
-            loops = self._loops(values, A, rows, owner)
-            result[rows] = loops.coefficients(harmonic) / A[rows]
-        if harmonic == 1 and moving.size < A.size:
-            rows = np.flatnonzero(A <= _AT_REST)
-            result[rows] = _at_rest(self.quasi_static_slope, values, rows)
-        return result.reshape(shape)
-
-    def _rated_stiffness(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int,
-    ) -> ComplexArray:
-        """Return F_k/X_1 of a velocity-dependent law, by collocation."""
-        values, A, shape, _ = _flat(values, amplitude, omega)
-        if not self.answers(harmonic):
-            return np.zeros(shape, dtype=np.complex128)
-        w = np.broadcast_to(omega, shape).ravel().astype(np.float64)
-        values, A, w, which = _distinct(values, np.maximum(A, _SMALLEST), w)
-        result = np.empty(A.shape, dtype=np.complex128)
-        for start in range(0, A.size, _RATED_BLOCK):
-            rows = np.arange(start, min(start + _RATED_BLOCK, A.size))
-            loop, own = self._rated(values, A, w, rows)
-            with np.errstate(invalid="ignore"):  # NaN where there is no settled loop
-                force = self.output(loop.force, loop.slope, loop.velocity, own)
-                result[rows] = loop.coefficients(np.asarray(force), harmonic) / A[rows]
-        return result[which].reshape(shape)
-
-    def _rated_gradient(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int,
-        wanted: Sequence[int],
-    ) -> StiffnessGradient:
-        """Return F_k/X_1 with the derivatives `wanted` by parameters, P the amplitude; 0 others.
-
-        The slope's and the force's own derivatives are central differences of fourth order.
-        """
-        values, A, shape, _ = _flat(values, amplitude, omega)
-        w = np.broadcast_to(omega, shape).ravel().astype(np.float64)
-        values, A, w, which = _distinct(values, np.maximum(A, _SMALLEST), w)
-        P = len(values)
-        found = np.zeros((P + 2, A.size), dtype=np.complex128)
-        for start in range(0, A.size if self.answers(harmonic) else 0, _RATED_BLOCK):
-            rows = np.arange(start, min(start + _RATED_BLOCK, A.size))
-            loop, own = self._rated(values, A, w, rows)
-            rates = np.zeros((rows.size, len(wanted), loop.theta.size))
-            with np.errstate(invalid="ignore", over="ignore"):
-                for column, i in enumerate(wanted):
-                    for place, weight in STENCIL:
-                        v, at, _ = _moved(loop, own, i, place * STEP)
-                        rates[:, column] += weight * self.slope(loop.force, loop.direction, v, at)
-                    rates[:, column] /= _moved(loop, own, i, STEP)[2]
-                    rates[:, column] += loop.slope if i == P else 0.0
-                changes = loop.changed(A[rows], rates)
-                for column, i in enumerate(wanted):
-                    change = np.zeros(loop.force.shape)
-                    for place, weight in STENCIL:
-                        v, at, step = _moved(loop, own, i, place * STEP)
-                        force = loop.force + step * changes[:, column]
-                        slope = self.slope(force, loop.direction, v, at)
-                        change += weight * np.asarray(self.output(force, slope, v, at))
-                    change /= _moved(loop, own, i, STEP)[2]
-                    found[1 + i, rows] = loop.coefficients(change, harmonic) / A[rows]
-                whole = self.output(loop.force, loop.slope, loop.velocity, own)
-                found[0, rows] = loop.coefficients(np.asarray(whole), harmonic) / A[rows]
-        found[P + 1] = (found[P + 1] - found[0]) / A  # of F_k/A
-        value, *by = (part[which].reshape(shape) for part in found)
-        return StiffnessGradient(value, by[P], tuple(by[:P]))
-
-    def _rated(
-        self, values: Sequence[FloatArray], A: FloatArray, w: FloatArray, rows: Rows
-    ) -> tuple[RatedLoop, list[FloatArray]]:
-        own = [v[rows, None] if v.ndim else v for v in values]
-        flat = _rows(values, rows)
-        start = np.minimum(
-            np.maximum(*self.force_limits(flat)), self.rest_stiffness(flat) * A[rows]
-        )
-        loop = rated_loop(
-            lambda force, direction, velocity: np.asarray(
-                self.slope(force, direction, velocity, own)
-            ),
-            A[rows], w[rows], np.broadcast_to(start, rows.shape),
-        )  # fmt: skip
-        return loop, own
+        """Return F_k/X_1 of the settled loop, unchecked; NaN where nothing settles."""
+        return self._settled_gradient(values, amplitude, omega, harmonic, ()).value
 
     def stiffness_gradient(
         self,
@@ -223,88 +118,42 @@ class SlopeLaw(Element):
         omega: FloatArray,
         harmonic: int = 1,
     ) -> StiffnessGradient:
-        """Return F_k/X_1 with its derivatives, by central differences of fourth order.
-
-        Those of a velocity-dependent law are from the variational equation. Else two parameters
-        need none where the units of all agree with the law: N is then homogeneous in the unit of
-        force and in that of displacement, and Euler's theorem gives the two from the others.
-        Derivatives by parameters that are fixed may be left at zero, which no estimate looks at.
-        """
-        P = len(values)
-        wanted = {P, *(i for i, p in enumerate(self.parameters) if p.free)}
-        if not self.rate_independent:
-            return self._rated_gradient(values, amplitude, omega, harmonic, sorted(wanted))
-        value = self.stiffness(values, amplitude, omega, harmonic)
-        arguments = [np.asarray(v) for v in values] + [np.asarray(amplitude)]
-        powers, pair = self._scaled_pair(arguments)
-        others = {i for i, row in enumerate(powers) if any(row)} - {*pair}
-        fewer = (wanted | others) - {*pair}
-        if len(fewer) < len(wanted):
-            wanted = fewer
-        else:
-            pair = ()
-
-        def at(*moved: FloatArray) -> ComplexArray:
-            return self.stiffness(moved[:-1], moved[-1], omega, harmonic)
-
-        slopes = {i: central_differences(at, arguments, i, value.shape) for i in wanted}
-        if pair:
-            # a_i p_i dN/dp_i sums up to N, and b_i p_i dN/dp_i with A dN/dA to -N
-            rest = np.stack([value, -value - arguments[P] * slopes[P]])
-            for i in others:
-                rest = rest - np.multiply.outer(powers[i], arguments[i] * slopes[i])
-            solved = np.tensordot(np.linalg.inv(np.transpose([powers[i] for i in pair])), rest, 1)
-            slopes |= {i: s / arguments[i] for i, s in zip(pair, solved, strict=True)}
-        nothing = np.zeros(value.shape, dtype=np.complex128)
-        by_parameter = tuple(slopes.get(i, nothing) for i in range(P))
-        return StiffnessGradient(value, slopes[P], by_parameter)
-
-    def _scaled_pair(
-        self, arguments: Sequence[FloatArray]
-    ) -> tuple[list[tuple[int, int]], tuple[int, ...]]:
-        """Return powers of force and displacement in all units, and two that are independent.
-
-        Two positive parameters; none where the units do not agree with the law. They do where the
-        slope is the same with force and displacement in other units, powers of two that change no
-        digit.
-        """
-        powers = [p.dimension[:2] if p.is_mechanical else (0, 0) for p in self.parameters]
-        positive = [i for i, p in enumerate(self.parameters) if p.positive]
-        pairs = [
-            (i, j)
-            for i, j in combinations(positive, 2)
-            if powers[i][0] * powers[j][1] != powers[i][1] * powers[j][0]
-        ]
-        if not (pairs and self.rate_independent and self.one_state):
-            return powers, ()
-        *one, A = (np.asarray(np.quantile(v, 0.5, method="nearest")) for v in arguments)
-        force = float(self.rest_stiffness(one)) * A * np.linspace(-1.5, 1.5, 12)
-        other = [
-            v * _FORCE_UNIT ** float(a) * _LENGTH_UNIT ** float(b)
-            for v, (a, b) in zip(one, powers, strict=True)
-        ]
-        same = True
-        with np.errstate(all="ignore"):
-            for direction in (1.0, -1.0):
-                s = self.quasi_static_slope(force, direction, one)
-                t = self.quasi_static_slope(force * _FORCE_UNIT, direction, other)
-                expected = np.asarray(s) * (_FORCE_UNIT / _LENGTH_UNIT)
-                same &= np.allclose(t, expected, rtol=1e-12, atol=0.0, equal_nan=True)
-        return powers, (pairs[0] if same else ())
+        """Return F_k/X_1 with its derivatives; 0 with respect to parameters that are fixed."""
+        free = [i for i, p in enumerate(self.parameters) if p.free]
+        return self._settled_gradient(values, amplitude, omega, harmonic, free)
 
     def stiffness_slope(
         self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
     ) -> tuple[ComplexArray, ComplexArray]:
         """Return F/X of the fundamental and its derivative with respect to amplitude, unchecked."""
-        if not self.rate_independent:
-            found = self._rated_gradient(values, amplitude, omega, 1, [len(values)])
-            return found.value, found.by_amplitude
-        value = self.stiffness(values, amplitude, omega)
+        found = self._settled_gradient(values, amplitude, omega, 1, ())
+        return found.value, found.by_amplitude
 
-        def at(moved: FloatArray) -> ComplexArray:
-            return self.stiffness(values, moved, omega)
+    def _settled_gradient(
+        self,
+        values: Sequence[FloatArray],
+        amplitude: FloatArray,
+        omega: FloatArray,
+        harmonic: int,
+        chosen: Sequence[int],
+    ) -> StiffnessGradient:
+        """Return F_k/X_1 with the derivatives `chosen`, the others 0."""
+        at, rows = _rows_of(values, amplitude, omega, rated=not self.rate_independent)
+        loops = self._loops(at, harmonic, chosen)
+        A = at[:, 0]
+        value = loops.coefficients[:, 0] / A
+        rests = A <= _SMALLEST
+        if self.rate_independent and rests.any():
+            own = [np.asarray(v) for v in at[rests, 2:].T]
+            value[rests] = self.rest_stiffness(own) if harmonic == 1 else 0.0
+        by = np.zeros((len(values), A.size), dtype=np.complex128)
+        by[list(chosen)] = loops.by_parameter[:, 0].T / A
+        by_amplitude = (loops.by_amplitude[:, 0] - value) / A
+        return StiffnessGradient(value[rows], by_amplitude[rows], tuple(d[rows] for d in by))
 
-        return value, central_differences(at, [amplitude], 0, value.shape)
+    def _loops(self, at: FloatArray, harmonic: int = 1, chosen: Sequence[int] = ()) -> Loops:
+        """Return settled loops at rows of amplitude, frequency and values."""
+        return held_motion.loops_of(self, at, harmonic, chosen)
 
     def force_history(
         self,
@@ -347,14 +196,18 @@ class SlopeLaw(Element):
 
     def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Return the forces of full slip in both directions, N; inf if there is none."""
-        values, _, shape, _ = _flat(values, np.zeros(()), np.zeros(()))
-        rows = np.arange(int(np.prod(shape)))
-        limits = []
-        for side in (self._rising, self._falling):
-            slope = partial(side, values)
-            stiffness = slope(np.zeros((rows.size, 1)), rows)[:, 0]
-            limits.append(force_limit(slope, stiffness * _FARTHEST).reshape(shape))
-        return limits[0], limits[1]
+        columns = [np.asarray(v)[..., None] for v in values]
+        start = np.asarray(self.rest_stiffness(values) * _FARTHEST)
+        shape = np.broadcast_shapes(start.shape, *(np.shape(v) for v in values))
+        start = np.broadcast_to(start, shape)
+
+        def rising(force: FloatArray) -> FloatArray:
+            return np.asarray(self.quasi_static_slope(force, 1.0, columns)) + 0.0 * force
+
+        def falling(force: FloatArray) -> FloatArray:
+            return np.asarray(self.quasi_static_slope(-force, -1.0, columns)) + 0.0 * force
+
+        return force_limit(rising, start), force_limit(falling, start)
 
     def rest_stiffness(self, values: Sequence[FloatArray]) -> FloatArray:
         """Return dF/dx at zero force, which N tends to at small amplitudes, N/m."""
@@ -410,54 +263,9 @@ class SlopeLaw(Element):
     def transient_decay(
         self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
     ) -> FloatArray:
-        """Return the factor by which a deviation from the steady loop shrinks in one cycle.
-
-        Along one direction a deviation changes as the slope does: by its ratio at the two tips.
-        """
-        values, A, shape, owner = _flat(values, amplitude, omega)
-        result = np.ones(A.shape)
-        rows = np.flatnonzero(A > _AT_REST)
-        if not self.rate_independent:
-            w = np.broadcast_to(omega, shape).ravel().astype(np.float64)
-            result[rows] = np.abs(self._rated(values, A, w, rows)[0].decay)
-        elif rows.size:
-            loop = self._loops(values, A, rows, owner)
-            ends = np.stack([loop.top, loop.bottom], axis=1)
-            up = self._rising(_rows(values, rows), ends, np.arange(rows.size))
-            down = self._falling(_rows(values, rows), -ends, np.arange(rows.size))
-            result[rows] = np.maximum(up[:, 0] / up[:, 1], 0.0)
-            result[rows] *= np.maximum(down[:, 1] / down[:, 0], 0.0)
-        return result.reshape(shape)
-
-    def behind_gap(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        gap: FloatArray,
-        harmonic: int,
-        *,
-        derivatives: bool = True,
-    ) -> StiffnessGradient | None:
-        """Return F_k/X_1 of this law behind a gap, if wanted with derivatives, the gap's last.
-
-        None where the law has no closed form for it.
-        """
-        return None
-
-    def history_behind_gap(
-        self,
-        values: Sequence[FloatArray | float],
-        gap: float,
-        displacement: FloatArray,
-        state: float,
-        *,
-        derivatives: bool = True,
-    ) -> HistoryGradient | None:
-        """Return the force behind a gap over time, if wanted with derivatives, the gap's last.
-
-        None where the law has no closed form for it.
-        """
-        return None
+        """Return the factor by which a deviation from the settled loop shrinks in one cycle."""
+        at, rows = _rows_of(values, amplitude, omega, rated=not self.rate_independent)
+        return np.asarray(np.abs(self._loops(at).decays)[rows])
 
     def steady_force(
         self, values: Sequence[FloatArray], path: FloatArray, cycles: int
@@ -481,72 +289,47 @@ class SlopeLaw(Element):
                 f"slip, {-down:g} and {up:g}"
             )
 
-    def _loops(self, values: Sequence[FloatArray], A: FloatArray, rows: Rows, owner: Rows) -> Loop:
-        own = _rows(values, rows)
-        sides = partial(self._rising, own), partial(self._falling, own)
-        return closed_loop(*sides, A[rows], owner[rows])
-
-    def _rising(self, values: Sequence[FloatArray], force: FloatArray, rows: Rows) -> FloatArray:
-        own = [v[rows, None] if v.ndim else v for v in values]
-        return np.asarray(self.quasi_static_slope(force, 1.0, own)) + 0.0 * force
-
-    def _falling(self, values: Sequence[FloatArray], force: FloatArray, rows: Rows) -> FloatArray:
-        own = [v[rows, None] if v.ndim else v for v in values]
-        return np.asarray(self.quasi_static_slope(-force, -1.0, own)) + 0.0 * force
-
     def _loop(self, values: Sequence[float], amplitude: float, theta: FloatArray) -> FloatArray:
-        """Return the force on the closed loop at angles from 0 to 2 pi."""
-        at = [np.asarray(v) for v in values]
-        one = np.zeros(1, dtype=np.intp)
-        top = self._loops(at, np.array([amplitude]), one, one).top[0]
+        """Return the force on the settled loop at angles from 0 to 2 pi."""
+        top = self._loops(np.array([[amplitude, 1.0, *values]])).tops[0]
         x = amplitude * np.cos(theta)
         return self.force_history(values, x, -amplitude * np.sin(theta), float(top))
 
 
-def _flat(
-    values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
-) -> tuple[list[FloatArray], FloatArray, tuple[int, ...], Rows]:
-    """Return values and amplitudes as rows, single numbers left alone, and the whole shape.
+def _rows_of(
+    values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray, *, rated: bool
+) -> tuple[FloatArray, NDArray[np.intp]]:
+    """Return rows of amplitude, frequency and values without repetition, and each point's row.
 
-    And the same number for rows with the same values.
+    Amplitudes of the same parameters rise from row to row.
     """
-    arrays = [np.asarray(v, dtype=np.float64) for v in values]
-    shape = np.broadcast_shapes(*(v.shape for v in arrays), np.shape(amplitude), np.shape(omega))
-    flat = [np.broadcast_to(v, shape).ravel() if v.size != 1 else v.reshape(()) for v in arrays]
-    batch = np.broadcast_shapes(*(v.shape for v in arrays))
-    owner = np.broadcast_to(np.arange(math.prod(batch)).reshape(batch), shape).ravel()
-    return flat, np.broadcast_to(amplitude, shape).ravel().astype(np.float64), shape, owner
+    speed = np.maximum(omega, _SMALLEST) if rated else np.ones(())  # at rest: quasi-static
+    columns = np.broadcast_arrays(*values, speed, np.maximum(amplitude, _SMALLEST), omega)[:-1]
+    every = np.column_stack([column.ravel() for column in columns]).astype(np.float64)
+    at, rows = np.unique(every, axis=0, return_inverse=True)
+    n = len(values)
+    return at[:, [n + 1, n, *range(n)]], rows.reshape(columns[0].shape)
 
 
-def _distinct(
-    values: Sequence[FloatArray], A: FloatArray, omega: FloatArray
-) -> tuple[list[FloatArray], FloatArray, FloatArray, Rows]:
-    """Return values, amplitudes and frequencies without repeated rows, and every row's place."""
-    columns = [A, omega, *(v for v in values if v.ndim)]
-    _, first, which = np.unique(
-        np.column_stack(columns), axis=0, return_index=True, return_inverse=True
-    )
-    return _rows(values, first), A[first], omega[first], which.ravel()
+def force_limit(rising: Callable[[FloatArray], FloatArray], start: FloatArray) -> FloatArray:
+    """Return the least force above 0 at which the slope vanishes, inf if there is none below.
 
-
-def _moved(
-    loop: RatedLoop, values: list[FloatArray], i: int, share: float
-) -> tuple[FloatArray, list[FloatArray], FloatArray]:
-    """Return velocity and values with one greater by a share, and by how much; last the speed."""
-    if i == len(values):
-        return loop.velocity * (1.0 + share), values, np.asarray(share)
-    step = share * np.where(values[i] == 0.0, 1.0, np.abs(values[i]))
-    return loop.velocity, [*values[:i], values[i] + step, *values[i + 1 :]], step
-
-
-def _rows(values: Sequence[FloatArray], rows: NDArray[Any]) -> list[FloatArray]:
-    return [v[rows] if v.ndim else v for v in values]
-
-
-def _at_rest(slope: Callable[..., Any], values: Sequence[FloatArray], rows: Rows) -> FloatArray:
-    """Return dF/dx at zero force."""
-    force = np.zeros(rows.size)
-    return np.asarray(slope(force, 1.0, _rows(values, rows))) + force
+    `rising` takes forces of shape (..., n), `start` is of shape (...).
+    """
+    fractions = np.arange(1, _SECTIONS + 1) / _SECTIONS
+    low, width = np.zeros(start.shape), start.copy()
+    found: NDArray[np.bool_] = np.ones(start.shape, dtype=bool)
+    for step in range(60):
+        with np.errstate(all="ignore"):
+            stuck = ~(rising(low[..., None] + width[..., None] * fractions) > 0.0)
+        if step == 0:
+            found = np.asarray(stuck.any(axis=-1))
+        stuck[..., -1] = True
+        width = width / _SECTIONS
+        low = low + width * stuck.argmax(axis=-1)
+        if np.all((width <= 1e-16 * low) | ~found):
+            break
+    return np.where(found, low, np.inf)
 
 
 def stepped(

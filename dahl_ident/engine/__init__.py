@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from dahl_ident.engine.differentiation import differentiated
 from dahl_ident.engine.drive import band_limited
-from dahl_ident.engine.motion import Motion, Settled, march, settled
+from dahl_ident.engine.motion import Loops, Motion, Settled, loops, march, settled
 from dahl_ident.engine.translate import Equations, System, translate
 
 __all__ = [
     "Equations",
+    "Loops",
     "Motion",
     "Settled",
     "System",
     "band_limited",
     "differentiated",
+    "loops",
     "march",
     "settled",
     "translate",

@@ -11,8 +11,17 @@ import numpy as np
 from numba import boolean, complex128, float64, int64, njit, types
 
 from dahl_ident.engine.integrate import advance
-from dahl_ident.engine.radau import STAGES, Signal, eliminate, layout, restart
-from dahl_ident.engine.samples import FUNCTION, MATRIX, NUMBERS, VECTOR
+from dahl_ident.engine.radau import (
+    FUNCTION,
+    NUMBERS,
+    STAGES,
+    TABLE,
+    VECTOR,
+    Signal,
+    eliminate,
+    layout,
+    restart,
+)
 
 _ITERATIONS = 40  # of shooting; five are the rule
 _CONVERGED = 1e-4  # change of the first state over the largest one; its square is corrected
@@ -24,8 +33,8 @@ _SHORTEST = 12.0  # steps of a cycle, and of one of the highest harmonic, at lea
 
 
 @njit(
-    types.Tuple((NUMBERS, complex128[:, :, ::1], MATRIX, float64[:, :, ::1]))(
-        FUNCTION, NUMBERS, NUMBERS, NUMBERS, boolean, VECTOR, VECTOR, MATRIX, MATRIX, NUMBERS,
+    types.Tuple((NUMBERS, complex128[:, :, ::1], TABLE, float64[:, :, ::1]))(
+        FUNCTION, NUMBERS, NUMBERS, NUMBERS, boolean, VECTOR, VECTOR, TABLE, TABLE, NUMBERS,
         VECTOR, int64, float64,
     ),
     cache=True,

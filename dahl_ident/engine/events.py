@@ -24,11 +24,11 @@ NEAR = 1e-10  # of a switching function's largest value: zero, to rounding
 LOCATED = 1e-13  # of the span: shorter steps, and times that differ by less, are none
 _BISECTIONS = 60
 _REPEATS = 12  # of a step that is shortened to an event; two are the rule
-_PLACES = np.concatenate(
+PLACES = np.concatenate(
     [a + (b - a) * np.arange(1, 5) / 4 for a, b in zip([0.0, *NODES[:-1]], NODES, strict=True)]
 )
 _POWERS = np.arange(STAGES + 1)
-WITHIN = _PLACES[:, None] ** _POWERS @ np.linalg.inv(np.append(0.0, NODES)[:, None] ** _POWERS)
+WITHIN = PLACES[:, None] ** _POWERS @ np.linalg.inv(np.append(0.0, NODES)[:, None] ** _POWERS)
 """Weights of values at the beginning and the stages in those at the places between them."""
 
 
@@ -108,7 +108,7 @@ def first_event(f, signal, t, h, y, w, at):
         near = NEAR * w[at.scale + row]
         older, old, low, middle = np.inf, w[at.before + e] * side, 0.0, 0.0
         for i in range(WITHIN.shape[0]):
-            high, value = _PLACES[i], WITHIN[i, 0] * w[at.before + e] * side
+            high, value = PLACES[i], WITHIN[i, 0] * w[at.before + e] * side
             for j in range(STAGES):
                 there = w[at.values + j * m + row] if e else y[1] + w[at.stages + j * n + 1]
                 value += WITHIN[i, 1 + j] * there * side

@@ -21,8 +21,10 @@ from dahl_ident.errors import FitError
 
 _SETTLED = 1e-6  # error of a step's polynomial; that of harmonics is then below 1e-10
 _SAMPLED = 1e-6  # the same where motions end at samples; a hundredth of it between
+_LOOP = 1e-6  # the same for loops of laws with one state, over the local force
+_RATED = 10.0  # finer, where the law depends on the speed: it changes most near rest
 _CYCLES = 4  # before Newton's method, from rest: a plant is then near its settled motion
-_KERNELS = ("radau", "events", "integrate", "samples", "cycle")
+_KERNELS = ("radau", "events", "integrate", "samples", "cycle", "loop")
 
 
 class Settled(NamedTuple):
@@ -48,6 +50,30 @@ class Settled(NamedTuple):
     by_parameter: ComplexArray
     starts: FloatArray
     maps: FloatArray
+
+
+class Loops(NamedTuple):
+    """Settled loops of a law; one row each.
+
+    Attributes
+    ----------
+    found : ndarray of bool, shape (rows,)
+    coefficients : ndarray of complex, shape (rows, harmonics)
+        c_k of the output, sum of Re c_k exp(j k theta); c_0 is its mean. NaN where not found.
+    by_amplitude : ndarray of complex, shape (rows, harmonics)
+    by_parameter : ndarray of complex, shape (rows, harmonics, chosen)
+    tops : ndarray, shape (rows,)
+        Forces at the largest displacement.
+    decays : ndarray, shape (rows,)
+        Factors by which a deviation shrinks in a cycle.
+    """
+
+    found: NDArray[np.bool_]
+    coefficients: ComplexArray
+    by_amplitude: ComplexArray
+    by_parameter: ComplexArray
+    tops: FloatArray
+    decays: FloatArray
 
 
 class Motion(NamedTuple):
@@ -118,6 +144,46 @@ def settled(
     found = found.astype(bool)
     result[~found] = np.nan
     return Settled(found, result[..., 0], result[..., 1], result[..., 2:], first, maps)
+
+
+def loops(
+    system: System,
+    amplitude: FloatArray,
+    omega: FloatArray,
+    parameters: FloatArray,
+    *,
+    chosen: Sequence[int] = (),
+    harmonics: Sequence[int] = (1,),
+    gap: bool = False,
+    finer: float = 1.0,
+) -> Loops:
+    """Return the settled loops of a law with one state under sines of displacement.
+
+    Parameters
+    ----------
+    system : System
+    amplitude, omega : ndarray, shape (rows,)
+        Of the displacement; rad/s.
+    parameters : ndarray, shape (rows, P)
+        Of the law; then, if `gap`, the gap in the link to it.
+    chosen : sequence of int
+        Parameters whose derivatives are wanted.
+    harmonics : sequence of int
+        Rising k of the output's harmonics.
+    gap : bool, default False
+        Whether the last parameter is a gap.
+    finer : float, default 1
+        How many times smaller the error of a step is than usual.
+    """
+    found, result, tops, decays = kernels("loop").loops(
+        system.function, system.sizes, system.odd, gap, _numbers(amplitude), _numbers(omega),
+        _numbers(parameters), np.asarray(chosen, dtype=np.int64),
+        np.asarray(harmonics, dtype=np.int64),
+        _LOOP / finer / (_RATED if system.sizes[4] else 1.0),
+    )  # fmt: skip
+    found = found.astype(bool)
+    result[~found] = np.nan
+    return Loops(found, result[..., 0], result[..., 1], result[..., 2:], tops, decays)
 
 
 def march(

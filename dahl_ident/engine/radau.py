@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections import namedtuple
 
 import numpy as np
-from numba import njit
+from numba import float64, int64, njit, types
 from numpy.polynomial import legendre
 
 from dahl_ident.arrays import FloatArray
@@ -59,11 +59,15 @@ _SHARES = tuple(
 )
 """Of the polynomials that are 1 at one node, and 0 at the others and the beginning."""
 
-_CHECKED = np.array([0.5 * NODES[0], 0.5 * (NODES[-2] + NODES[-1])])  # where rates are compared
+CHECKED = np.array([0.5 * NODES[0], 0.5 * (NODES[-2] + NODES[-1])])  # where rates are compared
 _POWERS = np.arange(1, STAGES + 1)
-SLOPE_CHECKED = (_POWERS * _CHECKED[:, None] ** (_POWERS - 1)) @ np.linalg.inv(
+SLOPE_CHECKED = (_POWERS * CHECKED[:, None] ** (_POWERS - 1)) @ np.linalg.inv(
     NODES[:, None] ** _POWERS
 )
+
+FUNCTION = types.FunctionType(types.void(types.CPointer(float64)))
+NUMBERS, VECTOR, TABLE = int64[::1], float64[::1], float64[:, ::1]
+"""Types of the kernels' arguments."""
 
 OPTIONS = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 compiled = njit(**OPTIONS)
@@ -372,12 +376,13 @@ def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
         largest = 0.0
         for a in range(R):
             r = solved[a]
-            size, change = max(w[at.scale + r], abs(y[r])), 0.0
+            size, change, total = max(w[at.scale + r], abs(y[r])), 0.0, 0.0
             for i in range(STAGES):
                 w[z + i * n + r] += columns[i * R + a, 0]
                 change = max(change, abs(columns[i * R + a, 0]))
+                total += abs(columns[i * R + a, 0])
                 size = max(size, abs(w[z + i * n + r]))
-            if not change < np.inf:
+            if not total < np.inf:  # nor not a number, which a maximum does not show
                 return False
             if change > 0.0:
                 largest = max(largest, change / size)
@@ -397,10 +402,10 @@ def error_of(f, states, read, signal, t, h, y, w, at):
     the polynomial of its values at the stages is from it at the beginning.
     """
     largest, m = 0.0, at.n + 1 + at.k
-    for i in range(-1, _CHECKED.size):
+    for i in range(-1, CHECKED.size):
         if i >= 0:
-            put_place(y, _CHECKED[i], w, at)
-            evaluate(f, signal, t + _CHECKED[i] * h, 0.0, w, at)
+            put_place(y, CHECKED[i], w, at)
+            evaluate(f, signal, t + CHECKED[i] * h, 0.0, w, at)
         for r in states:
             change = -h * (w[at.outputs + r] if i >= 0 else w[at.rates + r])
             size = max(w[at.scale + r], abs(y[r]))

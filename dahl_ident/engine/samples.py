@@ -6,15 +6,21 @@ import numpy as np
 from numba import float64, int64, njit, types
 
 from dahl_ident.engine.integrate import advance
-from dahl_ident.engine.radau import STAGES, Signal, layout, restart
-
-FUNCTION = types.FunctionType(types.void(types.CPointer(types.float64)))
-NUMBERS, VECTOR, MATRIX = int64[::1], float64[::1], float64[:, ::1]
+from dahl_ident.engine.radau import (
+    FUNCTION,
+    NUMBERS,
+    STAGES,
+    TABLE,
+    VECTOR,
+    Signal,
+    layout,
+    restart,
+)
 
 
 @njit(
-    types.Tuple((int64, VECTOR, MATRIX, MATRIX, MATRIX))(
-        FUNCTION, NUMBERS, NUMBERS, NUMBERS, VECTOR, MATRIX, VECTOR, VECTOR, VECTOR, NUMBERS,
+    types.Tuple((int64, VECTOR, TABLE, TABLE, TABLE))(
+        FUNCTION, NUMBERS, NUMBERS, NUMBERS, VECTOR, TABLE, VECTOR, VECTOR, VECTOR, NUMBERS,
         int64, float64,
     ),
     cache=True,
