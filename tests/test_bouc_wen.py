@@ -156,3 +156,31 @@ def test_force_derivatives(law: tuple[float, float, float]) -> None:
         np.testing.assert_allclose(
             found[:, i], expected, rtol=0.0, atol=1e-7 * np.abs(expected).max()
         )
+
+
+@pytest.mark.parametrize("n", [0.6, 2.0, 7.0])
+@pytest.mark.parametrize(("q", "p"), [(1.3, 0.5), (0.0, 2.0), (1.0, -0.4)])
+def test_an_exponent_against_the_integrated_loop(n: float, q: float, p: float) -> None:
+    sigma, A = 3.0, 1.1
+    law = BoucWen(sigma, q, p, exponent=n)
+
+    def slope(x: float, z: FloatArray, s: float) -> FloatArray:
+        rate = q if s * z[0] > 0.0 else -p
+        return np.asarray(s * sigma * (1.0 - np.sign(rate) * np.abs(rate * z / sigma) ** n))
+
+    z = 0.0
+    for s in [1.0] + 12 * [-1.0, 1.0]:
+        path = A if s * z == 0.0 else 2.0 * A
+        z = solve_ivp(slope, (0.0, path), [z], args=(s,), rtol=1e-11, atol=1e-13).y[0, -1]
+    assert float(law.loop(A)[1][0]) == pytest.approx(z, rel=1e-7)
+    described = law.describe()
+    parameters = {key: value for key, value in described.items() if key != "kind"}
+    assert BoucWen.from_description(parameters, None).describe() == described
+
+
+def test_the_exponent_1_is_not_a_parameter() -> None:
+    one, near = BoucWen(3.0, 1.3, 0.5), BoucWen(3.0, 1.3, 0.5, exponent=1.0 + 1e-9)
+    assert one.labels == ("sigma", "q", "p") == BoucWen(exponent=1.0).labels
+    assert near.labels == ("sigma", "q", "p", "exponent")
+    found = near.dynamic_stiffness([0.3, 2.0])
+    np.testing.assert_allclose(found, one.dynamic_stiffness([0.3, 2.0]), rtol=1e-8)

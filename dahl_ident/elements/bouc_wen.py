@@ -1,31 +1,32 @@
-"""Bouc-Wen hysteresis of exponent 1.
+r"""Bouc-Wen hysteresis.
 
-    dz/dx = sigma - q |z|   while z and the motion have one sign (loading)
-    dz/dx = sigma + p |z|   while they have opposite signs (unloading)
+    dF/dx = sigma (1 - sgn(q) |q F/sigma|^n)   while F and the motion have one sign (loading)
+    dF/dx = sigma (1 + sgn(p) |p F/sigma|^n)   while they have opposite signs (unloading)
 
-In the usual letters dz/dt = a v - beta |v| z - gamma v |z|: sigma = a, q = beta + gamma and
-p = beta - gamma. q = p = sigma/f_max is the linear Dahl model; q > 0 saturates at sigma/q, q <= 0
-never saturates; p = 0 unloads along a straight line.
+In the usual letters dz/dt = a v - beta |v| |z|^(n-1) z - gamma v |z|^n: sigma = a,
+beta + gamma = sgn(q) |q|^n a^(1-n) and beta - gamma = sgn(p) |p|^n a^(1-n). With n = 1,
+dF/dx = sigma - q |F| and sigma + p |F|; q = p = sigma/f_max is then the linear Dahl model.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.elements.element import Element
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
 
 
 class BoucWen(Friction):
-    """Bouc-Wen of exponent 1: dF/dx = sigma - q abs(F) loading, sigma + p abs(F) unloading.
+    """Bouc-Wen: dF/dx = sigma - q abs(F) loading, sigma + p abs(F) unloading, or their powers n.
 
     Loading is where the force and the motion have one sign. In the usual letters
-    dz/dt = a v - beta abs(v) z - gamma v abs(z): sigma = a, q = beta + gamma and
-    p = beta - gamma, so beta = (q + p)/2 and gamma = (q - p)/2.
+    dz/dt = a v - beta abs(v) abs(z)^(n-1) z - gamma v abs(z)^n: sigma = a, and for n = 1
+    q = beta + gamma and p = beta - gamma, so beta = (q + p)/2 and gamma = (q - p)/2.
 
     Parameters
     ----------
@@ -33,34 +34,44 @@ class BoucWen(Friction):
         Contact stiffness at zero force, a in the usual letters, N/m, > 0. Given: fixed; left
         out: free.
     q : float, optional
-        Rate of softening while loading, beta + gamma, 1/m. Above 0 the force saturates at
-        sigma/q; at 0 or below it never does.
+        Rate of softening while loading, 1/m. Above 0 the force saturates at sigma/q. At 0 or
+        below there is no such limit, and for n > 1 a force with q < 0 becomes infinite within a
+        finite displacement, beyond which the law has no value.
     p : float, optional
-        Rate of stiffening while unloading, beta - gamma, 1/m; at 0 the law unloads along a
-        straight line. Friction that loses energy has q + p > 0.
+        Rate of stiffening while unloading, 1/m; at 0 the law unloads along a straight line.
+        Friction that loses energy has q + p > 0.
+    exponent : float or None, default 1
+        n, from 0.05 to 100: how abruptly the force saturates. None: free. At exactly 1 it is not
+        a parameter of the element.
     name : str, optional
         Prefix of the parameters' names.
 
     Raises
     ------
     ValidationError
-        If sigma is not a number from 1e-90 to 1e90, or q or p is not finite.
+        If sigma is not a number from 1e-90 to 1e90, q or p is not finite, or the exponent is
+        outside its range.
 
     Notes
     -----
-    q = p = sigma/f_max is the linear Dahl model. Y.-K. Wen, Method for random vibration of
-    hysteretic systems, J. Eng. Mech. Div. 102 (1976) 249-263.
+    With an exponent, dF/dx = sigma (1 - sgn(q) abs(q F/sigma)^n) loading and
+    sigma (1 + sgn(p) abs(p F/sigma)^n) unloading, so that q and p keep their unit and the limit is
+    sigma/q for every n: beta + gamma = sgn(q) abs(q)^n sigma^(1-n), beta - gamma the same of p.
+    q = p = sigma/f_max with n = 1 is the linear Dahl model. Y.-K. Wen, Method for random
+    vibration of hysteretic systems, J. Eng. Mech. Div. 102 (1976) 249-263.
 
     Examples
     --------
     >>> law = BoucWen(sigma=3.0, q=1.3, p=0.5)
     >>> print(law.dynamic_stiffness(2.0).round(6))
     (0.998062+0.843296j)
+    >>> BoucWen(sigma=3.0, q=1.3, p=0.5, exponent=2.0)
+    BoucWen(sigma=3, q=1.3, p=0.5, exponent=2)
     """
 
     kind = "bouc_wen"
     equation = "dF/dx = sigma - q |F| (F and motion of one sign), sigma + p |F| (opposite signs)"
-    parameters = (
+    parameters: tuple[Parameter, ...] = (
         Parameter(
             "sigma", "N/m", "contact stiffness at zero force (a)", lower=0.0, transform="log"
         ),
@@ -68,6 +79,26 @@ class BoucWen(Friction):
         Parameter("p", "1/m", "rate of stiffening while unloading (beta - gamma)"),
     )
     linear_parameters = scale_parameters = ("sigma",)
+
+    def __init__(
+        self,
+        sigma: float | None = None,
+        q: float | None = None,
+        p: float | None = None,
+        *,
+        exponent: float | None = 1.0,
+        name: str | None = None,
+    ) -> None:
+        self._bind({"sigma": sigma, "q": q, "p": p, "exponent": exponent}, name)
+
+    def __new__(cls, *_: Any, exponent: float | None = 1.0, **__: Any) -> BoucWen:
+        """Return the element of exponent 1, or that with another one."""
+        return object.__new__(cls if exponent == 1.0 else _PowerBoucWen)
+
+    @classmethod
+    def from_description(cls, rest: Mapping[str, Any], name: str | None) -> Element:
+        """Return the element that :meth:`describe` described."""
+        return BoucWen(exponent=None if "exponent" in rest else 1.0, name=name)._described(rest)
 
     def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
         """Return dF/dx."""
@@ -104,3 +135,42 @@ class BoucWen(Friction):
         if values[1] + values[2] <= 0.0:
             return (f"{q.name} + {p.name} is not above 0: the loop would gain energy",)
         return ()
+
+
+class _PowerBoucWen(BoucWen):
+    """Bouc-Wen with an exponent."""
+
+    equation = (
+        "dF/dx = sigma (1 - sgn(q) |q F/sigma|^n) (F and motion of one sign), "
+        "sigma (1 + sgn(p) |p F/sigma|^n) (opposite signs), n = exponent"
+    )
+    parameters = (
+        *BoucWen.parameters,
+        Parameter(
+            "exponent", "", "exponent of the force", lower=0.05, upper=100.0, transform="log",
+            scan=(0.5, 1.0, 2.0, 4.0), prior=(0.5, 5.0),
+        ),
+    )  # fmt: skip
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        """Return dF/dx."""
+        sigma, q, p, n = values
+        softening, stiffening = (np.sign(rate) * np.fabs(rate) ** n for rate in (q, p))
+        side = np.sign(direction * force)
+        rate = 0.5 * ((softening - stiffening) + (softening + stiffening) * side)
+        return sigma * (1.0 - rate * np.fabs(force / sigma) ** n)
+
+    def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return sigma/q for both directions where the force saturates, inf where it does not."""
+        return super().force_limits(values[:3])
+
+    def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return 8 sigma/pi and 4/pi sigma/q where the force saturates, inf where it does not."""
+        return super().force_bounds(values[:3])
+
+    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return the inverse of the larger and of the smaller rate."""
+        return super().knee(values[:3])
+
+    def __repr__(self) -> str:
+        return super().__repr__().replace(type(self).__name__, "BoucWen", 1)

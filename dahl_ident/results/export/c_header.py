@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from dahl_ident.errors import ModelError
 from dahl_ident.results.export.device import LUMPED, Law, device
 
 _STEPS = {
@@ -60,6 +61,8 @@ def _dahl(law: Law, state: str) -> list[str]:
 
 
 def _bouc_wen(law: Law, state: str) -> list[str]:
+    if "exponent" in law.values:
+        raise ModelError("c has Bouc-Wen of exponent 1 alone; modelica has any exponent")
     values = ", ".join(repr(law[name]) for name in ("sigma", "q", "p"))
     return [f"{state} = friction_bouc_wen({state}, dx, {values});", f"force += {state};"]
 

@@ -119,6 +119,10 @@ def modelica(result: Any) -> str:
 
 def _slope(law: Law, i: int, v: str) -> str:
     """Return the change of force over displacement as an expression of Modelica."""
+    if law.kind == "bouc_wen" and "exponent" in law.values:
+        soft, stiff = (f"sign({r}{i})*abs({r}{i})^exponent{i}" for r in "qp")
+        rate = f"(({soft} - {stiff}) + ({soft} + {stiff})*sign({v}*z{i}))"
+        return f"sigma{i}*(1 - 0.5*{rate}*abs(z{i}/sigma{i})^exponent{i})"
     if law.kind == "bouc_wen":
         return f"sigma{i} - 0.5*((q{i} + p{i})*sign({v})*z{i} + (q{i} - p{i})*abs(z{i}))"
     if law.kind == "lugre":
