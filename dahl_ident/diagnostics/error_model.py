@@ -335,6 +335,9 @@ def _with_sources(
     if _distinguishes_noise(problem, assumed):
         sources = (*error_sources(estimate), *own_errors(estimate, _standing_apart(optimum)))
     state = _mixed(estimate, sources).reml(np.array([source.chance for source in sources]))
+    as_stated = problem.scale_known and estimate.misfit == 0.0
+    if as_stated and not _distinguishes_noise(problem, assumed):  # too few to doubt the noise
+        state = state.model.at(np.zeros(state.model.count))
     noises = state.model.noises
     kept = np.flatnonzero(state.variances[noises:] > 0.0)
     sources = tuple(sources[k] for k in kept)
