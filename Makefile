@@ -41,7 +41,7 @@ types: install  ## mypy, strict
 rooms: install  ## the order of the rooms
 	$(BIN)/lint-imports
 
-COMPILED := from dahl_ident.engine.motion import kernels; kernels("cycle"); kernels("samples")
+COMPILED := from dahl_ident.engine.motion import kernels; list(map(kernels, ("cycle", "samples", "loop")))
 
 kernels: install  ## the engine, compiled if it is not
 	$(BIN)/python -c '$(COMPILED)'

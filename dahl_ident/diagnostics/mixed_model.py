@@ -24,7 +24,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, optimize, special
+from scipy import linalg, special
 
 from dahl_ident.arrays import TINY, FloatArray
 
@@ -240,6 +240,8 @@ class State:
 
     def scored(self, price: FloatArray, free: NDArray[np.bool_]) -> FloatArray:
         """Return the variances >= 0 to which a scoring step leads, of the free ones."""
+        from scipy.optimize import nnls
+
         F = self.information
         size = np.sqrt(np.maximum(np.diagonal(F), 0.0))
         part = np.flatnonzero(free & (size > TINY))
@@ -248,7 +250,7 @@ class State:
         R = np.linalg.cholesky(scaled + _ALIKE * np.eye(len(part))).T
         rise = units * (self.gradient - price)[part]
         aim = R @ (s[part] / units) + linalg.solve_triangular(R, rise, trans=1)
-        s[part] = units * optimize.nnls(R, aim)[0]
+        s[part] = units * nnls(R, aim)[0]
         return s
 
     @cached_property
