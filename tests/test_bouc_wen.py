@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
+import dahl_ident as di
 from dahl_ident import BoucWen, Dahl
 from dahl_ident.arrays import FloatArray
 
@@ -184,3 +185,19 @@ def test_the_exponent_1_is_not_a_parameter() -> None:
     assert near.labels == ("sigma", "q", "p", "exponent")
     found = near.dynamic_stiffness([0.3, 2.0])
     np.testing.assert_allclose(found, one.dynamic_stiffness([0.3, 2.0]), rtol=1e-8)
+
+
+def test_an_exponent_is_estimated_and_handed_on() -> None:
+    law = BoucWen(30.0, 300.0, 100.0, exponent=2.0)
+    A = np.geomspace(1e-4, 3e-2, 14)
+    noise = np.random.default_rng(1).normal(scale=2e-3, size=(2, 14))
+    N = law.describing_function(A) * np.exp(noise[0] + 1j * noise[1])
+    fit = di.fit(di.FrequencyResponse(np.ones(14), N, A), BoucWen(exponent=None))
+    assert fit.trusted
+    for name, true in zip(law.labels, (30.0, 300.0, 100.0, 2.0), strict=True):
+        assert fit.params[name].value == pytest.approx(
+            true, abs=3.0 * (fit.params[name].stderr or 0.0)
+        )
+    assert "abs(z1/sigma1)^exponent1" in str(fit.export("modelica"))
+    with pytest.raises(di.errors.ModelError, match="exponent 1 alone"):
+        fit.export("c")

@@ -131,7 +131,7 @@ class BoucWen(Friction):
 
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return an objection to a loop that gains energy."""
-        q, p = self.parameters[1:]
+        _, q, p, *_ = self.parameters
         if values[1] + values[2] <= 0.0:
             return (f"{q.name} + {p.name} is not above 0: the loop would gain energy",)
         return ()
