@@ -37,6 +37,24 @@ class TestSr785:
         how = {"sweep": "1:100Hz log", "drive": "0.2 N", "columns": REAL_PART}
         return read_frequency_response(path, **{**how, **options})
 
+    @pytest.mark.parametrize("separator", [", ", "\t", " "])
+    def test_a_trace_that_looks_like_magnitude_and_phase_is_doubted(
+        self, separator: str, tmp_path: Path
+    ) -> None:
+        path = tmp_path / "trace.asc"
+        R = receptance(0.2)
+        pairs = zip(np.abs(R).tolist(), np.degrees(np.angle(R)).tolist(), strict=True)
+        rows = "".join(f"{a:.9g}{separator}{b:.9g}\n" for a, b in pairs)
+        path.write_text(f"{R.size}\n{rows}")
+        given: dict[str, Any] = {"sweep": "0.2:5Hz log", "drive": "0.2 N"}
+        with pytest.warns(DataWarning, match="look like magnitude and phase"):
+            read_frequency_response(path, columns={"real": {"unit": "m/N"}}, **given)
+        columns = {
+            "gain": {"column": "real", "unit": "m/N"}, "phase": {"column": "imag", "unit": "deg"}
+        }  # fmt: skip
+        data = read_frequency_response(path, columns=columns, **given)
+        np.testing.assert_allclose(data.response, R, rtol=1e-7)
+
     def test_trace(self, tmp_path: Path) -> None:
         path = tmp_path / "trace.asc"
         path.write_text(trace(1e3 * receptance(0.2)), newline="")

@@ -110,10 +110,15 @@ def in_options(message: str) -> str:
         pairs = re.findall(r"'([^']+)': (?:\((\w+), (\w+)\)|([^,}]+))", match[2])
         return " ".join(f"{match[1]} {n}={value or f'{a}:{b}'}" for n, a, b, value in pairs)
 
+    message = message.replace("select(harmonic=1)", "--where 'harmonic == 1'")
+    message = message.replace(
+        "frequency_hz=(low, high) keeps", "--where 'low <= frequency_hz <= high' keeps"
+    )
     message = re.sub(r"columns=(\{(?:[^{}]|\{[^{}]*\})*\})", _column_map, message)
     message = re.sub(r"(?<![\w.(-])([a-z]+(?:_[a-z]+)*)=(True\b|['\"\w]?)", argument, message)
     message = re.sub(r"(--(?:ranges|target|start|suspects)) ?\{([^}]*)\}", assigned, message)
     message = re.sub(r"limits\['([a-z]+)(?:_hz)?'\]", r"--\1", message)
+    message = re.sub(r"limits has no ([a-z]+)(?:_hz)?\b", r"--\1 is missing", message)
     return message.replace("di.fit(record, model)", "dahl-ident fit --record")
 
 

@@ -104,6 +104,10 @@ class Channel:
         return self.name if self.unit is None else f"{self.name} [{self.unit}]"
 
 
+TRACE = "analyser's trace"
+"""The format of pairs of numbers without a header, below their count."""
+
+
 @dataclass(frozen=True)
 class Source:
     """All channels of one file.

@@ -30,7 +30,7 @@ from dahl_ident.data.plausibility import (
     check_phase_size,
     check_phase_unit,
 )
-from dahl_ident.data.raw_columns import Channel, Source, plain
+from dahl_ident.data.raw_columns import TRACE, Channel, Source, plain
 from dahl_ident.data.tabular import ASSUMED, listed
 from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import (
@@ -48,6 +48,7 @@ from dahl_ident.units import (
 _FORMS = (("response",), ("real", "imag"), ("gain", "phase"), ("gain_db", "phase"))
 _NUMBER = r"([0-9.]+(?:[eE][-+]?[0-9]+)?)"
 _SWEEP = re.compile(rf"\s*{_NUMBER}\s*:\s*{_NUMBER}\s*(Hz|kHz)[\s,]+(log|linear)\s*")
+_DEGREES = 10.0  # a phase reaches more in a sweep through a resonance, or through slip
 _UNKNOWN_FREQUENCY = (
     "the table says no frequency: taken as 1 Hz, and good for laws that do not depend on it"
 )
@@ -85,6 +86,8 @@ def response_from(
     whole = Binding(source, columns, RESPONSE_COLUMNS)
     if source.runs:
         whole.doubt(f"the header is repeated in the file: read as {len(source.runs) + 1} runs")
+    if source.format == TRACE and not {"gain", "phase"} & columns.roles.keys():
+        _doubt_parts(whole)
     parts = []
     for label, one in by_level(source, columns).items():
         if label is not None:
@@ -102,6 +105,18 @@ def response_from(
     data = parts[0] if len(parts) == 1 else FrequencyResponse.concatenate(parts)
     assumed = {"frequency": ASSUMED} if _UNKNOWN_FREQUENCY in whole.notes else {}
     return replace(data, provenance=whole.provenance() | assumed)
+
+
+def _doubt_parts(trace: Binding) -> None:
+    """Warn where real and imaginary part may be magnitude and phase: above zero, and degrees."""
+    first, second = map(trace.source.numbers, trace.source.channels[:2])
+    reach = np.abs(second).max()
+    if (first > 0.0).all() and _DEGREES < reach <= 360.0 and reach > 10.0 * first.max():
+        trace.doubt(
+            "the columns of the trace are taken as real and imaginary part, but look like "
+            "magnitude and phase in degrees; if they are, give columns={'gain': {'column': "
+            "'real', 'unit': '...'}, 'phase': {'column': 'imag', 'unit': 'deg'}}"
+        )
 
 
 def _as_gain(channel: Channel) -> Channel:
@@ -300,7 +315,7 @@ class _Table(Binding):
         channel = self.required("frequency")
         values = self.numbers("frequency", channel)
         self.source.require(
-            values >= SMALLEST, channel, "a frequency > 0; frequency_hz=(low, high) leaves rows out"
+            values >= SMALLEST, channel, "a frequency > 0; frequency_hz=(low, high) keeps a range"
         )
         return self._hertz(values)
 

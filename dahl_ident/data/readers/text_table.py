@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.levels import stated_levels
-from dahl_ident.data.raw_columns import Channel, Source, plain, split_header, words
+from dahl_ident.data.raw_columns import TRACE, Channel, Source, plain, split_header, words
 from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
 from dahl_ident.data.readers.header import (
     CELL,
@@ -54,7 +54,8 @@ _FOOTER_LINES = 20  # that are left out at most; more text after the numbers is 
 _ERROR_VALUE = re.compile(r"\s*#(?:N/A|DIV/0!|[A-Z]{2,9}[!?])\s*")  # of a spreadsheet
 # the number of points above pairs of numbers, as the SR785 and SR780 write a trace
 _TRACE = re.compile(
-    rb"[ \t]*(\d{1,9})[ \t]*(?:\r\n|\n|\r)(?=[^\r\n,;]*\d[ \t]*,[^\r\n,;]*\d[ \t]*[\r\n])"
+    rb"[ \t]*(\d{1,9})[ \t]*(?:\r\n|\n|\r)"
+    rb"(?=[ \t]*[-+.\d][^\s,;]*(?:[ \t]*,[ \t]*|[ \t]+)[-+.\d][^\s,;]*[ \t]*[\r\n])"
 )
 _FOOTER = re.compile(r"\s*[\"']?[^\W\d_]{2}|\s*(?:\*\*|==|--)", re.UNICODE)
 _SUMMARIES = ("min", "max", "mean", "average", "avg", "std", "rms", "sum", "total", "median")
@@ -126,7 +127,7 @@ def read_text_table(file: File) -> Source:
         channels = (*channels, Channel("run", labels.astype(np.str_)))
     return Source(
         name,
-        "text table",
+        "text table" if trace is None else TRACE,
         channels,
         file.sha256,
         headerless=not layout.header.names,
