@@ -30,7 +30,6 @@ from dahl_ident.fitting.optimum import ConstraintCost
 
 _TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
-_NARROWEST = 0.7  # half width of 95 % bands over the rms misfit, which for noise is 1.4
 _ENOUGH_HELD_OUT = 16  # values, of which 80 % in bands of 95 % happen once in 100 times
 _DOUBTS_SHOWN = 5  # more would hide the verdict
 _CHANCE = 0.0027  # that data contradict a right constraint as much, as for a prior
@@ -159,7 +158,7 @@ def _bands(fit: Judged) -> Iterator[Finding]:
             continue
         if own.count >= _ENOUGH_HELD_OUT:
             misfit = _misfit_within_runs(part.errors)
-            if own.width < _NARROWEST * misfit:
+            if own.width < misfit:  # misfits inside a band have an rms below its half width
                 values = {"width": own.width, "misfit": misfit}
                 yield Finding(_DESCRIBED, _NOT_DESCRIBED, "narrow_bands", values)
                 return

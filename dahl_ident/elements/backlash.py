@@ -186,6 +186,10 @@ class Backlash(Friction):
         """Return 0: small motions do not cross the gap."""
         return np.zeros(np.broadcast_shapes(*(np.shape(v) for v in values)))
 
+    def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return those of the element."""
+        return self._element.force_limits(values[:-1])
+
     def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Return those of the element, whose amplitude is smaller."""
         return self._element.force_bounds(values[:-1])

@@ -287,7 +287,8 @@ class RecordProblem(BaseProblem):
         """Return the same problem with other values of parameters that are fixed."""
         other = copy(self)
         other.model = self.model.with_fixed(values)
-        other.__dict__.pop("_system", None)  # equations are shorter where a value is 0 or 1
+        for of_model in ("_system", "_coefficients", "_first"):
+            other.__dict__.pop(of_model, None)  # equations are shorter where a value is 0 or 1
         return other
 
     def without_noise(self, noise: float, lead: float = LEADS[1]) -> RecordProblem:
