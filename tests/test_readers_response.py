@@ -318,7 +318,7 @@ class TestRefusal:
     def test_zero_hertz_can_be_left_out(self) -> None:
         columns = {**RECTANGULAR, "frequency_hz": [0.0, 1.0, 2.0], "real [N/m]": [np.nan, 1.0, 1.0]}
         frame = pd.DataFrame(columns)
-        with pytest.raises(DataError, match=r"a frequency > 0; frequency_hz=\(low, high\) leaves"):
+        with pytest.raises(DataError, match=r"a frequency > 0; frequency_hz=\(low, high\) keeps"):
             read_frequency_response(frame)
 
     def test_empty_frame(self) -> None:
