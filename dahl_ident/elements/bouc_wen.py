@@ -108,7 +108,7 @@ class BoucWen(Friction):
 
     def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Return sigma/q for both directions where the force saturates, inf where it does not."""
-        sigma, q, _ = np.broadcast_arrays(*values)
+        sigma, q, *_ = np.broadcast_arrays(*values)
         limit = np.full(np.shape(q), np.inf)
         limit = np.asarray(np.divide(sigma, q, out=limit, where=q > 0.0))
         return limit, limit
@@ -118,13 +118,13 @@ class BoucWen(Friction):
 
         A tip's force is loaded over at most 2 A; a fundamental is at most 4/pi of it.
         """
-        sigma, q, _ = values
+        sigma, q, *_ = values
         steepest = np.where(np.asarray(q) >= 0.0, 8.0 / np.pi * np.asarray(sigma), np.inf)
         return steepest, 4.0 / np.pi * self.force_limits(values)[0]
 
     def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Return the inverse of the larger and of the smaller rate."""
-        _, q, p = values
+        _, q, p, *_ = values
         rates = np.sort(np.abs(np.array(np.broadcast_arrays(q, p), dtype=np.float64)), axis=0)
         low = 1.0 / np.maximum(rates[1], 1e-300)
         return low, np.minimum(1.0 / np.maximum(rates[0], 1e-300), 1e3 * low)
@@ -159,18 +159,6 @@ class _PowerBoucWen(BoucWen):
         side = np.sign(direction * force)
         rate = 0.5 * ((softening - stiffening) + (softening + stiffening) * side)
         return sigma * (1.0 - rate * np.fabs(force / sigma) ** n)
-
-    def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Return sigma/q for both directions where the force saturates, inf where it does not."""
-        return super().force_limits(values[:3])
-
-    def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Return 8 sigma/pi and 4/pi sigma/q where the force saturates, inf where it does not."""
-        return super().force_bounds(values[:3])
-
-    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Return the inverse of the larger and of the smaller rate."""
-        return super().knee(values[:3])
 
     def __repr__(self) -> str:
         return super().__repr__().replace(type(self).__name__, "BoucWen", 1)

@@ -78,7 +78,7 @@ def _of_both(fits: Sequence[Fit]) -> Compared:
     status = (str(VerdictStatus.NOT_DESCRIBED),) if disagree else ()
     return Compared(
         status,
-        tuple(_comparison_in_words(fits)),
+        tuple(_comparison_in_words(differences)),
         (_comparison(differences),) if differences else (),
         {"changes": [change.to_dict() for change, *_ in differences], "disagree": disagree},
     )
@@ -102,7 +102,10 @@ def _disagree(change: Change, differences: Sequence[_Difference]) -> bool:
 
 def disagreements(results: Sequence[object]) -> list[str]:
     """Return a sentence for each parameter that a table and waveforms give differently."""
-    differences = list(_differences(results))
+    return _disagreements(list(_differences(results)))
+
+
+def _disagreements(differences: Sequence[_Difference]) -> list[str]:
     sentences = []
     for change, *fits in differences:
         if _disagree(change, differences):
@@ -117,10 +120,10 @@ def disagreements(results: Sequence[object]) -> list[str]:
     return sentences
 
 
-def _comparison_in_words(results: Sequence[object]) -> list[str]:
-    if sentences := disagreements(results):
+def _comparison_in_words(differences: Sequence[_Difference]) -> list[str]:
+    if sentences := _disagreements(differences):
         return sentences
-    if any(math.isfinite(change.p) for change, _, _ in _differences(results)):
+    if any(math.isfinite(change.p) for change, _, _ in differences):
         return ["Table and waveforms agree within their uncertainties."]
     return ["Table and waveforms cannot be compared: they have no usable estimate in common."]
 

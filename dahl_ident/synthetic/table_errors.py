@@ -100,11 +100,8 @@ def stiffness_table(phasors: Phasors, table: Table, draws: Draws) -> FrequencyRe
     response = _referred(F, X, k)
     # of the true response: a covariance that followed each row's error would bias every fit
     true = _referred(phasors.force, phasors.displacement, k)
-    along, across = true, 1j * k * true  # changes with |X| and with its phase
-    force_part = (table.force_std * phasors.force_size / np.abs(phasors.displacement)) ** 2
-    covariance = table.displacement_std**2 * (_outer(along) + _outer(across)) + force_part[
-        :, None, None
-    ] * np.eye(2)
+    force_part = table.force_std * phasors.force_size / np.abs(phasors.displacement)
+    covariance = _covariance(true, k, table.displacement_std, force_part)
     data = FrequencyResponse(
         phasors.frequency_hz, response, np.abs(X), harmonic=k, level=phasors.level,
         controlled="displacement",
@@ -124,17 +121,23 @@ def receptance_table(phasors: Phasors, table: Table, draws: Draws) -> FrequencyR
     response = _referred(X, F, k)
     # of the true response: a covariance that followed each row's error would bias every fit
     true = _referred(phasors.displacement, phasors.force, k)
-    along, across = true, 1j * k * true  # changes with |F| and with its phase
-    own = (table.displacement_std * phasors.displacement_size / np.abs(phasors.force)) ** 2
-    covariance = table.force_std**2 * (_outer(along) + _outer(across)) + own[
-        :, None, None
-    ] * np.eye(2)
+    motion_part = table.displacement_std * phasors.displacement_size / np.abs(phasors.force)
+    covariance = _covariance(true, k, table.force_std, motion_part)
     data = FrequencyResponse(
         phasors.frequency_hz, response, amplitude, np.abs(F), level=phasors.level, harmonic=k,
         controlled="force", quantity="receptance",
     )  # fmt: skip
     shared = np.where(k == 1, true, 0.0)
     return _finished(data, covariance, shared, phasors.displacement_size, table, draws)
+
+
+def _covariance(
+    true: ComplexArray, k: NDArray[np.int64], shared_std: float, std: FloatArray
+) -> FloatArray:
+    """Return the covariance of responses: the error of what was held, and that of the answer."""
+    along, across = true, 1j * k * true  # changes with the size of what was held, and its phase
+    shared = shared_std**2 * (_outer(along) + _outer(across))
+    return np.asarray(shared + std[:, None, None] ** 2 * np.eye(2))
 
 
 def _referred(answer: ComplexArray, held: ComplexArray, k: NDArray[np.int64]) -> ComplexArray:
