@@ -51,7 +51,7 @@ _FIRST = 0.05  # rad, first step after a turning point that is tried
 _EXPANDS = 3.0  # beyond its limit a branch would; no step that follows the error spans more
 _PASSES = 4  # with fine steps, where coarse ones ended elsewhere; one is the rule
 _REPEATS, _BISECTIONS = 8, 60  # of a step that ends at an event; two are the rule
-_DECADE, _LEFT = 0.1, 1e-11  # by which a step may come nearer to a limit; what is left at last
+_DECADE, _LEFT = 0.1, 1e-11  # of the distance to a limit: left after a step; at the end
 _APPROACH = 0.6  # of the way to the turning point, for a law that depends on the speed
 _NEAREST = 1e-3  # rad before it: the last step
 
@@ -331,7 +331,7 @@ def _last_step(f, h, F, chosen, columns, harmonics, turned, sums, at):
     w, o, omega = at.w, at.o, at.numbers[1]
     for j in range(STAGES):
         _evaluate(f, 2.0, at.cosines[j], at.sines[j], F + at.stages[j], at)
-        rates, outputs = o + at.m + 6, o + at.m + 9  # derivatives by displacement, speed, force
+        rates, outputs = o + at.m + 6, o + at.m + 9  # derivatives with respect to x, v and force
         by_rate = o + 4 * at.m + 2 * (1 + at.P) + 1  # and by the parameters
         by_output = by_rate + 1 + at.P
         at.slopes[j], at.last[j], at.output[j] = w[rates + 2] / omega, w[outputs + 2], w[o + 3]
@@ -490,7 +490,7 @@ def _half_cycle(f, F, gap, chosen, last_pass, harmonics, sums, tolerance, longes
 def _settle(
     f, y, sure, halves, sign, gap, chosen, harmonics, sums, tolerance, longest, steps, at
 ):  # fmt: skip
-    """Return whether the loop settles, its first force, what is left to add to it, and 1 - map.
+    """Return whether the loop settles, its first force, the remaining correction, and 1 - map.
 
     By coarse passes, unless the guess y is `sure`, then by fine ones with all derivatives.
     """
