@@ -442,24 +442,25 @@ class FitResult(Fit):
 
     @classmethod
     def from_json(cls, text: str) -> FitResult:
-        """Return the fit that :meth:`to_json` wrote, also by an earlier version.
+        """Return the fit that :meth:`to_json` wrote.
 
         Raises
         ------
         DataError
-            If the text holds no fit, or one of a later version's schema.
+            If the text holds no fit, one of another version's schema, or was changed.
         """
         optimum, first_order = fit_storage.from_json(text)
         return cls(optimum, first_order=first_order)
 
     @classmethod
     def load(cls, path: str | Path) -> FitResult:
-        """Return the fit that :meth:`save` wrote, also by an earlier version.
+        """Return the fit that :meth:`save` wrote.
 
         Raises
         ------
         DataError
-            If the file cannot be read, holds no fit, or one of a later version's schema.
+            If the file cannot be read, holds no fit, one of another version's schema, or was
+            changed.
         """
         optimum, first_order = fit_storage.load(path)
         return cls(optimum, first_order=first_order)

@@ -28,8 +28,7 @@ from dahl_ident.sensors import EXACT, Sensors
 from dahl_ident.version import __version__
 
 SCHEMA = "dahl_ident.fit_result"
-VERSION = 3  # of the layout; older ones are read
-_FIRST_WITH_DIGEST = 2  # version from which on files have a digest
+VERSION = 3  # of the layout; others are refused
 _SAME = 1e-6  # relative: what versions of numerical libraries never change
 
 _COLUMNS = (
@@ -64,10 +63,9 @@ def to_dict(optimum: Optimum, first_order: bool) -> dict[str, Any]:
 def from_dict(content: Mapping[str, Any], source: str = "the content") -> tuple[Optimum, bool]:
     """Return the fit that :func:`to_dict` described, and whether only first order holds."""
     check_schema(content, source)
-    has_digest = content["schema_version"] >= _FIRST_WITH_DIGEST
-    if has_digest:
-        check_digest(content, source)
-    require_laws(content.get("laws", ()), source)
+    check_digest(content, source)
+    laws = content.get("laws", ())
+    require_laws(laws, source)
     try:
         optimum, first_order = _optimum(content), content["optimum"]["first_order"]
     except (KeyError, TypeError) as exc:
@@ -75,10 +73,7 @@ def from_dict(content: Mapping[str, Any], source: str = "the content") -> tuple[
             f"{source} says {SCHEMA}, version {content['schema_version']}, but lacks or garbles "
             f"{exc}; it may have been edited or cut short"
         ) from exc
-    laws = content.get("laws", ())
-    if not (first_order or (has_digest and not laws) or _agrees(optimum)):
-        if not laws:
-            raise changed(source)
+    if laws and not first_order and not _agrees(optimum):
         raise DataError(
             f"{source}: the law {laws[0]['kind']!r} does not give the residuals that the fit was "
             "saved with; take the file of the law as it was, or repeat the fit"
@@ -105,16 +100,16 @@ def load(path: str | Path) -> tuple[Optimum, bool]:
     return from_json(read_text(path), str(path))
 
 
-def check_schema(content: Any, source: str, schema: str = SCHEMA, newest: int = VERSION) -> None:
-    """Refuse what says to be something else than a fit of a version that is known."""
-    found = content.get("schema") if isinstance(content, Mapping) else None
-    if found != schema:
-        raise DataError(f"{source} has the schema {found!r}; expected {schema!r}, a saved fit")
-    found = content.get("schema_version")
-    if type(found) is not int or not 1 <= found <= newest:
+def check_schema(content: Any, source: str, schema: str = SCHEMA, version: int = VERSION) -> None:
+    """Refuse what says to be something else than a fit of the version that is known."""
+    name = content.get("schema") if isinstance(content, Mapping) else None
+    if name != schema:
+        raise DataError(f"{source} has the schema {name!r}; expected {schema!r}, a saved fit")
+    stated = content.get("schema_version")
+    if type(stated) is not int or stated != version:
         raise DataError(
-            f"{source} has schema version {found!r}; this version of dahl_ident reads 1 to "
-            f"{newest}: upgrade dahl_ident"
+            f"{source} has schema version {stated!r}; this version of dahl_ident reads {version}: "
+            "load it with the version that wrote it, or repeat the fit"
         )
 
 
@@ -127,22 +122,17 @@ def check_digest(content: Mapping[str, Any], source: str) -> None:
     """Refuse content that is not as it was written: nobody can answer for such numbers."""
     facts = {key: value for key, value in content.items() if key != "digest"}
     if content.get("digest") != digest(facts):
-        raise changed(source)
-
-
-def changed(source: str) -> DataError:
-    """Return the error about a file that is not as it was written."""
-    return DataError(
-        f"{source} was changed after the fit was saved: its data, model and estimate do not "
-        "agree with each other; take the file as it was written, or repeat the fit"
-    )
+        raise DataError(
+            f"{source} was changed after the fit was saved: its data, model and estimate do not "
+            "agree with each other; take the file as it was written, or repeat the fit"
+        )
 
 
 def _agrees(optimum: Optimum) -> bool:
     """Return whether values and sum of squares are those of the estimate, with these data.
 
-    What a file without a digest is checked by. At a limit the values are not finite numbers, and
-    a robust loss has another sum.
+    So that a user's law is still what it was. At a limit the values are not finite numbers, and a
+    robust loss has another sum.
     """
     if optimum.status.at_infinity or optimum.loss != "linear":
         return True
@@ -161,7 +151,7 @@ def _optimum(content: Mapping[str, Any]) -> Optimum:
         model_from_description(content["model"]),
         noise=content["noise"],
         sensors=EXACT if known.are_exact else known,
-        steady=content.get("steady", "describing function"),
+        steady=content["steady"],
     )
     return optimum_from(problem, content["optimum"])
 
