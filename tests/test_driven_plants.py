@@ -82,12 +82,12 @@ def test_a_force_that_is_not_a_sine_is_named_with_the_command_for_its_waveforms(
     R = di.response(plant, f, u).receptance
     rng = np.random.default_rng(3)
     s = 0.003 * np.abs(R)
-    share = np.full(f.size, 0.9999)
-    share[3] = 1.0 / 1.01  # a tenth of the force is not the sine
+    harmonics = np.full(f.size, 0.01)
+    harmonics[3] = 0.1
     sweep = di.FrequencyResponse(
         f, R + s * (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size)), drive=u,
         covariance=s[:, None, None] ** 2 * np.eye(2), controlled="force", quantity="receptance",
-        quality={"force_share": share}, provenance={"file": "run 7.csv"},
+        quality={"force_distortion": harmonics}, provenance={"file": "run 7.csv"},
     )  # fmt: skip
     fit = di.fit(sweep, di.Dahl(alpha=1.0) + di.Mass(0.3) + di.Damper() + di.Spring())
     assert fit.trusted

@@ -13,7 +13,8 @@ from dahl_ident.extraction.point import Point
 
 MEANS = (
     "bias_real", "bias_imag", "displacement_share", "force_share", "displacement_distortion",
-    "asymmetry", "displacement_steps", "force_steps", "displacement_clipped", "force_clipped",
+    "force_distortion", "asymmetry", "displacement_steps", "force_steps", "displacement_clipped",
+    "force_clipped",
 )  # fmt: skip
 
 

@@ -287,6 +287,17 @@ def test_distortion_is_measured_and_said() -> None:
     assert clean.quality["displacement_distortion"][0] < 1e-4
 
 
+@pytest.mark.parametrize("third", [0.0, 0.1])
+def test_noise_is_not_taken_for_a_distortion_of_the_force(third: float) -> None:
+    w, rng = waves(cycles=60.0), np.random.default_rng(2)
+    phase = 2.0 * np.pi * w.time
+    force = np.sin(phase) + third * np.sin(3.0 * phase) + 0.3 * rng.standard_normal(phase.size)
+    record = Record(w.time, displacement=np.sin(phase - 0.3), force=force)
+    data = extract(record, harmonics=(1,), controlled="force")
+    assert data.quality["force_share"][0] < 0.93
+    assert data.quality["force_distortion"][0] == pytest.approx(third, abs=0.02)
+
+
 def test_distortion_of_an_acceleration_is_that_of_the_displacement() -> None:
     w = waves()
     omega = 2.0 * np.pi

@@ -16,7 +16,7 @@ from dahl_ident.steady_state import response
 from dahl_ident.units import shown_unit
 
 _SEEN = 1e-3  # relative difference that is worth a place
-_DISTORTED = 0.05  # of a force, noise included: less changes the fundamental by well below 1 %
+_DISTORTED = 0.05  # of a force: less changes the fundamental by well below 1 %
 
 
 def steady_difference(optimum: Optimum) -> tuple[int, float] | None:
@@ -71,12 +71,10 @@ def steady_findings(optimum: Optimum, model: Model) -> Iterator[Finding]:
 
 def _distorted(data: FrequencyResponse) -> Iterator[Finding]:
     """Yield where the force is farthest from the sine for which the motion is predicted."""
-    share = data.quality.get("force_share")
-    if share is None:
+    harmonics = data.quality.get("force_distortion")
+    if harmonics is None:
         return
-    share = np.where(data.controlled == "force", np.asarray(share, dtype=np.float64), 1.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        apart = np.nan_to_num(np.sqrt(1.0 / share - 1.0))
+    apart = np.nan_to_num(np.where(data.controlled == "force", harmonics, 0.0))
     row = int(np.argmax(apart))
     if apart[row] > _DISTORTED:
         (name,) = row_names(data, [row])

@@ -24,7 +24,8 @@ from dahl_ident.extraction.point import Point
 _APART = 3.0  # cycles that may be missing between two parts
 _MEANS = (
     "bias_real", "bias_imag", "displacement_share", "force_share", "displacement_distortion",
-    "asymmetry", "displacement_steps", "force_steps", "displacement_clipped", "force_clipped",
+    "force_distortion", "asymmetry", "displacement_steps", "force_steps", "displacement_clipped",
+    "force_clipped",
 )  # fmt: skip
 
 

@@ -546,7 +546,8 @@ def _channel_quality(phasors: _Phasors, steps: FloatArray) -> dict[str, Any]:
     return {
         "displacement_share": shares[0],
         "force_share": shares[1],
-        "displacement_distortion": distortion(fit, phasors.settings.integrations),
+        "displacement_distortion": distortion(fit, 0, phasors.settings.integrations),
+        "force_distortion": distortion(fit, 1),
         "asymmetry": _asymmetry(phasors),
         "displacement_steps": in_steps[0],
         "force_steps": in_steps[1],

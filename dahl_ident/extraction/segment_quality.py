@@ -106,15 +106,18 @@ def fundamental_share(fit: SineFit, segment: Segment, within: FloatArray) -> Flo
     return np.asarray(sine / (sine + left))
 
 
-def distortion(fit: SineFit, integrations: int) -> float:
-    """Return the displacement's harmonics 2 to 9 over its fundamental, root of summed squares.
+def distortion(fit: SineFit, channel: int, integrations: int = 0) -> float:
+    """Return a channel's harmonics 2 to 9 over its fundamental, root of summed squares.
 
     What the noise adds to their power is subtracted.
     """
     orders = np.arange(1, min(HARMONICS, fit.orders) + 1)
-    noise = float(fit.residual_variance[0])
+    noise = float(fit.residual_variance[channel])
     power = np.array(
-        [abs(fit.phasors(k)[0]) ** 2 - noise * fit.phasor_variance(k) for k in orders.tolist()]
+        [
+            abs(fit.phasors(k)[channel]) ** 2 - noise * fit.phasor_variance(k)
+            for k in orders.tolist()
+        ]
     )
     power /= orders.astype(np.float64) ** (2 * integrations)
-    return float(np.sqrt(max(power[1:].sum(), 0.0)) / abs(fit.phasors(1)[0]))
+    return float(np.sqrt(max(power[1:].sum(), 0.0)) / abs(fit.phasors(1)[channel]))

@@ -113,8 +113,8 @@ def extract(
             First and last sample used, s.
         ``displacement_share``, ``force_share``
             The fundamental's share of the power of the motion channel and of the force.
-        ``displacement_distortion``
-            Harmonics 2 to 9 of the displacement over its fundamental.
+        ``displacement_distortion``, ``force_distortion``
+            Harmonics 2 to 9 of displacement and force over the fundamental.
         ``asymmetry``
             Even harmonics 2 to 8 of the force over its fundamental; 0 where noise or the
             displacement's own even harmonics explain them, and in a sweep.

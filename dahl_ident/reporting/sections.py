@@ -91,10 +91,14 @@ def document(
     return Document(
         title=title or given.title or title_of(first),
         status=max((*(str(r.status) for r in (*fits, *drawn)), *compared.status), key=RANK),
-        verdict=(
-            *compared.verdict,
-            *(line for fit in fits for line in _verdict(fit, fits)),
-            *(line for one in drawn for line in posterior_sections.verdict(one)),
+        verdict=tuple(
+            dict.fromkeys(
+                [
+                    *compared.verdict,
+                    *(line for fit in fits for line in _verdict(fit, fits)),
+                    *(line for one in drawn for line in posterior_sections.verdict(one)),
+                ]
+            )
         ),
         header=header(tables_first, given),
         sections=(
