@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import fft
+from scipy import fft, signal
 from scipy.linalg import solve_toeplitz, toeplitz
 
 from dahl_ident.arrays import FloatArray
@@ -21,6 +21,8 @@ from dahl_ident.problem.record_noise import HIGHEST_ORDER, SAMPLES_PER_ORDER
 _SINGULAR = 1e-13  # eigenvalues of J'J of unit columns that are rounding
 _INVOLVED = 1e-6  # share of a parameter in what has no effect: beyond rounding
 _SLIGHT = 1e-3  # of the variance: changes of autocovariances below do not matter
+_TRANSFORM = 2**15  # samples: enough unless the noise is very slow
+_VANISHED = 1e-9  # of the variance: autocovariances below are rounding
 _CORRECTIONS = 4  # each changes less, by the ratio of parameters to samples
 
 
@@ -56,15 +58,16 @@ def sandwich(
     samples = sum(e.size for e in residuals)
     total = sum(float(e @ e) for e in residuals)
     variance = total / max(samples - P, 1)
-    size = np.sqrt(sum((J**2).sum(axis=0) for J in jacobians))
-    size = np.where(size > 0.0, size, 1.0)
-    normal = np.zeros((P, P))
+    normal = np.asarray(sum(J.T @ J for J in jacobians))
     middle = np.zeros((P, P))
     for J, e in zip(jacobians, residuals, strict=True):
-        scaled = J / size
         own = np.flatnonzero((J != 0.0).any(axis=0))  # other records' states and offsets are not
-        normal[np.ix_(own, own)] += scaled[:, own].T @ scaled[:, own]
-        middle[np.ix_(own, own)] += _correlated(scaled[:, own], e)
+        involved = J if own.size == P else J[:, own]
+        smooth = correlated(involved, autocovariances(e, involved))
+        middle[np.ix_(own, own)] += involved.T @ smooth
+    size = np.sqrt(normal.diagonal())
+    size = np.where(size > 0.0, size, 1.0)
+    normal, middle = normal / np.outer(size, size), middle / np.outer(size, size)
     found = np.zeros((P, P))
     found[np.diag_indices(P)] = np.inf
     seen = np.flatnonzero(normal.diagonal() > 0.0)
@@ -164,14 +167,25 @@ def spectrum_of(model: tuple[FloatArray, float], m: int) -> FloatArray:
     return np.asarray(variance / np.abs(fft.rfft(np.concatenate([[1.0], -a]), m)) ** 2)
 
 
-def _correlated(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
-    """Return J'R J, R the residuals' covariance matrix from their spectrum."""
-    n = residual.size
-    m = fft.next_fast_len(2 * n, real=True)
-    spectrum = spectrum_of(autoregression(residual, jacobian), m)
-    waves = fft.rfft(jacobian, m, axis=0)
-    weights = np.full(spectrum.size, 2.0)
-    weights[0] = 1.0
-    if m % 2 == 0:
-        weights[-1] = 1.0
-    return np.asarray(np.real(waves.conj().T @ (waves * (spectrum * weights)[:, None])) / m)
+def autocovariances(residual: FloatArray, jacobian: FloatArray) -> FloatArray:
+    """Return the autocovariances of the noise in residuals of a fit, up to where they are slight.
+
+    From the autoregressive model; see :func:`autoregression`.
+    """
+    model = autoregression(residual, jacobian)
+    whole = fft.next_fast_len(2 * residual.size, real=True)
+    for m in (min(_TRANSFORM, whole), whole):
+        covariance = np.asarray(fft.irfft(spectrum_of(model, m), m)[: m // 2])
+        matters = np.abs(covariance) > _VANISHED * covariance[0]
+        if not matters[m // 4 :].any():
+            break
+    return covariance[: int(np.flatnonzero(matters).max(initial=0)) + 1][: residual.size]
+
+
+def correlated(waves: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return R times waves, (n, k), R the matrix of these autocovariances."""
+    if covariance.size == 1:
+        return waves * covariance
+    kernel = np.concatenate([covariance[:0:-1], covariance])[:, None]
+    full = signal.oaconvolve(waves, kernel, axes=0)
+    return np.asarray(full[covariance.size - 1 : covariance.size - 1 + len(waves)])

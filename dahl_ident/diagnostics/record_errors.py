@@ -290,38 +290,34 @@ def _by_displacement(
     As large as that of as much noise again; or, with a dead band, from where in it the true
     displacement may be.
     """
+    change_of = _change_of(problem, jacobians)
+
+    def moved(low: Sequence[FloatArray], end: RecordProblem) -> tuple[FloatArray, float]:
+        """Return the estimate's change to another problem, and the sum of squares it leaves."""
+        output = [b - a for a, b in zip(low, end.outputs(values), strict=True)]
+        change = change_of(output)
+        left = (y - J @ change for y, J in zip(output, jacobians, strict=True))
+        return change, sum(float(e @ e) for e in left)
+
     noise = problem.displacement_noise
     if noise:
-        ends = [problem.without_noise(noise, lead) for lead in LEADS[::2]]
-        change = 0.5 * _moved(ends, values, jacobians)[0]
+        low, high = (problem.without_noise(noise, lead) for lead in LEADS[::2])
+        change = 0.5 * moved(low.outputs(values), high)[0]
         return np.outer(change, change)
+    plain = problem.outputs(values)
 
     def noisier(noise: float) -> tuple[FloatArray, float]:
-        again = [
-            _moved([problem, problem.with_more_noise(noise, draw)], values, jacobians)
-            for draw in range(_DRAWS)
-        ]
+        again = [moved(plain, problem.with_more_noise(noise, draw)) for draw in range(_DRAWS)]
         changes = np.array([change for change, _ in again])
         return changes.T @ changes / _DRAWS, float(np.mean([left for _, left in again]))
 
     noise = problem.estimated_noise
-    moved, left = noisier(noise)
+    covariance, left = noisier(noise)
     squares = sum(float(e @ e) for e in residuals)
     if left <= squares:
-        return moved
+        return covariance
     # rough motion looks like noise, but so much noise would leave larger residuals
     return noisier(noise * (squares / left) ** 0.5)[0]
-
-
-def _moved(
-    ends: Sequence[RecordProblem], values: FloatArray, jacobians: Sequence[FloatArray]
-) -> tuple[FloatArray, float]:
-    """Return the estimate's change between two problems, and the sum of squares it leaves."""
-    low, high = (end.outputs(values) for end in ends)
-    output = [b - a for a, b in zip(low, high, strict=True)]
-    change = _change_of(ends[0], jacobians)(output)
-    left = [y - J @ change for y, J in zip(output, jacobians, strict=True)]
-    return change, sum(float(e @ e) for e in left)
 
 
 def _change_of(
@@ -329,13 +325,15 @@ def _change_of(
 ) -> Callable[[Sequence[FloatArray]], FloatArray]:
     """Return how the estimate changes with the measured outputs, to first order."""
     white = [problem.filtered(J) for J in jacobians]
-    size = np.sqrt(sum((J**2).sum(axis=0) for J in white))
+    normal = np.asarray(sum(J.T @ J for J in white))
+    size = np.sqrt(normal.diagonal())
     size = np.where(size > 0.0, size, 1.0)
-    normal = np.linalg.pinv(sum((J / size).T @ (J / size) for J in white), hermitian=True)
+    inverse = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
+    inverse = inverse / np.outer(size, size)
 
     def change(output: Sequence[FloatArray]) -> FloatArray:
         parts = zip(white, map(problem.filtered, output), strict=True)
-        return np.asarray(normal @ sum((J / size).T @ y for J, y in parts) / size)
+        return np.asarray(inverse @ sum(J.T @ y for J, y in parts))
 
     return change
 

@@ -193,11 +193,11 @@ class _Search:
 
 def _step(jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]) -> FloatArray:
     """Return the Gauss-Newton step of values."""
-    size = np.sqrt(sum((J**2).sum(axis=0) for J in jacobians))
+    normal = np.asarray(sum(J.T @ J for J in jacobians))
+    size = np.sqrt(normal.diagonal())
     size = np.where(size > 0.0, size, 1.0)
-    normal = sum((J / size).T @ (J / size) for J in jacobians)
-    right = sum((J / size).T @ e for J, e in zip(jacobians, residuals, strict=True))
-    return np.asarray(np.linalg.pinv(normal, hermitian=True) @ right / size)
+    right = sum(J.T @ e for J, e in zip(jacobians, residuals, strict=True)) / size
+    return np.asarray(np.linalg.pinv(normal / np.outer(size, size), hermitian=True) @ right / size)
 
 
 def between_blocks(
