@@ -22,7 +22,7 @@ from dahl_ident import (
     fit,
 )
 from dahl_ident.diagnostics.comparison import _candidates
-from dahl_ident.diagnostics.predictive_density import _LeftOut, predictive_density
+from dahl_ident.diagnostics.predictive_density import predictive_density
 from tests.command_line import Runner
 from tests.friction_tables import FRICTION, table
 
@@ -30,28 +30,6 @@ from tests.friction_tables import FRICTION, table
 @pytest.mark.parametrize("law", ["linear Dahl", "two limits", "gap"])
 def test_the_law_that_made_the_data_is_chosen(law: str) -> None:
     assert [right for _, right in choices(law, 1, seed=5, amplitudes=8)] == [True]
-
-
-def test_tests_left_out_are_predicted_by_the_others() -> None:
-    """Against generalised least squares without the rows of each test."""
-    rng = np.random.default_rng(2)
-    X, y = rng.standard_normal((12, 2)), rng.standard_normal(12)
-    group, test = np.repeat([0, 1], 6), np.repeat(np.arange(4), 3)
-    found = _LeftOut(y, X, 2, 0, np.zeros(12), group)
-    densities = found.densities(test, robust=False)
-    variance = 1.0 / found.weight
-    for t in range(4):
-        out, rest = test == t, test != t
-        inverse = np.linalg.inv(X[rest].T @ (X[rest] / variance[rest, None]))
-        b = inverse @ (X[rest].T @ (y[rest] / variance[rest]))
-        covariance = np.diag(variance[out]) + X[out] @ inverse @ X[out].T
-        e = y[out] - X[out] @ b
-        expected = -0.5 * (
-            e @ np.linalg.solve(covariance, e)
-            + np.linalg.slogdet(covariance)[1]
-            + 3.0 * np.log(2.0 * np.pi)
-        )
-        assert densities[t] == pytest.approx(expected, rel=1e-9)
 
 
 def test_tiny_covariances_of_harmonics_do_not_rule() -> None:

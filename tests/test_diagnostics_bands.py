@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import special
@@ -144,6 +146,8 @@ class TestMeasured:
             [extract(crank(f".A.{i}"), harmonics=[1]) for i in range(1, 11)]
         )
         model = Dahl() + Spring() + Damper()
+        assert "The extraction flagged every point" in fit(data, model).verdict
+        data = replace(data, quality={})  # taken as it is
         whole = fit(data, model)
         assert whole.status.usable
         inside, widths = [], []

@@ -227,9 +227,9 @@ class TestPhysics:
         data = table(beta=(10.0, 100.0))
         R = data.response.copy()
         R[-1] *= 1.2
-        warnings = judge(replace(data, response=R)).warnings
-        assert any("at 1 Hz, 333 mm friction's fundamental is" in w for w in warnings)
-        assert not judge(data).warnings
+        found = fit(replace(data, response=R), Dahl(), throw=False)
+        assert "At 1 Hz, 333 mm friction's fundamental is 0.1" in found.verdict
+        assert "beyond_slip" not in {one.code for one in fit(data, Dahl(), throw=False).findings}
 
     def test_units_that_were_mistaken(self) -> None:
         """Micrometres taken for metres; peak-to-peak amplitudes next to nominal levels."""

@@ -9,7 +9,7 @@ from scipy import stats
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit
 from dahl_ident.diagnostics import ErrorModel, error_model
 from dahl_ident.diagnostics.error_sources import NOISE
-from dahl_ident.diagnostics.held_out import band_factor, held_out
+from dahl_ident.diagnostics.held_out import band_factor
 from dahl_ident.diagnostics.table_groups import rows_of_tests
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
 
@@ -92,21 +92,22 @@ class TestLeftOut:
 
     @pytest.mark.parametrize("n", [32, 160])
     def test_is_the_prediction_from_the_others(self, n: int) -> None:
-        """Universal kriging by its definition."""
+        """Universal kriging by its definition, about the estimate without the test."""
         errors = self.errors(n)
-        found = held_out(errors)
+        found = errors.left_out
         assert found is not None
         m, V = 2 * n, float(errors.noises[0]) * np.eye(2 * n)
         for source, variance in zip(errors.sources, errors.variances.tolist(), strict=True):
             V += variance * source.columns[:m] @ source.columns[:m].T
-        J, y = errors.estimate.jacobian, errors.estimate.y
-        assert len(J) > m
-        prior, y_prior = J[m:].T @ J[m:], J[m:].T @ y[m:]
         units = errors.estimate.relative_units
         for test in (0, 3):
             rows = found.rows[found.test == test]
             b = (2 * rows[:, None] + np.arange(2)).ravel()
             a = np.setdiff1d(np.arange(m), b)
+            refit = errors.estimate.without(b)
+            J, y = refit.jacobian, refit.y
+            assert len(J) > m
+            prior, y_prior = J[m:].T @ J[m:], J[m:].T @ y[m:]
             W = np.linalg.inv(V[np.ix_(a, a)])
             C = np.linalg.inv(J[a].T @ W @ J[a] + prior)
             delta = C @ (J[a].T @ W @ y[a] + y_prior)
@@ -121,25 +122,37 @@ class TestLeftOut:
                 std = np.sqrt(np.diagonal(units[row] @ D[i, i] @ units[row].T))
                 np.testing.assert_allclose(found.std[k], std, rtol=1e-5)
 
+    def test_the_estimate_is_that_of_a_fit_without_the_test(self) -> None:
+        """One Gauss-Newton step from the whole estimate, which is a fraction of u away."""
+        data = table(n=16, noise=0.02, seed=4)
+        whole = fit(data, Dahl())
+        assert whole.errors is not None
+        for row in (0, 7, 15):
+            rest = fit(data.select(rows=np.arange(16) != row), Dahl())
+            assert rest.errors is not None
+            refit = whole.errors.estimate.without(np.array([2 * row, 2 * row + 1]))
+            apart = whole.errors.problem.to_values(refit.theta) - list(rest.errors.values.values())
+            assert np.all(np.abs(apart) < 0.1 * np.array(list(rest.errors.stderr.values())))
+
     @pytest.mark.parametrize("n", [32, 160])
     def test_falls_with_each_variance(self, n: int) -> None:
         """The degrees of freedom come from these derivatives; against differences."""
         errors = self.errors(n)
         rows, step = np.array([0, 1, 6, 7]), 1e-5
-        _, found = errors.state.block(rows)
+        found = errors.state.block_falls(rows)
         for k, variance in enumerate(errors.state.variances.tolist()):
             blocks = []
             for sign in (-1.0, 1.0):
                 moved = errors.state.variances.copy()
                 moved[k] = variance * (1.0 + sign * step)
-                blocks.append(errors.state.model.at(moved).block(rows)[0])
+                blocks.append(errors.state.model.at(moved).block(rows))
             slope = (blocks[1] - blocks[0]) / (2.0 * step * variance)
             np.testing.assert_allclose(found[k], -slope, rtol=1e-4, atol=1e-6 * np.abs(slope).max())
 
     def test_without_tests_there_are_none(self) -> None:
         errors = error_model(fit(table(n=2), Dahl(alpha=1.0)).optimum)
         assert errors is not None
-        assert held_out(errors) is None
+        assert errors.left_out is None
 
 
 class TestTestsThatScatter:

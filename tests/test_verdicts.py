@@ -9,9 +9,13 @@ import pytest
 from scipy import stats
 
 from dahl_ident import (
+    Backlash,
+    BoucWen,
     Dahl,
+    Element,
     FitResult,
     FrequencyResponse,
+    MaxwellSlip,
     Sensors,
     Spring,
     compare_models,
@@ -220,6 +224,65 @@ def test_a_free_delay_states_the_gain_that_it_assumes() -> None:
     assert isinstance(data, FrequencyResponse)
     delayed = fit(data, Dahl(), sensors=Sensors(delay=None), throw=False)
     assert "force_gain = 1 exactly" in delayed.verdict
+
+
+class TestNamed:
+    """What makes a result doubtful has a sentence, and is in the status."""
+
+    def test_a_force_that_friction_cannot_carry(self) -> None:
+        """A sinusoidal force above the limit, with nothing else to carry it."""
+        A = np.geomspace(0.1, 20.0, 14) * X_C
+        N = FRICTION.describing_function(A) * relative_noise(14, 0.01, 1)
+        for strongest, named in ((0.09, False), (0.12, True)):
+            kept = np.abs(N) * A < strongest
+            data = FrequencyResponse(
+                np.ones(kept.sum()), 1.0 / N[kept], drive=(np.abs(N) * A)[kept],
+                controlled="force", quantity="receptance",
+            )  # fmt: skip
+            found = fit(data, Dahl(), steady="describing function", throw=False)
+            assert ("the force held exceeds friction's limit (0." in found.verdict) is named
+            if named:
+                assert not found.trusted
+
+    def test_points_that_were_all_flagged(self) -> None:
+        flawed = np.array(["not settled"] * 30)
+        every = fit(replace(table(), quality={"verdict": flawed}), Dahl())
+        assert str(every.status) == "not determined"
+        assert "The extraction flagged every point fitted (" in every.verdict
+        flawed[3:] = "good"
+        some = fit(replace(table(), quality={"verdict": flawed}), Dahl())
+        assert str(some.status) == "approximate"
+        assert "The extraction flagged 3 of the points fitted (" in some.verdict
+
+    def test_gains_and_phases_that_were_held_out(self) -> None:
+        found = fit(_scattered(22, 1.1), Dahl())
+        check = found.cross_validation
+        assert check is not None
+        assert check.rows == 16
+        text = f"{check.gains} of 16 held-out gains and {check.phases} of 16 phases of fundamentals"
+        assert text in found.verdict
+
+    @pytest.mark.parametrize("law", [
+        MaxwellSlip([0.3 * X_C, 3.0 * X_C], [25.0, 8.0]),
+        BoucWen(30.0, 300.0, 300.0, exponent=2.0),
+        Backlash(FRICTION, 0.5 * X_C),
+    ])  # fmt: skip
+    def test_another_law_is_not_described_however_many_its_harmonics(self, law: Element) -> None:
+        """Or the limit of its force is within the interval: Bouc-Wen's loop is near to Dahl's."""
+        rng = np.random.default_rng(3)
+        A = np.geomspace(0.3, 10.0, 12) * X_C
+        size = 0.01 * np.abs(law.dynamic_stiffness(A))
+        noise = size * (rng.standard_normal((2, 12)) + 1j * rng.standard_normal((2, 12)))
+        R = noise + np.array([law.dynamic_stiffness(A, harmonic=k) for k in (1, 3)])
+        data = FrequencyResponse(
+            np.ones(24), R.ravel(), np.tile(A, 2), harmonic=np.repeat([1, 3], 12),
+            covariance=np.tile(size, 2)[:, None, None] ** 2 * np.eye(2),
+        )  # fmt: skip
+        one, both = (fit(data.select(rows=data.harmonic <= k), Dahl(), throw=False) for k in (1, 3))
+        assert both.status.rank >= one.status.rank
+        for found in (one, both):
+            _, low, high = found.conf_interval()["f_max"][1]
+            assert str(found.status) == "not described" or low < 0.1 < high
 
 
 class TestFindings:

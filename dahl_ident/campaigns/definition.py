@@ -61,25 +61,13 @@ _BLANK = ("", "na", "n/a", "nan")
 
 @dataclass(frozen=True)
 class Task:
-    """One fit of a campaign.
+    """One fit of a campaign."""
 
-    Attributes
-    ----------
-    device, run : str
-        Labels; `run` is empty where the fit takes all runs of the device.
-    files : tuple of Path
-        What is read, in the order of their names.
-    runs : tuple of str
-        Label of each file.
-    covariates : mapping of str to float or str
-        From the path and from the table of covariates.
-    """
-
-    device: str
+    device: str  # labels; `run` is empty where the fit takes all runs of the device
     run: str
-    files: tuple[Path, ...]
-    runs: tuple[str, ...]
-    covariates: Mapping[str, float | str]
+    files: tuple[Path, ...]  # what is read, in the order of their names
+    runs: tuple[str, ...]  # label of each file
+    covariates: Mapping[str, float | str]  # from the path and from the table of covariates
 
     @property
     def name(self) -> str:
@@ -89,28 +77,15 @@ class Task:
 
 @dataclass(frozen=True)
 class Definition:
-    """A checked campaign: files, options and the folder of the results.
+    """A checked campaign: files, options and the folder of the results."""
 
-    Attributes
-    ----------
-    source : str
-        Where it was read from, for messages.
-    options : mapping
-        All settings that a result depends on: kind, read, extract, fit, posterior, model and per;
-        digests of files that define laws of the model.
-    tasks : tuple of Task
-        In the order of their names.
-    folder : Path
-        Where results go.
-    reports : bool
-        Whether each fit gets a report.
-    """
-
-    source: str
+    source: str  # where it was read from, for messages
+    # all settings that a result depends on: kind, read, extract, fit, posterior, model and per;
+    # digests of files that define laws of the model
     options: Mapping[str, Any]
-    tasks: tuple[Task, ...]
-    folder: Path
-    reports: bool
+    tasks: tuple[Task, ...]  # In the order of their names
+    folder: Path  # where results go
+    reports: bool  # whether each fit gets a report
 
     def key(self, digests: Collection[str], version: str) -> str:
         """Return the key of a result: a digest of files, options and version."""

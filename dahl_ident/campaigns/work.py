@@ -29,33 +29,17 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 @dataclass(frozen=True)
 class Job:
-    """What a process needs to do one fit; plain data.
+    """What a process needs to do one fit; plain data."""
 
-    Attributes
-    ----------
-    name : str
-        Device and run.
-    files : tuple of (str, bytes or None)
-        Paths, with the contents if these are sent with the job.
-    runs : tuple of str
-        Label of each file.
-    options : mapping
-        Of :class:`dahl_ident.campaigns.definition.Definition`.
-    report : str or None
-        Where the report goes.
-    laws : tuple of (str or LawFile)
-        Modules, or files with their contents, that define laws of the model.
-    version : str
-        That of the package that made the job.
-    """
-
-    name: str
+    name: str  # device and run
+    # paths, with the contents if these are sent with the job
     files: tuple[tuple[str, bytes | None], ...]
-    runs: tuple[str, ...]
-    options: Mapping[str, Any]
-    report: str | None
+    runs: tuple[str, ...]  # label of each file
+    options: Mapping[str, Any]  # of :class:`dahl_ident.campaigns.definition.Definition`
+    report: str | None  # where the report goes
+    # modules, or files with their contents, that define laws of the model
     laws: tuple[str | LawFile, ...] = ()
-    version: str = __version__
+    version: str = __version__  # that of the package that made the job
 
 
 class UnseenError(DataError):
@@ -72,16 +56,7 @@ def failed(error: str, *, retry: bool = False, refused: bool = False, seconds: f
 
 
 def do(job: Job) -> Row:
-    """Return the row of one fit; a failure is a row with the reason.
-
-    Returns
-    -------
-    dict
-        ``status``: that of the verdict, or "failed"; ``statements`` or ``error``; for each
-        parameter ``p`` its value, ``unit_p``, ``u_p`` (combined standard uncertainty), ``U_p``
-        and ``dof_p``, and ``u_p_<source>`` for each source of its budget; ``points``: rows of
-        the response; ``digests``: of what was read; ``seconds``.
-    """
+    """Return the row of one fit; a failure is a row with the reason."""
     began = time.perf_counter()
     digests: list[str] = []
     try:

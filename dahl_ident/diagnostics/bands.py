@@ -21,7 +21,7 @@ from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.confidence_levels import checked_levels
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.formatting import with_unit
-from dahl_ident.diagnostics.held_out import band_factor, held_out
+from dahl_ident.diagnostics.held_out import band_factor
 from dahl_ident.diagnostics.information import Information
 from dahl_ident.diagnostics.parameters import values_at
 from dahl_ident.diagnostics.prediction_error import prediction_error, stated_noise
@@ -380,7 +380,7 @@ def _combined_band(
     parts[4, known] = made.dof
     centre = R.copy()
     centre[known] *= np.exp(made.departure @ np.array([1.0, 1.0j]))
-    left_out = held_out(errors) if of_a_test else None
+    left_out = errors.left_out if of_a_test else None
     scores = np.empty(0) if left_out is None else left_out.scores
     real, imag, gain, phase, dof = parts
     return ResponseBand(R, centre, real, imag, gain, phase, dof, scores)

@@ -46,18 +46,11 @@ _AT_LIMIT = 0.01  # of the replicates, from which on the tails cannot be disting
 
 @dataclass(frozen=True)
 class Replicates:
-    """Fits to simulated repetitions.
+    """Fits to simulated repetitions."""
 
-    Attributes
-    ----------
-    studentised : ndarray, shape (S, P)
-        t*, NaN where an optimum lies at infinity or is not determined.
-    gone : ndarray of bool, shape (S, P)
-        Which have no t*: diverging, or not determined.
-    """
-
+    # (S, P): t*, NaN where an optimum lies at infinity or is not determined
     studentised: FloatArray
-    gone: NDArray[np.bool_]
+    gone: NDArray[np.bool_]  # (S, P): which have no t*: diverging, or not determined
 
 
 def replicate(optimum: Optimum, replicates: int | None, seed: int) -> Replicates:
@@ -93,31 +86,7 @@ def bootstrap_intervals(
     replicates: int | None = None,
     seed: int = 0,
 ) -> ConfidenceIntervals:
-    """Return studentised bootstrap intervals.
-
-    Parameters
-    ----------
-    optimum : Optimum
-        The estimate, by least squares without a robust loss.
-    levels : sequence of float, default 0.6827, 0.9545, 0.9973
-        Confidence levels.
-    replicates : int, optional
-        At least 99; the 99.73 % level needs some thousands. Left out: 4999, of records 199.
-    seed : int, default 0
-        Of the simulated noise; the same seed gives the same intervals.
-
-    Returns
-    -------
-    ConfidenceIntervals
-        Open if too many replicates diverge.
-
-    Raises
-    ------
-    ValidationError
-        If the loss is robust, or `replicates` too few.
-    FitError
-        If there is no optimum to repeat.
-    """
+    """Return studentised bootstrap intervals."""
     array = checked_levels(levels)
     drawn = replicate(optimum, replicates, seed)
     tail = 0.5 * (1.0 - array)

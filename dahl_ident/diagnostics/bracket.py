@@ -20,21 +20,6 @@ _GROWTH, _SHRINKAGE = 3.0, 0.3  # of a step over the last, until the target is b
 class Bracket:
     """S searches outwards from 0, each for the point where its function reaches its target.
 
-    Parameters
-    ----------
-    target : ndarray, shape (S,)
-        Values wanted.
-    first : ndarray, shape (S,)
-        First positions.
-    step : ndarray, shape (S,)
-        Length of a step there.
-    furthest : ndarray, shape (S,)
-        Where a search has to stop, such as a parameter's bound.
-    logarithmic : ndarray of bool, shape (S,)
-        Whose steps have a longest length.
-    narrow_enough : ndarray, shape (S,)
-        Width of a bracket that needs no further narrowing.
-
     Attributes
     ----------
     position : ndarray, shape (S,)

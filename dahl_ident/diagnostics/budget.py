@@ -275,22 +275,6 @@ def budget(optimum: Optimum, errors: ErrorModel | None = None) -> Budget:
 
     That is every free parameter; where one is not determined, the determined combinations of it
     with others have a budget as well, and at infinity they alone.
-
-    Parameters
-    ----------
-    optimum : Optimum
-        ``fit(...).optimum``.
-    errors : ErrorModel, optional
-        Its error model, where that is known already.
-
-    Returns
-    -------
-    Budget
-
-    Raises
-    ------
-    FitError
-        If nothing is determined, or no residual is left to estimate an uncertainty from.
     """
     errors = errors or error_model(optimum, of_combinations=True)
     found = [] if errors is None else list(_determined(optimum, errors))

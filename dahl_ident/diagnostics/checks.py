@@ -20,7 +20,12 @@ from dahl_ident.diagnostics.held_out import CrossValidation
 from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.parameters import parameter_values
-from dahl_ident.diagnostics.physics import below_zero, is_single, slight
+from dahl_ident.diagnostics.physics import (
+    below_zero,
+    beyond_friction_limit,
+    is_single,
+    slight,
+)
 from dahl_ident.diagnostics.steady_motion import steady_findings
 from dahl_ident.diagnostics.verdicts import Identifiability
 from dahl_ident.elements import Model
@@ -179,6 +184,7 @@ def _misfit_within_runs(errors: ErrorModel) -> float:
 
 def _reservations(fit: Judged) -> Iterator[Finding]:
     """Yield what keeps a fit from being trusted although its residuals may look like noise."""
+    yield from _beyond_limit(fit)
     yield from _below_zero(fit)
     yield from _contradicted_priors(fit)
     yield from _moved_by_outliers(fit)
@@ -194,6 +200,15 @@ def _estimates(fit: Judged) -> tuple[dict[str, float], Mapping[str, float]]:
         if errors is None
         else (values | dict(errors.values), errors.stderr)
     )
+
+
+def _beyond_limit(fit: Judged) -> Iterator[Finding]:
+    """Yield where a force exceeds what friction can carry; not rows that a loss sets aside."""
+    errors, differ = fit.errors, fit.goodness.runs_differ
+    scatter = 0.0 if differ is None else sum(differ.scatter.values())
+    optimum = fit.optimum if errors is None else errors.at_estimate
+    aside = [p.row for p in fit.goodness.suspicious] if optimum.loss != "linear" else []
+    yield from beyond_friction_limit(optimum, scatter, aside)
 
 
 def _below_zero(fit: Judged) -> Iterator[Finding]:

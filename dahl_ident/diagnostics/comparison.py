@@ -42,6 +42,8 @@ _FALSE_ALARM = 1e-4  # of a force that falls with the frequency: one more candid
 _SEEN = 3.0  # rms differences over noise that has been averaged over all rows
 _STATED = "every source"  # of error is counted in what the fit states
 _RUNAWAY = 100.0  # times as large: a candidate's parameter that the data leave open
+_UNUSUAL = 5.0  # times beyond the usual range of an exponent: no mechanism's
+_DISAGREE = 0.2  # of a force limit: what else friction is then depends on the choice
 _PLACES = 6  # of a change: less is rounding
 _VAGUE = 0.5  # relative standard error from which a parameter is not determined
 _LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
@@ -90,10 +92,24 @@ class ComparedModel:
 
     @property
     def is_determined(self) -> bool:
-        """Whether the data determine every parameter that cannot be negative."""
+        """Whether the data determine every parameter, to a factor those that are above zero."""
         o = self.optimum
-        rows = zip(o.problem.parameters, o.values.tolist(), o.stderr.values(), strict=True)
-        return all(error < _VAGUE * value for p, value, error in rows if p.lower == 0.0)
+        return all(
+            np.isfinite(error) and (p.lower != 0.0 or error < _VAGUE * value)
+            for p, value, error in zip(
+                o.problem.parameters, o.values.tolist(), o.stderr.values(), strict=True
+            )
+        )
+
+    @property
+    def is_physical(self) -> bool:
+        """Whether every exponent is near its usual range."""
+        o = self.optimum
+        return all(
+            p.prior is None or any(p.dimension) or not p.positive
+            or p.prior[0] / _UNUSUAL < value < p.prior[1] * _UNUSUAL
+            for p, value in zip(o.problem.parameters, o.values.tolist(), strict=True)
+        )  # fmt: skip
 
     @cached_property
     def meaning(self) -> dict[str, float]:
@@ -151,28 +167,57 @@ class ModelComparison:
     def best(self) -> ComparedModel:
         """The simplest model within one standard error of the highest predictive density.
 
-        Apart from the one that was fitted, only models count whose parameters are determined, and
-        whose force limit and stiffness are not a hundred times those of the fit.
+        Apart from the one that was fitted, only models count whose parameters are determined and
+        physical, and whose force limit and stiffness are not a hundred times those of the fit. It
+        is the one that was fitted where models that are alike disagree (`undecided`).
         """
+        return self.models[0] if self.undecided else self._simplest
+
+    @cached_property
+    def undecided(self) -> tuple[ComparedModel, ...]:
+        """The simplest and the likeliest of models that these data do not distinguish.
+
+        Empty where they agree on the force limit, or are one model.
+        """
+        both = (self._simplest, self._likeliest)
+        a, b = (model.meaning["force limit"] for model in both)
+        agree = not abs(a - b) > _DISAGREE * max(a, b)
+        return () if agree or self.models[0] in both else both
+
+    @cached_property
+    def _likeliest(self) -> ComparedModel:
         first = self.models[0]
         possible = [m for m in self.models if m is first or self._is_sound(m)]
-        highest = max(possible, key=lambda model: model.density.total)
-        alike = []
-        for model in possible:
-            gain, error = highest.density.gain_over(model.density)
-            if gain <= max(error, _BY_CHANCE):
+        return max(possible, key=lambda model: model.density.total)
+
+    @cached_property
+    def _simplest(self) -> ComparedModel:
+        first, alike = self.models[0], []
+        for model in self.models:
+            gain, error = self._likeliest.density.gain_over(model.density)
+            sound = model is first or self._is_sound(model)
+            if sound and gain <= max(error, _BY_CHANCE):
                 alike.append(model)
         return min(alike, key=lambda model: (len(model.optimum.names), -model.density.total))
 
     def _is_sound(self, model: ComparedModel) -> bool:
         keys = ("force limit", "stiffness at zero force")
         sizes = [(model.meaning[k], self.models[0].meaning[k]) for k in keys]
-        return model.is_determined and not any(b > 0.0 and a > _RUNAWAY * b for a, b in sizes)
+        absurd = any(b > 0.0 and a > _RUNAWAY * b for a, b in sizes)
+        return model.is_determined and model.is_physical and not absurd
 
     @property
     def headline(self) -> str:
         """The verdict in a sentence or two."""
         first, best = self.models[0], self.best
+        if self.undecided:
+            one, other = self.undecided
+            limits = [f"{m.meaning['force limit']:.3g}" for m in self.undecided]
+            return (
+                f"{one.name} and {other.name} would both be better, and these data do not "
+                f"distinguish them: their force limits are {listed(limits)}. Neither is "
+                "recommended."
+            )
         if best is first:
             return "No model compared is better than the one fitted."
         gain, error = best.density.gain_over(first.density)

@@ -24,21 +24,12 @@ _OUTSIDE = 1e-3  # share of a direction that the data may leave open, from round
 
 @dataclass(frozen=True)
 class Basis:
-    """Orthonormal directions, (C, r), of coordinates over the size of what residuals notice, (C,).
-
-    Attributes
-    ----------
-    size, directions : ndarray
-    slopes : ndarray, shape (Q, C)
-        Of theta by the coordinates.
-    chart : Chart or None
-        Gives theta at the coordinates; None where they are theta.
-    """
+    """Orthonormal directions, (C, r), of coordinates over the sizes that residuals notice, (C,)."""
 
     size: FloatArray
     directions: FloatArray
-    slopes: FloatArray
-    chart: Chart | None = None
+    slopes: FloatArray  # (Q, C): of theta by the coordinates
+    chart: Chart | None = None  # gives theta at the coordinates; None where they are theta
 
     @classmethod
     def of(cls, J: FloatArray, theta: FloatArray, chart: Chart | None) -> Basis:

@@ -49,6 +49,7 @@ from dahl_ident.diagnostics.estimate import (
     weighted_estimate,
     with_assumed,
 )
+from dahl_ident.diagnostics.held_out import HeldOut, held_out
 from dahl_ident.diagnostics.misfit_explanations import at_an_end, neighbourhood
 from dahl_ident.diagnostics.mixed_model import MixedModel, State, shares
 from dahl_ident.diagnostics.outliers import suspicious_points
@@ -76,32 +77,15 @@ _CALIBRATIONS = {
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """The estimate, and its covariance by every source of error.
+    """The estimate, and its covariance by every source of error."""
 
-    Attributes
-    ----------
-    optimum : Optimum
-        The least-squares fit that it started from.
-    estimate : WeightedEstimate
-        Weighted least squares.
-    sources : tuple of Source
-        Random errors that rows share, those that the residuals show.
-    state : State
-        The mixed model of the residuals at the variances of noise and sources.
-    contributions : mapping of str to ndarray, shape (Q, Q)
-        Covariance of theta by source, type A first.
-    tests : int
-        Number of tests, of which each may have been left out.
-    assumed : tuple of str
-        Names of parameters that were assumed: exponents, the force gain for a drive factor.
-    """
-
-    optimum: Optimum
-    estimate: WeightedEstimate
-    sources: tuple[Source, ...]
-    state: State
-    contributions: Mapping[str, FloatArray]
-    tests: int
+    optimum: Optimum  # the least-squares fit that it started from
+    estimate: WeightedEstimate  # weighted least squares
+    sources: tuple[Source, ...]  # random errors that rows share, those that the residuals show
+    state: State  # the mixed model of the residuals at the variances of noise and sources
+    contributions: Mapping[str, FloatArray]  # (Q, Q): covariance of theta by source, type A first
+    tests: int  # number of tests, of which each may have been left out
+    # names of parameters that were assumed: exponents, the force gain for a drive factor
     assumed: tuple[str, ...]
     limit: FloatArray
     """Factor of each parameter's uncertainty by the model error: tests left out limit it."""
@@ -273,6 +257,11 @@ class ErrorModel:
         relative = np.einsum("nij,nj->ni", self.estimate.relative_units, moved)
         return np.asarray(self.estimate.predicted * np.exp(relative @ np.array([1.0, 1.0j])))
 
+    @cached_property
+    def left_out(self) -> HeldOut | None:
+        """Tests left out in turn and predicted; None with fewer than three."""
+        return held_out(self.estimate, self.state)
+
     def rms(self, name: str) -> float:
         """Return the rms of ln gain and phase that noise beyond a stated one, or a source, makes.
 
@@ -296,19 +285,8 @@ class ErrorModel:
 def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorModel | None:
     """Return the model of an optimum's errors; None where there is nothing to estimate it from.
 
-    Parameters
-    ----------
-    optimum : Optimum
-        From :func:`dahl_ident.fitting.solve`.
-    of_combinations : bool, default False
-        Also where parameters are undetermined, or their optimum lies at infinity: then
-        the covariance holds for combinations that the data determine, and for these alone.
-
-    Returns
-    -------
-    ErrorModel or None
-        None where no finite optimum was found, a parameter is undetermined, the loss is robust,
-        residuals are rounding errors, or none is left beyond the parameters.
+    That is a robust loss, residuals that are rounding errors, or an undetermined parameter;
+    `of_combinations`: then the covariance holds for what the data determine, and for that alone.
     """
     if optimum.loss != "linear":
         return None  # its errors are those of the robust estimate, noise alone

@@ -53,41 +53,22 @@ _FEWEST = 2  # runs, or repeated levels, that show a scatter
 
 @dataclass(frozen=True)
 class Source:
-    """One source of random error.
+    """One source of random error."""
 
-    Attributes
-    ----------
-    name : str
-        As a budget lists it; several sources may share one.
-    columns : ndarray, shape (M, q)
-        Residuals of unit variance that the source makes at unit variance.
-    mean_square : float
-        Of ln gain and phase over the rows, at unit variance.
-    shapes : Shapes or None
-        Extension of the source to other amplitudes and frequencies.
-    own : str
-        What another test has an own draw of: "gain", "phase", "both" or a parameter's name;
-        empty for noise and model error.
-    largest : float
-        Variance.
-    absorbed : ndarray, shape (Q, q), or None
-        Changes of theta that do the same as each column; taken out of the columns.
-    rate_of : (str, float) or None
-        Parameter that changes as a power of the peak speed, and ln of the speed where it is its
-        estimate.
-    chance : float
-        Share of tables in which noise alone may make the source appear; 1 where it is always
-        counted.
-    """
-
-    name: str
-    columns: FloatArray
-    mean_square: float
-    shapes: Shapes | None = None
+    name: str  # as a budget lists it; several sources may share one
+    columns: FloatArray  # (M, q): residuals of unit variance that the source makes at unit variance
+    mean_square: float  # of ln gain and phase over the rows, at unit variance
+    shapes: Shapes | None = None  # extension of the source to other amplitudes and frequencies
+    # what another test has an own draw of: "gain", "phase", "both" or a parameter's name; empty for
+    # noise and model error
     own: str = ""
-    largest: float = np.inf
+    largest: float = np.inf  # variance
+    # (Q, q): changes of theta that do the same as each column; taken out of the columns
     absorbed: FloatArray | None = None
+    # parameter that changes as a power of the peak speed, and ln of the speed where it is its
+    # estimate
     rate_of: tuple[str, float] | None = None
+    # share of tables in which noise alone may make the source appear; 1 where it is always counted
     chance: float = 1.0
 
     @property
@@ -132,22 +113,13 @@ def parts(relative: ComplexArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Shapes:
-    """Eigenvectors of a smooth correlation between rows, continued to other places.
+    """Eigenvectors of a smooth correlation between rows, continued to other places."""
 
-    Attributes
-    ----------
-    places : ndarray, shape (n, 2)
-        ln A and ln omega of the rows.
-    parallel : bool
-        Whether it is a force in parallel with the model, which depends on frequency alone.
-    unit : float
-        Stiffness at unit variance of such a force.
-    """
-
-    places: FloatArray
+    places: FloatArray  # (n, 2): ln A and ln omega of the rows
     weights: FloatArray
+    # whether it is a force in parallel with the model, which depends on frequency alone
     parallel: bool
-    unit: float
+    unit: float  # stiffness at unit variance of such a force
 
     @classmethod
     def of(cls, places: FloatArray, *, parallel: bool, unit: float = 1.0) -> Shapes:

@@ -14,7 +14,7 @@ Journal of Research of the National Bureau of Standards 87 (1982) 377.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -32,7 +32,7 @@ EXPONENT = "exponent"
 DRIVE = "drive factor"
 GAIN = "force_gain"
 _STEPS = 60  # Gauss-Newton steps; five are the rule
-_SETTLED = 1e-5  # of a standard deviation that a step still moves the estimate
+_SETTLED = 1e-3  # of a standard deviation that a step still moves the estimate
 _LONGEST_STEP = 0.7  # of a logarithm, in one step: the model is linearised
 _HALVINGS = 8  # of a step, until the sum of squares falls
 _ROOT_STEPS = 200  # Newton's, from below, for the misfit: it doubles where it is far off
@@ -65,32 +65,15 @@ def with_assumed(problem: Problem) -> tuple[Problem, dict[str, Assumption]]:
 
 @dataclass(frozen=True)
 class WeightedEstimate:
-    """Weighted least squares.
+    """Weighted least squares."""
 
-    Attributes
-    ----------
-    problem : Problem
-        The assumed exponents free.
-    theta : ndarray, shape (Q,)
-        The estimate, search coordinates.
-    misfit : float
-        Share s of the fundamental force of a row's test.
-    factors : ndarray, shape (n, 2, 2)
-        What takes each row's residuals to unit variance.
-    y : ndarray, shape (M,)
-        Residuals of data, then of priors, of unit variance.
-    jacobian : ndarray, shape (M, Q)
-        Their derivatives.
-    basis : Basis or None
-        Changes of theta that the data determine at all; None where that is every one.
-    """
-
-    problem: Problem
-    theta: FloatArray
-    misfit: float
-    factors: FloatArray
-    y: FloatArray
-    jacobian: FloatArray
+    problem: Problem  # the assumed exponents free
+    theta: FloatArray  # (Q,): the estimate, search coordinates
+    misfit: float  # share s of the fundamental force of a row's test
+    factors: FloatArray  # (n, 2, 2): what takes each row's residuals to unit variance
+    y: FloatArray  # (M,): residuals of data, then of priors, of unit variance
+    jacobian: FloatArray  # (M, Q): their derivatives
+    # changes of theta that the data determine at all; None where that is every one
     basis: Basis | None = None
 
     @property
@@ -133,6 +116,18 @@ class WeightedEstimate:
         Q, R = np.linalg.qr(J if kept is None else J * kept[:, None])
         return np.linalg.solve(R, Q.T)
 
+    def without(self, left_out: NDArray[np.intp]) -> WeightedEstimate:
+        """Return the estimate without some residuals: a Gauss-Newton step, which is short."""
+        kept = np.ones(len(self.y), dtype=bool)
+        kept[left_out] = False
+        step = np.linalg.lstsq(self.columns[kept], -self.y[kept], rcond=1e-13)[0]
+        theta = _moved(self.problem, self.theta, np.asarray(step), self.basis)
+        y, J = (_weighted(self.factors, part) for part in _rows(self.problem, theta))
+        if not (np.isfinite(y).all() and np.isfinite(J).all()):
+            return self
+        basis = None if self.basis is None else self.basis.at(theta)
+        return replace(self, theta=theta, y=y, jacobian=J, basis=basis)
+
     def jackknife(self, tests: Sequence[NDArray[np.intp]]) -> FloatArray:
         """Return the covariance of theta by leaving out each test, (Q, Q), to first order.
 
@@ -154,17 +149,7 @@ class WeightedEstimate:
 
 
 def weighted_estimate(optimum: Optimum, problem: Problem, *, determined: bool) -> WeightedEstimate:
-    """Return the estimate, searched from an optimum.
-
-    Parameters
-    ----------
-    optimum : Optimum
-        Of the search.
-    problem : Problem
-        The same with the assumed exponents free.
-    determined : bool
-        Whether the optimum is finite and every parameter determined.
-    """
+    """Return the estimate, searched from an optimum."""
     known = dict(zip(optimum.names, optimum.theta, strict=True))
     theta = np.array([known.get(p.name, np.log(p.value or 1.0)) for p in problem.parameters])
     m, dof = problem.n_residuals, problem.n_numbers - len(problem.names)

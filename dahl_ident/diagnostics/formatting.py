@@ -16,19 +16,6 @@ _SYMBOLS = {"f_max": r"f_\mathrm{max}", "sigma": r"\sigma", "alpha": r"\alpha"}
 def rounded(value: float, uncertainty: float | None) -> tuple[str, str]:
     """Return value and uncertainty as text, the uncertainty with two significant digits.
 
-    Parameters
-    ----------
-    value : float
-        Any number.
-    uncertainty : float or None
-        Standard deviation in the same unit; None, NaN or infinite where unknown.
-
-    Returns
-    -------
-    tuple of str
-        The value, to six digits where the uncertainty is unknown and to no more than twelve; the
-        uncertainty or ``"?"``.
-
     Examples
     --------
     >>> rounded(0.0999123, 0.00101)
@@ -69,18 +56,6 @@ def _alike(numbers: Sequence[float], last: int) -> list[str]:
 
 def with_unit(value: float, uncertainty: float | None, unit: str) -> str:
     """Return ``"0.0999 ± 0.0010 N"``.
-
-    Parameters
-    ----------
-    value, uncertainty : float
-        As for :func:`rounded`.
-    unit : str
-        Appended; may be empty.
-
-    Returns
-    -------
-    str
-        One line of text.
 
     Examples
     --------
@@ -145,18 +120,6 @@ def listed(words: Sequence[str]) -> str:
 
 def interval(lower: float, upper: float, unit: str) -> str:
     """Return ``"0.098 to 0.102 N"``; an open end is said in words.
-
-    Parameters
-    ----------
-    lower, upper : float
-        Ends; minus or plus infinity, or 0 for a positive parameter, where open.
-    unit : str
-        Appended; may be empty.
-
-    Returns
-    -------
-    str
-        One line of text.
 
     Examples
     --------

@@ -32,6 +32,7 @@ from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.misfit_explanations import (
     EXPLAINS,
     at_an_end,
+    least_misfit_without,
     neighbourhood,
     rms_misfit,
     set_aside,
@@ -51,6 +52,7 @@ _FALSE_ALARM = 0.01  # of all tests together: one sound data set in a hundred is
 _HINT = 0.05  # the same of hints, which doubt nothing
 _FAR_MORE = 2.0  # scatter over what was measured
 _NO_SENSOR = 0.3  # noise over the response
+_CLOSE = 0.8  # of the misfit: a bound above shows that no such law helps
 _WORTH_NAMING = 0.1  # of the largest scatter: less is not mentioned
 
 
@@ -156,6 +158,8 @@ class Goodness:
         What no mechanism does.
     flagged : tuple of str
         Rows that the extraction flagged, with the reason.
+    fundamentals : int
+        Rows of the fundamental.
     runs_differ : RunsDiffer or None
         Where the scatter between runs exceeds the noise. The other tests then judge the residuals
         within runs.
@@ -198,6 +202,7 @@ class Goodness:
     warnings: tuple[str, ...]
     flagged: tuple[str, ...]
     untested: bool
+    fundamentals: int = 0
     runs_differ: RunsDiffer | None = None
     sign: str = ""
     apart: tuple[str, ...] = ()
@@ -283,19 +288,7 @@ class Goodness:
     def findings(
         self, severity: VerdictStatus = VerdictStatus.NOT_DESCRIBED, *, counted: bool = False
     ) -> Iterator[Finding]:
-        """Yield whether the model describes the data.
-
-        Parameters
-        ----------
-        severity : VerdictStatus, default NOT_DESCRIBED
-            Of a misfit that exceeds the noise.
-        counted : bool, default False
-            Whether the stated uncertainties include that misfit.
-
-        Yields
-        ------
-        Finding
-        """
+        """Yield whether the model describes the data."""
         described, note = Question.DESCRIBED, VerdictStatus.TRUSTED
         misfit: dict[str, Any] = {"rms": self.rms_misfit}
         values: dict[str, Any]
@@ -318,7 +311,10 @@ class Goodness:
             values = {"hints": self.hints, "scatter": str(self.scatter) if far else ""}
             yield Finding(described, note, "noise", misfit | values)
         if self.flagged:
-            yield Finding(described, VerdictStatus.APPROXIMATE, "flagged", {"points": self.flagged})
+            every = len(self.flagged) == self.fundamentals
+            worst = VerdictStatus.NOT_DETERMINED if every else VerdictStatus.APPROXIMATE
+            values = {"points": self.flagged, "every": every}
+            yield Finding(described, worst, "flagged", values)
         if self.sign or self.apart:
             return
         if self.suspicious:
@@ -389,17 +385,22 @@ def _bound(optimum: Optimum, misfit: float) -> float | None:
         least = least_misfit(problem.data, problem.model)
     except DahlIdentError:
         return None
-    return least if least <= misfit else None
+    helps = least < FAR_LESS * misfit or _CLOSE * misfit < least <= misfit
+    return least if helps else None
 
 
 def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
     """Return `found` with the objections that remain without the suspicious rows."""
     rows = [point.row for point in found.suspicious]
-    other = set_aside(optimum, rows) if rows and found.objections else None
+    if not (rows and found.objections and not at_an_end(optimum, rows)):
+        return found
+    if not least_misfit_without(optimum, rows) * EXPLAINS < found.rms_misfit:
+        return found
+    other = set_aside(optimum, rows)
     rest = None if other is None else _tested_estimate(other)
     if rest is None or rest.objections or rest.hints or rest.untested or not rest.judged:
         return found
-    if not rest.rms_misfit * EXPLAINS < found.rms_misfit or at_an_end(optimum, rows):
+    if not rest.rms_misfit * EXPLAINS < found.rms_misfit:
         return found
     where = neighbourhood(optimum, rows)
     if where:
@@ -431,8 +432,7 @@ def _within_runs(errors: ErrorModel) -> Goodness | None:
         for source, v in zip(errors.sources, errors.variances.tolist(), strict=True)
         if source.name == RUNS and v > 0.0
     }
-    warnings = tuple(physical_warnings(optimum, sum(scatter.values())))
-    return replace(found, warnings=warnings, runs_differ=RunsDiffer(scatter, p))
+    return replace(found, runs_differ=RunsDiffer(scatter, p))
 
 
 def _tested(
@@ -464,6 +464,7 @@ def _tested(
         tuple(physical_warnings(optimum)),
         flagged_rows(problem.data),
         _untested(optimum),
+        int((problem.data.harmonic == 1).sum()),
     )
 
 

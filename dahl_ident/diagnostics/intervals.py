@@ -148,25 +148,7 @@ class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
 
 
 def wald_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> ConfidenceIntervals:
-    """Return theta ± q stderr, transformed to parameter values.
-
-    Parameters
-    ----------
-    optimum : Optimum
-        The estimate.
-    levels : sequence of float, default 0.6827, 0.9545, 0.9973
-        Confidence levels.
-
-    Returns
-    -------
-    ConfidenceIntervals
-        Everything possible where a parameter is undetermined.
-
-    Raises
-    ------
-    ValidationError
-        If a level is not between 0 and 1.
-    """
+    """Return theta ± q stderr, transformed to parameter values."""
     array = checked_levels(levels)
     error = np.sqrt(np.diagonal(optimum.covariance))
     width = thresholds(optimum, array)[:, None] * error
@@ -177,25 +159,7 @@ def wald_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> Confid
 
 
 def profile_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> ConfidenceIntervals:
-    """Return where the profile of the deviance meets the thresholds; never raises for a hard one.
-
-    Parameters
-    ----------
-    optimum : Optimum
-        The estimate.
-    levels : sequence of float, default 0.6827, 0.9545, 0.9973
-        Confidence levels.
-
-    Returns
-    -------
-    ConfidenceIntervals
-        Ends are open where the data set no limit; a bound of the parameter ends an interval.
-
-    Raises
-    ------
-    ValidationError
-        If a level is not between 0 and 1.
-    """
+    """Return where the profile of the deviance meets the thresholds; open where it does not."""
     array = checked_levels(levels)
     lower, upper = Profiler(optimum).limits(thresholds(optimum, array))
     return intervals_from_search(optimum, "profile", array, lower, upper)
@@ -210,23 +174,6 @@ def combined_intervals(
     """Return intervals that count every source of error: value -+ k u.
 
     Of a positive parameter whose u is above 20 %, value times or over exp(k u).
-
-    Parameters
-    ----------
-    optimum : Optimum
-        The search's result.
-    errors : ErrorModel
-        The estimate and its sources of error.
-    levels : sequence of float
-        Confidence levels.
-    profile : callable
-        Returns the profile intervals, which are open where noise alone sets no limit; asked for
-        where noise alone is large.
-
-    Returns
-    -------
-    ConfidenceIntervals
-        Around the estimates.
     """
     array = checked_levels(levels)
     held = np.array([errors.holds(name) for name in optimum.names])
@@ -347,27 +294,7 @@ class IntervalComparison:
 def compare(
     optimum: Optimum, intervals: Sequence[ConfidenceIntervals], tolerance: float = 0.2
 ) -> IntervalComparison:
-    """Return where each method differs from the last by more than `tolerance` half widths.
-
-    Parameters
-    ----------
-    optimum : Optimum
-        The estimate.
-    intervals : sequence of ConfidenceIntervals
-        At least two, of the same levels; the last is the most trusted.
-    tolerance : float, default 0.2
-        Difference of a limit that counts, over its distance from the estimate.
-
-    Returns
-    -------
-    IntervalComparison
-        With every limit that disagrees.
-
-    Raises
-    ------
-    ValidationError
-        If there are fewer than two, or their levels differ.
-    """
+    """Return where each method differs from the last by more than `tolerance` half widths."""
     if len(intervals) < 2:
         raise ValidationError(f"{len(intervals)} intervals given; a comparison needs two or more")
     last, found = intervals[-1], []

@@ -82,11 +82,6 @@ class Finding:
 class Judgement:
     """What was found about a result, the most serious first.
 
-    Parameters
-    ----------
-    findings : iterable of Finding
-        In the order in which they are to be told where they are equally serious.
-
     Attributes
     ----------
     status : VerdictStatus

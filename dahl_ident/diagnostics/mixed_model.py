@@ -37,25 +37,7 @@ _ALIKE = 1e-9  # added to correlations of one: sources that do the same share a 
 
 
 class MixedModel:
-    """Residuals, and the columns of parameters and sources.
-
-    Parameters
-    ----------
-    y : ndarray, shape (m,)
-        Residuals.
-    J : ndarray, shape (m, P)
-        Their derivatives with respect to the parameters.
-    Z : sequence of ndarray, shape (m, q)
-        Columns of each of K sources.
-    group : ndarray of int, shape (m,)
-        Group of each row, numbered from 0: G of noise to be estimated, then any of known noise.
-    known : ndarray
-        Known variance of the noise in every group.
-    groups : int
-        G.
-    most : ndarray, shape (K,)
-        Largest variance of each source.
-    """
+    """Residuals, and the columns of parameters and sources."""
 
     def __init__(
         self,
@@ -88,6 +70,12 @@ class MixedModel:
         ends = [*self.starts.tolist(), self.U.shape[1]]
         return slice(ends[k], ends[k + 1])
 
+    def elsewhere(self, y: FloatArray, J: FloatArray) -> MixedModel:
+        """Return the same sources with residuals and derivatives at other parameters."""
+        Z = [self.U[:, self.columns(k)] for k in range(len(self.starts))]
+        most = self.most[self.noises :]
+        return MixedModel(y, J, Z, self.group, self.known, self.noises, most)
+
     def at(self, variances: FloatArray) -> State:
         """Return the model at these variances."""
         return State(self, variances)
@@ -103,14 +91,7 @@ class MixedModel:
         return np.asarray(M[:P, :P] - Z[:P] @ np.linalg.solve(inner, Z[:P].T))
 
     def reml(self, chance: FloatArray) -> State:
-        """Return the state of the highest restricted likelihood.
-
-        Parameters
-        ----------
-        chance : ndarray, shape (K,)
-            Share of tables in which noise alone may make each source appear. A source stays out
-            unless its score, all others counted, exceeds what so many tables of noise make.
-        """
+        """Return the state of the highest restricted likelihood."""
         G = self.noises
         free = np.where(np.concatenate([np.ones(G), chance]) < 1.0, 0.0, self.most)
         total = max(float(self.y @ self.y) / max(len(self.y) - self.parameters, 1), TINY)
@@ -281,24 +262,24 @@ class State:
         rows = self.weights[self.model.group]
         return np.asarray(rows * (self.model.y - self.model.U @ self.predicted))
 
-    def block(self, rows: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-        """Return P of some rows, (r, r), and by how much it falls with each variance, (., r, r)."""
-        model, w = self.model, self.weights[self.model.group[rows]]
-        UK = w[:, None] * (model.U[rows] @ self.K)
-        P = np.diag(w) - UK @ (w[:, None] * model.U[rows]).T
-        falls = []
-        for g in range(model.noises):
-            A, same = model.grams[g][:-1, :-1], (model.group[rows] == g) * self.weights[g]
-            H = np.diag(w) - P
-            falls.append(
-                np.diag(same**2) - same[:, None] * H - H * same
-                + self.weights[g] ** 2 * UK @ A @ UK.T
-            )  # fmt: skip
-        PU = w[:, None] * (model.U[rows] @ self._left[:-1, :-1])
-        for k in range(len(model.starts)):
-            part = PU[:, model.columns(k)]
-            falls.append(part @ part.T)
-        return P, np.array(falls)
+    def block(self, rows: NDArray[np.intp]) -> FloatArray:
+        """Return P of some rows, (r, r)."""
+        w, U = self.weights[self.model.group[rows]], self.model.U[rows]
+        return np.asarray(np.diag(w) - (w[:, None] * U) @ self.K @ (U.T * w))
+
+    def block_falls(self, rows: NDArray[np.intp]) -> FloatArray:
+        """Return by how much P of some rows falls with each variance, (count, r, r)."""
+        model, group = self.model, self.model.group[rows]
+        w, falls = self.weights[group], []
+        WU = w[:, None] * model.U[rows]
+        H = WU @ self.K @ WU.T
+        for g, weight in enumerate(self.weights[: model.noises].tolist()):
+            same, UK = weight * (group == g), weight * WU @ self.K
+            inner = UK @ model.grams[g][:-1, :-1] @ UK.T
+            falls.append(np.diag(same**2) - same[:, None] * H - H * same + inner)
+        PU = WU @ self._left[:-1, :-1]
+        parts = (PU[:, model.columns(k)] for k in range(len(model.starts)))
+        return np.array([*falls, *(part @ part.T for part in parts)])
 
     def prediction_variance(self, X: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the covariance of the errors of X [delta, u], and its derivatives.

@@ -32,31 +32,15 @@ _GOOD = "good"
 
 @dataclass(frozen=True)
 class SuspiciousPoint:
-    """A point that noise does not explain.
+    """A point that noise does not explain."""
 
-    Attributes
-    ----------
-    row : int
-        Its index in the table.
-    name : str
-        What a person calls it: frequency, level, harmonic, run.
-    frequency_hz, amplitude : float
-        Where it is.
-    level : object
-        Its label, None where the table has none.
-    deviation : float
-        Its distance from the fit to the others, in standard deviations.
-    p_value : float
-        Probability that the worst of all points deviates as far by noise alone.
-    """
-
-    row: int
-    name: str
-    frequency_hz: float
+    row: int  # its index in the table
+    name: str  # what a person calls it: frequency, level, harmonic, run
+    frequency_hz: float  # where it is
     amplitude: float
-    level: Any
-    deviation: float
-    p_value: float
+    level: Any  # its label, None where the table has none
+    deviation: float  # its distance from the fit to the others, in standard deviations
+    p_value: float  # probability that the worst of all points deviates as far by noise alone
 
     def __str__(self) -> str:
         return f"{self.name} lies {self.deviation:.1f} standard deviations off"

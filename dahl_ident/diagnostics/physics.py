@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from scipy import special
@@ -13,7 +14,6 @@ from dahl_ident.diagnostics.formatting import percent, with_unit
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.steady_motion import steady_difference
-from dahl_ident.diagnostics.third_harmonic import third_harmonic_share
 from dahl_ident.elements import Element, Parameter
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.status import Status
@@ -21,8 +21,10 @@ from dahl_ident.units import Motion, engineering, shown_unit
 
 _LEVEL = 1e-3  # false-alarm rate, low: such a fit is called physically impossible
 _OFF = 0.02  # relative error of a prediction: as large as a good measurement's
-_HARMONIC_SHARE = 0.1  # of the fundamental; describing functions assume a pure sine
 _CLEARLY = 2.0  # standard uncertainties below zero
+_IMPOSSIBLE = 3.0  # standard errors of a limit that a force exceeds
+_WITH_HARMONICS = 4.0  # a mass at three times the frequency carries nine times as much of a third
+_DESCRIBED, _APPROXIMATE = Question.DESCRIBED, VerdictStatus.APPROXIMATE
 _FALLING = "fit a law whose force falls with speed (LuGre)"
 _INSTEAD = {
     (1, -1, 2): "a mass: leave it out, or give its value",
@@ -38,15 +40,11 @@ _RATIOS = {2.0: "peak-to-peak", 2.0**-0.5: "root-mean-square"}
 _ALIKE = 0.05  # relative difference from such a ratio, and spread
 
 
-def physical_warnings(optimum: Optimum, scatter: float = 0.0) -> Iterator[str]:
-    """Yield a sentence for everything in an estimate that physics forbids or that is unsafe.
-
-    `scatter` is the relative standard deviation of the force between runs.
-    """
+def physical_warnings(optimum: Optimum) -> Iterator[str]:
+    """Yield a sentence for everything in an estimate that physics forbids or that is unsafe."""
     yield from negative_parameters(optimum)
     if optimum.status is Status.AT_BOUND:
         yield optimum.message.removeprefix(Status.AT_BOUND.value).strip()
-    yield from _beyond_friction_limit(optimum, scatter)
     yield from _not_a_sine(optimum)
     yield from implausible_units(optimum)
 
@@ -57,22 +55,11 @@ def _not_a_sine(optimum: Optimum) -> Iterator[str]:
     if problem.is_exact or not (problem.data.controlled == "force").any():
         return
     found = steady_difference(optimum)
-    if found is not None:
-        if found[1] > _OFF:
-            (name,) = row_names(problem.data, [found[0]])
-            yield (
-                "the describing function, which takes the motion for a sine, is "
-                f"{percent(found[1])} off at {name}: fit with steady='exact'"
-            )
-        return
-    share = third_harmonic_share(optimum)
-    if share.size and share.max() > _HARMONIC_SHARE:
-        data = problem.data
-        (name,) = row_names(data, [int(np.flatnonzero(data.controlled == "force")[share.argmax()])])
+    if found is not None and found[1] > _OFF:
+        (name,) = row_names(problem.data, [found[0]])
         yield (
-            f"the displacement's third harmonic is predicted to be {percent(share.max())} of "
-            f"its fundamental at {name}: a describing function, which assumes a sine, is "
-            "inaccurate there; control the displacement, or leave such points out"
+            "the describing function, which takes the motion for a sine, is "
+            f"{percent(found[1])} off at {name}: fit with steady='exact'"
         )
 
 
@@ -94,32 +81,47 @@ def negative_parameters(optimum: Optimum) -> Iterator[str]:
             yield f"{parameter.name} is negative, {size}{within}"
 
 
-def _beyond_friction_limit(optimum: Optimum, scatter: float) -> Iterator[str]:
-    """Yield where friction's fundamental exceeds what slip can give, 4/pi of its force limits."""
-    values = parameter_values(optimum)
-    limit = 0.0
-    for element in optimum.problem.model.elements:
+def beyond_friction_limit(
+    optimum: Optimum, scatter: float, aside: Sequence[int]
+) -> Iterator[Finding]:
+    """Yield where friction would have to exceed its limits, rows that are set `aside` not counted.
+
+    Its fundamental is at most 4/pi of them. A sinusoidal force that is held has its peak in
+    common with friction and the linear elements, whose harmonics may be as large as a few times
+    their fundamental. `scatter` is the relative standard deviation of the force between runs.
+    """
+    problem, values = optimum.problem, parameter_values(optimum)
+    bound, u = 0.0, 0.0
+    for element in problem.model.elements:
         if not element.is_linear:
             own = [np.asarray(values[p.name]) for p in element.parameters]
-            limit += float(element.force_bounds(own)[1])
-    if not 0.0 < limit < np.inf:
+            bound += float(element.force_bounds(own)[1])
+            forces = (p for p in element.parameters if p.dimension == (1, 0, 0))
+            u += sum(optimum.stderr.get(p.name, 0.0) for p in forces)
+    if not 0.0 < bound < np.inf:
         return
+    limit = 0.25 * np.pi * bound
+    unit, view = shown_unit("N", problem.data.motion), problem.stiffness_data
+    names = partial(row_names, problem.data)
     force, error = friction_force(optimum)
-    error = np.hypot(error, scatter * limit)
-    excess = (force - limit) / error
-    rows = np.flatnonzero(np.isfinite(excess))
-    if not rows.size:
-        return
-    row = int(rows[np.argmax(excess[rows])])
+    error = np.hypot(error, scatter * bound)
+    force[aside] = np.nan
+    excess = np.nan_to_num((force - bound) / error, nan=-np.inf)
+    row = int(np.argmax(excess))
     dof = 1e9 if optimum.scale_known else max(optimum.dof, 1)
-    if excess[row] > special.stdtrit(dof, 1.0 - _LEVEL / rows.size):
-        unit = shown_unit("N", optimum.problem.data.motion)
-        (name,) = row_names(optimum.problem.data, [row])
-        yield (
-            f"at {name} friction's fundamental is {with_unit(force[row], error[row], unit)}, "
-            f"more than full slip can give ({limit:.3g} {unit}, 4/pi of its limit): something "
-            "besides the model carries force"
-        )
+    if excess[row] > special.stdtrit(dof, 1.0 - _LEVEL / np.isfinite(excess).sum()):
+        shown = {"force": with_unit(force[row], error[row], unit), "limit": f"{bound:.3g} {unit}"}
+        yield Finding(_DESCRIBED, _APPROXIMATE, "beyond_slip", {"row": names([row])[0], **shown})
+    if problem.data.drive is None:
+        return
+    held = (problem.data.controlled == "force") & np.isfinite(force)
+    carried = np.abs(view.stiffness * _sensed(optimum) - friction_stiffness(optimum))
+    carried = _WITH_HARMONICS * carried * view.amplitude
+    beyond = np.where(held, problem.data.drive - carried - limit, -np.inf)
+    row = int(np.argmax(beyond))
+    if beyond[row] > _IMPOSSIBLE * np.hypot(u, scatter * limit):
+        shown = {"carried": f"{carried[row]:.2g} {unit}", "limit": f"{limit:.3g} {unit}"}
+        yield Finding(_DESCRIBED, _APPROXIMATE, "beyond_limit", {"row": names([row])[0], **shown})
 
 
 def friction_force(optimum: Optimum) -> tuple[FloatArray, FloatArray]:
@@ -187,19 +189,7 @@ def below_zero(
     stderr: Mapping[str, float],
     motion: Motion = "translation",
 ) -> Iterator[Finding]:
-    """Yield a finding for every estimate clearly below zero, with what to do.
-
-    Parameters
-    ----------
-    parameters : sequence of Parameter
-        Of masses, dampers and springs; those that are not free were given, and are left out.
-    values, stderr : mapping of str to float
-    motion : {"translation", "rotation"}
-
-    Yields
-    ------
-    Finding
-    """
+    """Yield a finding for every estimate clearly below zero, with what to do."""
     for parameter in parameters:
         value, error = values[parameter.name], stderr.get(parameter.name, 0.0)
         if parameter.free and np.isfinite(value) and value < -_CLEARLY * error:
@@ -216,21 +206,7 @@ def below_zero(
 def slight(
     parameter: Parameter, value: float, error: float, share: float, misfit: float
 ) -> Iterator[Finding]:
-    """Yield a finding where an element carries less force than the model misses.
-
-    Parameters
-    ----------
-    parameter : Parameter
-        Of a mass, damper or spring.
-    value, error : float
-        Estimate and standard uncertainty.
-    share, misfit : float
-        Rms of its force and of the misfit, over that of the measured force.
-
-    Yields
-    ------
-    Finding
-    """
+    """Yield a finding where an element carries less force than the model misses."""
     if parameter.free and share < misfit and value >= -_CLEARLY * error:
         values = {
             "name": parameter.name,

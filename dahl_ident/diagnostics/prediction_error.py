@@ -55,25 +55,7 @@ def prediction_error(
     *,
     of_a_test: bool,
 ) -> PredictionError:
-    """Return the error of a predicted fundamental.
-
-    Parameters
-    ----------
-    errors : ErrorModel
-        Of the fit.
-    slopes : ndarray of complex, shape (n, Q)
-        Derivatives of the logarithm of what is predicted with respect to theta.
-    amplitude, omega : ndarray, shape (n,)
-        Where.
-    stiffness : ndarray of complex, shape (n,) or None
-        Dynamic stiffness there; None leaves out forces in parallel with the model.
-    of_a_test : bool
-        With the scatter and noise of one more test; else of the device itself.
-
-    Returns
-    -------
-    PredictionError
-    """
+    """Return the error of a predicted fundamental."""
     state, names = errors.state, errors.names
     model, basis = state.model, errors.estimate.basis
     where, own = places(amplitude, omega), parts(slopes)
@@ -142,20 +124,13 @@ def _nearest(problem: Problem, amplitude: FloatArray, omega: FloatArray) -> NDAr
 
 
 class Departures(NamedTuple):
-    """Model error at places to come, and what earlier data say of it.
+    """Model error at places to come, and what earlier data say of it."""
 
-    Attributes
-    ----------
-    columns : ndarray, shape (K, 2, W)
-        Changes of ln gain and phase at each place, at unit variance.
-    information : ndarray, shape (Q + W, Q + W)
-        Of theta and of the departures: earlier data, their priors, and the unit variances.
-    assumed : bool
-        Whether its variance is assumed, because residuals are too few to tell it from noise.
-    """
-
-    columns: FloatArray
+    columns: FloatArray  # (K, 2, W): changes of ln gain and phase at each place, at unit variance
+    # (Q + W, Q + W): Of theta and of the departures: earlier data, their priors, and the unit
+    # variances
     information: FloatArray
+    # whether its variance is assumed, because residuals are too few to tell it from noise
     assumed: bool
 
 
@@ -169,21 +144,6 @@ def departures(
     """Return the model error of a fit at other places; None where it has none.
 
     Where residuals are too few to tell it from noise, it is taken to be as large as the noise.
-
-    Parameters
-    ----------
-    errors : ErrorModel
-        Of the fit.
-    slopes : ndarray of complex, shape (K, Q)
-        Derivatives of ln R with respect to theta at the places.
-    amplitude, omega : ndarray, shape (K,)
-        The places.
-    stiffness : ndarray of complex, shape (K,)
-        Dynamic stiffness there.
-
-    Returns
-    -------
-    Departures or None
     """
     sized = {
         _kind(source): variance

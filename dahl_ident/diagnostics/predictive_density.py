@@ -21,30 +21,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.diagnostics.mixed_model import MixedModel, State
 from dahl_ident.fitting import Optimum
 
 _EXACT = 1e-5  # relative errors that count as none
-_ROUNDS = 30  # fixed-point steps of the variances, without a test of convergence
+_RANK = 1e-7  # singular value of the derivatives, over the largest, that counts as none
+_LEAST_LEFT = 1e-9  # of a row's weight, that the others do not determine
 _HEAVY = 4.0  # degrees of freedom of the density with a robust loss
 
 
 @dataclass(frozen=True)
 class PredictiveDensity:
-    """Log densities of tests left out.
+    """Log densities of tests left out."""
 
-    Attributes
-    ----------
-    tests : ndarray, shape (T,)
-        Log density of each test.
-    run : ndarray of int, shape (T,)
-        The run of each.
-    misfit, harmonic_misfit : float
-        Root mean square that the model leaves of the fundamentals, and of all harmonics over the
-        fundamental; NaN where there are none.
-    """
-
-    tests: FloatArray
-    run: NDArray[np.intp]
+    tests: FloatArray  # (T,): log density of each test
+    run: NDArray[np.intp]  # (T,): the run of each
+    # root mean square that the model leaves of the fundamentals, and of all harmonics over the
+    # fundamental; NaN where there are none
     misfit: float
     harmonic_misfit: float
 
@@ -91,22 +84,27 @@ def predictive_density(optimum: Optimum) -> PredictiveDensity:
     y = _parts(missed)
     J = problem.prediction_jacobian(optimum.theta) / size[:, None]
     known = np.isfinite(J).all(axis=0) & (np.abs(J) > 0.0).any(axis=0)
-    columns = [_parts(column) for column in J[:, known].T]
-    P = len(columns)
-    runs = int(run.max()) + 1
-    if runs > 1:
-        relative = predicted / size
-        for turn in (relative, 1j * data.harmonic * relative):
-            columns += [_parts(turn * (run == r)) for r in range(runs)]
-    X = np.array(columns).T if columns else np.zeros((y.size, 0))
-    X = X / np.maximum(np.linalg.norm(X, axis=0), 1e-300) if X.size else X
-    stated = _stated(optimum, size)
-    group = np.repeat(~fundamental, 2).astype(np.intp)
+    X = _orthonormal(np.array([_parts(column) for column in J[:, known].T]).reshape(-1, y.size).T)
+    scatter: list[FloatArray] = []
+    if run.max() > 0:
+        relative, own = predicted / size, run == np.arange(run.max() + 1)[:, None]
+        turns = (relative, 1j * data.harmonic * relative)
+        scatter = [np.array([_parts(turn) for turn in own * one]).T for one in turns]
+    stated, group = _stated(optimum, size), np.repeat(~fundamental, 2).astype(np.intp)
     real = np.repeat(data.harmonic == 0, 2) & (np.arange(y.size) % 2 == 1)
     keep = np.flatnonzero(~real)
-    loo = _LeftOut(y[keep], X[keep], P, runs if runs > 1 else 0, stated[keep], group[keep])
-    robust = optimum.loss != "linear"
-    tests = loo.densities(np.repeat(test, 2)[keep], robust=robust)
+    _, group = np.unique(group[keep], return_inverse=True)
+    groups, y, stated = int(group.max()) + 1, y[keep], stated[keep]
+    own = [group == g for g in range(groups)]
+    beyond = np.array([max(float(np.mean(y[g] ** 2 - stated[g])), 0.0) for g in own])
+    unit = np.sqrt(stated + beyond[group] + _EXACT**2)
+    Z = [one[keep] / unit[:, None] for one in scatter]
+    model = MixedModel(
+        y / unit, X[keep] / unit[:, None], Z, group, np.zeros(groups), groups,
+        np.full(len(Z), np.inf),
+    )  # fmt: skip
+    state = model.reml(np.ones(len(Z)))
+    tests = _densities(state, np.repeat(test, 2)[keep], unit, robust=optimum.loss != "linear")
     first = np.unique(test, return_index=True)[1]
     square = np.abs(missed) ** 2
     others = ~fundamental
@@ -150,69 +148,26 @@ def _stated(optimum: Optimum, size: FloatArray) -> FloatArray:
     return np.asarray(both.ravel())
 
 
-class _LeftOut:
-    """The linear mixed model of deviations."""
+def _densities(
+    state: State, test: NDArray[np.intp], unit: FloatArray, *, robust: bool
+) -> FloatArray:
+    """Return the log density of each test by what all others say."""
+    found = np.empty(int(test.max()) + 1)
+    for number in range(len(found)):
+        rows = np.flatnonzero(test == number)
+        values, vectors = np.linalg.eigh(state.block(rows))
+        values = np.maximum(values, _LEAST_LEFT * state.weights[state.model.group[rows]].max())
+        loss = float(np.sum((vectors.T @ state.weighted[rows]) ** 2 / values))
+        if robust:
+            loss = (_HEAVY + len(rows)) * float(np.log1p(loss / _HEAVY))
+        volume = np.log(values).sum() - len(rows) * np.log(2.0 * np.pi)
+        found[number] = 0.5 * float(volume - loss) - float(np.log(unit[rows]).sum())
+    return found
 
-    def __init__(
-        self,
-        y: FloatArray,
-        X: FloatArray,
-        P: int,
-        runs: int,
-        stated: FloatArray,
-        group: NDArray[np.intp],
-    ) -> None:
-        self.y, self.X, self.P, self.runs, self.group = y, X, P, runs, group
-        self.stated = stated
-        least = _EXACT**2
-        start = [float(np.mean(y[group == g] ** 2)) if (group == g).any() else 0.0 for g in (0, 1)]
-        beyond = np.maximum(start, least)
-        scatter = np.full(2, max(float(np.mean(y**2)), least) * y.size / max(runs, 1))
-        for _ in range(_ROUNDS):
-            self._solve(beyond, scatter)
-            w, left = self.weight, self.left
-            for g in (0, 1):
-                own = group == g
-                if own.any():
-                    wanted = float((w * w * left**2)[own].sum())
-                    expected = float((w * (1.0 - self.leverage))[own].sum())
-                    beyond[g] = max(beyond[g] * wanted / max(expected, 1e-300), least)
-            for i in range(2 if runs else 0):
-                part = slice(P + i * runs, P + (i + 1) * runs)
-                known = max(float(np.trace(self.inverse[part, part])) / scatter[i], 0.0)
-                scatter[i] = float(self.b[part] @ self.b[part]) / max(runs - known, 1e-3)
-                scatter[i] = max(scatter[i], least * 1e-4)
 
-    def _solve(self, beyond: FloatArray, scatter: FloatArray) -> None:
-        self.weight = 1.0 / (self.stated + beyond[self.group])
-        weighted = self.X * self.weight[:, None]
-        M = self.X.T @ weighted
-        if self.runs:
-            M[np.arange(self.P, len(M)), np.arange(self.P, len(M))] += np.repeat(
-                1.0 / scatter, self.runs
-            )
-        self.inverse = np.linalg.pinv(M, rcond=1e-13, hermitian=True)
-        self.b = self.inverse @ (weighted.T @ self.y)
-        self.left = self.y - self.X @ self.b
-        self.weighted = weighted
-        self.leverage = np.einsum("mi,ij,mj->m", weighted, self.inverse, self.X)
-
-    def densities(self, test: NDArray[np.intp], *, robust: bool) -> FloatArray:
-        """Return the log density of each test."""
-        found = np.empty(int(test.max()) + 1)
-        order = np.argsort(test, kind="stable")
-        count = np.bincount(test)
-        start = np.cumsum(count) - count
-        for size in np.unique(count).tolist():  # tests of one size at once
-            tests = np.flatnonzero(count == size)
-            rows = order[start[tests][:, None] + np.arange(size)]
-            part, weight = self.weighted[rows], self.weight[rows]
-            block = weight[:, :, None] * np.eye(size) - part @ self.inverse @ part.swapaxes(1, 2)
-            values, vectors = np.linalg.eigh(block)
-            values = np.maximum(values, 1e-9 * weight.max(axis=1, keepdims=True))
-            z = np.einsum("tij,ti->tj", vectors, weight * self.left[rows])
-            loss = np.sum(z * z / values, axis=1)
-            if robust:
-                loss = (_HEAVY + size) * np.log1p(loss / _HEAVY)
-            found[tests] = 0.5 * (np.log(values).sum(axis=1) - size * np.log(2.0 * np.pi) - loss)
-        return found
+def _orthonormal(columns: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of what the columns (m, k) span."""
+    if columns.shape[1] == 0:
+        return columns
+    U, size, _ = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), full_matrices=False)
+    return np.asarray(U[:, size > _RANK * size[0]])

@@ -18,46 +18,23 @@ from dahl_ident.problem import Problem
 
 @dataclass(frozen=True)
 class RunDeviations:
-    """How each of R runs deviates from theta.
+    """How each of R runs deviates from theta."""
 
-    Attributes
-    ----------
-    labels : ndarray of str, shape (R,)
-        The runs.
-    theta : ndarray, shape (R, Q)
-        Added to the search coordinates.
-    gain, phase : ndarray, shape (R,)
-        Added to ln gain, and to the phase of the fundamental, rad.
-    """
-
-    labels: NDArray[np.str_]
-    theta: FloatArray
-    gain: FloatArray
+    labels: NDArray[np.str_]  # (R,): the runs
+    theta: FloatArray  # (R, Q): added to the search coordinates
+    gain: FloatArray  # (R,): added to ln gain, and to the phase of the fundamental, rad
     phase: FloatArray
 
 
 @dataclass(frozen=True)
 class Linearization:
-    """Residuals (m,) of a problem's data, linearised at theta and the deviations of runs.
+    """Residuals (m,) of a problem's data, linearised at theta and the deviations of runs."""
 
-    Attributes
-    ----------
-    residuals : ndarray, shape (m,)
-        Residuals of each run at its own parameters.
-    J : ndarray, shape (m, Q)
-        Their derivatives with respect to theta.
-    predicted : ndarray of complex, shape (n,)
-        Responses, each run's at its own parameters.
-    fitted : ndarray of complex, shape (n,)
-        The same with each run's gain and phase.
-    parts : sequence of (Problem, ndarray, ndarray)
-        Problems, the rows (n,) that are theirs, and the theta of each.
-    """
-
-    residuals: FloatArray
-    J: FloatArray
-    predicted: ComplexArray
-    fitted: ComplexArray
+    residuals: FloatArray  # (m,): residuals of each run at its own parameters
+    J: FloatArray  # (m, Q): their derivatives with respect to theta
+    predicted: ComplexArray  # (n,): responses, each run's at its own parameters
+    fitted: ComplexArray  # (n,): the same with each run's gain and phase
+    # problems, the rows (n,) that are theirs, and the theta of each
     parts: Sequence[tuple[Problem, NDArray[np.bool_], FloatArray]]
 
     def change(self, changes: ComplexArray) -> FloatArray:
@@ -104,21 +81,7 @@ def run_deviations(
     problem: Problem, theta: FloatArray, mean: FloatArray, effects: FloatArray,
     spread: FloatArray, noise: float,
 ) -> RunDeviations:  # fmt: skip
-    """Return how runs deviate, where each run's residuals and deviations together are least.
-
-    Parameters
-    ----------
-    problem : Problem
-        Its data have runs.
-    theta, mean : ndarray, shape (Q,)
-        Where residuals are known, and how far the mean of the runs is from there.
-    effects : ndarray, shape (R, Q + 2)
-        Deviations of parameters, gain and phase from the mean, to start from.
-    spread : ndarray, shape (Q + 2,)
-        Their standard deviations between runs, 0 where none scatters.
-    noise : float
-        Standard deviation of the residuals.
-    """
+    """Return how runs deviate, where each run's residuals and deviations together are least."""
     labels, scatters = np.unique(np.asarray(problem.data.run)), spread > 0.0
     unit, b = spread[scatters], effects.copy()
     for last in (False, False, True):

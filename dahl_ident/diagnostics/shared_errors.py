@@ -13,18 +13,7 @@ _SAME = 1e-6  # of the noise's variance: as stated
 
 
 def row_errors(errors: ErrorModel) -> RowErrors | None:
-    """Return the covariance of the residuals by all sources; None where they are independent.
-
-    Parameters
-    ----------
-    errors : ErrorModel
-        Its assumed parameters are free in the posterior, so they are not a source here.
-
-    Returns
-    -------
-    RowErrors or None
-        None where noise of one scale is the only source.
-    """
+    """Return the covariance of the residuals by all sources; None where they are independent."""
     problem, estimate, m = errors.problem, errors.estimate, errors.problem.n_residuals
     as_stated = estimate.misfit == 0.0 and (errors.noises < 1.0 + _SAME).all()
     if not errors.sources and (as_stated or not problem.scale_known):

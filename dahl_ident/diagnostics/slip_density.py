@@ -69,13 +69,7 @@ class SlipDensity:
         return sentence("jenkins_bound", {"least": self.least_misfit, "law": False})
 
     def law(self) -> MaxwellSlip:
-        """Return the density as an element: its Jenkins elements and the spring, as fixed values.
-
-        Raises
-        ------
-        ModelError
-            If nothing has any stiffness.
-        """
+        """Return the density as an element: Jenkins elements and the spring, as fixed values."""
         slips, stiff = self.slip, self.stiffness
         if self.spring > 0.0:
             slips = np.append(slips, 1e6 * slips[-1])

@@ -36,26 +36,14 @@ LEAST_DOF = 6  # with fewer, no test of residuals of unknown scale applies
 
 @dataclass(frozen=True)
 class Stiffening:
-    """The largest rise of stiffness with amplitude that the data show, against its error.
+    """The largest rise of stiffness with amplitude that the data show, against its error."""
 
-    Attributes
-    ----------
-    low, high : float
-        The amplitudes between which it rises: means over their bands, geometric.
-    unit : str
-        Theirs.
-    rise, stderr : float
-        Relative to the stiffness at `low`.
-    p_value : float
-        Probability of as much by noise alone, all pairs of bands considered.
-    """
-
-    low: float
+    low: float  # the amplitudes between which it rises: means over their bands, geometric
     high: float
-    unit: str
-    rise: float
+    unit: str  # theirs
+    rise: float  # relative to the stiffness at `low`
     stderr: float
-    p_value: float
+    p_value: float  # probability of as much by noise alone, all pairs of bands considered
 
     def __str__(self) -> str:
         size = with_unit(100.0 * self.rise, 100.0 * self.stderr, "%")

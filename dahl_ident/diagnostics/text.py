@@ -136,19 +136,36 @@ def _suspicious(names: Sequence[str], neighbours: str) -> str:
     return f"Suspicious rows: {rows}; check them (a robust loss down-weights these rows)."
 
 
-def _flagged(points: Sequence[str]) -> str:
+def _flagged(points: Sequence[str], every: bool) -> str:
     which = joined(points, _MOST_ROWS)
+    if every:
+        return f"The extraction flagged every point fitted ({which}): measure them again."
     return (
         f"The extraction flagged {len(points)} of the points fitted ({which}): measure them again, "
         "or select the good ones."
     )
 
 
-def _held_out(tests: int, available: int, inside: int, count: int, width: float) -> str:
+def _beyond_limit(row: str, carried: str, limit: str) -> str:
+    return (
+        f"At {row} the force held exceeds friction's limit ({limit}) by more than the other "
+        f"elements carry ({carried}): the limit is wrong, or an element is missing."
+    )
+
+
+def _beyond_slip(row: str, force: str, limit: str) -> str:
+    return (
+        f"At {row} friction's fundamental is {force}, more than full slip can give ({limit}, 4/pi "
+        "of its limit): an element is missing."
+    )
+
+
+def _held_out(tests: int, available: int, gains: int, phases: int, rows: int, width: float) -> str:
     of = "" if tests == available else f" of {available}"
     return (
-        f"Leaving out each of {tests}{of} tests in turn, {inside} of {count} held-out gains and "
-        f"phases are inside their 95 % bands (half width {100.0 * width:.2g} %)."
+        f"Fitted without each of {tests}{of} tests in turn, {gains} of {rows} held-out gains and "
+        f"{phases} of {rows} phases of fundamentals are inside their 95 % bands "
+        f"(half width {100.0 * width:.2g} %)."
     )
 
 
@@ -310,6 +327,8 @@ _TEXT: Mapping[str, Callable[..., str]] = {
     "suspicious": _suspicious,
     "jenkins_bound": _jenkins_bound,
     "flagged": _flagged,
+    "beyond_limit": _beyond_limit,
+    "beyond_slip": _beyond_slip,
     "held_out": _held_out,
     "narrow_bands": _narrow_bands,
     "constraint": _constraint,

@@ -38,33 +38,20 @@ _FARTHEST = 9.0  # departure that is
 
 @dataclass(frozen=True)
 class Trend:
-    """How the data depart from the fitted model along one covariate.
+    """How the data depart from the fitted model along one covariate."""
 
-    Attributes
-    ----------
-    covariate : str
-        "amplitude", "frequency" or "drive".
-    low, high : float
-        Its range, SI units (Hz for frequency).
-    stiffness, loss : Coefficient
-        Change of the data's real and imaginary part of the friction force per displacement,
-        against the model and relative to it, from `low` to `high`; a straight line over the
-        covariate's logarithm. Natural logarithms: -0.36 is a fall by 30 %. The stiffness is that
-        of friction and springs together where the data know only their sum.
-    largest : float
-        Largest relative departure of the response that the smooth curve finds.
-    p_value : float
-        Probability of as much departure by noise alone.
-    """
-
-    covariate: str
-    low: float
+    covariate: str  # "amplitude", "frequency" or "drive"
+    low: float  # its range, SI units (Hz for frequency)
     high: float
     unit: str
+    # change of the data's real and imaginary part of the friction force per displacement, against
+    # the model and relative to it, from `low` to `high`; a straight line over the covariate's
+    # logarithm. Natural logarithms: -0.36 is a fall by 30 %. The stiffness is that of friction and
+    # springs together where the data know only their sum
     stiffness: Coefficient
     loss: Coefficient
-    largest: float
-    p_value: float
+    largest: float  # largest relative departure of the response that the smooth curve finds
+    p_value: float  # probability of as much departure by noise alone
 
     def __str__(self) -> str:
         ends = f"from {self.low:.3g} to {self.high:.3g} {self.unit}".rstrip()

@@ -36,22 +36,14 @@ _CHECKED_DRAWS = 25  # at which the number of steady amplitudes is counted
 
 @dataclass(frozen=True)
 class BenchLimits:
-    """Limits of the bench; lower limits are 0 where only the upper limit is given.
+    """Limits of the bench; lower limits are 0 where only the upper limit is given."""
 
-    Attributes
-    ----------
-    displacement, force, speed, acceleration, frequency_hz : (float, float)
-        Zero-to-peak, SI.
-    time : float
-        Seconds for everything.
-    """
-
-    displacement: tuple[float, float] = (0.0, np.inf)
+    displacement: tuple[float, float] = (0.0, np.inf)  # zero-to-peak, SI
     force: tuple[float, float] = (0.0, np.inf)
     speed: tuple[float, float] = (0.0, np.inf)
     acceleration: tuple[float, float] = (0.0, np.inf)
     frequency_hz: tuple[float, float] = (0.0, np.inf)
-    time: float = np.inf
+    time: float = np.inf  # seconds for everything
 
     @classmethod
     def of(cls, given: Mapping[str, Any] | None) -> BenchLimits:
@@ -95,18 +87,10 @@ class BenchLimits:
 
 @dataclass(frozen=True)
 class CycleNoise:
-    """Noise of one cycle: relative to the response, and floors of force and displacement.
+    """Noise of one cycle: relative to the response, and floors of force and displacement."""
 
-    Attributes
-    ----------
-    relative : float
-        Standard deviation of ln gain and of phase.
-    force, displacement : float
-        Standard deviation of each part of the fundamental, N and m.
-    """
-
-    relative: float
-    force: float = 0.0
+    relative: float  # standard deviation of ln gain and of phase
+    force: float = 0.0  # standard deviation of each part of the fundamental, N and m
     displacement: float = 0.0
 
     def variance(self, force: FloatArray, amplitude: FloatArray) -> FloatArray:
@@ -118,33 +102,19 @@ class CycleNoise:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Levels and frequencies with all data that the search needs.
+    """Levels and frequencies with all data that the search needs."""
 
-    Attributes
-    ----------
-    controlled : {"displacement", "force"}
-        What `level` is an amplitude of.
-    level, frequency_hz : ndarray, shape (K,)
-        SI.
-    amplitude, force : ndarray, shape (S, K)
-        Of displacement and of force, at every draw.
-    rows, offsets : ndarray, shape (S, K, 2, P) and (S, K, 2, 2)
-        Derivatives of the whitened residuals of one cycle, by parameters and by a run's gain and
-        phase.
-    variance : ndarray, shape (S, K)
-        Of ln gain and phase in one cycle.
-    motions : tuple of PlannedMotion
-        Motions in time whose periods the cycles are; empty for sines.
-    """
-
-    controlled: str
-    level: FloatArray
+    controlled: str  # what `level` is an amplitude of
+    level: FloatArray  # (K,): SI
     frequency_hz: FloatArray
-    amplitude: FloatArray
+    amplitude: FloatArray  # (S, K): of displacement and of force, at every draw
     force: FloatArray
+    # (S, K, 2, P): derivatives of the whitened residuals of one cycle, by parameters and by a run's
+    # gain and phase
     rows: FloatArray
     offsets: FloatArray
-    variance: FloatArray
+    variance: FloatArray  # (S, K): of ln gain and phase in one cycle
+    # motions in time whose periods the cycles are; empty for sines
     motions: tuple[PlannedMotion, ...] = ()
 
     @property

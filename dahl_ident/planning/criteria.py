@@ -34,22 +34,13 @@ _POWER = 4.0  # q: 1 would add the targets' variances, infinity would use only t
 
 @dataclass(frozen=True)
 class LevelInformation:
-    """Information of one cycle at every candidate, for every draw of the parameters.
+    """Information of one cycle at every candidate, for every draw of the parameters."""
 
-    Attributes
-    ----------
-    packed : ndarray, shape (..., K, S Q Q)
-        Q = P, or P + 2 with the gain and the phase of the run behind the parameters.
-    draws, parameters : int
-        S and P.
-    scatter : float
-        s, standard deviation of a run's ln gain and phase; 0 where runs do not differ.
-    """
-
+    # (..., K, S Q Q): Q = P, or P + 2 with the gain and the phase of the run behind the parameters
     packed: FloatArray
-    draws: int
+    draws: int  # S and P
     parameters: int
-    scatter: float
+    scatter: float  # s, standard deviation of a run's ln gain and phase; 0 where runs do not differ
 
     @classmethod
     def of(cls, rows: FloatArray, offsets: FloatArray, scatter: float) -> LevelInformation:
@@ -87,29 +78,16 @@ class LevelInformation:
 
 @dataclass(frozen=True)
 class Term:
-    """One criterion on one model: D-optimal, or targets.
+    """One criterion on one model: D-optimal, or targets."""
 
-    Attributes
-    ----------
-    levels : LevelInformation
-        Of the candidates.
-    known : ndarray, shape (S, P, P)
-        Information before the plan.
-    targets : ndarray, shape (S, P, C), or None
-        Directions over their wanted standard uncertainties; None: D-optimality.
-    starts : ndarray of int, shape (T,), or None
-        First column of each target, whose variances are added; None: a column each.
-    weight : float
-        In the sum of the terms.
-    departures : int
-        Number of parameters, the last ones, whose uncertainty does not matter by itself.
-    """
-
-    levels: LevelInformation
-    known: FloatArray
+    levels: LevelInformation  # of the candidates
+    known: FloatArray  # (S, P, P): information before the plan
+    # (S, P, C): directions over their wanted standard uncertainties; None: D-optimality
     targets: FloatArray | None = None
+    # (T,): first column of each target, whose variances are added; None: a column each
     starts: NDArray[np.intp] | None = None
-    weight: float = 1.0
+    weight: float = 1.0  # In the sum of the terms
+    # number of parameters, the last ones, whose uncertainty does not matter by itself
     departures: int = 0
 
     def value_and_slope(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -146,18 +124,10 @@ class DesignPoint:
 
 @dataclass(frozen=True)
 class Objective:
-    """The weighted sum of terms, as a function of the cycles of every candidate in one run.
+    """The weighted sum of terms, as a function of the cycles of every candidate in one run."""
 
-    Attributes
-    ----------
-    terms : tuple of Term
-        Of the same candidates.
-    runs : int
-        R, runs alike.
-    """
-
-    terms: tuple[Term, ...]
-    runs: int = 1
+    terms: tuple[Term, ...]  # of the same candidates
+    runs: int = 1  # R, runs alike
 
     @property
     def candidates(self) -> int:

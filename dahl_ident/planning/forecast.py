@@ -40,36 +40,19 @@ _PLACES = 24  # of the candidates, over which the response is averaged
 
 @dataclass(frozen=True)
 class Forecast:
-    """Candidates, the information before them, and the uncertainties after some of them.
+    """Candidates, the information before them, and the uncertainties after some of them."""
 
-    Attributes
-    ----------
-    knowledge : Knowledge
-        Before the plan.
-    candidates : Candidates
-        With derivatives with respect to scaled parameters and W departures, Q together.
-    before : ndarray, shape (S, Q, Q)
-        Information of the earlier data as their fit judges it.
-    searched : ndarray, shape (S, Q, Q)
-        The same for the choice of levels: with ranges, and an assumed model error.
-    directions : mapping of str to ndarray, shape (S, Q, c)
-        Relative changes of each quantity; the squares of several columns are added.
-    scatter : float
-        Standard deviation of ln gain and phase between runs.
-    model_error : {"none", "assumed", "estimated"}
-        Of the earlier fit.
-    draws : ndarray of int, shape (S,)
-        Which of the draws of the plan.
-    """
-
-    knowledge: Knowledge
+    knowledge: Knowledge  # before the plan
+    # with derivatives with respect to scaled parameters and W departures, Q together
     candidates: Candidates
-    before: FloatArray
+    before: FloatArray  # (S, Q, Q): information of the earlier data as their fit judges it
+    # (S, Q, Q): the same for the choice of levels: with ranges, and an assumed model error
     searched: FloatArray
+    # (S, Q, c): relative changes of each quantity; the squares of several columns are added
     directions: Mapping[str, FloatArray]
-    scatter: float
-    model_error: str
-    draws: NDArray[np.intp]
+    scatter: float  # standard deviation of ln gain and phase between runs
+    model_error: str  # of the earlier fit
+    draws: NDArray[np.intp]  # (S,): which of the draws of the plan
 
     @classmethod
     def of(

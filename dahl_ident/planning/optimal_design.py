@@ -33,21 +33,11 @@ _MOST_LEVELS = 24  # an optimum of six parameters takes at most 21 (Caratheodory
 
 @dataclass(frozen=True)
 class ContinuousDesign:
-    """Seconds at each candidate.
+    """Seconds at each candidate."""
 
-    Attributes
-    ----------
-    seconds : ndarray, shape (K,)
-        Their sum is the time given.
-    value : float
-        The criterion.
-    excess : float
-        Largest d_k/d - 1 over all candidates: 0 at the optimum.
-    """
-
-    seconds: FloatArray
-    value: float
-    excess: float
+    seconds: FloatArray  # (K,): their sum is the time given
+    value: float  # the criterion
+    excess: float  # largest d_k/d - 1 over all candidates: 0 at the optimum
 
 
 def continuous_design(
@@ -133,21 +123,11 @@ class Selection:
 
 @dataclass(frozen=True)
 class Coverage:
-    """What levels need so that their data can be judged.
+    """What levels need so that their data can be judged."""
 
-    Attributes
-    ----------
-    fewest : int
-        Number of levels, at least.
-    span : float
-        ln of the largest displacement amplitude over the smallest, at least.
-    amplitude : ndarray, shape (K,)
-        ln of the displacement amplitude of every candidate.
-    """
-
-    fewest: int
-    span: float
-    amplitude: FloatArray
+    fewest: int  # number of levels, at least
+    span: float  # ln of the largest displacement amplitude over the smallest, at least
+    amplitude: FloatArray  # (K,): ln of the displacement amplitude of every candidate
 
     def wide(self, levels: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Return which sets of levels, (..., m), span enough."""

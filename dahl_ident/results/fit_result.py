@@ -203,7 +203,7 @@ class FitResult(Fit):
     def cross_validation(self) -> CrossValidation | None:
         """Held-out tests against their bands; None without tests to hold out."""
         errors = self.errors_of_combinations
-        return None if errors is None else cross_validation(errors)
+        return None if errors is None else cross_validation(errors.left_out)
 
     @cached_property
     def fundamentals(self) -> FitResult | None:
