@@ -288,10 +288,11 @@ def compare(scenario: Scenario, count: int, seed: int, whole: int = 0) -> Iterat
     With `count` tables and `whole` experiments of each design.
     """
     first = scenario.plan(1e6, None, candidates=60)
-    planner: Any = first.planner
-    bench, levels = planner.search.bench, planner.search.logarithmic_grid(1e6, scenario.levels)[0]
+    bench, grid = first.search.bench, first.search.logarithmic_grid(1e6, scenario.levels)
+    assert grid is not None
+    levels = grid[0]
     time = bench.seconds(levels, np.full(len(levels), float(CYCLES)))
-    options = planner.forecast.candidates
+    options = first.search.forecast.candidates
     even = Design(
         options.level[levels], options.frequency_hz[levels], np.full(len(levels), float(CYCLES)),
         bench.settling_cycles(levels),

@@ -21,8 +21,13 @@ from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import solve_many
 from dahl_ident.planning import Plan, forecast
 from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
-from dahl_ident.planning.criteria import LevelInformation, Objective, Term
-from dahl_ident.planning.optimal_design import Exchange, continuous_design
+from dahl_ident.planning.design import (
+    Exchange,
+    Objective,
+    Term,
+    continuous_design,
+    packed_information,
+)
 from dahl_ident.problem import ProblemBatch
 
 F_MAX, SIGMA = 0.1, 30.0
@@ -39,10 +44,10 @@ def _objective(
     rng = np.random.default_rng(seed)
     rows = rng.standard_normal((draws, K, 2, P)) * rng.lognormal(0.0, 1.0, (1, K, 1, 1))
     offsets = np.broadcast_to(np.eye(2), (draws, K, 2, 2))
-    levels = LevelInformation.of(rows, offsets, scatter)
     known = np.broadcast_to(1e-9 * np.eye(P), (draws, P, P))
     wanted = rng.standard_normal((draws, P, targets)) if targets else None
-    return Objective((Term(levels, known, wanted),))
+    packed = packed_information(rows, offsets, scatter)
+    return Objective((Term(packed, known, scatter, wanted),))
 
 
 def _bench(seed: int, K: int) -> BenchTime:
@@ -60,7 +65,7 @@ class TestContinuousDesign:
         design = continuous_design(objective, f, time, tolerance=1e-3, iterations=4000)
         term = objective.terms[0]
         # by the matrices themselves, not by the derivative that the search used
-        packed = term.levels.packed.reshape(200, P, P)
+        packed = term.packed.reshape(200, P, P)
         M = np.einsum("k,kij->ij", design.seconds * f, packed)
         rate = np.einsum("ij,kji->k", np.linalg.inv(M), packed) * f * time
         assert rate.max() <= P * 1.0011
@@ -75,7 +80,7 @@ class TestContinuousDesign:
         assert design.excess < 1e-2
         for _ in range(200):
             other = design.seconds * rng.lognormal(0.0, 0.5, 40) + rng.exponential(0.02, 40)
-            assert objective.at(other * (10.0 / other.sum())).value <= design.value + 1e-4
+            assert objective.at(other * (10.0 / other.sum()))[0] <= design.value + 1e-4
 
     @pytest.mark.parametrize(
         "change",
@@ -85,18 +90,18 @@ class TestContinuousDesign:
         objective = _objective(3, 6, 3, targets=3, scatter=0.2)
         objective = replace(objective, terms=(replace(objective.terms[0], **change),))
         cycles = np.random.default_rng(1).uniform(1.0, 9.0, 6)
-        gradient = objective.gradient(objective.at(cycles))
+        gradient = objective.gradient(objective.at(cycles)[1])
         for k in range(6):
             step = np.where(np.arange(6) == k, 1e-5, 0.0)
-            up, down = objective.at(cycles + step).value, objective.at(cycles - step).value
+            (up, _), (down, _) = objective.at(cycles + step), objective.at(cycles - step)
             assert gradient[k] == pytest.approx((up - down) / 2e-5, rel=1e-5)
 
     def test_scatter_of_a_run_is_two_more_parameters(self) -> None:
         rng = np.random.default_rng(8)
         rows = rng.standard_normal((1, 5, 2, 3))
-        levels = LevelInformation.of(rows, np.broadcast_to(np.eye(2), (1, 5, 2, 2)), 0.4)
+        packed = packed_information(rows, np.broadcast_to(np.eye(2), (1, 5, 2, 2)), 0.4)
         cycles = rng.uniform(1.0, 5.0, 5)
-        found, _ = levels.of_run(cycles @ levels.packed)
+        found, _ = Term(packed, np.zeros((1, 3, 3)), 0.4).of_run(cycles)
         # generalised least squares with the covariance of all rows written out
         J = rows[0].reshape(10, 3)
         shared = np.tile(np.eye(2), (5, 1))
@@ -203,7 +208,7 @@ def _brute_force(objective: Objective, bench: BenchTime, time: float, most: int)
     """Return the best criterion over all sets of levels and whole cycles that use the time."""
     best = -np.inf
     for size in range(1, most + 1):
-        for levels in itertools.combinations(range(objective.candidates), size):
+        for levels in itertools.combinations(range(len(objective.terms[0].packed)), size):
             ordered = bench.order(levels)
             f, room = bench.frequency_hz[ordered], time - bench.fixed(ordered)
             sub = objective.only(ordered)
@@ -215,8 +220,7 @@ def _brute_force(objective: Objective, bench: BenchTime, time: float, most: int)
                 if last >= LEAST_CYCLES:
                     designs.append([*some, last])
             if designs:
-                packed = sub.terms[0].levels.packed
-                best = max(best, float(sub.values([np.array(designs) @ packed]).max()))
+                best = max(best, float(sub.at(np.array(designs, dtype=float))[0].max()))
     return best
 
 
@@ -231,8 +235,22 @@ class TestPlan:
 
     def test_it_beats_a_logarithmic_grid(self) -> None:
         plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 25}, noise=0.02, target="f_max")
-        even = plan.planner.forecast.expected(*plan.planner.search.logarithmic_grid(25.0))
+        even = plan.search.expected_after(25.0, grid=True)
         assert even["f_max"].after > 1.5 * plan.expected["f_max"].after
+
+    @pytest.mark.parametrize("model", [LINEAR, di.Dahl()])
+    def test_data_of_the_shortest_plan_can_be_used(self, model: Any) -> None:
+        """One level would be enough for the friction force, were it certain that it slips."""
+        limits = {"displacement": (1e-4, 10.0 * X_C), "frequency_hz": 5.0}
+        ranges, target = {"f_max": (0.05, 0.2), "sigma": (15.0, 60.0)}, {"f_max": 0.02}
+        plan = di.plan(model, ranges=ranges, limits=limits, noise=0.01, target=target)
+        assert plan.reached
+        usable = [_status(plan, model, 0.01, seed) != "not determined" for seed in range(30)]
+        assert sum(usable) >= 29
+        short = di.plan(model, ranges=ranges, noise=0.01, target=target,
+                        limits={**limits, "time": 0.5 * plan.seconds})  # fmt: skip
+        assert not short.reached
+        assert "too few to tell a wrong model from noise" in str(short)
 
     @pytest.mark.parametrize("known", [False, True])
     def test_its_data_alone_can_be_used(self, known: bool) -> None:
@@ -285,11 +303,12 @@ class TestPlan:
         assert less.seconds <= 0.93 * plan.seconds
 
     def test_a_time_that_rounding_exceeds_still_counts(self) -> None:
-        """Whole cycles fill the first time tried but for rounding; a twentieth is enough."""
+        """Whole cycles fill the first time tried but for rounding; a tenth is enough."""
         limits = {"displacement": (1e-4, 1e-2), "frequency_hz": 5.0}
         ranges = {"f_max": (0.05, 0.2), "sigma": (15.0, 60.0)}
         wanted = {"f_max": 0.01, "sigma": 0.01}
-        plan = di.plan(di.Dahl(), ranges=ranges, limits=limits, noise=0.01, target=wanted)
+        plan = di.plan(di.Dahl(), ranges=ranges, limits=limits, noise=0.01, target=wanted,
+                       change_over=0.5)  # fmt: skip
         assert plan.reached
         assert plan.seconds < 5.0
 
@@ -307,7 +326,7 @@ class TestPlan:
             LINEAR, ranges={"f_max": (0.05, 0.2), "sigma": (15.0, 60.0)}, controlled="force",
             noise=0.01, limits={"force": 1.0, "frequency_hz": 5.0, "time": 60.0}, candidates=60,
         )  # fmt: skip
-        draws = plan.planner.forecast.knowledge.values
+        draws = plan.search.forecast.knowledge.values
         assert max(step.level for step in plan.steps) < draws[:, 0].min()
 
     def test_earlier_data_shorten_it(self) -> None:
@@ -534,6 +553,18 @@ class TestProof:
         for name, error in got.items():
             # of 30 records the error of a standard deviation is 13 %
             assert error == pytest.approx(plan.expected[name].after, rel=0.4)
+
+
+def _status(plan: Plan, model: Any, noise: float, seed: int) -> str:
+    """Return the status of a fit to a table that was measured as the plan says."""
+    A = np.array([step.level for step in plan.steps])
+    std = noise / np.sqrt([step.measured_cycles for step in plan.steps])
+    pair = np.random.default_rng(seed).standard_normal((2, len(A)))
+    response = di.Dahl(F_MAX, SIGMA, alpha=1.0).describing_function(A)
+    response = response * np.exp(std * (pair.T @ [1.0, 1.0j]))
+    covariance = (std * np.abs(response))[:, None, None] ** 2 * np.eye(2)
+    data = FrequencyResponse(np.full(len(A), 5.0), response, A, covariance=covariance)
+    return di.fit(data, model).status.value
 
 
 def _errors(plan: Plan, truth: di.Model, noise: float, count: int) -> FloatArray:

@@ -12,25 +12,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.quantities import DEFINITIONS
 from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.prediction_error import Departures, departures
 from dahl_ident.planning.candidates import Candidates
-from dahl_ident.planning.criteria import NOTHING, Term
-from dahl_ident.planning.knowledge import Knowledge
-from dahl_ident.planning.measurement_plan import Expected
-from dahl_ident.planning.quantities import (
-    RESPONSE,
-    direction,
-    is_expanded,
-    least_factor,
-    product,
-    sizes,
-)
+from dahl_ident.planning.design import Term, packed_information
+from dahl_ident.planning.knowledge import Knowledge, spread
+from dahl_ident.planning.question import RESPONSE, Question, is_expanded, least_factor, powers_of
 
+NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _ROUNDING = 1e-14  # of a parameter's information: less is rounding, and could cancel to nothing
 _NONE = 1e12  # information on departures that are left out
 SEARCHED = 24  # draws that the search for levels averages over
@@ -39,51 +31,84 @@ _PLACES = 24  # of the candidates, over which the response is averaged
 
 
 @dataclass(frozen=True)
-class Forecast:
-    """Candidates, the information before them, and the uncertainties after some of them."""
+class Expected:
+    """Predicted relative standard uncertainty of a quantity; of ``"U(...)"`` the expanded one.
 
-    knowledge: Knowledge  # before the plan
-    # with derivatives with respect to scaled parameters and W departures, Q together
+    Attributes
+    ----------
+    value : float
+        Median over the draws; NaN of the response.
+    before, after : float
+        Relative standard uncertainty from the earlier data, and with the plan's data; inf where
+        nothing is known. Geometric mean over the draws.
+    low, high : float
+        Tenth and ninetieth percentile of `after` over the draws.
+    scatter_share : float
+        Fraction of the variance that is due to scatter between runs.
+    """
+
+    value: float
+    before: float
+    after: float
+    low: float
+    high: float
+    scatter_share: float
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Candidates, the information before them, and the uncertainties after some of them.
+
+    Attributes
+    ----------
+    knowledge : Knowledge
+        Before the plan.
+    candidates : Candidates
+        With derivatives with respect to scaled parameters and W departures, Q together.
+    before : ndarray, shape (S, Q, Q)
+        Information of the earlier data as their fit judges it.
+    searched : ndarray, shape (S, Q, Q)
+        The same for the choice of levels: with ranges, and an assumed model error.
+    directions : mapping of str to ndarray, shape (S, Q, c)
+        Relative changes of each quantity; the squares of several columns are added.
+    scatter : float
+        Standard deviation of ln gain and phase between runs.
+    model_error : {"none", "assumed", "estimated"}
+        Of the earlier fit.
+    """
+
+    knowledge: Knowledge
     candidates: Candidates
-    before: FloatArray  # (S, Q, Q): information of the earlier data as their fit judges it
-    # (S, Q, Q): the same for the choice of levels: with ranges, and an assumed model error
+    before: FloatArray
     searched: FloatArray
-    # (S, Q, c): relative changes of each quantity; the squares of several columns are added
     directions: Mapping[str, FloatArray]
-    scatter: float  # standard deviation of ln gain and phase between runs
-    model_error: str  # of the earlier fit
-    draws: NDArray[np.intp]  # (S,): which of the draws of the plan
+    scatter: float
+    model_error: str
 
     @classmethod
-    def of(
-        cls,
-        knowledge: Knowledge,
-        candidates: Candidates,
-        wanted: Mapping[str, float],
-        scatter: float,
-    ) -> Forecast:
-        """Return the forecast of candidates and wanted quantities."""
-        size = sizes(knowledge.parameters, knowledge.theta)
-        rows = candidates.rows * size
-        known = knowledge.information * np.outer(size, size)
-        searched = known + knowledge.prior * np.outer(size, size)
+    def of(cls, question: Question, candidates: Candidates) -> Forecast:
+        """Return the forecast of candidates and of the quantities asked for."""
+        knowledge, units = question.knowledge, question.knowledge.units
+        rows, square = candidates.rows * units, np.outer(units, units)
+        known = knowledge.information * square
+        searched = known + np.diag(knowledge.prior) * square
         error, model_error = _departures(knowledge, candidates), "none"
         if error is not None:
             model_error = "assumed" if error.assumed else "estimated"
-            own = error.columns / np.sqrt(candidates.variance)[..., None, None]
-            rows = np.concatenate([rows, own], axis=-1)
-            known, searched = _joint(known, searched, error, size)
+            rows = np.concatenate([rows, error.columns * candidates.weight], axis=-1)
+            known, searched = _joint(known, searched, error, units)
         candidates = replace(candidates, rows=rows)
-        directions = {}
-        for name in (*knowledge.names, *(n for n in wanted if n != RESPONSE)):
-            change = direction(name, knowledge.parameters, knowledge.values) * size
-            padded = np.zeros((len(change), known.shape[-1]))
-            padded[:, : len(size)] = change
-            directions[name] = padded[..., None]
-        if RESPONSE in wanted:
+        directions, positive = {}, [p.positive for p in knowledge.parameters]
+        for name in (*knowledge.names, *(n for n in question.target if n != RESPONSE)):
+            change = np.zeros((len(known), known.shape[-1]))
+            powers = powers_of(name, knowledge.names)
+            change[:, : units.size] = powers * units / np.where(positive, 1.0, knowledge.values)
+            directions[name] = change[..., None]
+        if RESPONSE in question.target:
             directions[RESPONSE] = _response(candidates)
-        draws = np.arange(len(known))
-        return cls(knowledge, candidates, known, searched, directions, scatter, model_error, draws)
+        return cls(
+            knowledge, candidates, known, searched, directions, question.scatter, model_error
+        )
 
     @property
     def departures(self) -> int:
@@ -92,9 +117,8 @@ class Forecast:
 
     def thinned(self) -> Forecast:
         """Return the forecast at the few draws that a search averages over."""
-        S = len(self.before)
         most = SEARCHED if self.departures == 0 else _SEARCHED_WITH_DEPARTURES
-        some = np.unique(np.linspace(0, S - 1, min(S, most)).astype(int))
+        some = spread(len(self.before), most)
         return replace(
             self,
             knowledge=self.knowledge.only(some),
@@ -102,26 +126,25 @@ class Forecast:
             before=self.before[some],
             searched=self.searched[some],
             directions={name: d[some] for name, d in self.directions.items()},
-            draws=some,
         )
 
-    def term(self, wanted: Mapping[str, float]) -> Term:
-        """Return the criterion: uncertainties over the wanted ones, or D-optimality."""
-        levels = self.candidates.information(self.scatter)
-        if not wanted:
-            return Term(levels, self.searched, departures=self.departures)
-        columns = [self.directions[n] * least_factor(n) / u for n, u in wanted.items()]
+    def term(self, target: Mapping[str, float], known: FloatArray | None = None) -> Term:
+        """Return the criterion: uncertainties over their targets, or D-optimality."""
+        c = self.candidates
+        packed = packed_information(c.rows, c.offsets, self.scatter)
+        known = self.searched if known is None else known
+        term = Term(packed, known, self.scatter, departures=self.departures)
+        if not target:
+            return term
+        columns = [self.directions[n] * least_factor(n) / u for n, u in target.items()]
         starts = np.cumsum([0, *(c.shape[-1] for c in columns[:-1])])
-        return Term(levels, self.searched, np.concatenate(columns, axis=-1), starts)
+        return replace(term, targets=np.concatenate(columns, axis=-1), starts=starts)
 
-    def covariance(
-        self, levels: Any, cycles: FloatArray, runs: int, scatter: float | None = None
-    ) -> FloatArray:
+    def covariance(self, levels: Any, cycles: FloatArray, runs: int, scatter: float) -> FloatArray:
         """Return the covariance of parameters and departures after a design, (S, Q, Q)."""
-        if not len(levels):
-            return covariance_of(self.before)
-        one = self.candidates.only(levels).information(self.scatter if scatter is None else scatter)
-        return covariance_of(self.before + runs * one.of_run(cycles @ one.packed)[0])
+        c = self.candidates.only(levels)
+        term = Term(packed_information(c.rows, c.offsets, scatter), self.before, scatter)
+        return covariance_of(self.before + runs * term.of_run(cycles)[0])
 
     def uncertainty(self, covariance: FloatArray) -> dict[str, FloatArray]:
         """Return the relative standard uncertainty of every quantity at every draw."""
@@ -138,27 +161,28 @@ class Forecast:
         Expanded uncertainties have the coverage factor of the runs' degrees of freedom; noise has
         many.
         """
-        found = self.uncertainty(self.covariance(levels, cycles, runs))
-        shares = dict.fromkeys(found, 0.0)
+        after = self.uncertainty(self.covariance(levels, cycles, runs, self.scatter))
+        shares = dict.fromkeys(after, 0.0)
         if self.scatter > 0.0:
             quiet = self.uncertainty(self.covariance(levels, cycles, runs, 0.0))
             for name, least in quiet.items():
-                if np.isfinite(typical(found[name])):
-                    shares[name] = max(0.0, 1.0 - (typical(least) / typical(found[name])) ** 2)
+                if np.isfinite(typical(after[name])):
+                    shares[name] = max(0.0, 1.0 - (typical(least) / typical(after[name])) ** 2)
         for name, share in shares.items():
             if is_expanded(name):
                 dof = max(runs - 1, 1) / share**2 if share > 0.0 else np.inf
-                found[name] = coverage_factor(dof) * found[name]
-        return found, shares
+                after[name] = coverage_factor(dof) * after[name]
+        return after, shares
 
     def expected(self, levels: Any, cycles: FloatArray, runs: int) -> dict[str, Expected]:
         """Return the expected uncertainty of each quantity after a design."""
         after, shares = self.after(levels, cycles, runs)
         before = self.uncertainty(covariance_of(self.before))
-        values = dict(zip(self.knowledge.names, self.knowledge.values.T, strict=True))
+        values, names = self.knowledge.values, self.knowledge.names
         return {
             name: Expected(
-                value=np.nan if name == RESPONSE else float(np.median(product(name, values))),
+                value=np.nan if name == RESPONSE
+                else float(np.median(np.prod(values ** powers_of(name, names), axis=-1))),
                 before=least_factor(name) * typical(before[name]),
                 after=typical(u),
                 low=_shown(float(np.quantile(u, 0.1))),
@@ -174,36 +198,34 @@ def _departures(knowledge: Knowledge, candidates: Candidates) -> Departures | No
     errors = knowledge.errors
     if errors is None:
         return None
-    own = [errors.names.index(name) for name in knowledge.names]
+    places = [errors.names.index(name) for name in knowledge.names]
     problem = knowledge.problem_at(candidates.level, candidates.frequency_hz, candidates.controlled)
-    theta = errors.theta[own]
-    predicted = problem.predict(theta)
+    predicted, changes = problem.prediction_and_jacobian(errors.theta[places])
     amplitude = candidates.level
     if candidates.controlled == "force":
         amplitude = amplitude / np.abs(predicted)
     # earlier responses that are receptances rise where the stiffness falls
     sign = DEFINITIONS[errors.problem.data.quantity].exponent
     slopes = np.zeros((candidates.count, len(errors.names)), dtype=np.complex128)
-    slopes[:, own] = sign * problem.prediction_jacobian(theta) / predicted[:, None]
-    found = departures(errors, slopes, amplitude, 2.0 * np.pi * candidates.frequency_hz, predicted)
-    if found is None:
+    slopes[:, places] = sign * changes / predicted[:, None]
+    error = departures(errors, slopes, amplitude, 2.0 * np.pi * candidates.frequency_hz, predicted)
+    if error is None:
         return None
-    W = found.columns.shape[-1]
-    kept = [*own, *range(len(errors.names), len(errors.names) + W)]
-    return found._replace(
-        columns=sign * found.columns, information=found.information[np.ix_(kept, kept)]
+    kept = [*places, *range(len(errors.names), len(error.information))]
+    return error._replace(
+        columns=sign * error.columns, information=error.information[np.ix_(kept, kept)]
     )
 
 
 def _joint(
-    known: FloatArray, searched: FloatArray, error: Departures, size: FloatArray
+    known: FloatArray, searched: FloatArray, error: Departures, units: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the information of parameters and departures: as the fit has it, and for the search.
 
     A model error that is only assumed is left out of the first.
     """
-    P, W = len(size), error.columns.shape[-1]
-    scale = np.concatenate([size, np.ones(W)])
+    P, W = len(units), error.columns.shape[-1]
+    scale = np.concatenate([units, np.ones(W)])
     joint = np.broadcast_to(error.information * np.outer(scale, scale), (len(known), P + W, P + W))
     ranges = np.zeros((P + W, P + W))
     ranges[:P, :P] = (searched - known)[0]
@@ -218,11 +240,9 @@ def _joint(
 def _response(candidates: Candidates) -> FloatArray:
     """Return changes of ln gain and phase, whose squares add up to their mean over places."""
     order = np.argsort(np.median(candidates.force, axis=0), kind="stable")
-    some = order[np.unique(np.linspace(0, candidates.count - 1, _PLACES).astype(int))]
-    part = candidates.only(some)
-    changes = part.rows * np.sqrt(part.variance)[..., None, None]
-    S, _, _, Q = changes.shape
-    changes = changes.reshape(S, -1, Q) / np.sqrt(2.0 * len(some))
+    part = candidates.only(order[spread(candidates.count, _PLACES)])
+    S, places, _, Q = part.rows.shape
+    changes = (part.rows / part.weight).reshape(S, -1, Q) / np.sqrt(2.0 * places)
     return np.asarray(np.linalg.qr(changes, mode="r")).swapaxes(-1, -2)
 
 

@@ -38,29 +38,55 @@ Ranges = Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class Knowledge:
-    """Draws of the free parameters and the information that earlier data hold on them."""
+    """Draws of the free parameters and the information that earlier data hold on them.
 
-    model: Model  # what is measured, and through what
-    sensors: Sensors | None
-    motion: Motion
-    parameters: tuple[Parameter, ...]  # the free ones, P of them
-    theta: FloatArray  # (S, P): draws, search coordinates
-    # (S, P, P): of the data measured before, at each draw, and of assumed values such as the
-    # exponent of ``Dahl()``, which are parameters here as they are in a fit's uncertainty
+    Attributes
+    ----------
+    model, sensors, motion
+        What is measured, and through what.
+    parameters : tuple of Parameter
+        The free ones, P of them.
+    theta : ndarray, shape (S, P)
+        Draws, search coordinates.
+    information : ndarray, shape (S, P, P)
+        Of the data measured before, at each draw, and of assumed values such as the exponent of
+        ``Dahl()``, which are parameters here as they are in a fit's uncertainty.
+    prior : ndarray, shape (P,)
+        Information of the ranges, each taken as very wide: it keeps the search defined where a
+        parameter cannot be determined, and a predicted uncertainty does not include it.
+    assumed : tuple of str
+        Names of the assumed parameters.
+    row_noise : float or None
+        Standard deviation of ln gain and of phase of a row of earlier data.
+    row_cycles : float
+        Cycles that such a row averages, if the data state it; else 1.
+    problem : Problem or None
+        Of the earlier data.
+    scatter : float
+        Standard deviation of ln gain and phase between runs in the earlier data.
+    errors : ErrorModel or None
+        Of an earlier fit.
+    sample_noise : float or None
+        Standard deviation of a sample of force in earlier records, N.
+    steady : {"exact", "describing function"}
+        How the response to a force that is held is predicted.
+    """
+
+    model: Model
+    parameters: tuple[Parameter, ...]
+    theta: FloatArray
     information: FloatArray
-    # (P, P): information of the ranges, each taken as very wide: it keeps the search defined where
-    # a parameter cannot be determined, and a predicted uncertainty does not include it
     prior: FloatArray
-    assumed: tuple[str, ...] = ()  # names of the assumed parameters
-    # standard deviation of ln gain and of phase of a row of earlier data
+    assumed: tuple[str, ...] = ()
+    sensors: Sensors | None = None
+    motion: Motion = "translation"
     row_noise: float | None = None
-    row_cycles: float = 1.0  # cycles that such a row averages, if the data state it; else 1
-    problem: Problem | None = None  # of the earlier data
-    scatter: float = 0.0  # standard deviation of ln gain and phase between runs in the earlier data
-    errors: ErrorModel | None = None  # of an earlier fit
-    # standard deviation of a sample of force in earlier records, N
+    row_cycles: float = 1.0
+    problem: Problem | None = None
+    scatter: float = 0.0
+    errors: ErrorModel | None = None
     sample_noise: float | None = None
-    steady: Steady = "exact"  # how the response to a force that is held is predicted
+    steady: Steady = "exact"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -77,14 +103,18 @@ class Knowledge:
         """Draws of the values, shape (S, P)."""
         return self.space.to_values(self.theta)
 
+    @property
+    def units(self) -> FloatArray:
+        """Scale of each search coordinate: 1 for logarithms, else the size of its draws, (P,)."""
+        return units_of(self.parameters, self.theta)
+
     def only(self, draws: NDArray[np.intp]) -> Knowledge:
         """Return the knowledge restricted to some of the draws."""
         return replace(self, theta=self.theta[draws], information=self.information[draws])
 
     def thinned(self, most: int) -> Knowledge:
         """Return the knowledge at no more than `most` of the draws, evenly spread."""
-        S = len(self.theta)
-        return self.only(np.unique(np.linspace(0, S - 1, min(S, most)).astype(int)))
+        return self.only(spread(len(self.theta), most))
 
     def problem_at(
         self,
@@ -114,19 +144,35 @@ class Knowledge:
         ]
 
 
+def spread(count: int, most: int) -> NDArray[np.intp]:
+    """Return at most `most` of the numbers below `count`, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.intp))
+
+
+def units_of(parameters: Sequence[Parameter], theta: FloatArray) -> FloatArray:
+    """Return the scale of each search coordinate: 1 for logarithms, else the size of its draws."""
+    size = np.median(np.abs(theta), axis=0)
+    size = np.where(size > 0.0, size, np.maximum(theta.std(axis=0), 1e-300))
+    size = np.where(size > 1e-290, size, 1.0)
+    return np.where(Space(parameters).positive, 1.0, size)
+
+
 def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowledge:
     """Return the knowledge from a model with ranges, a fit or a posterior."""
-    rng = np.random.default_rng(seed)
+    rng, ranges = np.random.default_rng(seed), ranges or {}
     if isinstance(source, Element):
-        return _of_model(as_model(source), ranges or {}, draws, rng)
+        return _of_model(as_model(source), ranges, draws, rng)
     problem, sampled = getattr(source, "problem", None), hasattr(source, "draws")
     if isinstance(problem, RecordProblem):
         fit, values = (source.fit, source.draws(_MANY, seed)) if sampled else (source, None)
-        return _of_record_fit(fit, ranges or {}, draws, rng, values)
+        return _of_records(fit, values, ranges, draws, rng)
     if isinstance(problem, Problem) and sampled:
-        return _of_posterior(source, ranges or {}, draws, seed)
+        values, P = np.asarray(source.draws(draws, seed)), len(problem.names)
+        scale = values[:, P] if values.shape[1] > P else np.ones(draws)
+        prior = _leaned_on(problem.parameters, *_moments(problem.parameters, ranges))
+        return _of_data(problem, problem.to_search(values[:, :P]), scale, prior)
     if isinstance(problem, Problem) and hasattr(source, "optimum"):
-        return _of_fit(source, ranges or {}, draws, rng)
+        return _of_fit(source, ranges, draws, rng)
     raise ValidationError(
         f"plan: got a {type(source).__name__}; expected a model such as Dahl(), a fit, or a "
         "posterior"
@@ -142,29 +188,22 @@ def _of_model(model: Model, ranges: Ranges, draws: int, rng: np.random.Generator
     centre, std = _moments(free, ranges)
     missing = [p.name for p, s in zip(free, std, strict=True) if np.isinf(s)]
     if missing:
-        wanted = ", ".join(f"{name!r}: (low, high)" for name in missing)
+        needed = ", ".join(f"{name!r}: (low, high)" for name in missing)
         raise ValidationError(
-            f"plan: nothing is known about {', '.join(missing)}; give ranges={{{wanted}}} that "
+            f"plan: nothing is known about {', '.join(missing)}; give ranges={{{needed}}} that "
             "contain the values with 95 % probability"
         )
-    theta = _within(centre + std * rng.standard_normal((draws, len(free))), free)
     model, assumed = _with_assumed(model)
     parameters = tuple(p for p in model.parameters if p.free)
-    names = [p.name for p in parameters]
-    own = [names.index(p.name) for p in free]
-    whole = np.array([np.log(p.value or 1.0) for p in parameters]) * np.ones((draws, 1))
-    whole[:, own] = theta
-    prior = np.zeros(len(names))
-    prior[own] = _leaned_on(free, centre, std)
-    known = np.broadcast_to(_of_assumed(names, assumed), (draws, len(names), len(names)))
-    return Knowledge(
-        model, None, "translation", parameters, whole, known, np.diag(prior), tuple(assumed)
-    )
+    theta = _within(centre + std * rng.standard_normal((draws, len(free))), free)
+    names, prior = [p.name for p in free], _leaned_on(free, centre, std)
+    theta, prior = _among(parameters, names, theta, prior)
+    known = np.broadcast_to(_of_assumed(parameters, assumed), (draws, *2 * prior.shape))
+    return Knowledge(model, parameters, theta, known, prior, tuple(assumed))
 
 
 def _of_fit(fit: Any, ranges: Ranges, draws: int, rng: np.random.Generator) -> Knowledge:
-    optimum, errors = fit.optimum, fit.errors
-    problem: Problem = optimum.problem
+    optimum, problem = fit.optimum, fit.optimum.problem
     centre, std = _moments(problem.parameters, ranges)
     theta = np.array(optimum.theta, dtype=np.float64)
     finite = np.isfinite(theta) & np.isfinite(optimum.values)
@@ -176,25 +215,61 @@ def _of_fit(fit: Any, ranges: Ranges, draws: int, rng: np.random.Generator) -> K
                 "or plan from the model with ranges="
             )
     prior = _leaned_on(problem.parameters, centre, std)
-    if errors is not None:
-        return _of_errors(errors, prior, draws, rng)
+    if fit.errors is not None:
+        return _of_errors(fit.errors, prior, draws, rng)
     theta = np.where(finite, theta, centre)
     scale = optimum.scale if np.isfinite(optimum.scale) else 1.0
     covariance = np.linalg.inv(problem.information(theta, scale) + np.diag(1.0 / std**2))
     # a range counts only where the data say nothing; elsewhere the estimate is the centre
     drawn = rng.multivariate_normal(theta, covariance, draws, method="eigh")
-    drawn = _within(drawn, problem.parameters)
-    return _with_data(problem, np.vstack([drawn, theta]), scale, prior, at=draws)
+    return _of_data(problem, _within(drawn, problem.parameters), scale, prior, at=theta)
 
 
-def _of_record_fit(
-    fit: Any, ranges: Ranges, draws: int, rng: np.random.Generator,
-    sampled: FloatArray | None = None,
-) -> Knowledge:  # fmt: skip
-    """Return the knowledge from a fit of records, whose force follows from the displacement.
+def _of_errors(
+    errors: ErrorModel, leaned: FloatArray, draws: int, rng: np.random.Generator
+) -> Knowledge:
+    """Return the knowledge from a fit with all its sources of error."""
+    fitted = errors.optimum.problem
+    model, assumed = _with_assumed(fitted.model)
+    kept = [i for i, name in enumerate(errors.names) if name in (*fitted.names, *assumed)]
+    parameters, part = tuple(errors.problem.parameters[i] for i in kept), np.ix_(kept, kept)
+    drawn = rng.multivariate_normal(
+        errors.theta[kept], errors.covariance[part], draws, method="eigh"
+    )
+    prior = np.zeros(len(kept))
+    prior[[p.name in fitted.names for p in parameters]] = leaned
+    known = np.linalg.inv(errors.covariance)[part]
+    stated, cycles = _row_noise(errors.problem, 0.0)
+    return Knowledge(
+        model, parameters, _within(drawn, parameters),
+        np.broadcast_to(known, (draws, *known.shape)), prior, tuple(assumed),
+        fitted.sensors, fitted.data.motion,
+        float(np.hypot(stated, errors.rms(NOISE))), cycles, errors.problem, errors.rms(RUNS),
+        errors, steady=fitted.steady,
+    )  # fmt: skip
 
-    With values sampled from their posterior, (N, P), the draws and the covariance are theirs.
-    """
+
+def _of_data(
+    fitted: Problem, drawn: FloatArray, scale: Any, leaned: FloatArray, at: FloatArray | None = None
+) -> Knowledge:
+    """Return draws with the information of their data, at each draw or at one place."""
+    model, assumed = _with_assumed(fitted.model)
+    problem = fitted.like(model=model) if assumed else fitted
+    theta, prior = _among(problem.parameters, fitted.names, drawn, leaned)
+    where = theta if at is None else _among(problem.parameters, fitted.names, at, leaned)[0]
+    known = problem.information(where, scale) + _of_assumed(problem.parameters, assumed)
+    noise, cycles = _row_noise(problem, float(np.median(scale)))
+    return Knowledge(
+        model, problem.parameters, theta, np.broadcast_to(known, (len(theta), *known.shape[-2:])),
+        prior, tuple(assumed), problem.sensors, problem.data.motion, noise, cycles, problem,
+        steady=problem.steady,
+    )  # fmt: skip
+
+
+def _of_records(
+    fit: Any, values: FloatArray | None, ranges: Ranges, draws: int, rng: np.random.Generator
+) -> Knowledge:
+    """Return the knowledge from a fit of records whose force was predicted, or its posterior."""
     if ranges:
         raise ValidationError(
             "plan: ranges are given with a fit of records, which determines its parameters; leave "
@@ -206,86 +281,24 @@ def _of_record_fit(
             "plan: the fit predicts the motion of a driven plant; planned are fits of frequency "
             "responses, and of records whose force was predicted: give the model with ranges="
         )
-    P, parameters = len(problem.free), tuple(problem.free)
-    space = Space(parameters)
-    values = np.asarray(fit.optimum.values)[:P] if sampled is None else sampled[:, :P]
-    theta = space.to_search(values)
-    if sampled is None:
-        slope = space.slopes(values)
+    parameters = tuple(problem.free)
+    space, P = Space(parameters), len(parameters)
+    if values is None:
+        best = np.asarray(fit.optimum.values)[:P]
+        slope = space.slopes(best)
         covariance = np.asarray(fit.covar)[:P, :P] / np.outer(slope, slope)
         if not np.isfinite(covariance).all():
             raise ValidationError("plan: the fit does not determine its parameters; give the model")
-        drawn = rng.multivariate_normal(theta, covariance, draws, method="eigh")
+        theta = rng.multivariate_normal(space.to_search(best), covariance, draws, method="eigh")
     else:
-        covariance = np.atleast_2d(np.cov(theta, rowvar=False))
-        drawn = theta[rng.integers(len(theta), size=draws)]
+        every = space.to_search(values[:, :P])
+        covariance = np.atleast_2d(np.cov(every, rowvar=False))
+        theta = every[rng.integers(len(every), size=draws)]
+    known = np.broadcast_to(np.linalg.inv(covariance), (draws, P, P))
     return Knowledge(
-        problem.model, None, problem.records[0].motion, parameters, _within(drawn, parameters),
-        np.broadcast_to(np.linalg.inv(covariance), (draws, P, P)), np.zeros((P, P)),
+        problem.model, parameters, _within(theta, parameters), known, np.zeros(P),
+        motion=problem.records[0].motion,
         sample_noise=float(np.std(np.concatenate(fit.residuals))),
-    )  # fmt: skip
-
-
-def _of_errors(
-    errors: ErrorModel, leaned: FloatArray, draws: int, rng: np.random.Generator
-) -> Knowledge:
-    """Return the knowledge from a fit with all its sources of error."""
-    given = errors.optimum.problem
-    model, assumed = _with_assumed(given.model)
-    kept = [i for i, name in enumerate(errors.names) if name in (*given.names, *assumed)]
-    parameters = tuple(errors.problem.parameters[i] for i in kept)
-    names = [p.name for p in parameters]
-    prior = np.zeros(len(kept))
-    prior[[names.index(name) for name in given.names]] = leaned
-    part = np.ix_(kept, kept)
-    drawn = rng.multivariate_normal(
-        errors.theta[kept], errors.covariance[part], draws, method="eigh"
-    )
-    known = np.linalg.inv(errors.covariance)[part]
-    stated, cycles = _row_noise(errors.problem, 0.0)
-    return Knowledge(
-        model, given.sensors, given.data.motion, parameters, _within(drawn, parameters),
-        np.broadcast_to(known, (draws, *known.shape)), np.diag(prior), tuple(assumed),
-        float(np.hypot(stated, errors.rms(NOISE))), cycles, errors.problem,
-        errors.rms(RUNS), errors, steady=given.steady,
-    )  # fmt: skip
-
-
-def _of_posterior(posterior: Any, ranges: Ranges, draws: int, seed: int) -> Knowledge:
-    problem: Problem = posterior.problem
-    P = len(problem.names)
-    values = np.asarray(posterior.draws(draws, seed))
-    scale = values[:, P] if values.shape[1] > P else np.ones(draws)
-    centre, std = _moments(problem.parameters, ranges)
-    prior = _leaned_on(problem.parameters, centre, std)
-    return _with_data(problem, problem.to_search(values[:, :P]), scale, prior)
-
-
-def _with_data(
-    given: Problem, drawn: FloatArray, scale: Any, leaned: FloatArray, at: int | None = None
-) -> Knowledge:
-    """Return draws with the information of their data, at each draw or at one of them."""
-    model, assumed = _with_assumed(given.model)
-    problem = given.like(model=model) if assumed else given
-    own = [problem.names.index(name) for name in given.names]
-    theta = np.array([np.log(p.value or 1.0) for p in problem.parameters]) * np.ones(
-        (len(drawn), 1)
-    )
-    theta[:, own] = drawn
-    prior = np.zeros(len(problem.names))
-    prior[own] = leaned
-    noise, cycles = _row_noise(problem, float(np.median(scale)))
-    if at is not None:
-        one = problem.information(theta[at], scale)
-        theta = np.delete(theta, at, axis=0)
-        known = np.broadcast_to(one, (len(theta), *one.shape))
-    else:
-        known = problem.information(theta, scale)
-    known = known + _of_assumed(problem.names, assumed)
-    return Knowledge(
-        model, problem.sensors, problem.data.motion, problem.parameters, theta, known,
-        np.diag(prior), tuple(assumed), noise, cycles, problem,
-        steady=problem.steady,
     )  # fmt: skip
 
 
@@ -299,8 +312,20 @@ def _with_assumed(model: Model) -> tuple[Model, dict[str, float]]:
     return (model.with_free(assumed) if assumed else model), assumed
 
 
-def _of_assumed(names: Sequence[str], assumed: Mapping[str, float]) -> FloatArray:
-    return np.diag([assumed.get(name, 0.0) for name in names])
+def _of_assumed(parameters: Sequence[Parameter], assumed: Mapping[str, float]) -> FloatArray:
+    return np.diag([assumed.get(p.name, 0.0) for p in parameters])
+
+
+def _among(
+    parameters: Sequence[Parameter], names: Sequence[str], theta: FloatArray, prior: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return coordinates and prior of some parameters among all, the others at their values."""
+    places = [[p.name for p in parameters].index(name) for name in names]
+    every = np.array([np.log(p.value or 1.0) for p in parameters]) * np.ones((*theta.shape[:-1], 1))
+    every[..., places] = theta
+    whole = np.zeros(len(parameters))
+    whole[places] = prior
+    return every, whole
 
 
 def _leaned_on(parameters: Sequence[Parameter], centre: FloatArray, std: FloatArray) -> FloatArray:
@@ -319,16 +344,16 @@ def _moments(parameters: Sequence[Parameter], ranges: Ranges) -> tuple[FloatArra
         )
     centre, std = np.zeros(len(parameters)), np.full(len(parameters), np.inf)
     for i, p in enumerate(parameters):
-        given = ranges.get(p.name, p.prior)
-        if given is None:
+        ends = ranges.get(p.name, p.prior)
+        if ends is None:
             continue
-        ends = finite_array(given, f"ranges[{p.name!r}]")
-        if ends.shape != (2,) or not ends[0] < ends[1] or (p.positive and ends[0] <= 0):
+        pair = finite_array(ends, f"ranges[{p.name!r}]")
+        if pair.shape != (2,) or not pair[0] < pair[1] or (p.positive and pair[0] <= 0):
             above = " above zero" if p.positive else ""
             raise ValidationError(
-                f"ranges[{p.name!r}] is {given!r}; expected two rising numbers{above}"
+                f"ranges[{p.name!r}] is {ends!r}; expected two rising numbers{above}"
             )
-        low, high = Space([p]).to_search(ends[:, None])[:, 0]
+        low, high = Space([p]).to_search(pair[:, None])[:, 0]
         centre[i], std[i] = 0.5 * (low + high), (high - low) / _NORMAL_RANGE
     return centre, std
 
@@ -341,11 +366,11 @@ def _within(theta: FloatArray, parameters: Sequence[Parameter]) -> FloatArray:
 def _row_noise(problem: Problem, scale: float) -> tuple[float, float]:
     """Return the relative noise of a row of the data, and the cycles that it averages."""
     data, size = problem.data, np.abs(problem.data.response)
-    cycles = 1.0
     if problem.noise == "relative":
-        return scale, cycles
+        return scale, 1.0
     if problem.noise == "absolute" or data.covariance is None:
-        return float(np.sqrt(np.median((scale / size) ** 2))), cycles
+        return float(np.sqrt(np.median((scale / size) ** 2))), 1.0
+    cycles = 1.0
     if data.dof is not None and np.isfinite(data.dof).all():
         cycles = float(np.median(data.dof)) + 1.0
     variance = 0.5 * np.trace(data.covariance, axis1=1, axis2=2) / size**2

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from dahl_ident.arrays import FloatArray, positive_number
 from dahl_ident.data.storage import place_of, plain_data, write_whole
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning import trajectories
+from dahl_ident.planning.advice import percent
+from dahl_ident.planning.forecast import Expected
+from dahl_ident.planning.search import Search
 from dahl_ident.synthetic.waveform import Waveform, WaveformBuilder
 from dahl_ident.units import Motion, shown_unit
 
@@ -49,37 +52,6 @@ class PlanStep:
     measured_cycles: int
     seconds: float
     motion: trajectories.PlannedMotion | None = None
-
-
-@dataclass(frozen=True)
-class Expected:
-    """Predicted relative standard uncertainty of a quantity; of ``"U(...)"`` the expanded one.
-
-    Attributes
-    ----------
-    value : float
-        Median over the draws; NaN of the response.
-    before, after : float
-        Relative standard uncertainty from the earlier data, and with the plan's data; inf where
-        nothing is known. Geometric mean over the draws.
-    low, high : float
-        Tenth and ninetieth percentile of `after` over the draws.
-    scatter_share : float
-        Fraction of the variance that is due to scatter between runs.
-    """
-
-    value: float
-    before: float
-    after: float
-    low: float
-    high: float
-    scatter_share: float
-
-
-class _Planner(Protocol):
-    question: Any
-    forecast: Any
-    search: Any
 
 
 @dataclass(frozen=True)
@@ -129,7 +101,7 @@ class Plan:
     assumptions: tuple[str, ...]
     change_over: float
     motion: Motion
-    planner: _Planner = field(repr=False, compare=False)
+    search: Search = field(repr=False, compare=False)
 
     def to_frame(self) -> pd.DataFrame:
         """Return the table: level, frequency, settling and measured cycles, seconds.
@@ -143,7 +115,7 @@ class Plan:
         """
         import pandas as pd
 
-        return pd.DataFrame([vars_of(step) for step in self.steps])
+        return pd.DataFrame([_row(step) for step in self.steps])
 
     def budget(self) -> pd.DataFrame:
         """Return the predicted uncertainty of every parameter and target.
@@ -155,7 +127,7 @@ class Plan:
         """
         import pandas as pd
 
-        rows = {name: vars_of(one) for name, one in self.expected.items()}
+        rows = {name: vars(one) for name, one in self.expected.items()}
         return pd.DataFrame.from_dict(rows, orient="index").rename_axis("quantity")
 
     def to_dict(self) -> dict[str, Any]:
@@ -164,8 +136,8 @@ class Plan:
             "controlled": self.controlled,
             "runs": self.runs,
             "seconds": self.seconds,
-            "steps": [vars_of(step) for step in self.steps],
-            "expected": {name: vars_of(one) for name, one in self.expected.items()},
+            "steps": [_row(step) for step in self.steps],
+            "expected": {name: dict(vars(one)) for name, one in self.expected.items()},
             "target": dict(self.target),
             "reached": self.reached,
             "undetermined": list(self.undetermined),
@@ -256,7 +228,7 @@ class Plan:
 
     def _check_moves(self, motions: list[trajectories.PlannedMotion]) -> None:
         """Check that the moves to the motions' starts are within the limits of the exciter."""
-        limits, place = self.planner.question.limits, 0.0
+        limits, place = self.search.question.limits, 0.0
         for i, motion in enumerate(motions, start=1):
             start = float(motion.displacement(np.zeros(1))[0])
             least = trajectories.seconds_of_move(
@@ -298,28 +270,18 @@ class Plan:
         levels with equal cycles; NaN where the time is too short. At the plan's own time, its
         uncertainties are those of the plan.
         """
-        names = list(self.target or self.expected)
         times = self.seconds * np.array(_CURVE)
-        planned = {name: np.full(len(times), np.nan) for name in names}
-        even = {name: np.full(len(times), np.nan) for name in names}
-        for i, time in enumerate(times.tolist()):
-            found = self.planner.search.solve(time) if time != self.seconds else None
-            if time == self.seconds:
-                for name in names:
-                    planned[name][i] = self.expected[name].after
-            elif found is not None:
-                selection = found.selection
-                told = self.planner.forecast.expected(
-                    selection.levels, selection.cycles, found.runs
-                )
-                for name in names:
-                    planned[name][i] = told[name].after
-            grid = self.planner.search.logarithmic_grid(time)
-            if grid is not None:
-                told = self.planner.forecast.expected(*grid)
-                for name in names:
-                    even[name][i] = told[name].after
-        return {name: (times, planned[name], even[name]) for name in names}
+        planned = [
+            self.expected if time == self.seconds else self.search.expected_after(time)
+            for time in times.tolist()
+        ]
+        even = [self.search.expected_after(time, grid=True) for time in times.tolist()]
+
+        def after(by_time: Sequence[Mapping[str, Expected]], name: str) -> FloatArray:
+            return np.array([e[name].after if e else np.nan for e in by_time])
+
+        names = list(self.target or self.expected)
+        return {name: (times, after(planned, name), after(even, name)) for name in names}
 
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the predicted uncertainty against bench time, next to that of a logarithmic grid.
@@ -344,13 +306,19 @@ class Plan:
     def __str__(self) -> str:
         """Return the plan as text."""
         lines = [_headline(self), "", *(self._motions() or self._levels())]
-        lines += ["", f"{'':24}{'value':>11}{'before':>11}{'after':>11}{'wanted':>11}"]
-        for name, e in self.expected.items():
-            wanted = _percent(self.target[name]) if name in self.target else ""
-            value = f"{e.value:.4g}" if np.isfinite(e.value) else ""
-            lines.append(
-                f"{name:24}{value:>11}{_percent(e.before):>11}{_percent(e.after):>11}{wanted:>11}"
+        columns = ("", "value", "before", "after", "wanted")
+        rows = [
+            (
+                name,
+                f"{e.value:.4g}" if np.isfinite(e.value) else "",
+                percent(e.before, "-"),
+                percent(e.after, "-"),
+                percent(self.target[name]) if name in self.target else "",
             )
+            for name, e in self.expected.items()
+        ]
+        lines.append("")
+        lines += [f"{c[0]:24}" + "".join(f"{text:>11}" for text in c[1:]) for c in (columns, *rows)]
         lines.append("Relative standard uncertainties; U(...) expanded, 95.45 %."
                      if any(name.startswith("U(") for name in self.expected)
                      else "Relative standard uncertainties.")  # fmt: skip
@@ -361,13 +329,11 @@ class Plan:
 
     def _spare(self) -> list[str]:
         """Return what the time that is left would buy, and what to use it for."""
-        time = self.planner.question.limits.time
+        time = self.search.question.limits.time
         if not (self.reached and self.seconds < 0.5 * time < np.inf):
             return []
-        found = self.planner.search.solve(time)
-        chosen = found.selection
-        told = self.planner.forecast.expected(chosen.levels, chosen.cycles, found.runs)
-        bought = ", ".join(f"{name} {_percent(told[name].after)}" for name in self.target)
+        whole = self.search.expected_after(time)
+        bought = ", ".join(f"{name} {percent(whole[name].after, '-')}" for name in self.target)
         lines = [f"{time - self.seconds:.4g} s are left; the whole time would give {bought}."]
         if self.runs == 1:
             lines.append(
@@ -410,17 +376,15 @@ class Plan:
         ]
 
 
-def vars_of(one: PlanStep | Expected) -> dict[str, Any]:
-    """Return the fields of a step or an expectation; of a motion what describes it."""
-    found = dict(vars(one))
-    if not isinstance(one, PlanStep):
-        return found
-    motion = found.pop("motion")
+def _row(step: PlanStep) -> dict[str, Any]:
+    """Return the fields of a step; of a motion what describes it."""
+    fields = dict(vars(step))
+    motion = fields.pop("motion")
     if motion is None:
-        return found
+        return fields
     return {
         "motion": motion.kind, **motion.parameters, "period": motion.period,
-        "repeats": one.measured_cycles, "seconds": one.seconds,
+        "repeats": step.measured_cycles, "seconds": step.seconds,
     }  # fmt: skip
 
 
@@ -432,7 +396,3 @@ def _headline(plan: Plan) -> str:
     if plan.target:
         end = "; meets the target" if plan.reached else "; does NOT meet the target"
     return f"{runs} in {plan.seconds:.4g} s{end}."
-
-
-def _percent(u: float) -> str:
-    return f"{100.0 * u:.3g} %" if np.isfinite(u) else "-"

@@ -18,8 +18,9 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.bench_time import LEAST_CYCLES
-from dahl_ident.planning.candidates import BenchLimits, Candidates, allowed
+from dahl_ident.planning.candidates import Candidates, allowed
 from dahl_ident.planning.knowledge import Knowledge
+from dahl_ident.planning.question import BenchLimits, RecordedForce
 from dahl_ident.planning.trajectories import SAMPLES_PER_CYCLE, Multisine, PlannedMotion, Trapezoid
 from dahl_ident.problem.record_problem import RecordProblem
 
@@ -35,97 +36,95 @@ _LINES = 10  # of a multisine, its highest frequency over its lowest
 def motions_of(kind: str, limits: BenchLimits, levels: tuple[float, float]) -> list[PlannedMotion]:
     """Return the candidates that a kind of motion stands for, within the limits."""
     amplitudes = np.geomspace(*levels, _LEVELS).tolist()
-    found: list[PlannedMotion] = []
-    if kind == "trapezoid":
-        for name in ("speed", "acceleration"):
-            if not np.isfinite(getattr(limits, name)[1]):
-                raise ValidationError(
-                    f"limits has no {name}; give the highest one of the exciter: the time of a "
-                    "trapezoidal trajectory follows from it"
-                )
-        for size in amplitudes:
-            fastest = min(limits.speed[1], float(np.sqrt(2.0 * size * limits.acceleration[1])))
-            found += [
-                Trapezoid(2.0 * size, fastest / _SLOWER**i, limits.acceleration[1])
-                for i in range(_SPEEDS)
-            ]
-        return found
     low, high = limits.frequency_hz
-    if not np.isfinite(high):
-        raise ValidationError("limits has no frequency_hz; give the highest one of the multisine")
-    for size in amplitudes:
-        for i in range(_BANDS):
-            top = high / _SLOWER**i
-            one = Multisine(max(top / _LINES, low), top, size) if top >= low else None
-            found += [one] if one is not None else []
-    return found
+    if kind == "multisine":
+        if not np.isfinite(high):
+            raise ValidationError(
+                "limits has no frequency_hz; give the highest one of the multisine"
+            )
+        tops = [top for i in range(_BANDS) if (top := high / _SLOWER**i) >= low]
+        return [Multisine(max(top / _LINES, low), top, size) for size in amplitudes for top in tops]
+    for name in ("speed", "acceleration"):
+        if not np.isfinite(getattr(limits, name)[1]):
+            raise ValidationError(
+                f"limits has no {name}; give the highest one of the exciter: the time of a "
+                "trapezoidal trajectory follows from it"
+            )
+    v, a = limits.speed[1], limits.acceleration[1]
+    return [
+        Trapezoid(2.0 * size, min(v, float(np.sqrt(2.0 * size * a))) / _SLOWER**i, a)
+        for size in amplitudes
+        for i in range(_SPEEDS)
+    ]
 
 
 @dataclass(frozen=True)
-class RecordedForce:
-    """What records of motions say: white noise of a force sample, and samples a second."""
+class RepeatSums:
+    """Information in the repeats of a motion, their own unknowns included, for unit noise.
 
-    noise: float
-    sample_rate: float
-
-    def information(self, knowledge: Knowledge, motion: PlannedMotion, repeats: int) -> FloatArray:
-        """Return the information of one record, (S, P, P): all its repeats, own unknowns out."""
-        rate = min(self.sample_rate, _PER_PERIOD / motion.period)
-        return _of_record(_sums(knowledge, motion, rate), repeats, motion.period) * (
-            self.sample_rate / rate / self.noise**2
-        )
-
-
-@dataclass(frozen=True)
-class _RepeatSums:
-    """Products of derivatives, (S, repeats, n, n), n = P + states + 2, and what repeats add."""
+    Attributes
+    ----------
+    products : ndarray, shape (S, repeats, n, n)
+        J'J of each repeat; n = P + states + offset + drift, the drift from the repeat's start.
+    parameters : int
+        P.
+    period : float
+        Seconds.
+    force : ndarray, shape (S,)
+        Largest, N.
+    weight : float
+        Samples measured for each one that was computed, over the variance of the noise.
+    """
 
     products: FloatArray
     parameters: int
-    force: FloatArray  # (S,), largest
+    period: float
+    force: FloatArray
+    weight: float
 
+    @classmethod
+    def of(cls, knowledge: Knowledge, motion: PlannedMotion, recorded: RecordedForce) -> RepeatSums:
+        """Return the sums of a motion at every draw of the parameters."""
+        rate = min(recorded.sample_rate, _PER_PERIOD / motion.period)
+        m = max(round(motion.period * rate), _LEAST_SAMPLES)
+        time = np.arange(float(_SIMULATED * m)) * (motion.period / m)
+        record = Record(time, displacement=motion.displacement(time), force=np.zeros(time.size))
+        problem = RecordProblem([record], knowledge.model, output="force")
+        P, n = len(problem.free), len(problem.parameters)
+        if tuple(p.name for p in problem.free) != knowledge.names:
+            raise ValidationError("plan: the model of the earlier data has parameters of sensors")
+        products, force = [], []
+        for values in knowledge.values:
+            predicted = problem.predict(np.concatenate([values, np.zeros(n - P)]), 0)
+            J = predicted.by * np.concatenate([knowledge.space.slopes(values), np.ones(n - P)])
+            J[:, -1] = np.mod(time + 0.5 * time[1], motion.period)  # drift, within its repeat
+            blocks = J.reshape(_SIMULATED, m, n)
+            products.append(blocks.swapaxes(1, 2) @ blocks)
+            force.append(float(np.abs(predicted.output).max()))
+        weight = recorded.sample_rate / rate / recorded.noise**2
+        return cls(np.array(products), P, motion.period, np.array(force), weight)
 
-def _sums(knowledge: Knowledge, motion: PlannedMotion, rate: float) -> _RepeatSums:
-    m = max(round(motion.period * rate), _LEAST_SAMPLES)
-    time = np.arange(float(_SIMULATED * m)) * (motion.period / m)
-    record = Record(time, displacement=motion.displacement(time), force=np.zeros(time.size))
-    problem = RecordProblem([record], knowledge.model, output="force")
-    P, n = len(problem.free), len(problem.parameters)
-    if tuple(p.name for p in problem.free) != knowledge.names:
-        raise ValidationError("plan: the model of the earlier data has parameters of sensors")
-    found, force = [], []
-    for values in knowledge.values:
-        whole = np.concatenate([values, np.zeros(n - P)])
-        predicted = problem.predict(whole, 0)
-        by = predicted.by * np.concatenate([knowledge.space.slopes(values), np.ones(n - P)])
-        by[:, -1] = np.mod(time + 0.5 * time[1], motion.period)  # drift, within its repeat
-        blocks = by.reshape(_SIMULATED, m, n)
-        found.append(blocks.swapaxes(1, 2) @ blocks)
-        force.append(float(np.abs(predicted.output).max()))
-    return _RepeatSums(np.array(found), P, np.array(force))
-
-
-def _of_record(sums: _RepeatSums, repeats: int, period: float) -> FloatArray:
-    """Return the information of the parameters after elimination, for unit noise."""
-    n, P = sums.products.shape[-1], sums.parameters
-    whole = np.zeros((len(sums.products), n, n))
-    later = np.arange(_SIMULATED, repeats) * period
-    for k in range(min(repeats, _SIMULATED)):
-        shift = np.eye(n)
-        shift[-2, -1] = k * period  # drift = within the repeat + the time of its start
-        whole += shift.T @ sums.products[:, k] @ shift
-    if later.size:
-        last = sums.products[:, -1]
-        one = np.zeros((n, n))
+    def rows(self, repeats: int) -> FloatArray:
+        """Return J of one of so many repeats in a record, (S, P, P), its unknowns eliminated."""
+        n, P = self.products.shape[-1], self.parameters
+        whole = np.zeros((len(self.products), n, n))
+        for k in range(min(repeats, _SIMULATED)):
+            shift = np.eye(n)
+            shift[-2, -1] = k * self.period  # drift = within the repeat + the time of its start
+            whole += shift.T @ self.products[:, k] @ shift
+        later = np.arange(_SIMULATED, repeats) * self.period
+        last, one = self.products[:, -1], np.zeros((n, n))
         one[-2, -1] = 1.0
         cross = last @ one
         whole += later.size * last + later.sum() * (cross + cross.swapaxes(1, 2))
         whole += (later**2).sum() * (one.T @ last @ one)
-    own = whole[:, P:, P:]
-    size = np.sqrt(np.maximum(np.diagonal(own, axis1=1, axis2=2), 1e-300))
-    units = size[:, :, None] * size[:, None, :]
-    inverse = np.linalg.pinv(own / units, hermitian=True, rcond=1e-10) / units
-    return np.asarray(whole[:, :P, :P] - whole[:, :P, P:] @ inverse @ whole[:, P:, :P])
+        unknowns = whole[:, P:, P:]
+        size = np.sqrt(np.maximum(np.diagonal(unknowns, axis1=1, axis2=2), 1e-300))
+        units = size[:, :, None] * size[:, None, :]
+        inverse = np.linalg.pinv(unknowns / units, hermitian=True, rcond=1e-10) / units
+        information = whole[:, :P, :P] - whole[:, :P, P:] @ inverse @ whole[:, P:, :P]
+        values, vectors = np.linalg.eigh(information * (self.weight / repeats))
+        return np.asarray(np.sqrt(np.maximum(values, 0.0))[..., None] * vectors.swapaxes(-1, -2))
 
 
 def evaluate_motions(
@@ -148,44 +147,26 @@ def evaluate_motions(
             f"trapezoid's way from end to end or a multisine's shortest cycle: "
             f"{SAMPLES_PER_CYCLE * slowest:.3g} Hz for the slowest motion; or slow the motions down"
         )
-    motions = resolved
-    peaks = np.array([motion.peaks for motion in motions])
-    rates = [min(rate, _PER_PERIOD / motion.period) for motion in motions]
-    sums = [_sums(knowledge, one, r) for one, r in zip(motions, rates, strict=True)]
-    force = np.stack([one.force for one in sums], axis=1)
+    peaks = np.array([motion.peaks for motion in resolved])
+    sums = [RepeatSums.of(knowledge, one, recorded) for one in resolved]
     sizes: dict[str, Any] = {
         "displacement": peaks[None, :, 0],
-        "force": force,
+        "force": np.stack([one.force for one in sums], axis=1),
         "speed": peaks[None, :, 1],
         "acceleration": peaks[None, :, 2],
-        "frequency_hz": np.array([[one.fastest_hz for one in motions]]),
     }
-    if all(one.kind == "trapezoid" for one in motions):
-        del sizes["frequency_hz"]
-    kept = np.flatnonzero(allowed(limits, sizes, len(motions)))
+    if any(one.kind != "trapezoid" for one in resolved):
+        sizes["frequency_hz"] = np.array([[one.fastest_hz for one in resolved]])
+    kept = np.flatnonzero(allowed(limits, sizes, len(resolved)))
+    period = np.array([one.period for one in resolved])[kept]
     repeats = [
-        _REPEATS if lasting is None else max(int(lasting / one.period), LEAST_CYCLES)
-        for one in motions
+        _REPEATS if lasting is None else max(int(lasting / seconds), LEAST_CYCLES)
+        for seconds in period.tolist()
     ]
-    rows = np.stack(
-        [
-            root(
-                _of_record(sums[k], repeats[k], motions[k].period)
-                * (rate / rates[k] / recorded.noise**2 / repeats[k])
-            )
-            for k in kept.tolist()
-        ],
-        axis=1,
-    )
-    S, K = len(knowledge.theta), kept.size
+    rows = [sums[k].rows(count) for k, count in zip(kept.tolist(), repeats, strict=True)]
+    S, level = len(knowledge.theta), peaks[kept, 0]
     return Candidates(
-        "displacement", peaks[kept, 0], np.array([1.0 / motions[k].period for k in kept.tolist()]),
-        np.broadcast_to(peaks[kept, 0], (S, K)), force[:, kept], rows, np.zeros((S, K, 2, 2)),
-        np.ones((S, K)), tuple(motions[k] for k in kept.tolist()),
+        "displacement", level, 1.0 / period, np.broadcast_to(level, (S, kept.size)),
+        sizes["force"][:, kept], np.stack(rows, axis=1), np.ones((S, kept.size)),
+        tuple(resolved[k] for k in kept.tolist()),
     )  # fmt: skip
-
-
-def root(information: FloatArray) -> FloatArray:
-    """Return J, (..., P, P), with J'J the information."""
-    values, vectors = np.linalg.eigh(information)
-    return np.asarray(np.sqrt(np.maximum(values, 0.0))[..., None] * vectors.swapaxes(-1, -2))

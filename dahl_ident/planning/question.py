@@ -1,86 +1,145 @@
-"""The arguments of a plan, checked."""
+"""What a plan is asked: the limits of the bench, the noise, and the quantities to determine."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from dahl_ident.arrays import non_negative_array, positive_number
-from dahl_ident.elements import Element
+from dahl_ident.arrays import FloatArray, non_negative_array, positive_array, positive_number
+from dahl_ident.diagnostics.budget import coverage_factor
+from dahl_ident.elements import Element, Model
 from dahl_ident.elements.element import as_model
-from dahl_ident.errors import ValidationError
-from dahl_ident.planning.candidates import BenchLimits, CycleNoise
+from dahl_ident.errors import ValidationError, choices
 from dahl_ident.planning.knowledge import Knowledge
-from dahl_ident.planning.motion_information import RecordedForce
 from dahl_ident.planning.trajectories import KINDS, PlannedMotion
+
+RESPONSE = "response"
+_POWER = re.compile(r"(?P<name>[A-Za-z_]\w*)(?:\^(?P<power>-?\d+(?:\.\d+)?))?")
+_EXPANDED = re.compile(r"U\((?P<quantity>.+)\)")
 
 
 @dataclass(frozen=True)
-class PlanRequest:
-    """The arguments of :func:`plan` in checked form; `recorded` only for motions in time."""
+class BenchLimits:
+    """Lowest and highest values, zero-to-peak, SI, and the seconds for everything."""
+
+    displacement: tuple[float, float] = (0.0, np.inf)
+    force: tuple[float, float] = (0.0, np.inf)
+    speed: tuple[float, float] = (0.0, np.inf)
+    acceleration: tuple[float, float] = (0.0, np.inf)
+    frequency_hz: tuple[float, float] = (0.0, np.inf)
+    time: float = np.inf
+
+    @classmethod
+    def of(cls, limits: Mapping[str, Any] | None) -> BenchLimits:
+        """Return the limits of a mapping."""
+        if not isinstance(limits, Mapping):
+            raise ValidationError(
+                "limits: expected a mapping, such as {'displacement': 1e-3, 'frequency_hz': 5, "
+                f"'time': 600}}, got {limits!r}"
+            )
+        known = cls.__dataclass_fields__
+        unknown = sorted(set(limits) - set(known))
+        if unknown:
+            raise ValidationError(
+                f"limits has {', '.join(map(str, unknown))}; expected some of {', '.join(known)}"
+            )
+        checked: dict[str, Any] = {}
+        for name, value in limits.items():
+            if name == "time":
+                checked[name] = positive_number(value, "limits['time']")
+                continue
+            ends = positive_array(value, f"limits[{name!r}]")
+            pair = [0.0, float(ends)] if ends.ndim == 0 else ends.tolist()
+            if len(pair) != 2 or not pair[0] <= pair[1]:
+                raise ValidationError(
+                    f"limits[{name!r}] is {value!r}; expected the highest value, or lowest and "
+                    "highest"
+                )
+            checked[name] = tuple(pair)
+        return cls(**checked)
+
+    def relaxed(self, name: str, factor: float) -> BenchLimits:
+        """Return the limits with one of them `factor` times wider at both ends."""
+        low, high = getattr(self, name)
+        changed: dict[str, Any] = {name: (low / factor, high * factor)}
+        return replace(self, **changed)
+
+    @property
+    def stated(self) -> tuple[str, ...]:
+        """Names of the limits that were given, time aside."""
+        return tuple(n for n, e in vars(self).items() if n != "time" and e != (0.0, np.inf))
+
+
+@dataclass(frozen=True)
+class CycleNoise:
+    """Noise of one cycle: of ln gain and phase, and of each part of force (N) and displacement."""
+
+    relative: float
+    force: float = 0.0
+    displacement: float = 0.0
+
+    def variance(self, force: FloatArray, amplitude: FloatArray) -> FloatArray:
+        """Return the variance of ln gain and of phase in one cycle."""
+        return np.asarray(
+            self.relative**2 + (self.force / force) ** 2 + (self.displacement / amplitude) ** 2
+        )
+
+
+@dataclass(frozen=True)
+class RecordedForce:
+    """White noise of a sample of force in the records of motions, N, and samples a second."""
+
+    noise: float
+    sample_rate: float
+
+
+@dataclass(frozen=True)
+class Question:
+    """The arguments of a plan in checked form; `recorded` and `motions` of motions in time.
+
+    `target` has the standard uncertainty of each quantity, 1 where only names were given;
+    `has_numbers` says which it is.
+    """
 
     knowledge: Knowledge
     limits: BenchLimits
-    controlled: str
-    noise: CycleNoise
-    wanted: dict[str, float]
-    numbers: bool
-    scatter: float
-    runs: int | None
+    target: dict[str, float]
+    has_numbers: bool
     costs: dict[str, float]
-    larger: Any
-    suspects: dict[str, float]
+    controlled: str = "displacement"
+    noise: CycleNoise = field(default_factory=lambda: CycleNoise(0.0))
+    scatter: float = 0.0
+    runs: int | None = 1
+    larger: Model | None = None
+    suspects: dict[str, float] = field(default_factory=dict)
     recorded: RecordedForce | None = None
     motions: str | tuple[PlannedMotion, ...] = ()
 
 
-def noise_of(given: float | Mapping[str, float] | None, knowledge: Knowledge) -> CycleNoise:
+def noise_of_cycle(noise: float | Mapping[str, float] | None, knowledge: Knowledge) -> CycleNoise:
     """Return the noise of one cycle, as given or from the earlier data."""
-    if given is None:
+    if noise is None:
         if knowledge.row_noise is None:
             raise ValidationError(
                 "plan: the noise is unknown before any data; give noise=0.01 (of ln gain and phase "
                 "in one cycle), or its parts: relative, force in N, displacement in m"
             )
         return CycleNoise(knowledge.row_noise * float(np.sqrt(knowledge.row_cycles)))
-    if not isinstance(given, Mapping):
-        return CycleNoise(positive_number(given, "noise"))
-    unknown = sorted(set(given) - {"relative", "force", "displacement"})
+    if not isinstance(noise, Mapping):
+        return CycleNoise(positive_number(noise, "noise"))
+    unknown = sorted(set(noise) - {"relative", "force", "displacement"})
     if unknown:
         raise ValidationError(
             f"noise has {', '.join(unknown)}; expected relative, force and displacement"
         )
-    parts = {n: float(non_negative_array(v, f"noise[{n!r}]")) for n, v in given.items()}
+    parts = {n: float(non_negative_array(v, f"noise[{n!r}]")) for n, v in noise.items()}
     if not any(parts.values()):
         raise ValidationError("noise is zero; one cycle would determine everything")
     return CycleNoise(**{"relative": 0.0, **parts})
-
-
-def motions_asked(candidates: Any) -> str | tuple[PlannedMotion, ...]:
-    """Return the motions in time among the candidates' forms, empty for sines."""
-    if isinstance(candidates, str):
-        if candidates not in KINDS:
-            raise ValidationError(
-                f"candidates is {candidates!r}; expected a number, pairs of level and frequency, "
-                f"motions, or one of {', '.join(KINDS)}"
-            )
-        return candidates
-    if isinstance(candidates, int):
-        return ()
-    try:
-        listed = tuple(candidates)
-    except TypeError:
-        raise ValidationError(
-            f"candidates is {candidates!r}; expected a number, pairs of level and frequency, a "
-            f"list of motions, or one of {', '.join(KINDS)}"
-        ) from None
-    moving = [getattr(one, "kind", None) in KINDS for one in listed]
-    if any(moving) and not all(moving):
-        raise ValidationError("candidates holds motions and others; plan one or the other")
-    return listed if any(moving) else ()
 
 
 def recorded_force(
@@ -105,27 +164,42 @@ def recorded_force(
     return RecordedForce(positive_number(noise["force"], "noise['force']"), rate)
 
 
-def targets_of(target: Any) -> tuple[dict[str, float], bool]:
-    """Return quantities with the uncertainty wanted, and whether numbers were given."""
-    if target is None:
-        return {}, False
-    if isinstance(target, str):
-        return {target: 1.0}, False
-    if isinstance(target, Mapping):
-        found = {str(n): positive_number(u, f"target[{n!r}]") for n, u in target.items()}
-        for name, u in found.items():
-            if u >= 1.0:
-                raise ValidationError(
-                    f"target[{name!r}] is {u:g}; expected a relative uncertainty below 1: 0.02 is "
-                    "2 %"
-                )
-        return found, bool(found)
-    return {str(name): 1.0 for name in target}, False
+def motions_among(candidates: Any) -> str | tuple[PlannedMotion, ...]:
+    """Return the motions in time among the candidates' forms, empty for sines."""
+    if isinstance(candidates, int):
+        return ()
+    named = isinstance(candidates, str)
+    if named and candidates in KINDS:
+        return str(candidates)
+    if named or not np.iterable(candidates):
+        raise ValidationError(
+            f"candidates is {candidates!r}; expected a number, pairs of level and frequency, a "
+            f"list of motions, or one of {', '.join(KINDS)}"
+        )
+    listed = tuple(candidates)
+    moving = [isinstance(one, PlannedMotion) for one in listed]
+    if any(moving) and not all(moving):
+        raise ValidationError("candidates holds motions and others; plan one or the other")
+    return listed if any(moving) else ()
+
+
+def target_of(target: Any) -> tuple[dict[str, float], bool]:
+    """Return quantities with their target uncertainty, and whether numbers were given."""
+    if not isinstance(target, Mapping):
+        names = () if target is None else (target,) if isinstance(target, str) else target
+        return {str(name): 1.0 for name in names}, False
+    checked = {str(n): positive_number(u, f"target[{n!r}]") for n, u in target.items()}
+    for name, u in checked.items():
+        if u >= 1.0:
+            raise ValidationError(
+                f"target[{name!r}] is {u:g}; expected a relative uncertainty below 1: 0.02 is 2 %"
+            )
+    return checked, bool(checked)
 
 
 def larger_model(
     knowledge: Knowledge, larger: Element | None, suspects: Mapping[str, float] | None
-) -> Any:
+) -> Model | None:
     """Return the model in which suspected parameters are free; None where there are none."""
     if not suspects:
         if larger is not None:
@@ -134,11 +208,47 @@ def larger_model(
     for name, u in suspects.items():
         positive_number(u, f"suspects[{name!r}]")
     model = as_model(larger) if larger is not None else knowledge.model
-    unknown = sorted(set(suspects) - {p.name for p in model.parameters})
+    names = {p.name for p in model.parameters}
+    unknown = sorted(set(suspects) - names)
     if unknown:
         raise ValidationError(
             f"suspects names {', '.join(unknown)}, which {model!r} does not have; give larger=, a "
             "model that has them"
         )
-    same = {p.name for p in model.parameters} & set(knowledge.names)
-    return model.with_free([*suspects, *same])
+    return model.with_free([*suspects, *(names & set(knowledge.names))])
+
+
+# Quantities: parameters, products of their powers, U(...) of either, the predicted response
+
+
+def is_expanded(name: str) -> bool:
+    """Return whether a quantity is an expanded uncertainty, ``U(...)``."""
+    return _EXPANDED.fullmatch(name) is not None
+
+
+def least_factor(name: str) -> float:
+    """Return the coverage factor of many degrees of freedom for an expanded uncertainty, else 1."""
+    return coverage_factor(np.inf) if is_expanded(name) else 1.0
+
+
+def powers_of(expression: str, names: tuple[str, ...]) -> FloatArray:
+    """Return the power of each parameter in a product such as ``sigma^2/f_max``."""
+    expanded = _EXPANDED.fullmatch(expression.replace(" ", ""))
+    product = (expanded["quantity"] if expanded else expression).replace(" ", "")
+    powers = np.zeros(len(names))
+    for place, part in enumerate(product.split("/")):
+        for factor in part.split("*"):
+            match = _POWER.fullmatch(factor)
+            if match is None:
+                raise ValidationError(
+                    f"target is {expression!r}; expected a parameter, or a product of powers such "
+                    "as 'sigma^2/f_max'"
+                )
+            name = match["name"]
+            if name not in names:
+                raise ValidationError(
+                    f"target names {name!r}; expected a product of powers, such as 'f_max/sigma', "
+                    f"of {choices(names, name)}"
+                )
+            powers[names.index(name)] += float(match["power"] or 1.0) * (-1.0 if place else 1.0)
+    return powers

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,35 +22,38 @@ UNITS = {
 _FINE = 64  # places a line at which a multisine's peaks are looked for: within 0.1 %
 
 
-class PlannedMotion(Protocol):
+class PlannedMotion(ABC):
     """One period of a motion, which begins and ends at rest at the same place."""
 
-    @property
-    def kind(self) -> str:
-        """One of `KINDS`."""
+    kind: ClassVar[str]
 
     @property
+    @abstractmethod
     def period(self) -> float:
         """Seconds."""
 
     @property
+    @abstractmethod
     def fastest_hz(self) -> float:
         """Frequency that the sample rate of a waveform has to resolve, Hz."""
 
     @property
     def parameters(self) -> Mapping[str, float]:
         """What describes it, SI."""
+        return dict(vars(self))
 
+    @abstractmethod
     def displacement(self, time: FloatArray) -> FloatArray:
         """Return the displacement at any times from the start of a period, m."""
 
     @property
+    @abstractmethod
     def peaks(self) -> tuple[float, float, float]:
         """Largest displacement, speed and acceleration, SI."""
 
 
 @dataclass(frozen=True)
-class Trapezoid:
+class Trapezoid(PlannedMotion):
     """There and back about zero with trapezoidal velocity, and a dwell at both ends.
 
     Attributes
@@ -68,6 +72,7 @@ class Trapezoid:
     (1.4, [-0.005, 0.005])
     """
 
+    kind: ClassVar[str] = "trapezoid"
     stroke: float
     speed: float
     acceleration: float
@@ -78,16 +83,6 @@ class Trapezoid:
         for name in ("stroke", "speed", "acceleration"):
             positive_number(getattr(self, name), f"{name} of a trapezoid")
         non_negative_array(self.dwell, "dwell of a trapezoid")
-
-    @property
-    def kind(self) -> str:
-        """``"trapezoid"``."""
-        return "trapezoid"
-
-    @property
-    def parameters(self) -> Mapping[str, float]:
-        """Stroke, speed, acceleration and dwell."""
-        return dict(vars(self))
 
     @property
     def _reached(self) -> float:
@@ -126,7 +121,7 @@ class Trapezoid:
 
 
 @dataclass(frozen=True)
-class Multisine:
+class Multisine(PlannedMotion):
     """Equal sines at all multiples of the lowest frequency up to the highest, Schroeder's phases.
 
     It starts at its largest displacement, at rest. Source of the phases: Schroeder, *IEEE Trans.
@@ -146,6 +141,7 @@ class Multisine:
     (2.0, [0.001, 0.001])
     """
 
+    kind: ClassVar[str] = "multisine"
     lowest_hz: float
     highest_hz: float
     peak: float
@@ -161,11 +157,6 @@ class Multisine:
             )
 
     @property
-    def kind(self) -> str:
-        """``"multisine"``."""
-        return "multisine"
-
-    @property
     def period(self) -> float:
         """Seconds."""
         return 1.0 / self.lowest_hz
@@ -178,26 +169,24 @@ class Multisine:
     @property
     def parameters(self) -> Mapping[str, float]:
         """Band, peak and rms."""
-        _, _, _, gain = self._shape()
-        lines = self._lines.size
-        return {**vars(self), "rms": abs(gain) * float(np.sqrt(0.5 * lines))}
-
-    @property
-    def _lines(self) -> FloatArray:
-        return np.arange(1.0, np.floor(self.highest_hz / self.lowest_hz + 1e-9) + 1.0)
+        w, _, _, gain = self._shape()
+        return {**vars(self), "rms": abs(gain) * float(np.sqrt(0.5 * w.size))}
 
     def _shape(self) -> tuple[FloatArray, FloatArray, float, float]:
         """Return angular frequencies and phases, where the period starts, and the amplitude."""
-        k = self._lines
+        k = np.arange(1.0, np.floor(self.highest_hz / self.lowest_hz + 1e-9) + 1.0)
         phase = -np.pi * k * (k - 1) / k.size
         w = 2.0 * np.pi * self.lowest_hz * k
-        fine = np.arange(_FINE * k.size) * self.period / (_FINE * k.size)
+        fine = self._fine(k.size)
         start = float(fine[np.argmax(np.abs(np.cos(np.outer(fine, w) + phase).sum(axis=-1)))])
         for _ in range(8):  # to where the velocity vanishes
             angle = w * start + phase
             start -= float((w * np.sin(angle)).sum() / (w**2 * np.cos(angle)).sum())
         top = float(np.cos(w * start + phase).sum())
         return w, phase, start, self.peak / top
+
+    def _fine(self, lines: int) -> FloatArray:
+        return np.arange(_FINE * lines) * self.period / (_FINE * lines)
 
     def displacement(self, time: FloatArray) -> FloatArray:
         """Return the displacement, m; it begins at the peak."""
@@ -208,8 +197,7 @@ class Multisine:
     def peaks(self) -> tuple[float, float, float]:
         """Largest displacement, speed and acceleration."""
         w, phase, _, gain = self._shape()
-        time = np.arange(_FINE * w.size) * self.period / (_FINE * w.size)
-        angle = np.multiply.outer(time, w) + phase
+        angle = np.multiply.outer(self._fine(w.size), w) + phase
         speed = abs(gain) * float(np.abs((w * np.sin(angle)).sum(axis=-1)).max())
         pull = abs(gain) * float(np.abs((w**2 * np.cos(angle)).sum(axis=-1)).max())
         return self.peak, speed, pull
@@ -238,9 +226,9 @@ def course(
         first = float(motion.displacement(np.zeros(1))[0])
         begin = start + change_over
         stop = begin + count * motion.period
-        there = (time >= start) & (time < begin)
-        tau = (time[there] - start) / change_over if change_over > 0.0 else time[there]
-        value[there] = place + (first - place) * tau**3 * (10.0 - tau * (15.0 - 6.0 * tau))
+        moving = (time >= start) & (time < begin)
+        tau = (time[moving] - start) / change_over if change_over > 0.0 else time[moving]
+        value[moving] = place + (first - place) * tau**3 * (10.0 - tau * (15.0 - 6.0 * tau))
         inside = (time >= begin - 1e-9) & (time < stop - 1e-9)
         value[inside] = motion.displacement(time[inside] - begin)
         number[(time >= start) & (time < stop)] = i + 1

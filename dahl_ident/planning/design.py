@@ -1,0 +1,373 @@
+"""Optimal designs: the criterion of a set of levels, and the search for the best set.
+
+A level measured for n cycles adds n J'J to the information, J being the derivatives of its whitened
+residuals. Errors of gain and phase that all rows of a run share, of standard deviation s, are two
+more parameters of each run with the information 1/s^2; after their elimination a run gives
+
+    S = M - B (C + I/s^2)^{-1} B'
+
+on the parameters, and R equal runs give R S. S is a concave function of the cycles (a Schur
+complement), and every criterion here is the mean over draws of the logarithm of a concave,
+homogeneous function of the information, so that the best design is a convex problem:
+
+- D: ln det(M)/P; with departures of the model among the parameters, that of the others
+  alone, -ln det((M^{-1})_PP) (D_s-optimality);
+- targets: -ln(sum_t (c_t' M^{-1} c_t / u_t^2)^q)/q; with one target c-optimality, with several
+  close to the largest ratio of variance to target.
+
+**Continuous.** Seconds t_k at each candidate, their sum given. With d_k the derivative of the
+criterion with respect to t_k and d the mean of d_k weighted by t_k, every t_k is multiplied by
+(d_k/d)^p; at the optimum d_k <= d everywhere (the equivalence theorem), with equality where
+t_k > 0. For D-optimality without earlier data d times the time is 1.
+
+**With fixed costs** each level needs time for change-over and settling before it gives information.
+Levels are added, exchanged and removed one at a time while this improves the criterion, and the
+remaining time is distributed by multiplication; then the cycles are rounded to whole numbers.
+
+Source: Pukelsheim, *Optimal Design of Experiments*, 2006, chapters 3 and 5; Silvey, Titterington
+and Torsney, *Commun. Stat. A* 7, 1379 (1978); Yu, *Ann. Stat.* 38, 1593 (2010).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
+
+_POWER = 4.0  # q: 1 would add the targets' variances, infinity would use only the largest
+_IMPROVES = 1e-3  # least improvement of the logarithm by a change of the levels
+_TRIED = 3  # candidates whose times are optimised after a first look at all
+_NO_TIME = 1e-9  # s, shared where there is none, so that the sums stay defined
+_MOST_LEVELS = 24  # an optimum of six parameters takes at most 21 (Caratheodory)
+
+
+def packed_information(
+    rows: FloatArray, offsets: FloatArray, scatter: float
+) -> NDArray[np.float64]:
+    """Return J'J of each candidate, (K, S Q Q).
+
+    For rows (S, K, m, P) and the derivatives with respect to a run's gain and phase (S, K, m, 2),
+    which are further parameters where runs scatter.
+    """
+    if scatter > 0.0:
+        rows = np.concatenate([rows, offsets], axis=-1)
+    products = rows.swapaxes(-1, -2) @ rows
+    return np.ascontiguousarray(products.swapaxes(0, 1).reshape(rows.shape[1], -1))
+
+
+@dataclass(frozen=True)
+class Term:
+    """One criterion on one model: D-optimality, or the uncertainty of targets.
+
+    Attributes
+    ----------
+    packed : ndarray, shape (..., K, S Q Q)
+        Information of one cycle at every candidate and draw; Q = P, or P + 2 with a run's gain and
+        phase behind the parameters.
+    known : ndarray, shape (S, P, P)
+        Information before the plan.
+    scatter : float
+        s, standard deviation of a run's ln gain and phase; 0 where runs do not differ.
+    targets : ndarray, shape (S, P, C), or None
+        Directions over their wanted standard uncertainties; None: D-optimality.
+    starts : ndarray of int, shape (T,), or None
+        First column of each target, whose variances are added; None: a column each.
+    weight : float
+        In the sum of the terms.
+    departures : int
+        Number of parameters, the last ones, whose uncertainty does not matter by itself.
+    """
+
+    packed: FloatArray
+    known: FloatArray
+    scatter: float = 0.0
+    targets: FloatArray | None = None
+    starts: NDArray[np.intp] | None = None
+    weight: float = 1.0
+    departures: int = 0
+
+    def of_run(self, cycles: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return S for cycles (..., K), and L in dS = L dM L' with M of all Q parameters."""
+        S, P = self.known.shape[:2]
+        Q = P + 2 * (self.scatter > 0.0)
+        total = (cycles[..., None, :] @ self.packed)[..., 0, :]
+        M = total.reshape(*total.shape[:-1], S, Q, Q)
+        ahead = np.broadcast_to(np.eye(P), (*M.shape[:-2], P, P))
+        if Q == P:
+            return M, ahead
+        C = M[..., P:, P:] + np.eye(2) / self.scatter**2
+        lever = -M[..., :P, P:] @ np.linalg.inv(C)
+        return M[..., :P, :P] + lever @ M[..., P:, :P], np.concatenate([ahead, lever], axis=-1)
+
+    def at(self, cycles: FloatArray, runs: int) -> tuple[FloatArray, FloatArray]:
+        """Return the weighted criterion, and its derivative with respect to the packed sums."""
+        S, back = self.of_run(cycles)
+        value, slope = self._criterion(self.known + runs * S)
+        slope = (self.weight * runs / len(self.known)) * (back.swapaxes(-1, -2) @ slope @ back)
+        return self.weight * value, slope.reshape(*value.shape, -1)
+
+    def _criterion(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the mean over draws, (...), and S times its derivative, (..., S, P, P)."""
+        inverse = np.linalg.inv(M)
+        if self.targets is None:
+            P = M.shape[-1] - self.departures
+            if not self.departures:
+                return np.linalg.slogdet(M)[1].mean(axis=-1) / P, inverse / P
+            part, ahead = inverse[..., :P, :P], inverse[..., :P, :]
+            slope = ahead.swapaxes(-1, -2) @ np.linalg.inv(part) @ ahead
+            return -np.linalg.slogdet(part)[1].mean(axis=-1) / P, slope / P
+        moved = inverse @ self.targets
+        h = np.einsum("...spc,spc->...sc", moved, self.targets)
+        starts = np.arange(h.shape[-1]) if self.starts is None else self.starts
+        sums = np.add.reduceat(h, starts, axis=-1)
+        top = sums.max(axis=-1, keepdims=True)
+        powers = (sums / top) ** (_POWER - 1.0)
+        total = (powers * sums / top).sum(axis=-1)
+        value = -(np.log(top[..., 0]) + np.log(total) / _POWER).mean(axis=-1)
+        share = np.repeat(
+            powers / (total[..., None] * top), np.diff([*starts, h.shape[-1]]), axis=-1
+        )
+        return value, (moved * share[..., None, :]) @ moved.swapaxes(-1, -2)
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The sum of terms over the same candidates, a function of their cycles in one of `runs`."""
+
+    terms: tuple[Term, ...]
+    runs: int = 1
+
+    def only(self, candidates: Sequence[int] | NDArray[np.intp]) -> Objective:
+        """Return the objective of some candidates, or of each of several sets, (designs, m)."""
+        chosen = np.asarray(candidates, dtype=np.intp)
+        return replace(self, terms=tuple(replace(t, packed=t.packed[chosen]) for t in self.terms))
+
+    def at(self, cycles: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+        """Return the criterion at the cycles of every candidate, (..., K), and sensitivities."""
+        found = [term.at(cycles, self.runs) for term in self.terms]
+        return np.asarray(sum(value for value, _ in found)), [slope for _, slope in found]
+
+    def gradient(self, sensitivities: Sequence[FloatArray]) -> FloatArray:
+        """Return derivatives with respect to the cycles of this objective's candidates."""
+        pairs = zip(self.terms, sensitivities, strict=True)
+        return np.asarray(sum((t.packed @ s[..., None])[..., 0] for t, s in pairs))
+
+
+@dataclass(frozen=True)
+class ContinuousDesign:
+    """Seconds at each candidate, the criterion, and the largest d_k/d - 1: 0 at the optimum."""
+
+    seconds: FloatArray
+    value: float
+    excess: float
+
+
+def continuous_design(
+    objective: Objective,
+    frequency_hz: FloatArray,
+    time: float,
+    *,
+    tolerance: float = 0.01,
+    iterations: int = 400,
+) -> ContinuousDesign:
+    """Return the best seconds at each candidate, settling and change-over left out."""
+    K = len(frequency_hz)
+    seconds, active = np.full(K, time / K), np.arange(K)
+    value, excess = np.array(-np.inf), np.inf
+    for _ in range(30):
+        sub, f = objective.only(active), frequency_hz[active]
+        seconds[active] = _shared(sub, f, time, seconds[active], iterations // 10, tolerance)
+        value, sensitivities = sub.at(seconds[active] * f)
+        rate = objective.gradient(sensitivities) * frequency_hz
+        mean = float(rate @ seconds) / time
+        excess = float(rate.max() / mean) - 1.0
+        if excess < tolerance:
+            break
+        # candidates that cannot matter are set aside; those that should be measured return
+        resting = (seconds < 1e-4 * seconds.max()) & (rate < 0.9 * mean)
+        seconds[resting] = 0.0
+        missing = ~resting & (seconds == 0.0) & (rate > mean)
+        seconds[missing] = 1e-3 * time / max(int(missing.sum()), 1)
+        seconds *= time / seconds.sum()
+        active = np.flatnonzero(seconds)
+    return ContinuousDesign(seconds, float(value), excess)
+
+
+def _shared(
+    objective: Objective,
+    frequency_hz: FloatArray,
+    time: FloatArray | float,
+    start: FloatArray,
+    iterations: int,
+    tolerance: float,
+    least: FloatArray | float = 0.0,
+) -> FloatArray:
+    """Return seconds beyond `least` that share the `time` of each design, (..., m), best."""
+    seconds = start * (time / start.sum(axis=-1, keepdims=True))
+    power = np.ones((*seconds.shape[:-1], 1))
+    value, sensitivities = objective.at((least + seconds) * frequency_hz)
+    rate = objective.gradient(sensitivities) * frequency_hz
+    for _ in range(iterations):
+        mean = (rate * seconds).sum(axis=-1, keepdims=True) / time
+        better = (mean > 0.0) & (rate.max(axis=-1, keepdims=True) >= (1.0 + tolerance) * mean)
+        if not better.any():
+            break
+        with np.errstate(divide="ignore", invalid="ignore"):
+            moved = seconds * (rate / mean) ** power
+            moved *= time / moved.sum(axis=-1, keepdims=True)
+        moved = np.where(better, moved, seconds)
+        new_value, sensitivities = objective.at((least + moved) * frequency_hz)
+        # only D-optimality rises with full steps; a step that fell is tried again, half as long
+        fell = (new_value < value)[..., None] & (power >= 0.1)
+        power = np.where(fell, 0.5 * power, power)
+        if fell.all():
+            continue
+        new_rate = objective.gradient(sensitivities) * frequency_hz
+        seconds, rate = np.where(fell, seconds, moved), np.where(fell, rate, new_rate)
+        value = np.where(fell[..., 0], value, new_value)
+    return np.asarray(seconds)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Levels in the order of the run, whole cycles at each, and the criterion."""
+
+    levels: NDArray[np.intp]
+    cycles: FloatArray
+    value: float
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What levels need so that their data can be judged.
+
+    Attributes
+    ----------
+    fewest : int
+        Number of levels, at least.
+    span : float
+        ln of the largest displacement amplitude over the smallest, at least.
+    amplitude : ndarray, shape (K,)
+        ln of the displacement amplitude of every candidate.
+    """
+
+    fewest: int
+    span: float
+    amplitude: FloatArray
+
+    def wide(self, levels: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return which sets of levels, (..., m), span enough; one alone can still be added to."""
+        enough = np.ptp(self.amplitude[levels], axis=-1) >= self.span
+        return np.asarray(enough | (levels.shape[-1] < 2))
+
+    def holds(self, levels: NDArray[np.intp], runs: int) -> bool:
+        """Return whether the data of some runs at these levels can be judged."""
+        span = float(np.ptp(self.amplitude[levels]))
+        return runs * len(levels) >= self.fewest and span >= self.span
+
+
+class Exchange:
+    """The search for levels with settling and change-over, covering what their data need."""
+
+    def __init__(
+        self,
+        objective: Objective,
+        bench: BenchTime,
+        pool: NDArray[np.intp],
+        coverage: Coverage | None = None,
+    ) -> None:
+        self._objective, self._bench, self._pool = objective, bench, pool
+        self._coverage = coverage or Coverage(1, 0.0, np.zeros(len(bench.frequency_hz)))
+
+    def best(self, time: float, start: Sequence[int] = ()) -> Selection | None:
+        """Return the best levels for one run of `time` s; None where nothing can be measured."""
+        chosen, value, fewest = list(start), -np.inf, self._coverage.fewest
+        if chosen:
+            value = float(self._values([chosen], time)[0])
+            chosen = chosen if np.isfinite(value) else []
+        improves = True
+        while improves:
+            too_few = len(chosen) < fewest
+            for trials, least in (
+                (self._additions(chosen, time), -np.inf if too_few else value),
+                (self._exchanges(chosen, time), value),
+            ):
+                tried = list(trials)
+                values = self._values(tried, time)
+                improves = bool(tried) and bool(values.max() > least + _IMPROVES)
+                if improves:
+                    chosen, value = tried[int(values.argmax())], float(values.max())
+                    break
+        return self.whole(chosen, time) if chosen else None
+
+    def _additions(self, chosen: list[int], time: float) -> Iterator[list[int]]:
+        if len(chosen) < _MOST_LEVELS:
+            for k in self._promising(chosen, time):
+                yield [*chosen, k]
+
+    def _exchanges(self, chosen: list[int], time: float) -> Iterator[list[int]]:
+        for k in chosen:
+            others = [j for j in chosen if j != k]
+            if len(others) >= self._coverage.fewest:
+                yield others
+            for j in self._promising(others, time):
+                if j != k:
+                    yield [*others, j]
+
+    def _share(
+        self, levels: NDArray[np.intp], time: float, iterations: int
+    ) -> tuple[Objective, FloatArray]:
+        """Return the cycles at the levels of each design, (..., m); NaN without enough time."""
+        f = self._bench.frequency_hz[levels]
+        least = LEAST_CYCLES / f
+        room = (time - self._bench.fixed(levels) - least.sum(axis=-1))[..., None]
+        sub = self._objective.only(levels)
+        some = np.maximum(room, _NO_TIME)
+        seconds = _shared(sub, f, some, np.ones(f.shape), iterations, 0.003, least)
+        return sub, np.where(room >= 0.0, (least + np.where(room > 0.0, seconds, 0.0)) * f, np.nan)
+
+    def _values(self, trials: list[list[int]], time: float) -> FloatArray:
+        """Return the criterion of each set of levels; -inf without enough time."""
+        result = np.full(len(trials), -np.inf)
+        sizes = np.array([len(trial) for trial in trials])
+        for size in np.unique(sizes[sizes > 0]).tolist():
+            same = np.flatnonzero(sizes == size)
+            levels = np.array([trials[i] for i in same], dtype=np.intp)
+            sub, cycles = self._share(levels, time, 15)
+            enough = np.isfinite(cycles).all(axis=-1) & self._coverage.wide(levels)
+            value, _ = sub.at(np.where(enough[:, None], cycles, 1.0))
+            result[same] = np.where(enough, value, -np.inf)
+        return result
+
+    def _promising(self, chosen: list[int], time: float) -> list[int]:
+        """Return the candidates that look best in addition to the chosen ones, at equal shares."""
+        others = np.setdiff1d(self._pool, chosen)
+        joined = np.column_stack([np.tile(chosen, (others.size, 1)), others]).astype(np.intp)
+        least = (LEAST_CYCLES / self._bench.frequency_hz[joined]).sum(axis=-1)
+        rooms = time - self._bench.fixed(joined) - least
+        fits = (rooms >= 0.0) & self._coverage.wide(joined)
+        if not fits.any():
+            return []
+        joined, rooms = joined[fits], rooms[fits] / joined.shape[1]
+        cycles = LEAST_CYCLES + rooms[:, None] * self._bench.frequency_hz[joined]
+        values, _ = self._objective.only(joined).at(cycles)
+        return [int(k) for k in joined[np.argsort(-values)[:_TRIED], -1]]
+
+    def whole(self, levels: Sequence[int], time: float) -> Selection:
+        """Return whole cycles at the levels; the remaining time goes where it helps most."""
+        ordered = self._bench.order(levels)
+        f = self._bench.frequency_hz[ordered]
+        sub, shared = self._share(ordered, time, 100)
+        cycles = np.maximum(np.floor(shared + 1e-9), float(LEAST_CYCLES))
+        while True:
+            value, sensitivities = sub.at(cycles)
+            possible = 1.0 / f <= time - self._bench.seconds(ordered, cycles) + 1e-9
+            if not possible.any():
+                return Selection(ordered, cycles, float(value))
+            gain = np.where(possible, sub.gradient(sensitivities) * f, -np.inf)
+            cycles[int(np.argmax(gain))] += 1.0

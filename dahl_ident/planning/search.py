@@ -1,0 +1,284 @@
+"""The search for levels, cycles and runs: the best in a time, the least time for targets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.stiffening import LEAST_DOF
+from dahl_ident.diagnostics.trends import LEAST_RANGE
+from dahl_ident.errors import ValidationError
+from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
+from dahl_ident.planning.candidates import Candidates
+from dahl_ident.planning.design import Coverage, Exchange, Objective, Selection, continuous_design
+from dahl_ident.planning.forecast import Expected, Forecast, typical
+from dahl_ident.planning.knowledge import spread
+from dahl_ident.planning.motion_information import RepeatSums
+from dahl_ident.planning.question import Question
+from dahl_ident.planning.suspects import Suspects
+
+_POOL = 80  # candidates: the time of the search grows with their number
+_MOST_RUNS = 8  # against scatter between runs: a ninth would gain 6 %
+_WEIGHTS = (0.0, 0.1, 0.25, 0.5, 0.75)  # of the suspected parameters, the least that is enough
+LONGEST = 30.0 * 86400.0  # s, of a plan for which no time is given: a month
+_TIMES = 20  # corrections of the time that reaches a target
+_HELPS = 0.1  # of what the square root of the time would do, below which more time is useless
+_CLOSE = 0.985  # fraction of the target at which the search stops
+_AIMED = 0.995  # fraction of the target that a corrected time aims at
+_NARROWS = 0.6  # of the logarithm of the interval that a correction leaves, else it is halved
+_APART = 2.0  # times the range that a fit takes as one amplitude: measured ones are not exact
+_GRID_LEVELS = 10  # of the usual plan that the best one is compared with
+_CORRECTIONS = 6  # of the repeats of motions, each by the whole information
+_FILLED = 0.999  # fraction of the target that corrected repeats aim at
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Levels for one run, the number of runs, and the largest ratio of uncertainty to target."""
+
+    selection: Selection
+    runs: int
+    seconds: float
+    ratio: float
+
+    @property
+    def design(self) -> tuple[NDArray[np.intp], FloatArray, int]:
+        """Levels, cycles and runs."""
+        return self.selection.levels, self.selection.cycles, self.runs
+
+
+class Search:
+    """The search for levels and cycles: candidates evaluated once, then solved for any time."""
+
+    def __init__(self, question: Question, candidates: Candidates) -> None:
+        self.question, knowledge = question, question.knowledge
+        self.bench = BenchTime.of(candidates, knowledge, **question.costs)
+        settles = np.isfinite(self.bench.alone)
+        if not settles.any():
+            raise ValidationError(
+                "plan: no candidate ever settles; widen limits['displacement'] upwards"
+            )
+        if not settles.all():
+            candidates = candidates.only(np.flatnonzero(settles))
+            self.bench = BenchTime.of(candidates, knowledge, **question.costs)
+        self.forecast = Forecast.of(question, candidates)
+        few = self.forecast.thinned()
+        self._term, self._suspects = few.term(question.target), None
+        if question.larger is not None:
+            self._suspects = Suspects.of(question, few.knowledge, few.candidates)
+        self._pool: NDArray[np.intp] | None = None
+
+    def best(self) -> Solution:
+        """Return the least time that reaches the targets, or the best in the time allowed."""
+        q = self.question
+        found = self.least_time() if q.has_numbers else self.solve(q.limits.time)
+        if found is None:
+            least = float((self.bench.alone + LEAST_CYCLES / self.bench.frequency_hz).min())
+            raise ValidationError(
+                f"limits['time'] is {q.limits.time:g} s, and the quickest "
+                f"{'level' if q.recorded is None else 'motion'} takes {least:.3g} "
+                "s to change over, settle and measure; give more time"
+            )
+        return found if q.recorded is None else self._exactly(found)
+
+    def score(self, solution: Solution) -> tuple[bool, float]:
+        """Return what is larger for the better of two solutions of the same question."""
+        if self.question.has_numbers:
+            reached = self.reached(solution)
+            return reached, -solution.seconds if reached else -solution.ratio
+        term = self.forecast.thinned().term(self.question.target)
+        value, _ = Objective((term,)).only(solution.selection.levels).at(solution.selection.cycles)
+        return True, float(value)
+
+    def solve(self, time: float, start: Sequence[int] = ()) -> Solution | None:
+        """Return the best levels and runs for a time; None where it is too short."""
+        best: Solution | None = None
+        least = np.inf
+        for weight in (0.0,) if self._suspects is None else _WEIGHTS:
+            found = self._solve(time, weight, start)
+            if found is None:
+                return None
+            ratio = self.suspect_ratio(found)
+            if best is None or ratio < least:
+                best, least = found, ratio
+            if ratio <= 1.0:
+                break
+        return best
+
+    def _solve(self, time: float, weight: float, start: Sequence[int]) -> Solution | None:
+        q, best = self.question, None
+        most = _MOST_RUNS if q.scatter > 0.0 else 1
+        for runs in (q.runs,) if q.runs else range(1, most + 1):
+            objective = self._objective(weight, runs)
+            search = Exchange(objective, self.bench, self._promising(time), self._coverage)
+            found = search.best(time / runs, start)
+            if found is None or (best is not None and found.value <= best.selection.value):
+                break
+            seconds = runs * self.bench.seconds(found.levels, found.cycles)
+            best = Solution(found, runs, seconds, np.nan)
+            best = replace(best, ratio=self.ratio(best))
+            start = found.levels.tolist()
+        return best
+
+    def _objective(self, weight: float = 0.0, runs: int = 1) -> Objective:
+        terms = [replace(self._term, weight=1.0 - weight)]
+        if self._suspects is not None and weight > 0.0:
+            terms.append(replace(self._suspects.term, weight=weight))
+        return Objective(tuple(terms), runs)
+
+    @cached_property
+    def _coverage(self) -> Coverage:
+        """What levels need for a fit to them alone that can tell a wrong model from noise."""
+        known, candidates = self.question.knowledge, self.forecast.candidates
+        amplitude = np.log(np.median(candidates.amplitude, axis=0))
+        if known.problem is not None or known.sample_noise is not None or candidates.motions:
+            return Coverage(1, 0.0, amplitude)
+        fitted = len(known.names) - len(known.assumed)
+        span = _APART * LEAST_RANGE if np.ptp(amplitude) >= _APART * LEAST_RANGE else 0.0
+        fewest = min((LEAST_DOF + fitted + 1) // 2, candidates.count)
+        return Coverage(fewest, span, amplitude)
+
+    def can_be_judged(self, solution: Solution) -> bool:
+        """Return whether the data of a solution alone can tell a wrong model from noise."""
+        return self._coverage.holds(solution.selection.levels, solution.runs)
+
+    def reached(self, solution: Solution) -> bool:
+        """Return whether a solution reaches every target, with data that can be judged."""
+        judged = not self.question.has_numbers or self.can_be_judged(solution)
+        return solution.ratio <= 1.0 and judged
+
+    def _promising(self, time: float) -> NDArray[np.intp]:
+        """Return promising candidates: those of the continuous design, and evenly spread ones."""
+        if self._pool is None:
+            K, f, alone = self.forecast.candidates.count, self.bench.frequency_hz, self.bench.alone
+            if K <= _POOL:
+                self._pool = np.arange(K)
+                return self._pool
+            usual = 0.2 * time if np.isfinite(time) else 20.0 * float(np.median(alone))
+            reachable = alone + LEAST_CYCLES / f <= time
+            rate = f * usual / (usual + alone) * reachable + 1e-12
+            objective = self._objective(0.5 if self._suspects else 0.0)
+            seconds = continuous_design(
+                objective, rate, usual, tolerance=0.05, iterations=200
+            ).seconds
+            best = np.argsort(-seconds, kind="stable")[: _POOL // 2]
+            even = np.argsort(self.bench.force, kind="stable")[spread(K, _POOL // 2)]
+            self._pool = np.unique(np.concatenate([best[seconds[best] > 0.0], even]))
+        return self._pool
+
+    def ratio(self, solution: Solution) -> float:
+        """Return the largest ratio of an uncertainty to its target, suspects included."""
+        worst = self.suspect_ratio(solution)
+        if self.question.has_numbers:
+            after, _ = self.forecast.after(*solution.design)
+            target = self.question.target
+            worst = max(worst, *(typical(after[name]) / u for name, u in target.items()))
+        return worst
+
+    def suspect_ratio(self, solution: Solution) -> float:
+        """Return the largest ratio of a suspected parameter's uncertainty to its target."""
+        return 0.0 if self._suspects is None else self._suspects.ratio(*solution.design)
+
+    def least_time(self) -> Solution | None:
+        """Return the shortest plan that reaches the targets, or the best in the time allowed.
+
+        Where no time is given, that is a month.
+        """
+        most = min(self.question.limits.time, LONGEST)
+        time = min(most, 30.0 * float(np.median(self.bench.alone)) + 1.0)
+        best: Solution | None = None
+        last: Solution | None = None
+        start: list[int] = []
+        short, wide = 0.0, np.inf
+        for _ in range(_TIMES):
+            found = self.solve(time, start)
+            if found is not None:
+                start = found.selection.levels.tolist()
+            if found is not None and self.reached(found):
+                best = found if best is None or found.seconds < best.seconds else best
+                if found.ratio >= _CLOSE:
+                    break
+            else:
+                short = max(short, time)
+            if best is None:
+                if time >= most:
+                    return found or last
+                if found is not None and found.ratio > 1.0 and last is not None:
+                    by_time = 0.5 * np.log(found.seconds / last.seconds)
+                    if np.log(last.ratio / found.ratio) < _HELPS * by_time:
+                        return last
+                last = found or last
+                factor = 4.0 if last is None else float(np.clip(last.ratio**2, 1.3, 1e3))
+                time = min(factor * time, most)
+                continue
+            if short >= _CLOSE * best.seconds:
+                break
+            fixed = best.runs * float(self.bench.fixed(best.selection.levels))
+            time = fixed + (best.seconds - fixed) * (best.ratio / _AIMED) ** 2
+            narrow = np.log(best.seconds / max(short, 1e-3 * best.seconds))
+            if not short < time < 0.99 * best.seconds or narrow > _NARROWS * wide:
+                time = float(np.sqrt(best.seconds * max(short, 0.25 * best.seconds)))
+            wide = narrow
+        return best or last
+
+    def _exactly(self, found: Solution) -> Solution:
+        """Return the repeats that reach the targets by the information of the whole records.
+
+        The search takes each repeat of a motion as worth the same; the first ones, which also have
+        to determine the state at the start, the offset and the drift, are worth less.
+        """
+        q, candidates, levels = self.question, self.forecast.candidates, found.selection.levels
+        assert q.recorded is not None
+        sums = [RepeatSums.of(q.knowledge, candidates.motions[k], q.recorded) for k in levels]
+        risen, best = False, found
+        for attempt in range(_CORRECTIONS):
+            rows, cycles = candidates.rows.copy(), best.selection.cycles
+            for k, one, repeats in zip(levels.tolist(), sums, cycles.tolist(), strict=True):
+                rows[:, k] = one.rows(int(repeats)) * q.knowledge.units
+            self.forecast = replace(self.forecast, candidates=replace(candidates, rows=rows))
+            best = replace(best, ratio=self.ratio(best), seconds=self.bench.seconds(levels, cycles))
+            better = np.maximum(np.ceil(cycles * (best.ratio / _FILLED) ** 2), float(LEAST_CYCLES))
+            possible = self.bench.seconds(levels, better) <= min(q.limits.time, LONGEST)
+            done = (best.ratio <= 1.0 and risen) or bool((better == cycles).all())
+            if done or not (q.has_numbers and possible) or attempt == _CORRECTIONS - 1:
+                break
+            risen = risen or best.ratio > 1.0
+            best = replace(best, selection=replace(best.selection, cycles=better))
+        return best
+
+    def expected_after(self, time: float, *, grid: bool = False) -> dict[str, Expected]:
+        """Return what the best plan of a time, or a grid, determines; empty if it is too short."""
+        if grid:
+            design = self.logarithmic_grid(time)
+        else:
+            design = None if (found := self.solve(time)) is None else found.design
+        return {} if design is None else self.forecast.expected(*design)
+
+    def logarithmic_grid(
+        self, time: float, levels: int = _GRID_LEVELS
+    ) -> tuple[NDArray[np.intp], FloatArray, int] | None:
+        """Return levels, cycles and runs of an even logarithmic grid, equal cycles at each.
+
+        In the same order and with the same settling; of several frequencies a third of the levels
+        at each of three. None where the time is too short.
+        """
+        c, rate_free = self.forecast.candidates, self.question.knowledge.model.rate_independent
+        frequencies, groups = np.unique(c.frequency_hz), [np.arange(c.count)]
+        single = c.motions or (rate_free and self.question.controlled == "displacement")
+        if not single and len(frequencies) > 2:
+            three = frequencies[[0, len(frequencies) // 2, -1]]
+            groups = [np.flatnonzero(c.frequency_hz == f) for f in three]
+        chosen: list[int] = []
+        for group in groups:
+            level = np.log(c.level[group])
+            places = np.linspace(level.min(), level.max(), max(levels // len(groups), 2))
+            chosen += [int(group[np.argmin(np.abs(level - p))]) for p in places]
+        ordered, runs = self.bench.order(np.unique(chosen)), self.question.runs or 1
+        room = time / runs - self.bench.fixed(ordered)
+        cycles = np.floor(room / float((1.0 / c.frequency_hz[ordered]).sum()))
+        return None if cycles < 1.0 else (ordered, np.full(len(ordered), cycles), runs)
