@@ -26,28 +26,16 @@ class BenchTime:
     A transient starts as the fraction abs(F - F')/F of the friction force F, where F' is that of
     the previous level, and shrinks by `decay` per cycle; measuring starts when it is below
     `settled`.
-
-    Attributes
-    ----------
-    frequency_hz, decay, force : ndarray, shape (K,)
-        Frequency, factor by which a transient shrinks in a cycle, and friction force.
-    change_over : float
-        Seconds from one level to the next.
-    settled : float
-        Share of the friction force.
-    between_runs : float
-        Seconds that a run takes in addition to its levels.
-    least_settling : int
-        Cycles before measuring, at least.
     """
 
+    # (K,) frequency, factor by which a transient shrinks in a cycle, and friction force
     frequency_hz: FloatArray
     decay: FloatArray
     force: FloatArray
-    change_over: float
-    settled: float
-    between_runs: float = 0.0
-    least_settling: float = _LEAST_SETTLING
+    change_over: float  # seconds from one level to the next
+    settled: float  # share of the friction force
+    between_runs: float = 0.0  # seconds that a run takes in addition to its levels
+    least_settling: float = _LEAST_SETTLING  # cycles before measuring, at least
 
     @classmethod
     def of(cls, candidates: Candidates, knowledge: Knowledge, **costs: float) -> BenchTime:

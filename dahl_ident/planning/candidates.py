@@ -32,31 +32,17 @@ _OF_DRAWS = ("amplitude", "force", "rows", "variance")
 
 @dataclass(frozen=True)
 class Candidates:
-    """Levels and frequencies with all data that the search needs.
+    """Levels and frequencies with all data that the search needs."""
 
-    Attributes
-    ----------
-    controlled : {"displacement", "force"}
-        What `level` is an amplitude of.
-    level, frequency_hz : ndarray, shape (K,)
-        SI.
-    amplitude, force : ndarray, shape (S, K)
-        Of displacement and of force, at every draw.
-    rows : ndarray, shape (S, K, m, P)
-        Derivatives of the whitened residuals of one cycle with respect to the parameters.
-    variance : ndarray, shape (S, K)
-        Of ln gain and phase in one cycle.
-    motions : tuple of PlannedMotion
-        Motions in time whose periods the cycles are; empty for sines.
-    """
-
-    controlled: str
-    level: FloatArray
+    controlled: str  # {"displacement", "force"} what `level` is an amplitude of
+    level: FloatArray  # (K,) SI
     frequency_hz: FloatArray
-    amplitude: FloatArray
+    amplitude: FloatArray  # (S, K) of displacement and of force, at every draw
     force: FloatArray
+    # (S, K, m, P) derivatives of the whitened residuals of one cycle with respect to the parameters
     rows: FloatArray
-    variance: FloatArray
+    variance: FloatArray  # (S, K) of ln gain and phase in one cycle
+    # motions in time whose periods the cycles are; empty for sines
     motions: tuple[PlannedMotion, ...] = ()
 
     @property

@@ -62,33 +62,20 @@ def packed_information(
 
 @dataclass(frozen=True)
 class Term:
-    """One criterion on one model: D-optimality, or the uncertainty of targets.
+    """One criterion on one model: D-optimality, or the uncertainty of targets."""
 
-    Attributes
-    ----------
-    packed : ndarray, shape (..., K, S Q Q)
-        Information of one cycle at every candidate and draw; Q = P, or P + 2 with a run's gain and
-        phase behind the parameters.
-    known : ndarray, shape (S, P, P)
-        Information before the plan.
-    scatter : float
-        s, standard deviation of a run's ln gain and phase; 0 where runs do not differ.
-    targets : ndarray, shape (S, P, C), or None
-        Directions over their wanted standard uncertainties; None: D-optimality.
-    starts : ndarray of int, shape (T,), or None
-        First column of each target, whose variances are added; None: a column each.
-    weight : float
-        In the sum of the terms.
-    departures : int
-        Number of parameters, the last ones, whose uncertainty does not matter by itself.
-    """
-
+    # (..., K, S Q Q) information of one cycle at every candidate and draw; Q = P, or P + 2 with a
+    # run's gain and phase behind the parameters
     packed: FloatArray
-    known: FloatArray
+    known: FloatArray  # (S, P, P) information before the plan
+    # s, standard deviation of a run's ln gain and phase; 0 where runs do not differ
     scatter: float = 0.0
+    # (S, P, C) directions over their wanted standard uncertainties; None: D-optimality
     targets: FloatArray | None = None
+    # (T,) first column of each target, whose variances are added; None: a column each
     starts: NDArray[np.intp] | None = None
-    weight: float = 1.0
+    weight: float = 1.0  # in the sum of the terms
+    # number of parameters, the last ones, whose uncertainty does not matter by itself
     departures: int = 0
 
     def of_run(self, cycles: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -244,21 +231,11 @@ class Selection:
 
 @dataclass(frozen=True)
 class Coverage:
-    """What levels need so that their data can be judged.
+    """What levels need so that their data can be judged."""
 
-    Attributes
-    ----------
-    fewest : int
-        Number of levels, at least.
-    span : float
-        ln of the largest displacement amplitude over the smallest, at least.
-    amplitude : ndarray, shape (K,)
-        ln of the displacement amplitude of every candidate.
-    """
-
-    fewest: int
-    span: float
-    amplitude: FloatArray
+    fewest: int  # number of levels, at least
+    span: float  # ln of the largest displacement amplitude over the smallest, at least
+    amplitude: FloatArray  # (K,) ln of the displacement amplitude of every candidate
 
     def wide(self, levels: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Return which sets of levels, (..., m), span enough; one alone can still be added to."""
@@ -268,7 +245,7 @@ class Coverage:
     def holds(self, levels: NDArray[np.intp], runs: int) -> bool:
         """Return whether the data of some runs at these levels can be judged."""
         span = float(np.ptp(self.amplitude[levels]))
-        return runs * len(levels) >= self.fewest and span >= self.span
+        return runs * len(levels) >= self.fewest and bool(span >= self.span)
 
 
 class Exchange:

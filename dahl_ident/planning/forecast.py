@@ -32,58 +32,32 @@ _PLACES = 24  # of the candidates, over which the response is averaged
 
 @dataclass(frozen=True)
 class Expected:
-    """Predicted relative standard uncertainty of a quantity; of ``"U(...)"`` the expanded one.
+    """Predicted relative standard uncertainty of a quantity; of ``"U(...)"`` the expanded one."""
 
-    Attributes
-    ----------
-    value : float
-        Median over the draws; NaN of the response.
-    before, after : float
-        Relative standard uncertainty from the earlier data, and with the plan's data; inf where
-        nothing is known. Geometric mean over the draws.
-    low, high : float
-        Tenth and ninetieth percentile of `after` over the draws.
-    scatter_share : float
-        Fraction of the variance that is due to scatter between runs.
-    """
-
-    value: float
+    value: float  # median over the draws; NaN of the response
+    # relative standard uncertainty from the earlier data, and with the plan's data; inf where
+    # nothing is known. Geometric mean over the draws
     before: float
     after: float
-    low: float
+    low: float  # tenth and ninetieth percentile of `after` over the draws
     high: float
-    scatter_share: float
+    scatter_share: float  # fraction of the variance that is due to scatter between runs
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Candidates, the information before them, and the uncertainties after some of them.
+    """Candidates, the information before them, and the uncertainties after some of them."""
 
-    Attributes
-    ----------
-    knowledge : Knowledge
-        Before the plan.
-    candidates : Candidates
-        With derivatives with respect to scaled parameters and W departures, Q together.
-    before : ndarray, shape (S, Q, Q)
-        Information of the earlier data as their fit judges it.
-    searched : ndarray, shape (S, Q, Q)
-        The same for the choice of levels: with ranges, and an assumed model error.
-    directions : mapping of str to ndarray, shape (S, Q, c)
-        Relative changes of each quantity; the squares of several columns are added.
-    scatter : float
-        Standard deviation of ln gain and phase between runs.
-    model_error : {"none", "assumed", "estimated"}
-        Of the earlier fit.
-    """
-
-    knowledge: Knowledge
+    knowledge: Knowledge  # before the plan
+    # with derivatives with respect to scaled parameters and W departures, Q together
     candidates: Candidates
-    before: FloatArray
+    before: FloatArray  # (S, Q, Q) information of the earlier data as their fit judges it
+    # (S, Q, Q) the same for the choice of levels: with ranges, and an assumed model error
     searched: FloatArray
+    # (S, Q, c) relative changes of each quantity; the squares of several columns are added
     directions: Mapping[str, FloatArray]
-    scatter: float
-    model_error: str
+    scatter: float  # standard deviation of ln gain and phase between runs
+    model_error: str  # {"none", "assumed", "estimated"} of the earlier fit
 
     @classmethod
     def of(cls, question: Question, candidates: Candidates) -> Forecast:

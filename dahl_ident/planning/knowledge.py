@@ -38,54 +38,29 @@ Ranges = Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class Knowledge:
-    """Draws of the free parameters and the information that earlier data hold on them.
+    """Draws of the free parameters and the information that earlier data hold on them."""
 
-    Attributes
-    ----------
-    model, sensors, motion
-        What is measured, and through what.
-    parameters : tuple of Parameter
-        The free ones, P of them.
-    theta : ndarray, shape (S, P)
-        Draws, search coordinates.
-    information : ndarray, shape (S, P, P)
-        Of the data measured before, at each draw, and of assumed values such as the exponent of
-        ``Dahl()``, which are parameters here as they are in a fit's uncertainty.
-    prior : ndarray, shape (P,)
-        Information of the ranges, each taken as very wide: it keeps the search defined where a
-        parameter cannot be determined, and a predicted uncertainty does not include it.
-    assumed : tuple of str
-        Names of the assumed parameters.
-    row_noise : float or None
-        Standard deviation of ln gain and of phase of a row of earlier data.
-    row_cycles : float
-        Cycles that such a row averages, if the data state it; else 1.
-    problem : Problem or None
-        Of the earlier data.
-    scatter : float
-        Standard deviation of ln gain and phase between runs in the earlier data.
-    errors : ErrorModel or None
-        Of an earlier fit.
-    sample_noise : float or None
-        Standard deviation of a sample of force in earlier records, N.
-    steady : {"exact", "describing function"}
-        How the response to a force that is held is predicted.
-    """
-
-    model: Model
-    parameters: tuple[Parameter, ...]
-    theta: FloatArray
+    model: Model  # what is measured, and through what
+    parameters: tuple[Parameter, ...]  # the free ones, P of them
+    theta: FloatArray  # (S, P) draws, search coordinates
+    # (S, P, P) of the data measured before, at each draw, and of assumed values such as the
+    # exponent of ``Dahl()``, which are parameters here as they are in a fit's uncertainty
     information: FloatArray
+    # (P,) information of the ranges, each taken as very wide: it keeps the search defined where a
+    # parameter cannot be determined, and a predicted uncertainty does not include it
     prior: FloatArray
-    assumed: tuple[str, ...] = ()
+    assumed: tuple[str, ...] = ()  # names of the assumed parameters
     sensors: Sensors | None = None
     motion: Motion = "translation"
+    # standard deviation of ln gain and of phase of a row of earlier data
     row_noise: float | None = None
-    row_cycles: float = 1.0
-    problem: Problem | None = None
-    scatter: float = 0.0
-    errors: ErrorModel | None = None
+    row_cycles: float = 1.0  # cycles that such a row averages, if the data state it; else 1
+    problem: Problem | None = None  # of the earlier data
+    scatter: float = 0.0  # standard deviation of ln gain and phase between runs in the earlier data
+    errors: ErrorModel | None = None  # of an earlier fit
+    # standard deviation of a sample of force in earlier records, N
     sample_noise: float | None = None
+    # {"exact", "describing function"} how the response to a force that is held is predicted
     steady: Steady = "exact"
 
     @property

@@ -30,27 +30,14 @@ _CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the plan's time, in the picture
 
 @dataclass(frozen=True)
 class PlanStep:
-    """One level of a run, or one motion in time.
+    """One level of a run, or one motion in time."""
 
-    Attributes
-    ----------
-    level : float
-        Amplitude of displacement (m) or drive (N), zero to peak.
-    frequency_hz : float
-        Hz; one over the period of a motion.
-    settling_cycles, measured_cycles : int
-        Cycles before measuring, and measured: the repeats of a motion.
-    seconds : float
-        Change-over, settling and measuring.
-    motion : PlannedMotion or None
-        The motion in time that is repeated, None for a sine.
-    """
-
-    level: float
-    frequency_hz: float
-    settling_cycles: int
+    level: float  # amplitude of displacement (m) or drive (N), zero to peak
+    frequency_hz: float  # hz; one over the period of a motion
+    settling_cycles: int  # cycles before measuring, and measured: the repeats of a motion
     measured_cycles: int
-    seconds: float
+    seconds: float  # change-over, settling and measuring
+    # the motion in time that is repeated, None for a sine
     motion: trajectories.PlannedMotion | None = None
 
 

@@ -60,27 +60,15 @@ def motions_of(kind: str, limits: BenchLimits, levels: tuple[float, float]) -> l
 
 @dataclass(frozen=True)
 class RepeatSums:
-    """Information in the repeats of a motion, their own unknowns included, for unit noise.
+    """Information in the repeats of a motion, their own unknowns included, for unit noise."""
 
-    Attributes
-    ----------
-    products : ndarray, shape (S, repeats, n, n)
-        J'J of each repeat; n = P + states + offset + drift, the drift from the repeat's start.
-    parameters : int
-        P.
-    period : float
-        Seconds.
-    force : ndarray, shape (S,)
-        Largest, N.
-    weight : float
-        Samples measured for each one that was computed, over the variance of the noise.
-    """
-
+    # (S, repeats, n, n) J'J of each repeat; n = P + states + offset + drift, the drift from the
+    # repeat's start
     products: FloatArray
-    parameters: int
-    period: float
-    force: FloatArray
-    weight: float
+    parameters: int  # P
+    period: float  # seconds
+    force: FloatArray  # (S,) largest, N
+    weight: float  # samples measured for each one that was computed, over the variance of the noise
 
     @classmethod
     def of(cls, knowledge: Knowledge, motion: PlannedMotion, recorded: RecordedForce) -> RepeatSums:

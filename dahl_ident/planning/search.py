@@ -150,7 +150,7 @@ class Search:
     def reached(self, solution: Solution) -> bool:
         """Return whether a solution reaches every target, with data that can be judged."""
         judged = not self.question.has_numbers or self.can_be_judged(solution)
-        return solution.ratio <= 1.0 and judged
+        return bool(solution.ratio <= 1.0) and judged
 
     def _promising(self, time: float) -> NDArray[np.intp]:
         """Return promising candidates: those of the continuous design, and evenly spread ones."""
