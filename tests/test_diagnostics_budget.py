@@ -11,8 +11,8 @@ from scipy import optimize, stats
 
 from dahl_ident import BoucWen, Dahl, FrequencyResponse, Sensors, Spring, fit, load_dataset
 from dahl_ident.diagnostics import ErrorModel, budget, error_model
+from dahl_ident.diagnostics.error_sources import repeated_levels
 from dahl_ident.diagnostics.mixed_model import MixedModel
-from dahl_ident.diagnostics.table_groups import repeated_levels
 from dahl_ident.errors import FitError
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
 

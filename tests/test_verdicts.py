@@ -23,7 +23,7 @@ from dahl_ident import (
     load_dataset,
 )
 from dahl_ident.diagnostics import Verdict
-from dahl_ident.diagnostics.stiffening import Stiffening, stiffening
+from dahl_ident.diagnostics.trends import Stiffening, stiffening
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
 
 
@@ -253,6 +253,23 @@ class TestNamed:
         some = fit(replace(table(), quality={"verdict": flawed}), Dahl())
         assert str(some.status) == "approximate"
         assert "The extraction flagged 3 of the points fitted (" in some.verdict
+
+    @pytest.mark.parametrize("column", ["level", "run", "tension"])
+    def test_devices_in_one_table(self, column: str) -> None:
+        tensions = [20, 40, 60]
+        A = np.geomspace(0.3, 10.0, 10) * X_C
+        R = np.outer(tensions, FRICTION.describing_function(A)).ravel() / 40.0
+        labels = np.repeat([f"{t} lb" for t in tensions], 10)
+        data = FrequencyResponse(
+            np.ones(30), R * relative_noise(30, 0.01, 2), np.tile(A, 3),
+            level=labels if column == "level" else None, run=labels if column == "run" else None,
+            quality={column: labels} if column == "tension" else None,
+        )  # fmt: skip
+        found = fit(data, Dahl())
+        assert str(found.status) == "not described"
+        expected = "the runs differ (gain by" if column == "run" else f"gain differs with {column}:"
+        assert expected in found.verdict
+        assert "parallel Jenkins" not in found.verdict
 
     def test_gains_and_phases_that_were_held_out(self) -> None:
         found = fit(_scattered(22, 1.1), Dahl())

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.intervals import Interval
-from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.physics import is_spring
 from dahl_ident.elements import Element, Parameter
 from dahl_ident.fitting import Optimum

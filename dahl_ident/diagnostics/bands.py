@@ -22,8 +22,7 @@ from dahl_ident.diagnostics.confidence_levels import checked_levels
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.held_out import band_factor
-from dahl_ident.diagnostics.information import Information
-from dahl_ident.diagnostics.parameters import values_at
+from dahl_ident.diagnostics.information import Information, values_at
 from dahl_ident.diagnostics.prediction_error import prediction_error, stated_noise
 from dahl_ident.elements import Element, Model
 from dahl_ident.errors import ModelError, ValidationError

@@ -17,16 +17,16 @@ from dahl_ident.diagnostics.budget import taken_as_exact
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.goodness import Goodness
 from dahl_ident.diagnostics.held_out import CrossValidation
+from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
-from dahl_ident.diagnostics.parameters import parameter_values
 from dahl_ident.diagnostics.physics import (
     below_zero,
     beyond_friction_limit,
     is_single,
     slight,
+    steady_findings,
 )
-from dahl_ident.diagnostics.steady_motion import steady_findings
 from dahl_ident.diagnostics.verdicts import Identifiability
 from dahl_ident.elements import Model
 from dahl_ident.fitting import Optimum

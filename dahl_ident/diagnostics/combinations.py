@@ -20,7 +20,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.bands import friction_and_slopes
-from dahl_ident.diagnostics.parameters import parameter_values
+from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.physics import is_spring
 from dahl_ident.elements import Parameter
 from dahl_ident.fitting import Optimum

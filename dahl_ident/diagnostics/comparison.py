@@ -23,7 +23,7 @@ from numpy.polynomial import legendre
 from scipy import special
 
 from dahl_ident.diagnostics.formatting import listed, percent, table, with_unit
-from dahl_ident.diagnostics.parameters import parameter_values
+from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.physics import is_spring, negative_parameters
 from dahl_ident.diagnostics.predictive_density import PredictiveDensity, predictive_density
 from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit

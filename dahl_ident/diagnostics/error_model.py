@@ -40,6 +40,7 @@ from dahl_ident.diagnostics.error_sources import (
     Source,
     error_sources,
     own_errors,
+    rows_of_tests,
 )
 from dahl_ident.diagnostics.estimate import (
     EXPONENT,
@@ -50,16 +51,14 @@ from dahl_ident.diagnostics.estimate import (
     with_assumed,
 )
 from dahl_ident.diagnostics.held_out import HeldOut, held_out
-from dahl_ident.diagnostics.misfit_explanations import at_an_end, neighbourhood
+from dahl_ident.diagnostics.misfit_explanations import at_an_end, neighbourhood, suspicious_points
 from dahl_ident.diagnostics.mixed_model import MixedModel, State, shares
-from dahl_ident.diagnostics.outliers import suspicious_points
-from dahl_ident.diagnostics.residual_space import ResidualSpace
-from dahl_ident.diagnostics.run_deviations import (
+from dahl_ident.diagnostics.residual_space import (
+    ResidualSpace,
     RunDeviations,
     linearization,
     run_deviations,
 )
-from dahl_ident.diagnostics.table_groups import rows_of_tests
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem
 

@@ -31,19 +31,31 @@ from dahl_ident.diagnostics.formatting import p_text, percent, with_unit
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.misfit_explanations import (
     EXPLAINS,
+    SuspiciousPoint,
     at_an_end,
+    flagged_rows,
     least_misfit_without,
     neighbourhood,
     rms_misfit,
     set_aside,
     sign_convention,
+    suspicious_points,
 )
-from dahl_ident.diagnostics.outliers import SuspiciousPoint, flagged_rows, suspicious_points
 from dahl_ident.diagnostics.physics import physical_warnings
 from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
-from dahl_ident.diagnostics.stiffening import LEAST_DOF, Stiffening, stiffening
-from dahl_ident.diagnostics.trends import LEAST_RANGE, Runs, Trend, runs, trends
+from dahl_ident.diagnostics.trends import (
+    LEAST_DOF,
+    LEAST_RANGE,
+    GroupsDiffer,
+    Runs,
+    Stiffening,
+    Trend,
+    groups,
+    runs,
+    stiffening,
+    trends,
+)
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.fitting import Optimum
@@ -125,6 +137,9 @@ class RunsDiffer:
         return f"the runs differ ({', '.join(parts)})"
 
 
+_Test = GroupsDiffer | RunsDiffer | ChiSquare | Stiffening | Trend | Runs | Exponent | ThirdHarmonic
+
+
 @dataclass(frozen=True)
 class Goodness:
     """Residuals after the fit, and what they mean.
@@ -146,6 +161,8 @@ class Goodness:
         Departure over each covariate that varies.
     runs : tuple of Runs
         Runs of sign over each covariate.
+    groups : tuple of GroupsDiffer
+        Differences between the labels of each column, such as devices in one table.
     exponent : Exponent or None
         Where one Dahl element has a fixed exponent.
     third_harmonic : ThirdHarmonic or None
@@ -195,6 +212,7 @@ class Goodness:
     stiffening: Stiffening | None
     trends: tuple[Trend, ...]
     runs: tuple[Runs, ...]
+    groups: tuple[GroupsDiffer, ...]
     exponent: Exponent | None
     third_harmonic: ThirdHarmonic | None
     scatter: Scatter | None
@@ -222,13 +240,11 @@ class Goodness:
         return _FALSE_ALARM / max(left, 1)
 
     @property
-    def _tests(
-        self,
-    ) -> list[RunsDiffer | ChiSquare | Stiffening | Trend | Runs | Exponent | ThirdHarmonic]:
+    def _tests(self) -> list[_Test]:
         """Every test that applies."""
         first = (self.runs_differ, self.chi_square, self.stiffening)
         last = (self.exponent, self.third_harmonic)
-        every = (*first, *self.trends, *self.runs, *last)
+        every = (*first, *self.groups, *self.trends, *self.runs, *last)
         return [test for test in every if test is not None]
 
     @property
@@ -259,6 +275,7 @@ class Goodness:
         """Yield every departure whose p-value is below `level`, those over frequency first."""
         if self.runs_differ is not None:
             yield str(self.runs_differ)
+        yield from (str(one) for one in self.groups if one.p_value < level)
         found = [trend for trend in self.trends if trend.p_value < level]
         rate = [trend for trend in found if trend.covariate == "frequency"]
         if self.beyond_any_sensor and self.noise_share is not None:
@@ -365,7 +382,10 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
     if sign:
         return replace(found, sign=sign, warnings=(*found.warnings, sign))
     found = _without_suspicious(optimum, found)
-    return replace(found, bound=_bound(optimum, found.rms_misfit)) if found.objections else found
+    differ = found.runs_differ or any(one.p_value < found.level for one in found.groups)
+    if differ or not found.objections:
+        return found  # no law describes several devices at once
+    return replace(found, bound=_bound(optimum, found.rms_misfit))
 
 
 def _tested_estimate(optimum: Optimum) -> Goodness:
@@ -457,6 +477,7 @@ def _tested(
         stiffening(optimum),
         tuple(trends(optimum, weighted)),
         tuple(runs(optimum, space)),
+        tuple(groups(optimum, space)),
         _exponent(optimum, space, chi_square),
         _third_harmonic(optimum, space),
         _scatter(optimum),

@@ -33,10 +33,10 @@ from numpy.typing import NDArray
 from scipy import special
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.error_sources import FEWEST_TESTS, rows_of_tests
 from dahl_ident.diagnostics.estimate import WeightedEstimate
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.mixed_model import State
-from dahl_ident.diagnostics.table_groups import FEWEST_TESTS, rows_of_tests
 
 _MOST_TESTS = 100  # left out one at a time: the share inside is then known to 2 %
 _PRIOR_SCORES = 10.0  # values that Student's t counts for: a table's own 5 % are known from more

@@ -6,9 +6,24 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.fitting import Optimum
+from dahl_ident.problem import Problem
 
 _NULL = 1e-13  # eigenvalue of the scaled information below which a direction is undetermined
 _PART = 1e-4  # of a direction in the undetermined ones that matters
+
+
+def parameter_values(optimum: Optimum) -> dict[str, float]:
+    """Return the value of every parameter of model and sensors at the optimum, by name."""
+    return values_at(optimum.problem, optimum.theta)
+
+
+def values_at(problem: Problem, theta: FloatArray) -> dict[str, float]:
+    """Return the value of every parameter of model and sensors at theta, by name."""
+    values = {
+        p.name: np.nan if p.value is None else p.value
+        for p in (*problem.model.parameters, *problem.sensors.parameters)
+    }
+    return values | dict(zip(problem.names, problem.to_values(theta).tolist(), strict=True))
 
 
 class Information:

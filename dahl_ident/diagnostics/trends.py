@@ -7,33 +7,141 @@ phase each have their own. What the parameters could explain is taken out
 more than noise. The departure's size comes with it, in percent and degrees, so that a significant
 trend can be distinguished from one that matters. A Wald-Wolfowitz test of the residuals' signs
 looks for runs that no low polynomial follows.
+
+A stiffness that rises with amplitude speaks against every law that softens, whatever its
+parameters and whatever else the model misses. No curve is assumed: the real part of the dynamic
+stiffness, less that of the linear elements, is a straight line over ln A in each of a few bands,
+estimated with a free mass's correction by weighted least squares, and compared from centre to
+centre. Rows that are predicted by the exact steady motion have no such test.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.polynomial import legendre
+from numpy.typing import NDArray
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.quantities import COMPLIANCES
 from dahl_ident.diagnostics.formatting import percent, with_unit
-from dahl_ident.diagnostics.parameters import parameter_values
-from dahl_ident.diagnostics.physics import is_spring
+from dahl_ident.diagnostics.information import parameter_values
+from dahl_ident.diagnostics.physics import friction_stiffness, is_spring
 from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, ResidualSpace
+from dahl_ident.elements import Element
 from dahl_ident.fitting import Optimum
 from dahl_ident.units import shown_unit
 
+_BANDS = 8  # of the range of amplitudes: few, so that each holds rows for a mean
+_NARROWEST = np.log(1.1)  # of a band, in the logarithm of the amplitude
+_FEWEST_ROWS = 3  # in a band
+LEAST_DOF = 6  # with fewer, no test of residuals of unknown scale applies
 _DEGREES = {"amplitude": 3, "drive": 3, "frequency": 2}
+_FEWEST_IN_A_GROUP = 3  # rows on average: fewer groups than that are not levels of their own
 _SAME = 0.01  # of the covariate's logarithm: values closer than this are one
 LEAST_RANGE = np.log(1.05)  # of a covariate that varies
 _LEAST_DOF_PER_COLUMN = 3  # for each shape; with fewer, tests find little
 _FEWEST_SIGNS = 10  # of each kind on average, for the number of runs to be normal
 _STEEPEST = np.log(10.0)  # change of a logarithm that is worth a number
 _FARTHEST = 9.0  # departure that is
+
+
+@dataclass(frozen=True)
+class Stiffening:
+    """The largest rise of stiffness with amplitude that the data show, against its error."""
+
+    low: float  # the amplitudes between which it rises: means over their bands, geometric
+    high: float
+    unit: str  # theirs
+    rise: float  # relative to the stiffness at `low`
+    stderr: float
+    p_value: float  # probability of as much by noise alone, all pairs of bands considered
+
+    def __str__(self) -> str:
+        size = with_unit(100.0 * self.rise, 100.0 * self.stderr, "%")
+        ends = f"from {self.low:.3g} to {self.high:.3g} {self.unit}"
+        return f"stiffness rises with amplitude, by {size} {ends}, which this law cannot describe"
+
+
+def stiffening(optimum: Optimum) -> Stiffening | None:
+    """Return the most significant rise of stiffness with amplitude; None where there is none."""
+    elements = optimum.problem.model.elements
+    friction = [e for e in elements if not e.is_linear]
+    if optimum.is_exact or not friction or not all(e.softens for e in friction):
+        return None
+    problem, view = optimum.problem, optimum.problem.stiffness_data
+    sines = ~(problem.is_exact & (problem.data.controlled == "force"))
+    rows = np.flatnonzero((view.harmonic == 1) & (view.weights > 0.0) & sines)
+    if not rows.size:
+        return None
+    kept, band = _bands(np.log(view.amplitude[rows]))
+    rows = rows[kept]
+    count = int(band.max()) + 1 if band.size else 0
+    own = (band[:, None] == np.arange(count)).astype(np.float64)
+    x = np.log(view.amplitude[rows])
+    centre = x @ own / own.sum(axis=0)
+    design = np.column_stack([own, own * (x[:, None] - centre)])
+    if any(_is_free_mass(e) for e in elements):
+        square = view.omega[rows] ** 2
+        design = np.column_stack([design, square / square.mean() - 1.0])
+    dof = len(rows) - design.shape[1]
+    if count < 2 or dof < LEAST_DOF:
+        return None
+    stiffness = friction_stiffness(optimum, with_springs=True).real[rows]
+    values, covariance = _weighted_means(design, stiffness, view.weights[rows], dof)
+    unit = shown_unit("m", optimum.problem.data.motion)
+    return _largest_rise(
+        np.exp(centre).tolist(), unit, values[:count], covariance[:count, :count], dof
+    )
+
+
+def _is_free_mass(element: Element) -> bool:
+    own = [element.parameter(label) for label in element.linear_parameters]
+    return element.is_linear and any(p.free and p.is_mass for p in own)
+
+
+def _bands(x: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Return which rows lie in bands with enough of them, and the number of the band of each."""
+    width = max(float(np.ptp(x)) / _BANDS, _NARROWEST) * (1.0 + 1e-9)
+    place = np.floor((x - x.min()) / width)
+    _, number, size = np.unique(place, return_inverse=True, return_counts=True)
+    kept = size[number] >= _FEWEST_ROWS
+    _, band = np.unique(number[kept], return_inverse=True)
+    return kept, band
+
+
+def _weighted_means(
+    design: FloatArray, y: FloatArray, weights: FloatArray, dof: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the coefficients of weighted least squares and their covariance as they scatter."""
+    inverse = np.linalg.pinv(weights[:, None] * design)
+    values = inverse @ (weights * y)
+    left = weights * (y - design @ values)
+    return values, inverse @ inverse.T * float(left @ left / dof)
+
+
+def _largest_rise(
+    amplitude: Sequence[float], unit: str, values: FloatArray, covariance: FloatArray, dof: int
+) -> Stiffening | None:
+    """Return the rise between two bands that is the largest against its error."""
+    pairs = list(combinations(range(len(values)), 2))
+    rise = np.array([values[j] - values[i] for i, j in pairs])
+    error = np.array(
+        [(covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j]) ** 0.5 for i, j in pairs]
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.nan_to_num(rise / error)
+    best = int(np.argmax(t))
+    i, j = pairs[best]
+    if t[best] <= 0.0 or values[i] <= 0.0:
+        return None
+    p = min(1.0, len(pairs) * float(special.stdtr(dof, -t[best])))
+    size, spread = rise[best] / values[i], error[best] / values[i]
+    return Stiffening(amplitude[i], amplitude[j], unit, float(size), float(spread), p)
 
 
 @dataclass(frozen=True)
@@ -78,6 +186,51 @@ class Runs:
 
     def __str__(self) -> str:
         return f"{self.runs} runs of sign over {self.covariate}, {self.expected:.0f} expected"
+
+
+@dataclass(frozen=True)
+class GroupsDiffer:
+    """How the gain differs between groups of rows that a column names, such as devices."""
+
+    column: str
+    lowest: tuple[str, float]  # label, and its gain over the model's
+    highest: tuple[str, float]
+    p_value: float
+
+    def __str__(self) -> str:
+        ends = [
+            f"{percent(abs(gain - 1.0))} {'below' if gain < 1.0 else 'above'} the model at {label}"
+            for label, gain in (self.lowest, self.highest)
+        ]
+        return f"the gain differs with {self.column}: {' and '.join(ends)}"
+
+
+def groups(optimum: Optimum, space: ResidualSpace) -> list[GroupsDiffer]:
+    """Return the differences between the groups of each column of labels.
+
+    Those in which the amplitude varies: else they are levels, over which there is a trend.
+    """
+    data, found = optimum.problem.data, []
+    amplitude = np.log(optimum.problem.stiffness_data.amplitude)
+    columns = {} if "verdict" in data.quality else dict(data.quality)  # the extraction's are not
+    if data.level is not None:
+        columns["level"] = data.level
+    for name, labels in columns.items():
+        names, which = np.unique(labels, return_inverse=True)
+        if not 1 < len(names) <= data.n // _FEWEST_IN_A_GROUP:
+            continue
+        own = which == np.arange(len(names))[:, None]
+        if min(float(np.ptp(amplitude[rows])) for rows in own) < LEAST_RANGE:
+            continue
+        changes = own.astype(np.complex128)
+        p = space.p_value(changes)
+        if not np.isnan(p):
+            gain = np.exp(RelativeSpace(optimum).fitted(changes).real)
+            low, high = (
+                (str(labels[row]), float(gain[row])) for row in (gain.argmin(), gain.argmax())
+            )
+            found.append(GroupsDiffer(name, low, high, p))
+    return found
 
 
 def trends(optimum: Optimum, space: ResidualSpace) -> list[Trend]:

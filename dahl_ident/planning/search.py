@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.stiffening import LEAST_DOF
-from dahl_ident.diagnostics.trends import LEAST_RANGE
+from dahl_ident.diagnostics.trends import LEAST_DOF, LEAST_RANGE
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
 from dahl_ident.planning.candidates import Candidates
